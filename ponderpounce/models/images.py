@@ -1,0 +1,40 @@
+"""Camera frames to network pixels: resize with the ratio kept, pad to a square, scale to [-1, 1]."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor
+
+PADDING = -1.0
+"""Black; also every pixel of a missing camera."""
+
+
+def resize_with_pad(frame: NDArray[np.uint8], size_px: int) -> Tensor:
+    """(h, w, 3) uint8 -> (3, size_px, size_px) float32 in [-1, 1], centred on black.
+
+    Bilinear with antialiasing on uint8, as the PIL resize of openpi's data path and client; lerobot interpolates
+    floats without antialiasing, which differs wherever a frame shrinks.
+    """
+    height_px, width_px = frame.shape[:2]
+    longest_px = max(height_px, width_px)
+    new_height_px, new_width_px = height_px * size_px // longest_px, width_px * size_px // longest_px
+    pixels = torch.from_numpy(np.ascontiguousarray(frame)).permute(2, 0, 1)
+    if (new_height_px, new_width_px) != (height_px, width_px):
+        pixels = F.interpolate(
+            pixels[None], (new_height_px, new_width_px), mode="bilinear", antialias=True, align_corners=False
+        )[0]
+    image = torch.full((3, size_px, size_px), PADDING)
+    top_px, left_px = (size_px - new_height_px) // 2, (size_px - new_width_px) // 2
+    image[:, top_px : top_px + new_height_px, left_px : left_px + new_width_px] = pixels.float() / 127.5 - 1.0
+    return image
+
+
+def camera_batch(frames: Sequence[NDArray[np.uint8] | None], size_px: int) -> tuple[Tensor, Tensor]:
+    """Returns the views of one moment, (1, V, 3, px, px), and which cameras delivered, (1, V) bool; None is missing."""
+    missing = torch.full((3, size_px, size_px), PADDING)
+    views = [missing if frame is None else resize_with_pad(frame, size_px) for frame in frames]
+    has_view = [frame is not None for frame in frames]
+    return torch.stack(views)[None], torch.tensor(has_view)[None]

@@ -1,0 +1,236 @@
+"""pi0.5: a frozen-layout PaliGemma that sees, and an action expert that reads its keys and values.
+
+The token stream is [cognition P][view 0]...[view V-1][text] (the "prefix" of the pi0 literature), followed by the
+action tokens. The prefix never sees the actions, so its keys and values are computed once (`prefill`) and every
+evaluation of the velocity, in training as in sampling, reads them (`velocity`). Parity with the public
+implementations is a test: `tests/models/test_pi05_golden.py`.
+
+    # B batch, V views, P cognition tokens, T prefix tokens, N horizon, A action dim
+    # W language width, E expert width, h/g query/key heads, D head dim, M norms of the expert
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ponderpounce.models import flow
+from ponderpounce.models.gemma import ActionExpert, GemmaConfig, LanguageModel, Rotation, attend
+from ponderpounce.models.siglip import VisionConfig, VisionTower
+from ponderpounce.models.sinusoid import sinusoid
+
+TIME_MIN_PERIOD = 4e-3
+TIME_MAX_PERIOD = 4.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pi05Config:
+    """Sizes of the public model; nothing of ours."""
+
+    vision: VisionConfig
+    language: GemmaConfig
+    expert: GemmaConfig
+    vocab_size: int = 257_152
+    action_dim: int = 32
+    """Padded width of an action; a robot uses the first few."""
+    horizon: int = 50
+
+    def __post_init__(self) -> None:
+        shared = ("depth", "num_heads", "num_kv_heads", "head_dim")
+        for name in shared:
+            ours, theirs = getattr(self.language, name), getattr(self.expert, name)
+            if ours != theirs:
+                raise ValueError(
+                    f"both streams attend jointly: language.{name} {ours} != expert.{name} {theirs}"
+                )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Prefix:
+    """The embedded prefix stream before the first layer."""
+
+    embeds: Tensor
+    is_real: Tensor
+    """bool; False for padding and for the tokens of a missing camera: unseen, and they take no position."""
+    num_cognition: int = 0
+    """The first tokens are P; the rest are images and text."""
+    is_isolated: bool = False
+    """P and (images, text) do not see each other; the actions see both."""
+
+    def positions(self) -> Tensor:
+        return self.is_real.long().cumsum(dim=1) - 1
+
+    def visible(self) -> Tensor:
+        """Returns which keys a row may see, broadcastable to (B, 1, T, T).
+
+        Rows of padding are left to see the real keys: nobody reads them, and a row that saw nothing would be NaN.
+        """
+        visible_B11T = self.is_real[:, None, None, :]
+        if not self.is_isolated:
+            return visible_B11T
+        is_cognition_T = (
+            torch.arange(self.is_real.shape[1], device=self.is_real.device) < self.num_cognition
+        )
+        same_part_TT = is_cognition_T[:, None] == is_cognition_T[None, :]
+        return visible_B11T & same_part_TT
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PrefixCache:
+    """What the action stream reads of the prefix: per layer keys and values (B, g, T, D), and which may be seen."""
+
+    keys: tuple[Tensor, ...]
+    values: tuple[Tensor, ...]
+    visible: Tensor
+    num_real: Tensor
+    """The first action token's position."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StepTable:
+    """The adaRMS styles at every time of the Euler sampler: constants of the weights, computed once per model.
+
+    37 dense layers times 10 steps would otherwise be evaluated, and read from memory, in every invocation.
+    """
+
+    num_steps: int
+    styles: tuple[Tensor, ...]
+    """One (M, 3, 1, 1, E) per step; broadcasts over the batch."""
+
+
+class Pi05(nn.Module):
+    """The public pi0.5 network. Parameters are float32 or mixed as in `cast_for_serving`."""
+
+    def __init__(self, config: Pi05Config) -> None:
+        super().__init__()
+        self.config = config
+        expert_width = config.expert.width
+        self.vision = VisionTower(config.vision)
+        self.projector = nn.Linear(config.vision.width, config.language.width)
+        self.language = LanguageModel(config.language, config.vocab_size)
+        self.expert = ActionExpert(config.expert)
+        self.action_in_proj = nn.Linear(config.action_dim, expert_width)
+        self.action_out_proj = nn.Linear(expert_width, config.action_dim)
+        self.time_mlp_in = nn.Linear(expert_width, expert_width)
+        self.time_mlp_out = nn.Linear(expert_width, expert_width)
+
+    @property
+    def stream_dtype(self) -> torch.dtype:
+        return self.language.embed_tokens.weight.dtype
+
+    def embed_images(self, images_BV3PP: Tensor) -> Tensor:
+        """(B, V, 3, px, px) in [-1, 1] -> (B, V * patches, W). Not divided by sqrt(W), unlike stock PaliGemma."""
+        features_XSW = self.projector(self.vision(images_BV3PP.flatten(0, 1)))
+        return features_XSW.unflatten(0, images_BV3PP.shape[:2]).flatten(1, 2)  # type: ignore[no-any-return]
+
+    def embed_prefix(
+        self,
+        images_BV3PP: Tensor,
+        has_view_BV: Tensor,
+        token_ids_BT: Tensor,
+        is_token_BT: Tensor,
+        *,
+        cognition_BPW: Tensor | None = None,
+        is_isolated: bool = False,
+    ) -> Prefix:
+        """Assembles [P][views][text]. A missing camera keeps its slots but is neither seen nor counted.
+
+        ``cognition_BPW`` enters as it is: like image tokens and unlike text it is not multiplied by sqrt(W).
+        """
+        image_embeds = self.embed_images(images_BV3PP)
+        is_image = has_view_BV.repeat_interleave(self.config.vision.num_patches, dim=1)
+        parts = [image_embeds, self.language.embed(token_ids_BT)]
+        is_real = [is_image, is_token_BT]
+        num_cognition = 0
+        if cognition_BPW is not None:
+            num_cognition = cognition_BPW.shape[1]
+            parts.insert(0, cognition_BPW)
+            is_real.insert(0, is_token_BT.new_ones(cognition_BPW.shape[:2]))
+        return Prefix(
+            embeds=torch.cat([part.to(self.stream_dtype) for part in parts], dim=1),
+            is_real=torch.cat(is_real, dim=1),
+            num_cognition=num_cognition,
+            is_isolated=is_isolated,
+        )
+
+    def prefill(self, prefix: Prefix) -> PrefixCache:
+        """Runs the prefix through the language layers and keeps every layer's keys and values.
+
+        Of the last layer only keys and values are computed: its output feeds nothing.
+        """
+        keys, values, _ = self._run_prefix(prefix, last_layer_output=False)
+        return PrefixCache(
+            keys=keys, values=values, visible=prefix.is_real, num_real=prefix.is_real.sum(dim=1)
+        )
+
+    def prefix_hidden(self, prefix: Prefix) -> Tensor:
+        """Returns (B, T, W) after the last norm. Acting needs it nowhere; parity tests and probes do."""
+        _, _, hidden_BTW = self._run_prefix(prefix, last_layer_output=True)
+        return self.language.norm(hidden_BTW)  # type: ignore[no-any-return]
+
+    def _run_prefix(
+        self, prefix: Prefix, *, last_layer_output: bool
+    ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...], Tensor]:
+        rotation = Rotation.at(prefix.positions(), self.config.language.head_dim)
+        visible = prefix.visible()
+        hidden_BTW = prefix.embeds
+        keys: list[Tensor] = []
+        values: list[Tensor] = []
+        for layer in self.language.layers:
+            q_BhTD, k_BgTD, v_BgTD = layer.self_attn.qkv(layer.input_layernorm(hidden_BTW), rotation)
+            keys.append(k_BgTD)
+            values.append(v_BgTD)
+            if len(keys) == self.config.language.depth and not last_layer_output:
+                break
+            hidden_BTW = hidden_BTW + layer.self_attn.o_proj(attend(q_BhTD, k_BgTD, v_BgTD, visible))
+            hidden_BTW = hidden_BTW + layer.mlp(layer.post_attention_layernorm(hidden_BTW))
+        return tuple(keys), tuple(values), hidden_BTW
+
+    def time_condition(self, time_B: Tensor) -> Tensor:
+        """Returns (B, E): the vector every adaRMS norm of the expert is conditioned on."""
+        features_BE = sinusoid(
+            time_B, self.config.expert.width, min_period=TIME_MIN_PERIOD, max_period=TIME_MAX_PERIOD
+        )
+        return F.silu(self.time_mlp_out(F.silu(self.time_mlp_in(features_BE))))
+
+    def step_table(self, num_steps: int) -> StepTable:
+        """Tabulates the styles at the times of the Euler sampler; stale once a weight changes."""
+        device = self.time_mlp_in.weight.device
+        times = torch.tensor(flow.euler_times(num_steps), dtype=torch.float32, device=device)
+        styles_M3S1E = self.expert.styles(self.time_condition(times))
+        return StepTable(num_steps=num_steps, styles=tuple(styles_M3S1E.split(1, dim=2)))
+
+    def velocity(self, x_BNA: Tensor, styles_M3B1E: Tensor, cache: PrefixCache) -> Tensor:
+        """Returns v(x_t, t | prefix), (B, N, A) float32; ``styles_M3B1E`` carries t.
+
+        Action tokens see every visible prefix token and each other. pi0.5 has no state token.
+        """
+        num_actions = x_BNA.shape[1]
+        offsets_N = torch.arange(num_actions, device=x_BNA.device)
+        rotation = Rotation.at(cache.num_real[:, None] + offsets_N, self.config.expert.head_dim)
+        is_action_BN = cache.visible.new_ones(x_BNA.shape[:2])
+        visible = torch.cat([cache.visible, is_action_BN], dim=1)[:, None, None, :]
+        x_BNE = self.action_in_proj(x_BNA).to(self.stream_dtype)
+        styles = iter(styles_M3B1E)
+        for layer, prefix_key, prefix_value in zip(self.expert.layers, cache.keys, cache.values, strict=True):
+            normed_BNE, gate = layer.input_layernorm(x_BNE, next(styles))
+            q_BhND, k_BgND, v_BgND = layer.self_attn.qkv(normed_BNE, rotation)
+            keys = torch.cat([prefix_key, k_BgND], dim=2)
+            values = torch.cat([prefix_value, v_BgND], dim=2)
+            x_BNE = x_BNE + gate * layer.self_attn.o_proj(attend(q_BhND, keys, values, visible))
+            normed_BNE, gate = layer.post_attention_layernorm(x_BNE, next(styles))
+            x_BNE = x_BNE + gate * layer.mlp(normed_BNE)
+        final_BNE, _ = self.expert.norm(x_BNE, next(styles))  # the last norm has no residual to gate
+        return self.action_out_proj(final_BNE.float())  # type: ignore[no-any-return]
+
+    def velocity_at(self, x_BNA: Tensor, time_B: Tensor, cache: PrefixCache) -> Tensor:
+        """`velocity` with one flow time per sample: training's form."""
+        return self.velocity(x_BNA, self.expert.styles(self.time_condition(time_B)), cache)
+
+    def sample(self, noise_BNA: Tensor, cache: PrefixCache, table: StepTable) -> Iterator[flow.EulerStep]:
+        """Integrates from noise to actions against one prefilled prefix; yields after every step."""
+        return flow.euler(
+            lambda index, x_BNA: self.velocity(x_BNA, table.styles[index], cache), noise_BNA, table.num_steps
+        )

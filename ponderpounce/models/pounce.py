@@ -1,0 +1,147 @@
+"""POUNCE, System 1: pi0.5 with the cognition prefix in front of what it sees (paper 3.1).
+
+# B batch, V views, T text tokens, K carriers, H carrier size, N horizon, A padded action dim
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from ponderpounce.models import flow
+from ponderpounce.models.interface import CognitionConfig, CognitionPrefix
+from ponderpounce.models.pi05 import Pi05, Pi05Config, PrefixCache, StepTable
+
+Freeze = Literal["none", "vision", "vlm"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PounceInputs:
+    """One batch as the network takes it: resized, normalised, tokenised."""
+
+    images: Tensor
+    """float32 in [-1, 1]; a missing camera is all -1."""
+    has_view: Tensor
+    """bool"""
+    token_ids: Tensor
+    """int64"""
+    is_token: Tensor
+    """bool; False for padding"""
+    age_ns: Tensor
+    """int64 age of the cognition; 0 where null"""
+    cognition: Tensor | None = None
+    """float32; None means null cognition everywhere, or K = 0"""
+    is_null: Tensor | None = None
+    """bool; samples of ``cognition_BKH`` to replace by the learned null"""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PounceConfig:
+    """Everything that fixes POUNCE's shapes. Named complete ones are in `pounce_configs`."""
+
+    pi05: Pi05Config
+    cognition: CognitionConfig
+    robot_action_dim: int = 8
+    """The first dims of the padded action: 7 arm joints and the gripper."""
+    num_cameras: int = 2
+    """front, wrist"""
+    num_steps: int = 10
+    """Euler steps per chunk."""
+    max_prompt_tokens: int = 200
+
+    def __post_init__(self) -> None:
+        if not 0 < self.robot_action_dim <= self.pi05.action_dim:
+            raise ValueError(
+                f"robot_action_dim must be 1..{self.pi05.action_dim}, came {self.robot_action_dim}"
+            )
+        for name in ("num_cameras", "num_steps", "max_prompt_tokens"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, came {getattr(self, name)}")
+
+    def example_inputs(self, batch_size: int, *, num_tokens: int = 12, seed: int = 0) -> PounceInputs:
+        """Fabricates a valid batch for tests, warm-up and benchmarks: all views present, cognition 300 ms old."""
+        generator = torch.Generator().manual_seed(seed)
+        px = self.pi05.vision.image_px
+        cognition = self.cognition
+        image_shape = (batch_size, self.num_cameras, 3, px, px)
+        token_shape = (batch_size, num_tokens)
+        cognition_BKH = torch.randn(
+            (batch_size, cognition.num_carriers, cognition.cognition_size), generator=generator
+        )
+        return PounceInputs(
+            images=torch.rand(image_shape, generator=generator) * 2 - 1,
+            has_view=torch.ones(batch_size, self.num_cameras, dtype=torch.bool),
+            token_ids=torch.randint(self.pi05.vocab_size, token_shape, generator=generator),
+            is_token=torch.ones(token_shape, dtype=torch.bool),
+            age_ns=torch.full((batch_size,), 300_000_000),
+            cognition=cognition_BKH if cognition.num_carriers else None,
+        )
+
+    def example_actions(self, batch_size: int, *, seed: int = 0) -> Tensor:
+        """Fabricates normalised training targets, (B, N, A) float32, zero beyond the robot's dims."""
+        generator = torch.Generator().manual_seed(seed)
+        actions = torch.zeros(batch_size, self.pi05.horizon, self.pi05.action_dim)
+        actions[..., : self.robot_action_dim].uniform_(-1, 1, generator=generator)
+        return actions
+
+
+class Pounce(nn.Module):
+    """pi0.5 plus, for K >= 1, the cognition prefix."""
+
+    def __init__(self, config: PounceConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.pi05 = Pi05(config.pi05)
+        has_prefix = config.cognition.num_carriers > 0
+        self.prefix = CognitionPrefix(config.cognition, config.pi05.language.width) if has_prefix else None
+
+    def prefill(self, inputs: PounceInputs) -> PrefixCache:
+        """Embeds [P][images][text] and runs it through the language layers once."""
+        cognition_BPW = None
+        if self.prefix is not None:
+            cognition_BPW = self.prefix(inputs.cognition, inputs.age_ns, inputs.is_null)
+        prefix = self.pi05.embed_prefix(
+            inputs.images,
+            inputs.has_view,
+            inputs.token_ids,
+            inputs.is_token,
+            cognition_BPW=cognition_BPW,
+            is_isolated=self.config.cognition.attention == "isolated",
+        )
+        return self.pi05.prefill(prefix)
+
+    def loss(self, inputs: PounceInputs, actions_BNA: Tensor, noise_BNA: Tensor, time_B: Tensor) -> Tensor:
+        """Returns the unreduced flow-matching loss, (B, N, A); reduce it with `flow.mean_loss`."""
+        x_BNA = flow.noised(actions_BNA, noise_BNA, time_B)
+        velocity_BNA = self.pi05.velocity_at(x_BNA, time_B, self.prefill(inputs))
+        return (flow.target_velocity(actions_BNA, noise_BNA) - velocity_BNA).square()
+
+    def step_table(self) -> StepTable:
+        return self.pi05.step_table(self.config.num_steps)
+
+    def sample(self, inputs: PounceInputs, noise_BNA: Tensor, table: StepTable) -> Iterator[flow.EulerStep]:
+        """Yields the sampler's steps; the last one's ``actions_BNA`` are the normalised chunk."""
+        return self.pi05.sample(noise_BNA, self.prefill(inputs), table)
+
+
+def freeze(model: Pounce, what: Freeze = "vlm") -> None:
+    """Sets ``requires_grad`` of every parameter; gradients still flow *through* frozen layers to the cognition.
+
+    - ``vlm`` (the paper, B.1: "including the PaliGemma backbone"): vision, projector and language model frozen.
+    - ``vision`` (RoboMME's released pi0.5 recipe, which the paper's wording contradicts): SigLIP and projector only.
+    - ``none``: everything trains.
+
+    Never run the prefix under ``no_grad`` or ``detach`` it to save memory: that is the path to PONDER.
+    """
+    frozen: dict[Freeze, list[nn.Module]] = {
+        "none": [],
+        "vision": [model.pi05.vision, model.pi05.projector],
+        "vlm": [model.pi05.vision, model.pi05.projector, model.pi05.language],
+    }
+    if what not in frozen:
+        raise ValueError(f"freeze must be one of {', '.join(frozen)}, came {what!r}")
+    model.requires_grad_(True)
+    for part in frozen[what]:
+        part.requires_grad_(False)

@@ -1,0 +1,52 @@
+"""POUNCE from a seed: every parameter drawn from one generator, in a fixed order, without global random state."""
+
+import torch
+from torch import nn
+
+from ponderpounce.models.gemma import RmsNorm
+from ponderpounce.models.pounce import Pounce, PounceConfig
+
+
+def random_pounce(config: PounceConfig, seed: int) -> Pounce:
+    """Returns a CPU float32 model with seeded random weights: moves the arm, knows nothing.
+
+    Built on the meta device first, because the constructors of torch.nn draw from the global generator.
+    """
+    with torch.device("meta"):
+        model = Pounce(config)
+    model.to_empty(device="cpu")
+    generator = torch.Generator().manual_seed(seed)
+    _initialise_pi05(model.pi05, generator)
+    initialise_prefix(model, generator)
+    return model
+
+
+def initialise_prefix(model: Pounce, generator: torch.Generator) -> None:
+    """Draws fresh prefix weights to the scale of the text embeddings that ``model`` holds; no-op at K = 0."""
+    if model.prefix is None:
+        return
+    embedding = model.pi05.language.embed_tokens.weight.detach()
+    text_rms = embedding.float().square().mean().sqrt().item() * embedding.shape[1] ** 0.5
+    model.prefix.to_empty(device=embedding.device)
+    model.prefix.initialise(text_rms, generator)
+
+
+@torch.no_grad()
+def _initialise_pi05(pi05: nn.Module, generator: torch.Generator) -> None:
+    """Keeps the variance of activations: weights N(0, 1 / fan-in), biases 0, norms the identity.
+
+    The adaRMS layers are drawn like the rest. Public training starts them at zero, which shuts every gate: such a
+    model would not look at its images, and a test on it would show nothing.
+    """
+    for module in pi05.modules():
+        if isinstance(module, nn.Linear | nn.Conv2d):
+            module.weight.normal_(std=module.weight[0].numel() ** -0.5, generator=generator)
+            if module.bias is not None:
+                module.bias.zero_()
+        elif isinstance(module, nn.Embedding):
+            module.weight.normal_(std=module.embedding_dim**-0.5, generator=generator)
+        elif isinstance(module, nn.LayerNorm):
+            module.weight.fill_(1.0)
+            module.bias.zero_()
+        elif isinstance(module, RmsNorm):
+            module.weight.zero_()

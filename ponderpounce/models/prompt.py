@@ -1,0 +1,103 @@
+"""The text POUNCE reads: instruction and proprioception in one line, and its tokens.
+
+Traps, each a different prompt from the same inputs in public code: the state is written BEFORE it is padded to 32 dims
+(lerobot 0.4.x wrote 32 numbers); openpi's pi05_libero and RoboMME's policies leave the state out altogether
+(``discrete_state_input=False``), so they act without proprioception; a value below q01 becomes bin -1, not 0.
+"""
+
+import io
+from pathlib import Path
+
+import numpy as np
+import sentencepiece
+from numpy.typing import ArrayLike
+
+NUM_BINS = 256
+TINY_VOCAB_SIZE = 512
+
+# Enough of RoboMME's language for the pieces of a tiny tokenizer to be words; bytes cover everything else.
+_TASK_LANGUAGE = (
+    "put two red cubes and one blue cube into the bin, then press the button to stop",
+    "pick up the green cube and place it on the target, repeating this action three times",
+    "swing the cube between the right target and the left target, then put it down on the table",
+    "press the button to stop the moving cube exactly on the target the second time",
+    "watch the video carefully, then pick up the container that hides the red cube",
+    "first press both buttons, then pick up the containers hiding the blue cube and the green cube",
+    "press the button, pick all cubes that were highlighted, then press the button again to stop",
+    "watch the video carefully, then repeatedly pick up and put down the same cube that was picked up",
+    "place the blue cube on the target where it was placed before the button was pressed",
+    "move the cube to the target in the same manner, insert the peg into the box from the same end",
+    "trace the same pattern with the stick, navigate around the sticks clockwise and counterclockwise",
+)
+
+
+def state_bins(state: ArrayLike) -> list[int]:
+    """Bins a normalised state into 256 equal parts of [-1, 1]: 0..255, and -1 for anything below -1."""
+    edges = np.linspace(-1.0, 1.0, NUM_BINS + 1)[:-1]
+    return [int(bin_) for bin_ in np.digitize(np.asarray(state), edges) - 1]
+
+
+def prompt_text(instruction: str, state: ArrayLike) -> str:
+    """Returns pi0.5's prompt for an instruction and a normalised, unpadded state."""
+    text = instruction.strip().replace("_", " ").replace("\n", " ")
+    return f"Task: {text}, State: {' '.join(map(str, state_bins(state)))};\nAction: "
+
+
+class Tokenizer:
+    """A SentencePiece model, PaliGemma's or any other; prompts begin with its BOS.
+
+    Attributes:
+        model_bytes: the serialised model, for saving beside the weights that were trained with it.
+    """
+
+    def __init__(self, model_bytes: bytes) -> None:
+        self.model_bytes = model_bytes
+        self._pieces = sentencepiece.SentencePieceProcessor(model_proto=model_bytes)
+        if self._pieces.bos_id() < 0:
+            raise ValueError(
+                "tokenizer has no BOS piece; pi0.5 prompts begin with one (paligemma_tokenizer.model has)"
+            )
+
+    @classmethod
+    def from_file(cls, path: Path) -> "Tokenizer":
+        if not path.is_file():
+            raise FileNotFoundError(
+                f"no tokenizer at {path}. Public pi0.5 weights need PaliGemma's SentencePiece file "
+                "(gs://big_vision/paligemma_tokenizer.model, 257152 ids); give its path with --tokenizer."
+            )
+        return cls(path.read_bytes())
+
+    @property
+    def vocab_size(self) -> int:
+        return int(self._pieces.vocab_size())
+
+    def encode(self, text: str) -> list[int]:
+        return [int(id_) for id_ in self._pieces.encode(text, add_bos=True)]
+
+
+def tiny_tokenizer_for_random_weights() -> Tokenizer:
+    """Trains a 512-id byte-fallback BPE on a few task sentences: the same ids on every call, useless to real weights.
+
+    Special ids are PaliGemma's (pad 0, eos 1, bos 2, unk 3) and digits are split, as Gemma's tokenizer does.
+    """
+    model = io.BytesIO()
+    states = (f"Task: {text}, State: 0 12 37 64 128 193 255 255;\nAction: " for text in _TASK_LANGUAGE)
+    sentencepiece.SentencePieceTrainer.train(
+        sentence_iterator=states,
+        model_writer=model,
+        model_type="bpe",
+        vocab_size=TINY_VOCAB_SIZE,
+        hard_vocab_limit=False,
+        byte_fallback=True,
+        split_digits=True,
+        pad_id=0,
+        eos_id=1,
+        bos_id=2,
+        unk_id=3,
+        normalization_rule_name="identity",
+        remove_extra_whitespaces=False,
+        add_dummy_prefix=False,
+        num_threads=1,
+        minloglevel=2,
+    )
+    return Tokenizer(model.getvalue())

@@ -1,0 +1,23 @@
+"""A scalar as sines and cosines: how flow time and cognition age enter a network.
+
+# B batch, F features
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+
+def sinusoid(values_B: Tensor, num_features: int, *, min_period: float, max_period: float) -> Tensor:
+    """Returns ``[sin | cos]`` of ``values_B`` at log-spaced periods, shape (B, num_features), float32.
+
+    Periods run from ``min_period`` to ``max_period`` in the unit of the values. The angles are computed in
+    float64, as the public pi0.5 implementations do: at period 4e-3 a float32 angle is already off by 1e-4.
+    """
+    if num_features % 2:
+        raise ValueError(f"sinusoid needs an even number of features, came {num_features}")
+    fraction = torch.linspace(0.0, 1.0, num_features // 2, dtype=torch.float64, device=values_B.device)
+    period = min_period * (max_period / min_period) ** fraction
+    angle_BF = values_B.to(torch.float64)[:, None] * (2.0 * math.pi / period)
+    return torch.cat([angle_BF.sin(), angle_BF.cos()], dim=-1).to(torch.float32)

@@ -1,0 +1,27 @@
+"""Which parameters may be bfloat16 when serving, and which stay float32 (openpi's choice)."""
+
+from typing import Literal
+
+import torch
+
+from ponderpounce.models.pounce import Pounce
+
+DTypeName = Literal["float32", "bfloat16"]
+
+_STREAMS = ("pi05.vision.", "pi05.projector.", "pi05.language.", "pi05.expert.")
+_FLOAT32_PARTS = ("norm", "patch_embedding", "position_embedding")
+
+
+def cast_for_serving(model: Pounce, dtype: DTypeName) -> Pounce:
+    """Casts ``model`` in place and returns it.
+
+    In bfloat16 the two streams' matrices are cast; norms (adaRMS layers with them), pixel and position embeddings,
+    the action and time projections and the cognition prefix stay float32, and each norm computes in float32.
+    """
+    if dtype not in ("float32", "bfloat16"):
+        raise ValueError(f"dtype must be 'float32' or 'bfloat16', came {dtype!r}")
+    if dtype == "bfloat16":
+        for name, parameter in model.named_parameters():
+            if name.startswith(_STREAMS) and not any(part in name for part in _FLOAT32_PARTS):
+                parameter.data = parameter.data.to(torch.bfloat16)
+    return model

@@ -1,0 +1,159 @@
+"""Our pi0.5 against numbers from the public implementations: every tensor the goldens hold, float32, 1e-4."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+
+from ponderpounce.models import flow
+from ponderpounce.models.gemma import GemmaConfig
+from ponderpounce.models.interface import CognitionConfig
+from ponderpounce.models.pi05 import Pi05Config, Prefix
+from ponderpounce.models.pi05_weights import load_weights
+from ponderpounce.models.pounce import Pounce, PounceConfig, PounceInputs
+from ponderpounce.models.siglip import VisionConfig
+
+TOLERANCE = 1e-4
+COMMITTED = Path(__file__).parent / "data" / "goldens"
+SHARED = Path(__file__).parents[3] / "shared" / "goldens"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Golden:
+    model: Pounce
+    inputs: PounceInputs
+    given: dict[str, Tensor]
+    expected: dict[str, Tensor]
+    num_real_dims: int
+
+    def prefix(self) -> Prefix:
+        inputs = self.inputs
+        return self.model.pi05.embed_prefix(inputs.images, inputs.has_view, inputs.token_ids, inputs.is_token)
+
+
+def _gemma(sizes: dict[str, Any]) -> GemmaConfig:
+    return GemmaConfig(
+        width=sizes["width"],
+        depth=sizes["depth"],
+        mlp_width=sizes["mlp"],
+        num_heads=sizes["heads"],
+        num_kv_heads=sizes["kv_heads"],
+        head_dim=sizes["head_dim"],
+    )
+
+
+def _config(sizes: dict[str, Any]) -> PounceConfig:
+    vision = sizes["vision"]
+    return PounceConfig(
+        pi05=Pi05Config(
+            vision=VisionConfig(
+                width=vision["hidden"],
+                depth=vision["depth"],
+                num_heads=vision["heads"],
+                mlp_width=vision["mlp"],
+                image_px=vision["image_size"],
+                patch_px=vision["patch"],
+            ),
+            language=_gemma(sizes["llm"]),
+            expert=_gemma(sizes["expert"]),
+            vocab_size=sizes["llm"]["vocab"],
+            action_dim=sizes["action_dim"],
+            horizon=sizes["horizon"],
+        ),
+        cognition=CognitionConfig(num_carriers=0),
+        robot_action_dim=sizes["real_action_dim"],
+        num_cameras=sizes["views"],
+        num_steps=sizes["num_steps"],
+    )
+
+
+@pytest.fixture(scope="module", params=["pi05_base", "pi05_three_views"])
+def golden(request: pytest.FixtureRequest) -> Golden:
+    folder = next((root / request.param for root in (COMMITTED, SHARED) if (root / request.param).is_dir()), None)
+    if folder is None:
+        pytest.skip(f"golden {request.param} is neither committed nor in ../shared/goldens beside the checkout")
+    sizes = json.loads((folder / "config.json").read_text())
+    with torch.device("meta"):
+        model = Pounce(_config(sizes))
+    load_weights(model, folder / "weights.safetensors")
+    given = load_file(folder / "inputs.safetensors")
+    inputs = PounceInputs(
+        images=given["images"],
+        has_view=given["image_masks"],
+        token_ids=given["token_ids"],
+        is_token=given["token_mask"],
+        age_ns=torch.zeros(len(given["time"]), dtype=torch.int64),
+    )
+    return Golden(
+        model=model.eval().requires_grad_(False),
+        inputs=inputs,
+        given=given,
+        expected=load_file(folder / "expected.safetensors"),
+        num_real_dims=sizes["real_action_dim"],
+    )
+
+
+def _assert_close(ours: Tensor, expected: Tensor) -> None:
+    torch.testing.assert_close(ours, expected, atol=TOLERANCE, rtol=0.0)
+
+
+def test_prefix_embeddings_and_padding(golden: Golden) -> None:
+    prefix = golden.prefix()
+    _assert_close(prefix.embeds, golden.expected["prefix_embeds"])
+    assert torch.equal(prefix.is_real, golden.expected["prefix_pad_mask"])
+
+
+def test_prefix_hidden_states_where_real(golden: Golden) -> None:
+    is_real = golden.expected["prefix_pad_mask"]
+    hidden = golden.model.pi05.prefix_hidden(golden.prefix())
+    _assert_close(hidden[is_real], golden.expected["prefix_hidden"][is_real])
+
+
+def test_time_condition(golden: Golden) -> None:
+    _assert_close(golden.model.pi05.time_condition(golden.given["time"]), golden.expected["time_cond"])
+
+
+def test_velocity(golden: Golden) -> None:
+    given = golden.given
+    x_t = flow.noised(given["actions"], given["noise"], given["time"])
+    velocity = golden.model.pi05.velocity_at(x_t, given["time"], golden.model.prefill(golden.inputs))
+    _assert_close(velocity, golden.expected["velocity"])
+
+
+def test_loss_unreduced_and_both_means(golden: Golden) -> None:
+    given, expected = golden.given, golden.expected
+    loss = golden.model.loss(golden.inputs, given["actions"], given["noise"], given["time"])
+    _assert_close(loss, expected["loss_unreduced"])
+    _assert_close(flow.mean_loss(loss, golden.num_real_dims, over="all"), expected["loss_mean_all"][0])
+    _assert_close(flow.mean_loss(loss, golden.num_real_dims, over="real"), expected["loss_mean_real"][0])
+
+
+def test_sampler_step_by_step(golden: Golden) -> None:
+    noise = golden.given["noise"]
+    steps = list(golden.model.sample(golden.inputs, noise, golden.model.step_table()))
+    velocities = torch.stack([step.velocity for step in steps], dim=1)
+    trajectory = torch.stack([noise, *(step.actions for step in steps)], dim=1)
+    _assert_close(velocities, golden.expected["sample_velocities"])
+    _assert_close(trajectory, golden.expected["sample_trajectory"])
+    _assert_close(steps[-1].actions, golden.expected["actions"])
+
+
+def test_every_expected_tensor_is_compared(golden: Golden) -> None:
+    assert set(golden.expected) == {
+        "prefix_embeds",
+        "prefix_pad_mask",
+        "prefix_hidden",
+        "time_cond",
+        "velocity",
+        "loss_unreduced",
+        "loss_mean_all",
+        "loss_mean_real",
+        "sample_velocities",
+        "sample_trajectory",
+        "actions",
+    }
