@@ -1,0 +1,119 @@
+"""What the daemon and a PONDER engine say to each other: no tensors, no torch.
+
+The node and the shell need this file only, so they can be tested with a fake engine in milliseconds.
+
+# K carriers, H hidden, h w height and width in pixels
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal, Protocol, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+Frame: TypeAlias = npt.NDArray[np.uint8]
+"""One camera image, (h, w, 3) uint8 RGB."""
+
+Progress: TypeAlias = Callable[[], None]
+"""Called between pieces of work, so that a heartbeat comes from the loop that works and not from a timer."""
+
+
+def no_progress() -> None:
+    """The default :data:`Progress`."""
+
+
+class SessionError(ValueError):
+    """A session does not exist, exists already, or there is no room for one more."""
+
+
+class ContextFull(ValueError):  # noqa: N818 - a state, not a mistake of the caller
+    """A session's context has no room for what was asked; the session is left as it was."""
+
+    def __init__(self, *, session: str, used: int, wanted: int, limit: int) -> None:
+        super().__init__(
+            f"session {session!r} holds {used} tokens and needs {wanted} more, the limit is {limit}. "
+            "Close it and open a new one with a shorter history, or raise max_context_tokens; an append-only "
+            "context cannot drop its oldest tokens."
+        )
+        self.session, self.used, self.wanted, self.limit = session, used, wanted, limit
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EngineSpec:
+    """What an engine expects and what it gives; fixed for its lifetime."""
+
+    num_carriers: int
+    """K"""
+    hidden_size: int
+    """H"""
+    image_px: tuple[int, int]
+    """(h, w) of every frame."""
+    num_cameras: int
+    """Frames per fire, always the same cameras in the same order."""
+    max_context_tokens: int
+    model_hash: str
+    """12 hex digits over the weights."""
+    is_random: bool
+    """True if the weights were never trained: every cognition is noise, and reports must say so."""
+    dtype: str
+    """Of weights and activations, e.g. "float32"; cognition is float32 always."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Opening:
+    """What an episode starts from."""
+
+    instruction: str
+    demo_frames: tuple[tuple[Frame, ...], ...] = field(default=())
+    """Demonstration sampled at 1 Hz: for each instant, its views."""
+
+    @property
+    def has_demo(self) -> bool:
+        return bool(self.demo_frames)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Text:
+    """A text PONDER wrote into its own context. It never reaches POUNCE."""
+
+    kind: Literal["subgoal", "demo_reasoning"]
+    text: str
+    token_ids: tuple[int, ...]
+    truncated: bool
+    """True if it was cut at the token limit and closed as it was."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fire:
+    """The answer to one query."""
+
+    cognition: npt.NDArray[np.float32]
+    """C_t, (K, H): the carriers' final hidden states, neither decoded nor pooled."""
+    is_transition: bool
+    """T_t = T_yes."""
+    texts: tuple[Text, ...]
+    context_tokens: int
+    """Tokens in the session after this fire."""
+
+
+class PonderEngine(Protocol):
+    """An engine answers one call at a time; it is not thread-safe."""
+
+    @property
+    def spec(self) -> EngineSpec: ...
+
+    def open(self, session: str, opening: Opening, progress: Progress = no_progress) -> int:
+        """Starts an episode; its context tokens. Raises SessionError, ContextFull or ValueError."""
+
+    def fire(self, session: str, frames: tuple[Frame, ...], progress: Progress = no_progress) -> Fire:
+        """Appends one observation and answers it, or raises SessionError, ContextFull or ValueError.
+
+        All or nothing: after an error the session is as it was.
+        """
+
+    def close(self, session: str) -> None:
+        """Ends an episode and frees its memory. Raises SessionError if it is not open."""
+
+    def warm_up(self) -> list[int]:
+        """Runs throwaway fires; durations in ns of at least 20, the first few left unmeasured."""

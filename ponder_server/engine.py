@@ -1,0 +1,348 @@
+"""The engine that thinks with a Qwen3.5: sessions, one-pass fires, greedy text.
+
+A fire appends observation *and carriers* in one forward and reads T_t at the last observation token. T_no,
+the usual case, is done then: T_no is never part of the context (appendix A.2), so the guess was the truth. On
+T_yes the append is undone, the observation is appended again with T_yes behind it (its vision tokens are
+kept), the text is decoded, and the carriers follow.
+
+Nothing here depends on a clock or on chance: equal calls give equal bits, within a session and after
+reopening it.
+
+# K carriers, H hidden, T tokens, V vocabulary
+"""
+
+import time
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ponder_server.contract import (
+    ContextFull,
+    EngineSpec,
+    Fire,
+    Frame,
+    Opening,
+    Progress,
+    SessionError,
+    Text,
+    no_progress,
+)
+from ponder_server.session import SavedState, Session
+from ponderpounce.models.context import Segment
+from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.ponder_checkpoint import weights_hash
+
+WARM_UP_SESSION = "warm-up"
+NUM_UNMEASURED_FIRES = 5
+NUM_MEASURED_FIRES = 30
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EngineConfig:
+    num_cameras: int = 2
+    max_context_tokens: int = 16_384
+    """Per session (paper, section 3.4: 16K holds 100 fires of two cameras and more)."""
+    max_sessions: int = 4
+    """Contexts held at once; each is allocated in full when first opened."""
+    max_text_tokens: int = 256
+    """Limit of one text. A text that reaches it is closed as it is and flagged ``truncated``."""
+    prefill_chunk_tokens: int = 512
+    """Opening tokens per forward: more is faster, fewer lets ``progress`` be heard more often."""
+
+
+@dataclass(slots=True, kw_only=True)
+class _Episode:
+    """A session in use, and the one thing about it that is not in its tokens."""
+
+    context: Session
+    before_fire: SavedState
+    owes_reasoning: bool
+    """A demonstration was shown and its reasoning (DR) not yet written; the first transition writes it."""
+
+
+class QwenEngine:
+    """A ``PonderEngine`` on one device, one call at a time."""
+
+    def __init__(self, ponder: Ponder, config: EngineConfig, *, is_random: bool) -> None:
+        self._ponder = ponder
+        self._config = config
+        self._format = ponder.format
+        self._vocabulary = ponder.format.vocabulary
+        self._episodes: dict[str, _Episode] = {}
+        self._free: list[_Episode] = []
+        self._spec = EngineSpec(
+            num_carriers=self._format.num_carriers,
+            hidden_size=ponder.hidden_size,
+            image_px=ponder.image_px,
+            num_cameras=config.num_cameras,
+            max_context_tokens=config.max_context_tokens,
+            model_hash=weights_hash(ponder),
+            is_random=is_random,
+            dtype=str(ponder.dtype).removeprefix("torch."),
+        )
+        v = self._vocabulary
+        self._ends = frozenset({v.t_yes, v.t_no, v.end_of_text, v.im_end})
+        is_text_V = torch.zeros(ponder.vocab_size, dtype=torch.bool)
+        is_text_V[: v.num_tokens] = True
+        is_text_V[list(v.control_ids)] = False
+        may_end_V = is_text_V.clone()
+        may_end_V[list(self._ends)] = True
+        self._is_text_V, self._may_end_V = is_text_V.to(ponder.device), may_end_V.to(ponder.device)
+
+    @property
+    def spec(self) -> EngineSpec:
+        return self._spec
+
+    @torch.inference_mode()
+    def open(self, session: str, opening: Opening, progress: Progress = no_progress) -> int:
+        """Encodes instruction and demonstration; see ``PonderEngine.open``."""
+        if session in self._episodes:
+            raise SessionError(f"session {session!r} is already open; close it first.")
+        if len(self._episodes) >= self._config.max_sessions:
+            raise SessionError(
+                f"session {session!r} does not fit: {sorted(self._episodes)} are open and max_sessions is "
+                f"{self._config.max_sessions}. Close one, or raise max_sessions."
+            )
+        for instant, views in enumerate(opening.demo_frames):
+            if not views:
+                raise ValueError(f"demo instant {instant} has no view")
+            self._check_frames(views, f"demo instant {instant}")
+        segments = self._format.opening(opening.instruction, [len(views) for views in opening.demo_frames])
+        wanted = sum(len(segment) for segment in segments)
+        if wanted > self._config.max_context_tokens:
+            raise ContextFull(session=session, used=0, wanted=wanted, limit=self._config.max_context_tokens)
+        episode = self._free.pop() if self._free else self._allocate()
+        episode.context.clear()
+        episode.context.name = session
+        episode.owes_reasoning = opening.has_demo
+        frames = [frame for views in opening.demo_frames for frame in views]
+        try:
+            for chunk in _chunks(segments, self._config.prefill_chunk_tokens):
+                ids = [token for segment in chunk for token in segment.ids]
+                num_images = sum(segment.num_images for segment in chunk)
+                episode.context.append(ids, self._embed(ids, frames[:num_images]))
+                del frames[:num_images]
+                progress()
+        except BaseException:
+            self._free.append(episode)
+            raise
+        self._episodes[session] = episode
+        return episode.context.num_tokens
+
+    @torch.inference_mode()
+    def fire(
+        self,
+        session: str,
+        frames: tuple[Frame, ...],
+        progress: Progress = no_progress,
+        *,
+        force_text_tokens: int | None = None,
+    ) -> Fire:
+        """One query; see ``PonderEngine.fire``.
+
+        ``force_text_tokens`` makes it a transition with a subgoal of exactly so many tokens, whatever the
+        model wants to say (the paper's 45-token workload, appendix D). For benchmarks: the text is
+        meaningless.
+        """
+        episode = self._episode(session)
+        context = episode.context
+        if len(frames) != self._config.num_cameras:
+            raise ValueError(
+                f"fire got {len(frames)} frames, this engine has num_cameras {self._config.num_cameras}"
+            )
+        self._check_frames(frames, "observation")
+        if force_text_tokens is not None and force_text_tokens < 1:
+            raise ValueError(f"force_text_tokens is {force_text_tokens}; at least 1, or None")
+        observation, carriers = self._format.observation(len(frames)), self._format.carriers()
+        wanted = len(observation) + len(carriers)
+        if wanted > context.room:
+            raise ContextFull(
+                session=session, used=context.num_tokens, wanted=wanted, limit=context.max_tokens
+            )
+        ids = [*observation.ids, *carriers.ids]
+        embeds_TH = self._embed(ids, frames)
+        before = context.save(episode.before_fire)
+        try:
+            if force_text_tokens is None:
+                hidden_TH = context.append(ids, embeds_TH)
+                progress()
+                if self._gate(hidden_TH[len(observation) - 1]) != self._vocabulary.t_yes:
+                    return self._answer(context, hidden_TH[len(observation) :], ())
+                context.restore(before)
+            observation_TH = embeds_TH[: len(observation)]
+            texts = self._write(episode, observation, observation_TH, progress, force_text_tokens)
+            hidden_KH = context.append(carriers.ids, embeds_TH[len(observation) :])
+            progress()
+            answer = self._answer(context, hidden_KH, texts)
+        except BaseException:
+            context.restore(before)
+            raise
+        if force_text_tokens is None:
+            episode.owes_reasoning = False
+        return answer
+
+    def close(self, session: str) -> None:
+        """Keeps the memory for the next session; see ``PonderEngine.close``."""
+        episode = self._episode(session)
+        del self._episodes[session]
+        self._free.append(episode)
+
+    @torch.inference_mode()
+    def warm_up(self) -> list[int]:
+        """Durations in ns of cognition-only fires at one and the same short context, results on the host."""
+        height, width = self._spec.image_px
+        noise = np.random.default_rng(0)
+        frames = tuple(
+            noise.integers(0, 256, (height, width, 3), dtype=np.uint8)
+            for _ in range(self._config.num_cameras)
+        )
+        self.open(WARM_UP_SESSION, Opening(instruction="warm up"))
+        try:
+            context = self._episode(WARM_UP_SESSION).context
+            opened = context.save()
+            self.fire(WARM_UP_SESSION, frames, force_text_tokens=1)
+            durations_ns = []
+            for _ in range(NUM_UNMEASURED_FIRES + NUM_MEASURED_FIRES):
+                context.restore(opened)
+                start_ns = time.perf_counter_ns()
+                self.fire(WARM_UP_SESSION, frames)
+                durations_ns.append(time.perf_counter_ns() - start_ns)
+        finally:
+            self.close(WARM_UP_SESSION)
+        return durations_ns[NUM_UNMEASURED_FIRES:]
+
+    def _allocate(self) -> _Episode:
+        context = Session(self._ponder, max_tokens=self._config.max_context_tokens)
+        return _Episode(context=context, before_fire=context.save(), owes_reasoning=False)
+
+    def _episode(self, session: str) -> _Episode:
+        episode = self._episodes.get(session)
+        if episode is None:
+            raise SessionError(f"session {session!r} is not open; open are {sorted(self._episodes)}.")
+        return episode
+
+    def _check_frames(self, frames: tuple[Frame, ...], where: str) -> None:
+        expected = (*self._spec.image_px, 3)
+        for index, frame in enumerate(frames):
+            if frame.shape != expected or frame.dtype != np.uint8:
+                raise ValueError(
+                    f"{where}, frame {index}: {frame.dtype} of shape {frame.shape}; expected uint8 {expected}"
+                )
+
+    def _embed(self, ids: list[int], frames: tuple[Frame, ...] | list[Frame]) -> Tensor:
+        if not frames:
+            return self._ponder.embed(ids)
+        return self._ponder.embed(ids, torch.from_numpy(np.stack(frames)).to(self._ponder.device))
+
+    def _gate(self, hidden_H: Tensor) -> int:
+        """The most likely next token, of all tokens: only exact T_yes is a transition."""
+        return int(self._ponder.logits(hidden_H[None])[0].argmax())
+
+    def _answer(self, context: Session, hidden_KH: Tensor, texts: tuple[Text, ...]) -> Fire:
+        cognition = hidden_KH.float().cpu().numpy()
+        if not np.isfinite(cognition).all():
+            raise FloatingPointError(
+                f"session {context.name!r}: cognition is not finite after {context.num_tokens} tokens; "
+                f"weights {self._spec.model_hash} in {self._spec.dtype} are broken or overflow."
+            )
+        return Fire(
+            cognition=cognition,
+            is_transition=bool(texts),
+            texts=texts,
+            context_tokens=context.num_tokens,
+        )
+
+    def _write(
+        self,
+        episode: _Episode,
+        observation: Segment,
+        observation_TH: Tensor,
+        progress: Progress,
+        force_text_tokens: int | None,
+    ) -> tuple[Text, ...]:
+        """Appends O_t and the transition's text; room for the carriers is kept.
+
+        The text is [T_yes, DR, T_yes, S] at the first transition after a demonstration, else [T_yes, S]. DR
+        is closed by the T_yes that opens S, or by its limit (S follows all the same); any other end ends the
+        transition.
+        """
+        context = episode.context
+        t_yes = self._vocabulary.t_yes
+        t_yes_TH = self._ponder.embed([t_yes])
+        hidden_H = context.append([*observation.ids, t_yes], torch.cat([observation_TH, t_yes_TH]))[-1]
+        progress()
+        keep = self._format.num_carriers
+        if force_text_tokens is not None:
+            text, _ = self._decode(context, hidden_H, "subgoal", keep, progress, exactly=force_text_tokens)
+            return (text,)
+        texts = []
+        if episode.owes_reasoning:
+            keep_subgoal = 2  # T_yes and one token
+            text, end = self._decode(context, hidden_H, "demo_reasoning", keep + keep_subgoal, progress)
+            texts.append(text)
+            if end not in (t_yes, None):
+                return tuple(texts)
+            hidden_H = context.append([t_yes], t_yes_TH)[-1]
+            progress()
+        text, _ = self._decode(context, hidden_H, "subgoal", keep, progress)
+        return (*texts, text)
+
+    def _decode(
+        self,
+        context: Session,
+        hidden_H: Tensor,
+        kind: Literal["subgoal", "demo_reasoning"],
+        num_kept: int,
+        progress: Progress,
+        *,
+        exactly: int | None = None,
+    ) -> tuple[Text, int | None]:
+        """Greedy text after the given hidden state, and the token that ended it (None: the limit did).
+
+        ``num_kept`` positions of the context stay free. The ending token is not appended; control tokens that
+        end nothing (images, carriers, padding rows) cannot be said, because a context cannot hold them as
+        text.
+        """
+        limit = min(self._config.max_text_tokens, context.room - num_kept) if exactly is None else exactly
+        if not 1 <= limit <= context.room - num_kept:
+            wanted = num_kept + max(limit, 1)
+            raise ContextFull(
+                session=context.name, used=context.num_tokens, wanted=wanted, limit=context.max_tokens
+            )
+        sayable_V = self._may_end_V if exactly is None else self._is_text_V
+        ids: list[int] = []
+        end: int | None = None
+        while len(ids) != exactly:
+            logits_V = self._ponder.logits(hidden_H[None])[0]
+            token = int(logits_V.masked_fill(~sayable_V, float("-inf")).argmax())
+            if token in self._ends:
+                end = token
+                break
+            if len(ids) == limit:
+                break
+            ids.append(token)
+            hidden_H = context.append([token], self._ponder.embed([token]))[-1]
+            progress()
+        text = Text(
+            kind=kind,
+            text=self._vocabulary.decode(ids),
+            token_ids=tuple(ids),
+            truncated=end is None and exactly is None,
+        )
+        return text, end
+
+
+def _chunks(segments: tuple[Segment, ...], max_tokens: int) -> list[list[Segment]]:
+    """Consecutive segments in groups of at most ``max_tokens``, or of one that is longer."""
+    chunks: list[list[Segment]] = []
+    num_tokens = 0
+    for segment in segments:
+        if not chunks or num_tokens + len(segment) > max_tokens:
+            chunks.append([])
+            num_tokens = 0
+        chunks[-1].append(segment)
+        num_tokens += len(segment)
+    return chunks

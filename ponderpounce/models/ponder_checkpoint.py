@@ -1,0 +1,199 @@
+"""PONDER on disk: a HuggingFace-layout folder, checked name by name before a single weight is read.
+
+    config.json                                      transformers' Qwen3.5 configuration tokenizer.json
+    the tokenizer model.safetensors | model.safetensors.index.json + shards ponder.json
+    what PONDER adds: carriers and image size (absent: the defaults)
+
+A public Qwen3.5 checkpoint loads as it is; its carrier rows are then untrained padding rows.
+"""
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+from transformers.models.qwen3_5 import Qwen3_5Config
+
+from ponderpounce.models.context import ContextFormat
+from ponderpounce.models.ponder import Ponder, image_grid, skeleton
+from ponderpounce.models.vocabulary import Vocabulary
+
+INDEX_NAME = "model.safetensors.index.json"
+SINGLE_NAME = "model.safetensors"
+IGNORED_PREFIX = "mtp."  # multi-token prediction: in public checkpoints, not in transformers' Qwen3.5
+MAX_SHARD_BYTES = 5_000_000_000
+MAX_NAMES_SHOWN = 5
+
+
+class CheckpointError(ValueError):
+    """A checkpoint folder does not hold the network its config.json describes."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Addition:
+    """Contents of ponder.json."""
+
+    num_carriers: int = 1
+    first_carrier_id: int | None = None
+    """None: the first row after the tokenizer's last id."""
+    image_px: tuple[int, int] = (256, 256)
+
+
+def load_ponder(
+    directory: Path, *, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
+) -> Ponder:
+    """Reads a checkpoint folder.
+
+    Raises FileNotFoundError for a file that is not there, CheckpointError naming every missing, extra or
+    misshapen tensor, and ValueError for a configuration that contradicts itself.
+    """
+    config_path = directory / "config.json"
+    if not config_path.is_file():
+        raise FileNotFoundError(
+            f"{config_path}: not a checkpoint folder (--checkpoint DIR needs config.json)."
+        )
+    raw = json.loads(config_path.read_text())
+    if raw.get("model_type") != "qwen3_5":
+        raise CheckpointError(
+            f"{config_path}: model_type is {raw.get('model_type')!r}; PONDER reads 'qwen3_5'."
+        )
+    qwen_config = Qwen3_5Config.from_dict(raw)
+    vocabulary = Vocabulary.load(directory)
+    addition = _read_addition(directory)
+    first_carrier_id = addition.first_carrier_id
+    context_format = ContextFormat(
+        vocabulary=vocabulary,
+        num_carriers=addition.num_carriers,
+        first_carrier_id=vocabulary.num_tokens if first_carrier_id is None else first_carrier_id,
+        image_grid=image_grid(qwen_config, addition.image_px),
+    )
+    if qwen_config.image_token_id != vocabulary.image_pad:
+        raise CheckpointError(
+            f"{config_path}: image_token_id is {qwen_config.image_token_id}, but tokenizer.json says "
+            f"<|image_pad|> is {vocabulary.image_pad}; the two files are from different checkpoints."
+        )
+    files = _files_by_tensor(directory)
+    _check_tensors(directory, files, skeleton(qwen_config), tied=qwen_config.tie_word_embeddings)
+    ponder = Ponder(qwen_config, context_format, image_px=addition.image_px, device=device, dtype=dtype)
+    _read_tensors(files, ponder.qwen)
+    return ponder
+
+
+def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_SHARD_BYTES) -> None:
+    """Writes a folder that :func:`load_ponder` and transformers' ``from_pretrained`` both read."""
+    directory.mkdir(parents=True, exist_ok=True)
+    ponder.qwen.config.save_pretrained(directory)
+    ponder.format.vocabulary.save(directory)
+    addition = Addition(
+        num_carriers=ponder.format.num_carriers,
+        first_carrier_id=ponder.format.first_carrier_id,
+        image_px=ponder.image_px,
+    )
+    (directory / "ponder.json").write_text(json.dumps(asdict(addition), indent=2) + "\n")
+    shards: list[dict[str, Tensor]] = [{}]
+    shard_bytes = 0
+    for name, tensor in _own_tensors(ponder.qwen).items():
+        if shards[-1] and shard_bytes + tensor.nbytes > max_shard_bytes:
+            shards.append({})
+            shard_bytes = 0
+        shards[-1][name] = tensor.contiguous()
+        shard_bytes += tensor.nbytes
+    if len(shards) == 1:
+        save_file(shards[0], directory / SINGLE_NAME, metadata={"format": "pt"})
+        return
+    weight_map: dict[str, str] = {}
+    for number, shard in enumerate(shards, start=1):
+        file_name = f"model-{number:05d}-of-{len(shards):05d}.safetensors"
+        save_file(shard, directory / file_name, metadata={"format": "pt"})
+        weight_map |= dict.fromkeys(shard, file_name)
+    total_size = sum(tensor.nbytes for shard in shards for tensor in shard.values())
+    index = {"metadata": {"total_size": total_size}, "weight_map": weight_map}
+    (directory / INDEX_NAME).write_text(json.dumps(index, indent=2) + "\n")
+
+
+def weights_hash(module: nn.Module) -> str:
+    """12 hex digits of sha256 over every tensor's name, dtype, shape and bytes: provenance."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(_own_tensors(module).items()):
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
+        flat = tensor.detach().contiguous().reshape(-1).view(torch.uint8)
+        digest.update(flat.cpu().numpy().data)
+    return digest.hexdigest()[:12]
+
+
+def _own_tensors(module: nn.Module) -> dict[str, Tensor]:
+    """State dict without the second name of a tied tensor."""
+    seen: set[int] = set()
+    own = {}
+    for name, tensor in module.state_dict(keep_vars=True).items():
+        if id(tensor) not in seen:
+            seen.add(id(tensor))
+            own[name] = tensor.detach()
+    return own
+
+
+def _read_addition(directory: Path) -> Addition:
+    path = directory / "ponder.json"
+    if not path.is_file():
+        return Addition()
+    raw = json.loads(path.read_text())
+    unknown = sorted(set(raw) - set(Addition.__dataclass_fields__))
+    if unknown:
+        raise CheckpointError(
+            f"{path}: unknown fields {unknown}; known: {sorted(Addition.__dataclass_fields__)}."
+        )
+    if "image_px" in raw:
+        height, width = raw["image_px"]
+        raw["image_px"] = (int(height), int(width))
+    return Addition(**raw)
+
+
+def _files_by_tensor(directory: Path) -> dict[str, Path]:
+    """Tensor name -> the safetensors file that holds it."""
+    index_path = directory / INDEX_NAME
+    if index_path.is_file():
+        weight_map: dict[str, str] = json.loads(index_path.read_text())["weight_map"]
+        for file_name in sorted(set(weight_map.values())):
+            if not (directory / file_name).is_file():
+                raise FileNotFoundError(f"{directory / file_name}: named by {INDEX_NAME}, but not there.")
+        return {name: directory / file_name for name, file_name in weight_map.items()}
+    single = directory / SINGLE_NAME
+    if not single.is_file():
+        raise FileNotFoundError(f"{directory}: neither {SINGLE_NAME} nor {INDEX_NAME} is there.")
+    with safe_open(single, framework="pt") as file:
+        return dict.fromkeys(file.keys(), single)
+
+
+def _check_tensors(directory: Path, files: dict[str, Path], expected: nn.Module, *, tied: bool) -> None:
+    expected_shapes = {name: tuple(tensor.shape) for name, tensor in _own_tensors(expected).items()}
+    found = {name for name in files if not name.startswith(IGNORED_PREFIX)}
+    if tied:
+        found.discard("lm_head.weight")  # some exporters write the tied tensor twice
+    faults = [f"missing {name} {expected_shapes[name]}" for name in sorted(set(expected_shapes) - found)]
+    faults += [f"extra {name}" for name in sorted(found - set(expected_shapes))]
+    for path in sorted(set(files.values())):
+        with safe_open(path, framework="pt") as file:
+            in_file = set(file.keys())
+            for name in sorted(n for n in found & set(expected_shapes) if files[n] == path):
+                if name not in in_file:
+                    faults.append(f"missing {name}: {INDEX_NAME} places it in {path.name}, which lacks it")
+                elif (shape := tuple(file.get_slice(name).get_shape())) != expected_shapes[name]:
+                    faults.append(f"misshapen {name}: {shape}, config.json says {expected_shapes[name]}")
+    if faults:
+        rest = len(faults) - MAX_NAMES_SHOWN
+        shown = "; ".join(faults[:MAX_NAMES_SHOWN]) + (f"; and {rest} more" if rest > 0 else "")
+        raise CheckpointError(f"{directory} does not match its config.json ({len(faults)} faults): {shown}.")
+
+
+@torch.no_grad()
+def _read_tensors(files: dict[str, Path], module: nn.Module) -> None:
+    own = _own_tensors(module)
+    for path in sorted(set(files.values())):
+        with safe_open(path, framework="pt") as file:
+            for name in file.keys():  # noqa: SIM118 - safe_open is not a mapping
+                if name in own and files.get(name) == path:
+                    own[name].copy_(file.get_tensor(name))

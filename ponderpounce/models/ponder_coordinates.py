@@ -1,0 +1,52 @@
+"""Grounded coordinates: ``<y, x>`` in image pixels to normalised ``[x, y]`` in 0..1000, and back.
+
+PONDER's pretrained grounding speaks normalised [x, y] of 0..1000; the simulator's templates speak <y, x>
+pixels of a 256 px image (paper, appendix A.2). Both directions round half up in integers, so no platform's
+float decides a token. Because 1000 > 256, pixels -> normalised -> pixels is the identity for images of up to
+1000 px.
+"""
+
+import re
+
+_YX_PX = re.compile(r"<\s*(\d+)\s*,\s*(\d+)\s*>")
+_XY_1000 = re.compile(r"\[\s*(\d+)\s*,\s*(\d+)\s*\]")
+
+
+def _scaled(value: int, numerator: int, denominator: int) -> int:
+    return (2 * value * numerator + denominator) // (2 * denominator)
+
+
+def xy_1000_from_yx_px(yx_px: tuple[int, int], image_px: tuple[int, int] = (256, 256)) -> tuple[int, int]:
+    """``(y, x)`` pixels of a (height, width) image as ``(x, y)`` in 0..1000. ValueError if outside."""
+    (y, x), (height, width) = yx_px, image_px
+    if not (0 <= y <= height and 0 <= x <= width):
+        raise ValueError(f"<y, x> = <{y}, {x}> lies outside the {height} x {width} px image")
+    return _scaled(x, 1000, width), _scaled(y, 1000, height)
+
+
+def yx_px_from_xy_1000(xy_1000: tuple[int, int], image_px: tuple[int, int] = (256, 256)) -> tuple[int, int]:
+    """Inverse of :func:`xy_1000_from_yx_px`; the nearest pixel. ValueError if outside 0..1000."""
+    (x, y), (height, width) = xy_1000, image_px
+    if not (0 <= x <= 1000 and 0 <= y <= 1000):
+        raise ValueError(f"[x, y] = [{x}, {y}] lies outside 0..1000")
+    return _scaled(y, height, 1000), _scaled(x, width, 1000)
+
+
+def normalised_text(text: str, image_px: tuple[int, int] = (256, 256)) -> str:
+    """Every ``<y, x>`` in ``text`` rewritten as ``[x, y]``: what PONDER is trained to say."""
+
+    def rewrite(match: re.Match[str]) -> str:
+        x, y = xy_1000_from_yx_px((int(match[1]), int(match[2])), image_px)
+        return f"[{x}, {y}]"
+
+    return _YX_PX.sub(rewrite, text)
+
+
+def pixel_text(text: str, image_px: tuple[int, int] = (256, 256)) -> str:
+    """Every ``[x, y]`` in ``text`` rewritten as ``<y, x>``: what the task texts and the viewer show."""
+
+    def rewrite(match: re.Match[str]) -> str:
+        y, x = yx_px_from_xy_1000((int(match[1]), int(match[2])), image_px)
+        return f"<{y}, {x}>"
+
+    return _XY_1000.sub(rewrite, text)

@@ -1,0 +1,142 @@
+"""Which ids stand for which tokens: Qwen's tokenizer, with every control token looked up by name.
+
+A checkpoint brings its own ``tokenizer.json``. Where there is none (tests, the demo), :meth:`Vocabulary.tiny`
+trains a small byte-level BPE on the spot with the same control tokens in the same order, so no id may be
+written down anywhere: T_yes is 248060 in one tokenizer and 400 in the other.
+
+Source: Qwen3.5's public tokenizer files; T_yes and T_no: paper, appendix A.2.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Self
+
+from tokenizers import Regex, Tokenizer, decoders, models, normalizers, pre_tokenizers, trainers
+
+T_YES = "<|fim_prefix|>"
+T_NO = "<|fim_pad|>"
+END_OF_TEXT = "<|endoftext|>"
+IM_START = "<|im_start|>"
+IM_END = "<|im_end|>"
+VISION_START = "<|vision_start|>"
+VISION_END = "<|vision_end|>"
+IMAGE_PAD = "<|image_pad|>"
+VIDEO_PAD = "<|video_pad|>"
+
+REQUIRED_TOKENS = (
+    T_YES, T_NO, END_OF_TEXT, IM_START, IM_END, VISION_START, VISION_END, IMAGE_PAD, VIDEO_PAD,
+)  # fmt: skip
+
+CONTROL_TOKENS = (
+    "<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|object_ref_start|>", "<|object_ref_end|>",
+    "<|box_start|>", "<|box_end|>", "<|quad_start|>", "<|quad_end|>", "<|vision_start|>",
+    "<|vision_end|>", "<|vision_pad|>", "<|image_pad|>", "<|video_pad|>", "<tool_call>",
+    "</tool_call>", "<|fim_prefix|>", "<|fim_middle|>", "<|fim_suffix|>", "<|fim_pad|>",
+    "<|repo_name|>", "<|file_sep|>", "<tool_response>", "</tool_response>", "<think>", "</think>",
+    "<|audio_start|>", "<|audio_end|>", "<tts_pad>", "<tts_text_bos>", "<tts_text_eod>",
+    "<tts_text_bos_single>", "<|audio_pad|>",
+)  # fmt: skip
+"""Qwen3.5's control tokens in id order (248044..248076 there)."""
+
+_SPLIT = (  # Qwen3.5's pre-tokenizer; every digit is a token of its own, so coordinates are spelled out
+    r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?[\p{L}\p{M}]+|\p{N}"
+    r"| ?[^\s\p{L}\p{M}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+"
+)
+
+_TINY_CORPUS = (
+    "pick up the red cube and place it on the target at <72, 104>",
+    "press the button on the left, then the blue button in the middle",
+    "move to the nearest right target by circling around the stick clockwise",
+    "Demo route across the button row: target_0 at <77, 103> → target_1 at <71, 74>. "
+    "Arc directions in order: clockwise, counterclockwise. Reproduce exactly; next is",
+    "Target: 3; completed: 1; remaining: 2. Next, move the green cube to the bin",
+    "Reveal: container A hides yellow. Track swaps; final target is at <128, 64>.",
+)
+_TINY_NUM_BPE_TOKENS = 384
+
+
+class Vocabulary:
+    """A tokenizer whose control tokens are attributes and can never be smuggled in through text."""
+
+    def __init__(self, tokenizer: Tokenizer) -> None:
+        missing = [name for name in REQUIRED_TOKENS if tokenizer.token_to_id(name) is None]
+        if missing:
+            raise ValueError(
+                f"tokenizer lacks the control tokens {missing}; PONDER needs all of {list(REQUIRED_TOKENS)}. "
+                "Use the tokenizer.json of a Qwen3.5 checkpoint."
+            )
+        self._tokenizer = tokenizer
+        self.num_tokens: int = 1 + max(tokenizer.get_vocab(with_added_tokens=True).values())
+        """One past the last real id; the rows from here to ``vocab_size`` are unused padding."""
+        self.control_ids: frozenset[int] = frozenset(tokenizer.get_added_tokens_decoder())
+        """Ids that are never part of plain text."""
+        self.t_yes = self.id_of(T_YES)
+        self.t_no = self.id_of(T_NO)
+        self.end_of_text = self.id_of(END_OF_TEXT)
+        self.im_start = self.id_of(IM_START)
+        self.im_end = self.id_of(IM_END)
+        self.vision_start = self.id_of(VISION_START)
+        self.vision_end = self.id_of(VISION_END)
+        self.image_pad = self.id_of(IMAGE_PAD)
+        self.video_pad = self.id_of(VIDEO_PAD)
+
+    @classmethod
+    def load(cls, directory: Path) -> Self:
+        """Reads ``tokenizer.json`` of a checkpoint folder; FileNotFoundError when it is not there."""
+        path = directory / "tokenizer.json"
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: a checkpoint needs its tokenizer.json beside config.json.")
+        return cls(Tokenizer.from_file(str(path)))
+
+    @classmethod
+    def tiny(cls) -> Self:
+        """A byte-level BPE of about 400 tokens trained on a few subgoal texts: any UTF-8 text round-trips."""
+        tokenizer = Tokenizer(models.BPE())
+        tokenizer.normalizer = normalizers.NFC()
+        tokenizer.pre_tokenizer = pre_tokenizers.Sequence(
+            [
+                pre_tokenizers.Split(Regex(_SPLIT), behavior="isolated"),
+                pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False),
+            ]
+        )
+        tokenizer.decoder = decoders.ByteLevel()
+        trainer = trainers.BpeTrainer(
+            vocab_size=_TINY_NUM_BPE_TOKENS,
+            initial_alphabet=sorted(pre_tokenizers.ByteLevel.alphabet()),
+            show_progress=False,
+        )
+        tokenizer.train_from_iterator(_TINY_CORPUS, trainer)
+        tokenizer.add_special_tokens(list(CONTROL_TOKENS))
+        return cls(tokenizer)
+
+    def save(self, directory: Path) -> None:
+        """Writes ``tokenizer.json`` into an existing folder."""
+        self._tokenizer.save(str(directory / "tokenizer.json"))
+
+    def id_of(self, name: str) -> int:
+        """Id of one token by its exact name; KeyError when the tokenizer has no such token."""
+        token_id = self._tokenizer.token_to_id(name)
+        if token_id is None:
+            raise KeyError(f"the tokenizer has no token {name!r}")
+        return int(token_id)
+
+    def encode(self, text: str) -> tuple[int, ...]:
+        """Ids of plain text. Raises ValueError if the text spells a control token.
+
+        Qwen's tokenizers extract control tokens from ordinary text, so an instruction that contains
+        ``<|fim_prefix|>`` would otherwise open a payload.
+        """
+        ids = tuple(self._tokenizer.encode(text, add_special_tokens=False).ids)
+        smuggled = self.control_ids.intersection(ids)
+        if smuggled:
+            names = sorted(str(self._tokenizer.id_to_token(i)) for i in smuggled)
+            raise ValueError(f"text {text!r} spells the control tokens {names}; remove them.")
+        return ids
+
+    def decode(self, ids: Sequence[int]) -> str:
+        """Text of ``ids``, control tokens included by name; bytes that are no UTF-8 become U+FFFD."""
+        return str(self._tokenizer.decode(list(ids), skip_special_tokens=False))
+
+    def names(self) -> Mapping[str, int]:
+        """Every token name with its id."""
+        return dict(self._tokenizer.get_vocab(with_added_tokens=True))
