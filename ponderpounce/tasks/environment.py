@@ -1,0 +1,253 @@
+"""The order of calls: reset, act for 50 ms, judge, look. One environment runs one task, one episode at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ponderpounce.tasks import captions, engine, panda, sight
+from ponderpounce.tasks.captions import Caption
+from ponderpounce.tasks.engine import Progress, Status
+from ponderpounce.tasks.geometry import pose_of
+from ponderpounce.tasks.oracle import Motions
+from ponderpounce.tasks.physics import Physics, PhysicsState
+from ponderpounce.tasks.rendering import Cameras
+from ponderpounce.tasks.scene import FRONT, table_scene
+from ponderpounce.tasks.task import DIFFICULTIES, Subtask, Task, TaskError, make_task
+
+IMAGE_PX = 256
+MAX_STEPS = 1300  # the paper's limit; upstream's own default is 10000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Snapshot:
+    """What the robot and its cameras say at one instant, before the next action. Its arrays belong to it alone."""
+
+    step: int  # control steps since reset
+    frames: Mapping[str, NDArray[np.uint8]]  # camera name -> (image_px, image_px, 3) RGB; empty without rendering
+    state: NDArray[np.float32]  # (8,): seven joints [rad], one finger's opening [m]
+    tcp_pose: NDArray[np.float64]  # (7,): xyz [m], quaternion wxyz
+    status: Status
+    reason: str  # why the episode ended; empty while it is ongoing
+    simple_subgoal: str
+    grounded_subgoal: str
+    subtask_index: int  # the engine's; the texts follow it one step later, as upstream delivers them
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeState:
+    """A saved episode: restoring it, in any environment of the same task, continues it bit-exactly."""
+
+    task: str
+    difficulty: str
+    layout: Any
+    step: int
+    physics: PhysicsState
+    memory: Any
+    progress: Progress
+    caption: Caption
+
+
+def make_environment(
+    name: str, *, image_px: int = IMAGE_PX, render: bool = True, max_steps: int = MAX_STEPS
+) -> Environment:
+    """Returns an environment of a registered task. Raises TaskError for an unknown name."""
+    return Environment(make_task(name), image_px=image_px, render=render, max_steps=max_steps)
+
+
+class Environment:
+    """One task in its simulated world, stepped at 20 Hz. Use it as a context manager or close it.
+
+    Without rendering nothing touches GL; texts and physics are the same either way.
+    """
+
+    def __init__(self, task: Task[Any, Any], *, image_px: int, render: bool, max_steps: int) -> None:
+        self._task = task
+        spec = table_scene()
+        task.furnish(spec)
+        self.physics = Physics(spec)
+        self._image_px = image_px
+        self._cameras = Cameras(self.physics, image_px) if render else None
+        self._max_steps = max_steps
+        self._layout: Any = None
+        self._memory: Any = None
+        self._subtasks: tuple[Subtask, ...] = ()
+        self._progress = Progress()
+        self._caption: Caption | None = None
+        self._step = 0
+        self.difficulty = ""
+
+    @property
+    def instruction(self) -> str:
+        """The sentence the robot is given in this episode."""
+        self._require_episode()
+        return self._task.instruction(self._layout)
+
+    @property
+    def layout(self) -> Any:
+        """What this episode looks like and asks for; the type is the task's."""
+        self._require_episode()
+        return self._layout
+
+    @property
+    def subtasks(self) -> tuple[Subtask, ...]:
+        """The ordered list of subtasks of this episode."""
+        self._require_episode()
+        return self._subtasks
+
+    def reset(self, seed: int, difficulty: str | None = None, *, layout: Any = None) -> Snapshot:
+        """Starts an episode and returns its first snapshot.
+
+        The seed alone decides the scene. Without a difficulty it is the seed's remainder by three: easy, medium, hard, as
+        upstream. A ``layout`` takes the place of the drawn one. Raises TaskError for an unknown difficulty.
+        """
+        difficulty = DIFFICULTIES[seed % 3] if difficulty is None else difficulty
+        if difficulty not in DIFFICULTIES:
+            raise TaskError(f"unknown difficulty {difficulty!r}; expected one of {', '.join(DIFFICULTIES)}")
+        if layout is None:
+            layout = self._task.sample(np.random.default_rng(seed), difficulty)
+        self._begin(difficulty, layout)
+        # Upstream's reset spends one control step too: the button's cap settles on its spring.
+        self.physics.advance(np.append(panda.HOME_QPOS, 1.0))
+        return self._observe()
+
+    def step(self, action: ArrayLike) -> Snapshot:
+        """Applies an action (8,) for exactly 50 ms and returns what is seen then.
+
+        The action is seven absolute joint targets in rad and the gripper's command in [-1, 1], clipped there. Raises
+        ValueError if it has another shape or is not finite, and RuntimeError if the episode is over or never began.
+        """
+        self._require_episode()
+        if self._progress.status is not Status.ONGOING:
+            raise RuntimeError(
+                f"the episode ended with {self._progress.status.value} at step {self._step} "
+                f"({self._progress.reason}); call reset before stepping on"
+            )
+        self.physics.advance(_checked(action))
+        self._step += 1
+        return self._observe()
+
+    def oracle(self) -> Iterator[NDArray[np.float32]]:
+        """Yields the actions (8,) that solve the episode, planned as the world is when each is asked for.
+
+        Take one, step with it, take the next; stop when the episode ends.
+        """
+        self._require_episode()
+        motions = Motions(self.physics)
+        for subtask in self._subtasks[self._progress.index :]:
+            yield from subtask.motion(motions)
+
+    def save(self) -> EpisodeState:
+        """Returns a copy of the whole episode as it stands."""
+        self._require_episode()
+        assert self._caption is not None
+        return EpisodeState(
+            task=self._task.name,
+            difficulty=self.difficulty,
+            layout=self._layout,
+            step=self._step,
+            physics=self.physics.save(),
+            memory=self._memory,
+            progress=self._progress,
+            caption=self._caption,
+        )
+
+    def restore(self, state: EpisodeState) -> Snapshot:
+        """Continues a saved episode and returns its snapshot. Raises TaskError if it is another task's."""
+        if state.task != self._task.name:
+            raise TaskError(f"the saved episode is of task {state.task!r}; this environment runs {self._task.name!r}")
+        self._begin(state.difficulty, state.layout)
+        self.physics.load(state.physics)
+        self._step, self._memory = state.step, state.memory
+        self._progress, self._caption = state.progress, state.caption
+        return self._snapshot()
+
+    def close(self) -> None:
+        """Frees the renderer. May be called twice."""
+        if self._cameras is not None:
+            self._cameras.close()
+            self._cameras = None
+
+    def __enter__(self) -> Environment:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _begin(self, difficulty: str, layout: Any) -> None:
+        self.difficulty, self._layout = difficulty, layout
+        self._subtasks = self._task.subtasks(layout)
+        self._step, self._memory, self._caption, self._progress = 0, None, None, Progress()
+        self.physics.reset()
+        self._task.arrange(self.physics, layout)
+        self.physics.refresh()
+
+    def _observe(self) -> Snapshot:
+        """Stages, remembers, judges and captions the instant the physics is at."""
+        self._task.stage(self.physics, self._layout, self._step)
+        spoken_of = self._progress.index  # texts change one step after the engine does
+        self._memory = self._task.remember(self._memory, self.physics, self._layout)
+        self._progress = engine.judge(
+            self._progress,
+            self._subtasks,
+            self.physics,
+            self._memory,
+            is_accomplished=self._task.is_accomplished(self._memory, self._layout),
+        )
+        if self._progress.status is Status.ONGOING and self._step >= self._max_steps:
+            reason = f"not done after {self._max_steps} steps"
+            self._progress = Progress(index=self._progress.index, status=Status.TIMEOUT, reason=reason)
+        subtask = self._subtasks[spoken_of]
+        caption = captions.follow(self._caption, spoken_of, subtask.text, lambda: self._look_for(subtask))
+        if self._progress.status is Status.SUCCESS:
+            caption = captions.completed(caption)
+        self._caption = caption
+        return self._snapshot()
+
+    def _look_for(self, subtask: Subtask) -> list[captions.Pixel] | None:
+        """Where the front camera sees the subtask's objects; None if one of them is hidden."""
+        points = []
+        for body in subtask.grounds:
+            pixels = sight.visible_pixels(self.physics, FRONT, body, self._image_px)
+            point = sight.mean_pixel(pixels)
+            if point is None:
+                return None
+            points.append(point)
+        return points
+
+    def _snapshot(self) -> Snapshot:
+        assert self._caption is not None
+        opening_m = self.physics.finger_openings_m()[:1]
+        return Snapshot(
+            step=self._step,
+            frames={} if self._cameras is None else self._cameras.frames(),
+            state=np.concatenate([self.physics.arm_qpos(), opening_m]).astype(np.float32),
+            tcp_pose=pose_of(self.physics.tcp_transform()),
+            status=self._progress.status,
+            reason=self._progress.reason,
+            simple_subgoal=self._caption.simple,
+            grounded_subgoal=self._caption.grounded,
+            subtask_index=self._progress.index,
+        )
+
+    def _require_episode(self) -> None:
+        if self._layout is None:
+            raise RuntimeError("no episode has begun; call reset first")
+
+
+def _checked(action: ArrayLike) -> NDArray[np.float64]:
+    values = np.asarray(action, dtype=np.float64)
+    if values.shape != (8,):
+        raise ValueError(
+            f"action has shape {values.shape}; expected (8,): seven joint targets and the gripper's command"
+        )
+    if not np.isfinite(values).all():
+        raise ValueError(f"action {values.tolist()} is not finite")
+    return values

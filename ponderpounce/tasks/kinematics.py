@@ -1,0 +1,91 @@
+"""Joint angles and tool poses: forward, inverse, and the joint path of a straight screw motion.
+
+Inverse kinematics is damped least squares from a nearby start. Its steps are the shortest in joint space, so a path
+solved point by point stays smooth and resolves the arm's seventh degree of freedom as upstream's planner does.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from ponderpounce.tasks import panda
+from ponderpounce.tasks.geometry import Array, rotation_log, screw_exp, screw_log
+
+_DAMPING = 1e-4
+_POSITION_TOLERANCE_M = 1e-5
+_ROTATION_TOLERANCE_RAD = 1e-4
+_MAX_ITERATIONS = 40
+
+
+class UnreachableError(RuntimeError):
+    """No joint angles within the limits put the tool there."""
+
+
+class Kinematics:
+    """The arm's kinematics on its own scratch copy of the world: nothing here moves the real one."""
+
+    def __init__(self, model: Any) -> None:
+        self._model = model
+        self._scratch = mujoco.MjData(model)
+        self._qpos = np.array([model.joint(name).qposadr[0] for name in panda.ARM_JOINTS])
+        self._dof = np.array([model.joint(name).dofadr[0] for name in panda.ARM_JOINTS])
+        self._tcp = model.site(panda.TCP_SITE).id
+        self._jacobian = np.zeros((6, model.nv))
+
+    def tcp(self, qpos: Array) -> Array:
+        """Returns the tool's transform (4, 4) at joint angles (7,)."""
+        self._scratch.qpos[self._qpos] = qpos
+        mujoco.mj_kinematics(self._model, self._scratch)
+        T = np.eye(4)
+        T[:3, :3] = self._scratch.site_xmat[self._tcp].reshape(3, 3)
+        T[:3, 3] = self._scratch.site_xpos[self._tcp]
+        return T
+
+    def jacobian(self, qpos: Array) -> Array:
+        """Returns d(tool)/d(joints) (6, 7) at joint angles (7,): linear rows, then angular, both in the world frame."""
+        self.tcp(qpos)
+        return self._jacobian_here()
+
+    def solve(self, target: Array, start: Array) -> Array:
+        """Returns joint angles (7,) near ``start`` (7,) that put the tool at ``target`` (4, 4).
+
+        Raises UnreachableError if 40 steps do not get within 0.01 mm and 1e-4 rad, or lead out of the joint limits.
+        """
+        qpos = start.copy()
+        for _ in range(_MAX_ITERATIONS):
+            here = self.tcp(qpos)
+            error = np.concatenate([target[:3, 3] - here[:3, 3], rotation_log(target[:3, :3] @ here[:3, :3].T)])
+            if np.abs(error[:3]).max() < _POSITION_TOLERANCE_M and np.abs(error[3:]).max() < _ROTATION_TOLERANCE_RAD:
+                break
+            J = self._jacobian_here()
+            qpos = qpos + J.T @ np.linalg.solve(J @ J.T + _DAMPING * np.eye(6), error)
+        else:
+            raise UnreachableError(f"the arm cannot reach {target[:3, 3].round(4)} m from {start.round(3)} rad")
+        beyond = np.maximum(panda.JOINT_LOW_RAD - qpos, qpos - panda.JOINT_HIGH_RAD)
+        if beyond.max() > 0:
+            joint = int(beyond.argmax())
+            raise UnreachableError(
+                f"reaching {target[:3, 3].round(4)} m turns joint {joint + 1} to {qpos[joint]:.3f} rad, limits "
+                f"[{panda.JOINT_LOW_RAD[joint]}, {panda.JOINT_HIGH_RAD[joint]}]"
+            )
+        return qpos
+
+    def screw_path(self, start: Array, target: Array, num_points: int) -> Array:
+        """Returns joint angles (num_points, 7) along the constant screw from ``start`` (7,) to the pose ``target`` (4, 4).
+
+        The first row is ``start``. Raises UnreachableError if a point of the way is.
+        """
+        origin = self.tcp(start)
+        twist = screw_log(np.linalg.inv(origin) @ target)
+        path = [start]
+        for fraction in np.linspace(0.0, 1.0, num_points)[1:]:
+            path.append(self.solve(origin @ screw_exp(fraction * twist), path[-1]))
+        return np.array(path)
+
+    def _jacobian_here(self) -> Array:
+        mujoco.mj_comPos(self._model, self._scratch)  # mj_jacSite reads what it computes
+        mujoco.mj_jacSite(self._model, self._scratch, self._jacobian[:3], self._jacobian[3:], self._tcp)
+        return self._jacobian[:, self._dof]

@@ -1,0 +1,160 @@
+"""The arm: robosuite's Panda with RoboMME's gains, home pose, tool point and light meshes.
+
+Only robosuite's asset files are used: the package is located, never imported (importing it compiles numba code, which
+has been seen to corrupt rendered frames, and pulls in a dozen packages).
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from ponderpounce.tasks.geometry import Array
+
+ARM_JOINTS = tuple(f"joint{i}" for i in range(1, 8))
+FINGER_JOINTS = ("finger_joint1", "finger_joint2")  # the second one opens towards negative values
+FINGER_BODIES = ("leftfinger", "rightfinger")
+TCP_SITE = "tcp"
+HOME_QPOS = np.array([0.0, 0.0, 0.0, -np.pi / 2, 0.0, np.pi / 2, np.pi / 4])  # rad
+HOME_OPENING_M = 0.04
+BASE_POSITION_M = (-0.615, 0.0, 0.0)
+
+# State and action are (8,): seven joints in rad, then the gripper. The state's last entry is one finger's opening in
+# metres; the action's is a command in [-1, 1], -1 closed. Joint limits are Franka's, as in robosuite's robot.xml.
+JOINT_LOW_RAD = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
+JOINT_HIGH_RAD = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])
+STATE_LOW = np.append(JOINT_LOW_RAD, 0.0)
+STATE_HIGH = np.append(JOINT_HIGH_RAD, 0.04)
+ACTION_LOW = np.append(JOINT_LOW_RAD, -1.0)
+ACTION_HIGH = np.append(JOINT_HIGH_RAD, 1.0)
+
+ROBOT_BIT, WORLD_BIT = 2, 1  # contact bits: the robot touches the world, not itself
+
+_GAIN_KP, _GAIN_KD, _FORCE_LIMIT = 1000.0, 100.0, 100.0  # N m / rad and N / m alike, as upstream
+_FINGER_TARGET_M = (-0.01, 0.04)  # where commands -1 and +1 drive one finger; below 0 means squeezing
+_HAND_FROM_FLANGE_M = 0.107  # Franka's datasheet; robosuite mounts its hand half a millimetre short
+_FINGER_FROM_HAND_M = 0.0584  # likewise; robosuite's fingers start 6 mm short
+_TCP_FROM_HAND_M = 0.1034
+_CELL_M = 0.004  # clustering grid of the visual meshes: at 256 px the robot looks the same and renders twice as fast
+
+
+def control_of(action: Array) -> Array:
+    """Returns actuator set points (9,) for an action (8,): seven joints [rad], two fingers [m]."""
+    closed_m, open_m = _FINGER_TARGET_M
+    opening_m = closed_m + (np.clip(action[7], -1.0, 1.0) + 1) / 2 * (open_m - closed_m)
+    return np.concatenate([action[:7], [opening_m, -opening_m]])
+
+
+def panda_spec() -> mujoco.MjSpec:
+    """Returns a fresh, uncompiled model of the arm with its gripper, base at the origin of the world frame's table.
+
+    Raises FileNotFoundError if robosuite's assets are not installed.
+    """
+    spec = _source_spec()
+    light_meshes = _light_meshes()
+    for name, (vertices, faces) in light_meshes.items():
+        spec.add_mesh(
+            name=f"light_{name}",
+            uservert=vertices.ravel(),
+            userface=faces.ravel(),
+            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
+        )
+    for geom in spec.geoms:
+        if geom.meshname in light_meshes:
+            geom.meshname = f"light_{geom.meshname}"
+    for name in light_meshes:
+        spec.delete(spec.mesh(name))
+    return spec
+
+
+def _source_spec() -> mujoco.MjSpec:
+    """Robosuite's robot and gripper joined, corrected and given our gains, with the full visual meshes."""
+    assets = _assets()
+    spec = mujoco.MjSpec.from_file(str(assets / "robots/panda/robot.xml"))
+    gripper = mujoco.MjSpec.from_file(str(assets / "grippers/panda_gripper.xml"))
+    hand = spec.body("right_hand")
+    hand.pos = [0.0, 0.0, _HAND_FROM_FLANGE_M]
+    hand.quat = [np.cos(np.pi / 8), 0.0, 0.0, -np.sin(np.pi / 8)]  # robosuite rounds it to three digits
+    spec.attach(gripper, prefix="", frame=hand.add_frame())
+    for camera in list(spec.cameras):
+        spec.delete(camera)
+    for sensor in list(spec.sensors):
+        spec.delete(sensor)
+    hand.add_site(name=TCP_SITE, pos=[0.0, 0.0, _TCP_FROM_HAND_M], group=4)
+    spec.body("base").pos = BASE_POSITION_M
+    for body in spec.bodies:
+        body.gravcomp = 1.0  # upstream's arm feels no gravity; the real one compensates for it
+    for finger in FINGER_BODIES:
+        spec.body(finger).pos = [0.0, 0.0, _FINGER_FROM_HAND_M]
+    for name in FINGER_JOINTS:
+        # Bare fingers: with robosuite's armature and damping they would close three times slower than upstream's.
+        spec.joint(name).armature, spec.joint(name).damping, spec.joint(name).frictionloss = 0.0, [0.0] * 3, 0.0
+    for geom in spec.geoms:
+        if geom.contype or geom.conaffinity:
+            geom.contype, geom.conaffinity = ROBOT_BIT, WORLD_BIT
+    for finger in (1, 2):
+        for geom in (spec.geom(f"finger{finger}_collision"), spec.geom(f"finger{finger}_pad_collision")):
+            geom.friction, geom.condim = [2.0, 0.05, 0.0001], 4
+    for actuator in spec.actuators:
+        actuator.set_to_position(kp=_GAIN_KP, kv=_GAIN_KD)
+        actuator.ctrllimited = False
+        actuator.forcelimited = True
+        actuator.forcerange = [-_FORCE_LIMIT, _FORCE_LIMIT]
+    return spec
+
+
+def _assets() -> Path:
+    found = importlib.util.find_spec("robosuite")
+    if found is None or not found.submodule_search_locations:
+        raise FileNotFoundError(
+            "the arm's meshes come with robosuite, which is not installed. "
+            "Install its files with: pip install --no-deps robosuite==1.5.2"
+        )
+    return Path(found.submodule_search_locations[0]) / "models" / "assets"
+
+
+@functools.cache
+def _light_meshes() -> dict[str, tuple[Array, NDArray[np.int32]]]:
+    """Clustered copies of all visual meshes by name: vertices (n, 3) in metres, faces (m, 3). Takes about a second, once."""
+    spec = _source_spec()
+    names = {geom.meshname for geom in spec.geoms if geom.meshname and geom.group == 1}
+    model = spec.compile()
+    meshes = {}
+    for name in sorted(names):
+        mesh = model.mesh(name)
+        first, last = mesh.vertadr[0], mesh.vertadr[0] + mesh.vertnum[0]
+        rotation = np.empty(9)
+        # The compiler moves every mesh to its own inertial frame; undo that, or the links come apart.
+        mujoco.mju_quat2Mat(rotation, model.mesh_quat[mesh.id])
+        vertices = model.mesh_vert[first:last].astype(np.float64) @ rotation.reshape(3, 3).T + model.mesh_pos[mesh.id]
+        faces = model.mesh_face[mesh.faceadr[0] : mesh.faceadr[0] + mesh.facenum[0]]
+        light = cluster(vertices, faces, cell_m=_CELL_M)
+        if len(light[0]) >= 4 and len(light[1]) >= 4:  # too small a detail stays as it is: a mesh needs a volume
+            meshes[name] = light
+    return meshes
+
+
+def cluster(
+    vertices: Array, faces: NDArray[np.int32], *, cell_m: float
+) -> tuple[Array, NDArray[np.int32]]:
+    """Merges all vertices that share a grid cell into their mean, and drops the faces that collapse.
+
+    Args: vertices (n, 3) in metres; faces (m, 3) indices into them. Returns the smaller pair, in a fixed order.
+    Vertex clustering after Rossignac and Borrel, "Multi-resolution 3D approximations", 1993.
+    """
+    cells = np.round(vertices / cell_m).astype(np.int64)
+    _, cell_of_vertex, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    cell_of_vertex = cell_of_vertex.reshape(-1)  # numpy 2.0 alone returns it with a second axis
+    merged = np.zeros((len(count), 3))
+    np.add.at(merged, cell_of_vertex, vertices)
+    merged /= count[:, None]
+    corners = cell_of_vertex[faces]
+    a, b, c = corners.T
+    corners = corners[(a != b) & (b != c) & (c != a)]
+    _, first = np.unique(np.sort(corners, axis=1), axis=0, return_index=True)
+    return merged, corners[first].astype(np.int32)

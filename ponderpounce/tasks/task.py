@@ -1,0 +1,142 @@
+"""What a task is: a scene, a list of subtasks, and a registry of the tasks that exist.
+
+Task, physics and environment are three things. Physics knows numbers by name, a task knows what they mean, the environment
+knows the order of calls. A task never steps, physics never scores, predicates are pure readings. Task objects hold no state:
+what one episode asks is its layout, what has happened so far is its memory, and both are frozen values, so that an episode
+can be saved and restored.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import pkgutil
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, ClassVar, Generic, TypeVar
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from ponderpounce.tasks.oracle import Motions
+from ponderpounce.tasks.physics import Physics
+
+DIFFICULTIES = ("easy", "medium", "hard")
+FAMILIES = ("counting", "permanence", "reference", "imitation")
+
+LayoutT = TypeVar("LayoutT")
+MemoryT = TypeVar("MemoryT")
+TaskT = TypeVar("TaskT", bound="type[Task[Any, Any]]")
+
+
+class TaskError(ValueError):
+    """A task or difficulty was asked for that does not exist."""
+
+
+def never(physics: Physics, memory: Any) -> str | None:
+    """The failure predicate of a subtask that cannot fail."""
+    return None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Subtask:
+    """One entry of an episode's list."""
+
+    text: str  # template, see `captions`
+    is_done: Callable[[Physics, Any], bool]
+    motion: Callable[[Motions], Iterator[NDArray[np.float32]]]  # what the oracle does for it
+    failure: Callable[[Physics, Any], str | None] = never  # the reason, or None while there is none
+    grounds: tuple[str, ...] = ()  # bodies whose pixels fill the template's coordinates, in order
+
+
+class Task(ABC, Generic[LayoutT, MemoryT]):
+    """One kind of episode. Subclasses carry `@task(family=...)`, one file each.
+
+    Every method but `arrange` and `stage` is a pure function of its arguments.
+    """
+
+    name: ClassVar[str]
+    family: ClassVar[str]
+
+    @abstractmethod
+    def furnish(self, spec: mujoco.MjSpec) -> None:
+        """Adds all props that any difficulty may need; those a layout leaves out stay parked."""
+
+    @abstractmethod
+    def sample(self, rng: np.random.Generator, difficulty: str) -> LayoutT:
+        """Draws what one episode looks like and asks for."""
+
+    @abstractmethod
+    def arrange(self, physics: Physics, layout: LayoutT) -> None:
+        """Places and paints the props of a freshly reset scene as the layout says."""
+
+    @abstractmethod
+    def instruction(self, layout: LayoutT) -> str:
+        """Returns the sentence the robot is given, upstream's first wording."""
+
+    @abstractmethod
+    def subtasks(self, layout: LayoutT) -> tuple[Subtask, ...]:
+        """Returns the ordered list of subtasks."""
+
+    @abstractmethod
+    def remember(self, memory: MemoryT | None, physics: Physics, layout: LayoutT) -> MemoryT:
+        """Returns the memory after one more observation; ``memory`` is None at the first."""
+
+    def stage(self, physics: Physics, layout: LayoutT, step: int) -> None:
+        """Moves scripted things to where the observation of ``step`` shall show them. The default moves nothing.
+
+        Called after every control step with the number of control steps since reset, and at reset with 0.
+        """
+        return
+
+    def is_accomplished(self, memory: MemoryT, layout: LayoutT) -> bool:
+        """True if the whole task is done whatever the list says. The default leaves it to the list."""
+        return False
+
+
+_REGISTRY: dict[str, type[Task[Any, Any]]] = {}
+
+
+def task(*, family: str) -> Callable[[TaskT], TaskT]:
+    """Registers a task under its class name. Raises TaskError for an unknown family or a name taken twice."""
+    if family not in FAMILIES:
+        raise TaskError(f"unknown task family {family!r}; expected one of {', '.join(FAMILIES)}")
+
+    def register(cls: TaskT) -> TaskT:
+        name = cls.__name__
+        if name in _REGISTRY:
+            raise TaskError(f"task {name!r} is defined in both {_REGISTRY[name].__module__} and {cls.__module__}")
+        cls.name, cls.family = name, family
+        _REGISTRY[name] = cls
+        return cls
+
+    return register
+
+
+def task_names() -> tuple[str, ...]:
+    """Returns the names of all tasks that can be made, sorted."""
+    _import_all_tasks()
+    return tuple(sorted(_REGISTRY))
+
+
+def make_task(name: str) -> Task[Any, Any]:
+    """Returns a new task object. Raises TaskError for an unknown name."""
+    known = task_names()
+    if name not in known:
+        close = difflib.get_close_matches(name, known, n=1)
+        hint = f"Did you mean {close[0]!r}? " if close else ""
+        raise TaskError(f"unknown task {name!r}. {hint}sim-client --list-tasks shows all.")
+    return _REGISTRY[name]()
+
+
+def _import_all_tasks() -> None:
+    """Imports every module of the family packages: a task registers itself where it is defined, and nowhere else."""
+    for family in FAMILIES:
+        package_name = f"{__package__}.{family}"
+        if importlib.util.find_spec(package_name) is None:
+            continue
+        package = importlib.import_module(package_name)
+        for module in pkgutil.iter_modules(package.__path__):
+            importlib.import_module(f"{package_name}.{module.name}")
