@@ -35,7 +35,8 @@ class EngineSpec:
     horizon: int
     """Rows per chunk, played at 20 Hz."""
     action_dim: int
-    """Dims of a row in robot units, which are also the dims of proprio: 7 joints (rad) and the gripper."""
+    """Dims of a row in robot units: 7 joint targets (rad) and the gripper, -1 closed to 1 open."""
+    proprio_dim: int
     num_carriers: int
     """K; 0 means the engine takes no cognition."""
     cognition_size: int
@@ -82,7 +83,7 @@ class PounceEngine(Protocol):
     def spec(self) -> EngineSpec: ...
 
     def invoke(self, request: Request, progress: Progress = _silent) -> NDArray[np.float32]:
-        """Returns rows (horizon, action_dim) float32 in robot units; calls ``progress`` once per flow step."""
+        """Returns rows (horizon, action_dim) float32 in robot units; calls ``progress`` every flow step."""
         ...
 
     def warm_up(self) -> list[int]:
@@ -91,7 +92,7 @@ class PounceEngine(Protocol):
 
 
 class Pi05Engine:
-    """Eager PyTorch. One at a time: an engine is not shared between threads."""
+    """Eager PyTorch, for one thread at a time. Takes over the bundle's model: casts and moves it in place."""
 
     def __init__(self, bundle: PounceBundle, *, device: str = "cpu", dtype: DTypeName = "float32") -> None:
         config = bundle.model.config
@@ -102,6 +103,7 @@ class Pi05Engine:
         self.spec = EngineSpec(
             horizon=config.pi05.horizon,
             action_dim=config.robot_action_dim,
+            proprio_dim=bundle.statistics.state.num_dims,
             num_carriers=config.cognition.num_carriers,
             cognition_size=config.cognition.cognition_size,
             image_px=config.pi05.vision.image_px,
@@ -184,7 +186,7 @@ def check_request(request: Request, spec: EngineSpec) -> None:
             frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3 or not frame.size
         ):
             raise ValueError(f"frame {index}: expected (h, w, 3) uint8, came {frame.shape} {frame.dtype}")
-    _check_floats("proprio", request.proprio, (spec.action_dim,))
+    _check_floats("proprio", request.proprio, (spec.proprio_dim,))
     if request.age_ns < 0:
         raise ValueError(f"age_ns must not be negative, came {request.age_ns}: cognition from the future")
     if request.cognition is None:
@@ -211,7 +213,7 @@ def example_request(spec: EngineSpec, *, frame_px: int = 256, seed: int = 0) -> 
     cognition = generator.standard_normal((spec.num_carriers, spec.cognition_size)).astype(np.float32)
     home = np.array([0.0, 0.0, 0.0, -math.pi / 2, 0.0, math.pi / 2, math.pi / 4, 0.04], dtype=np.float32)
     return Request(
-        instruction="press the button, pick all cubes that were highlighted, then press the button again to stop",
+        instruction="press the button, pick all cubes that were highlighted, then press it again to stop",
         frames=tuple(generator.integers(0, 256, shape, dtype=np.uint8) for _ in range(spec.num_cameras)),
         proprio=home,
         cognition=cognition if spec.num_carriers else None,

@@ -15,8 +15,9 @@ _FLOAT32_PARTS = ("norm", "patch_embedding", "position_embedding")
 def cast_for_serving(model: Pounce, dtype: DTypeName) -> Pounce:
     """Casts ``model`` in place and returns it.
 
-    In bfloat16 the two streams' matrices are cast; norms (adaRMS layers with them), pixel and position embeddings,
-    the action and time projections and the cognition prefix stay float32, and each norm computes in float32.
+    In bfloat16 the two streams' matrices are cast; norms (adaRMS layers with them), pixel and position
+    embeddings, the action and time projections and the cognition prefix stay float32, and each norm computes
+    in float32.
     """
     if dtype not in ("float32", "bfloat16"):
         raise ValueError(f"dtype must be 'float32' or 'bfloat16', came {dtype!r}")

@@ -13,14 +13,17 @@ Record = TypeVar("Record")
 def from_json(kind: type[Record], values: Any, where: str) -> Record:
     """Builds ``kind`` from parsed JSON; ``where`` names the place in errors.
 
-    Every field must be there: a file written with other defaults than today's must not change its meaning silently.
+    Every field must be there: a file must not change its meaning when a default does.
+
+    Raises:
+        ValueError: a field is missing or unknown, or the record's own checks refuse a value.
     """
     if not dataclasses.is_dataclass(kind):
         raise TypeError(f"{kind} is no dataclass")
     names = {field.name for field in dataclasses.fields(kind)}
     if not isinstance(values, dict) or values.keys() != names:
-        came = sorted(values) if isinstance(values, dict) else values
-        raise ValueError(f"{where}: expected the fields {sorted(names)}, came {came}")
+        came = values.keys() if isinstance(values, dict) else set()
+        raise ValueError(f"{where}: missing {sorted(names - came)}, unknown {sorted(came - names)}")
     hints = typing.get_type_hints(kind)
     return kind(**{name: _value(hints[name], values[name], f"{where}.{name}") for name in names})
 

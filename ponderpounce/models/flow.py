@@ -1,7 +1,7 @@
 """Flow matching as pi0.5 does it: the straight path, its velocity, the loss and the Euler sampler.
 
-Convention: t = 1 is noise and t = 0 is data, as in the public pi0.5 code. The pi0 paper and GR00T N1.5 write it the
-other way round; a checkpoint of one convention drives the arm away from the data under the other.
+Convention: t = 1 is noise and t = 0 is data, as in the public pi0.5 code. The pi0 paper and GR00T N1.5 write
+it the other way round; weights of one convention, sampled with the other, drive away from the data.
 
     # B batch, N horizon, A action dim
 """
@@ -15,7 +15,7 @@ from torch import Tensor
 
 LossDims = Literal["real", "all"]
 
-# t ~ Beta(1.5, 1) * 0.999 + 0.001 leans towards noise and never reaches t = 0, where nothing is left to learn.
+# t ~ Beta(1.5, 1) * 0.999 + 0.001: leans towards noise, stays away from t = 0 where nothing is left to learn.
 TIME_BETA_ALPHA = 1.5
 TIME_SPAN = 0.999
 TIME_MIN = 0.001
@@ -42,10 +42,11 @@ def sample_times(batch_size: int, generator: torch.Generator) -> Tensor:
 
 
 def mean_loss(loss_BNA: Tensor, num_real_dims: int, over: LossDims = "real") -> Tensor:
-    """Averages the unreduced loss over the robot's own dims ("real", lerobot) or all padded dims ("all", openpi).
+    """Averages the unreduced loss over the robot's own dims ("real", lerobot) or all dims ("all", openpi).
 
-    The two are not the same number: with 8 of 32 dims in use, "all" dilutes the robot's gradient by the padding,
-    which the network learns to predict at once. Default "real": the paper's w_1 = 1 then weighs action error only.
+    The two differ in scale: with 8 of 32 dims in use, "all" is a quarter of the robot's error plus whatever
+    is left on the padding, which is easy to learn. The paper does not say; default "real", so that w_1 = 1
+    weighs action error alone.
     """
     if not 0 < num_real_dims <= loss_BNA.shape[-1]:
         raise ValueError(
@@ -55,7 +56,11 @@ def mean_loss(loss_BNA: Tensor, num_real_dims: int, over: LossDims = "real") -> 
 
 
 def euler_times(num_steps: int) -> list[float]:
-    """Returns 1, 1 - 1/n, ..., 1/n: where each Euler step looks. Computed from the index, so no error accumulates."""
+    """Returns 1, 1 - 1/n, ..., 1/n: where each Euler step looks.
+
+    Computed from the index, as lerobot does. openpi accumulates ``time += dt`` in float32, which moves the
+    goldens' actions by up to 2e-5.
+    """
     if num_steps < 1:
         raise ValueError(f"the Euler sampler needs at least 1 step, came {num_steps}")
     return [1.0 - step / num_steps for step in range(num_steps)]

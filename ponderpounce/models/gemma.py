@@ -4,11 +4,14 @@
 # M norms of the expert (two per layer and the last), E expert width
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+from ponderpounce.models.stack import Stack
 
 RMS_NORM_EPS = 1e-6
 ROPE_BASE = 10_000.0
@@ -93,7 +96,8 @@ class GeGlu(nn.Module):
 
     def forward(self, x_BTW: Tensor) -> Tensor:
         gate = F.gelu(self.gate_proj(x_BTW), approximate="tanh")
-        return self.down_proj(gate * self.up_proj(x_BTW))  # type: ignore[no-any-return]
+        out_BTW: Tensor = self.down_proj(gate * self.up_proj(x_BTW))
+        return out_BTW
 
 
 class RmsNorm(nn.Module):
@@ -146,18 +150,18 @@ class ExpertLayer(nn.Module):
 
 
 class LanguageModel(nn.Module):
-    """Gemma over [cognition][images][text]: token embedding, layers, last norm. No LM head: pi0.5 reads none."""
+    """Gemma over [cognition][images][text]: token embedding, layers, last norm. pi0.5 reads no LM head."""
 
     def __init__(self, config: GemmaConfig, vocab_size: int) -> None:
         super().__init__()
         self.embed_tokens = nn.Embedding(vocab_size, config.width)
-        self.layers = nn.ModuleList(GemmaLayer(config) for _ in range(config.depth))
+        self.layers = Stack[GemmaLayer](GemmaLayer(config) for _ in range(config.depth))
         self.norm = RmsNorm(config.width)
 
     def embed(self, token_ids_BT: Tensor) -> Tensor:
         """Text embeddings times sqrt(width); image and cognition tokens are not scaled."""
         embeds_BTW: Tensor = self.embed_tokens(token_ids_BT)
-        return embeds_BTW * embeds_BTW.shape[-1] ** 0.5
+        return embeds_BTW * math.sqrt(embeds_BTW.shape[-1])
 
 
 class ActionExpert(nn.Module):
@@ -165,7 +169,7 @@ class ActionExpert(nn.Module):
 
     def __init__(self, config: GemmaConfig) -> None:
         super().__init__()
-        self.layers = nn.ModuleList(ExpertLayer(config) for _ in range(config.depth))
+        self.layers = Stack[ExpertLayer](ExpertLayer(config) for _ in range(config.depth))
         self.norm = AdaRmsNorm(config.width)
 
     def styles(self, cond_BE: Tensor) -> Tensor:

@@ -15,12 +15,13 @@ PADDING = -1.0
 def resize_with_pad(frame: NDArray[np.uint8], size_px: int) -> Tensor:
     """(h, w, 3) uint8 -> (3, size_px, size_px) float32 in [-1, 1], centred on black.
 
-    Bilinear with antialiasing on uint8, as the PIL resize of openpi's data path and client; lerobot interpolates
-    floats without antialiasing, which differs wherever a frame shrinks.
+    Bilinear with antialiasing on uint8, like the PIL resize of openpi's data path and client. lerobot
+    interpolates floats without antialiasing, which differs wherever a frame shrinks.
     """
     height_px, width_px = frame.shape[:2]
     longest_px = max(height_px, width_px)
-    new_height_px, new_width_px = height_px * size_px // longest_px, width_px * size_px // longest_px
+    new_height_px = max(1, height_px * size_px // longest_px)
+    new_width_px = max(1, width_px * size_px // longest_px)
     pixels = torch.from_numpy(np.ascontiguousarray(frame)).permute(2, 0, 1)
     if (new_height_px, new_width_px) != (height_px, width_px):
         pixels = F.interpolate(
@@ -33,7 +34,7 @@ def resize_with_pad(frame: NDArray[np.uint8], size_px: int) -> Tensor:
 
 
 def camera_batch(frames: Sequence[NDArray[np.uint8] | None], size_px: int) -> tuple[Tensor, Tensor]:
-    """Returns the views of one moment, (1, V, 3, px, px), and which cameras delivered, (1, V) bool; None is missing."""
+    """Returns one moment's views, (1, V, 3, px, px), and which cameras delivered (were not None), (1, V) bool."""
     missing = torch.full((3, size_px, size_px), PADDING)
     views = [missing if frame is None else resize_with_pad(frame, size_px) for frame in frames]
     has_view = [frame is not None for frame in frames]

@@ -1,15 +1,16 @@
 """The cognition interface: P = [e_age, W_c C_1, ..., W_c C_K], all that System 2 tells System 1 (paper 3.1).
 
-Choices the paper leaves open, made here: the age enters as [sin | cos] at log-spaced periods from 0.1 s to 100 s and
-does not pass W_c (as the equation reads); P stands in front of the images; fresh W_c and W_a are scaled so that P has
-the rms of the text embeddings. The last matters little to pi0.5, whose first act is a scale-free RMSNorm: a small
-W_c does not make the prefix silent, and even an all-zero token takes part in the softmax. Null is not absent.
+Choices the paper leaves open, made here: the age enters as [sin | cos] at log-spaced periods from 0.1 s to
+100 s and does not pass W_c (as the equation reads); P stands in front of the images; fresh W_c and W_a give P
+the rms of the text embeddings. That scale matters little to pi0.5, whose first act is a scale-free RMSNorm: a
+small W_c does not make the prefix silent, and even an all-zero token takes part in the softmax. Null is not
+absent.
 
     # B batch, K carriers, H size of a carrier state, W width of the language stream, P = 1 + K tokens
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 from torch import Tensor, nn
@@ -27,16 +28,17 @@ class CognitionConfig:
     """Shape and treatment of the cognition prefix."""
 
     num_carriers: int = 1
-    """K. The paper trains K = 1 and times K = 8; K = 0 removes the prefix, age token included: the public pi0.5."""
+    """K; the paper trains 1 and times 8. 0 removes the prefix, age token included: the public pi0.5."""
     cognition_size: int = 4096
     """H, the hidden size of PONDER (4096 for Qwen3.5-9B)."""
     attention: PrefixAttention = "full"
-    """full: P is one bidirectional block with images and text, like a text prefix. isolated: images and text do not
-    see P nor P them, so their keys and values do not depend on cognition; the actions see both."""
+    """full: P is in one bidirectional block with images and text, as a text prefix would be. isolated: P and
+    they do not see each other, so image and text keys do not depend on cognition; the actions see both."""
     gradient_scale: float = 0.5
     """Scale of the action gradient that enters PONDER through C (paper A.3)."""
     projector_std: float | None = None
-    """Initial std of W_c; None matches the rms of the text embeddings for C of rms 1. The paper's 1e-3 is GR00T's."""
+    """Initial std of W_c. None: for C of rms 1, W_c C has the rms of the text embeddings. (The paper's 1e-3 is
+    for GR00T.)"""
     age_features: int = 64
     age_min_period_s: float = 0.1
     age_max_period_s: float = 100.0
@@ -62,13 +64,13 @@ class _ScaleGradient(torch.autograd.Function):
         return x.view_as(x)
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
         return grad * ctx.scale, None
 
 
 def scale_gradient(x: Tensor, scale: float) -> Tensor:
     """Identity forward; multiplies the gradient by ``scale`` on the way back."""
-    return _ScaleGradient.apply(x, scale)  # type: ignore[no-any-return,no-untyped-call]
+    return cast(Tensor, _ScaleGradient.apply(x, scale))  # type: ignore[no-untyped-call]
 
 
 class CognitionPrefix(nn.Module):

@@ -17,7 +17,7 @@ GRIPPER_MIN, GRIPPER_MAX = -1.0, 1.0  # closed, open
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Quantiles:
-    """1 % and 99 % quantiles of each dim over the training data. Values outside map outside [-1, 1], unclipped."""
+    """1 % and 99 % quantiles of each dim in the training data; what lies beyond maps beyond [-1, 1]."""
 
     q01: tuple[float, ...]
     q99: tuple[float, ...]
@@ -27,6 +27,10 @@ class Quantiles:
             raise ValueError(f"q01 has {len(self.q01)} dims and q99 {len(self.q99)}; they must agree")
         if any(low > high for low, high in zip(self.q01, self.q99, strict=True)):
             raise ValueError(f"q01 {self.q01} exceeds q99 {self.q99} in some dim")
+
+    @property
+    def num_dims(self) -> int:
+        return len(self.q01)
 
     @property
     def _low(self) -> NDArray[np.float64]:
@@ -51,13 +55,13 @@ class Quantiles:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobotStatistics:
-    """Quantiles of the state and of the action as the network learns it: arm deltas and an absolute gripper."""
+    """Quantiles of the state, and of the action as the network learns it: arm deltas, absolute gripper."""
 
     state: Quantiles
     action: Quantiles
 
     def normalise_targets(self, targets_N8: ArrayLike, state_8: ArrayLike) -> Floats:
-        """Absolute joint targets -> the network's actions; every row is relative to the same current state."""
+        """Absolute joint targets -> the network's actions; all rows are relative to the one current state."""
         actions_N8 = np.array(targets_N8, dtype=np.float64)
         actions_N8[..., :NUM_ARM_JOINTS] -= np.asarray(state_8, dtype=np.float64)[:NUM_ARM_JOINTS]
         return self.action.normalise(actions_N8)
@@ -80,5 +84,5 @@ ROBOMME = RobotStatistics(
         q99=(0.196, 0.377, 0.117, 0.414, 0.126, 0.522, 0.417, 1.0),
     ),
 )
-"""RoboMME's published statistics, rounded to three decimals as we have them: enough for our own models; a public
-RoboMME checkpoint wants the exact table of its own norm_stats."""
+"""RoboMME's published statistics, as we have them: rounded to three decimals. Right for models trained with
+this table; a public RoboMME checkpoint wants the exact numbers of its own norm_stats."""

@@ -1,9 +1,8 @@
-"""pi0.5: a frozen-layout PaliGemma that sees, and an action expert that reads its keys and values.
+"""pi0.5: a PaliGemma that sees, and an action expert that reads its keys and values.
 
-The token stream is [cognition P][view 0]...[view V-1][text] (the "prefix" of the pi0 literature), followed by the
-action tokens. The prefix never sees the actions, so its keys and values are computed once (`prefill`) and every
-evaluation of the velocity, in training as in sampling, reads them (`velocity`). Parity with the public
-implementations is a test: `tests/models/test_pi05_golden.py`.
+The token stream is [cognition P][view 0]...[view V-1][text], the "prefix" of the pi0 literature, and then the
+action tokens. The prefix never sees the actions, so its keys and values are computed once (`prefill`) and
+every evaluation of the velocity, in training as in sampling, reads them (`velocity`).
 
     # B batch, V views, P cognition tokens, T prefix tokens, N horizon, A action dim
     # W language width, E expert width, h/g query/key heads, D head dim, M norms of the expert
@@ -52,47 +51,49 @@ class Prefix:
     """The embedded prefix stream before the first layer."""
 
     embeds: Tensor
+    """(B, T, W)"""
     is_real: Tensor
-    """bool; False for padding and for the tokens of a missing camera: unseen, and they take no position."""
+    """(B, T) bool; False for padding and missing cameras: tokens that are unseen and take no position."""
     num_cognition: int = 0
     """The first tokens are P; the rest are images and text."""
     is_isolated: bool = False
     """P and (images, text) do not see each other; the actions see both."""
 
     def positions(self) -> Tensor:
+        """Returns (B, T) int64, counting real tokens only."""
         return self.is_real.long().cumsum(dim=1) - 1
 
     def visible(self) -> Tensor:
         """Returns which keys a row may see, broadcastable to (B, 1, T, T).
 
-        Rows of padding are left to see the real keys: nobody reads them, and a row that saw nothing would be NaN.
+        Rows of padding see the real keys too: nobody reads such a row, and one that saw nothing would be NaN.
         """
         visible_B11T = self.is_real[:, None, None, :]
         if not self.is_isolated:
             return visible_B11T
-        is_cognition_T = (
-            torch.arange(self.is_real.shape[1], device=self.is_real.device) < self.num_cognition
-        )
+        is_cognition_T = torch.arange(self.is_real.shape[1], device=self.is_real.device) < self.num_cognition
         same_part_TT = is_cognition_T[:, None] == is_cognition_T[None, :]
         return visible_B11T & same_part_TT
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PrefixCache:
-    """What the action stream reads of the prefix: per layer keys and values (B, g, T, D), and which may be seen."""
+    """What the action stream reads of the prefix."""
 
     keys: tuple[Tensor, ...]
+    """Rotated, one (B, g, T, D) per layer."""
     values: tuple[Tensor, ...]
     visible: Tensor
+    """(B, T) bool: which prefix tokens the actions may see."""
     num_real: Tensor
-    """The first action token's position."""
+    """(B,) int64: the position of the first action token."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepTable:
-    """The adaRMS styles at every time of the Euler sampler: constants of the weights, computed once per model.
+    """The adaRMS styles at every time of the Euler sampler: constants of the weights, computed once.
 
-    37 dense layers times 10 steps would otherwise be evaluated, and read from memory, in every invocation.
+    At full size this keeps 37 dense layers out of every one of the 10 steps.
     """
 
     num_steps: int
@@ -121,9 +122,10 @@ class Pi05(nn.Module):
         return self.language.embed_tokens.weight.dtype
 
     def embed_images(self, images_BV3PP: Tensor) -> Tensor:
-        """(B, V, 3, px, px) in [-1, 1] -> (B, V * patches, W). Not divided by sqrt(W), unlike stock PaliGemma."""
-        features_XSW = self.projector(self.vision(images_BV3PP.flatten(0, 1)))
-        return features_XSW.unflatten(0, images_BV3PP.shape[:2]).flatten(1, 2)  # type: ignore[no-any-return]
+        """(B, V, 3, px, px) -> (B, V * patches, W). Not divided by sqrt(W), unlike stock PaliGemma."""
+        batch_size, num_views = images_BV3PP.shape[:2]
+        features: Tensor = self.projector(self.vision(images_BV3PP.flatten(0, 1), self.stream_dtype))
+        return features.reshape(batch_size, num_views * features.shape[1], -1)
 
     def embed_prefix(
         self,
@@ -168,7 +170,8 @@ class Pi05(nn.Module):
     def prefix_hidden(self, prefix: Prefix) -> Tensor:
         """Returns (B, T, W) after the last norm. Acting needs it nowhere; parity tests and probes do."""
         _, _, hidden_BTW = self._run_prefix(prefix, last_layer_output=True)
-        return self.language.norm(hidden_BTW)  # type: ignore[no-any-return]
+        normed_BTW: Tensor = self.language.norm(hidden_BTW)
+        return normed_BTW
 
     def _run_prefix(
         self, prefix: Prefix, *, last_layer_output: bool
@@ -200,7 +203,7 @@ class Pi05(nn.Module):
         device = self.time_mlp_in.weight.device
         times = torch.tensor(flow.euler_times(num_steps), dtype=torch.float32, device=device)
         styles_M3S1E = self.expert.styles(self.time_condition(times))
-        return StepTable(num_steps=num_steps, styles=tuple(styles_M3S1E.split(1, dim=2)))
+        return StepTable(num_steps=num_steps, styles=torch.split(styles_M3S1E, 1, dim=2))
 
     def velocity(self, x_BNA: Tensor, styles_M3B1E: Tensor, cache: PrefixCache) -> Tensor:
         """Returns v(x_t, t | prefix), (B, N, A) float32; ``styles_M3B1E`` carries t.
@@ -223,7 +226,8 @@ class Pi05(nn.Module):
             normed_BNE, gate = layer.post_attention_layernorm(x_BNE, next(styles))
             x_BNE = x_BNE + gate * layer.mlp(normed_BNE)
         final_BNE, _ = self.expert.norm(x_BNE, next(styles))  # the last norm has no residual to gate
-        return self.action_out_proj(final_BNE.float())  # type: ignore[no-any-return]
+        velocity_BNA: Tensor = self.action_out_proj(final_BNE.float())
+        return velocity_BNA
 
     def velocity_at(self, x_BNA: Tensor, time_B: Tensor, cache: PrefixCache) -> Tensor:
         """`velocity` with one flow time per sample: training's form."""

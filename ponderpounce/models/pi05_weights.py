@@ -1,10 +1,10 @@
 """Public pi0.5 checkpoints: their tensor names, and reading and writing them.
 
-The layout is the one openpi's PyTorch port and lerobot share (812 tensors at full size); lerobot's policy adds a
-leading ``model.``. Our own tensors ride in the same file under ``pounce_prefix.``. Three habits of the layout:
+The layout is the one openpi's PyTorch port and lerobot share (812 tensors at full size); lerobot's policy
+adds a leading ``model.``. Our own tensors ride in the same file under ``pounce_prefix.``. Its habits:
 
 - the token embedding is tied to the LM head and usually stored only as ``...paligemma.lm_head.weight``;
-- ``...gemma_expert.lm_head.weight`` (263 M random numbers at full size) is never used: dropped here, not written
+- ``...gemma_expert.lm_head.weight`` (263 M numbers at full size) is never used: dropped here and not written
   back, so a strict foreign loader must be told to allow one missing key;
 - Gemma norms store w of (1 + w).
 """
@@ -70,9 +70,10 @@ def save_weights(model: Pounce, path: Path) -> None:
 
 
 def read_weights(path: Path) -> dict[str, Tensor]:
-    """Reads a file in the public layout, undoing its three habits; keys are canonical public names."""
+    """Reads a file in the public layout, undoing its habits; keys are canonical public names."""
     with safe_open(path, framework="pt") as file:
-        tensors = {name: file.get_tensor(name) for name in file.keys() if not name.endswith(_UNUSED_HEAD)}  # noqa: SIM118
+        names = [name for name in file.keys() if not name.endswith(_UNUSED_HEAD)]  # noqa: SIM118, no mapping
+        tensors = {name: file.get_tensor(name) for name in names}
     if any(name.startswith(_LEROBOT_PREFIX + _ROOT) for name in tensors):
         tensors = {name.removeprefix(_LEROBOT_PREFIX): tensor for name, tensor in tensors.items()}
     embedding = tensors.pop(_EMBEDDING, None)

@@ -22,19 +22,19 @@ class PounceInputs:
     """One batch as the network takes it: resized, normalised, tokenised."""
 
     images: Tensor
-    """float32 in [-1, 1]; a missing camera is all -1."""
+    """(B, V, 3, px, px) float32 in [-1, 1]; a missing camera is all -1."""
     has_view: Tensor
-    """bool"""
+    """(B, V) bool"""
     token_ids: Tensor
-    """int64"""
+    """(B, T) int64"""
     is_token: Tensor
-    """bool; False for padding"""
+    """(B, T) bool; False for padding"""
     age_ns: Tensor
-    """int64 age of the cognition; 0 where null"""
+    """(B,) int64 age of the cognition; 0 where null"""
     cognition: Tensor | None = None
-    """float32; None means null cognition everywhere, or K = 0"""
+    """(B, K, H) float32; None means null cognition everywhere, or K = 0"""
     is_null: Tensor | None = None
-    """bool; samples of ``cognition_BKH`` to replace by the learned null"""
+    """(B,) bool; samples of ``cognition`` to replace by the learned null"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,7 +61,7 @@ class PounceConfig:
                 raise ValueError(f"{name} must be at least 1, came {getattr(self, name)}")
 
     def example_inputs(self, batch_size: int, *, num_tokens: int = 12, seed: int = 0) -> PounceInputs:
-        """Fabricates a valid batch for tests, warm-up and benchmarks: all views present, cognition 300 ms old."""
+        """Fabricates a valid batch for tests and benchmarks: all views present, cognition 300 ms old."""
         generator = torch.Generator().manual_seed(seed)
         px = self.pi05.vision.image_px
         cognition = self.cognition
@@ -127,10 +127,10 @@ class Pounce(nn.Module):
 
 
 def freeze(model: Pounce, what: Freeze = "vlm") -> None:
-    """Sets ``requires_grad`` of every parameter; gradients still flow *through* frozen layers to the cognition.
+    """Sets ``requires_grad`` of every parameter. Gradients still flow *through* frozen layers, to the cognition.
 
-    - ``vlm`` (the paper, B.1: "including the PaliGemma backbone"): vision, projector and language model frozen.
-    - ``vision`` (RoboMME's released pi0.5 recipe, which the paper's wording contradicts): SigLIP and projector only.
+    - ``vlm`` (the paper, B.1: "including the PaliGemma backbone"): vision, projector and language are frozen.
+    - ``vision`` (RoboMME's released pi0.5 recipe; the paper's wording differs): SigLIP and projector are.
     - ``none``: everything trains.
 
     Never run the prefix under ``no_grad`` or ``detach`` it to save memory: that is the path to PONDER.

@@ -36,9 +36,16 @@ class PounceBundle:
     """True where the cognition prefix is untrained, though pi0.5 itself may be."""
 
     def __post_init__(self) -> None:
-        vocab_size = self.model.config.pi05.vocab_size
-        if self.tokenizer.vocab_size > vocab_size:
-            raise ValueError(f"tokenizer has {self.tokenizer.vocab_size} ids, the model embeds {vocab_size}")
+        config = self.model.config
+        if self.tokenizer.vocab_size > config.pi05.vocab_size:
+            raise ValueError(
+                f"tokenizer has {self.tokenizer.vocab_size} ids, the model embeds {config.pi05.vocab_size}"
+            )
+        if self.statistics.action.num_dims != config.robot_action_dim:
+            raise ValueError(
+                f"statistics describe {self.statistics.action.num_dims} action dims, "
+                f"the config {config.robot_action_dim}"
+            )
 
     def digest(self) -> str:
         """Returns 16 hex digits over weights, config, statistics and tokenizer: equal digests act equally."""
@@ -62,7 +69,7 @@ def random_bundle(config: PounceConfig, seed: int) -> PounceBundle:
 
 
 def save_bundle(bundle: PounceBundle, folder: Path) -> None:
-    """Writes the folder that `load_bundle` reads; the weights in the public pi0.5 layout plus ``pounce_prefix.*``."""
+    """Writes the folder that `load_bundle` reads; its weights are in the public layout (`pi05_weights`)."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / CONFIG_FILE).write_text(json.dumps(_to_json(bundle), indent=1) + "\n")
     (folder / TOKENIZER_FILE).write_bytes(bundle.tokenizer.model_bytes)
@@ -75,14 +82,14 @@ def load_bundle(
     """Reads our own folder, or a public pi0.5 one.
 
     Args:
-        config: for a public folder, whose config.json is in another dialect; default `pi05_base`. Ours brings its own.
+        config: for a public folder, whose config.json is another dialect; default `pi05_base()`.
         tokenizer: SentencePiece file; default the folder's tokenizer.model.
         prefix_seed: draws the cognition prefix where the folder has none.
 
     Raises:
         FileNotFoundError: no weights, or no tokenizer anywhere.
         WeightsError: the tensors do not fit the configuration.
-        ValueError: config.json is ours and unreadable, or ``config`` is given although the folder has its own.
+        ValueError: our config.json does not parse, or ``config`` is given although the folder has its own.
     """
     weights_path = folder / WEIGHTS_FILE
     if not weights_path.is_file():

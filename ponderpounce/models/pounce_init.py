@@ -1,4 +1,4 @@
-"""POUNCE from a seed: every parameter drawn from one generator, in a fixed order, without global random state."""
+"""POUNCE from a seed: every parameter drawn from one generator in a fixed order, no global random state."""
 
 import torch
 from torch import nn
@@ -35,8 +35,8 @@ def initialise_prefix(model: Pounce, generator: torch.Generator) -> None:
 def _initialise_pi05(pi05: nn.Module, generator: torch.Generator) -> None:
     """Keeps the variance of activations: weights N(0, 1 / fan-in), biases 0, norms the identity.
 
-    The adaRMS layers are drawn like the rest. Public training starts them at zero, which shuts every gate: such a
-    model would not look at its images, and a test on it would show nothing.
+    The adaRMS layers are drawn like the rest. Public training starts them at zero, which shuts every gate:
+    such a model does not look at its images, and a test on it would show nothing.
     """
     for module in pi05.modules():
         if isinstance(module, nn.Linear | nn.Conv2d):

@@ -1,8 +1,9 @@
 """The text POUNCE reads: instruction and proprioception in one line, and its tokens.
 
-Traps, each a different prompt from the same inputs in public code: the state is written BEFORE it is padded to 32 dims
-(lerobot 0.4.x wrote 32 numbers); openpi's pi05_libero and RoboMME's policies leave the state out altogether
-(``discrete_state_input=False``), so they act without proprioception; a value below q01 becomes bin -1, not 0.
+Traps, each a different prompt from the same inputs in public code: the state is written BEFORE it is padded
+to 32 dims (lerobot 0.4.x wrote 32 numbers); openpi's pi05_libero and RoboMME's policies leave the state out
+altogether (``discrete_state_input=False``) and so act without proprioception; a value below -1 becomes bin
+-1, not 0.
 """
 
 import io
@@ -76,7 +77,7 @@ class Tokenizer:
 
 
 def tiny_tokenizer_for_random_weights() -> Tokenizer:
-    """Trains a 512-id byte-fallback BPE on a few task sentences: the same ids on every call, useless to real weights.
+    """Trains a 512-id byte-fallback BPE on a few task sentences: equal on every call, useless to real weights.
 
     Special ids are PaliGemma's (pad 0, eos 1, bos 2, unk 3) and digits are split, as Gemma's tokenizer does.
     """

@@ -9,6 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from ponderpounce.models.stack import Stack
+
 LAYER_NORM_EPS = 1e-6
 
 
@@ -34,6 +36,16 @@ class VisionConfig:
         return (self.image_px // self.patch_px) ** 2
 
 
+class Float32LayerNorm(nn.LayerNorm):
+    """LayerNorm whose parameters stay float32 while the stream may be bfloat16, as in openpi."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__(width, eps=LAYER_NORM_EPS)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(x.float()).to(x.dtype)
+
+
 class VisionAttention(nn.Module):
     """Every patch sees every patch of its own image."""
 
@@ -51,7 +63,8 @@ class VisionAttention(nn.Module):
             for proj in (self.q_proj, self.k_proj, self.v_proj)
         )
         mixed_BhSD = F.scaled_dot_product_attention(q_BhSD, k_BhSD, v_BhSD)
-        return self.out_proj(mixed_BhSD.transpose(1, 2).flatten(2))  # type: ignore[no-any-return]
+        out_BSW: Tensor = self.out_proj(mixed_BhSD.transpose(1, 2).flatten(2))
+        return out_BSW
 
 
 class VisionMlp(nn.Module):
@@ -61,7 +74,8 @@ class VisionMlp(nn.Module):
         self.fc2 = nn.Linear(config.mlp_width, config.width)
 
     def forward(self, x_BSW: Tensor) -> Tensor:
-        return self.fc2(F.gelu(self.fc1(x_BSW), approximate="tanh"))  # type: ignore[no-any-return]
+        out_BSW: Tensor = self.fc2(F.gelu(self.fc1(x_BSW), approximate="tanh"))
+        return out_BSW
 
 
 class VisionLayer(nn.Module):
@@ -76,39 +90,29 @@ class VisionLayer(nn.Module):
 
     def forward(self, x_BSW: Tensor) -> Tensor:
         x_BSW = x_BSW + self.self_attn(self.layer_norm1(x_BSW))
-        return x_BSW + self.mlp(self.layer_norm2(x_BSW))  # type: ignore[no-any-return]
-
-
-class Float32LayerNorm(nn.LayerNorm):
-    """LayerNorm whose parameters stay float32 while the stream may be bfloat16 (openpi's choice of dtypes)."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__(width, eps=LAYER_NORM_EPS)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return super().forward(x.float()).to(x.dtype)
+        mlp_BSW: Tensor = self.mlp(self.layer_norm2(x_BSW))
+        return x_BSW + mlp_BSW
 
 
 class VisionTower(nn.Module):
-    """(B, 3, P, P) float32 in [-1, 1] -> (B, S, W) after the last LayerNorm.
-
-    Submodules carry the public key names (`patch_embedding`, `layers.0.self_attn.q_proj`, ...), so that
-    `pi05_weights` renames whole prefixes only.
-    """
+    """Submodules carry the public key names, so that `pi05_weights` renames whole prefixes only."""
 
     def __init__(self, config: VisionConfig) -> None:
         super().__init__()
         self.config = config
         self.patch_embedding = nn.Conv2d(3, config.width, config.patch_px, stride=config.patch_px)
         self.position_embedding = nn.Embedding(config.num_patches, config.width)
-        self.layers = nn.ModuleList(VisionLayer(config) for _ in range(config.depth))
+        self.layers = Stack[VisionLayer](VisionLayer(config) for _ in range(config.depth))
         self.post_layernorm = Float32LayerNorm(config.width)
 
-    def forward(self, images_B3PP: Tensor) -> Tensor:
+    def forward(self, images_B3PP: Tensor, stream_dtype: torch.dtype) -> Tensor:
+        """(B, 3, P, P) float32 in [-1, 1] -> (B, S, W) after the last LayerNorm.
+
+        Pixels and positions are added in float32; the layers run in ``stream_dtype``, that of their matrices.
+        """
         patches_BSW = self.patch_embedding(images_B3PP).flatten(2).transpose(1, 2)
-        # Pixels and positions are float32; the stream takes the dtype of the attention weights.
-        stream_dtype = self.layers[0].self_attn.q_proj.weight.dtype if len(self.layers) else torch.float32
         x_BSW = (patches_BSW + self.position_embedding.weight).to(stream_dtype)
         for layer in self.layers:
             x_BSW = layer(x_BSW)
-        return self.post_layernorm(x_BSW)  # type: ignore[no-any-return]
+        out_BSW: Tensor = self.post_layernorm(x_BSW)
+        return out_BSW

@@ -74,9 +74,13 @@ def _config(sizes: dict[str, Any]) -> PounceConfig:
 
 @pytest.fixture(scope="module", params=["pi05_base", "pi05_three_views"])
 def golden(request: pytest.FixtureRequest) -> Golden:
-    folder = next((root / request.param for root in (COMMITTED, SHARED) if (root / request.param).is_dir()), None)
+    folder = next(
+        (root / request.param for root in (COMMITTED, SHARED) if (root / request.param).is_dir()), None
+    )
     if folder is None:
-        pytest.skip(f"golden {request.param} is neither committed nor in ../shared/goldens beside the checkout")
+        pytest.skip(
+            f"golden {request.param} is neither committed nor in ../shared/goldens beside the checkout"
+        )
     sizes = json.loads((folder / "config.json").read_text())
     with torch.device("meta"):
         model = Pounce(_config(sizes))
