@@ -34,12 +34,18 @@ ACTION_LOW = np.append(JOINT_LOW_RAD, -1.0)
 ACTION_HIGH = np.append(JOINT_HIGH_RAD, 1.0)
 
 ROBOT_BIT, WORLD_BIT = 2, 1  # contact bits: the robot touches the world, not itself
+# As stiff as the physics step allows. With MuJoCo's defaults the fingers sink millimetres into the light cube they squeeze.
+STIFF_SOLREF, STIFF_SOLIMP = (0.01, 1.0), (0.95, 0.99, 0.001, 0.5, 2.0)
 
 _GAIN_KP, _GAIN_KD, _FORCE_LIMIT = 1000.0, 100.0, 100.0  # N m / rad and N / m alike, as upstream
 _FINGER_TARGET_M = (-0.01, 0.04)  # where commands -1 and +1 drive one finger; below 0 means squeezing
+# Bare 100 g fingers bounce off a squeezed cube at a physics step of 5 ms; with this inertia they hold it, and they still
+# close as their gains tell them to (it adds 5 ms to a time constant of 100 ms).
+_FINGER_ARMATURE_KG = 0.5
 _HAND_FROM_FLANGE_M = 0.107  # Franka's datasheet; robosuite mounts its hand half a millimetre short
 _FINGER_FROM_HAND_M = 0.0584  # likewise; robosuite's fingers start 6 mm short
 _TCP_FROM_HAND_M = 0.1034
+_HEAVY_FACES = 1000  # lighter meshes stay as they are; among them the fingers, which the wrist camera sees close up
 _CELL_M = 0.004  # clustering grid of the visual meshes: at 256 px the robot looks the same and renders twice as fast
 
 
@@ -92,14 +98,30 @@ def _source_spec() -> mujoco.MjSpec:
     for finger in FINGER_BODIES:
         spec.body(finger).pos = [0.0, 0.0, _FINGER_FROM_HAND_M]
     for name in FINGER_JOINTS:
-        # Bare fingers: with robosuite's armature and damping they would close three times slower than upstream's.
-        spec.joint(name).armature, spec.joint(name).damping, spec.joint(name).frictionloss = 0.0, [0.0] * 3, 0.0
+        # With robosuite's own damping and friction the fingers would close at half of upstream's speed.
+        spec.joint(name).damping, spec.joint(name).frictionloss = [0.0] * 3, 0.0
+        spec.joint(name).armature = _FINGER_ARMATURE_KG
     for geom in spec.geoms:
         if geom.contype or geom.conaffinity:
             geom.contype, geom.conaffinity = ROBOT_BIT, WORLD_BIT
     for finger in (1, 2):
         for geom in (spec.geom(f"finger{finger}_collision"), spec.geom(f"finger{finger}_pad_collision")):
             geom.friction, geom.condim = [2.0, 0.05, 0.0001], 4
+            geom.solref, geom.solimp = STIFF_SOLREF, STIFF_SOLIMP
+    for finger, side in zip(FINGER_BODIES, (1.0, -1.0), strict=True):
+        spec.body(finger).add_geom(
+            name=f"{finger}_tip",  # upstream's hand has black rubber tips and bright fingers
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=[0.0108, 0.005, 0.0095],
+            pos=[0.0, side * 0.0048, 0.0447],
+            rgba=[0.12, 0.12, 0.12, 1.0],
+            contype=0,
+            conaffinity=0,
+            group=1,
+            mass=0.0,
+        )
+    for finger in (1, 2):
+        spec.geom(f"finger{finger}_visual").rgba = [0.8, 0.8, 0.8, 1.0]
     for actuator in spec.actuators:
         actuator.set_to_position(kp=_GAIN_KP, kv=_GAIN_KD)
         actuator.ctrllimited = False
@@ -127,15 +149,15 @@ def _light_meshes() -> dict[str, tuple[Array, NDArray[np.int32]]]:
     meshes = {}
     for name in sorted(names):
         mesh = model.mesh(name)
+        if mesh.facenum[0] < _HEAVY_FACES:
+            continue
         first, last = mesh.vertadr[0], mesh.vertadr[0] + mesh.vertnum[0]
         rotation = np.empty(9)
         # The compiler moves every mesh to its own inertial frame; undo that, or the links come apart.
         mujoco.mju_quat2Mat(rotation, model.mesh_quat[mesh.id])
         vertices = model.mesh_vert[first:last].astype(np.float64) @ rotation.reshape(3, 3).T + model.mesh_pos[mesh.id]
         faces = model.mesh_face[mesh.faceadr[0] : mesh.faceadr[0] + mesh.facenum[0]]
-        light = cluster(vertices, faces, cell_m=_CELL_M)
-        if len(light[0]) >= 4 and len(light[1]) >= 4:  # too small a detail stays as it is: a mesh needs a volume
-            meshes[name] = light
+        meshes[name] = cluster(vertices, faces, cell_m=_CELL_M)
     return meshes
 
 

@@ -7,13 +7,14 @@ freely; buttons, discs and other scripted things are mocap bodies, so that where
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from ponderpounce.tasks.geometry import Footprint, is_clear
-from ponderpounce.tasks.panda import ROBOT_BIT, WORLD_BIT, panda_spec
+from ponderpounce.tasks.panda import ROBOT_BIT, STIFF_SOLIMP, STIFF_SOLREF, WORLD_BIT, panda_spec
 
 FRONT, WRIST = "front", "wrist"
 CAMERAS = (FRONT, WRIST)  # upstream calls them base_camera and hand_camera
@@ -22,6 +23,7 @@ PHYSICS_STEP_S = 0.005
 CUBE_HALF_M = 0.02
 BUTTON_HALF_M = (0.0375, 0.0375)
 BUTTON_BASE_HEIGHT_M = 0.015
+_CAP_TRAVEL_M = 0.015
 DISC_RADIUS_M = 0.05
 
 RGBA = tuple[float, float, float, float]
@@ -85,7 +87,7 @@ def add_cube(spec: mujoco.MjSpec, name: str, half_m: float = CUBE_HALF_M) -> Non
 def add_button(spec: mujoco.MjSpec, name: str) -> None:
     """Adds a button, origin on the table: a white base and ``name/cap``, a grey cap on a vertical spring.
 
-    The cap meets the table after 15 mm, which is what stops a finger upstream too; it does not collide with its base.
+    The cap can go down 15 mm. Upstream it is stopped there by the table.
     """
     base = spec.worldbody.add_body(name=name, mocap=True)
     half_height_m = BUTTON_BASE_HEIGHT_M / 2
@@ -103,9 +105,14 @@ def add_button(spec: mujoco.MjSpec, name: str) -> None:
         type=mujoco.mjtJoint.mjJNT_SLIDE,
         axis=[0.0, 0.0, 1.0],
         limited=True,
-        range=[-0.15, 0.0],
+        range=[-_CAP_TRAVEL_M, 0.0],
         stiffness=[800.0, 0.0, 0.0],
         damping=[40.0, 0.0, 0.0],
+        # MuJoCo's stops are soft in proportion to the mass they stop, and the cap weighs 43 g. This inertia lets the stop
+        # hold a pressing arm; the cap still follows its spring and damper, whose time constant is far longer.
+        armature=0.3,
+        solref_limit=STIFF_SOLREF,
+        solimp_limit=STIFF_SOLIMP,
     )
     cap.add_geom(
         name=f"{name}/cap",
@@ -116,7 +123,8 @@ def add_button(spec: mujoco.MjSpec, name: str) -> None:
         rgba=display_rgba((0.5, 0.5, 0.5, 1)),
         **_solid(),
     )
-    spec.add_exclude(bodyname1=name, bodyname2=f"{name}/cap")
+    for below in (name, "world"):
+        spec.add_exclude(bodyname1=below, bodyname2=f"{name}/cap")
 
 
 def add_disc(spec: mujoco.MjSpec, name: str, radius_m: float = DISC_RADIUS_M, rgba: RGBA = WHITE) -> None:
@@ -159,8 +167,14 @@ def sample_footprint(
     )
 
 
-def _solid() -> dict[str, int]:
-    return {"contype": WORLD_BIT, "conaffinity": WORLD_BIT | ROBOT_BIT, "group": _VISIBLE}
+def _solid() -> dict[str, Any]:
+    return {
+        "contype": WORLD_BIT,
+        "conaffinity": WORLD_BIT | ROBOT_BIT,
+        "group": _VISIBLE,
+        "solref": STIFF_SOLREF,
+        "solimp": STIFF_SOLIMP,
+    }
 
 
 def _add_room(spec: mujoco.MjSpec) -> None:
