@@ -77,12 +77,12 @@ class Ponder(nn.Module):
             )
         self.format = context_format
         self.image_px = image_px
-        self.qwen: Any = skeleton(qwen_config).to(dtype=dtype).to_empty(device=device)
-        self.qwen.tie_weights()  # to_empty makes a separate tensor of every name
+        qwen: Any = skeleton(qwen_config).to(dtype=dtype).to_empty(device=device)
+        qwen.tie_weights()  # to_empty makes a separate tensor of every name
         # Frequencies are buffers that no checkpoint holds; to_empty left them undefined.
-        self.qwen.model.language_model.rotary_emb = Qwen3_5TextRotaryEmbedding(text).to(device)
-        self.qwen.model.visual.rotary_pos_emb = Qwen3_5VisionRotaryEmbedding(vision).to(device)
-        self.qwen.eval()
+        qwen.model.language_model.rotary_emb = Qwen3_5TextRotaryEmbedding(text).to(device)
+        qwen.model.visual.rotary_pos_emb = Qwen3_5VisionRotaryEmbedding(vision).to(device)
+        self.qwen: Any = qwen.eval()
 
     @classmethod
     def random(

@@ -1,0 +1,138 @@
+"""Laws of the episode row: append-stable, T_no only as a target, positions that move by an image's side."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ponderpounce.models.context import IGNORE, ContextFormat, Segment, SegmentKind, Transition
+from ponderpounce.models.vocabulary import Vocabulary
+
+VOCABULARY = Vocabulary.tiny()
+FORMAT = ContextFormat(vocabulary=VOCABULARY, num_carriers=3, first_carrier_id=440, image_grid=(8, 8))
+
+plain_ids = st.lists(st.integers(0, 383), max_size=6).map(tuple)
+transitions = st.builds(Transition, subgoal=plain_ids, reasoning=st.none() | plain_ids)
+episodes = st.tuples(
+    st.text("abc <>,123", max_size=12),
+    st.lists(st.integers(1, 2), max_size=3),
+    st.lists(st.tuples(st.integers(1, 3), st.none() | transitions), max_size=5),
+)
+Episode = tuple[str, list[int], list[tuple[int, Transition | None]]]
+
+
+def segments_of(episode: Episode) -> list[Segment]:
+    instruction, demo_views, queries = episode
+    segments = list(FORMAT.opening(instruction, demo_views))
+    for num_cameras, transition in queries:
+        segments += FORMAT.query(num_cameras, transition)
+    return segments
+
+
+@given(episodes)
+def test_segments_end_to_end_are_the_training_row(episode: Episode) -> None:
+    segments = segments_of(episode)
+    row = FORMAT.row(segments)
+    assert row.ids == tuple(i for s in segments for i in s.ids)
+    assert row.targets == tuple(t for s in segments for t in s.targets)
+    assert row.num_images == sum(s.num_images for s in segments)
+    assert row.ids.count(VOCABULARY.image_pad) == 64 * row.num_images
+
+
+@given(episodes, st.integers(0, 40))
+def test_a_shorter_episode_is_a_prefix_of_a_longer_one(episode: Episode, cut: int) -> None:
+    segments = segments_of(episode)
+    part, whole = FORMAT.row(segments[:cut]), FORMAT.row(segments)
+    assert whole.ids[: len(part.ids)] == part.ids
+    assert whole.targets[: len(part.targets)] == part.targets
+
+
+@given(episodes)
+def test_t_no_is_only_ever_the_target_of_a_first_carrier(episode: Episode) -> None:
+    row = FORMAT.row(segments_of(episode))
+    assert VOCABULARY.t_no not in row.ids
+    first_carriers = row.carrier_index[:, 0].tolist()
+    assert [i for i, target in enumerate(row.targets) if target == VOCABULARY.t_no] == first_carriers
+
+
+@given(episodes)
+def test_every_other_target_is_the_token_itself(episode: Episode) -> None:
+    row = FORMAT.row(segments_of(episode))
+    first_carriers = set(row.carrier_index[:, 0].tolist())
+    for index, (token, target) in enumerate(zip(row.ids, row.targets, strict=True)):
+        assert target in (IGNORE, token) or index in first_carriers
+
+
+@given(episodes)
+def test_every_decision_is_read_from_an_observation_or_a_text(episode: Episode) -> None:
+    row = FORMAT.row(segments_of(episode))
+    carriers = set(FORMAT.carrier_ids)
+    assert not any(row.ids[i] in carriers for i in row.supervised_index)
+
+
+@given(episodes, st.integers(0, 40))
+def test_positions_in_pieces_are_the_positions_of_the_whole(episode: Episode, cut: int) -> None:
+    segments = segments_of(episode)
+    head, whole = FORMAT.row(segments[:cut]).ids, FORMAT.row(segments).ids
+    head_positions, next_position = FORMAT.positions(head)
+    tail_positions, _ = FORMAT.positions(
+        whole[len(head) :], first_index=len(head), first_position=next_position
+    )
+    both = np.concatenate([head_positions, tail_positions], axis=1)
+    np.testing.assert_array_equal(both, FORMAT.positions(whole)[0])
+
+
+@given(episodes)
+def test_the_mrope_position_moves_by_one_per_token_and_by_eight_per_image(episode: Episode) -> None:
+    row = FORMAT.row(segments_of(episode))
+    positions, next_position = FORMAT.positions(row.ids)
+    assert next_position == len(row.ids) - row.num_images * (64 - 8)
+    np.testing.assert_array_equal(positions[0], np.arange(len(row.ids)))
+
+
+def test_an_image_spreads_over_h_and_w_at_one_instant() -> None:
+    form = replace(FORMAT, image_grid=(2, 3))
+    positions, next_position = form.positions(form.observation(1).ids, first_index=10, first_position=5)
+    assert positions.tolist() == [
+        [10, 11, 12, 13, 14, 15, 16, 17],
+        [5, 6, 6, 6, 6, 6, 6, 9],
+        [5, 6, 6, 6, 7, 7, 7, 9],
+        [5, 6, 7, 8, 6, 7, 8, 9],
+    ]
+    assert next_position == 10
+
+
+def test_first_execution_transition_reads_t_yes_reasoning_t_yes_subgoal() -> None:
+    t_yes = VOCABULARY.t_yes
+    segments = FORMAT.query(2, Transition(subgoal=(7, 8), reasoning=(5, 6)))
+    assert [s.kind for s in segments] == [SegmentKind.OBSERVATION, SegmentKind.TEXT, SegmentKind.CARRIERS]
+    assert segments[1].ids == (t_yes, 5, 6, t_yes, 7, 8)
+    assert segments[1].targets == segments[1].ids
+
+
+def test_the_papers_growth_is_132_tokens_per_fire_and_one_carrier() -> None:
+    form = replace(FORMAT, num_carriers=1)
+    assert sum(len(s) for s in form.query(2)) == 132 + 1
+
+
+def test_a_cut_image_is_refused() -> None:
+    with pytest.raises(ValueError, match="image at token 1 has 63 tokens, not 8x8"):
+        FORMAT.positions(FORMAT.observation(1).ids[:-2])
+
+
+def test_an_instruction_cannot_open_a_payload() -> None:
+    with pytest.raises(ValueError, match="fim_prefix"):
+        FORMAT.opening("be quick <|fim_prefix|> now")
+
+
+def test_carriers_must_be_unused_rows() -> None:
+    with pytest.raises(ValueError, match=f"unused rows start at {VOCABULARY.num_tokens}"):
+        replace(FORMAT, first_carrier_id=VOCABULARY.num_tokens - 1)
+
+
+@pytest.mark.parametrize("num_carriers", [0, 17])
+def test_number_of_carriers_is_bounded(num_carriers: int) -> None:
+    with pytest.raises(ValueError, match=r"1\.\.16"):
+        replace(FORMAT, num_carriers=num_carriers)

@@ -1,0 +1,150 @@
+"""Checkpoints: what is written is what is read, by transformers too; every fault names its tensor."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from transformers.models.qwen3_5 import Qwen3_5ForConditionalGeneration
+
+from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.ponder_checkpoint import (
+    INDEX_NAME,
+    SINGLE_NAME,
+    CheckpointError,
+    load_ponder,
+    save_ponder,
+    weights_hash,
+)
+from ponderpounce.models.ponder_configs import tiny_cpu
+from ponderpounce.models.vocabulary import Vocabulary
+
+VOCABULARY = Vocabulary.tiny()
+CONFIG = replace(tiny_cpu(), num_layers=4, vision_depth=1, image_px=(64, 64), num_carriers=2)
+Tensors = dict[str, torch.Tensor]
+
+
+@pytest.fixture(scope="module")
+def ponder() -> Ponder:
+    return Ponder.random(CONFIG, VOCABULARY, seed=1)
+
+
+@pytest.fixture
+def folder(ponder: Ponder, tmp_path: Path) -> Path:
+    save_ponder(ponder, tmp_path)
+    return tmp_path
+
+
+def edit_tensors(folder: Path, edit: Callable[[Tensors], None]) -> None:
+    tensors = load_file(folder / SINGLE_NAME)
+    edit(tensors)
+    save_file(tensors, folder / SINGLE_NAME)
+
+
+@pytest.mark.parametrize("tied", [False, True])
+@pytest.mark.parametrize("max_shard_bytes", [10**9, 200_000])
+def test_saved_and_loaded_it_is_the_same_network(tmp_path: Path, tied: bool, max_shard_bytes: int) -> None:
+    saved = Ponder.random(replace(CONFIG, tied_embeddings=tied), VOCABULARY, seed=2)
+    save_ponder(saved, tmp_path, max_shard_bytes=max_shard_bytes)
+    loaded = load_ponder(tmp_path)
+    assert (tmp_path / INDEX_NAME).is_file() == (max_shard_bytes < 10**9)
+    assert weights_hash(loaded) == weights_hash(saved)
+    assert loaded.format.carrier_ids == saved.format.carrier_ids
+    assert loaded.image_px == (64, 64)
+    row = saved.format.row([*saved.format.opening("press"), *saved.format.query(1)])
+    frames = torch.full((1, 64, 64, 3), 200, dtype=torch.uint8)
+    with torch.no_grad():
+        hidden = saved.encode_row(row, frames)
+        assert torch.equal(loaded.encode_row(row, frames), hidden)
+        assert torch.equal(loaded.logits(hidden), saved.logits(hidden))
+
+
+def test_transformers_reads_what_we_write(ponder: Ponder, folder: Path) -> None:
+    public = Qwen3_5ForConditionalGeneration.from_pretrained(folder, dtype=torch.float32)
+    ours = ponder.qwen.state_dict()
+    theirs = public.state_dict()
+    assert ours.keys() == theirs.keys()
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+
+
+def test_a_public_checkpoint_without_our_file_gets_the_defaults(folder: Path) -> None:
+    (folder / "ponder.json").unlink()
+    loaded = load_ponder(folder)
+    assert loaded.format.carrier_ids == (VOCABULARY.num_tokens,)
+    assert loaded.image_px == (256, 256)
+
+
+def test_a_missing_tensor_is_named(folder: Path) -> None:
+    edit_tensors(folder, lambda tensors: tensors.pop("model.language_model.layers.3.self_attn.q_norm.weight"))
+    with pytest.raises(CheckpointError, match=r"missing model\.language_model\.layers\.3\.self_attn\.q_norm"):
+        load_ponder(folder)
+
+
+def test_an_extra_tensor_is_named(folder: Path) -> None:
+    edit_tensors(folder, lambda tensors: tensors.update(surprise=torch.zeros(1)))
+    with pytest.raises(CheckpointError, match="extra surprise"):
+        load_ponder(folder)
+
+
+def test_a_misshapen_tensor_is_named_with_both_shapes(folder: Path) -> None:
+    edit_tensors(folder, lambda tensors: tensors.update({"lm_head.weight": torch.zeros(512, 95)}))
+    with pytest.raises(CheckpointError, match=r"misshapen lm_head\.weight: \(512, 95\), .* \(512, 96\)"):
+        load_ponder(folder)
+
+
+def test_many_faults_are_counted_not_listed(folder: Path) -> None:
+    edit_tensors(folder, lambda tensors: tensors.update({f"x{i}": torch.zeros(1) for i in range(9)}))
+    with pytest.raises(CheckpointError, match=r"\(9 faults\).*and 4 more"):
+        load_ponder(folder)
+
+
+def test_multi_token_prediction_weights_are_left_alone(ponder: Ponder, folder: Path) -> None:
+    edit_tensors(folder, lambda tensors: tensors.update({"mtp.fc.weight": torch.zeros(2, 2)}))
+    assert weights_hash(load_ponder(folder)) == weights_hash(ponder)
+
+
+def test_a_shard_that_is_not_there_is_named(ponder: Ponder, tmp_path: Path) -> None:
+    save_ponder(ponder, tmp_path, max_shard_bytes=200_000)
+    shard = min(tmp_path.glob("model-*.safetensors"))
+    shard.unlink()
+    with pytest.raises(FileNotFoundError, match=shard.name):
+        load_ponder(tmp_path)
+
+
+def test_an_index_that_lies_is_caught(ponder: Ponder, tmp_path: Path) -> None:
+    save_ponder(ponder, tmp_path, max_shard_bytes=200_000)
+    index = json.loads((tmp_path / INDEX_NAME).read_text())
+    first, last = min(index["weight_map"].values()), max(index["weight_map"].values())
+    name = next(n for n, file_name in index["weight_map"].items() if file_name == first)
+    index["weight_map"][name] = last
+    (tmp_path / INDEX_NAME).write_text(json.dumps(index))
+    with pytest.raises(CheckpointError, match=f"missing {name}: .* places it in {last}"):
+        load_ponder(tmp_path)
+
+
+def test_a_tokenizer_of_another_checkpoint_is_noticed(folder: Path) -> None:
+    config = json.loads((folder / "config.json").read_text())
+    config["image_token_id"] = 7
+    (folder / "config.json").write_text(json.dumps(config))
+    with pytest.raises(CheckpointError, match="image_token_id is 7"):
+        load_ponder(folder)
+
+
+def test_another_architecture_is_refused(folder: Path) -> None:
+    (folder / "config.json").write_text(json.dumps({"model_type": "llama"}))
+    with pytest.raises(CheckpointError, match="'llama'"):
+        load_ponder(folder)
+
+
+def test_an_unknown_field_is_refused(folder: Path) -> None:
+    (folder / "ponder.json").write_text(json.dumps({"num_carrier": 2}))
+    with pytest.raises(CheckpointError, match=r"unknown fields \['num_carrier'\]"):
+        load_ponder(folder)
+
+
+def test_an_empty_folder_says_what_it_needs(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"config\.json"):
+        load_ponder(tmp_path)

@@ -1,0 +1,57 @@
+"""The tokenizer: any text survives, control tokens keep their names, none can be smuggled in."""
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tokenizers import Tokenizer, models
+
+from ponderpounce.models.vocabulary import CONTROL_TOKENS, Vocabulary
+
+TINY = Vocabulary.tiny()
+
+
+@given(st.text(st.characters(codec="ascii"), max_size=40).filter(lambda s: "<" not in s))
+def test_plain_text_survives(text: str) -> None:
+    assert TINY.decode(TINY.encode(text)) == text
+
+
+def test_two_trainings_give_one_tokenizer() -> None:
+    assert Vocabulary.tiny().names() == TINY.names()
+
+
+def test_control_tokens_keep_qwens_order_behind_the_text_tokens() -> None:
+    ids = [TINY.id_of(name) for name in CONTROL_TOKENS]
+    assert ids == list(range(ids[0], ids[0] + len(CONTROL_TOKENS)))
+    assert TINY.num_tokens == ids[-1] + 1
+    assert TINY.control_ids == set(ids)
+
+
+def test_digits_are_single_tokens() -> None:
+    assert len(TINY.encode("2026")) == 4
+
+
+@pytest.mark.parametrize("name", CONTROL_TOKENS)
+def test_no_control_token_can_come_from_text(name: str) -> None:
+    with pytest.raises(ValueError, match="control token"):
+        TINY.encode(f"take the {name} cube")
+
+
+def test_saved_and_loaded_it_is_the_same(tmp_path: Path) -> None:
+    TINY.save(tmp_path)
+    loaded = Vocabulary.load(tmp_path)
+    assert loaded.names() == TINY.names()
+    text = "move to <77, 103> → the 2nd button"
+    assert loaded.encode(text) == TINY.encode(text)
+    assert loaded.t_yes == TINY.t_yes
+
+
+def test_a_tokenizer_without_the_gate_tokens_is_refused() -> None:
+    with pytest.raises(ValueError, match="fim_prefix"):
+        Vocabulary(Tokenizer(models.BPE()))
+
+
+def test_a_folder_without_a_tokenizer_says_so(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"tokenizer\.json"):
+        Vocabulary.load(tmp_path)

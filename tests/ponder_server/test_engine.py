@@ -1,0 +1,368 @@
+"""The engine: a fire is one query of the training row, whatever path it took; errors leave no trace."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from ponder_server.contract import ContextFull, Frame, Opening, SessionError
+from ponder_server.engine import EngineConfig, QwenEngine
+from ponder_server.session import Session
+from ponderpounce.models.context import Row, Transition
+from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.ponder_configs import tiny_cpu
+from ponderpounce.models.vocabulary import Vocabulary
+
+TOLERANCE = 1e-4
+VOCABULARY = Vocabulary.tiny()
+MODEL = replace(tiny_cpu(), image_px=(64, 64), num_carriers=2)
+CONFIG = EngineConfig(num_cameras=2, max_context_tokens=400, max_sessions=3)
+INSTRUCTION = "press the buttons in order"
+REASONING = VOCABULARY.encode("left, then right, then the left")
+SUBGOAL = VOCABULARY.encode("press the left button")
+SUBGOAL_2 = VOCABULARY.encode("press the right one")
+Script = tuple[Transition | None, ...]
+SCRIPT: Script = (
+    None,
+    Transition(subgoal=SUBGOAL, reasoning=REASONING),
+    None,
+    Transition(subgoal=SUBGOAL_2),
+)
+
+
+def frame(seed: int) -> Frame:
+    return np.random.default_rng(seed).integers(0, 256, (64, 64, 3), dtype=np.uint8)
+
+
+def observation(query: int) -> tuple[Frame, ...]:
+    return frame(100 + 2 * query), frame(101 + 2 * query)
+
+
+DEMO = tuple((frame(i),) for i in range(3))
+WITH_DEMO = Opening(instruction=INSTRUCTION, demo_frames=DEMO)
+WITHOUT_DEMO = Opening(instruction=INSTRUCTION)
+
+
+def untrained() -> Ponder:
+    return Ponder.random(MODEL, VOCABULARY, seed=1)
+
+
+def training_row(ponder: Ponder, transitions: Script, opening: Opening = WITH_DEMO) -> Row:
+    form = ponder.format
+    queries = [segment for transition in transitions for segment in form.query(2, transition)]
+    return form.row([*form.opening(INSTRUCTION, [len(views) for views in opening.demo_frames]), *queries])
+
+
+def encode(ponder: Ponder, row: Row, opening: Opening = WITH_DEMO) -> torch.Tensor:
+    frames = [f for views in opening.demo_frames for f in views]
+    frames += [f for query in range(len(row.carrier_index)) for f in observation(query)]
+    with torch.inference_mode():
+        return ponder.encode_row(row, torch.from_numpy(np.stack(frames)))
+
+
+def taught(script: Script, opening: Opening = WITH_DEMO) -> Ponder:
+    """A PONDER whose LM head is fitted to one row's targets by least squares: trained, without training."""
+    ponder = untrained()
+    row = training_row(ponder, script, opening)
+    hidden_NH = encode(ponder, row, opening)[torch.from_numpy(row.supervised_index)].double()
+    targets = torch.tensor(row.targets)[torch.from_numpy(row.supervised_index + 1)]
+    assert len(hidden_NH) < ponder.hidden_size, "more targets than the head can fit exactly"
+    wanted_NV = 10.0 * torch.nn.functional.one_hot(targets, ponder.vocab_size).double()
+    with torch.no_grad():
+        ponder.qwen.lm_head.weight.copy_((torch.linalg.pinv(hidden_NH) @ wanted_NV).T)
+    return ponder
+
+
+@pytest.fixture(scope="module")
+def ponder() -> Ponder:
+    return taught(SCRIPT)
+
+
+@pytest.fixture
+def engine(ponder: Ponder) -> QwenEngine:
+    return QwenEngine(ponder, CONFIG, is_random=True)
+
+
+def context_of(engine: QwenEngine, session: str) -> Session:
+    return engine._episode(session).context
+
+
+def state_of(context: Session) -> tuple[list[int], int, list[torch.Tensor]]:
+    saved = context.save()
+    return list(context.ids), saved.next_position, saved.tensors
+
+
+def assert_untouched(context: Session, before: tuple[list[int], int, list[torch.Tensor]]) -> None:
+    ids, next_position, tensors = state_of(context)
+    assert (ids, next_position) == before[:2]
+    assert all(torch.equal(now, then) for now, then in zip(tensors, before[2], strict=True))
+
+
+def test_serving_regenerates_the_training_row(ponder: Ponder, engine: QwenEngine) -> None:
+    row = training_row(ponder, SCRIPT)
+    engine.open("a", WITH_DEMO)
+    answers = [engine.fire("a", observation(query)) for query in range(len(SCRIPT))]
+    assert context_of(engine, "a").ids == list(row.ids)
+    assert [a.is_transition for a in answers] == [False, True, False, True]
+    assert [(t.kind, t.token_ids, t.truncated) for t in answers[1].texts] == [
+        ("demo_reasoning", REASONING, False),
+        ("subgoal", SUBGOAL, False),
+    ]
+    assert [t.text for t in answers[3].texts] == ["press the right one"]
+    expected = encode(ponder, row)[torch.from_numpy(row.carrier_index)]
+    for answer, C_t in zip(answers, expected, strict=True):
+        assert answer.cognition.dtype == np.float32
+        assert np.abs(answer.cognition - C_t.numpy()).max() < TOLERANCE
+    assert answers[-1].context_tokens == len(row.ids)
+
+
+def test_a_transition_has_forgotten_its_speculative_carriers_to_the_last_bit(engine: QwenEngine) -> None:
+    engine.open("a", WITH_DEMO)
+    engine.open("b", WITH_DEMO)
+    engine.fire("a", observation(0))
+    engine.fire("b", observation(0))
+    by_engine = engine.fire("a", observation(1))
+
+    form, ponder, context = engine._format, engine._ponder, engine._episode("b").context
+    t_yes = VOCABULARY.t_yes
+    with torch.inference_mode():
+        ids = [*form.observation(2).ids, t_yes]
+        context.append(ids, ponder.embed(ids, torch.from_numpy(np.stack(observation(1)))))
+        for token in (*REASONING, t_yes, *SUBGOAL):
+            context.append([token], ponder.embed([token]))
+        by_hand = context.append(form.carrier_ids, ponder.embed(form.carrier_ids))
+    np.testing.assert_array_equal(by_engine.cognition, by_hand.numpy())
+
+
+def test_equal_sessions_give_equal_bits_also_interleaved_and_reopened(engine: QwenEngine) -> None:
+    queries = range(len(SCRIPT))
+    engine.open("alone", WITH_DEMO)
+    alone = [engine.fire("alone", observation(q)).cognition for q in queries]
+    engine.close("alone")
+    engine.open("x", WITH_DEMO)
+    engine.open("other", WITHOUT_DEMO)
+    interleaved = []
+    for q in queries:
+        engine.fire("other", observation(q + 50), force_text_tokens=3)
+        interleaved.append(engine.fire("x", observation(q)).cognition)
+    np.testing.assert_array_equal(interleaved, alone)
+
+
+def test_demo_reasoning_is_written_at_the_first_transition_only() -> None:
+    script = (None, Transition(subgoal=REASONING), Transition(subgoal=SUBGOAL))
+    engine = QwenEngine(taught(script), CONFIG, is_random=True)
+    engine.open("a", WITH_DEMO)
+    texts = [engine.fire("a", observation(query)).texts for query in range(3)]
+    # T_no right after the reasoning ends the whole transition; it is not asked for again
+    assert [[(t.kind, t.token_ids) for t in ts] for ts in texts] == [
+        [],
+        [("demo_reasoning", REASONING)],
+        [("subgoal", SUBGOAL)],
+    ]
+
+
+def test_without_a_demo_the_first_transition_is_a_subgoal() -> None:
+    engine = QwenEngine(taught((Transition(subgoal=SUBGOAL),), WITHOUT_DEMO), CONFIG, is_random=True)
+    engine.open("a", WITHOUT_DEMO)
+    assert [(t.kind, t.text) for t in engine.fire("a", observation(0)).texts] == [
+        ("subgoal", "press the left button")
+    ]
+
+
+@pytest.mark.parametrize("max_text_tokens", [len(REASONING), len(REASONING) - 1])
+def test_a_text_is_truncated_only_if_it_would_have_gone_on(ponder: Ponder, max_text_tokens: int) -> None:
+    assert len(SUBGOAL) <= len(REASONING) - 1
+    config = replace(CONFIG, max_text_tokens=max_text_tokens)
+    engine = QwenEngine(ponder, config, is_random=True)
+    engine.open("a", WITH_DEMO)
+    engine.fire("a", observation(0))
+    reasoning, subgoal = engine.fire("a", observation(1)).texts
+    assert reasoning.truncated == (max_text_tokens < len(REASONING))
+    assert reasoning.token_ids == REASONING[:max_text_tokens]
+    assert subgoal.kind == "subgoal"  # S follows a truncated DR all the same
+    ids = context_of(engine, "a").ids
+    payload = (VOCABULARY.t_yes, *reasoning.token_ids, VOCABULARY.t_yes, *subgoal.token_ids)
+    assert tuple(ids[-2 - len(payload) : -2]) == payload
+
+
+def test_text_leaves_room_for_the_carriers(ponder: Ponder) -> None:
+    opened = QwenEngine(ponder, CONFIG, is_random=True).open("a", WITH_DEMO)
+    ordinary, text = 12 + 2, 1 + len(REASONING) + 1 + 3
+    limit = opened + 2 * ordinary + text
+    engine = QwenEngine(ponder, replace(CONFIG, max_context_tokens=limit), is_random=True)
+    engine.open("a", WITH_DEMO)
+    engine.fire("a", observation(0))
+    answer = engine.fire("a", observation(1))
+    assert [(t.token_ids, t.truncated) for t in answer.texts] == [(REASONING, False), (SUBGOAL[:3], True)]
+    assert answer.context_tokens == limit
+
+
+@pytest.mark.parametrize("room_for_text", [0, 2])
+def test_a_transition_that_does_not_fit_leaves_no_trace(ponder: Ponder, room_for_text: int) -> None:
+    opened = QwenEngine(ponder, CONFIG, is_random=True).open("a", WITH_DEMO)
+    limit = opened + 2 * (12 + 2) + room_for_text
+    engine = QwenEngine(ponder, replace(CONFIG, max_context_tokens=limit), is_random=True)
+    engine.open("a", WITH_DEMO)
+    engine.fire("a", observation(0))
+    before = state_of(context_of(engine, "a"))
+    with pytest.raises(ContextFull, match=f"the limit is {limit}"):
+        engine.fire("a", observation(1))
+    assert_untouched(context_of(engine, "a"), before)
+
+
+@pytest.mark.parametrize("call", [1, 2, 5])
+def test_a_fire_that_is_interrupted_leaves_no_trace(engine: QwenEngine, call: int) -> None:
+    engine.open("a", WITH_DEMO)
+    engine.fire("a", observation(0))
+    before = state_of(context_of(engine, "a"))
+    calls = iter(range(1, 1000))
+
+    def interrupt() -> None:
+        if next(calls) == call:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        engine.fire("a", observation(1), interrupt)
+    assert_untouched(context_of(engine, "a"), before)
+    assert [t.kind for t in engine.fire("a", observation(1)).texts] == ["demo_reasoning", "subgoal"]
+
+
+def test_progress_is_heard_at_every_chunk_and_every_token(ponder: Ponder) -> None:
+    engine = QwenEngine(ponder, replace(CONFIG, prefill_chunk_tokens=1), is_random=True)
+    calls: list[int] = []
+    engine.open("a", WITH_DEMO, lambda: calls.append(0))
+    assert len(calls) == 1 + len(DEMO) + 1
+    engine.fire("a", observation(0), lambda: calls.append(1))
+    assert calls.count(1) == 1
+    engine.fire("a", observation(1), lambda: calls.append(2))
+    # one-pass try, observation again, each token, T_yes between the texts, carriers
+    assert calls.count(2) == 1 + 1 + len(REASONING) + 1 + len(SUBGOAL) + 1
+
+
+def test_the_chunks_of_the_opening_do_not_matter(ponder: Ponder) -> None:
+    answers = []
+    for prefill_chunk_tokens in (1, 20, 512):
+        config = replace(CONFIG, prefill_chunk_tokens=prefill_chunk_tokens)
+        engine = QwenEngine(ponder, config, is_random=True)
+        engine.open("a", WITH_DEMO)
+        answers.append(engine.fire("a", observation(0)).cognition)
+    np.testing.assert_allclose(answers[1:], [answers[0]] * 2, rtol=0, atol=TOLERANCE)
+
+
+def test_forced_text_has_exactly_so_many_plain_tokens(engine: QwenEngine) -> None:
+    opened = engine.open("a", WITH_DEMO)
+    answer = engine.fire("a", observation(0), force_text_tokens=45)
+    (text,) = answer.texts
+    assert answer.is_transition
+    assert len(text.token_ids) == 45
+    assert not text.truncated
+    assert not VOCABULARY.control_ids.intersection(text.token_ids)
+    assert max(text.token_ids) < VOCABULARY.num_tokens
+    assert answer.context_tokens == opened + 12 + 1 + 45 + 2
+
+
+def test_forced_text_that_does_not_fit_is_refused(engine: QwenEngine) -> None:
+    engine.open("a", WITH_DEMO)
+    before = state_of(context_of(engine, "a"))
+    with pytest.raises(ContextFull):
+        engine.fire("a", observation(0), force_text_tokens=400)
+    assert_untouched(context_of(engine, "a"), before)
+
+
+def test_a_full_context_refuses_before_it_computes(ponder: Ponder) -> None:
+    opened = QwenEngine(ponder, CONFIG, is_random=True).open("a", WITH_DEMO)
+    engine = QwenEngine(ponder, replace(CONFIG, max_context_tokens=opened + 2 * 14 - 1), is_random=True)
+    engine.open("a", WITH_DEMO)
+    engine.fire("a", observation(0))
+    before = state_of(context_of(engine, "a"))
+    calls: list[int] = []
+    with pytest.raises(ContextFull, match=f"holds {opened + 14} tokens and needs 14 more"):
+        engine.fire("a", observation(2), lambda: calls.append(1))
+    assert not calls
+    assert_untouched(context_of(engine, "a"), before)
+
+
+BAD_FRAMES = {
+    "float": (frame(0).astype(np.float32), frame(1)),
+    "not finite": (np.full((64, 64, 3), np.nan), frame(1)),
+    "too small": (frame(0)[:32], frame(1)),
+    "channels first": (frame(0).transpose(2, 0, 1), frame(1)),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FRAMES)
+def test_a_wrong_frame_is_refused_with_its_shape(engine: QwenEngine, name: str) -> None:
+    engine.open("a", WITHOUT_DEMO)
+    with pytest.raises(ValueError, match=r"observation, frame 0: .* expected uint8 \(64, 64, 3\)"):
+        engine.fire("a", BAD_FRAMES[name])  # type: ignore[arg-type]
+
+
+def test_a_wrong_demo_frame_is_refused_and_nothing_is_opened(engine: QwenEngine) -> None:
+    demo = ((frame(0),), (frame(1)[:32],))
+    with pytest.raises(ValueError, match="demo instant 1, frame 0"):
+        engine.open("a", Opening(instruction="x", demo_frames=demo))
+    with pytest.raises(ValueError, match="demo instant 0 has no view"):
+        engine.open("a", Opening(instruction="x", demo_frames=((),)))
+    with pytest.raises(SessionError, match="not open"):
+        engine.close("a")
+
+
+def test_a_missing_camera_is_refused(engine: QwenEngine) -> None:
+    engine.open("a", WITHOUT_DEMO)
+    with pytest.raises(ValueError, match="1 frames, this engine has num_cameras 2"):
+        engine.fire("a", (frame(0),))
+
+
+def test_sessions_have_names_and_a_number(engine: QwenEngine) -> None:
+    with pytest.raises(SessionError, match="'a' is not open; open are \\[\\]"):
+        engine.fire("a", observation(0))
+    for name in "abc":
+        engine.open(name, WITHOUT_DEMO)
+    with pytest.raises(SessionError, match="already open"):
+        engine.open("a", WITHOUT_DEMO)
+    with pytest.raises(SessionError, match="max_sessions is 3"):
+        engine.open("d", WITHOUT_DEMO)
+    engine.close("a")
+    engine.open("d", WITHOUT_DEMO)
+
+
+def test_an_opening_that_does_not_fit_is_refused(engine: QwenEngine) -> None:
+    with pytest.raises(ContextFull, match="holds 0 tokens"):
+        engine.open("a", Opening(instruction="go " * 400))
+    engine.open("a", WITHOUT_DEMO)
+
+
+def test_a_broken_network_does_not_answer() -> None:
+    ponder = untrained()
+    with torch.no_grad():
+        ponder.qwen.model.language_model.norm.weight.fill_(float("nan"))
+    engine = QwenEngine(ponder, CONFIG, is_random=True)
+    engine.open("a", WITHOUT_DEMO)
+    before = state_of(context_of(engine, "a"))
+    with pytest.raises(FloatingPointError, match="cognition is not finite"):
+        engine.fire("a", observation(0))
+    assert_untouched(context_of(engine, "a"), before)
+
+
+def test_warm_up_measures_enough_and_leaves_nothing_open(engine: QwenEngine) -> None:
+    engine.open("a", WITH_DEMO)
+    before = state_of(context_of(engine, "a"))
+    durations_ns = engine.warm_up()
+    assert len(durations_ns) >= 20
+    assert all(duration_ns > 0 for duration_ns in durations_ns)
+    assert_untouched(context_of(engine, "a"), before)
+    with pytest.raises(SessionError, match=r"open are \['a'\]"):
+        engine.close("warm-up")
+
+
+def test_the_spec_says_what_the_engine_is() -> None:
+    ponder = Ponder.random(MODEL, VOCABULARY, seed=1, dtype=torch.bfloat16)
+    engine = QwenEngine(ponder, CONFIG, is_random=True)
+    spec = engine.spec
+    assert (spec.num_carriers, spec.hidden_size, spec.image_px, spec.num_cameras) == (2, 96, (64, 64), 2)
+    assert (spec.max_context_tokens, spec.is_random, spec.dtype) == (400, True, "bfloat16")
+    assert len(spec.model_hash) == 12
+    engine.open("a", WITH_DEMO)
+    cognition = engine.fire("a", observation(0)).cognition
+    assert (cognition.shape, cognition.dtype) == ((2, 96), np.float32)
