@@ -34,7 +34,7 @@ def resize_with_pad(frame: NDArray[np.uint8], size_px: int) -> Tensor:
 
 
 def camera_batch(frames: Sequence[NDArray[np.uint8] | None], size_px: int) -> tuple[Tensor, Tensor]:
-    """Returns one moment's views, (1, V, 3, px, px), and which cameras delivered (were not None), (1, V) bool."""
+    """Returns one moment's views, (1, V, 3, px, px), and which cameras were not None, (1, V) bool."""
     missing = torch.full((3, size_px, size_px), PADDING)
     views = [missing if frame is None else resize_with_pad(frame, size_px) for frame in frames]
     has_view = [frame is not None for frame in frames]

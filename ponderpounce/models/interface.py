@@ -37,8 +37,8 @@ class CognitionConfig:
     gradient_scale: float = 0.5
     """Scale of the action gradient that enters PONDER through C (paper A.3)."""
     projector_std: float | None = None
-    """Initial std of W_c. None: for C of rms 1, W_c C has the rms of the text embeddings. (The paper's 1e-3 is
-    for GR00T.)"""
+    """Initial std of W_c. None: for C of rms 1, W_c C has the rms of the text embeddings. (The paper's 1e-3
+    is for GR00T.)"""
     age_features: int = 64
     age_min_period_s: float = 0.1
     age_max_period_s: float = 100.0

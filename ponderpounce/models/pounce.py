@@ -127,7 +127,7 @@ class Pounce(nn.Module):
 
 
 def freeze(model: Pounce, what: Freeze = "vlm") -> None:
-    """Sets ``requires_grad`` of every parameter. Gradients still flow *through* frozen layers, to the cognition.
+    """Sets ``requires_grad`` of every parameter. Gradients still pass *through* frozen layers to C.
 
     - ``vlm`` (the paper, B.1: "including the PaliGemma backbone"): vision, projector and language are frozen.
     - ``vision`` (RoboMME's released pi0.5 recipe; the paper's wording differs): SigLIP and projector are.

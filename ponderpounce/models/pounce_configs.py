@@ -30,8 +30,8 @@ def tiny_cpu(
 ) -> PounceConfig:
     """A network of the same parts that one CPU thread runs at 20 Hz; for random weights and tests.
 
-    Frames are resized to the public 224 px but cut into 28 px patches, 64 a view. With the public 14 px, 256 a
-    view, attention doubles the time of an invocation.
+    Frames are resized to the public 224 px but cut into 28 px patches, 64 a view. With the public 14 px,
+    256 a view, attention doubles the time of an invocation.
     """
     return PounceConfig(
         pi05=Pi05Config(

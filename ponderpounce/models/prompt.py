@@ -77,7 +77,7 @@ class Tokenizer:
 
 
 def tiny_tokenizer_for_random_weights() -> Tokenizer:
-    """Trains a 512-id byte-fallback BPE on a few task sentences: equal on every call, useless to real weights.
+    """Trains a 512-id byte-fallback BPE on a few task sentences: equal on every call, no use to real weights.
 
     Special ids are PaliGemma's (pad 0, eos 1, bos 2, unk 3) and digits are split, as Gemma's tokenizer does.
     """

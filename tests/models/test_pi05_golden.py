@@ -1,9 +1,9 @@
 """Our pi0.5 against numbers from the public implementations: every tensor the goldens hold, float32, 1e-4."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 import torch
@@ -16,6 +16,7 @@ from ponderpounce.models.interface import CognitionConfig
 from ponderpounce.models.pi05 import Pi05Config, Prefix
 from ponderpounce.models.pi05_weights import load_weights
 from ponderpounce.models.pounce import Pounce, PounceConfig, PounceInputs
+from ponderpounce.models.pounce_init import random_pounce
 from ponderpounce.models.siglip import VisionConfig
 
 TOLERANCE = 1e-4
@@ -145,6 +146,39 @@ def test_sampler_step_by_step(golden: Golden) -> None:
     _assert_close(velocities, golden.expected["sample_velocities"])
     _assert_close(trajectory, golden.expected["sample_trajectory"])
     _assert_close(steps[-1].actions, golden.expected["actions"])
+
+
+def _with_cognition(golden: Golden, attention: Literal["full", "isolated"]) -> tuple[Pounce, PounceInputs]:
+    """The golden's weights behind a fresh, loud cognition prefix of K = 3."""
+    cognition = CognitionConfig(num_carriers=3, cognition_size=16, attention=attention)
+    model = random_pounce(replace(golden.model.config, cognition=cognition), seed=0)
+    model.load_state_dict(golden.model.state_dict(), strict=False)
+    batch_size = len(golden.inputs.age_ns)
+    carriers = torch.randn(batch_size, 3, 16, generator=torch.Generator().manual_seed(1))
+    return model.requires_grad_(False), replace(golden.inputs, cognition=carriers)
+
+
+def test_isolated_prefix_hidden_from_the_actions_is_the_public_model(golden: Golden) -> None:
+    """Images and text are untouched by P, and P's shift of all positions cancels in RoPE."""
+    model, inputs = _with_cognition(golden, "isolated")
+    cache = model.prefill(inputs)
+    visible = cache.visible.clone()
+    visible[:, : model.config.cognition.num_tokens] = False
+    given = golden.given
+    x_t = flow.noised(given["actions"], given["noise"], given["time"])
+    velocity = model.pi05.velocity_at(x_t, given["time"], replace(cache, visible=visible))
+    _assert_close(velocity, golden.expected["velocity"])
+
+
+@pytest.mark.parametrize("attention", ["full", "isolated"])
+def test_visible_prefix_is_not_the_public_model(
+    golden: Golden, attention: Literal["full", "isolated"]
+) -> None:
+    model, inputs = _with_cognition(golden, attention)
+    given = golden.given
+    x_t = flow.noised(given["actions"], given["noise"], given["time"])
+    velocity = model.pi05.velocity_at(x_t, given["time"], model.prefill(inputs))
+    assert (velocity - golden.expected["velocity"]).abs().max() > 10 * TOLERANCE
 
 
 def test_every_expected_tensor_is_compared(golden: Golden) -> None:

@@ -1,0 +1,139 @@
+"""The checkpoint folder: all of a bundle survives it, and a public folder gets a flagged fresh prefix."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from ponderpounce.models.config_json import from_json
+from ponderpounce.models.interface import CognitionConfig
+from ponderpounce.models.normalisation import ROBOMME, Quantiles, RobotStatistics
+from ponderpounce.models.pi05_weights import WeightsError
+from ponderpounce.models.pounce_checkpoint import PounceBundle, load_bundle, random_bundle, save_bundle
+from ponderpounce.models.pounce_configs import tiny_cpu
+
+
+@pytest.fixture(scope="module")
+def bundle() -> PounceBundle:
+    return random_bundle(tiny_cpu(num_carriers=2), seed=0)
+
+
+@pytest.fixture
+def folder(bundle: PounceBundle, tmp_path: Path) -> Path:
+    save_bundle(bundle, tmp_path)
+    return tmp_path
+
+
+def _make_public(folder: Path) -> None:
+    """Strips a folder to what openpi publishes: pi0.5 tensors and a config in another dialect."""
+    path = folder / "model.safetensors"
+    save_file(
+        {n: tensor for n, tensor in load_file(path).items() if not n.startswith("pounce_prefix.")}, path
+    )
+    (folder / "config.json").write_text('{"action_dim": 32, "paligemma_variant": "gemma_2b"}')
+
+
+def test_a_bundle_survives_its_folder(bundle: PounceBundle, folder: Path) -> None:
+    loaded = load_bundle(folder)
+    assert loaded.model.config == bundle.model.config
+    assert loaded.statistics == bundle.statistics
+    assert (loaded.is_random, loaded.has_fresh_prefix) == (True, True)
+    assert loaded.digest() == bundle.digest()
+
+
+def test_flags_of_trained_weights_survive(bundle: PounceBundle, tmp_path: Path) -> None:
+    save_bundle(replace(bundle, is_random=False, has_fresh_prefix=False), tmp_path)
+    loaded = load_bundle(tmp_path)
+    assert (loaded.is_random, loaded.has_fresh_prefix) == (False, False)
+
+
+def test_digest_tells_every_ingredient_apart(bundle: PounceBundle) -> None:
+    longer = RobotStatistics(state=ROBOMME.state, action=Quantiles(q01=(-9.0,) * 8, q99=(9.0,) * 8))
+    digests = [
+        bundle.digest(),
+        random_bundle(bundle.model.config, seed=1).digest(),
+        random_bundle(replace(bundle.model.config, num_steps=5), seed=0).digest(),
+        replace(bundle, statistics=longer).digest(),
+    ]
+    assert len(set(digests)) == len(digests)
+    assert random_bundle(bundle.model.config, seed=0).digest() == digests[0]
+
+
+def test_public_folder_loads_with_a_fresh_flagged_prefix(bundle: PounceBundle, folder: Path) -> None:
+    _make_public(folder)
+    loaded = load_bundle(folder, config=bundle.model.config)
+    assert (loaded.is_random, loaded.has_fresh_prefix) == (False, True)
+    assert torch.equal(loaded.model.pi05.action_in_proj.weight, bundle.model.pi05.action_in_proj.weight)
+    assert loaded.digest() == load_bundle(folder, config=bundle.model.config).digest(), (
+        "seeded, not arbitrary"
+    )
+    text_rms = bundle.model.pi05.language.embed_tokens.weight.square().mean().sqrt() * 64**0.5
+    cognition = torch.randn(200, 2, 64, generator=torch.Generator().manual_seed(0))
+    tokens = loaded.model.prefix(cognition, torch.zeros(200, dtype=torch.int64))[:, 1:]
+    assert tokens.square().mean().sqrt().item() == pytest.approx(text_rms.item(), rel=0.1)
+
+
+def test_public_folder_without_carriers_has_no_prefix_to_flag(bundle: PounceBundle, folder: Path) -> None:
+    _make_public(folder)
+    config = replace(bundle.model.config, cognition=CognitionConfig(num_carriers=0))
+    assert load_bundle(folder, config=config).has_fresh_prefix is False
+
+
+def test_public_folder_is_taken_for_full_size_by_default(folder: Path) -> None:
+    _make_public(folder)
+    with pytest.raises(WeightsError, match=r"misshapen: .*expected"):
+        load_bundle(folder)
+
+
+def test_missing_files_are_named(folder: Path) -> None:
+    (folder / "tokenizer.model").unlink()
+    with pytest.raises(FileNotFoundError, match="--tokenizer"):
+        load_bundle(folder)
+    (folder / "model.safetensors").unlink()
+    with pytest.raises(FileNotFoundError, match=r"no model\.safetensors"):
+        load_bundle(folder)
+
+
+def test_two_configs_for_one_folder_are_refused(bundle: PounceBundle, folder: Path) -> None:
+    with pytest.raises(ValueError, match=r"has its own config\.json"):
+        load_bundle(folder, config=bundle.model.config)
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        (
+            ("config", "pi05", "vision", "width"),
+            r"config\.json\.pi05\.vision: missing \['width'\], unknown \[\]",
+        ),
+        (("config", "num_steps"), r"config\.json: missing \['num_steps'\]"),
+    ],
+)
+def test_a_config_with_a_hole_names_it(folder: Path, path: tuple[str, ...], message: str) -> None:
+    stored = json.loads((folder / "config.json").read_text())
+    record = stored
+    for name in path[:-1]:
+        record = record[name]
+    del record[path[-1]]
+    (folder / "config.json").write_text(json.dumps(stored))
+    with pytest.raises(ValueError, match=message):
+        load_bundle(folder)
+
+
+def test_records_refuse_unknown_names_and_non_records() -> None:
+    with pytest.raises(ValueError, match=r"here: missing .* unknown \['colour'\]"):
+        from_json(CognitionConfig, {"colour": 1}, "here")
+    with pytest.raises(ValueError, match="here: missing"):
+        from_json(CognitionConfig, [1, 2], "here")
+
+
+def test_parts_that_do_not_fit_each_other_are_refused(bundle: PounceBundle) -> None:
+    small = random_bundle(replace(tiny_cpu(), robot_action_dim=8), seed=0)
+    vocabulary = replace(small.model.config.pi05, vocab_size=100)
+    with pytest.raises(ValueError, match="tokenizer has 512 ids, the model embeds 100"):
+        random_bundle(replace(small.model.config, pi05=vocabulary), seed=0)
+    with pytest.raises(ValueError, match="statistics describe 8 action dims, the config 7"):
+        random_bundle(replace(small.model.config, robot_action_dim=7), seed=0)
