@@ -1,0 +1,115 @@
+"""Chunk to action at a fixed rate: which row is due at a tick, and how chunks are joined.
+
+The row is a function of the tick and of the chunk's ``t_row0``, never of an estimated latency: rows that are already
+past when a chunk arrives are simply never asked for. Deadlines are computed from the start, so nothing accumulates.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from clock.timebase import NS_PER_S
+from protocol.messages import Floats, Seam, SeamKind
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Chunk:
+    """What playback needs to know of one POUNCE answer. ``rows_NA``: (horizon, action_dim) float32, robot units."""
+
+    invocation: int
+    t_row0: int
+    rows_NA: Floats
+    ref_query: int | None
+    age_ns: int
+
+
+def deadline_ns(start_ns: int, tick: int, rate_hz: int) -> int:
+    """Deadline of a tick, rounded up to a whole nanosecond."""
+    return start_ns - (-tick * NS_PER_S // rate_hz)
+
+
+def tick_at(start_ns: int, now_ns: int, rate_hz: int) -> int:
+    """The newest tick whose deadline has come; the inverse of ``deadline_ns``. Negative before the start."""
+    return (now_ns - start_ns) * rate_hz // NS_PER_S
+
+
+def row_of(chunk: Chunk, tick: int) -> int | None:
+    """Index of the row due at ``tick``; None if the chunk does not reach it."""
+    row = tick - chunk.t_row0
+    return row if 0 <= row < len(chunk.rows_NA) else None
+
+
+def chunk_for(chunks: Sequence[Chunk], tick: int) -> Chunk | None:
+    """The newest chunk that has a row for ``tick``."""
+    return max((c for c in chunks if row_of(c, tick) is not None), key=lambda c: c.invocation, default=None)
+
+
+Join = Callable[[Sequence[Chunk], int], Floats]
+"""A seam policy: the chunks that have a row for this tick (oldest first, at least one), and the tick -> (action_dim,)."""
+
+
+def switch(chunks: Sequence[Chunk], tick: int) -> Floats:
+    """The newest chunk's row, at once."""
+    return _row(chunks[-1], tick)
+
+
+def offset_fade(fade_ticks: int) -> Join:
+    """Cancels the jump at the switch and fades the correction out linearly over ``fade_ticks``.
+
+    The jump is what the previous chunk would have said at the new chunk's first played tick minus what the new one
+    says there, both pure functions of the chunks: no state, so the log re-derives it.
+    """
+
+    def join(chunks: Sequence[Chunk], tick: int) -> Floats:
+        row = _row(chunks[-1], tick)
+        if len(chunks) < 2:
+            return row
+        new, old = chunks[-1], chunks[-2]
+        since = tick - new.t_row0
+        weight = max(0.0, 1.0 - since / fade_ticks) if fade_ticks else 0.0
+        if weight == 0.0 or row_of(old, new.t_row0) is None:
+            return row
+        jump = _row(old, new.t_row0) - _row(new, new.t_row0)
+        jump[-1] = 0.0  # the gripper is a switch, not a coordinate
+        return (row + np.float32(weight) * jump).astype(np.float32)
+
+    return join
+
+
+def ensemble(decay: float) -> Join:
+    """Exponential average over all chunks that cover the tick, oldest weighing most for decay > 0 (ACT, section IV-D)."""
+
+    def join(chunks: Sequence[Chunk], tick: int) -> Floats:
+        weights = [math.exp(-decay * rank) for rank in range(len(chunks))]
+        rows = np.stack([_row(c, tick) for c in chunks]).astype(np.float64)
+        mean = np.average(rows, axis=0, weights=weights).astype(np.float32)
+        mean[-1] = _row(chunks[-1], tick)[-1]  # an averaged gripper would be half open
+        return mean
+
+    return join
+
+
+def seam_policy(seam: Seam) -> Join:
+    if seam.kind == SeamKind.OFFSET_FADE:
+        return offset_fade(seam.fade_ticks)
+    if seam.kind == SeamKind.ENSEMBLE:
+        return ensemble(seam.ensemble_decay)
+    return switch
+
+
+def covering(chunks: Sequence[Chunk], tick: int) -> list[Chunk]:
+    """The chunks with a row for ``tick``, oldest first."""
+    return sorted((c for c in chunks if row_of(c, tick) is not None), key=lambda c: c.invocation)
+
+
+def _row(chunk: Chunk, tick: int) -> Floats:
+    row = row_of(chunk, tick)
+    if row is None:
+        raise ValueError(
+            f"chunk {chunk.invocation} has rows for ticks {chunk.t_row0}..; tick {tick} is not among them"
+        )
+    return chunk.rows_NA[row].astype(np.float32, copy=True)

@@ -1,0 +1,204 @@
+"""A bus moves bytes between processes; ``LocalBus`` moves them within one, in order and without threads.
+
+A ``Bus`` knows keys and bytes only; ``link`` adds types, identity and suspicion. Nobody is called back with a message:
+a subscriber drains its subscription when it is ready, so no model ever runs on a transport's receive thread.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+from protocol.errors import CallFailed
+from protocol.topics import Priority, matches
+
+ATTACHMENT_BYTES = (
+    24  # seq u64, source_ns i64, boot_id u64, little-endian: drops and restarts seen without decoding
+)
+
+
+class Sample(NamedTuple):
+    """One message as it travelled. ``payload`` of an alive subscription is b"1" (appeared) or b"" (gone)."""
+
+    key: str
+    payload: bytes
+    encoding: str
+    attachment: bytes
+
+
+class Subscription:
+    """A ring of the newest ``keep`` samples (zenoh's RingChannel, with a bell): old ones fall out and are counted.
+
+    Filled by one thread, drained by another; both ends of a deque with ``maxlen`` are atomic.
+    """
+
+    def __init__(self, keep: int) -> None:
+        self._ring: deque[Callable[[], Sample]] = deque(maxlen=keep)
+        self.num_received = 0
+        self._num_drained = 0
+
+    def put(self, sample: Callable[[], Sample]) -> None:
+        """Stores a sample by the function that copies it out of the transport: what falls out is never copied."""
+        self._ring.append(sample)
+        self.num_received += 1
+
+    def drain(self) -> list[Sample]:
+        """Everything that waits, oldest first."""
+        samples = []
+        while self._ring:
+            try:
+                samples.append(self._ring.popleft()())
+            except IndexError:  # the filler pushed the last one out meanwhile
+                break
+        self._num_drained += len(samples)
+        return samples
+
+    @property
+    def num_superseded(self) -> int:
+        """Samples that newer ones pushed out unread."""
+        return max(0, self.num_received - self._num_drained - len(self._ring))
+
+
+class Request(NamedTuple):
+    """A call that waits for ``reply(bytes)``; leaving it unanswered lets the caller time out."""
+
+    payload: bytes
+    reply: Callable[[bytes], None]
+
+
+class Inbox:
+    """Requests in order of arrival; at most ``keep``, the oldest falling out (its caller times out)."""
+
+    def __init__(self, keep: int = 32) -> None:
+        self._requests: deque[Request] = deque(maxlen=keep)
+
+    def put(self, request: Request) -> None:
+        self._requests.append(request)
+
+    def drain(self) -> list[Request]:
+        requests = []
+        while self._requests:
+            requests.append(self._requests.popleft())
+        return requests
+
+
+class Bus(Protocol):
+    """What a process needs of a transport."""
+
+    is_local: bool
+    """True if every peer shares this host: raw pixels travel well."""
+
+    def publish(
+        self, key: str, payload: bytes, *, encoding: str, attachment: bytes, priority: Priority
+    ) -> None: ...
+    def subscribe(self, expression: str, *, keep: int) -> Subscription: ...
+    def serve(self, key: str) -> Inbox: ...
+    def call(self, key: str, payload: bytes, *, timeout_ns: int) -> bytes:
+        """Raises CallFailed if nobody answers in time."""
+        ...
+
+    def declare_alive(self, key: str) -> None: ...
+    def watch_alive(self, expression: str) -> Subscription: ...
+    def wait(self, timeout_ns: int) -> None:
+        """Returns when something may have arrived, or after ``timeout_ns``."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class LocalBus:
+    """All parties in one process and one thread: a message is in its subscribers' rings when ``publish`` returns.
+
+    A call is answered by running the other parties' ``step`` functions (``add_party``) until one replies. Used by the
+    in-process lockstep mode and by tests; it is the whole difference between them and zenoh.
+    """
+
+    is_local = True
+
+    def __init__(self) -> None:
+        self._subscriptions: list[tuple[str, Subscription]] = []
+        self._inboxes: dict[str, Inbox] = {}
+        self._alive: list[str] = []
+        self._watchers: list[tuple[str, Subscription]] = []
+        self._parties: list[Callable[[], bool]] = []
+
+    def add_party(self, step: Callable[[], bool]) -> None:
+        """``step`` does one piece of pending work and says whether there was any."""
+        self._parties.append(step)
+
+    def publish(
+        self, key: str, payload: bytes, *, encoding: str, attachment: bytes, priority: Priority
+    ) -> None:
+        sample = Sample(key, payload, encoding, attachment)
+        for expression, subscription in self._subscriptions:
+            if matches(expression, key):
+                subscription.put(lambda: sample)
+
+    def subscribe(self, expression: str, *, keep: int) -> Subscription:
+        subscription = Subscription(keep)
+        self._subscriptions.append((expression, subscription))
+        return subscription
+
+    def serve(self, key: str) -> Inbox:
+        return self._inboxes.setdefault(key, Inbox())
+
+    def call(self, key: str, payload: bytes, *, timeout_ns: int) -> bytes:
+        inbox = self._inboxes.get(key)
+        if inbox is None:
+            raise CallFailed(key, timeout_ns / 1e6, "nobody serves it")
+        answers: list[bytes] = []
+        inbox.put(Request(payload, answers.append))
+        while not answers:
+            if not self.run_parties():
+                raise CallFailed(key, timeout_ns / 1e6, "its server has nothing to do and did not answer")
+        return answers[0]
+
+    def run_parties(self) -> bool:
+        """Lets every party do one piece of work; False if nobody had any."""
+        return any([step() for step in self._parties])  # a list: everybody gets a turn
+
+    def declare_alive(self, key: str) -> None:
+        self._alive.append(key)
+        self._announce(key, b"1")
+
+    def end_alive(self, key: str) -> None:
+        """What a transport does when a process dies (tests)."""
+        self._alive.remove(key)
+        self._announce(key, b"")
+
+    def _announce(self, key: str, payload: bytes) -> None:
+        for expression, subscription in self._watchers:
+            if matches(expression, key):
+                subscription.put(lambda: Sample(key, payload, "", b""))
+
+    def watch_alive(self, expression: str) -> Subscription:
+        subscription = Subscription(64)
+        self._watchers.append((expression, subscription))
+        for key in self._alive:
+            if matches(expression, key):
+                subscription.put(lambda key=key: Sample(key, b"1", "", b""))  # type: ignore[misc]
+        return subscription
+
+    def wait(self, timeout_ns: int) -> None:
+        self.run_parties()
+
+    def close(self) -> None:
+        self._subscriptions.clear()
+        self._inboxes.clear()
+
+
+class Bell:
+    """Wakes one waiting thread when anything arrives on any subscription."""
+
+    def __init__(self) -> None:
+        self._event = threading.Event()
+
+    def ring(self) -> None:
+        self._event.set()
+
+    def wait(self, timeout_ns: int) -> None:
+        if timeout_ns > 0 and not self._event.is_set():
+            self._event.wait(timeout_ns / 1e9)
+        self._event.clear()

@@ -1,0 +1,319 @@
+"""What a decoded message must satisfy before anything else sees it: shapes, finiteness, size caps.
+
+Each check is pure and raises ``MalformedMessage`` with both numbers. The caps bound memory that a stranger can make us
+hold; they are far above anything a real model sends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from protocol import messages as m
+from protocol.errors import MalformedMessage
+
+MAX_MESSAGE_BYTES = 64 << 20  # an OpenRequest with a 48 s demonstration of two raw 256 px views is 19 MB
+MAX_IMAGES = 8
+MAX_IMAGE_SIDE_PX = 4096
+MAX_CARRIERS = 64
+MAX_HIDDEN = 65_536
+MAX_HORIZON = 1_000
+MAX_DIM = 256
+MAX_TEXT = 20_000
+MAX_ID = 128
+MAX_INSTANT_NS = 10**18  # 31 years: more is a unit mistake
+MAX_INDEX = 2**53
+MAX_DEMO_FRAMES = 600
+
+
+def _require(ok: bool, message: object, field: str, expected: str, came: object) -> None:
+    if not ok:
+        raise MalformedMessage(type(message).__name__, field, expected, str(came))
+
+
+def _index(message: Any, *names: str) -> None:
+    for name in names:
+        value = getattr(message, name)
+        _require(0 <= value <= MAX_INDEX, message, name, f"0..{MAX_INDEX}", value)
+
+
+def _instant(message: Any, *names: str) -> None:
+    for name in names:
+        value = getattr(message, name)
+        _require(abs(value) <= MAX_INSTANT_NS, message, name, "nanoseconds within 31 years", value)
+
+
+def _vector(message: Any, name: str, *, low: int = 0, high: int = MAX_DIM) -> None:
+    value = getattr(message, name)
+    _require(
+        value.ndim == 1 and low <= len(value) <= high, message, name, f"{low}..{high} numbers", value.shape
+    )
+    _require(bool(np.isfinite(value).all()), message, name, "finite numbers", "NaN or infinity")
+
+
+def _carriers(message: Any, name: str, *, may_be_empty: bool) -> None:
+    value = getattr(message, name)
+    if may_be_empty and value.size == 0:
+        return
+    good = value.ndim == 2 and 1 <= value.shape[0] <= MAX_CARRIERS and 1 <= value.shape[1] <= MAX_HIDDEN
+    _require(good, message, name, f"(K <= {MAX_CARRIERS}, H <= {MAX_HIDDEN})", value.shape)
+    _require(bool(np.isfinite(value).all()), message, name, "finite numbers", "NaN or infinity")
+
+
+def _text(message: Any, *names: str, limit: int = MAX_TEXT) -> None:
+    for name in names:
+        value = getattr(message, name)
+        _require(len(value) <= limit, message, name, f"at most {limit} characters", len(value))
+
+
+def _chosen(message: Any, *names: str) -> None:
+    for name in names:
+        _require(int(getattr(message, name)) != 0, message, name, "a specified value", "UNSPECIFIED")
+
+
+def _map(message: Any, name: str) -> None:
+    value = getattr(message, name)
+    _require(len(value) <= 256, message, name, "at most 256 entries", len(value))
+    longest = max((max(len(k), len(str(v))) for k, v in value.items()), default=0)
+    _require(longest <= MAX_TEXT, message, name, f"texts of at most {MAX_TEXT} characters", longest)
+
+
+def _images(message: Any, images: tuple[m.Image, ...]) -> None:
+    _require(len(images) <= MAX_IMAGES, message, "images", f"at most {MAX_IMAGES}", len(images))
+    for image in images:
+        check_image(image)
+
+
+def check_image(i: m.Image) -> None:
+    _text(i, "camera", limit=MAX_ID)
+    sides = 1 <= i.height <= MAX_IMAGE_SIDE_PX and 1 <= i.width <= MAX_IMAGE_SIDE_PX
+    _require(sides, i, "height, width", f"1..{MAX_IMAGE_SIDE_PX} px", (i.height, i.width))
+    _chosen(i, "codec")
+    raw_bytes = i.height * i.width * 3
+    if i.codec == m.ImageCodec.RAW:
+        _require(len(i.data) == raw_bytes, i, "data", f"{raw_bytes} bytes of RGB", len(i.data))
+    elif i.codec == m.ImageCodec.ELSEWHERE:
+        _require(len(i.data) == 0, i, "data", "no bytes", len(i.data))
+    else:
+        _require(
+            0 < len(i.data) <= 2 * raw_bytes + 4096, i, "data", "a compressed image", f"{len(i.data)} bytes"
+        )
+
+
+def check_header(h: m.Header) -> None:
+    _text(h, "robot", "session", "episode", "proc", "clock_id", limit=MAX_ID)
+    _index(h, "seq", "epoch")
+    _instant(h, "at_ns")
+
+
+def check_observation(o: m.Observation) -> None:
+    _index(o, "tick")
+    _instant(o, "source_ns")
+    _vector(o, "proprio", low=1)
+    _chosen(o, "status")
+    _text(o, "reason")
+    _images(o, o.images)
+
+
+def check_query(q: m.Query) -> None:
+    _index(q, "query", "tick")
+    _instant(q, "source_ns")
+
+
+def check_cognition(c: m.Cognition) -> None:
+    _index(c, "query", "tick", "context_tokens")
+    _instant(c, "source_ns", "ready_ns", "infer_ns")
+    _require(c.infer_ns >= 0, c, "infer_ns", "a duration", c.infer_ns)
+    _carriers(c, "vector", may_be_empty=False)
+    _text(c, "model_hash", limit=MAX_ID)
+
+
+def check_stamp(s: m.Stamp) -> None:
+    _chosen(s, "kind")
+    _index(s, "index")
+    _instant(s, "source_ns", "ready_ns", "arrived_ns")
+    _require(s.ready_ns >= s.source_ns, s, "ready_ns", f">= source_ns {s.source_ns}", s.ready_ns)
+
+
+def check_invocation(i: m.Invocation) -> None:
+    _index(i, "invocation", "tick", "committed_rows", "num_samples")
+    _instant(i, "now_ns", "age_ns")
+    _carriers(i, "cognition", may_be_empty=True)
+    is_null = i.ref_query is None
+    _require(
+        not is_null or (i.age_ns == 0 and i.cognition.size == 0),
+        i,
+        "age_ns",
+        "0 for null cognition",
+        i.age_ns,
+    )
+    _require(is_null or i.cognition.size > 0, i, "cognition", "the vector of ref_query", "nothing")
+    _require(i.age_ns >= 0, i, "age_ns", ">= 0", i.age_ns)
+    _vector(i, "previous_rows", high=MAX_HORIZON * MAX_DIM)
+
+
+def check_action_chunk(c: m.ActionChunk) -> None:
+    _index(c, "invocation", "t_row0", "committed_rows")
+    _instant(c, "source_ns", "age_ns", "infer_ns")
+    _require(1 <= c.horizon <= MAX_HORIZON, c, "horizon", f"1..{MAX_HORIZON}", c.horizon)
+    _require(1 <= c.action_dim <= MAX_DIM, c, "action_dim", f"1..{MAX_DIM}", c.action_dim)
+    _require(c.dt_ns > 0, c, "dt_ns", "> 0", c.dt_ns)
+    size = c.horizon * c.action_dim
+    _vector(c, "rows", low=size, high=size)
+    _vector(c, "reference_state")
+    _vector(c, "previous_rows", high=MAX_HORIZON * MAX_DIM)
+    _chosen(c, "action_space")
+    _require(c.age_ns >= 0, c, "age_ns", ">= 0", c.age_ns)
+    _require(len(c.features) <= 1 << 20, c, "features", "at most 1 MiB", len(c.features))
+    _text(c, "model_hash", limit=MAX_ID)
+
+
+def check_action(a: m.Action) -> None:
+    _index(a, "tick")
+    _instant(a, "deadline_ns")
+    _chosen(a, "level")
+    _vector(a, "values", low=1)
+
+
+def check_tick(t: m.Tick) -> None:
+    _index(t, "tick", "t_row0", "row", "observation_tick")
+    _instant(t, "deadline_ns", "decided_ns", "late_ns", "age_ns")
+    _chosen(t, "level")
+    for name in ("state", "action"):
+        _vector(t, name)
+    # raw_row may hold the very NaN that the limits refused: it is evidence, not a command.
+    _require(
+        t.raw_row.ndim == 1 and len(t.raw_row) <= MAX_DIM,
+        t,
+        "raw_row",
+        f"0..{MAX_DIM} numbers",
+        t.raw_row.shape,
+    )
+
+
+def check_subgoal(s: m.Subgoal) -> None:
+    _chosen(s, "kind")
+    _text(s, "text")
+    _index(s, "tick")
+    _require(len(s.token_ids) <= MAX_TEXT, s, "token_ids", f"at most {MAX_TEXT}", len(s.token_ids))
+
+
+def check_event(e: m.Event) -> None:
+    _chosen(e, "severity")
+    _text(e, "name", limit=MAX_ID)
+    _text(e, "text")
+    _index(e, "tick")
+    _map(e, "attributes")
+
+
+def check_phase(p: m.Phase) -> None:
+    _text(p, "state", limit=MAX_ID)
+
+
+def check_health(h: m.Health) -> None:
+    _chosen(h, "state")
+    _require(0.0 <= h.progress <= 1.0, h, "progress", "0..1", h.progress)
+    _text(h, "detail", "version")
+    _text(h, "open_episode", "model_hash", limit=MAX_ID)
+    _index(h, "next_index", "num_answered")
+    _instant(h, "infer_p50_ns", "infer_p99_ns")
+    _map(h, "dropped")
+
+
+def check_schedule(s: m.Schedule) -> None:
+    _chosen(s, "mode", "wait")
+    _require(1 <= s.control_hz <= 1000, s, "control_hz", "1..1000", s.control_hz)
+    _require(1 <= s.horizon <= MAX_HORIZON, s, "horizon", f"1..{MAX_HORIZON}", s.horizon)
+    _require(s.query_period_ns > 0, s, "query_period_ns", "> 0", s.query_period_ns)
+    _require(s.invoke_period_ticks >= 1, s, "invoke_period_ticks", ">= 1", s.invoke_period_ticks)
+    for delay in (s.query_delay, s.invoke_delay):
+        _chosen(delay, "kind")
+        _instant(delay, "mean_ns")
+        _require(delay.mean_ns >= 0, delay, "mean_ns", ">= 0", delay.mean_ns)
+        _require(0 <= delay.sigma <= 3, delay, "sigma", "0..3", delay.sigma)
+    _chosen(s.delivery, "kind")
+    _chosen(s.seam, "kind")
+    _instant(s, "max_age_ns", "stale_limit_ns")
+    _index(s, "hold_limit_ticks", "decelerate_ticks", "max_ticks")
+
+
+def check_robot(r: m.Robot) -> None:
+    dim = len(r.command_low)
+    for name in ("command_low", "command_high", "max_step", "initial_command"):
+        _vector(r, name, low=max(dim, 1), high=max(dim, 1))
+    _require(
+        bool((r.command_low <= r.command_high).all()), r, "command_low", "<= command_high", "the opposite"
+    )
+    _require(bool((r.max_step >= 0).all()), r, "max_step", ">= 0", "a negative step")
+    _require(len(r.cameras) <= MAX_IMAGES, r, "cameras", f"at most {MAX_IMAGES}", len(r.cameras))
+    _index(r, "image_height", "image_width", "num_proprio")
+
+
+def check_episode_info(e: m.EpisodeInfo) -> None:
+    _text(e, "task", "suite", "difficulty", "policy", limit=MAX_ID)
+    _text(e, "instruction")
+    check_schedule(e.schedule)
+    check_robot(e.robot)
+    _map(e, "versions")
+
+
+def check_episode_result(r: m.EpisodeResult) -> None:
+    _chosen(r, "status")
+    _text(r, "reason")
+    _index(r, "num_ticks")
+    _text(r, "stream_sha256", limit=MAX_ID)
+    _map(r, "statistics")
+
+
+def check_open_request(r: m.OpenRequest) -> None:
+    check_episode_info(r.info)
+    _require(len(r.demo) <= MAX_DEMO_FRAMES, r, "demo", f"at most {MAX_DEMO_FRAMES} instants", len(r.demo))
+    for frame in r.demo:
+        _images(frame, frame.images)
+
+
+def check_journal_request(r: m.JournalRequest) -> None:
+    _index(r, "first_query")
+    _require(1 <= r.max_queries <= 64, r, "max_queries", "1..64", r.max_queries)
+
+
+def check_error_reply(r: Any) -> None:
+    _text(r, "error")
+
+
+CHECKS: dict[type, Callable[[Any], None]] = {
+    m.Observation: check_observation,
+    m.Query: check_query,
+    m.Cognition: check_cognition,
+    m.Stamp: check_stamp,
+    m.Invocation: check_invocation,
+    m.ActionChunk: check_action_chunk,
+    m.Action: check_action,
+    m.Tick: check_tick,
+    m.Subgoal: check_subgoal,
+    m.Event: check_event,
+    m.Phase: check_phase,
+    m.Health: check_health,
+    m.EpisodeInfo: check_episode_info,
+    m.EpisodeResult: check_episode_result,
+    m.OpenRequest: check_open_request,
+    m.JournalRequest: check_journal_request,
+    m.OpenReply: check_error_reply,
+    m.CloseReply: check_error_reply,
+    m.ActiveReply: check_error_reply,
+    m.JournalReply: check_error_reply,
+    m.TimeReply: check_error_reply,
+    m.EngageReply: check_error_reply,
+}
+
+
+def check(message: Any) -> None:
+    """Raises MalformedMessage if ``message`` may not be acted on."""
+    header = getattr(message, "header", None)
+    if header is not None:
+        check_header(header)
+    checker = CHECKS.get(type(message))
+    if checker is not None:
+        checker(message)

@@ -1,0 +1,216 @@
+"""One process's typed end of the bus: it signs what it sends and suspects what it receives.
+
+A message that does not decode, breaks a rule of ``checks``, names another robot, or whose header disagrees with its key
+is counted, logged once per source and reason, and dropped. Nothing a peer sends can raise out of ``Stream.drain``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import secrets
+import struct
+from collections import Counter
+from collections.abc import Callable
+from typing import Any, Generic, NamedTuple, TypeVar
+
+from protocol import codec, topics
+from protocol.bus import Bus, Inbox, Sample, Subscription
+from protocol.errors import CallFailed, ProtocolError
+from protocol.messages import EPISODE_CLOCK, Header
+from protocol.topics import Call, Topic
+
+T = TypeVar("T")
+
+log = logging.getLogger(__name__)
+
+_ATTACHMENT = struct.Struct("<QqQ")  # seq, source_ns, boot_id
+_ENCODING = "application/protobuf;"
+
+
+class Received(NamedTuple, Generic[T]):
+    """A checked message, and the bytes it came as (the log and the journal keep those)."""
+
+    message: T
+    sample: Sample
+
+
+class Link:
+    """A process's identity on a bus.
+
+    ``enter_episode`` sets the episode that everything published afterwards belongs to.
+    """
+
+    def __init__(self, bus: Bus, *, robot: str, proc: str, boot_id: int | None = None) -> None:
+        self.bus = bus
+        self.robot = topics.checked_id(robot, "robot")
+        self.proc = topics.checked_id(proc, "process")
+        self.boot_id = boot_id if boot_id is not None else secrets.randbits(63)
+        self.session = ""
+        self.episode = ""
+        self.epoch = 0
+        self.dropped: Counter[str] = Counter()
+        self._seqs: Counter[str] = Counter()
+        self._told: set[tuple[str, str]] = set()
+
+    def enter_episode(self, session: str, episode: str, epoch: int) -> None:
+        """Signs what follows with this episode.
+
+        Raises:
+            ProtocolError: an id cannot be part of a key.
+        """
+        self.session = topics.checked_id(session, "session")
+        self.episode = topics.checked_id(episode, "episode")
+        self.epoch = epoch
+
+    def leave_episode(self) -> None:
+        self.episode, self.epoch = "", 0
+
+    def header(self, topic: str, at_ns: int, clock_id: str = EPISODE_CLOCK) -> Header:
+        seq = self._seqs[topic]
+        self._seqs[topic] += 1
+        return Header(
+            robot=self.robot,
+            session=self.session,
+            episode=self.episode,
+            epoch=self.epoch,
+            proc=self.proc,
+            boot_id=self.boot_id,
+            seq=seq,
+            clock_id=clock_id,
+            at_ns=at_ns,
+        )
+
+    def publish(self, topic: Topic[T], message: T, *, at_ns: int, clock_id: str = EPISODE_CLOCK) -> T:
+        """Signs, checks, encodes and sends; returns the message as sent.
+
+        Raises:
+            MalformedMessage: our own message breaks the protocol (a bug here, not the peer's fault).
+        """
+        signed = dataclasses.replace(message, header=self.header(topic.name, at_ns, clock_id))  # type: ignore[type-var]
+        payload = codec.encode(signed)
+        source_ns = getattr(signed, "source_ns", at_ns)
+        self.bus.publish(
+            topics.stream_key(topic, self.robot, self.episode or "none", self.proc),
+            payload,
+            encoding=_ENCODING + codec.type_name(topic.cls),
+            attachment=_ATTACHMENT.pack(signed.header.seq, source_ns, self.boot_id),  # type: ignore[attr-defined]
+            priority=topic.priority,
+        )
+        return signed  # type: ignore[no-any-return]
+
+    def subscribe(self, topic: Topic[T], *, keep: int | None = None, proc: str = "*") -> Stream[T]:
+        """All episodes of this robot on ``topic``; whose turn it is, the node decides."""
+        expression = topics.stream_key(topic, self.robot, "*", proc)
+        return Stream(self, topic, self.bus.subscribe(expression, keep=keep or topic.keep))
+
+    def serve(self, call: Call) -> Service:
+        return Service(self, call, self.bus.serve(topics.call_key(call, self.robot, self.proc)))
+
+    def call(self, call: Call, proc: str, request: Any, *, timeout_ns: int) -> Any:
+        """Asks ``proc`` and waits.
+
+        Raises:
+            CallFailed: no answer, or an answer that is not a ``call.reply``.
+        """
+        key = topics.call_key(call, self.robot, proc)
+        if hasattr(request, "header"):
+            request = dataclasses.replace(request, header=self.header(call.name, 0))
+        payload = self.bus.call(key, codec.encode(request), timeout_ns=timeout_ns)
+        try:
+            return codec.decode(call.reply, payload)
+        except ProtocolError as error:
+            raise CallFailed(key, timeout_ns / 1e6, f"unreadable answer: {error}") from None
+
+    def drop(self, source: str, reason: str, detail: str) -> None:
+        """Counts a message that will not be used; the first of its kind from its source is logged."""
+        self.dropped[reason] += 1
+        if (source, reason) not in self._told and len(self._told) < 1000:
+            self._told.add((source, reason))
+            log.warning(
+                "dropped source=%s reason=%s detail=%r (later ones are only counted)", source, reason, detail
+            )
+
+
+class Stream(Generic[T]):
+    """Checked messages of one topic, oldest first."""
+
+    def __init__(self, link: Link, topic: Topic[T], subscription: Subscription) -> None:
+        self._link = link
+        self._topic = topic
+        self._encoding = _ENCODING + codec.type_name(topic.cls)
+        self.subscription = subscription
+
+    def drain(self) -> list[T]:
+        return [received.message for received in self.receive()]
+
+    def receive(self) -> list[Received[T]]:
+        """As ``drain``, with the bytes each message travelled as."""
+        accepted = []
+        for sample in self.subscription.drain():
+            message = self._accept(sample)
+            if message is not None:
+                accepted.append(Received(message, sample))
+        return accepted
+
+    def _accept(self, sample: Sample) -> T | None:
+        source = f"{sample.key}#{_boot_of(sample)}"
+        if sample.encoding != self._encoding:
+            self._link.drop(source, "wrong_encoding", f"expected {self._encoding}, came {sample.encoding}")
+            return None
+        try:
+            message = codec.decode(self._topic.cls, sample.payload)
+        except ProtocolError as error:
+            self._link.drop(source, "malformed", str(error))
+            return None
+        header: Header = message.header  # type: ignore[attr-defined]
+        episode = topics.episode_of(sample.key)
+        if header.robot != self._link.robot:
+            self._link.drop(source, "wrong_robot", f"expected {self._link.robot}, came {header.robot}")
+            return None
+        if episode and header.episode != episode:
+            self._link.drop(source, "wrong_episode", f"key says {episode}, header says {header.episode}")
+            return None
+        return message
+
+
+def _boot_of(sample: Sample) -> int:
+    return _ATTACHMENT.unpack(sample.attachment)[2] if len(sample.attachment) == _ATTACHMENT.size else 0
+
+
+class Service:
+    """Calls of one kind that wait for this process."""
+
+    def __init__(self, link: Link, call: Call, inbox: Inbox) -> None:
+        self._link = link
+        self._call = call
+        self._inbox = inbox
+
+    def answer(self, handler: Callable[[Any], Any]) -> int:
+        """Answers every waiting call with ``handler(request)``; returns how many there were.
+
+        A request that does not decode, or that the handler refuses with a ProtocolError, gets that sentence as its
+        reply's ``error``: never a traceback.
+        """
+        requests = self._inbox.drain()
+        for request in requests:
+            try:
+                reply = handler(codec.decode(self._call.request, request.payload))
+            except ProtocolError as error:
+                self._link.drop(f"call {self._call.name}", "refused_call", str(error))
+                reply = self._call.reply(error=str(error))
+            request.reply(codec.encode(reply))
+        return len(requests)
+
+
+def is_of_episode(link: Link, header: Header) -> bool:
+    """Whether a message belongs to the episode this process is in; if not, it is counted as dropped."""
+    if header.episode == link.episode and header.epoch == link.epoch:
+        return True
+    came = f"{header.episode} epoch {header.epoch}"
+    link.drop(
+        f"{header.proc}#{header.boot_id}",
+        "other_episode",
+        f"in {link.episode} epoch {link.epoch}, came {came}",
+    )
+    return False

@@ -1,0 +1,217 @@
+"""The bus over zenoh; the only file that imports zenoh.
+
+Peers with explicit endpoints: no multicast, no gossip, so strangers on the host cannot join. Loopback by default; an
+endpoint that others can reach is refused without TLS. Shared memory is on: raw frames between processes of one host
+travel through it by themselves. Lease 500 ms: a frozen peer's token is gone in half a second (default: 10 s).
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from protocol.bus import Bell, Inbox, Request, Sample, Subscription
+from protocol.errors import CallFailed, TransportError
+from protocol.topics import Priority
+
+LEASE_MS = 500
+_PRIORITIES = {
+    Priority.REAL_TIME: zenoh.Priority.REAL_TIME,
+    Priority.INTERACTIVE_HIGH: zenoh.Priority.INTERACTIVE_HIGH,
+    Priority.DATA_HIGH: zenoh.Priority.DATA_HIGH,
+    Priority.DATA: zenoh.Priority.DATA,
+    Priority.BACKGROUND: zenoh.Priority.BACKGROUND,
+}
+_MAX_PUBLISHERS = 256
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tls:
+    """Mutual TLS: PEM files. Both sides prove who they are; access control by certificate name is zenoh's own config."""
+
+    ca: Path
+    certificate: Path
+    key: Path
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Endpoints:
+    """Where one process listens and whom it connects to, as zenoh endpoints: ``tcp/127.0.0.1:7448``."""
+
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+    tls: Tls | None = None
+    shared_memory: bool = True
+
+    def __post_init__(self) -> None:
+        for endpoint in (*self.listen, *self.connect):
+            if not is_loopback(endpoint) and not (endpoint.startswith(("tls/", "quic/")) and self.tls):
+                raise TransportError(
+                    f"endpoint {endpoint} can be reached from other hosts and is not encrypted. "
+                    f"Use a loopback address, or tls/HOST:PORT with --tls.ca, --tls.certificate and --tls.key."
+                )
+
+    @property
+    def are_local(self) -> bool:
+        return all(is_loopback(e) for e in (*self.listen, *self.connect))
+
+
+def is_loopback(endpoint: str) -> bool:
+    """Whether only this host can use ``endpoint``.
+
+    Raises:
+        TransportError: it does not read ``PROTOCOL/ADDRESS``.
+    """
+    protocol, slash, address = endpoint.partition("/")
+    if not slash or not address:
+        raise TransportError(
+            f"endpoint {endpoint!r}: expected PROTOCOL/ADDRESS, for example tcp/127.0.0.1:7447"
+        )
+    if protocol == "unixsock-stream":
+        return True
+    host = address.split("?")[0].split("#")[0].rpartition(":")[0].strip("[]")
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def zenoh_config(endpoints: Endpoints) -> zenoh.Config:
+    settings: dict[str, Any] = {
+        "mode": "peer",
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "listen/endpoints": list(endpoints.listen),
+        "connect/endpoints": list(endpoints.connect),
+        "connect/timeout_ms": -1,  # with the next line: keep trying behind our back; 0 would try once
+        "connect/exit_on_failure": False,
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 400, "period_increase_factor": 2},
+        "transport/link/tx/lease": LEASE_MS,
+        "transport/link/tx/keep_alive": 5,
+        "transport/shared_memory/enabled": endpoints.shared_memory and endpoints.are_local,
+    }
+    if endpoints.tls:
+        tls = endpoints.tls
+        settings |= {
+            "transport/link/tls/root_ca_certificate": str(tls.ca),
+            "transport/link/tls/enable_mtls": True,
+            "transport/link/tls/listen_certificate": str(tls.certificate),
+            "transport/link/tls/listen_private_key": str(tls.key),
+            "transport/link/tls/connect_certificate": str(tls.certificate),
+            "transport/link/tls/connect_private_key": str(tls.key),
+        }
+    config = zenoh.Config()
+    for path, value in settings.items():
+        config.insert_json5(path, json.dumps(value))
+    return config
+
+
+class ZenohBus:
+    """``Bus`` over one zenoh session.
+
+    Zenoh's threads only append to rings and ring the bell; whoever owns the bus drains and works in its own thread.
+
+    Raises:
+        TransportError: the listen endpoint is taken or cannot be opened.
+    """
+
+    def __init__(self, endpoints: Endpoints) -> None:
+        zenoh.init_log_from_env_or("error")
+        try:
+            self._session = zenoh.open(zenoh_config(endpoints))
+        except zenoh.ZError as error:
+            where = ", ".join(endpoints.listen) or "no listen endpoint"
+            raise TransportError(f"zenoh does not open ({where}): {error}. Is the port taken?") from None
+        self.is_local = endpoints.are_local
+        self._bell = Bell()
+        self._publishers: dict[str, Any] = {}
+        self._declared: list[Any] = []  # dropped handles would undeclare themselves
+
+    def publish(
+        self, key: str, payload: bytes, *, encoding: str, attachment: bytes, priority: Priority
+    ) -> None:
+        publisher = self._publishers.get(key)
+        if publisher is None:
+            if len(self._publishers) >= _MAX_PUBLISHERS:  # keys name episodes: forget the oldest
+                self._publishers.pop(next(iter(self._publishers))).undeclare()
+            publisher = self._session.declare_publisher(
+                key,
+                encoding=zenoh.Encoding(encoding),
+                priority=_PRIORITIES[priority],
+                congestion_control=zenoh.CongestionControl.DROP,
+                express=True,
+            )
+            self._publishers[key] = publisher
+        publisher.put(payload, attachment=attachment)
+
+    def subscribe(self, expression: str, *, keep: int) -> Subscription:
+        subscription = Subscription(keep)
+
+        def arrived(sample: zenoh.Sample) -> None:
+            subscription.put(lambda: _copy(sample))
+            self._bell.ring()
+
+        self._declared.append(self._session.declare_subscriber(expression, arrived))
+        return subscription
+
+    def serve(self, key: str) -> Inbox:
+        inbox = Inbox()
+
+        def asked(query: zenoh.Query) -> None:
+            payload = query.payload.to_bytes() if query.payload is not None else b""
+            inbox.put(Request(payload, _replier(query, key)))
+            self._bell.ring()
+
+        self._declared.append(self._session.declare_queryable(key, asked, complete=True))
+        return inbox
+
+    def call(self, key: str, payload: bytes, *, timeout_ns: int) -> bytes:
+        timeout_ms = timeout_ns / 1e6
+        why = "nobody serves it (is the process up, are the endpoints right?)"
+        for reply in self._session.get(key, payload=payload, timeout=timeout_ns / 1e9):
+            if reply.ok is not None:
+                return bytes(reply.ok.payload.to_bytes())
+            why = reply.err.payload.to_string() if reply.err is not None else why
+        raise CallFailed(key, timeout_ms, why)  # zenoh gives no error for an absent server, only no reply
+
+    def declare_alive(self, key: str) -> None:
+        self._declared.append(self._session.liveliness().declare_token(key))
+
+    def watch_alive(self, expression: str) -> Subscription:
+        subscription = Subscription(64)
+
+        def changed(sample: zenoh.Sample) -> None:
+            key, payload = str(sample.key_expr), b"1" if sample.kind == zenoh.SampleKind.PUT else b""
+            subscription.put(lambda: Sample(key, payload, "", b""))
+            self._bell.ring()
+
+        watcher = self._session.liveliness().declare_subscriber(expression, changed, history=True)
+        self._declared.append(watcher)
+        return subscription
+
+    def wait(self, timeout_ns: int) -> None:
+        self._bell.wait(timeout_ns)
+
+    def close(self) -> None:
+        self._session.close()  # type: ignore[no-untyped-call, unused-ignore]
+
+
+def _copy(sample: zenoh.Sample) -> Sample:
+    attachment = sample.attachment.to_bytes() if sample.attachment is not None else b""
+    return Sample(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding), attachment)
+
+
+def _replier(query: zenoh.Query, key: str) -> Callable[[bytes], None]:
+    def reply(payload: bytes) -> None:
+        query.reply(key, payload)
+        query.drop()  # the caller waits for the end of replies, not for the first
+
+    return reply
