@@ -154,12 +154,18 @@ class Pi05Engine:
                 f"prompt has {len(token_ids)} tokens, the model was trained with at most "
                 f"{self._config.max_prompt_tokens}; shorten the instruction: {request.instruction[:60]!r}"
             )
-        # torch.tensor copies into aligned memory; a NumPy array's alignment is luck, and rows depend on it by
-        # a bit. cognition = None if request.cognition is None else torch.tensor(request.cognition,
-        # device=self._device)[None] return PounceInputs( images=images.to(self._device),
-        # has_view=has_view.to(self._device), token_ids=torch.tensor([token_ids], device=self._device),
-        # is_token=torch.ones(1, len(token_ids), dtype=torch.bool, device=self._device),
-        # age_ns=torch.tensor([request.age_ns], device=self._device), cognition=cognition, )
+        cognition = None
+        if request.cognition is not None:
+            # Copied into aligned memory: where a NumPy array happens to lie changes the last bit of a product.
+            cognition = torch.tensor(request.cognition, device=self._device)[None]
+        return PounceInputs(
+            images=images.to(self._device),
+            has_view=has_view.to(self._device),
+            token_ids=torch.tensor([token_ids], device=self._device),
+            is_token=torch.ones(1, len(token_ids), dtype=torch.bool, device=self._device),
+            age_ns=torch.tensor([request.age_ns], device=self._device),
+            cognition=cognition,
+        )
 
     def _noise(self, seed: int) -> Tensor:
         """Drawn on the CPU: one seed is one noise on every device."""

@@ -114,9 +114,8 @@ def load_weights(model: Pounce, path: Path) -> bool:
     }
     if any(problems.values()):
         raise WeightsError(str(path), problems)
-    # Copied even where float32 already: tensors of a mapped file are not aligned to 64 bytes, and CPU matrix
-    # products
-    # of unaligned weights differ in the last bit from those of the model that was saved.
+    # Copied even where float32 already: tensors of a mapped file lie unaligned, and CPU products of unaligned
+    # weights differ in the last bit from those of the model that was saved.
     state = {name: found[public].to(torch.float32, copy=True) for public, name in wanted.items()}
     model.load_state_dict(state, strict=False, assign=True)
     return has_prefix
