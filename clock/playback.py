@@ -49,7 +49,7 @@ def chunk_for(chunks: Sequence[Chunk], tick: int) -> Chunk | None:
 
 
 Join = Callable[[Sequence[Chunk], int], Floats]
-"""A seam policy: the chunks that have a row for this tick (oldest first, at least one), and the tick -> (action_dim,)."""
+"""A seam policy: the chunks that have a row for this tick (oldest first, at least one) and the tick give (action_dim,)."""
 
 
 def switch(chunks: Sequence[Chunk], tick: int) -> Floats:
@@ -81,7 +81,7 @@ def offset_fade(fade_ticks: int) -> Join:
 
 
 def ensemble(decay: float) -> Join:
-    """Exponential average over all chunks that cover the tick, oldest weighing most for decay > 0 (ACT, section IV-D)."""
+    """Exponential average over all chunks that cover the tick, the oldest weighing most for decay > 0 (ACT)."""
 
     def join(chunks: Sequence[Chunk], tick: int) -> Floats:
         weights = [math.exp(-decay * rank) for rank in range(len(chunks))]
@@ -109,7 +109,6 @@ def covering(chunks: Sequence[Chunk], tick: int) -> list[Chunk]:
 def _row(chunk: Chunk, tick: int) -> Floats:
     row = row_of(chunk, tick)
     if row is None:
-        raise ValueError(
-            f"chunk {chunk.invocation} has rows for ticks {chunk.t_row0}..; tick {tick} is not among them"
-        )
-    return chunk.rows_NA[row].astype(np.float32, copy=True)
+        raise ValueError(f"chunk {chunk.invocation} has rows for ticks {chunk.t_row0}..; tick {tick} is not among them")
+    values: Floats = chunk.rows_NA[row].astype(np.float32, copy=True)
+    return values

@@ -43,7 +43,5 @@ class VirtualClock:
             ValueError: that would be backwards.
         """
         if instant_ns < self._now_ns:
-            raise ValueError(
-                f"a clock does not run backwards: now {self._now_ns} ns, asked for {instant_ns} ns"
-            )
+            raise ValueError(f"a clock does not run backwards: now {self._now_ns} ns, asked for {instant_ns} ns")
         self._now_ns = instant_ns

@@ -14,9 +14,7 @@ from typing import NamedTuple, Protocol
 from protocol.errors import CallFailed
 from protocol.topics import Priority, matches
 
-ATTACHMENT_BYTES = (
-    24  # seq u64, source_ns i64, boot_id u64, little-endian: drops and restarts seen without decoding
-)
+ATTACHMENT_BYTES = 24  # seq u64, source_ns i64, boot_id u64, little-endian: drops and restarts seen without decoding
 
 
 class Sample(NamedTuple):
@@ -90,9 +88,7 @@ class Bus(Protocol):
     is_local: bool
     """True if every peer shares this host: raw pixels travel well."""
 
-    def publish(
-        self, key: str, payload: bytes, *, encoding: str, attachment: bytes, priority: Priority
-    ) -> None: ...
+    def publish(self, key: str, payload: bytes, *, encoding: str, attachment: bytes, priority: Priority) -> None: ...
     def subscribe(self, expression: str, *, keep: int) -> Subscription: ...
     def serve(self, key: str) -> Inbox: ...
     def call(self, key: str, payload: bytes, *, timeout_ns: int) -> bytes:
@@ -128,9 +124,7 @@ class LocalBus:
         """``step`` does one piece of pending work and says whether there was any."""
         self._parties.append(step)
 
-    def publish(
-        self, key: str, payload: bytes, *, encoding: str, attachment: bytes, priority: Priority
-    ) -> None:
+    def publish(self, key: str, payload: bytes, *, encoding: str, attachment: bytes, priority: Priority) -> None:
         sample = Sample(key, payload, encoding, attachment)
         for expression, subscription in self._subscriptions:
             if matches(expression, key):

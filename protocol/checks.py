@@ -47,9 +47,7 @@ def _instant(message: Any, *names: str) -> None:
 
 def _vector(message: Any, name: str, *, low: int = 0, high: int = MAX_DIM) -> None:
     value = getattr(message, name)
-    _require(
-        value.ndim == 1 and low <= len(value) <= high, message, name, f"{low}..{high} numbers", value.shape
-    )
+    _require(value.ndim == 1 and low <= len(value) <= high, message, name, f"{low}..{high} numbers", value.shape)
     _require(bool(np.isfinite(value).all()), message, name, "finite numbers", "NaN or infinity")
 
 
@@ -97,9 +95,7 @@ def check_image(i: m.Image) -> None:
     elif i.codec == m.ImageCodec.ELSEWHERE:
         _require(len(i.data) == 0, i, "data", "no bytes", len(i.data))
     else:
-        _require(
-            0 < len(i.data) <= 2 * raw_bytes + 4096, i, "data", "a compressed image", f"{len(i.data)} bytes"
-        )
+        _require(0 < len(i.data) <= 2 * raw_bytes + 4096, i, "data", "a compressed image", f"{len(i.data)} bytes")
 
 
 def check_header(h: m.Header) -> None:
@@ -243,9 +239,7 @@ def check_robot(r: m.Robot) -> None:
     dim = len(r.command_low)
     for name in ("command_low", "command_high", "max_step", "initial_command"):
         _vector(r, name, low=max(dim, 1), high=max(dim, 1))
-    _require(
-        bool((r.command_low <= r.command_high).all()), r, "command_low", "<= command_high", "the opposite"
-    )
+    _require(bool((r.command_low <= r.command_high).all()), r, "command_low", "<= command_high", "the opposite")
     _require(bool((r.max_step >= 0).all()), r, "max_step", ">= 0", "a negative step")
     _require(len(r.cameras) <= MAX_IMAGES, r, "cameras", f"at most {MAX_IMAGES}", len(r.cameras))
     _index(r, "image_height", "image_width", "num_proprio")

@@ -60,9 +60,7 @@ def encode(message: Any) -> bytes:
     check(message)
     if isinstance(message, m.Observation):
         bare = dataclasses.replace(message, images=())
-        blobs = [
-            (_to_proto(dataclasses.replace(i, data=b"")).SerializeToString(), i.data) for i in message.images
-        ]
+        blobs = [(_to_proto(dataclasses.replace(i, data=b"")).SerializeToString(), i.data) for i in message.images]
         return splice.join(_to_proto(bare).SerializeToString(), _OBSERVATION_IMAGES, _IMAGE_DATA, blobs)
     return _to_proto(message).SerializeToString()
 
@@ -109,7 +107,7 @@ class _Field(NamedTuple):
 
 def _to_proto(message: Any) -> Proto:
     proto = proto_class(type(message))()
-    for field in _fields(type(message)):
+    for field in _fields(type(message)):  # type: ignore[arg-type]
         try:
             field.put(proto, field.name, getattr(message, field.name))
         except (TypeError, ValueError) as error:
@@ -131,7 +129,7 @@ def _from_proto(cls: type, proto: Proto) -> Any:
 
 
 @cache
-def _fields(cls: type) -> tuple[_Field, ...]:
+def _fields(cls: Any) -> tuple[_Field, ...]:
     descriptor = proto_class(cls).DESCRIPTOR
     names = [f.name for f in dataclasses.fields(cls)]
     if set(names) != set(descriptor.fields_by_name):
@@ -143,7 +141,7 @@ def _fields(cls: type) -> tuple[_Field, ...]:
 _Pair = tuple[Callable[[Proto, str, Any], None], Callable[[Proto, str], Any]]
 
 
-def _kind(field: FieldDescriptor) -> _Pair:
+def _kind(field: Any) -> _Pair:
     is_message = field.type == FieldDescriptor.TYPE_MESSAGE
     if is_message and field.message_type.GetOptions().map_entry:
         return _put_map, _get_map
@@ -158,11 +156,7 @@ def _kind(field: FieldDescriptor) -> _Pair:
             lambda proto, name: _from_proto(cls, getattr(proto, name)) if _has(proto, name) else None,
         )
     if field.is_repeated:
-        return (
-            (_put_floats, _get_floats)
-            if field.type == FieldDescriptor.TYPE_FLOAT
-            else (_put_scalars, _get_scalars)
-        )
+        return (_put_floats, _get_floats) if field.type == FieldDescriptor.TYPE_FLOAT else (_put_scalars, _get_scalars)
     if field.type == FieldDescriptor.TYPE_ENUM:
         enum: type[IntEnum] = getattr(m, field.enum_type.name)
         return _put_scalar, lambda proto, name: enum(getattr(proto, name))
@@ -216,7 +210,7 @@ def _get_tensor(proto: Proto, name: str) -> m.Floats:
         halves = np.frombuffer(data, "<u2") if len(data) % 2 == 0 else np.zeros(0, "<u2")
         flat = (halves.astype(np.uint32) << 16).view(np.float32)
     elif tensor.dtype in _DTYPES:
-        dtype = _DTYPES[tensor.dtype]
+        dtype: Any = _DTYPES[tensor.dtype]
         flat = np.frombuffer(data, dtype).astype(np.float32, copy=False)  # ValueError if the length is off
     else:
         raise ValueError(f"dtype {tensor.dtype}")

@@ -40,7 +40,7 @@ def _pack(camera: str, frame: NDArray[np.uint8], codec: ImageCodec, quality: int
     if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
         raise MalformedMessage("Image", "data", "(height, width, 3) uint8", f"{frame.shape} {frame.dtype}")
     if codec == ImageCodec.RAW:
-        data: bytes | memoryview = memoryview(np.ascontiguousarray(frame)).cast("B")
+        data: bytes | memoryview = np.ascontiguousarray(frame).data.cast("B")
     else:
         data = jpeg(frame, quality)
     height, width = frame.shape[:2]

@@ -127,9 +127,7 @@ class Link:
         self.dropped[reason] += 1
         if (source, reason) not in self._told and len(self._told) < 1000:
             self._told.add((source, reason))
-            log.warning(
-                "dropped source=%s reason=%s detail=%r (later ones are only counted)", source, reason, detail
-            )
+            log.warning("dropped source=%s reason=%s detail=%r (later ones are only counted)", source, reason, detail)
 
 
 class Stream(Generic[T]):

@@ -3,7 +3,7 @@
 Protobuf's wire format lets a message's fields stand in any order, so a message with big blobs is its small part, as the
 library serializes it, followed by ``tag length bytes`` for each blob. Python's library would copy a 200 kB image into
 the message, into its parent, into the string, and again on the way out; joining by hand copies once, splitting not at
-all. Format: https://protobuf.dev/programming-guides/encoding (field tag = number << 3 | wire type; 2 = length-delimited).
+all. Format: protobuf.dev/programming-guides/encoding (field tag = number << 3 | wire type; 2 = length-delimited).
 """
 
 from __future__ import annotations

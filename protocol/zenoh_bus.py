@@ -33,7 +33,7 @@ _MAX_PUBLISHERS = 256
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tls:
-    """Mutual TLS: PEM files. Both sides prove who they are; access control by certificate name is zenoh's own config."""
+    """Mutual TLS: PEM files. Both sides prove who they are; access control by certificate is zenoh's config."""
 
     ca: Path
     certificate: Path
@@ -70,9 +70,7 @@ def is_loopback(endpoint: str) -> bool:
     """
     protocol, slash, address = endpoint.partition("/")
     if not slash or not address:
-        raise TransportError(
-            f"endpoint {endpoint!r}: expected PROTOCOL/ADDRESS, for example tcp/127.0.0.1:7447"
-        )
+        raise TransportError(f"endpoint {endpoint!r}: expected PROTOCOL/ADDRESS, for example tcp/127.0.0.1:7447")
     if protocol == "unixsock-stream":
         return True
     host = address.split("?")[0].split("#")[0].rpartition(":")[0].strip("[]")
@@ -135,9 +133,7 @@ class ZenohBus:
         self._publishers: dict[str, Any] = {}
         self._declared: list[Any] = []  # dropped handles would undeclare themselves
 
-    def publish(
-        self, key: str, payload: bytes, *, encoding: str, attachment: bytes, priority: Priority
-    ) -> None:
+    def publish(self, key: str, payload: bytes, *, encoding: str, attachment: bytes, priority: Priority) -> None:
         publisher = self._publishers.get(key)
         if publisher is None:
             if len(self._publishers) >= _MAX_PUBLISHERS:  # keys name episodes: forget the oldest

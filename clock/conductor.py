@@ -1,0 +1,476 @@
+"""The schedule of one episode as a pure state machine: messages and instants in, messages out.
+
+It decides when PONDER looks (query), what POUNCE is given (invocation: reference, age, cognition), which row is played
+at each tick, and what happens when there is none. It never reads a clock, sleeps or touches a bus, so real time and
+lockstep are the same code: in lockstep the shell asks ``is_waiting`` and lets time stand still meanwhile.
+
+    WAIT_OBSERVATION -> WAIT_COGNITION -> WAIT_CHUNK -> RUNNING -> ENDED
+
+As in the paper, control starts only after the first cognition; with WaitKind.HOLD, ticks run from the first observation
+and hold the initial command until then.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+
+from clock.delays import in_order, modelled_ns
+from clock.ladder import Ladder
+from clock.limits import Hit, within_limits
+from clock.playback import Chunk, Join, covering, deadline_ns, row_of, seam_policy, tick_at
+from clock.reference import Ready, Reference, refer
+from protocol.messages import (
+    Action,
+    ActionChunk,
+    Cognition,
+    EpisodeInfo,
+    Event,
+    Floats,
+    Invocation,
+    Level,
+    Mode,
+    Observation,
+    Query,
+    Severity,
+    Stamp,
+    StampKind,
+    TaskStatus,
+    Tick,
+    WaitKind,
+)
+
+Effect = Query | Stamp | Invocation | Action | Tick | Event
+
+_NO_CARRIERS: Floats = np.zeros((0, 0), np.float32)
+_NO_FLOATS: Floats = np.zeros(0, np.float32)
+
+
+class Stage(Enum):
+    WAIT_OBSERVATION = "wait_observation"
+    WAIT_COGNITION = "wait_cognition"
+    WAIT_CHUNK = "wait_chunk"
+    RUNNING = "running"
+    ENDED = "ended"
+
+
+@dataclass(slots=True)
+class _Asked:
+    """A query or an invocation that is under way. ``ready_ns`` is known beforehand only if the delay is modelled."""
+
+    index: int
+    source_ns: int
+    delay_ns: int | None
+    answer: Cognition | ActionChunk | None = None
+    arrived_ns: int = 0
+
+    @property
+    def due_ns(self) -> int:
+        """No instant before this one depends on the answer."""
+        return self.source_ns + (self.delay_ns or 0)
+
+
+@dataclass(slots=True)
+class Conductor:
+    """One episode's schedule. All instants are episode time.
+
+    Attributes:
+        info: what was agreed when the episode was opened.
+        committed_ticks: ticks that will be played whatever a new chunk says (told to POUNCE).
+        start_ns: deadline of tick 0, once known.
+    """
+
+    info: EpisodeInfo
+    committed_ticks: int = 0
+    stage: Stage = Stage.WAIT_OBSERVATION
+    start_ns: int = 0
+    tick: int = 0
+    num_queries: int = 0
+    num_invocations: int = 0
+    ladder: Ladder = field(init=False)
+    last_command: Floats = field(init=False)
+    _absent: set[str] = field(default_factory=set)
+    _newest: Observation | None = None
+    _queries: list[_Asked] = field(default_factory=list)
+    _invocations: list[_Asked] = field(default_factory=list)
+    _ready: list[Ready] = field(default_factory=list)
+    _vectors: dict[int, Floats] = field(default_factory=dict)
+    _chunks: list[Chunk] = field(default_factory=list)
+    _last_ready_ns: dict[StampKind, int] = field(default_factory=dict)
+    _query_due_ns: int = 0
+    _invoke_due_tick: int = 0
+    _queried_tick: int = -1
+    _begun_tick: int = -1
+    _played_invocation: int | None = None
+    _told: set[str] = field(default_factory=set)
+    _join: Join = field(init=False)
+    _query_rng: np.random.Generator = field(init=False)
+    _invoke_rng: np.random.Generator = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.ladder = Ladder(self.info.schedule)
+        self.last_command = self.info.robot.initial_command
+        self._join = seam_policy(self.info.schedule.seam)
+        streams = np.random.SeedSequence(self.info.schedule.seed).spawn(2)
+        self._query_rng, self._invoke_rng = (np.random.default_rng(s) for s in streams)
+
+    # -- what comes in
+
+    def on_observation(self, observation: Observation) -> None:
+        if self._newest is None or observation.tick >= self._newest.tick:
+            self._newest = observation
+
+    def on_cognition(self, cognition: Cognition, now_ns: int) -> bool:
+        """Takes PONDER's answer; False if nobody asked for it (late, doubled, unknown)."""
+        return _take(self._queries, cognition.query, cognition, cognition.infer_ns, now_ns, self._is_lockstep)
+
+    def on_chunk(self, chunk: ActionChunk, now_ns: int) -> bool:
+        """Takes POUNCE's answer; False if nobody asked for it, or it has another shape than agreed."""
+        if (chunk.horizon, chunk.action_dim) != (self.info.schedule.horizon, self.info.robot.action_dim):
+            return False
+        return _take(self._invocations, chunk.invocation, chunk, chunk.infer_ns, now_ns, self._is_lockstep)
+
+    def on_lost(self, proc: str) -> None:
+        """A server is gone: what it still owed will not come."""
+        self._absent.add(proc)
+        unanswered = self._queries if proc == "ponder" else self._invocations
+        unanswered[:] = [asked for asked in unanswered if asked.answer is not None]
+
+    def on_back(self, proc: str) -> None:
+        self._absent.discard(proc)
+
+    def engage(self) -> None:
+        self.ladder.engage()
+
+    # -- what goes out
+
+    def poll(self, now_ns: int) -> list[Effect]:
+        """Everything that is due at ``now_ns``, in order."""
+        effects: list[Effect] = []
+        if self._newest is not None and self._newest.status != TaskStatus.ONGOING:
+            self.stage = Stage.ENDED
+        self._stamp_answers(now_ns, effects)
+        if self.stage == Stage.WAIT_OBSERVATION and self._newest is not None:
+            self._ask_ponder(self._newest, effects)
+            self._query_due_ns = self._newest.source_ns + self.info.schedule.query_period_ns
+            self.stage = Stage.WAIT_COGNITION
+            if self.info.schedule.wait == WaitKind.HOLD:
+                self._start(now_ns)
+        if self.stage == Stage.WAIT_COGNITION and self._ready and "pounce" not in self._absent:
+            self._ask_pounce(0, now_ns, effects)
+            self._invoke_due_tick = self.info.schedule.invoke_period_ticks
+            self.stage = Stage.WAIT_CHUNK
+        if self.stage == Stage.WAIT_CHUNK:
+            self._stamp_answers(now_ns, effects)
+            if self._chunks:
+                self._start(now_ns)
+            elif not self._invocations:  # lost on its way, or POUNCE died: ask again
+                self.stage = Stage.WAIT_COGNITION
+        while self.stage == Stage.RUNNING and self.deadline_ns(self.tick) <= now_ns:
+            if not self._run_tick(now_ns, effects):
+                break
+        return effects
+
+    def next_ns(self, now_ns: int) -> int | None:
+        """When ``poll`` has something to do at the latest; None if only a message can change anything."""
+        if self.stage == Stage.RUNNING:
+            return self.deadline_ns(self.tick)
+        modelled = [a.due_ns for a in (*self._queries, *self._invocations) if a.delay_ns is not None]
+        return min((due for due in modelled if due > now_ns), default=None)
+
+    def is_waiting(self, now_ns: int) -> bool:
+        """Lockstep: whether time must stand still at ``now_ns`` because an answer or an observation is owed."""
+        if self._newest is None:
+            return True
+        if self.stage == Stage.RUNNING and self.deadline_ns(self.tick) <= now_ns and self._newest.tick < self.tick:
+            return True
+        return self._is_owed_by(now_ns)
+
+    def deadline_ns(self, tick: int) -> int:
+        return deadline_ns(self.start_ns, tick, self.info.schedule.control_hz)
+
+    # -- inside
+
+    @property
+    def _is_lockstep(self) -> bool:
+        return self.info.schedule.mode == Mode.LOCKSTEP
+
+    def _is_owed_by(self, now_ns: int) -> bool:
+        return any(a.answer is None and a.due_ns <= now_ns for a in (*self._queries, *self._invocations))
+
+    def _start(self, now_ns: int) -> None:
+        self.stage, self.start_ns = Stage.RUNNING, now_ns
+
+    def _run_tick(self, now_ns: int, effects: list[Effect]) -> bool:
+        """One tick; False if it has to wait (lockstep)."""
+        if self._is_lockstep and self._newest is not None and self._newest.tick < self.tick:
+            return False
+        if self._begun_tick < self.tick:
+            if not self._is_lockstep:
+                self._skip_missed(now_ns, effects)
+            self._begun_tick = self.tick
+            self._ask_if_due(effects)
+        if self._is_lockstep and self._is_owed_by(now_ns):
+            return False
+        self._stamp_answers(now_ns, effects)
+        self._play(now_ns, effects)
+        self.tick += 1
+        return True
+
+    def _skip_missed(self, now_ns: int, effects: list[Effect]) -> None:
+        """The clock itself was stalled: whole ticks are past. They are logged as skipped, and nothing is caught up."""
+        newest = tick_at(self.start_ns, now_ns, self.info.schedule.control_hz)
+        if newest > self.tick:
+            text = f"ticks {self.tick}..{newest - 1} passed unplayed: the clock service was not running"
+            self._tell(effects, Severity.ERROR, "ticks_skipped", text, always=True)
+        for tick in range(self.tick, newest):
+            effects.append(self._account(tick, now_ns, Level.SKIPPED, None, _NO_FLOATS, _NO_FLOATS, Hit.NONE, 0.0))
+        self.tick = max(self.tick, newest)
+
+    def _ask_if_due(self, effects: list[Effect]) -> None:
+        tau_ns = self.deadline_ns(self.tick)
+        newest = self._newest
+        if newest is None:
+            return
+        if tau_ns >= self._query_due_ns and newest.tick > self._queried_tick:
+            if "ponder" in self._absent:
+                self._tell(effects, Severity.WARNING, "query_skipped", "PONDER is away: no queries until it is back")
+            elif self._is_lockstep or not self._queries:  # real time: one at a time, the next sees a fresh observation
+                self._ask_ponder(newest, effects)
+                while self._query_due_ns <= tau_ns:
+                    self._query_due_ns += self.info.schedule.query_period_ns
+        if self.tick >= self._invoke_due_tick and self._ready:
+            if "pounce" in self._absent:
+                self._tell(
+                    effects,
+                    Severity.WARNING,
+                    "invocation_skipped",
+                    "POUNCE is away: no invocations until it is back",
+                )
+            elif self._is_lockstep or not self._invocations:
+                self._ask_pounce(self.tick, tau_ns, effects)
+                while self._invoke_due_tick <= self.tick:
+                    self._invoke_due_tick += self.info.schedule.invoke_period_ticks
+
+    def _ask_ponder(self, observation: Observation, effects: list[Effect]) -> None:
+        delay = modelled_ns(self.info.schedule.query_delay, self._query_rng)
+        asked = _Asked(self.num_queries, observation.source_ns, delay)
+        self._queries.append(asked)
+        effects.append(Query(query=asked.index, tick=observation.tick, source_ns=observation.source_ns))
+        self.num_queries += 1
+        self._queried_tick = observation.tick
+
+    def _ask_pounce(self, tick: int, tau_ns: int, effects: list[Effect]) -> None:
+        reference = refer(self._ready, tau_ns, self.info.schedule.delivery)
+        delay = modelled_ns(self.info.schedule.invoke_delay, self._invoke_rng)
+        asked = _Asked(self.num_invocations, tau_ns, delay)
+        self._invocations.append(asked)
+        tail = self._unplayed_rows(tick)
+        effects.append(
+            Invocation(
+                invocation=asked.index,
+                tick=self._newest.tick if self._newest is not None else tick,
+                now_ns=tau_ns,
+                ref_query=reference.query,
+                age_ns=reference.age_ns,
+                cognition=self._vector_of(reference),
+                seed=invocation_seed(self.info.schedule.seed, asked.index),
+                previous_rows=tail.ravel(),
+                committed_rows=min(self.committed_ticks, len(tail)),
+            )
+        )
+        self.num_invocations += 1
+
+    def _vector_of(self, reference: Reference) -> Floats:
+        return _NO_CARRIERS if reference.query is None else self._vectors[reference.query]
+
+    def _unplayed_rows(self, tick: int) -> Floats:
+        chunks = covering(self._chunks, tick)
+        if not chunks:
+            return np.zeros((0, self.info.robot.action_dim), np.float32)
+        return chunks[-1].rows_NA[tick - chunks[-1].t_row0 :]
+
+    def _stamp_answers(self, now_ns: int, effects: list[Effect]) -> None:
+        """Admits every answer that is ready; the stamp is the log's authority on it."""
+        for asked, stamp in _ripe(self._queries, StampKind.COGNITION, self._last_ready_ns, now_ns):
+            answer = asked.answer
+            assert isinstance(answer, Cognition)
+            self._ready.append(
+                Ready(
+                    query=stamp.index,
+                    source_ns=stamp.source_ns,
+                    ready_ns=stamp.ready_ns,
+                    is_transition=answer.is_transition,
+                )
+            )
+            self._vectors[stamp.index] = answer.vector
+            self._forget_vectors()
+            effects.append(stamp)
+        for asked, stamp in _ripe(self._invocations, StampKind.CHUNK, self._last_ready_ns, now_ns):
+            answer = asked.answer
+            assert isinstance(answer, ActionChunk)
+            self._chunks.append(
+                Chunk(
+                    invocation=answer.invocation,
+                    t_row0=answer.t_row0,
+                    rows_NA=answer.rows_NA,
+                    ref_query=answer.ref_query,
+                    age_ns=answer.age_ns,
+                )
+            )
+            effects.append(stamp)
+        self._chunks = [c for c in self._chunks if c.t_row0 + len(c.rows_NA) > self.tick]
+
+    def _forget_vectors(self) -> None:
+        """Keeps only vectors that a delivery can still refer to: the newest, the first, and the last transition's."""
+        transitions = [r.query for r in self._ready if r.is_transition]
+        keep = {self._ready[0].query, *transitions[-1:], *(r.query for r in self._ready[-8:])}
+        for query in self._vectors.keys() - keep:
+            del self._vectors[query]
+
+    def _play(self, now_ns: int, effects: list[Effect]) -> None:
+        schedule, robot = self.info.schedule, self.info.robot
+        usable = [c for c in covering(self._chunks, self.tick) if c.age_ns <= schedule.stale_limit_ns]
+        raw, row, hit = _NO_FLOATS, None, Hit.NONE
+        if usable:
+            raw = self._join(usable, self.tick)
+            row, hit = within_limits(raw, self.last_command, robot)
+        if Hit.NON_FINITE in hit:
+            self._tell(
+                effects,
+                Severity.ERROR,
+                "non_finite_row",
+                f"chunk {usable[-1].invocation} has a NaN row: held",
+            )
+        elif hit:
+            self._tell(effects, Severity.WARNING, "limit_hit", f"first row clipped to the robot's limits: {hit!s}")
+        before = self.ladder.level
+        was_playing = self.ladder.has_played
+        is_stale = bool(usable) and usable[-1].age_ns > schedule.max_age_ns
+        proprio = self._newest.proprio if self._newest is not None else self.last_command
+        command = self.ladder.step(row, is_stale, self.last_command, proprio)
+        level = self.ladder.level
+        if level in (Level.DECELERATE, Level.STOPPED):  # the straight line obeys the limits too
+            command = _limited(command, self.last_command, self.info)
+        chunk = usable[-1] if level in (Level.PLAY, Level.STALE) else None
+        jump = self._seam_jump(chunk, raw)
+        self.last_command = command
+        if level != before and (was_playing or level != Level.PLAY):
+            self._tell_level(effects, before, level)
+        effects.append(Action(tick=self.tick, deadline_ns=self.deadline_ns(self.tick), level=level, values=command))
+        effects.append(self._account(self.tick, now_ns, level, chunk, command, raw, hit, jump))
+
+    def _seam_jump(self, chunk: Chunk | None, raw: Floats) -> float:
+        """How far the first row of a new chunk lies from the last command; 0 between switches."""
+        if chunk is None or chunk.invocation == self._played_invocation or not np.isfinite(raw).all():
+            return 0.0
+        self._played_invocation = chunk.invocation
+        return float(np.abs(raw[:-1] - self.last_command[:-1]).max(initial=0.0))
+
+    def _account(
+        self,
+        tick: int,
+        now_ns: int,
+        level: Level,
+        chunk: Chunk | None,
+        command: Floats,
+        raw: Floats,
+        hit: Hit,
+        jump: float,
+    ) -> Tick:
+        due_ns = self.deadline_ns(tick)
+        row = row_of(chunk, tick) if chunk is not None else None
+        return Tick(
+            tick=tick,
+            deadline_ns=due_ns,
+            decided_ns=now_ns,
+            late_ns=now_ns - due_ns,
+            level=level,
+            invocation=chunk.invocation if chunk is not None else None,
+            t_row0=chunk.t_row0 if chunk is not None else 0,
+            row=row or 0,
+            ref_query=chunk.ref_query if chunk is not None else None,
+            age_ns=chunk.age_ns if chunk is not None else 0,
+            observation_tick=self._newest.tick if self._newest is not None else 0,
+            state=self._newest.proprio if self._newest is not None else _NO_FLOATS,
+            action=command,
+            raw_row=raw,
+            limits_hit=int(hit),
+            seam_jump=jump,
+            age_ms=chunk.age_ns / 1e6 if chunk is not None else 0.0,
+            late_ms=(now_ns - due_ns) / 1e6,
+        )
+
+    def _tell_level(self, effects: list[Effect], before: Level, level: Level) -> None:
+        severity = {Level.PLAY: Severity.INFO, Level.STALE: Severity.WARNING}.get(level, Severity.ERROR)
+        why = {
+            Level.PLAY: "rows of a chunk with fresh cognition",
+            Level.STALE: f"cognition older than {self.info.schedule.max_age_ns / 1e6:.0f} ms",
+            Level.HOLD: "no usable row: the last commanded row is held",
+            Level.DECELERATE: f"held for {self.info.schedule.hold_limit_ticks} ticks: towards the measured joints",
+            Level.STOPPED: "stopped until somebody engages again",
+        }[level]
+        self._tell(effects, severity, "level", f"{before.name} -> {level.name}: {why}", always=True)
+
+    def _tell(self, effects: list[Effect], severity: Severity, name: str, text: str, *, always: bool = False) -> None:
+        """An event; those that would repeat every tick are told once per episode and counted in the ticks."""
+        if always or name not in self._told:
+            self._told.add(name)
+            effects.append(Event(severity=severity, name=name, text=text, tick=self.tick))
+
+
+def invocation_seed(episode_seed: int, invocation: int) -> int:
+    """The flow noise's seed: the same for the same episode seed and invocation, wherever and whenever it runs."""
+    return int(np.random.SeedSequence([episode_seed, invocation]).generate_state(1, np.uint64)[0] >> 1)
+
+
+def _limited(command: Floats, last_command: Floats, info: EpisodeInfo) -> Floats:
+    limited, _ = within_limits(command, last_command, info.robot)
+    return last_command if limited is None else limited
+
+
+def _take(
+    asked: list[_Asked],
+    index: int,
+    answer: Cognition | ActionChunk,
+    infer_ns: int,
+    now_ns: int,
+    is_lockstep: bool,
+) -> bool:
+    found = next((a for a in asked if a.index == index and a.answer is None), None)
+    if found is None or answer.source_ns != found.source_ns:
+        return False
+    found.answer, found.arrived_ns = answer, now_ns
+    if found.delay_ns is None:  # measured: what it took (lockstep), or when it came (real time)
+        found.delay_ns = infer_ns if is_lockstep else now_ns - found.source_ns
+    return True
+
+
+def _ripe(
+    asked: list[_Asked], kind: StampKind, last_ready_ns: dict[StampKind, int], now_ns: int
+) -> list[tuple[_Asked, Stamp]]:
+    """Removes and stamps the answers that are ready at ``now_ns``, in the order they were asked for.
+
+    An answer that comes later than its modelled delay is ready when it came; none overtakes an earlier one.
+    """
+    ripe: list[tuple[_Asked, Stamp]] = []
+    while asked and asked[0].answer is not None:
+        head = asked[0]
+        assert head.delay_ns is not None
+        ready_ns = in_order(max(head.due_ns, head.arrived_ns), last_ready_ns.get(kind))
+        if ready_ns > now_ns:
+            break
+        last_ready_ns[kind] = ready_ns
+        asked.pop(0)
+        stamp = Stamp(
+            kind=kind,
+            index=head.index,
+            source_ns=head.source_ns,
+            ready_ns=ready_ns,
+            arrived_ns=head.arrived_ns,
+            is_transition=isinstance(head.answer, Cognition) and head.answer.is_transition,
+        )
+        ripe.append((head, stamp))
+    return ripe

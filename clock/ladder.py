@@ -1,0 +1,67 @@
+"""What is commanded when there is nothing good to command: play, stale, hold, decelerate, stop.
+
+A row comes from a chunk, or it is the last commanded row, or a straight line from there to where the joints were
+measured: never zeros, never an extrapolation. Once decelerating, only ``engage`` starts motion again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from protocol.messages import Floats, Level, Schedule
+
+
+@dataclass(slots=True)
+class Ladder:
+    """The rung the robot stands on. ``step`` is called once per tick, in tick order."""
+
+    schedule: Schedule
+    level: Level = Level.HOLD
+    held_ticks: int = 0
+    slowing_ticks: int = 0
+    has_played: bool = False
+    _from: Floats | None = None
+    _to: Floats | None = None
+
+    @property
+    def is_latched(self) -> bool:
+        return self.level in (Level.DECELERATE, Level.STOPPED)
+
+    def engage(self) -> None:
+        """Somebody says that motion may start again: back to HOLD, playing as soon as there is a row."""
+        self.level, self.held_ticks, self.slowing_ticks = Level.HOLD, 0, 0
+
+    def step(self, row: Floats | None, is_stale: bool, last_command: Floats, proprio: Floats) -> Floats:
+        """The command of this tick and, in ``level``, where it came from.
+
+        Args:
+            row: (action_dim,) within limits, from a chunk; None if no chunk has one.
+            is_stale: the cognition behind ``row`` was older than ``max_age_ns``.
+            last_command: (action_dim,).
+            proprio: (num_proprio,) newest measured joints; the last command's dimension is the gripper, kept as it is.
+        """
+        if not self.is_latched:
+            if row is not None:
+                self.level, self.held_ticks, self.has_played = (
+                    Level.STALE if is_stale else Level.PLAY,
+                    0,
+                    True,
+                )
+                return row
+            # Before the first row there is nothing to have lost: the servos hold what they held at reset.
+            self.held_ticks += self.has_played
+            if self.held_ticks <= self.schedule.hold_limit_ticks:
+                self.level = Level.HOLD
+                return last_command
+            self.level, self.slowing_ticks = Level.DECELERATE, 0
+            self._from = last_command
+            self._to = np.append(proprio[: len(last_command) - 1], last_command[-1]).astype(np.float32)
+        if self.level == Level.STOPPED or self._from is None or self._to is None:
+            return last_command
+        self.slowing_ticks += 1
+        share = np.float32(min(1.0, self.slowing_ticks / max(1, self.schedule.decelerate_ticks)))
+        if share >= 1:
+            self.level = Level.STOPPED
+        return (self._from + share * (self._to - self._from)).astype(np.float32)

@@ -1,0 +1,65 @@
+"""A request names the observation it is about; whichever comes first waits for the other.
+
+Observations and requests travel with different priorities, so neither may assume that the other is already here.
+Pure; both model servers' nodes are built on it.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterator
+from typing import Generic, Protocol, TypeVar
+
+from protocol.messages import Observation
+
+
+class NamesTick(Protocol):
+    @property
+    def tick(self) -> int: ...
+
+
+R = TypeVar("R", bound=NamesTick)
+
+KEEP_OBSERVATIONS = 8
+
+
+class Rendezvous(Generic[R]):
+    """Pairs requests, in order, with the observation of their tick."""
+
+    def __init__(self, *, keep_requests: int) -> None:
+        self._observations: OrderedDict[int, Observation] = OrderedDict()
+        self._requests: list[R] = []
+        self._keep_requests = keep_requests
+        self.num_superseded = 0
+
+    def on_observation(self, observation: Observation) -> None:
+        self._observations[observation.tick] = observation
+        while len(self._observations) > KEEP_OBSERVATIONS:
+            self._observations.popitem(last=False)
+
+    def on_request(self, request: R) -> None:
+        self._requests.append(request)
+        while len(self._requests) > self._keep_requests:
+            self._requests.pop(0)
+            self.num_superseded += 1
+
+    def next_pair(self) -> tuple[R, Observation] | None:
+        """The oldest request whose observation is here, and that observation."""
+        for position, request in enumerate(self._requests):
+            observation = self._observations.get(request.tick)
+            if observation is not None:
+                del self._requests[position]
+                return request, observation
+        return None
+
+    def give_up(self) -> Iterator[R]:
+        """Removes requests whose observation can no longer come: a newer one is here and the ring has moved past."""
+        oldest = next(iter(self._observations), None)
+        for request in list(self._requests):
+            if oldest is not None and request.tick < oldest:
+                self._requests.remove(request)
+                yield request
+
+    def clear(self) -> None:
+        self._observations.clear()
+        self._requests.clear()
