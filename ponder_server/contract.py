@@ -55,7 +55,7 @@ class EngineSpec:
     model_hash: str
     """12 hex digits over the weights."""
     is_random: bool
-    """True if the weights were never trained: every cognition is noise, and reports must say so."""
+    """The carriers were never trained: every cognition is noise, and reports must say so."""
     dtype: str
     """Of weights and activations, e.g. "float32"; cognition is float32 always."""
 

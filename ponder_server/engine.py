@@ -66,7 +66,7 @@ class _Episode:
 class QwenEngine:
     """A ``PonderEngine`` on one device, one call at a time."""
 
-    def __init__(self, ponder: Ponder, config: EngineConfig, *, is_random: bool) -> None:
+    def __init__(self, ponder: Ponder, config: EngineConfig) -> None:
         self._ponder = ponder
         self._config = config
         self._format = ponder.format
@@ -80,7 +80,7 @@ class QwenEngine:
             num_cameras=config.num_cameras,
             max_context_tokens=config.max_context_tokens,
             model_hash=weights_hash(ponder),
-            is_random=is_random,
+            is_random=ponder.is_random,
             dtype=str(ponder.dtype).removeprefix("torch."),
         )
         v = self._vocabulary
@@ -242,7 +242,8 @@ class QwenEngine:
         return int(self._ponder.logits(hidden_H[None])[0].argmax())
 
     def _answer(self, context: Session, hidden_KH: Tensor, texts: tuple[Text, ...]) -> Fire:
-        cognition = hidden_KH.float().cpu().numpy()
+        # a copy: a view would keep the hidden states of the whole observation alive
+        cognition = hidden_KH.to("cpu", torch.float32, copy=True).numpy()
         if not np.isfinite(cognition).all():
             raise FloatingPointError(
                 f"session {context.name!r}: cognition is not finite after {context.num_tokens} tokens; "

@@ -77,6 +77,8 @@ class Ponder(nn.Module):
             )
         self.format = context_format
         self.image_px = image_px
+        self.is_random = True
+        """The carriers were never trained: cognition is noise. A trainer sets it False, checkpoints keep it."""
         qwen: Any = skeleton(qwen_config).to(dtype=dtype).to_empty(device=device)
         qwen.tie_weights()  # to_empty makes a separate tensor of every name
         # Frequencies are buffers that no checkpoint holds; to_empty left them undefined.

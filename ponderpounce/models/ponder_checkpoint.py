@@ -41,6 +41,8 @@ class Addition:
     first_carrier_id: int | None = None
     """None: the first row after the tokenizer's last id."""
     image_px: tuple[int, int] = (256, 256)
+    is_random: bool = True
+    """The carriers were never trained; so it is with a public Qwen3.5, which has no ponder.json."""
 
 
 def load_ponder(
@@ -79,6 +81,7 @@ def load_ponder(
     files = _files_by_tensor(directory)
     _check_tensors(directory, files, skeleton(qwen_config), tied=qwen_config.tie_word_embeddings)
     ponder = Ponder(qwen_config, context_format, image_px=addition.image_px, device=device, dtype=dtype)
+    ponder.is_random = addition.is_random
     _read_tensors(files, ponder.qwen)
     return ponder
 
@@ -92,6 +95,7 @@ def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_S
         num_carriers=ponder.format.num_carriers,
         first_carrier_id=ponder.format.first_carrier_id,
         image_px=ponder.image_px,
+        is_random=ponder.is_random,
     )
     (directory / "ponder.json").write_text(json.dumps(asdict(addition), indent=2) + "\n")
     shards: list[dict[str, Tensor]] = [{}]

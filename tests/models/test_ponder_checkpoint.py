@@ -70,11 +70,21 @@ def test_transformers_reads_what_we_write(ponder: Ponder, folder: Path) -> None:
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)
 
 
+@pytest.mark.parametrize("is_random", [True, False])
+def test_a_checkpoint_remembers_whether_it_was_trained(tmp_path: Path, is_random: bool) -> None:
+    ponder = Ponder.random(CONFIG, VOCABULARY, seed=1)
+    assert ponder.is_random
+    ponder.is_random = is_random
+    save_ponder(ponder, tmp_path)
+    assert load_ponder(tmp_path).is_random == is_random
+
+
 def test_a_public_checkpoint_without_our_file_gets_the_defaults(folder: Path) -> None:
     (folder / "ponder.json").unlink()
     loaded = load_ponder(folder)
     assert loaded.format.carrier_ids == (VOCABULARY.num_tokens,)
     assert loaded.image_px == (256, 256)
+    assert loaded.is_random
 
 
 def test_a_missing_tensor_is_named(folder: Path) -> None:

@@ -81,7 +81,7 @@ def ponder() -> Ponder:
 
 @pytest.fixture
 def engine(ponder: Ponder) -> QwenEngine:
-    return QwenEngine(ponder, CONFIG, is_random=True)
+    return QwenEngine(ponder, CONFIG)
 
 
 def context_of(engine: QwenEngine, session: str) -> Session:
@@ -151,7 +151,7 @@ def test_equal_sessions_give_equal_bits_also_interleaved_and_reopened(engine: Qw
 
 def test_demo_reasoning_is_written_at_the_first_transition_only() -> None:
     script = (None, Transition(subgoal=REASONING), Transition(subgoal=SUBGOAL))
-    engine = QwenEngine(taught(script), CONFIG, is_random=True)
+    engine = QwenEngine(taught(script), CONFIG)
     engine.open("a", WITH_DEMO)
     texts = [engine.fire("a", observation(query)).texts for query in range(3)]
     # T_no right after the reasoning ends the whole transition; it is not asked for again
@@ -163,7 +163,7 @@ def test_demo_reasoning_is_written_at_the_first_transition_only() -> None:
 
 
 def test_without_a_demo_the_first_transition_is_a_subgoal() -> None:
-    engine = QwenEngine(taught((Transition(subgoal=SUBGOAL),), WITHOUT_DEMO), CONFIG, is_random=True)
+    engine = QwenEngine(taught((Transition(subgoal=SUBGOAL),), WITHOUT_DEMO), CONFIG)
     engine.open("a", WITHOUT_DEMO)
     assert [(t.kind, t.text) for t in engine.fire("a", observation(0)).texts] == [
         ("subgoal", "press the left button")
@@ -174,7 +174,7 @@ def test_without_a_demo_the_first_transition_is_a_subgoal() -> None:
 def test_a_text_is_truncated_only_if_it_would_have_gone_on(ponder: Ponder, max_text_tokens: int) -> None:
     assert len(SUBGOAL) <= len(REASONING) - 1
     config = replace(CONFIG, max_text_tokens=max_text_tokens)
-    engine = QwenEngine(ponder, config, is_random=True)
+    engine = QwenEngine(ponder, config)
     engine.open("a", WITH_DEMO)
     engine.fire("a", observation(0))
     reasoning, subgoal = engine.fire("a", observation(1)).texts
@@ -187,10 +187,10 @@ def test_a_text_is_truncated_only_if_it_would_have_gone_on(ponder: Ponder, max_t
 
 
 def test_text_leaves_room_for_the_carriers(ponder: Ponder) -> None:
-    opened = QwenEngine(ponder, CONFIG, is_random=True).open("a", WITH_DEMO)
+    opened = QwenEngine(ponder, CONFIG).open("a", WITH_DEMO)
     ordinary, text = 12 + 2, 1 + len(REASONING) + 1 + 3
     limit = opened + 2 * ordinary + text
-    engine = QwenEngine(ponder, replace(CONFIG, max_context_tokens=limit), is_random=True)
+    engine = QwenEngine(ponder, replace(CONFIG, max_context_tokens=limit))
     engine.open("a", WITH_DEMO)
     engine.fire("a", observation(0))
     answer = engine.fire("a", observation(1))
@@ -200,9 +200,9 @@ def test_text_leaves_room_for_the_carriers(ponder: Ponder) -> None:
 
 @pytest.mark.parametrize("room_for_text", [0, 2])
 def test_a_transition_that_does_not_fit_leaves_no_trace(ponder: Ponder, room_for_text: int) -> None:
-    opened = QwenEngine(ponder, CONFIG, is_random=True).open("a", WITH_DEMO)
+    opened = QwenEngine(ponder, CONFIG).open("a", WITH_DEMO)
     limit = opened + 2 * (12 + 2) + room_for_text
-    engine = QwenEngine(ponder, replace(CONFIG, max_context_tokens=limit), is_random=True)
+    engine = QwenEngine(ponder, replace(CONFIG, max_context_tokens=limit))
     engine.open("a", WITH_DEMO)
     engine.fire("a", observation(0))
     before = state_of(context_of(engine, "a"))
@@ -229,7 +229,7 @@ def test_a_fire_that_is_interrupted_leaves_no_trace(engine: QwenEngine, call: in
 
 
 def test_progress_is_heard_at_every_chunk_and_every_token(ponder: Ponder) -> None:
-    engine = QwenEngine(ponder, replace(CONFIG, prefill_chunk_tokens=1), is_random=True)
+    engine = QwenEngine(ponder, replace(CONFIG, prefill_chunk_tokens=1))
     calls: list[int] = []
     engine.open("a", WITH_DEMO, lambda: calls.append(0))
     assert len(calls) == 1 + len(DEMO) + 1
@@ -244,7 +244,7 @@ def test_the_chunks_of_the_opening_do_not_matter(ponder: Ponder) -> None:
     answers = []
     for prefill_chunk_tokens in (1, 20, 512):
         config = replace(CONFIG, prefill_chunk_tokens=prefill_chunk_tokens)
-        engine = QwenEngine(ponder, config, is_random=True)
+        engine = QwenEngine(ponder, config)
         engine.open("a", WITH_DEMO)
         answers.append(engine.fire("a", observation(0)).cognition)
     np.testing.assert_allclose(answers[1:], [answers[0]] * 2, rtol=0, atol=TOLERANCE)
@@ -271,8 +271,8 @@ def test_forced_text_that_does_not_fit_is_refused(engine: QwenEngine) -> None:
 
 
 def test_a_full_context_refuses_before_it_computes(ponder: Ponder) -> None:
-    opened = QwenEngine(ponder, CONFIG, is_random=True).open("a", WITH_DEMO)
-    engine = QwenEngine(ponder, replace(CONFIG, max_context_tokens=opened + 2 * 14 - 1), is_random=True)
+    opened = QwenEngine(ponder, CONFIG).open("a", WITH_DEMO)
+    engine = QwenEngine(ponder, replace(CONFIG, max_context_tokens=opened + 2 * 14 - 1))
     engine.open("a", WITH_DEMO)
     engine.fire("a", observation(0))
     before = state_of(context_of(engine, "a"))
@@ -337,7 +337,7 @@ def test_a_broken_network_does_not_answer() -> None:
     ponder = untrained()
     with torch.no_grad():
         ponder.qwen.model.language_model.norm.weight.fill_(float("nan"))
-    engine = QwenEngine(ponder, CONFIG, is_random=True)
+    engine = QwenEngine(ponder, CONFIG)
     engine.open("a", WITHOUT_DEMO)
     before = state_of(context_of(engine, "a"))
     with pytest.raises(FloatingPointError, match="cognition is not finite"):
@@ -358,7 +358,7 @@ def test_warm_up_measures_enough_and_leaves_nothing_open(engine: QwenEngine) -> 
 
 def test_the_spec_says_what_the_engine_is() -> None:
     ponder = Ponder.random(MODEL, VOCABULARY, seed=1, dtype=torch.bfloat16)
-    engine = QwenEngine(ponder, CONFIG, is_random=True)
+    engine = QwenEngine(ponder, CONFIG)
     spec = engine.spec
     assert (spec.num_carriers, spec.hidden_size, spec.image_px, spec.num_cameras) == (2, 96, (64, 64), 2)
     assert (spec.max_context_tokens, spec.is_random, spec.dtype) == (400, True, "bfloat16")
