@@ -1,7 +1,8 @@
 """Subgoal texts: one template per subtask, a plain and a grounded reading of it, and when the grounded one is fixed.
 
-In a template, what only the grounded text says stands in brackets, and ``<>`` is a coordinate: "press the button[ at <>]"
-reads "press the button", or "press the button at <69, 99>" with the row first. Templates are upstream's, typos included.
+In a template, what only the grounded text says stands in brackets, and ``<>`` is a coordinate: "press the button[
+at <>]" reads "press the button", or "press the button at <69, 99>" with the row first. Templates are upstream's,
+typos included.
 """
 
 from __future__ import annotations
@@ -54,9 +55,9 @@ class Caption:
 def follow(previous: Caption | None, index: int, template: str, look: Callable[[], list[Pixel] | None]) -> Caption:
     """Returns the texts of subtask ``index``, given those of the observation before.
 
-    ``look`` returns where the subtask's objects are seen, or None while one of them is hidden. It is asked only until the
-    coordinates are fixed: they stay where the object was first seen, even if it moves. Until then the grounded text is
-    the simple one.
+    ``look`` returns where the subtask's objects are seen, or None while one of them is hidden. It is asked only
+    until the coordinates are fixed: they stay where the object was first seen, even if it moves. Until then the
+    grounded text is the simple one.
     """
     if previous is not None and previous.index == index and previous.is_latched:
         return previous

@@ -1,7 +1,7 @@
 """Where an episode stands: an ordered list of subtasks, judged once per control step.
 
-Failure of the current subtask is looked at first, then its completion; at most one subtask is passed per step. Failures of
-other subtasks do not count while they are not current. Outcomes are final.
+Failure of the current subtask is looked at first, then its completion; at most one subtask is passed per step.
+Failures of other subtasks do not count while they are not current. Outcomes are final.
 """
 
 from __future__ import annotations

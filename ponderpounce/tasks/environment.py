@@ -20,7 +20,7 @@ from ponderpounce.tasks.rendering import Cameras
 from ponderpounce.tasks.scene import FRONT, table_scene
 from ponderpounce.tasks.task import DIFFICULTIES, Subtask, Task, TaskError, make_task
 
-IMAGE_PX = 256
+IMAGE_PX = 256  # upstream's; grounded texts count in these pixels
 MAX_STEPS = 1300  # the paper's limit; upstream's own default is 10000
 
 
@@ -71,7 +71,6 @@ class Environment:
         spec = table_scene()
         task.furnish(spec)
         self.physics = Physics(spec)
-        self._image_px = image_px
         self._cameras = Cameras(self.physics, image_px) if render else None
         self._max_steps = max_steps
         self._layout: Any = None
@@ -103,8 +102,9 @@ class Environment:
     def reset(self, seed: int, difficulty: str | None = None, *, layout: Any = None) -> Snapshot:
         """Starts an episode and returns its first snapshot.
 
-        The seed alone decides the scene. Without a difficulty it is the seed's remainder by three: easy, medium, hard, as
-        upstream. A ``layout`` takes the place of the drawn one. Raises TaskError for an unknown difficulty.
+        The seed alone decides the scene. Without a difficulty it is the seed's remainder by three: easy, medium,
+        hard, as upstream. A ``layout`` takes the place of the drawn one. Raises TaskError for an unknown
+        difficulty.
         """
         difficulty = DIFFICULTIES[seed % 3] if difficulty is None else difficulty
         if difficulty not in DIFFICULTIES:
@@ -212,10 +212,13 @@ class Environment:
         return self._snapshot()
 
     def _look_for(self, subtask: Subtask) -> list[captions.Pixel] | None:
-        """Where the front camera sees the subtask's objects; None if one of them is hidden."""
+        """Where the front camera sees the subtask's objects; None if one of them is hidden.
+
+        Texts speak of a 256 px image, whatever size is rendered.
+        """
         points = []
         for body in subtask.grounds:
-            pixels = sight.visible_pixels(self.physics, FRONT, body, self._image_px)
+            pixels = sight.visible_pixels(self.physics, FRONT, body, IMAGE_PX)
             point = sight.mean_pixel(pixels)
             if point is None:
                 return None

@@ -74,7 +74,7 @@ class Kinematics:
         return qpos
 
     def screw_path(self, start: Array, target: Array, num_points: int) -> Array:
-        """Returns joint angles (num_points, 7) along the constant screw from ``start`` (7,) to the pose ``target`` (4, 4).
+        """Returns joint angles (num_points, 7) along the constant screw from ``start`` (7,) to ``target`` (4, 4).
 
         The first row is ``start``. Raises UnreachableError if a point of the way is.
         """

@@ -1,8 +1,8 @@
 """The oracle's motion library: generators of absolute joint targets, written as one would tell a robot what to do.
 
-Every motion plans from where the arm is when it starts, not from where it was told to be, so it must be consumed step by
-step with the physics: next action, advance, next action. Motions are straight screws of the tool, timed to the arm's speed
-and acceleration limits; a gripper command holds the arm still for six steps.
+Every motion plans from where the arm is when it starts, not from where it was told to be, so it must be consumed
+step by step with the physics: next action, advance, next action. Motions are straight screws of the tool, timed to
+the arm's speed and acceleration limits; a gripper command holds the arm still for six steps.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ class Motions:
     def __init__(self, physics: Physics) -> None:
         self._physics = physics
         self._kinematics = Kinematics(physics.model)
-        self._gripper = OPEN
+        self._gripper = physics.gripper_command()  # it may be holding something already
 
     def move(self, target: Array) -> Actions:
-        """Moves the tool along a straight screw to a transform (4, 4). Raises UnreachableError before the first action."""
+        """Moves the tool along a straight screw to a transform (4, 4). Raises UnreachableError, before moving."""
         path = self._kinematics.screw_path(self._physics.arm_qpos(), target, _PATH_POINTS)
         times_s = timing.fastest(path, max_speed=MAX_SPEED_RAD_S, max_acceleration=MAX_ACCELERATION_RAD_S2)
         for qpos in timing.sample(path, times_s, 1 / CONTROL_HZ):

@@ -34,26 +34,31 @@ ACTION_LOW = np.append(JOINT_LOW_RAD, -1.0)
 ACTION_HIGH = np.append(JOINT_HIGH_RAD, 1.0)
 
 ROBOT_BIT, WORLD_BIT = 2, 1  # contact bits: the robot touches the world, not itself
-# As stiff as the physics step allows. With MuJoCo's defaults the fingers sink millimetres into the light cube they squeeze.
+# As stiff as the physics step allows. With MuJoCo's defaults the fingers sink millimetres into the light cube they
+# squeeze.
 STIFF_SOLREF, STIFF_SOLIMP = (0.01, 1.0), (0.95, 0.99, 0.001, 0.5, 2.0)
 
 _GAIN_KP, _GAIN_KD, _FORCE_LIMIT = 1000.0, 100.0, 100.0  # N m / rad and N / m alike, as upstream
 _FINGER_TARGET_M = (-0.01, 0.04)  # where commands -1 and +1 drive one finger; below 0 means squeezing
-# Bare 100 g fingers bounce off a squeezed cube at a physics step of 5 ms; with this inertia they hold it, and they still
-# close as their gains tell them to (it adds 5 ms to a time constant of 100 ms).
+# Bare 100 g fingers bounce off a squeezed cube at a physics step of 5 ms; with this inertia they hold it, and they
+# still close as their gains tell them to (it adds 5 ms to a time constant of 100 ms).
 _FINGER_ARMATURE_KG = 0.5
 _HAND_FROM_FLANGE_M = 0.107  # Franka's datasheet; robosuite mounts its hand half a millimetre short
 _FINGER_FROM_HAND_M = 0.0584  # likewise; robosuite's fingers start 6 mm short
 _TCP_FROM_HAND_M = 0.1034
 _HEAVY_FACES = 1000  # lighter meshes stay as they are; among them the fingers, which the wrist camera sees close up
-_CELL_M = 0.004  # clustering grid of the visual meshes: at 256 px the robot looks the same and renders twice as fast
+_CELL_M = 0.006  # clustering grid of the visual meshes: looks the same at 256 px, halves the cost of a frame
 
 
 def control_of(action: Array) -> Array:
     """Returns actuator set points (9,) for an action (8,): seven joints [rad], two fingers [m]."""
-    closed_m, open_m = _FINGER_TARGET_M
-    opening_m = closed_m + (np.clip(action[7], -1.0, 1.0) + 1) / 2 * (open_m - closed_m)
+    opening_m = np.interp(action[7], (-1.0, 1.0), _FINGER_TARGET_M)  # clips
     return np.concatenate([action[:7], [opening_m, -opening_m]])
+
+
+def gripper_command_of(control: Array) -> float:
+    """Returns the gripper command in [-1, 1] behind set points (9,)."""
+    return float(np.interp(control[7], _FINGER_TARGET_M, (-1.0, 1.0)))
 
 
 def panda_spec() -> mujoco.MjSpec:
@@ -95,8 +100,8 @@ def _source_spec() -> mujoco.MjSpec:
     spec.body("base").pos = BASE_POSITION_M
     for body in spec.bodies:
         body.gravcomp = 1.0  # upstream's arm feels no gravity; the real one compensates for it
-    for finger in FINGER_BODIES:
-        spec.body(finger).pos = [0.0, 0.0, _FINGER_FROM_HAND_M]
+    for body_name in FINGER_BODIES:
+        spec.body(body_name).pos = [0.0, 0.0, _FINGER_FROM_HAND_M]
     for name in FINGER_JOINTS:
         # With robosuite's own damping and friction the fingers would close at half of upstream's speed.
         spec.joint(name).damping, spec.joint(name).frictionloss = [0.0] * 3, 0.0
@@ -108,9 +113,9 @@ def _source_spec() -> mujoco.MjSpec:
         for geom in (spec.geom(f"finger{finger}_collision"), spec.geom(f"finger{finger}_pad_collision")):
             geom.friction, geom.condim = [2.0, 0.05, 0.0001], 4
             geom.solref, geom.solimp = STIFF_SOLREF, STIFF_SOLIMP
-    for finger, side in zip(FINGER_BODIES, (1.0, -1.0), strict=True):
-        spec.body(finger).add_geom(
-            name=f"{finger}_tip",  # upstream's hand has black rubber tips and bright fingers
+    for body_name, side in zip(FINGER_BODIES, (1.0, -1.0), strict=True):
+        spec.body(body_name).add_geom(
+            name=f"{body_name}_tip",  # upstream's hand has black rubber tips and bright fingers
             type=mujoco.mjtGeom.mjGEOM_BOX,
             size=[0.0108, 0.005, 0.0095],
             pos=[0.0, side * 0.0048, 0.0447],
@@ -142,7 +147,7 @@ def _assets() -> Path:
 
 @functools.cache
 def _light_meshes() -> dict[str, tuple[Array, NDArray[np.int32]]]:
-    """Clustered copies of all visual meshes by name: vertices (n, 3) in metres, faces (m, 3). Takes about a second, once."""
+    """Clustered visual meshes by name: vertices (n, 3) in metres, faces (m, 3). Takes a second, once."""
     spec = _source_spec()
     names = {geom.meshname for geom in spec.geoms if geom.meshname and geom.group == 1}
     model = spec.compile()
@@ -161,9 +166,7 @@ def _light_meshes() -> dict[str, tuple[Array, NDArray[np.int32]]]:
     return meshes
 
 
-def cluster(
-    vertices: Array, faces: NDArray[np.int32], *, cell_m: float
-) -> tuple[Array, NDArray[np.int32]]:
+def cluster(vertices: Array, faces: NDArray[np.int32], *, cell_m: float) -> tuple[Array, NDArray[np.int32]]:
     """Merges all vertices that share a grid cell into their mean, and drops the faces that collapse.
 
     Args: vertices (n, 3) in metres; faces (m, 3) indices into them. Returns the smaller pair, in a fixed order.

@@ -12,14 +12,14 @@ import mujoco
 import numpy as np
 
 from ponderpounce.tasks import panda
-from ponderpounce.tasks.geometry import Array
+from ponderpounce.tasks.geometry import Array, pose
 from ponderpounce.tasks.scene import RGBA
 
 CONTROL_HZ = 20
 
 _GRASP_FORCE_N = 0.5
 _GRASP_COS = np.cos(np.deg2rad(85.0))
-_PARK_M = np.array([10.0, 10.0, 10.0])  # behind the front camera; upstream parks its props here too
+_PARK_XYZ_M = (10.0, 10.0, 10.0)  # behind the front camera; upstream parks its props here too
 _PARK_SPACING_M = 0.5
 
 
@@ -69,9 +69,9 @@ class Physics:
             self.park(name)
         self.refresh()
 
-    def place(self, name: str, pose: Array) -> None:
+    def place(self, name: str, pose_7: Array) -> None:
         """Puts a prop at a pose (7,), at rest. Call `refresh` after the last one."""
-        self._set_pose(name, pose)
+        self._set_pose(name, pose_7)
         body = self.model.body(name)
         if body.mocapid[0] < 0:
             self.data.xfrc_applied[body.id] = 0.0
@@ -79,8 +79,8 @@ class Physics:
     def park(self, name: str) -> None:
         """Puts a prop out of sight of both cameras, where it floats at rest until it is placed again."""
         body = self.model.body(name)
-        spot = _PARK_M + [self._props.index(name) * _PARK_SPACING_M, 0.0, 0.0]
-        self._set_pose(name, np.concatenate([spot, [1.0, 0.0, 0.0, 0.0]]))
+        x_m = _PARK_XYZ_M[0] + self._props.index(name) * _PARK_SPACING_M
+        self._set_pose(name, pose(x_m, *_PARK_XYZ_M[1:]))
         if body.mocapid[0] < 0:
             # An upward push equal to its weight; unlike model.body_gravcomp it is part of the saved state.
             self.data.xfrc_applied[body.id, :3] = -body.mass[0] * self.model.opt.gravity
@@ -114,6 +114,10 @@ class Physics:
     def finger_openings_m(self) -> Array:
         """Both fingers' distances (2,) from the closed position."""
         return np.abs(self.data.qpos[self._finger_qpos])
+
+    def gripper_command(self) -> float:
+        """The gripper command in [-1, 1] that is in force; 1 is open."""
+        return panda.gripper_command_of(self.data.ctrl)
 
     def tcp_transform(self) -> Array:
         """Tool centre point as a (4, 4) transform: z leaves the palm, the fingers open along y."""
@@ -179,16 +183,16 @@ class Physics:
     def _set_integration(self, state: PhysicsState) -> None:
         mujoco.mj_setState(self.model, self.data, state.integration, mujoco.mjtState.mjSTATE_INTEGRATION)
 
-    def _set_pose(self, name: str, pose: Array) -> None:
+    def _set_pose(self, name: str, pose_7: Array) -> None:
         body = self.model.body(name)
         mocap = int(body.mocapid[0])
         if mocap >= 0:
-            self.data.mocap_pos[mocap] = pose[:3]
-            self.data.mocap_quat[mocap] = pose[3:]
+            self.data.mocap_pos[mocap] = pose_7[:3]
+            self.data.mocap_quat[mocap] = pose_7[3:]
             return
         joint = self.model.joint(name)
         qpos, dof = int(joint.qposadr[0]), int(joint.dofadr[0])
-        self.data.qpos[qpos : qpos + 7] = pose
+        self.data.qpos[qpos : qpos + 7] = pose_7
         self.data.qvel[dof : dof + 6] = 0.0
 
 

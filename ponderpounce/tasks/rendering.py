@@ -13,10 +13,10 @@ _UNSEEN_GROUPS = (0, 3, 4, 5)  # 0 holds the arm's collision shapes
 
 
 class Cameras:
-    """Renders one physics' scene at one size. Needs a GL context (MUJOCO_GL=egl without a display); close it after use.
+    """Renders one physics at one size. Needs a GL context (MUJOCO_GL=egl without a display); close it after use.
 
-    Reflections, shadows and the sky are off: together with antialiasing (off in the scene) they are most of the cost of a
-    software-rendered frame.
+    Reflections, shadows and the sky are off: together with antialiasing (off in the scene) they are most of the
+    cost of a software-rendered frame.
     """
 
     def __init__(self, physics: Physics, image_px: int) -> None:

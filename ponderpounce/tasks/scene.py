@@ -108,8 +108,9 @@ def add_button(spec: mujoco.MjSpec, name: str) -> None:
         range=[-_CAP_TRAVEL_M, 0.0],
         stiffness=[800.0, 0.0, 0.0],
         damping=[40.0, 0.0, 0.0],
-        # MuJoCo's stops are soft in proportion to the mass they stop, and the cap weighs 43 g. This inertia lets the stop
-        # hold a pressing arm; the cap still follows its spring and damper, whose time constant is far longer.
+        # MuJoCo's stops are soft in proportion to the mass they stop, and the cap weighs 43 g. This inertia lets
+        # the stop hold a pressing arm; the cap still follows its spring and damper, whose time constant is far
+        # longer.
         armature=0.3,
         solref_limit=STIFF_SOLREF,
         solimp_limit=STIFF_SOLIMP,
@@ -152,7 +153,7 @@ def sample_footprint(
     gap_m: float,
     max_tries: int = 256,
 ) -> Footprint:
-    """Draws a footprint whose centre is uniform in ``center_m`` +- ``reach_m`` and that keeps ``gap_m`` from all obstacles.
+    """Draws a footprint with its centre uniform in ``center_m`` +- ``reach_m``, ``gap_m`` from all obstacles.
 
     Raises SceneFullError after ``max_tries`` draws that all met an obstacle.
     """
@@ -238,7 +239,7 @@ _GRAIN_PX = 512
 
 
 def wood_grain() -> NDArray[np.uint8]:
-    """Returns a wood-like texture (512, 512, 3): streaks along y that repeat without a seam, the same on every machine."""
+    """Returns a wood-like texture (512, 512, 3): streaks along y that repeat without a seam, always the same."""
     rng = np.random.default_rng(0)
     noise = rng.standard_normal((_GRAIN_PX, _GRAIN_PX))
     cycles = np.fft.fftfreq(_GRAIN_PX, 1 / _GRAIN_PX)

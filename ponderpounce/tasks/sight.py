@@ -21,7 +21,7 @@ _NO_BODY = -1
 
 
 def intrinsic(physics: Physics, camera: str, image_px: int) -> Array:
-    """Returns the camera matrix K (3, 3) for a square image: pixel = K (R p + t), (0, 0) at the image's top left corner."""
+    """Returns the camera matrix K (3, 3) of a square image: pixel = K (R p + t), (0, 0) the top left corner."""
     focal_px = image_px / 2 / np.tan(np.deg2rad(physics.model.camera(camera).fovy[0]) / 2)
     return np.array([[focal_px, 0.0, image_px / 2], [0.0, focal_px, image_px / 2], [0.0, 0.0, 1.0]])
 

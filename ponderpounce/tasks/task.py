@@ -1,15 +1,16 @@
 """What a task is: a scene, a list of subtasks, and a registry of the tasks that exist.
 
-Task, physics and environment are three things. Physics knows numbers by name, a task knows what they mean, the environment
-knows the order of calls. A task never steps, physics never scores, predicates are pure readings. Task objects hold no state:
-what one episode asks is its layout, what has happened so far is its memory, and both are frozen values, so that an episode
-can be saved and restored.
+Task, physics and environment are three things. Physics knows numbers by name, a task knows what they mean, the
+environment knows the order of calls. A task never steps, physics never scores, predicates are pure readings. Task
+objects hold no state: what one episode asks is its layout, what has happened so far is its memory, and both are
+frozen values, so that an episode can be saved and restored.
 """
 
 from __future__ import annotations
 
 import difflib
 import importlib
+import importlib.util
 import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator

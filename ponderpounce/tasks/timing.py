@@ -1,9 +1,9 @@
 """When to be where on a joint path: the fastest timing under speed and acceleration limits.
 
-Reachability analysis after Pham and Pham, "A new approach to time-optimal path parameterization" (TOPP-RA), 2018. Along a
-path q(s) the unknowns are x = (ds/dt)^2 and u = d2s/dt2. Joint accelerations q'u + q''x are linear in both, and x moves
-linearly with u from one grid point to the next, so a backward pass of small linear programs finds the largest x from which
-the end can still be reached, and a forward pass takes the largest u that stays below.
+Reachability analysis after Pham and Pham, "A new approach to time-optimal path parameterization" (TOPP-RA), 2018.
+Along a path q(s) the unknowns are x = (ds/dt)^2 and u = d2s/dt2. Joint accelerations q'u + q''x are linear in both,
+and x moves linearly with u from one grid point to the next, so a backward pass of small linear programs finds the
+largest x from which the end can still be reached, and a forward pass takes the largest u that stays below.
 """
 
 from __future__ import annotations
@@ -41,28 +41,25 @@ def fastest(path: Array, *, max_speed: float, max_acceleration: float) -> Array:
 
 
 def sample(path: Array, times_s: Array, period_s: float) -> Array:
-    """Returns the path's points at even times (m, joints), both ends included, at most ``period_s`` apart by rounding down.
+    """Returns the path's points at even times (m, joints), both ends included, about ``period_s`` apart.
 
-    Rounding the number of samples down is upstream's habit: consecutive targets may differ a little faster than the limit.
+    Rounding the number of samples down is upstream's habit: consecutive targets may differ a little faster than the
+    limit.
     """
     num_samples = max(2, int(times_s[-1] / period_s))
     even_s = np.linspace(0.0, times_s[-1], num_samples)
     return np.stack([np.interp(even_s, times_s, joint) for joint in path.T], axis=1)
 
 
-def _acceleration_bounds(
-    slope: Array, bend: Array, limit: float
-) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Lower and upper bounds on u, each as (offset, rate): u >= offset + rate x, u <= offset + rate x, per moving joint."""
+def _acceleration_bounds(slope: Array, bend: Array, limit: float) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Lower and upper bounds on u per moving joint, each as (offset, rate): offset + rate x."""
     moving = np.abs(slope) > 1e-6
     slope, bend = slope[moving], bend[moving]
     offset, rate = limit / np.abs(slope), -bend / slope
     return (-offset, rate), (offset, rate)
 
 
-def _largest_x(
-    slope: Array, bend: Array, limit: float, *, x_next_max: float, ds: float, x_cap: float
-) -> float:
+def _largest_x(slope: Array, bend: Array, limit: float, *, x_next_max: float, ds: float, x_cap: float) -> float:
     """The largest x from which some allowed u leads into [0, x_next_max] within one grid step.
 
     Eliminating u leaves one inequality per (lower, upper) pair of bounds on it.

@@ -3,8 +3,8 @@
 White discs lie under the target cubes from step 10 to step 100 and never again. They follow the step clock: whether the
 button has been pressed by then makes no difference. Source: RoboMME's PickHighlight at 598e3b4, rules restated.
 
-Kept from upstream on purpose: the episode is a success as soon as every target has been lifted once, in any order, even if
-the button was never pressed; and lifting a wrong cube fails only once the button has been pressed.
+Kept from upstream on purpose: the episode is a success as soon as every target has been lifted once, in any order,
+even if the button was never pressed; and lifting a wrong cube fails only once the button has been pressed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from ponderpounce.tasks import captions, predicates
-from ponderpounce.tasks.geometry import Footprint, pose
+from ponderpounce.tasks.geometry import pose
 from ponderpounce.tasks.oracle import Actions, Motions
 from ponderpounce.tasks.physics import Physics
 from ponderpounce.tasks.scene import (
