@@ -1,11 +1,10 @@
 """The action engine: one request in, one chunk of absolute joint targets out.
 
 Everything a peer can get wrong is refused here, by name; behind `invoke` shapes are trusted.
-
-    # N horizon, A padded action dim, K carriers, H carrier size
 """
 
-import math
+# N horizon, A padded action dim, K carriers, H carrier size
+
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -55,7 +54,7 @@ class EngineSpec:
     dtype: DTypeName
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Request:
     """One invocation's inputs, at one instant."""
 
@@ -69,7 +68,7 @@ class Request:
     age_ns: int
     """Age of the cognition's source observation; 0 with null."""
     seed: int
-    """Of the starting noise: the same seed and inputs give the same rows, bit for bit, on one machine."""
+    """Of the starting noise, at least 0: same seed and inputs, same rows, bit for bit on one machine."""
 
 
 def _silent() -> None:
@@ -151,8 +150,8 @@ class Pi05Engine:
         token_ids = self._tokenizer.encode(prompt_text(request.instruction, state))
         if len(token_ids) > self._config.max_prompt_tokens:
             raise ValueError(
-                f"prompt has {len(token_ids)} tokens, the model was trained with at most "
-                f"{self._config.max_prompt_tokens}; shorten the instruction: {request.instruction[:60]!r}"
+                f"prompt has {len(token_ids)} tokens, expected at most {self._config.max_prompt_tokens} "
+                f"(max_prompt_tokens); shorten the instruction {request.instruction[:60]!r}"
             )
         cognition = None
         if request.cognition is not None:
@@ -179,17 +178,15 @@ def check_request(request: Request, spec: EngineSpec) -> None:
     if not request.instruction.strip():
         raise ValueError("instruction is empty; POUNCE needs the task's text")
     if len(request.frames) != spec.num_cameras:
-        raise ValueError(
-            f"expected {spec.num_cameras} frames (front, wrist order), came {len(request.frames)}"
-        )
+        raise ValueError(f"expected {spec.num_cameras} frames (front, wrist order), came {len(request.frames)}")
     if all(frame is None for frame in request.frames):
         raise ValueError(f"all {spec.num_cameras} cameras are missing; POUNCE does not act blind")
     for index, frame in enumerate(request.frames):
-        if frame is not None and (
-            frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3 or not frame.size
-        ):
+        if frame is not None and (frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3 or not frame.size):
             raise ValueError(f"frame {index}: expected (h, w, 3) uint8, came {frame.shape} {frame.dtype}")
     _check_floats("proprio", request.proprio, (spec.proprio_dim,))
+    if not 0 <= request.seed < 2**63:
+        raise ValueError(f"seed: expected 0 <= seed < 2**63, came {request.seed}")
     if request.age_ns < 0:
         raise ValueError(f"age_ns must not be negative, came {request.age_ns}: cognition from the future")
     if request.cognition is None:
@@ -205,20 +202,19 @@ def _check_floats(name: str, values: NDArray[np.float32], shape: tuple[int, ...]
     if values.shape != shape or values.dtype != np.float32:
         raise ValueError(f"{name}: expected {shape} float32, came {values.shape} {values.dtype}")
     if not np.isfinite(values).all():
-        bad = [int(index) for index in np.flatnonzero(~np.isfinite(values))]
+        bad = np.flatnonzero(~np.isfinite(values))
         raise ValueError(f"{name}: expected finite numbers, came {len(bad)} that are not, first at {bad[0]}")
 
 
 def example_request(spec: EngineSpec, *, frame_px: int = 256, seed: int = 0) -> Request:
-    """Fabricates a request that fits ``spec``: noise for pictures, a home pose, cognition 300 ms old."""
+    """Fabricates a request that fits ``spec``: noise for pictures, joints at zero, cognition 300 ms old."""
     generator = np.random.default_rng(seed)
     shape = (frame_px, frame_px, 3)
     cognition = generator.standard_normal((spec.num_carriers, spec.cognition_size)).astype(np.float32)
-    home = np.array([0.0, 0.0, 0.0, -math.pi / 2, 0.0, math.pi / 2, math.pi / 4, 0.04], dtype=np.float32)
     return Request(
         instruction="press the button, pick all cubes that were highlighted, then press it again to stop",
         frames=tuple(generator.integers(0, 256, shape, dtype=np.uint8) for _ in range(spec.num_cameras)),
-        proprio=home,
+        proprio=np.zeros(spec.proprio_dim, dtype=np.float32),
         cognition=cognition if spec.num_carriers else None,
         age_ns=300_000_000 if spec.num_carriers else 0,
         seed=seed,

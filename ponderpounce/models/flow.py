@@ -2,9 +2,9 @@
 
 Convention: t = 1 is noise and t = 0 is data, as in the public pi0.5 code. The pi0 paper and GR00T N1.5 write
 it the other way round; weights of one convention, sampled with the other, drive away from the data.
-
-    # B batch, N horizon, A action dim
 """
+
+# B batch, N horizon, A action dim
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -49,9 +49,9 @@ def mean_loss(loss_BNA: Tensor, num_real_dims: int, over: LossDims = "real") -> 
     weighs action error alone.
     """
     if not 0 < num_real_dims <= loss_BNA.shape[-1]:
-        raise ValueError(
-            f"num_real_dims must be 1..{loss_BNA.shape[-1]} (padded action dim), came {num_real_dims}"
-        )
+        raise ValueError(f"num_real_dims must be 1..{loss_BNA.shape[-1]} (padded action dim), came {num_real_dims}")
+    if over not in ("real", "all"):
+        raise ValueError(f"over must be 'real' or 'all', came {over!r}")
     return (loss_BNA if over == "all" else loss_BNA[..., :num_real_dims]).mean()
 
 
@@ -66,7 +66,7 @@ def euler_times(num_steps: int) -> list[float]:
     return [1.0 - step / num_steps for step in range(num_steps)]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class EulerStep:
     """One step of the sampler: where it was taken, the velocity there, and the actions after it."""
 
@@ -75,15 +75,13 @@ class EulerStep:
     actions: Tensor
 
 
-def euler(
-    velocity_at: Callable[[int, Tensor], Tensor], noise_BNA: Tensor, num_steps: int
-) -> Iterator[EulerStep]:
+def euler(velocity_at: Callable[[int, Tensor], Tensor], noise_BNA: Tensor, num_steps: int) -> Iterator[EulerStep]:
     """Integrates from noise at t = 1 to actions at t = 0; yields after every step.
 
     ``velocity_at(index, x_BNA)`` is the network at time ``euler_times(num_steps)[index]``.
     """
     x_BNA = noise_BNA
-    for index in range(len(euler_times(num_steps))):
+    for index in range(num_steps):
         velocity_BNA = velocity_at(index, x_BNA)
         x_BNA = x_BNA - velocity_BNA / num_steps
         yield EulerStep(index, velocity_BNA, x_BNA)

@@ -1,8 +1,7 @@
-"""Gemma layers as pi0.5 uses them: a plain stream for what is seen, an adaRMS stream for the actions.
+"""Gemma layers as pi0.5 uses them: a plain stream for what is seen, an adaRMS stream for the actions."""
 
 # B batch, T query tokens, S key tokens, W width, h query heads, g key heads, D head dim
 # M norms of the expert (two per layer and the last), E expert width
-"""
 
 import math
 from dataclasses import dataclass
@@ -30,14 +29,12 @@ class GemmaConfig:
 
     def __post_init__(self) -> None:
         if self.num_heads % self.num_kv_heads:
-            raise ValueError(
-                f"{self.num_heads} query heads do not share {self.num_kv_heads} key heads evenly"
-            )
+            raise ValueError(f"{self.num_heads} query heads do not share {self.num_kv_heads} key heads evenly")
         if self.head_dim % 2:
             raise ValueError(f"head_dim {self.head_dim} is odd; RoPE rotates pairs")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Rotation:
     """RoPE of given positions: cosines and sines, (B, 1, T, D/2) float32."""
 
@@ -174,7 +171,5 @@ class ActionExpert(nn.Module):
 
     def styles(self, cond_BE: Tensor) -> Tensor:
         """Returns (M, 3, B, 1, E): the styles of all norms in the order in which the stream meets them."""
-        norms = [
-            norm for layer in self.layers for norm in (layer.input_layernorm, layer.post_attention_layernorm)
-        ]
+        norms = [norm for layer in self.layers for norm in (layer.input_layernorm, layer.post_attention_layernorm)]
         return torch.stack([norm.style(cond_BE) for norm in (*norms, self.norm)])

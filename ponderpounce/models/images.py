@@ -22,7 +22,8 @@ def resize_with_pad(frame: NDArray[np.uint8], size_px: int) -> Tensor:
     longest_px = max(height_px, width_px)
     new_height_px = max(1, height_px * size_px // longest_px)
     new_width_px = max(1, width_px * size_px // longest_px)
-    pixels = torch.from_numpy(np.ascontiguousarray(frame)).permute(2, 0, 1)
+    # Copied: frames off the wire are read-only views of bytes, which torch warns of, and may have any strides.
+    pixels = torch.from_numpy(np.array(frame, order="C")).permute(2, 0, 1)
     if (new_height_px, new_width_px) != (height_px, width_px):
         pixels = F.interpolate(
             pixels[None], (new_height_px, new_width_px), mode="bilinear", antialias=True, align_corners=False

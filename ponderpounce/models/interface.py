@@ -5,9 +5,9 @@ Choices the paper leaves open, made here: the age enters as [sin | cos] at log-s
 the rms of the text embeddings. That scale matters little to pi0.5, whose first act is a scale-free RMSNorm: a
 small W_c does not make the prefix silent, and even an all-zero token takes part in the softmax. Null is not
 absent.
-
-    # B batch, K carriers, H size of a carrier state, W width of the language stream, P = 1 + K tokens
 """
+
+# B batch, K carriers, H size of a carrier state, W width of the language stream, P = 1 + K tokens
 
 from dataclasses import dataclass
 from typing import Any, Literal, cast
@@ -48,6 +48,8 @@ class CognitionConfig:
             raise ValueError(f"num_carriers must be 0..{MAX_CARRIERS}, came {self.num_carriers}")
         if self.cognition_size < 1:
             raise ValueError(f"cognition_size must be at least 1, came {self.cognition_size}")
+        if self.age_features < 2 or self.age_features % 2:
+            raise ValueError(f"age_features must be even and at least 2, came {self.age_features}")
         if self.attention not in ("full", "isolated"):
             raise ValueError(f"attention must be 'full' or 'isolated', came {self.attention!r}")
 
@@ -97,26 +99,30 @@ class CognitionPrefix(nn.Module):
             std = text_rms * self.config.cognition_size**-0.5
         self.projector.weight.normal_(std=std, generator=generator)
         self.projector.bias.zero_()
-        # Half of the squared features are sin^2 + cos^2 = 1 in pairs: rms sqrt(1/2) at every age.
-        self.age_projection.weight.normal_(
-            std=text_rms * (self.config.age_features / 2) ** -0.5, generator=generator
-        )
+        # sin^2 + cos^2 = 1 per period: the features' squared length is age_features / 2 at every age.
+        age_std = text_rms * (self.config.age_features / 2) ** -0.5
+        self.age_projection.weight.normal_(std=age_std, generator=generator)
         self.null_cognition.zero_()
 
-    def forward(
-        self, cognition_BKH: Tensor | None, age_ns_B: Tensor, is_null_B: Tensor | None = None
-    ) -> Tensor:
+    def forward(self, cognition_BKH: Tensor | None, age_ns_B: Tensor, is_null_B: Tensor | None = None) -> Tensor:
         """Returns P, (B, 1 + K, W) float32.
 
         Args:
             cognition_BKH: carrier states; None means null for every sample.
             age_ns_B: int64 age of each cognition. Null samples get age 0 whatever stands here (paper 3.1).
             is_null_B: bool, samples that see C_null instead: nothing ready yet, or cognition dropout.
+
+        Raises:
+            ValueError: cognition has another K or H than configured; the network would run with any K.
         """
-        batch_size = age_ns_B.shape[0]
-        null_BKH = self.null_cognition.expand(batch_size, -1, -1)
+        null_BKH = self.null_cognition.expand(len(age_ns_B), -1, -1)
         if cognition_BKH is None:
             source_BKH, age_ns_B = null_BKH, torch.zeros_like(age_ns_B)
+        elif cognition_BKH.shape != null_BKH.shape:
+            raise ValueError(
+                f"cognition: expected {tuple(null_BKH.shape)}, came {tuple(cognition_BKH.shape)} "
+                "(batch, num_carriers, cognition_size)"
+            )
         else:
             # Scaled before the null is chosen: C_null is POUNCE's own parameter and learns at full rate.
             source_BKH = scale_gradient(cognition_BKH.float(), self.config.gradient_scale)

@@ -1,7 +1,6 @@
-"""Robot units to the network's [-1, 1] and back: quantiles, and arm actions as deltas from the current state.
+"""Robot units to the network's [-1, 1] and back: quantiles, and arm actions as deltas from the current state."""
 
 # N horizon, 8 = 7 arm joints (rad) + gripper
-"""
 
 from dataclasses import dataclass
 
@@ -42,15 +41,11 @@ class Quantiles:
 
     def normalise(self, values: ArrayLike) -> Floats:
         """(..., dims) in robot units -> (..., dims) float32, mostly in [-1, 1]."""
-        return ((np.asarray(values, dtype=np.float64) - self._low) / self._span * 2.0 - 1.0).astype(
-            np.float32
-        )
+        return ((np.asarray(values, dtype=np.float64) - self._low) / self._span * 2.0 - 1.0).astype(np.float32)
 
     def denormalise(self, values: ArrayLike) -> Floats:
         """Inverse of `normalise`."""
-        return ((np.asarray(values, dtype=np.float64) + 1.0) / 2.0 * self._span + self._low).astype(
-            np.float32
-        )
+        return ((np.asarray(values, dtype=np.float64) + 1.0) / 2.0 * self._span + self._low).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

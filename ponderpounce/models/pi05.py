@@ -1,12 +1,13 @@
 """pi0.5: a PaliGemma that sees, and an action expert that reads its keys and values.
 
-The token stream is [cognition P][view 0]...[view V-1][text], the "prefix" of the pi0 literature, and then the
-action tokens. The prefix never sees the actions, so its keys and values are computed once (`prefill`) and
-every evaluation of the velocity, in training as in sampling, reads them (`velocity`).
-
-    # B batch, V views, P cognition tokens, T prefix tokens, N horizon, A action dim
-    # W language width, E expert width, h/g query/key heads, D head dim, M norms of the expert
+The token stream is [cognition P][view 0]...[view V-1][text], then the action tokens. All before the actions is
+"prefix" here, as in the pi0 literature; the paper's prefix P is "cognition". The prefix never sees the actions,
+so its keys and values are computed once (`prefill`), and every evaluation of the velocity, in training as in
+sampling, reads them (`velocity`).
 """
+
+# B batch, V views, P cognition tokens, T prefix tokens, N horizon, A action dim
+# W language width, E expert width, h/g query/key heads, D head dim, M norms of the expert
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -37,16 +38,13 @@ class Pi05Config:
     horizon: int = 50
 
     def __post_init__(self) -> None:
-        shared = ("depth", "num_heads", "num_kv_heads", "head_dim")
-        for name in shared:
-            ours, theirs = getattr(self.language, name), getattr(self.expert, name)
-            if ours != theirs:
-                raise ValueError(
-                    f"both streams attend jointly: language.{name} {ours} != expert.{name} {theirs}"
-                )
+        for name in ("depth", "num_heads", "num_kv_heads", "head_dim"):
+            language, expert = getattr(self.language, name), getattr(self.expert, name)
+            if language != expert:
+                raise ValueError(f"both streams attend jointly: language.{name} {language} != expert.{name} {expert}")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Prefix:
     """The embedded prefix stream before the first layer."""
 
@@ -76,7 +74,7 @@ class Prefix:
         return visible_B11T & same_part_TT
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PrefixCache:
     """What the action stream reads of the prefix."""
 
@@ -89,7 +87,7 @@ class PrefixCache:
     """(B,) int64: the position of the first action token."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StepTable:
     """The adaRMS styles at every time of the Euler sampler: constants of the weights, computed once.
 
@@ -102,7 +100,7 @@ class StepTable:
 
 
 class Pi05(nn.Module):
-    """The public pi0.5 network. Parameters are float32 or mixed as in `cast_for_serving`."""
+    """The public pi0.5 network, and room for cognition tokens at the front of its prefix."""
 
     def __init__(self, config: Pi05Config) -> None:
         super().__init__()
@@ -163,9 +161,7 @@ class Pi05(nn.Module):
         Of the last layer only keys and values are computed: its output feeds nothing.
         """
         keys, values, _ = self._run_prefix(prefix, last_layer_output=False)
-        return PrefixCache(
-            keys=keys, values=values, visible=prefix.is_real, num_real=prefix.is_real.sum(dim=1)
-        )
+        return PrefixCache(keys=keys, values=values, visible=prefix.is_real, num_real=prefix.is_real.sum(dim=1))
 
     def prefix_hidden(self, prefix: Prefix) -> Tensor:
         """Returns (B, T, W) after the last norm. Acting needs it nowhere; parity tests and probes do."""
@@ -193,9 +189,7 @@ class Pi05(nn.Module):
 
     def time_condition(self, time_B: Tensor) -> Tensor:
         """Returns (B, E): the vector every adaRMS norm of the expert is conditioned on."""
-        features_BE = sinusoid(
-            time_B, self.config.expert.width, min_period=TIME_MIN_PERIOD, max_period=TIME_MAX_PERIOD
-        )
+        features_BE = sinusoid(time_B, self.config.expert.width, min_period=TIME_MIN_PERIOD, max_period=TIME_MAX_PERIOD)
         return F.silu(self.time_mlp_out(F.silu(self.time_mlp_in(features_BE))))
 
     def step_table(self, num_steps: int) -> StepTable:

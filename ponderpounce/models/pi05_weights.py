@@ -26,6 +26,7 @@ _TIED_HEAD = _ROOT + "paligemma.lm_head.weight"
 _EMBEDDING = _PALIGEMMA + "language_model.embed_tokens.weight"
 _UNUSED_HEAD = _ROOT + "gemma_expert.lm_head.weight"
 _LEROBOT_PREFIX = "model."
+_COGNITION = "pounce_prefix."
 
 # (ours, public), first match wins; names below these prefixes are the same on both sides.
 _PREFIXES = (
@@ -37,7 +38,7 @@ _PREFIXES = (
     ("pi05.language.", _PALIGEMMA + "language_model."),
     ("pi05.expert.", _EXPERT),
     ("pi05.", ""),  # action_in_proj, action_out_proj, time_mlp_in, time_mlp_out
-    ("prefix.", "pounce_prefix."),
+    ("cognition_prefix.", _COGNITION),
 )
 
 
@@ -94,9 +95,9 @@ def load_weights(model: Pounce, path: Path) -> bool:
     """
     found = read_weights(path)
     wanted = {public_name(name): name for name in model.state_dict()}
-    has_prefix = any(name.startswith("pounce_prefix.") for name in found)
+    has_prefix = any(name.startswith(_COGNITION) for name in found)
     if not has_prefix:
-        wanted = {public: name for public, name in wanted.items() if not public.startswith("pounce_prefix.")}
+        wanted = {public: name for public, name in wanted.items() if not public.startswith(_COGNITION)}
     parameters = dict(model.named_parameters())
     shapes = {
         public: (tuple(parameters[name].shape), tuple(found[public].shape))
@@ -107,9 +108,7 @@ def load_weights(model: Pounce, path: Path) -> bool:
         "missing": wanted.keys() - found.keys(),
         "unknown": found.keys() - wanted.keys(),
         "misshapen": [
-            f"{name} expected {ours} came {theirs}"
-            for name, (ours, theirs) in shapes.items()
-            if ours != theirs
+            f"{name} expected {ours} came {theirs}" for name, (ours, theirs) in shapes.items() if ours != theirs
         ],
     }
     if any(problems.values()):

@@ -1,7 +1,6 @@
-"""POUNCE, System 1: pi0.5 with the cognition prefix in front of what it sees (paper 3.1).
+"""POUNCE, System 1: pi0.5 with the cognition prefix in front of what it sees (paper 3.1)."""
 
 # B batch, V views, T text tokens, K carriers, H carrier size, N horizon, A padded action dim
-"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from ponderpounce.models.pi05 import Pi05, Pi05Config, PrefixCache, StepTable
 Freeze = Literal["none", "vision", "vlm"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PounceInputs:
     """One batch as the network takes it: resized, normalised, tokenised."""
 
@@ -53,9 +52,7 @@ class PounceConfig:
 
     def __post_init__(self) -> None:
         if not 0 < self.robot_action_dim <= self.pi05.action_dim:
-            raise ValueError(
-                f"robot_action_dim must be 1..{self.pi05.action_dim}, came {self.robot_action_dim}"
-            )
+            raise ValueError(f"robot_action_dim must be 1..{self.pi05.action_dim}, came {self.robot_action_dim}")
         for name in ("num_cameras", "num_steps", "max_prompt_tokens"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, came {getattr(self, name)}")
@@ -67,9 +64,7 @@ class PounceConfig:
         cognition = self.cognition
         image_shape = (batch_size, self.num_cameras, 3, px, px)
         token_shape = (batch_size, num_tokens)
-        cognition_BKH = torch.randn(
-            (batch_size, cognition.num_carriers, cognition.cognition_size), generator=generator
-        )
+        cognition_BKH = torch.randn((batch_size, cognition.num_carriers, cognition.cognition_size), generator=generator)
         return PounceInputs(
             images=torch.rand(image_shape, generator=generator) * 2 - 1,
             has_view=torch.ones(batch_size, self.num_cameras, dtype=torch.bool),
@@ -95,13 +90,14 @@ class Pounce(nn.Module):
         self.config = config
         self.pi05 = Pi05(config.pi05)
         has_prefix = config.cognition.num_carriers > 0
-        self.prefix = CognitionPrefix(config.cognition, config.pi05.language.width) if has_prefix else None
+        width = config.pi05.language.width
+        self.cognition_prefix = CognitionPrefix(config.cognition, width) if has_prefix else None
 
     def prefill(self, inputs: PounceInputs) -> PrefixCache:
         """Embeds [P][images][text] and runs it through the language layers once."""
         cognition_BPW = None
-        if self.prefix is not None:
-            cognition_BPW = self.prefix(inputs.cognition, inputs.age_ns, inputs.is_null)
+        if self.cognition_prefix is not None:
+            cognition_BPW = self.cognition_prefix(inputs.cognition, inputs.age_ns, inputs.is_null)
         prefix = self.pi05.embed_prefix(
             inputs.images,
             inputs.has_view,
@@ -112,8 +108,24 @@ class Pounce(nn.Module):
         )
         return self.pi05.prefill(prefix)
 
-    def loss(self, inputs: PounceInputs, actions_BNA: Tensor, noise_BNA: Tensor, time_B: Tensor) -> Tensor:
-        """Returns the unreduced flow-matching loss, (B, N, A); reduce it with `flow.mean_loss`."""
+    def loss(
+        self,
+        inputs: PounceInputs,
+        actions_BNA: Tensor,
+        noise_BNA: Tensor,
+        time_B: Tensor,
+        *,
+        over: flow.LossDims = "real",
+    ) -> Tensor:
+        """Returns the scalar L_fm, by default over the robot's action dims only (`flow.mean_loss`).
+
+        ``actions_BNA`` are normalised and zero beyond the robot's dims; noise fills all of A, as in sampling.
+        """
+        unreduced_BNA = self.unreduced_loss(inputs, actions_BNA, noise_BNA, time_B)
+        return flow.mean_loss(unreduced_BNA, self.config.robot_action_dim, over)
+
+    def unreduced_loss(self, inputs: PounceInputs, actions_BNA: Tensor, noise_BNA: Tensor, time_B: Tensor) -> Tensor:
+        """Returns the squared error of the velocity, (B, N, A)."""
         x_BNA = flow.noised(actions_BNA, noise_BNA, time_B)
         velocity_BNA = self.pi05.velocity_at(x_BNA, time_B, self.prefill(inputs))
         return (flow.target_velocity(actions_BNA, noise_BNA) - velocity_BNA).square()
@@ -122,7 +134,7 @@ class Pounce(nn.Module):
         return self.pi05.step_table(self.config.num_steps)
 
     def sample(self, inputs: PounceInputs, noise_BNA: Tensor, table: StepTable) -> Iterator[flow.EulerStep]:
-        """Yields the sampler's steps; the last one's ``actions_BNA`` are the normalised chunk."""
+        """Yields the sampler's steps; the actions of the last are the normalised chunk."""
         return self.pi05.sample(noise_BNA, self.prefill(inputs), table)
 
 

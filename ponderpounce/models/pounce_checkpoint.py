@@ -113,7 +113,7 @@ def load_bundle(
         tokenizer=Tokenizer.from_file(tokenizer or folder / TOKENIZER_FILE),
         statistics=statistics,
         is_random=is_random,
-        has_fresh_prefix=stored.get("has_fresh_prefix", False) if has_prefix else model.prefix is not None,
+        has_fresh_prefix=stored.get("has_fresh_prefix", False) if has_prefix else model.cognition_prefix is not None,
     )
 
 

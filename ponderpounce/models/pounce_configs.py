@@ -10,9 +10,7 @@ ROBOMME_HORIZON = 20
 """One second of 20 Hz playback (paper B.1)."""
 
 
-def pi05_base(
-    *, num_carriers: int = 1, cognition_size: int = 4096, horizon: int = ROBOMME_HORIZON
-) -> PounceConfig:
+def pi05_base(*, num_carriers: int = 1, cognition_size: int = 4096, horizon: int = ROBOMME_HORIZON) -> PounceConfig:
     """The 3.35 B public pi0.5 with the paper's prefix: two views, K = 1 from a 9B PONDER, 20-step chunks."""
     return PounceConfig(
         pi05=Pi05Config(
@@ -25,9 +23,7 @@ def pi05_base(
     )
 
 
-def tiny_cpu(
-    *, num_carriers: int = 1, cognition_size: int = 64, horizon: int = ROBOMME_HORIZON
-) -> PounceConfig:
+def tiny_cpu(*, num_carriers: int = 1, cognition_size: int = 64, horizon: int = ROBOMME_HORIZON) -> PounceConfig:
     """A network of the same parts that one CPU thread runs at 20 Hz; for random weights and tests.
 
     Frames are resized to the public 224 px but cut into 28 px patches, 64 a view. With the public 14 px,

@@ -4,6 +4,7 @@ import torch
 from torch import nn
 
 from ponderpounce.models.gemma import RmsNorm
+from ponderpounce.models.pi05 import Pi05
 from ponderpounce.models.pounce import Pounce, PounceConfig
 
 
@@ -16,23 +17,23 @@ def random_pounce(config: PounceConfig, seed: int) -> Pounce:
         model = Pounce(config)
     model.to_empty(device="cpu")
     generator = torch.Generator().manual_seed(seed)
-    _initialise_pi05(model.pi05, generator)
+    initialise_pi05(model.pi05, generator)
     initialise_prefix(model, generator)
     return model
 
 
 def initialise_prefix(model: Pounce, generator: torch.Generator) -> None:
-    """Draws fresh prefix weights to the scale of the text embeddings that ``model`` holds; no-op at K = 0."""
-    if model.prefix is None:
+    """Draws a fresh cognition prefix to the scale of the model's text embeddings; nothing to do at K = 0."""
+    if model.cognition_prefix is None:
         return
     embedding = model.pi05.language.embed_tokens.weight.detach()
     text_rms = embedding.float().square().mean().sqrt().item() * embedding.shape[1] ** 0.5
-    model.prefix.to_empty(device=embedding.device)
-    model.prefix.initialise(text_rms, generator)
+    model.cognition_prefix.to_empty(device=embedding.device)
+    model.cognition_prefix.initialise(text_rms, generator)
 
 
 @torch.no_grad()
-def _initialise_pi05(pi05: nn.Module, generator: torch.Generator) -> None:
+def initialise_pi05(pi05: Pi05, generator: torch.Generator) -> None:
     """Keeps the variance of activations: weights N(0, 1 / fan-in), biases 0, norms the identity.
 
     The adaRMS layers are drawn like the rest. Public training starts them at zero, which shuts every gate:

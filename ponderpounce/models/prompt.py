@@ -55,9 +55,7 @@ class Tokenizer:
         self.model_bytes = model_bytes
         self._pieces = sentencepiece.SentencePieceProcessor(model_proto=model_bytes)
         if self._pieces.bos_id() < 0:
-            raise ValueError(
-                "tokenizer has no BOS piece; pi0.5 prompts begin with one (paligemma_tokenizer.model has)"
-            )
+            raise ValueError("tokenizer has no BOS piece; pi0.5 prompts begin with one (paligemma_tokenizer.model has)")
 
     @classmethod
     def from_file(cls, path: Path) -> "Tokenizer":

@@ -1,7 +1,6 @@
-"""SigLIP vision tower: pixels to one feature per patch, without a pooling head (So400m/14 in pi0.5).
+"""SigLIP vision tower: pixels to one feature per patch, without a pooling head (So400m/14 in pi0.5)."""
 
 # B images, S patches, W width, h heads, D head dim, M mlp width, P image px
-"""
 
 from dataclasses import dataclass
 

@@ -1,7 +1,6 @@
-"""A scalar as sines and cosines: how flow time and cognition age enter a network.
+"""A scalar as sines and cosines: how flow time and cognition age enter a network."""
 
 # B batch, F features
-"""
 
 import math
 

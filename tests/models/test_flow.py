@@ -30,9 +30,7 @@ def test_path_begins_in_noise_and_ends_in_data(seed: int) -> None:
 @given(seed=st.integers(0, 1000), early=st.floats(0, 1), late=st.floats(0, 1))
 def test_target_is_the_slope_of_the_path(seed: int, early: float, late: float) -> None:
     actions, noise = _pair(seed)
-    rise = flow.noised(actions, noise, torch.full((2,), late)) - flow.noised(
-        actions, noise, torch.full((2,), early)
-    )
+    rise = flow.noised(actions, noise, torch.full((2,), late)) - flow.noised(actions, noise, torch.full((2,), early))
     torch.testing.assert_close(rise, (late - early) * flow.target_velocity(actions, noise), atol=1e-5, rtol=0)
 
 
@@ -84,9 +82,7 @@ def test_times_follow_the_stretched_beta_and_their_seed() -> None:
     assert times.min() >= flow.TIME_MIN
     assert times.max() <= 1.0
     assert times.mean().item() == pytest.approx(0.6 * flow.TIME_SPAN + flow.TIME_MIN, abs=0.01)
-    assert (times < 0.5).float().mean().item() == pytest.approx(
-        0.5**1.5, abs=0.02
-    )  # the cdf of Beta(1.5, 1) is x^1.5
+    assert (times < 0.5).float().mean().item() == pytest.approx(0.5**1.5, abs=0.02)  # the cdf of Beta(1.5, 1) is x^1.5
     assert torch.equal(times, flow.sample_times(20_000, torch.Generator().manual_seed(0)))
 
 
@@ -95,3 +91,5 @@ def test_refusals_say_what_came() -> None:
         flow.euler_times(0)
     with pytest.raises(ValueError, match=r"1\.\.6 .* came 7"):
         flow.mean_loss(torch.zeros(SHAPE), 7)
+    with pytest.raises(ValueError, match="'real' or 'all', came 'some'"):
+        flow.mean_loss(torch.zeros(SHAPE), 6, over="some")

@@ -59,8 +59,11 @@ def test_a_missing_camera_is_black_and_flagged() -> None:
     assert has_view.tolist() == [[True, False]]
 
 
+def test_read_only_frames_off_the_wire_pass_without_a_warning() -> None:
+    frame = np.frombuffer(_frame(64, 64).tobytes(), np.uint8).reshape(64, 64, 3)
+    assert resize_with_pad(frame, SIZE_PX).shape == (3, SIZE_PX, SIZE_PX)
+
+
 def test_strided_frames_are_read_right() -> None:
     frame = _frame(64, 64)
-    assert torch.equal(
-        resize_with_pad(frame[:, ::-1], SIZE_PX), resize_with_pad(frame[:, ::-1].copy(), SIZE_PX)
-    )
+    assert torch.equal(resize_with_pad(frame[:, ::-1], SIZE_PX), resize_with_pad(frame[:, ::-1].copy(), SIZE_PX))

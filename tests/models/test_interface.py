@@ -122,12 +122,19 @@ def test_one_playback_tick_of_age_is_visible() -> None:
         ({"num_carriers": 17}, r"0\.\.16, came 17"),
         ({"num_carriers": -1}, r"0\.\.16, came -1"),
         ({"cognition_size": 0}, "at least 1, came 0"),
+        ({"age_features": 7}, "even and at least 2, came 7"),
         ({"attention": "half"}, "'full' or 'isolated', came 'half'"),
     ],
 )
 def test_wrong_configurations_are_refused(wrong: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         CognitionConfig(**wrong)
+
+
+@pytest.mark.parametrize("shape", [(2, 2, SIZE), (2, 3, SIZE + 1), (1, 3, SIZE)])
+def test_cognition_of_another_shape_is_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"expected \(2, 3, 24\), came"):
+        _prefix()(torch.zeros(shape), AGES_NS)
 
 
 def test_no_carriers_no_module() -> None:

@@ -22,9 +22,7 @@ def test_denormalise_inverts_normalise(values: np.ndarray) -> None:
 @pytest.mark.parametrize("table", [ROBOMME.state, ROBOMME.action], ids=["state", "action"])
 def test_quantiles_map_to_the_ends(table: Quantiles) -> None:
     np.testing.assert_allclose(table.normalise(table.q01), -1.0, atol=1e-6)
-    np.testing.assert_allclose(
-        table.normalise(table.q99), 1.0, atol=1e-4
-    )  # the public epsilon in the denominator
+    np.testing.assert_allclose(table.normalise(table.q99), 1.0, atol=1e-4)  # the public epsilon in the denominator
 
 
 def test_values_beyond_the_quantiles_are_not_clipped() -> None:
@@ -52,9 +50,7 @@ def test_arm_moves_with_the_state_and_gripper_does_not(actions: np.ndarray, stat
 def test_gripper_is_clipped_to_its_command_range() -> None:
     actions = np.zeros((2, 8))
     actions[:, NUM_ARM_JOINTS] = [-7.0, 7.0]
-    np.testing.assert_array_equal(
-        ROBOMME.absolute_targets(actions, np.zeros(8))[:, NUM_ARM_JOINTS], [-1.0, 1.0]
-    )
+    np.testing.assert_array_equal(ROBOMME.absolute_targets(actions, np.zeros(8))[:, NUM_ARM_JOINTS], [-1.0, 1.0])
 
 
 def test_inputs_are_left_alone() -> None:

@@ -30,7 +30,6 @@ class Golden:
     inputs: PounceInputs
     given: dict[str, Tensor]
     expected: dict[str, Tensor]
-    num_real_dims: int
 
     def prefix(self) -> Prefix:
         inputs = self.inputs
@@ -75,13 +74,9 @@ def _config(sizes: dict[str, Any]) -> PounceConfig:
 
 @pytest.fixture(scope="module", params=["pi05_base", "pi05_three_views"])
 def golden(request: pytest.FixtureRequest) -> Golden:
-    folder = next(
-        (root / request.param for root in (COMMITTED, SHARED) if (root / request.param).is_dir()), None
-    )
+    folder = next((root / request.param for root in (COMMITTED, SHARED) if (root / request.param).is_dir()), None)
     if folder is None:
-        pytest.skip(
-            f"golden {request.param} is neither committed nor in ../shared/goldens beside the checkout"
-        )
+        pytest.skip(f"golden {request.param} is neither committed nor in ../shared/goldens beside the checkout")
     sizes = json.loads((folder / "config.json").read_text())
     with torch.device("meta"):
         model = Pounce(_config(sizes))
@@ -99,7 +94,6 @@ def golden(request: pytest.FixtureRequest) -> Golden:
         inputs=inputs,
         given=given,
         expected=load_file(folder / "expected.safetensors"),
-        num_real_dims=sizes["real_action_dim"],
     )
 
 
@@ -132,10 +126,10 @@ def test_velocity(golden: Golden) -> None:
 
 def test_loss_unreduced_and_both_means(golden: Golden) -> None:
     given, expected = golden.given, golden.expected
-    loss = golden.model.loss(golden.inputs, given["actions"], given["noise"], given["time"])
-    _assert_close(loss, expected["loss_unreduced"])
-    _assert_close(flow.mean_loss(loss, golden.num_real_dims, over="all"), expected["loss_mean_all"][0])
-    _assert_close(flow.mean_loss(loss, golden.num_real_dims, over="real"), expected["loss_mean_real"][0])
+    batch = golden.inputs, given["actions"], given["noise"], given["time"]
+    _assert_close(golden.model.unreduced_loss(*batch), expected["loss_unreduced"])
+    _assert_close(golden.model.loss(*batch, over="all"), expected["loss_mean_all"][0])
+    _assert_close(golden.model.loss(*batch), expected["loss_mean_real"][0])
 
 
 def test_sampler_step_by_step(golden: Golden) -> None:
@@ -171,9 +165,7 @@ def test_isolated_prefix_hidden_from_the_actions_is_the_public_model(golden: Gol
 
 
 @pytest.mark.parametrize("attention", ["full", "isolated"])
-def test_visible_prefix_is_not_the_public_model(
-    golden: Golden, attention: Literal["full", "isolated"]
-) -> None:
+def test_visible_prefix_is_not_the_public_model(golden: Golden, attention: Literal["full", "isolated"]) -> None:
     model, inputs = _with_cognition(golden, attention)
     given = golden.given
     x_t = flow.noised(given["actions"], given["noise"], given["time"])

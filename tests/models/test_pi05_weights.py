@@ -67,9 +67,9 @@ def test_public_file_without_prefix_leaves_ours_alone(model: Pounce, saved: Path
     prefix_names = [name for name in load_file(saved) if name.startswith("pounce_prefix.")]
     _rewrite(saved, dict.fromkeys(prefix_names))
     other = random_pounce(tiny_cpu(), seed=2)
-    before = other.prefix.projector.weight.clone()
+    before = other.cognition_prefix.projector.weight.clone()
     assert load_weights(other, saved) is False
-    assert torch.equal(other.prefix.projector.weight, before)
+    assert torch.equal(other.cognition_prefix.projector.weight, before)
     assert torch.equal(other.pi05.action_in_proj.weight, model.pi05.action_in_proj.weight)
 
 

@@ -10,7 +10,7 @@ from ponderpounce.models import flow
 from ponderpounce.models.pi05 import Prefix
 from ponderpounce.models.pounce import Pounce, PounceConfig, PounceInputs, freeze
 from ponderpounce.models.pounce_configs import pi05_base, tiny_cpu
-from ponderpounce.models.pounce_init import random_pounce
+from ponderpounce.models.pounce_init import initialise_pi05, initialise_prefix, random_pounce
 
 
 def _isolated(config: PounceConfig) -> PounceConfig:
@@ -50,9 +50,7 @@ def _moved(model: Pounce, inputs: PounceInputs, **changed: Tensor | None) -> flo
 
 
 @pytest.mark.parametrize("attention", ["full", "isolated"])
-def test_everything_that_enters_moves_the_actions(
-    model: Pounce, inputs: PounceInputs, attention: str
-) -> None:
+def test_everything_that_enters_moves_the_actions(model: Pounce, inputs: PounceInputs, attention: str) -> None:
     if attention == "isolated":
         isolated = random_pounce(_isolated(model.config), seed=0)
         isolated.load_state_dict(model.state_dict())
@@ -72,6 +70,12 @@ def test_a_missing_cameras_pixels_do_not_matter(model: Pounce, inputs: PounceInp
     assert _moved(model, inputs, has_view=missing.has_view) > 1e-3
 
 
+def test_a_missing_camera_is_as_if_it_had_no_slot(model: Pounce, inputs: PounceInputs) -> None:
+    missing = replace(inputs, has_view=torch.tensor([[True, False], [True, False]]))
+    absent = replace(inputs, images=inputs.images[:, :1], has_view=inputs.has_view[:, :1])
+    torch.testing.assert_close(_velocity(model, missing), _velocity(model, absent), atol=1e-5, rtol=0)
+
+
 def test_padding_does_not_matter(model: Pounce, inputs: PounceInputs) -> None:
     padding = torch.full((2, 5), 7)
     padded = replace(
@@ -86,9 +90,7 @@ def test_rows_of_a_batch_do_not_mix(model: Pounce, inputs: PounceInputs) -> None
     together = _velocity(model, inputs)
     x, times = model.config.example_actions(2, seed=3), torch.linspace(0.2, 0.9, 2)
     for row in range(2):
-        alone = model.pi05.velocity_at(
-            x[row : row + 1], times[row : row + 1], model.prefill(_row(inputs, row))
-        )
+        alone = model.pi05.velocity_at(x[row : row + 1], times[row : row + 1], model.prefill(_row(inputs, row)))
         torch.testing.assert_close(alone[0], together[row], atol=1e-5, rtol=0)
 
 
@@ -97,22 +99,16 @@ def test_tabulated_styles_are_the_styles_of_the_time(model: Pounce, inputs: Poun
     x = model.config.example_actions(2, seed=3)
     for index, time in enumerate(flow.euler_times(model.config.num_steps)):
         direct = model.pi05.velocity_at(x, torch.full((2,), time), cache)
-        torch.testing.assert_close(
-            model.pi05.velocity(x, table.styles[index], cache), direct, atol=1e-5, rtol=0
-        )
+        torch.testing.assert_close(model.pi05.velocity(x, table.styles[index], cache), direct, atol=1e-5, rtol=0)
 
 
-def test_full_attention_lets_images_see_cognition_and_isolated_does_not(
-    model: Pounce, inputs: PounceInputs
-) -> None:
+def test_full_attention_lets_images_see_cognition_and_isolated_does_not(model: Pounce, inputs: PounceInputs) -> None:
     num_cognition = model.config.cognition.num_tokens
     other = replace(inputs, cognition=-inputs.cognition)
     isolated = random_pounce(_isolated(model.config), seed=0)
     last = -1
     for candidate, may_differ in ((model, True), (isolated, False)):
-        keys, other_keys = (
-            candidate.prefill(each).keys[last][:, :, num_cognition:] for each in (inputs, other)
-        )
+        keys, other_keys = (candidate.prefill(each).keys[last][:, :, num_cognition:] for each in (inputs, other))
         assert torch.equal(keys, other_keys) is not may_differ
 
 
@@ -141,8 +137,7 @@ def test_gradient_reaches_cognition_through_the_frozen_backbone(attention: str) 
     cognition = model.config.example_inputs(2).cognition.requires_grad_()
     inputs = replace(model.config.example_inputs(2), cognition=cognition)
     actions, noise = model.config.example_actions(2), model.config.example_actions(2, seed=9)
-    loss = model.loss(inputs, actions, noise, torch.tensor([0.3, 0.8]))
-    flow.mean_loss(loss, model.config.robot_action_dim).backward()
+    model.loss(inputs, actions, noise, torch.tensor([0.3, 0.8])).backward()
 
     assert cognition.grad is not None
     assert cognition.grad.isfinite().all()
@@ -150,8 +145,8 @@ def test_gradient_reaches_cognition_through_the_frozen_backbone(attention: str) 
     for part in (model.pi05.vision, model.pi05.projector, model.pi05.language):
         assert all(parameter.grad is None for parameter in part.parameters())
     for parameter in (
-        model.prefix.projector.weight,
-        model.prefix.age_projection.weight,
+        model.cognition_prefix.projector.weight,
+        model.cognition_prefix.age_projection.weight,
         model.pi05.expert.norm.dense.weight,
     ):
         assert (parameter.grad != 0).any()
@@ -182,6 +177,15 @@ def test_same_seed_same_weights_and_the_global_generator_is_left_alone() -> None
     assert torch.equal(torch.get_rng_state(), before)
     assert all(torch.equal(first[name], again[name]) for name in first)
     assert any(not torch.equal(first[name], other[name]) for name in first)
+
+
+def test_every_parameter_is_drawn() -> None:
+    model = random_pounce(tiny_cpu(), seed=0).requires_grad_(False)
+    for parameter in model.parameters():
+        parameter.fill_(torch.nan)
+    initialise_pi05(model.pi05, torch.Generator().manual_seed(0))
+    initialise_prefix(model, torch.Generator().manual_seed(0))
+    assert all(parameter.isfinite().all() for parameter in model.parameters())
 
 
 def test_full_size_has_the_published_parameter_count() -> None:

@@ -30,9 +30,7 @@ def folder(bundle: PounceBundle, tmp_path: Path) -> Path:
 def _make_public(folder: Path) -> None:
     """Strips a folder to what openpi publishes: pi0.5 tensors and a config in another dialect."""
     path = folder / "model.safetensors"
-    save_file(
-        {n: tensor for n, tensor in load_file(path).items() if not n.startswith("pounce_prefix.")}, path
-    )
+    save_file({n: tensor for n, tensor in load_file(path).items() if not n.startswith("pounce_prefix.")}, path)
     (folder / "config.json").write_text('{"action_dim": 32, "paligemma_variant": "gemma_2b"}')
 
 
@@ -67,12 +65,10 @@ def test_public_folder_loads_with_a_fresh_flagged_prefix(bundle: PounceBundle, f
     loaded = load_bundle(folder, config=bundle.model.config)
     assert (loaded.is_random, loaded.has_fresh_prefix) == (False, True)
     assert torch.equal(loaded.model.pi05.action_in_proj.weight, bundle.model.pi05.action_in_proj.weight)
-    assert loaded.digest() == load_bundle(folder, config=bundle.model.config).digest(), (
-        "seeded, not arbitrary"
-    )
+    assert loaded.digest() == load_bundle(folder, config=bundle.model.config).digest(), "seeded, not arbitrary"
     text_rms = bundle.model.pi05.language.embed_tokens.weight.square().mean().sqrt() * 64**0.5
     cognition = torch.randn(200, 2, 64, generator=torch.Generator().manual_seed(0))
-    tokens = loaded.model.prefix(cognition, torch.zeros(200, dtype=torch.int64))[:, 1:]
+    tokens = loaded.model.cognition_prefix(cognition, torch.zeros(200, dtype=torch.int64))[:, 1:]
     assert tokens.square().mean().sqrt().item() == pytest.approx(text_rms.item(), rel=0.1)
 
 

@@ -124,10 +124,11 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         r"cognition: expected \(2, 24\) .*came \(2, 25\)",
     ),
     "inf cognition": ({"cognition": np.full((2, 24), np.inf, np.float32)}, "cognition: expected finite"),
+    "negative seed": ({"seed": -1}, "seed: expected 0 <= seed .* came -1"),
     "negative age": ({"age_ns": -1}, "must not be negative, came -1"),
     "old null": ({"cognition": None}, "null cognition has age 0 .* came age_ns 300000000"),
     "no words": ({"instruction": " \n"}, "instruction is empty"),
-    "too many words": ({"instruction": "cube " * 500}, "prompt has .* tokens, .* at most 200; shorten"),
+    "too many words": ({"instruction": "cube " * 500}, "prompt has .* tokens, expected at most 200 .* shorten"),
 }
 
 
@@ -158,4 +159,4 @@ def test_bfloat16_rows_stay_near_float32(engine: Pi05Engine, request_: Request) 
 
 def test_unknown_dtype_is_refused() -> None:
     with pytest.raises(ValueError, match="came 'float16'"):
-        Pi05Engine(random_bundle(tiny_cpu(), seed=0), dtype="float16")  # type: ignore[arg-type]
+        Pi05Engine(random_bundle(tiny_cpu(), seed=0), dtype="float16")
