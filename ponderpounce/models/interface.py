@@ -15,10 +15,10 @@ from typing import Any, Literal, cast
 import torch
 from torch import Tensor, nn
 
+from clock.timebase import NS_PER_S
 from ponderpounce.models.sinusoid import sinusoid
 
 MAX_CARRIERS = 16
-NS_PER_S = 1_000_000_000
 
 PrefixAttention = Literal["full", "isolated"]
 

@@ -79,7 +79,7 @@ def save_bundle(bundle: PounceBundle, folder: Path) -> None:
 def load_bundle(
     folder: Path, *, config: PounceConfig | None = None, tokenizer: Path | None = None, prefix_seed: int = 0
 ) -> PounceBundle:
-    """Reads our own folder, or a public pi0.5 one.
+    """Reads our own folder, or a public pi0.5 one, which acts with RoboMME's statistics.
 
     Args:
         config: for a public folder, whose config.json is another dialect; default `pi05_base()`.

@@ -11,8 +11,8 @@ from torch import Tensor
 def sinusoid(values_B: Tensor, num_features: int, *, min_period: float, max_period: float) -> Tensor:
     """Returns ``[sin | cos]`` of ``values_B`` at log-spaced periods, shape (B, num_features), float32.
 
-    Periods run from ``min_period`` to ``max_period`` in the unit of the values. The angles are computed in
-    float64, as the public pi0.5 implementations do: at period 4e-3 a float32 angle is already off by 1e-4.
+    Periods run from ``min_period`` to ``max_period`` in the unit of the values. Angles are float64, as in the
+    public pi0.5 code: at time 1 and period 4e-3 the angle is 1571 rad, which float32 resolves to 1e-4 only.
     """
     if num_features % 2:
         raise ValueError(f"sinusoid needs an even number of features, came {num_features}")

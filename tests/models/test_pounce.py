@@ -1,6 +1,6 @@
 """Laws of POUNCE as a whole: what may and may not move the actions, and where gradients reach."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -198,6 +198,21 @@ def test_full_size_has_the_published_parameter_count() -> None:
     assert round(used / 1e9, 3) == 3.353
     assert used + unused_head == 3_616_757_520  # with it, the published 3.617 B in 812 tensors
     assert len(parameters) + 1 == 812
+
+
+def test_full_size_runs_on_the_meta_device() -> None:
+    """Shapes fit at full size, and no tensor is created on another device than the inputs'."""
+    config = pi05_base(num_carriers=8)
+    inputs = config.example_inputs(1)
+    on_meta = {field.name: getattr(inputs, field.name) for field in fields(inputs) if field.name != "is_null"}
+    with torch.device("meta"):
+        model = Pounce(config)
+    noise = torch.empty(1, 20, 32, device="meta")
+    cache = model.prefill(PounceInputs(**{name: tensor.to("meta") for name, tensor in on_meta.items()}))
+    assert cache.keys[0].shape == (1, 1, 9 + 2 * 256 + 12, 256)
+    styles = model.step_table().styles
+    assert (len(styles), styles[0].shape) == (10, (37, 3, 1, 1, 1024))
+    assert model.pi05.velocity(noise, styles[0], cache).shape == (1, 20, 32)
 
 
 def test_streams_that_cannot_attend_jointly_are_refused() -> None:
