@@ -1,12 +1,9 @@
 """Which parameters may be bfloat16 when serving, and which stay float32 (openpi's choice)."""
 
-from typing import Literal
-
 import torch
 
 from ponderpounce.models.pounce import Pounce
-
-DTypeName = Literal["float32", "bfloat16"]
+from pounce_server.contract import DTypeName
 
 _STREAMS = ("pi05.vision.", "pi05.projector.", "pi05.language.", "pi05.expert.")
 _FLOAT32_PARTS = ("norm", "patch_embedding", "position_embedding")

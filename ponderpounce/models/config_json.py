@@ -4,6 +4,7 @@ Writing needs no code: `dataclasses.asdict` and `json.dumps`.
 """
 
 import dataclasses
+import types
 import typing
 from typing import Any, TypeVar
 
@@ -13,17 +14,20 @@ Record = TypeVar("Record")
 def from_json(kind: type[Record], values: Any, where: str) -> Record:
     """Builds ``kind`` from parsed JSON; ``where`` names the place in errors.
 
-    Every field must be there: a file must not change its meaning when a default does.
+    Every field must be there: a file must not change its meaning when a default does. Fields may be numbers,
+    strings, booleans, Literals, unions, homogeneous tuples, and records of these.
 
     Raises:
-        ValueError: a field is missing or unknown, or the record's own checks refuse a value.
+        ValueError: a field is missing, unknown or of another type, or the record's own checks refuse it.
     """
     if not dataclasses.is_dataclass(kind):
         raise TypeError(f"{kind} is no dataclass")
+    if not isinstance(values, dict):
+        raise ValueError(f"{where}: expected an object, came {values!r}")
     names = {field.name for field in dataclasses.fields(kind)}
-    if not isinstance(values, dict) or values.keys() != names:
-        came = values.keys() if isinstance(values, dict) else set()
-        raise ValueError(f"{where}: missing {sorted(names - came)}, unknown {sorted(came - names)}")
+    if values.keys() != names:
+        missing, unknown = sorted(names - values.keys()), sorted(values.keys() - names)
+        raise ValueError(f"{where}: missing {missing}, unknown {unknown}")
     hints = typing.get_type_hints(kind)
     return kind(**{name: _value(hints[name], values[name], f"{where}.{name}") for name in names})
 
@@ -31,4 +35,19 @@ def from_json(kind: type[Record], values: Any, where: str) -> Record:
 def _value(hint: Any, value: Any, where: str) -> Any:
     if dataclasses.is_dataclass(hint):
         return from_json(typing.cast(type[Any], hint), value, where)
+    if not _fits(hint, value):
+        raise ValueError(f"{where}: expected {getattr(hint, '__name__', hint)}, came {value!r}")
     return tuple(value) if typing.get_origin(hint) is tuple else value
+
+
+def _fits(hint: Any, value: Any) -> bool:
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Literal:
+        return value in args
+    if origin in (typing.Union, types.UnionType):
+        return any(_fits(arg, value) for arg in args)
+    if origin is tuple:
+        return isinstance(value, list) and all(_fits(args[0], item) for item in value)
+    if hint in (int, float):
+        return isinstance(value, (int, hint)) and not isinstance(value, bool)
+    return isinstance(value, hint)

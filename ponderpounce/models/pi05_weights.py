@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import torch
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
@@ -72,9 +72,12 @@ def save_weights(model: Pounce, path: Path) -> None:
 
 def read_weights(path: Path) -> dict[str, Tensor]:
     """Reads a file in the public layout, undoing its habits; keys are canonical public names."""
-    with safe_open(path, framework="pt") as file:
-        names = [name for name in file.keys() if not name.endswith(_UNUSED_HEAD)]  # noqa: SIM118, no mapping
-        tensors = {name: file.get_tensor(name) for name in names}
+    try:
+        with safe_open(path, framework="pt") as file:
+            names = [name for name in file.keys() if not name.endswith(_UNUSED_HEAD)]  # noqa: SIM118, no mapping
+            tensors = {name: file.get_tensor(name) for name in names}
+    except SafetensorError as error:
+        raise WeightsError(str(path), {"unreadable": [str(error)]}) from error
     if any(name.startswith(_LEROBOT_PREFIX + _ROOT) for name in tensors):
         tensors = {name.removeprefix(_LEROBOT_PREFIX): tensor for name, tensor in tensors.items()}
     embedding = tensors.pop(_EMBEDDING, None)

@@ -1,11 +1,10 @@
 """A POUNCE checkpoint folder: config.json, model.safetensors and tokenizer.model, all that acting needs."""
 
-import dataclasses
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Final, Literal
 
 import torch
 
@@ -17,13 +16,24 @@ from ponderpounce.models.pounce_configs import pi05_base
 from ponderpounce.models.pounce_init import initialise_prefix, random_pounce
 from ponderpounce.models.prompt import Tokenizer, tiny_tokenizer_for_random_weights
 
-FORMAT = "ponderpounce.pounce/1"
+FORMAT: Final = "ponderpounce.pounce/1"
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
 TOKENIZER_FILE = "tokenizer.model"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class StoredConfig:
+    """Contents of config.json."""
+
+    format: Literal["ponderpounce.pounce/1"] = FORMAT
+    is_random: bool
+    has_fresh_prefix: bool
+    config: PounceConfig
+    statistics: RobotStatistics
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PounceBundle:
     """A model with what surrounds it: how to read text, and what its numbers mean on the robot."""
 
@@ -47,10 +57,18 @@ class PounceBundle:
                 f"the config {config.robot_action_dim}"
             )
 
+    def stored_config(self) -> StoredConfig:
+        return StoredConfig(
+            is_random=self.is_random,
+            has_fresh_prefix=self.has_fresh_prefix,
+            config=self.model.config,
+            statistics=self.statistics,
+        )
+
     def digest(self) -> str:
         """Returns 16 hex digits over weights, config, statistics and tokenizer: equal digests act equally."""
         digest = hashlib.blake2b(digest_size=8)
-        digest.update(json.dumps(_to_json(self), sort_keys=True).encode())
+        digest.update(json.dumps(asdict(self.stored_config()), sort_keys=True).encode())
         digest.update(self.tokenizer.model_bytes)
         for name, tensor in sorted(self.model.state_dict().items()):
             digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
@@ -71,7 +89,7 @@ def random_bundle(config: PounceConfig, seed: int) -> PounceBundle:
 def save_bundle(bundle: PounceBundle, folder: Path) -> None:
     """Writes the folder that `load_bundle` reads; its weights are in the public layout (`pi05_weights`)."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / CONFIG_FILE).write_text(json.dumps(_to_json(bundle), indent=1) + "\n")
+    (folder / CONFIG_FILE).write_text(json.dumps(asdict(bundle.stored_config()), indent=1) + "\n")
     (folder / TOKENIZER_FILE).write_bytes(bundle.tokenizer.model_bytes)
     save_weights(bundle.model, folder / WEIGHTS_FILE)
 
@@ -94,34 +112,31 @@ def load_bundle(
     weights_path = folder / WEIGHTS_FILE
     if not weights_path.is_file():
         raise FileNotFoundError(f"checkpoint {folder} has no {WEIGHTS_FILE}")
-    config_path = folder / CONFIG_FILE
-    stored = json.loads(config_path.read_text()) if config_path.is_file() else {}
-    is_random, statistics = False, ROBOMME
-    if stored.get("format") == FORMAT:
+    stored = _read_config(folder / CONFIG_FILE)
+    if stored is not None:
         if config is not None:
             raise ValueError(f"checkpoint {folder} has its own {CONFIG_FILE}; leave the config argument out")
-        config = from_json(PounceConfig, stored["config"], CONFIG_FILE)
-        statistics = from_json(RobotStatistics, stored["statistics"], CONFIG_FILE)
-        is_random = bool(stored["is_random"])
+        config = stored.config
     with torch.device("meta"):
         model = Pounce(config or pi05_base())
     has_prefix = load_weights(model, weights_path)
     if not has_prefix:
         initialise_prefix(model, torch.Generator().manual_seed(prefix_seed))
+    is_prefix_trained = has_prefix and not (stored is not None and stored.has_fresh_prefix)
     return PounceBundle(
         model=model,
         tokenizer=Tokenizer.from_file(tokenizer or folder / TOKENIZER_FILE),
-        statistics=statistics,
-        is_random=is_random,
-        has_fresh_prefix=stored.get("has_fresh_prefix", False) if has_prefix else model.cognition_prefix is not None,
+        statistics=ROBOMME if stored is None else stored.statistics,
+        is_random=stored is not None and stored.is_random,
+        has_fresh_prefix=model.cognition_prefix is not None and not is_prefix_trained,
     )
 
 
-def _to_json(bundle: PounceBundle) -> dict[str, Any]:
-    return {
-        "format": FORMAT,
-        "is_random": bundle.is_random,
-        "has_fresh_prefix": bundle.has_fresh_prefix,
-        "config": dataclasses.asdict(bundle.model.config),
-        "statistics": dataclasses.asdict(bundle.statistics),
-    }
+def _read_config(path: Path) -> StoredConfig | None:
+    """Returns None for a public folder: no config.json, or one that is not in our format."""
+    if not path.is_file():
+        return None
+    values = json.loads(path.read_text())
+    if not isinstance(values, dict) or values.get("format") != FORMAT:
+        return None
+    return from_json(StoredConfig, values, path.name)

@@ -53,7 +53,10 @@ class Tokenizer:
 
     def __init__(self, model_bytes: bytes) -> None:
         self.model_bytes = model_bytes
-        self._pieces = sentencepiece.SentencePieceProcessor(model_proto=model_bytes)
+        try:
+            self._pieces = sentencepiece.SentencePieceProcessor(model_proto=model_bytes)
+        except RuntimeError as error:
+            raise ValueError(f"tokenizer of {len(model_bytes)} bytes is no SentencePiece model: {error}") from error
         if self._pieces.bos_id() < 0:
             raise ValueError("tokenizer has no BOS piece; pi0.5 prompts begin with one (paligemma_tokenizer.model has)")
 

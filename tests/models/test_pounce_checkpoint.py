@@ -1,7 +1,7 @@
 """The checkpoint folder: all of a bundle survives it, and a public folder gets a flagged fresh prefix."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -103,9 +103,10 @@ def test_two_configs_for_one_folder_are_refused(bundle: PounceBundle, folder: Pa
     [
         (
             ("config", "pi05", "vision", "width"),
-            r"config\.json\.pi05\.vision: missing \['width'\], unknown \[\]",
+            r"config\.json\.config\.pi05\.vision: missing \['width'\], unknown \[\]",
         ),
-        (("config", "num_steps"), r"config\.json: missing \['num_steps'\]"),
+        (("config", "num_steps"), r"config\.json\.config: missing \['num_steps'\]"),
+        (("statistics",), r"config\.json: missing \['statistics'\]"),
     ],
 )
 def test_a_config_with_a_hole_names_it(folder: Path, path: tuple[str, ...], message: str) -> None:
@@ -122,8 +123,34 @@ def test_a_config_with_a_hole_names_it(folder: Path, path: tuple[str, ...], mess
 def test_records_refuse_unknown_names_and_non_records() -> None:
     with pytest.raises(ValueError, match=r"here: missing .* unknown \['colour'\]"):
         from_json(CognitionConfig, {"colour": 1}, "here")
-    with pytest.raises(ValueError, match="here: missing"):
+    with pytest.raises(ValueError, match=r"here: expected an object, came \[1, 2\]"):
         from_json(CognitionConfig, [1, 2], "here")
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("num_carriers", "1"),
+        ("num_carriers", 1.5),
+        ("num_carriers", True),
+        ("attention", "half"),
+        ("projector_std", []),
+    ],
+)
+def test_values_of_another_type_are_refused(name: str, wrong: object) -> None:
+    values = asdict(CognitionConfig())
+    assert from_json(CognitionConfig, values | {"projector_std": 1, "gradient_scale": 1}, "here").gradient_scale == 1
+    with pytest.raises(ValueError, match=rf"here\.{name}: expected .*, came"):
+        from_json(CognitionConfig, values | {name: wrong}, "here")
+
+
+def test_files_that_are_not_what_they_are_called_are_refused(folder: Path) -> None:
+    (folder / "tokenizer.model").write_bytes(b"not a tokenizer")
+    with pytest.raises(ValueError, match="no SentencePiece model"):
+        load_bundle(folder)
+    (folder / "model.safetensors").write_bytes(b"not weights")
+    with pytest.raises(WeightsError, match="1 unreadable: "):
+        load_bundle(folder)
 
 
 def test_parts_that_do_not_fit_each_other_are_refused(bundle: PounceBundle) -> None:

@@ -1,6 +1,8 @@
 """The engine's contract: equal requests give equal bits, a heartbeat per step, a plain no to misfits."""
 
 import math
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,8 @@ import pytest
 from ponderpounce.models.normalisation import ROBOMME
 from ponderpounce.models.pounce_checkpoint import load_bundle, random_bundle, save_bundle
 from ponderpounce.models.pounce_configs import tiny_cpu
-from pounce_server.engine import Pi05Engine, PounceEngine, Request, example_request
+from pounce_server.contract import PounceEngine, Request, example_request
+from pounce_server.engine import Pi05Engine
 
 
 @pytest.fixture(scope="module")
@@ -30,6 +33,11 @@ def test_engine_is_a_pounce_engine_that_admits_to_be_random(engine: Pi05Engine) 
     assert (spec.horizon, spec.action_dim, spec.proprio_dim) == (20, 8, 8)
     assert (spec.num_carriers, spec.cognition_size, spec.num_cameras) == (2, 24, 2)
     assert (spec.is_random, spec.has_fresh_prefix, spec.dtype) == (True, True, "float32")
+
+
+def test_the_contract_needs_no_torch() -> None:
+    script = "import sys, pounce_server.contract; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
 
 
 def test_rows_are_finite_absolute_targets_that_vary(engine: Pi05Engine, request_: Request) -> None:

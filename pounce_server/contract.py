@@ -1,0 +1,129 @@
+"""What the daemon and an action engine say to each other: arrays and numbers, no tensors, no torch.
+
+The node and the shell need this file only, so they are tested with a fake engine in milliseconds.
+"""
+
+# N horizon, K carriers, H carrier size
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+DTypeName: TypeAlias = Literal["float32", "bfloat16"]
+
+Progress: TypeAlias = Callable[[], None]
+"""Called between flow steps, so that a heartbeat comes from the loop that works and not from a timer."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EngineSpec:
+    """What a process announces about its engine, and what requests are checked against."""
+
+    horizon: int
+    """Rows per chunk, played at 20 Hz."""
+    action_dim: int
+    """Dims of a row in robot units: 7 joint targets (rad) and the gripper, -1 closed to 1 open."""
+    proprio_dim: int
+    num_carriers: int
+    """K; 0 means the engine takes no cognition."""
+    cognition_size: int
+    """H of one carrier."""
+    image_px: int
+    """Side to which frames are resized; any frame size is accepted."""
+    num_steps: int
+    """Flow steps per invocation, hence calls of ``progress``."""
+    num_cameras: int
+    model_hash: str
+    """Equal hashes act equally on equal requests (same dtype and machine)."""
+    is_random: bool
+    """Weights drawn, not trained."""
+    has_fresh_prefix: bool
+    """The cognition prefix is drawn, not trained: cognition moves the actions, but not with sense."""
+    dtype: DTypeName
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Request:
+    """One invocation's inputs, at one instant."""
+
+    instruction: str
+    frames: tuple[NDArray[np.uint8] | None, ...]
+    """(h, w, 3) uint8 per camera, front then wrist; None for a camera that did not deliver."""
+    proprio: NDArray[np.float32]
+    """(8,) float32: 7 joint positions (rad), finger opening (m)."""
+    cognition: NDArray[np.float32] | None
+    """(K, H) float32; None means the learned null."""
+    age_ns: int
+    """Age of the cognition's source observation; 0 with null."""
+    seed: int
+    """Of the starting noise, at least 0: same seed and inputs, same rows, bit for bit on one machine."""
+
+
+def no_progress() -> None:
+    """The default `Progress`."""
+
+
+class PounceEngine(Protocol):
+    """What the node drives; pi0.5 here, other action models behind the same three names."""
+
+    @property
+    def spec(self) -> EngineSpec: ...
+
+    def invoke(self, request: Request, progress: Progress = no_progress) -> NDArray[np.float32]:
+        """Returns rows (horizon, action_dim) float32 in robot units; calls ``progress`` every flow step."""
+        ...
+
+    def warm_up(self) -> list[int]:
+        """Runs until times are steady, then returns the durations of at least 20 invocations, in ns."""
+        ...
+
+
+def check_request(request: Request, spec: EngineSpec) -> None:
+    """Raises ValueError, saying what was expected and what came, unless ``request`` fits ``spec``."""
+    if not request.instruction.strip():
+        raise ValueError("instruction is empty; POUNCE needs the task's text")
+    if len(request.frames) != spec.num_cameras:
+        raise ValueError(f"expected {spec.num_cameras} frames (front, wrist order), came {len(request.frames)}")
+    if all(frame is None for frame in request.frames):
+        raise ValueError(f"all {spec.num_cameras} cameras are missing; POUNCE does not act blind")
+    for index, frame in enumerate(request.frames):
+        if frame is not None and (frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3 or not frame.size):
+            raise ValueError(f"frame {index}: expected (h, w, 3) uint8, came {frame.shape} {frame.dtype}")
+    _check_floats("proprio", request.proprio, (spec.proprio_dim,))
+    if not 0 <= request.seed < 2**63:
+        raise ValueError(f"seed: expected 0 <= seed < 2**63, came {request.seed}")
+    if request.age_ns < 0:
+        raise ValueError(f"age_ns must not be negative, came {request.age_ns}: cognition from the future")
+    if request.cognition is None:
+        if request.age_ns:
+            raise ValueError(f"null cognition has age 0 (paper 3.1), came age_ns {request.age_ns}")
+    elif spec.num_carriers == 0:
+        raise ValueError(f"this engine takes no cognition (K = 0), came {request.cognition.shape}")
+    else:
+        _check_floats("cognition", request.cognition, (spec.num_carriers, spec.cognition_size))
+
+
+def _check_floats(name: str, values: NDArray[np.float32], shape: tuple[int, ...]) -> None:
+    if values.shape != shape or values.dtype != np.float32:
+        raise ValueError(f"{name}: expected {shape} float32, came {values.shape} {values.dtype}")
+    if not np.isfinite(values).all():
+        bad = np.flatnonzero(~np.isfinite(values))
+        raise ValueError(f"{name}: expected finite numbers, came {len(bad)} that are not, first at {bad[0]}")
+
+
+def example_request(spec: EngineSpec, *, frame_px: int = 256, seed: int = 0) -> Request:
+    """Fabricates a request that fits ``spec``: noise for pictures, joints at zero, cognition 300 ms old."""
+    generator = np.random.default_rng(seed)
+    shape = (frame_px, frame_px, 3)
+    cognition = generator.standard_normal((spec.num_carriers, spec.cognition_size)).astype(np.float32)
+    return Request(
+        instruction="press the button, pick all cubes that were highlighted, then press it again to stop",
+        frames=tuple(generator.integers(0, 256, shape, dtype=np.uint8) for _ in range(spec.num_cameras)),
+        proprio=np.zeros(spec.proprio_dim, dtype=np.float32),
+        cognition=cognition if spec.num_carriers else None,
+        age_ns=300_000_000 if spec.num_carriers else 0,
+        seed=seed,
+    )
