@@ -41,8 +41,8 @@ class Motions:
     def move(self, target: Array) -> Actions:
         """Moves the tool along a straight screw to a transform (4, 4). Raises UnreachableError, before moving."""
         path = self._kinematics.screw_path(self._physics.arm_qpos(), target, _PATH_POINTS)
-        times_s = timing.fastest(path, max_speed=MAX_SPEED_RAD_S, max_acceleration=MAX_ACCELERATION_RAD_S2)
-        for qpos in timing.sample(path, times_s, 1 / CONTROL_HZ):
+        quickest = timing.fastest(path, max_speed=MAX_SPEED_RAD_S, max_acceleration=MAX_ACCELERATION_RAD_S2)
+        for qpos in timing.sample(path, quickest, 1 / CONTROL_HZ):
             yield self._action(qpos)
 
     def hold(self, num_steps: int) -> Actions:

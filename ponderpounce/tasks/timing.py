@@ -8,15 +8,42 @@ largest x from which the end can still be reached, and a forward pass takes the 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from ponderpounce.tasks.geometry import Array
 
+_MOVING = 1e-6  # slopes below this are a joint at rest
 
-def fastest(path: Array, *, max_speed: float, max_acceleration: float) -> Array:
-    """Returns the times (n,) in seconds at which the points of a joint path (n, joints) are passed, from rest to rest.
 
-    Limits hold for every joint, in units of the path per second and per second squared.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Timing:
+    """How the fraction of a path that lies behind grows from 0 to 1, with constant acceleration between grid points."""
+
+    times_s: Array  # (n,), when each of n evenly spaced fractions is reached
+    speeds_hz: Array  # (n,), fractions per second there
+
+    @property
+    def duration_s(self) -> float:
+        """The time of the last point."""
+        return float(self.times_s[-1])
+
+    def fraction(self, at_s: Array) -> Array:
+        """Returns the fraction (m,) of the path that lies behind at times (m,) in seconds."""
+        cell = np.clip(np.searchsorted(self.times_s, at_s, side="right") - 1, 0, len(self.times_s) - 2)
+        since_s = at_s - self.times_s[cell]
+        acceleration = np.diff(self.speeds_hz)[cell] / np.diff(self.times_s)[cell]
+        fraction = cell / (len(self.times_s) - 1) + since_s * (self.speeds_hz[cell] + since_s * acceleration / 2)
+        return np.clip(fraction, 0.0, 1.0)
+
+
+def fastest(path: Array, *, max_speed: float, max_acceleration: float) -> Timing:
+    """Returns the quickest timing of a joint path (n, joints) from rest to rest; n points evenly spaced along it.
+
+    Limits are for every joint, in units of the path per second and per second squared. They hold at the points; between
+    two points around which a joint turns back, its acceleration can be up to a tenth over. A path that goes nowhere
+    takes no time.
     """
     n = len(path)
     ds = 1.0 / (n - 1)
@@ -24,8 +51,11 @@ def fastest(path: Array, *, max_speed: float, max_acceleration: float) -> Array:
     bend = np.gradient(slope, ds, axis=0, edge_order=2)
     steepest = np.abs(slope).max(axis=1)
     if steepest.max() < 1e-9:
-        return np.zeros(n)
+        return Timing(times_s=np.zeros(n), speeds_hz=np.zeros(n))
     x_cap = np.square(max_speed / np.maximum(steepest, 1e-9))
+    # A joint that is just turning round bounds x alone; the bounds on u below leave it out.
+    turning = np.where(np.abs(slope) > _MOVING, 0.0, np.abs(bend)).max(axis=1)
+    x_cap = np.minimum(x_cap, max_acceleration / np.maximum(turning, 1e-9))
     x_cap[[0, -1]] = 0.0
 
     x_max = np.zeros(n)
@@ -35,25 +65,28 @@ def fastest(path: Array, *, max_speed: float, max_acceleration: float) -> Array:
     for i in range(n - 1):
         _, (offset, rate) = _acceleration_bounds(slope[i], bend[i], max_acceleration)
         x[i + 1] = min(x_max[i + 1], x[i] + 2 * ds * float(np.min(offset + rate * x[i])))
-    speed = np.sqrt(np.maximum(x, 0.0))
-    # Exact for constant u between grid points; the first and last segments start or end at rest.
-    return np.concatenate([[0.0], np.cumsum(2 * ds / np.maximum(speed[:-1] + speed[1:], 1e-9))])
+    speeds_hz = np.sqrt(np.maximum(x, 0.0))
+    cell_s = 2 * ds / np.maximum(speeds_hz[:-1] + speeds_hz[1:], 1e-9)  # exact for constant u within a cell
+    return Timing(times_s=np.concatenate([[0.0], np.cumsum(cell_s)]), speeds_hz=speeds_hz)
 
 
-def sample(path: Array, times_s: Array, period_s: float) -> Array:
-    """Returns the path's points at even times (m, joints), both ends included, about ``period_s`` apart.
+def sample(path: Array, timing: Timing, period_s: float) -> Array:
+    """Returns a path's points (m, joints) at even times about ``period_s`` apart, both ends included.
 
     Rounding the number of samples down is upstream's habit: consecutive targets may differ a little faster than the
     limit.
     """
-    num_samples = max(2, int(times_s[-1] / period_s))
-    even_s = np.linspace(0.0, times_s[-1], num_samples)
-    return np.stack([np.interp(even_s, times_s, joint) for joint in path.T], axis=1)
+    if timing.duration_s == 0.0:
+        return path[[0, -1]]
+    num_samples = max(2, int(timing.duration_s / period_s))
+    fractions = timing.fraction(np.linspace(0.0, timing.duration_s, num_samples))
+    grid = np.linspace(0.0, 1.0, len(path))
+    return np.stack([np.interp(fractions, grid, joint) for joint in path.T], axis=1)
 
 
 def _acceleration_bounds(slope: Array, bend: Array, limit: float) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """Lower and upper bounds on u per moving joint, each as (offset, rate): offset + rate x."""
-    moving = np.abs(slope) > 1e-6
+    moving = np.abs(slope) > _MOVING
     slope, bend = slope[moving], bend[moving]
     offset, rate = limit / np.abs(slope), -bend / slope
     return (-offset, rate), (offset, rate)

@@ -1,0 +1,68 @@
+"""Shared fixtures: one environment per task, and the recorded benchmark episode as plain facts."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("MUJOCO_GL", "egl")  # before anything imports mujoco
+
+import pytest
+
+from ponderpounce.tasks.environment import Environment, make_environment
+from ponderpounce.tasks.physics import Physics
+from ponderpounce.tasks.reference.pick_highlight import Layout, PlacedCube
+from ponderpounce.tasks.scene import add_button, add_cube, add_disc, table_scene
+
+
+@pytest.fixture(scope="session")
+def environment() -> Callable[[str], Environment]:
+    """Returns one environment without cameras per task name; building a scene takes longer than resetting it."""
+    return functools.cache(lambda name: make_environment(name, render=False))
+
+
+@pytest.fixture(scope="session")
+def pick_highlight(environment: Callable[[str], Environment]) -> Environment:
+    return environment("PickHighlight")
+
+
+@pytest.fixture(scope="session")
+def rendered() -> Iterator[Environment]:
+    """PickHighlight with cameras; only for tests marked sim."""
+    with make_environment("PickHighlight") as env:
+        yield env
+
+
+@pytest.fixture(scope="session")
+def _small_world() -> Physics:
+    spec = table_scene()
+    add_cube(spec, "cube")
+    add_button(spec, "button")
+    add_disc(spec, "disc")
+    return Physics(spec)
+
+
+@pytest.fixture
+def world(_small_world: Physics) -> Physics:
+    """The table with a cube, a button and a disc, freshly reset."""
+    _small_world.reset()
+    return _small_world
+
+
+@pytest.fixture(scope="session")
+def recording() -> dict[str, Any]:
+    """Measured values of one episode of the real benchmark."""
+    return json.loads((Path(__file__).parent / "data" / "pick_highlight_train006.json").read_text())
+
+
+@pytest.fixture(scope="session")
+def recorded_layout(recording: dict[str, Any]) -> Layout:
+    return Layout(
+        button_xy_m=tuple(recording["button_xy_m"]),
+        cubes=tuple(PlacedCube(**cube) for cube in recording["cubes"]),
+        targets=tuple(recording["targets"]),
+    )

@@ -1,0 +1,268 @@
+"""What every registered task keeps, at every difficulty: a new task is tested before it has a file of its own."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from itertools import islice
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ponderpounce.tasks import panda, sight
+from ponderpounce.tasks.engine import Status
+from ponderpounce.tasks.environment import IMAGE_PX, Environment, Snapshot
+from ponderpounce.tasks.scene import FRONT
+from ponderpounce.tasks.task import DIFFICULTIES, TaskError, task_names
+
+EnvironmentOf = Callable[[str], Environment]
+HOME = np.append(panda.HOME_QPOS, 1.0)
+SEED = 7
+
+every_task = pytest.mark.parametrize("name", task_names())
+every_difficulty = pytest.mark.parametrize("difficulty", DIFFICULTIES)
+
+
+def snapshots(env: Environment, seed: int, difficulty: str) -> Iterator[Snapshot]:
+    """The oracle's episode, one snapshot per observation."""
+    snapshot = env.reset(seed, difficulty)
+    yield snapshot
+    for action in env.oracle():
+        snapshot = env.step(action)
+        yield snapshot
+        if snapshot.status is not Status.ONGOING:
+            return
+
+
+def facts(snapshot: Snapshot) -> tuple[Any, ...]:
+    """Everything a snapshot says, as comparable bytes and values."""
+    return (
+        snapshot.step,
+        snapshot.state.tobytes(),
+        snapshot.tcp_pose.tobytes(),
+        snapshot.status,
+        snapshot.simple_subgoal,
+        snapshot.grounded_subgoal,
+        snapshot.subtask_index,
+    )
+
+
+@every_task
+@every_difficulty
+def test_the_oracle_succeeds(environment: EnvironmentOf, name: str, difficulty: str) -> None:
+    for seed in (SEED, SEED + 1):
+        *_, last = snapshots(environment(name), seed, difficulty)
+        assert (last.status, last.simple_subgoal) == (Status.SUCCESS, "All tasks completed")
+        assert last.reason
+
+
+@every_task
+@every_difficulty
+def test_snapshots_are_well_formed(environment: EnvironmentOf, name: str, difficulty: str) -> None:
+    env = environment(name)
+    for step, snapshot in enumerate(snapshots(env, SEED, difficulty)):
+        assert snapshot.step == step
+        assert snapshot.state.shape == (8,)
+        assert snapshot.state.dtype == np.float32
+        assert snapshot.tcp_pose.shape == (7,)
+        assert np.isfinite(snapshot.state).all()
+        assert np.isfinite(snapshot.tcp_pose).all()
+        assert np.all(snapshot.state >= panda.STATE_LOW - 1e-3)
+        assert np.all(snapshot.state <= panda.STATE_HIGH + 1e-3)
+        assert 0 <= snapshot.subtask_index <= len(env.subtasks)
+
+
+@every_task
+@every_difficulty
+def test_the_oracle_speaks_in_actions(environment: EnvironmentOf, name: str, difficulty: str) -> None:
+    env = environment(name)
+    snapshot = env.reset(SEED, difficulty)
+    for action in islice(env.oracle(), 150):
+        assert action.shape == (8,)
+        assert action.dtype == np.float32
+        assert np.all(action >= panda.ACTION_LOW)
+        assert np.all(action <= panda.ACTION_HIGH)
+        assert np.abs(action[:7] - snapshot.state[:7]).max() < 0.25  # the arm can follow
+        snapshot = env.step(action)
+
+
+@every_task
+@every_difficulty
+def test_texts_are_filled_and_change_with_the_subtask(environment: EnvironmentOf, name: str, difficulty: str) -> None:
+    env = environment(name)
+    index_before = 0
+    for snapshot in snapshots(env, SEED, difficulty):
+        assert "<>" not in snapshot.grounded_subgoal
+        assert not set("[]") & set(snapshot.simple_subgoal + snapshot.grounded_subgoal)
+        if snapshot.status is Status.ONGOING:
+            plain = re.sub(r" at <\d+, \d+>", "", snapshot.grounded_subgoal)
+            assert plain == snapshot.simple_subgoal
+            spoken = env.subtasks[index_before].text
+            assert snapshot.simple_subgoal == re.sub(r"\[.*?\]", "", spoken)
+        index_before = snapshot.subtask_index
+
+
+@every_task
+@every_difficulty
+def test_fixed_coordinates_lie_on_the_object(environment: EnvironmentOf, name: str, difficulty: str) -> None:
+    env = environment(name)
+    text_before, index_before, num_checked = "", 0, 0
+    for snapshot in snapshots(env, SEED, difficulty):
+        new_text = snapshot.grounded_subgoal != text_before
+        points = [(int(y), int(x)) for y, x in re.findall(r"<(\d+), (\d+)>", snapshot.grounded_subgoal)]
+        if new_text and snapshot.status is Status.ONGOING and points:
+            for body, point in zip(env.subtasks[index_before].grounds, points, strict=True):
+                pixels = sight.visible_pixels(env.physics, FRONT, body, IMAGE_PX)
+                assert np.abs(pixels - point).max(axis=1).min() <= 2
+                num_checked += 1
+        text_before, index_before = snapshot.grounded_subgoal, snapshot.subtask_index
+    assert num_checked > 0
+
+
+@every_task
+@every_difficulty
+def test_doing_nothing_never_succeeds(environment: EnvironmentOf, name: str, difficulty: str) -> None:
+    env = environment(name)
+    env.reset(SEED, difficulty)
+    for _ in range(400):
+        snapshot = env.step(HOME)
+        assert snapshot.status is not Status.SUCCESS
+        if snapshot.status is not Status.ONGOING:
+            return
+
+
+@every_task
+@every_difficulty
+def test_the_same_seed_gives_the_same_trajectory(environment: EnvironmentOf, name: str, difficulty: str) -> None:
+    env = environment(name)
+    first = [facts(s) for s in islice(snapshots(env, SEED, difficulty), 120)]
+    list(islice(snapshots(env, SEED + 1, difficulty), 30))  # what came before must not matter
+    assert [facts(s) for s in islice(snapshots(env, SEED, difficulty), 120)] == first
+
+
+@every_task
+@every_difficulty
+def test_another_seed_gives_another_scene(environment: EnvironmentOf, name: str, difficulty: str) -> None:
+    env = environment(name)
+    layouts = []
+    for seed in range(5):
+        env.reset(seed, difficulty)
+        layouts.append(env.layout)
+    assert all(a != b for i, a in enumerate(layouts) for b in layouts[:i])
+
+
+@every_task
+@pytest.mark.parametrize("fork_step", [5, 60, 190])
+def test_a_restored_episode_continues_bit_exactly(environment: EnvironmentOf, name: str, fork_step: int) -> None:
+    env = environment(name)
+    actions = []
+    env.reset(SEED, "hard")
+    for action in islice(env.oracle(), fork_step + 60):
+        actions.append(action)
+        env.step(action)
+
+    env.reset(SEED, "hard")
+    for action in actions[:fork_step]:
+        forked = env.step(action)
+    saved = env.save()
+    first = [facts(env.step(action)) for action in actions[fork_step:]]
+    env.reset(SEED + 1, "easy")  # another episode in between
+    assert facts(env.restore(saved)) == facts(forked)
+    assert [facts(env.step(action)) for action in actions[fork_step:]] == first
+
+
+@every_task
+def test_the_oracle_can_take_over_anywhere(environment: EnvironmentOf, name: str) -> None:
+    env = environment(name)
+    for handover in (30, 130, 215):
+        before = list(islice(snapshots(env, SEED, "hard"), handover))
+        assert before[-1].status is Status.ONGOING
+        for action in env.oracle():
+            snapshot = env.step(action)
+            if snapshot.status is not Status.ONGOING:
+                break
+        assert snapshot.status is Status.SUCCESS, (handover, snapshot.reason)
+
+
+@every_task
+def test_snapshots_share_no_memory(environment: EnvironmentOf, name: str) -> None:
+    env = environment(name)
+    a, b = islice(snapshots(env, SEED, "easy"), 2)
+    assert not np.shares_memory(a.state, b.state)
+    assert not np.shares_memory(a.tcp_pose, b.tcp_pose)
+    for array in (b.state, b.tcp_pose):
+        assert not np.shares_memory(array, env.physics.data.qpos)
+        assert array.flags.owndata
+
+
+@every_task
+@pytest.mark.parametrize("seed", [0, 1, 2, 12600])
+def test_difficulty_follows_the_seed_unless_given(environment: EnvironmentOf, name: str, seed: int) -> None:
+    env = environment(name)
+    env.reset(seed)
+    assert env.difficulty == ("easy", "medium", "hard")[seed % 3]
+    env.reset(seed, "hard")
+    assert env.difficulty == "hard"
+
+
+@every_task
+@pytest.mark.parametrize(
+    ("action", "complaint"),
+    [
+        (np.zeros(7), r"shape \(7,\); expected \(8,\)"),
+        (np.zeros((1, 8)), r"shape \(1, 8\); expected \(8,\)"),
+        (np.append(panda.HOME_QPOS, np.nan), "is not finite"),
+        (np.append(panda.HOME_QPOS, np.inf), "is not finite"),
+    ],
+)
+def test_a_bad_action_is_refused_and_changes_nothing(
+    environment: EnvironmentOf, name: str, action: np.ndarray, complaint: str
+) -> None:
+    env = environment(name)
+    env.reset(SEED)
+    before = env.physics.data.qpos.copy()
+    with pytest.raises(ValueError, match=complaint):
+        env.step(action)
+    np.testing.assert_array_equal(env.physics.data.qpos, before)
+    assert env.step(HOME).step == 1
+
+
+@every_task
+def test_an_unknown_difficulty_is_refused(environment: EnvironmentOf, name: str) -> None:
+    with pytest.raises(TaskError, match="unknown difficulty 'extreme'; expected one of easy, medium, hard"):
+        environment(name).reset(0, "extreme")
+
+
+@every_task
+def test_another_process_walks_the_same_trajectory(environment: EnvironmentOf, name: str) -> None:
+    script = f"""
+import hashlib, itertools
+from ponderpounce.tasks.environment import make_environment
+env = make_environment({name!r}, render=False)
+env.reset({SEED}, "medium")
+digest = hashlib.sha256()
+for action in itertools.islice(env.oracle(), 100):
+    digest.update(env.step(action).state.tobytes() + env.physics.data.qpos.tobytes())
+raise SystemExit(digest.hexdigest())
+"""
+
+    def walk() -> str:
+        completed = subprocess.run(
+            [sys.executable, "-c", script], capture_output=True, text=True, env=dict(os.environ), check=False
+        )
+        return completed.stderr.strip()
+
+    first = walk()
+    assert re.fullmatch("[0-9a-f]{64}", first), first
+
+    env = environment(name)
+    env.reset(SEED, "medium")
+    digest = hashlib.sha256()
+    for action in islice(env.oracle(), 100):
+        digest.update(env.step(action).state.tobytes() + env.physics.data.qpos.tobytes())
+    assert digest.hexdigest() == first
