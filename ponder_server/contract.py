@@ -27,7 +27,7 @@ class SessionError(ValueError):
     """A session does not exist, exists already, or there is no room for one more."""
 
 
-class ContextFull(ValueError):  # noqa: N818 - a state, not a mistake of the caller
+class ContextFull(ValueError):
     """A session's context has no room for what was asked; the session is left as it was."""
 
     def __init__(self, *, session: str, used: int, wanted: int, limit: int) -> None:
@@ -60,7 +60,7 @@ class EngineSpec:
     """Of weights and activations, e.g. "float32"; cognition is float32 always."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Opening:
     """What an episode starts from."""
 
@@ -84,7 +84,7 @@ class Text:
     """True if it was cut at the token limit and closed as it was."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Fire:
     """The answer to one query."""
 

@@ -42,7 +42,10 @@ NUM_MEASURED_FIRES = 30
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EngineConfig:
+    """How an engine serves; what it serves is in its ``Ponder``."""
+
     num_cameras: int = 2
+    """Frames per fire, always the same cameras in the same order."""
     max_context_tokens: int = 16_384
     """Per session (paper, section 3.4: 16K holds 100 fires of two cameras and more)."""
     max_sessions: int = 4
@@ -51,6 +54,11 @@ class EngineConfig:
     """Limit of one text. A text that reaches it is closed as it is and flagged ``truncated``."""
     prefill_chunk_tokens: int = 512
     """Opening tokens per forward: more is faster, fewer lets ``progress`` be heard more often."""
+
+    def __post_init__(self) -> None:
+        for name in self.__slots__:
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1.")
 
 
 @dataclass(slots=True, kw_only=True)
@@ -106,6 +114,8 @@ class QwenEngine:
                 f"session {session!r} does not fit: {sorted(self._episodes)} are open and max_sessions is "
                 f"{self._config.max_sessions}. Close one, or raise max_sessions."
             )
+        if not opening.instruction.strip():
+            raise ValueError(f"session {session!r}: the instruction is empty; PONDER needs the task's text")
         for instant, views in enumerate(opening.demo_frames):
             if not views:
                 raise ValueError(f"demo instant {instant} has no view")
@@ -150,18 +160,14 @@ class QwenEngine:
         episode = self._episode(session)
         context = episode.context
         if len(frames) != self._config.num_cameras:
-            raise ValueError(
-                f"fire got {len(frames)} frames, this engine has num_cameras {self._config.num_cameras}"
-            )
+            raise ValueError(f"fire got {len(frames)} frames, this engine has num_cameras {self._config.num_cameras}")
         self._check_frames(frames, "observation")
         if force_text_tokens is not None and force_text_tokens < 1:
             raise ValueError(f"force_text_tokens is {force_text_tokens}; at least 1, or None")
         observation, carriers = self._format.observation(len(frames)), self._format.carriers()
         wanted = len(observation) + len(carriers)
         if wanted > context.room:
-            raise ContextFull(
-                session=session, used=context.num_tokens, wanted=wanted, limit=context.max_tokens
-            )
+            raise ContextFull(session=session, used=context.num_tokens, wanted=wanted, limit=context.max_tokens)
         ids = [*observation.ids, *carriers.ids]
         embeds_TH = self._embed(ids, frames)
         before = context.save(episode.before_fire)
@@ -180,8 +186,7 @@ class QwenEngine:
         except BaseException:
             context.restore(before)
             raise
-        if force_text_tokens is None:
-            episode.owes_reasoning = False
+        episode.owes_reasoning = False
         return answer
 
     def close(self, session: str) -> None:
@@ -196,8 +201,7 @@ class QwenEngine:
         height, width = self._spec.image_px
         noise = np.random.default_rng(0)
         frames = tuple(
-            noise.integers(0, 256, (height, width, 3), dtype=np.uint8)
-            for _ in range(self._config.num_cameras)
+            noise.integers(0, 256, (height, width, 3), dtype=np.uint8) for _ in range(self._config.num_cameras)
         )
         self.open(WARM_UP_SESSION, Opening(instruction="warm up"))
         try:
@@ -310,9 +314,7 @@ class QwenEngine:
         limit = min(self._config.max_text_tokens, context.room - num_kept) if exactly is None else exactly
         if not 1 <= limit <= context.room - num_kept:
             wanted = num_kept + max(limit, 1)
-            raise ContextFull(
-                session=context.name, used=context.num_tokens, wanted=wanted, limit=context.max_tokens
-            )
+            raise ContextFull(session=context.name, used=context.num_tokens, wanted=wanted, limit=context.max_tokens)
         sayable_V = self._may_end_V if exactly is None else self._is_text_V
         ids: list[int] = []
         end: int | None = None

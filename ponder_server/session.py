@@ -155,9 +155,7 @@ class Session:
             visible = torch.ones(1, num_new, num_tokens + num_new, dtype=torch.bool, device=embeds_TH.device)
             visible_BTS = visible.tril_(diagonal=num_tokens)
         self._cache.num_tokens = num_tokens
-        hidden_BTH: Tensor = self._ponder(
-            embeds_TH[None], positions_4BT, cache=self._cache, visible_BTS=visible_BTS
-        )
+        hidden_BTH: Tensor = self._ponder(embeds_TH[None], positions_4BT, cache=self._cache, visible_BTS=visible_BTS)
         self.ids.extend(ids_T)
         self._next_position = next_position
         return hidden_BTH[0]
@@ -188,9 +186,7 @@ class Session:
             copy = other._cache.attention[index]
             copy.keys[:, :, : self.num_tokens] = layer.keys[:, :, : self.num_tokens]
             copy.values[:, :, : self.num_tokens] = layer.values[:, :, : self.num_tokens]
-        for theirs, ours in zip(
-            other._cache.recurrent_tensors(), self._cache.recurrent_tensors(), strict=True
-        ):
+        for theirs, ours in zip(other._cache.recurrent_tensors(), self._cache.recurrent_tensors(), strict=True):
             theirs.copy_(ours)
         other.ids[:] = self.ids
         other._next_position = self._next_position

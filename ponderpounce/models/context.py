@@ -61,7 +61,7 @@ class Transition:
     reasoning: tuple[int, ...] | None = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Row:
     """Segments laid end to end: one causal training row, or the contents of a serving session."""
 
@@ -194,9 +194,7 @@ class ContextFormat:
             while end < len(ids) and ids[end] == image_pad:
                 end += 1
             if end - index != rows * columns:
-                raise ValueError(
-                    f"image at token {first_index + index} has {end - index} tokens, not {rows}x{columns}"
-                )
+                raise ValueError(f"image at token {first_index + index} has {end - index} tokens, not {rows}x{columns}")
             positions_4T[1, index:end] = position
             positions_4T[2, index:end] = position + offset_h
             positions_4T[3, index:end] = position + offset_w

@@ -90,13 +90,18 @@ class Ponder(nn.Module):
     def random(
         cls,
         config: PonderConfig,
-        vocabulary: Vocabulary,
+        vocabulary: Vocabulary | None = None,
         *,
         seed: int,
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float32,
     ) -> Self:
-        """A network whose weights depend on ``config`` and ``seed`` alone; no global random state moves."""
+        """A network whose weights depend on ``config`` and ``seed`` alone; no global random state moves.
+
+        Without a ``vocabulary`` it speaks the tiny one.
+        """
+        if vocabulary is None:
+            vocabulary = Vocabulary.tiny()
         qwen_config = config.qwen(vocabulary)
         context_format = ContextFormat(
             vocabulary=vocabulary,

@@ -1,29 +1,34 @@
 """PONDER on disk: a HuggingFace-layout folder, checked name by name before a single weight is read.
 
-    config.json                                      transformers' Qwen3.5 configuration tokenizer.json
-    the tokenizer model.safetensors | model.safetensors.index.json + shards ponder.json
-    what PONDER adds: carriers and image size (absent: the defaults)
+    config.json          transformers' Qwen3.5 configuration
+    tokenizer.json       the tokenizer
+    model.safetensors    the weights, or model.safetensors.index.json and its shards
+    ponder.json          what PONDER adds: carriers and image size
 
-A public Qwen3.5 checkpoint loads as it is; its carrier rows are then untrained padding rows.
+A public Qwen3.5 checkpoint has no ponder.json and loads as it is; its carriers are untrained padding rows.
 """
 
 import hashlib
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 import torch
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 from transformers.models.qwen3_5 import Qwen3_5Config
 
+from ponderpounce.models.config_json import from_json
 from ponderpounce.models.context import ContextFormat
 from ponderpounce.models.ponder import Ponder, image_grid, skeleton
 from ponderpounce.models.vocabulary import Vocabulary
 
+CONFIG_NAME = "config.json"
 INDEX_NAME = "model.safetensors.index.json"
 SINGLE_NAME = "model.safetensors"
+OWN_NAME = "ponder.json"
 IGNORED_PREFIX = "mtp."  # multi-token prediction: in public checkpoints, not in transformers' Qwen3.5
 MAX_SHARD_BYTES = 5_000_000_000
 MAX_NAMES_SHOWN = 5
@@ -34,44 +39,39 @@ class CheckpointError(ValueError):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Addition:
-    """Contents of ponder.json."""
+class StoredPonder:
+    """Contents of ponder.json. The defaults are for a public Qwen3.5, which has none; a file has every field."""
 
+    format: Literal["ponderpounce.ponder/1"] = "ponderpounce.ponder/1"
     num_carriers: int = 1
     first_carrier_id: int | None = None
     """None: the first row after the tokenizer's last id."""
     image_px: tuple[int, int] = (256, 256)
     is_random: bool = True
-    """The carriers were never trained; so it is with a public Qwen3.5, which has no ponder.json."""
+    """The carriers were never trained."""
 
 
-def load_ponder(
-    directory: Path, *, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
-) -> Ponder:
+def load_ponder(directory: Path, *, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Ponder:
     """Reads a checkpoint folder.
 
     Raises FileNotFoundError for a file that is not there, CheckpointError naming every missing, extra or
     misshapen tensor, and ValueError for a configuration that contradicts itself.
     """
-    config_path = directory / "config.json"
+    config_path = directory / CONFIG_NAME
     if not config_path.is_file():
-        raise FileNotFoundError(
-            f"{config_path}: not a checkpoint folder (--checkpoint DIR needs config.json)."
-        )
-    raw = json.loads(config_path.read_text())
+        raise FileNotFoundError(f"{config_path}: not a checkpoint folder (--checkpoint DIR needs config.json).")
+    raw = _read_json(config_path)
     if raw.get("model_type") != "qwen3_5":
-        raise CheckpointError(
-            f"{config_path}: model_type is {raw.get('model_type')!r}; PONDER reads 'qwen3_5'."
-        )
+        raise CheckpointError(f"{config_path}: model_type is {raw.get('model_type')!r}; PONDER reads 'qwen3_5'.")
     qwen_config = Qwen3_5Config.from_dict(raw)
     vocabulary = Vocabulary.load(directory)
-    addition = _read_addition(directory)
-    first_carrier_id = addition.first_carrier_id
+    stored = _read_stored(directory)
+    first_carrier_id = stored.first_carrier_id
     context_format = ContextFormat(
         vocabulary=vocabulary,
-        num_carriers=addition.num_carriers,
+        num_carriers=stored.num_carriers,
         first_carrier_id=vocabulary.num_tokens if first_carrier_id is None else first_carrier_id,
-        image_grid=image_grid(qwen_config, addition.image_px),
+        image_grid=image_grid(qwen_config, stored.image_px),
     )
     if qwen_config.image_token_id != vocabulary.image_pad:
         raise CheckpointError(
@@ -80,24 +80,29 @@ def load_ponder(
         )
     files = _files_by_tensor(directory)
     _check_tensors(directory, files, skeleton(qwen_config), tied=qwen_config.tie_word_embeddings)
-    ponder = Ponder(qwen_config, context_format, image_px=addition.image_px, device=device, dtype=dtype)
-    ponder.is_random = addition.is_random
+    ponder = Ponder(qwen_config, context_format, image_px=stored.image_px, device=device, dtype=dtype)
+    ponder.is_random = stored.is_random
     _read_tensors(files, ponder.qwen)
     return ponder
 
 
 def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_SHARD_BYTES) -> None:
-    """Writes a folder that :func:`load_ponder` and transformers' ``from_pretrained`` both read."""
+    """Writes a folder that :func:`load_ponder` and transformers' ``from_pretrained`` both read.
+
+    Raises FileExistsError rather than mix two checkpoints in one folder.
+    """
+    if (directory / CONFIG_NAME).exists():
+        raise FileExistsError(f"{directory} already holds a checkpoint; save into a new folder.")
     directory.mkdir(parents=True, exist_ok=True)
     ponder.qwen.config.save_pretrained(directory)
     ponder.format.vocabulary.save(directory)
-    addition = Addition(
+    stored = StoredPonder(
         num_carriers=ponder.format.num_carriers,
         first_carrier_id=ponder.format.first_carrier_id,
         image_px=ponder.image_px,
         is_random=ponder.is_random,
     )
-    (directory / "ponder.json").write_text(json.dumps(asdict(addition), indent=2) + "\n")
+    (directory / OWN_NAME).write_text(json.dumps(asdict(stored), indent=2) + "\n")
     shards: list[dict[str, Tensor]] = [{}]
     shard_bytes = 0
     for name, tensor in _own_tensors(ponder.qwen).items():
@@ -119,10 +124,13 @@ def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_S
     (directory / INDEX_NAME).write_text(json.dumps(index, indent=2) + "\n")
 
 
-def weights_hash(module: nn.Module) -> str:
-    """12 hex digits of sha256 over every tensor's name, dtype, shape and bytes: provenance."""
+def weights_hash(ponder: Ponder) -> str:
+    """12 hex digits of sha256 over every tensor's name, dtype, shape and bytes: provenance.
+
+    Reads every weight once, which takes seconds per ten gigabytes: compute it when a network is loaded.
+    """
     digest = hashlib.sha256()
-    for name, tensor in sorted(_own_tensors(module).items()):
+    for name, tensor in sorted(_own_tensors(ponder.qwen).items()):
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
         flat = tensor.detach().contiguous().reshape(-1).view(torch.uint8)
         digest.update(flat.cpu().numpy().data)
@@ -140,27 +148,32 @@ def _own_tensors(module: nn.Module) -> dict[str, Tensor]:
     return own
 
 
-def _read_addition(directory: Path) -> Addition:
-    path = directory / "ponder.json"
+def _read_json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text())
+    except ValueError as error:
+        raise CheckpointError(f"{path} is no JSON: {error}") from error
+
+
+def _open(path: Path) -> Any:
+    try:
+        return safe_open(path, framework="pt")
+    except SafetensorError as error:
+        raise CheckpointError(f"{path} is no safetensors file, or was cut short: {error}") from error
+
+
+def _read_stored(directory: Path) -> StoredPonder:
+    path = directory / OWN_NAME
     if not path.is_file():
-        return Addition()
-    raw = json.loads(path.read_text())
-    unknown = sorted(set(raw) - set(Addition.__dataclass_fields__))
-    if unknown:
-        raise CheckpointError(
-            f"{path}: unknown fields {unknown}; known: {sorted(Addition.__dataclass_fields__)}."
-        )
-    if "image_px" in raw:
-        height, width = raw["image_px"]
-        raw["image_px"] = (int(height), int(width))
-    return Addition(**raw)
+        return StoredPonder()
+    return from_json(StoredPonder, _read_json(path), str(path))
 
 
 def _files_by_tensor(directory: Path) -> dict[str, Path]:
     """Tensor name -> the safetensors file that holds it."""
     index_path = directory / INDEX_NAME
     if index_path.is_file():
-        weight_map: dict[str, str] = json.loads(index_path.read_text())["weight_map"]
+        weight_map: dict[str, str] = _read_json(index_path)["weight_map"]
         for file_name in sorted(set(weight_map.values())):
             if not (directory / file_name).is_file():
                 raise FileNotFoundError(f"{directory / file_name}: named by {INDEX_NAME}, but not there.")
@@ -168,7 +181,7 @@ def _files_by_tensor(directory: Path) -> dict[str, Path]:
     single = directory / SINGLE_NAME
     if not single.is_file():
         raise FileNotFoundError(f"{directory}: neither {SINGLE_NAME} nor {INDEX_NAME} is there.")
-    with safe_open(single, framework="pt") as file:
+    with _open(single) as file:
         return dict.fromkeys(file.keys(), single)
 
 
@@ -180,7 +193,7 @@ def _check_tensors(directory: Path, files: dict[str, Path], expected: nn.Module,
     faults = [f"missing {name} {expected_shapes[name]}" for name in sorted(set(expected_shapes) - found)]
     faults += [f"extra {name}" for name in sorted(found - set(expected_shapes))]
     for path in sorted(set(files.values())):
-        with safe_open(path, framework="pt") as file:
+        with _open(path) as file:
             in_file = set(file.keys())
             for name in sorted(n for n in found & set(expected_shapes) if files[n] == path):
                 if name not in in_file:
@@ -197,7 +210,7 @@ def _check_tensors(directory: Path, files: dict[str, Path], expected: nn.Module,
 def _read_tensors(files: dict[str, Path], module: nn.Module) -> None:
     own = _own_tensors(module)
     for path in sorted(set(files.values())):
-        with safe_open(path, framework="pt") as file:
+        with _open(path) as file:
             for name in file.keys():  # noqa: SIM118 - safe_open is not a mapping
                 if name in own and files.get(name) == path:
                     own[name].copy_(file.get_tensor(name))

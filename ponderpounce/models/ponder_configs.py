@@ -54,9 +54,7 @@ class PonderConfig:
                 f"{self.vocab_size}; lower first_carrier_id or num_carriers."
             )
         if 8 * sum(self.mrope_section) != self.head_dim:
-            raise ValueError(
-                f"mrope_section {self.mrope_section} must sum to head_dim / 8 = {self.head_dim / 8}"
-            )
+            raise ValueError(f"mrope_section {self.mrope_section} must sum to head_dim / 8 = {self.head_dim / 8}")
 
     def qwen(self, vocabulary: Vocabulary | None = None) -> Qwen3_5Config:
         """The transformers configuration; token ids come from ``vocabulary`` when there is one."""

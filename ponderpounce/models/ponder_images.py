@@ -25,6 +25,4 @@ def patchify(frames_NHW3: Tensor, *, patch_px: int = 16, merge: int = 2, tempora
     pixels = pixels.reshape(num_frames, rows, merge, patch_px, columns, merge, patch_px, channels)
     patches = pixels.permute(0, 1, 4, 2, 5, 7, 3, 6)  # N R C m m 3 p p
     patches = patches.unsqueeze(6).expand(-1, -1, -1, -1, -1, -1, temporal, -1, -1)
-    return patches.reshape(
-        num_frames * rows * columns * merge * merge, channels * temporal * patch_px * patch_px
-    )
+    return patches.reshape(num_frames * rows * columns * merge * merge, channels * temporal * patch_px * patch_px)

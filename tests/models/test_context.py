@@ -77,9 +77,7 @@ def test_positions_in_pieces_are_the_positions_of_the_whole(episode: Episode, cu
     segments = segments_of(episode)
     head, whole = FORMAT.row(segments[:cut]).ids, FORMAT.row(segments).ids
     head_positions, next_position = FORMAT.positions(head)
-    tail_positions, _ = FORMAT.positions(
-        whole[len(head) :], first_index=len(head), first_position=next_position
-    )
+    tail_positions, _ = FORMAT.positions(whole[len(head) :], first_index=len(head), first_position=next_position)
     both = np.concatenate([head_positions, tail_positions], axis=1)
     np.testing.assert_array_equal(both, FORMAT.positions(whole)[0])
 

@@ -28,9 +28,7 @@ def episode_row(form: ContextFormat) -> Row:
     return form.row(
         [
             *form.opening("press the button", [1, 2]),
-            *form.query(
-                2, Transition(subgoal=VOCABULARY.encode("press"), reasoning=VOCABULARY.encode("two"))
-            ),
+            *form.query(2, Transition(subgoal=VOCABULARY.encode("press"), reasoning=VOCABULARY.encode("two"))),
             *form.query(2),
         ]
     )

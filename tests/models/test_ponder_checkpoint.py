@@ -52,6 +52,9 @@ def test_saved_and_loaded_it_is_the_same_network(tmp_path: Path, tied: bool, max
     loaded = load_ponder(tmp_path)
     assert (tmp_path / INDEX_NAME).is_file() == (max_shard_bytes < 10**9)
     assert weights_hash(loaded) == weights_hash(saved)
+    for ponder in (saved, loaded):
+        table = ponder.qwen.model.language_model.embed_tokens.weight
+        assert (ponder.qwen.lm_head.weight is table) == tied
     assert loaded.format.carrier_ids == saved.format.carrier_ids
     assert loaded.image_px == (64, 64)
     row = saved.format.row([*saved.format.opening("press"), *saved.format.query(1)])
@@ -150,9 +153,23 @@ def test_another_architecture_is_refused(folder: Path) -> None:
 
 
 def test_an_unknown_field_is_refused(folder: Path) -> None:
-    (folder / "ponder.json").write_text(json.dumps({"num_carrier": 2}))
-    with pytest.raises(CheckpointError, match=r"unknown fields \['num_carrier'\]"):
+    stored = json.loads((folder / "ponder.json").read_text())
+    (folder / "ponder.json").write_text(json.dumps({**stored, "num_carrier": 2}))
+    with pytest.raises(ValueError, match=r"ponder\.json: .*unknown \['num_carrier'\]"):
         load_ponder(folder)
+
+
+@pytest.mark.parametrize("name", ["config.json", "ponder.json", SINGLE_NAME])
+def test_a_file_that_was_cut_short_is_named(folder: Path, name: str) -> None:
+    whole = (folder / name).read_bytes()
+    (folder / name).write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(CheckpointError, match=name):
+        load_ponder(folder)
+
+
+def test_a_checkpoint_is_never_overwritten(ponder: Ponder, folder: Path) -> None:
+    with pytest.raises(FileExistsError, match="already holds a checkpoint"):
+        save_ponder(ponder, folder)
 
 
 def test_an_empty_folder_says_what_it_needs(tmp_path: Path) -> None:

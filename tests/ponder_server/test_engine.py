@@ -165,9 +165,7 @@ def test_demo_reasoning_is_written_at_the_first_transition_only() -> None:
 def test_without_a_demo_the_first_transition_is_a_subgoal() -> None:
     engine = QwenEngine(taught((Transition(subgoal=SUBGOAL),), WITHOUT_DEMO), CONFIG)
     engine.open("a", WITHOUT_DEMO)
-    assert [(t.kind, t.text) for t in engine.fire("a", observation(0)).texts] == [
-        ("subgoal", "press the left button")
-    ]
+    assert [(t.kind, t.text) for t in engine.fire("a", observation(0)).texts] == [("subgoal", "press the left button")]
 
 
 @pytest.mark.parametrize("max_text_tokens", [len(REASONING), len(REASONING) - 1])
@@ -308,10 +306,20 @@ def test_a_wrong_demo_frame_is_refused_and_nothing_is_opened(engine: QwenEngine)
         engine.close("a")
 
 
+def test_an_episode_without_an_instruction_is_refused(engine: QwenEngine) -> None:
+    with pytest.raises(ValueError, match="'a': the instruction is empty"):
+        engine.open("a", Opening(instruction=" "))
+
+
 def test_a_missing_camera_is_refused(engine: QwenEngine) -> None:
     engine.open("a", WITHOUT_DEMO)
     with pytest.raises(ValueError, match="1 frames, this engine has num_cameras 2"):
         engine.fire("a", (frame(0),))
+
+
+def test_a_limit_of_nothing_is_refused() -> None:
+    with pytest.raises(ValueError, match="max_text_tokens is 0"):
+        replace(CONFIG, max_text_tokens=0)
 
 
 def test_sessions_have_names_and_a_number(engine: QwenEngine) -> None:
@@ -325,6 +333,14 @@ def test_sessions_have_names_and_a_number(engine: QwenEngine) -> None:
         engine.open("d", WITHOUT_DEMO)
     engine.close("a")
     engine.open("d", WITHOUT_DEMO)
+
+
+def test_the_memory_of_a_closed_session_serves_the_next_one(engine: QwenEngine) -> None:
+    engine.open("a", WITHOUT_DEMO)
+    memory = context_of(engine, "a")
+    engine.close("a")
+    engine.open("b", WITHOUT_DEMO)
+    assert context_of(engine, "b") is memory
 
 
 def test_an_opening_that_does_not_fit_is_refused(engine: QwenEngine) -> None:

@@ -54,9 +54,7 @@ def text_error(chunk: int, num_tokens: int = 140) -> float:
         positions, _ = FORMAT.positions(ids)
         full = PONDER(embeds[None], torch.from_numpy(positions)[:, None])[0]
         session = new_session()
-        pieces = [
-            session.append(ids[i : i + chunk], embeds[i : i + chunk]) for i in range(0, len(ids), chunk)
-        ]
+        pieces = [session.append(ids[i : i + chunk], embeds[i : i + chunk]) for i in range(0, len(ids), chunk)]
     return float((torch.cat(pieces) - full).abs().max())
 
 
