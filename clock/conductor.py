@@ -208,8 +208,11 @@ class Conductor:
         if self._is_lockstep and self._newest is not None and self._newest.tick < self.tick:
             return False
         if self._begun_tick < self.tick:
+            if self._is_lockstep and self._is_owed_by(now_ns):  # an answer ready by now must be seen by what we ask now
+                return False
             if not self._is_lockstep:
                 self._skip_missed(now_ns, effects)
+            self._stamp_answers(now_ns, effects)
             self._begun_tick = self.tick
             self._ask_if_due(effects)
         if self._is_lockstep and self._is_owed_by(now_ns):

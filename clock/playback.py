@@ -49,7 +49,7 @@ def chunk_for(chunks: Sequence[Chunk], tick: int) -> Chunk | None:
 
 
 Join = Callable[[Sequence[Chunk], int], Floats]
-"""A seam policy: the chunks that have a row for this tick (oldest first, at least one) and the tick give (action_dim,)."""
+"""A seam policy: from the chunks that have a row for a tick (oldest first, at least one), and it, to (action_dim,)."""
 
 
 def switch(chunks: Sequence[Chunk], tick: int) -> Floats:

@@ -5,8 +5,8 @@ the usual case, is done then: T_no is never part of the context (appendix A.2), 
 T_yes the append is undone, the observation is appended again with T_yes behind it (its vision tokens are
 kept), the text is decoded, and the carriers follow.
 
-Nothing here depends on a clock or on chance: equal calls give equal bits, within a session and after
-reopening it.
+Nothing here depends on a clock or on chance: on one machine equal calls give equal bits, also after reopening
+a session.
 
 # K carriers, H hidden, T tokens, V vocabulary
 """
@@ -281,23 +281,23 @@ class QwenEngine:
         progress()
         keep = self._format.num_carriers
         if force_text_tokens is not None:
-            text, _ = self._decode(context, hidden_H, "subgoal", keep, progress, exactly=force_text_tokens)
+            text, _ = self._decode(episode, hidden_H, "subgoal", keep, progress, exactly=force_text_tokens)
             return (text,)
         texts = []
         if episode.owes_reasoning:
             keep_subgoal = 2  # T_yes and one token
-            text, end = self._decode(context, hidden_H, "demo_reasoning", keep + keep_subgoal, progress)
+            text, end = self._decode(episode, hidden_H, "demo_reasoning", keep + keep_subgoal, progress)
             texts.append(text)
             if end not in (t_yes, None):
                 return tuple(texts)
             hidden_H = context.append([t_yes], t_yes_TH)[-1]
             progress()
-        text, _ = self._decode(context, hidden_H, "subgoal", keep, progress)
+        text, _ = self._decode(episode, hidden_H, "subgoal", keep, progress)
         return (*texts, text)
 
     def _decode(
         self,
-        context: Session,
+        episode: _Episode,
         hidden_H: Tensor,
         kind: Literal["subgoal", "demo_reasoning"],
         num_kept: int,
@@ -311,10 +311,13 @@ class QwenEngine:
         end nothing (images, carriers, padding rows) cannot be said, because a context cannot hold them as
         text.
         """
-        limit = min(self._config.max_text_tokens, context.room - num_kept) if exactly is None else exactly
-        if not 1 <= limit <= context.room - num_kept:
-            wanted = num_kept + max(limit, 1)
-            raise ContextFull(session=context.name, used=context.num_tokens, wanted=wanted, limit=context.max_tokens)
+        context = episode.context
+        room = context.room - num_kept
+        limit = min(self._config.max_text_tokens, room) if exactly is None else exactly
+        if not 1 <= limit <= room:
+            used = episode.before_fire.num_tokens  # what the session goes back to
+            wanted = context.num_tokens - used + max(limit, 1) + num_kept
+            raise ContextFull(session=context.name, used=used, wanted=wanted, limit=context.max_tokens)
         sayable_V = self._may_end_V if exactly is None else self._is_text_V
         ids: list[int] = []
         end: int | None = None

@@ -205,6 +205,9 @@ def is_of_episode(link: Link, header: Header) -> bool:
     """Whether a message belongs to the episode this process is in; if not, it is counted as dropped."""
     if header.episode == link.episode and header.epoch == link.epoch:
         return True
+    if not link.episode:  # between episodes: the tail of the last one, nobody's fault
+        link.dropped["no_episode"] += 1
+        return False
     came = f"{header.episode} epoch {header.epoch}"
     link.drop(
         f"{header.proc}#{header.boot_id}",

@@ -18,6 +18,7 @@ import zenoh
 
 from protocol.bus import Bell, Inbox, Request, Sample, Subscription
 from protocol.errors import CallFailed, TransportError
+from protocol.options import LinkOptions
 from protocol.topics import Priority
 
 LEASE_MS = 500
@@ -211,3 +212,15 @@ def _replier(query: zenoh.Query, key: str) -> Callable[[bytes], None]:
         query.drop()  # the caller waits for the end of replies, not for the first
 
     return reply
+
+
+def open_bus(options: LinkOptions) -> ZenohBus:
+    """The bus that a daemon's options describe.
+
+    Raises:
+        TransportError: an endpoint is taken, malformed, or open to the network without TLS.
+    """
+    files = options.tls_files()
+    tls = Tls(ca=files[0], certificate=files[1], key=files[2]) if files else None
+    endpoints = Endpoints(listen=options.listen, connect=options.connect, tls=tls, shared_memory=options.shared_memory)
+    return ZenohBus(endpoints)

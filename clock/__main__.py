@@ -1,0 +1,41 @@
+"""``clock-serve``: the clock service as its own process."""
+
+from __future__ import annotations
+
+import logging
+import sys
+
+import tyro
+
+from clock.config import ClockOptions
+from clock.service import ClockService
+from protocol.errors import TransportError
+from protocol.link import Link
+from protocol.process import IDLE_WAIT_NS, StopFlag, set_up_logging
+from protocol.zenoh_bus import open_bus
+
+log = logging.getLogger("clock-serve")
+
+
+def main(argv: list[str] | None = None) -> int:
+    options = tyro.cli(ClockOptions, args=argv, prog="clock-serve", description=ClockOptions.__doc__)
+    set_up_logging()
+    should_stop = StopFlag()
+    try:
+        bus = open_bus(options.link)
+    except TransportError as error:
+        print(f"clock-serve: {error}", file=sys.stderr)
+        return 2
+    service = ClockService(Link(bus, robot=options.link.robot, proc="clock"), options.service())
+    log.info("ready robot=%s listen=%s", options.link.robot, ",".join(options.link.listen))
+    try:
+        while not should_stop():
+            if not service.step():
+                bus.wait(service.wait_ns(IDLE_WAIT_NS))
+    finally:
+        bus.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,111 @@
+"""``pp-check``: does an episode's log follow from itself? Every decision derived again, the first that differs named.
+
+Causes before consequences: queries, stamps, invocations, chunks, deadlines, rows, result. An "oracle" episode has no
+servers, so only deadlines and result are checked.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from clock.check_answers import answers_of, check_chunks, check_invocations, check_queries, check_stamps
+from clock.check_findings import Disagreement, compare
+from clock.check_ticks import check_deadlines, check_rows
+from clock.report import statistics, stream_sha256
+from protocol.errors import ProtocolError
+from protocol.mcap_log import EpisodeRecord, read_log, recover
+
+AGREES, DISAGREES, UNREADABLE = 0, 1, 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CheckConfig:
+    """Derives every decision of recorded episodes again. Exit code 0: all agree, 1: one does not, 2: unreadable."""
+
+    files: tyro.conf.Positional[tuple[Path, ...]]
+    """Episode logs (.mcap, or .mcap.partial of a killed process)."""
+    recover: Path | None = None
+    """Write what is readable of the one FILE into this finished log, and check that."""
+    json: bool = False
+    """One JSON object per file instead of a sentence."""
+
+
+def disagreements(record: EpisodeRecord) -> Iterator[Disagreement]:
+    """All of them, causes before consequences; only the first is sure to be a cause. Lazy: take one with ``next``."""
+    if record.info.policy != "oracle":
+        answers = answers_of(record)
+        yield from check_queries(record)
+        yield from check_stamps(record, answers)
+        yield from check_invocations(record, answers)
+        yield from check_chunks(record, answers)
+        yield from check_deadlines(record)
+        yield from check_rows(record, answers)
+    else:
+        yield from check_deadlines(record)
+    yield from check_result(record)
+
+
+def check_result(record: EpisodeRecord) -> Iterator[Disagreement]:
+    """The result's count and hash; a log without a result, or a result without a hash, promises nothing."""
+    result = record.result
+    if result is None:
+        return
+    yield from compare("EpisodeResult", 0, num_ticks=(len(record.ticks), result.num_ticks))
+    if result.stream_sha256:
+        yield from compare("EpisodeResult", 0, stream_sha256=(stream_sha256(record.ticks), result.stream_sha256))
+
+
+def main(argv: list[str] | None = None) -> int:
+    config = tyro.cli(CheckConfig, args=argv, prog="pp-check")
+    if not config.files or (config.recover is not None and len(config.files) != 1):
+        sys.stderr.write("pp-check: name at least one log, and exactly one with --recover\n")
+        return UNREADABLE
+    return max(_check(path, config) for path in config.files)
+
+
+def _check(path: Path, config: CheckConfig) -> int:
+    try:
+        if config.recover is not None:
+            recover(path, config.recover)
+            path = config.recover
+        record = read_log(path)
+    except (OSError, ProtocolError) as error:
+        _tell(config, {"file": str(path), "error": str(error)}, f"{path}: unreadable: {error}")
+        return UNREADABLE
+    found = next(disagreements(record), None)
+    dropped = int(record.metadata.get("ponderpounce.result", {}).get("dropped_messages", "0"))
+    fields: dict[str, object] = {
+        "file": str(path),
+        "agrees": found is None,
+        "disagreement": None if found is None else _fields(found),
+        "unfinished": record.why if record.recovered else None,
+        "dropped_messages": dropped,
+        "stream_sha256": stream_sha256(record.ticks),
+        "statistics": statistics(record.ticks, record.stamps, record.invocations),
+    }
+    sentence = f"{path}: " + ("agrees" if found is None else f"DISAGREES: {found}")
+    sentence += f" ({len(record.ticks)} ticks, {len(record.queries)} queries, {len(record.invocations)} invocations)"
+    if record.recovered:
+        sentence += f"; {record.why}"
+    if dropped:
+        sentence += f"; the recorder dropped {dropped} messages, which may be all that is missing"
+    _tell(config, fields, sentence)
+    return AGREES if found is None else DISAGREES
+
+
+def _fields(found: Disagreement) -> dict[str, object]:
+    return {name: getattr(found, name) for name in ("message", "index", "field", "expected", "found")}
+
+
+def _tell(config: CheckConfig, fields: dict[str, object], sentence: str) -> None:
+    sys.stdout.write((json.dumps(fields) if config.json else sentence) + "\n")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,228 @@
+"""Were the right questions asked, and was each answer admitted when it should have been? Queries to chunks.
+
+Everything is derived again from the messages and the pure rules (``reference``, ``delays``); nothing here knows the
+Conductor, so a defect there cannot hide itself. Two facts of its publishing are relied on: ``header.at_ns`` of a Query
+is the instant of the poll that asked, and the stamps' ``arrived_ns`` are measurements, which no rule gives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from clock.check_findings import Disagreement, compare
+from clock.conductor import invocation_seed
+from clock.delays import in_order, modelled_ns
+from clock.playback import Chunk, covering, deadline_ns, tick_at
+from clock.reference import Ready, refer
+from protocol.mcap_log import EpisodeRecord
+from protocol.messages import (
+    EPISODE_CLOCK,
+    ActionChunk,
+    Cognition,
+    DeliveryKind,
+    Floats,
+    Invocation,
+    Level,
+    Mode,
+    Query,
+    Stamp,
+    StampKind,
+    WaitKind,
+)
+
+
+@dataclass(slots=True)
+class Answers:
+    """What the clock service had to work with, by index: the answers it took, and the stamps that admitted them."""
+
+    cognitions: dict[int, Cognition] = field(default_factory=dict)
+    chunks: dict[int, ActionChunk] = field(default_factory=dict)
+    ready: list[Ready] = field(default_factory=list)
+    chunk_ready_ns: dict[int, int] = field(default_factory=dict)
+
+    def admitted(self, now_ns: int) -> list[Chunk]:
+        """The chunks that could be played at ``now_ns``."""
+        return [
+            Chunk(
+                invocation=chunk.invocation,
+                t_row0=chunk.t_row0,
+                rows_NA=chunk.rows_NA,
+                ref_query=chunk.ref_query,
+                age_ns=chunk.age_ns,
+            )
+            for index, chunk in self.chunks.items()
+            if index in self.chunk_ready_ns and self.chunk_ready_ns[index] <= now_ns
+        ]
+
+
+def answers_of(record: EpisodeRecord) -> Answers:
+    """The answers as the clock service takes them: the first to what was asked; doubles and strangers do not count."""
+    asked_ns = {q.query: q.source_ns for q in record.queries}
+    invoked_ns = {i.invocation: i.now_ns for i in record.invocations}
+    shape = (record.info.schedule.horizon, record.info.robot.action_dim)
+    answers = Answers()
+    for cognition in record.cognitions:
+        if asked_ns.get(cognition.query) == cognition.source_ns:
+            answers.cognitions.setdefault(cognition.query, cognition)
+    for chunk in record.chunks:
+        if invoked_ns.get(chunk.invocation) == chunk.source_ns and (chunk.horizon, chunk.action_dim) == shape:
+            answers.chunks.setdefault(chunk.invocation, chunk)
+    for stamp in record.stamps:
+        if stamp.kind == StampKind.CHUNK:
+            answers.chunk_ready_ns[stamp.index] = stamp.ready_ns
+        else:
+            answers.ready.append(
+                Ready(
+                    query=stamp.index,
+                    source_ns=stamp.source_ns,
+                    ready_ns=stamp.ready_ns,
+                    is_transition=stamp.is_transition,
+                )
+            )
+    return answers
+
+
+def check_queries(record: EpisodeRecord) -> Iterator[Disagreement]:
+    """Numbered without gaps, each about an observation that was there, never twice in one query period."""
+    schedule, queries = record.info.schedule, record.queries
+    sources: dict[int, set[int]] = {}
+    for observation in record.observations:
+        if observation.header.clock_id == EPISODE_CLOCK:  # on another clock the log cannot say
+            sources.setdefault(observation.tick, set()).add(observation.source_ns)
+    window = 0
+    for index, query in enumerate(queries):
+        yield from compare("Query", index, query=(index, query.query))
+        if query.tick in sources and query.source_ns not in sources[query.tick]:
+            yield from compare("Query", index, source_ns=(min(sources[query.tick]), query.source_ns))
+        if index == 0:
+            continue
+        if query.tick <= queries[index - 1].tick:
+            yield from compare("Query", index, tick=(f"later than {queries[index - 1].tick}", query.tick))
+        if record.ticks and query.header.clock_id == EPISODE_CLOCK:
+            start_ns, hz = record.ticks[0].deadline_ns, schedule.control_hz
+            asked_ns = deadline_ns(start_ns, tick_at(start_ns, query.header.at_ns, hz), hz)
+            previous, window = window, (asked_ns - queries[0].source_ns) // schedule.query_period_ns
+            if window <= previous:
+                period_ms = schedule.query_period_ns / 1e6
+                expected = f"the first of its {period_ms:.0f} ms, period {previous + 1} or later"
+                yield from compare("Query", index, period=(expected, f"period {window}"))
+
+
+def check_stamps(record: EpisodeRecord, answers: Answers) -> Iterator[Disagreement]:
+    """One stamp per answer, in order, at the instant that the delay model gives."""
+    schedule = record.info.schedule
+    query_rng, invoke_rng = map(np.random.default_rng, np.random.SeedSequence(schedule.seed).spawn(2))
+    yield from _check_kind(
+        "Stamp of cognition",
+        record,
+        [s for s in record.stamps if s.kind == StampKind.COGNITION],
+        record.queries,
+        answers.cognitions,
+        [modelled_ns(schedule.query_delay, query_rng) for _ in record.queries],
+    )
+    yield from _check_kind(
+        "Stamp of chunk",
+        record,
+        [s for s in record.stamps if s.kind == StampKind.CHUNK],
+        record.invocations,
+        answers.chunks,
+        [modelled_ns(schedule.invoke_delay, invoke_rng) for _ in record.invocations],
+    )
+
+
+def _check_kind(
+    name: str,
+    record: EpisodeRecord,
+    stamps: Sequence[Stamp],
+    asked: Sequence[Query] | Sequence[Invocation],
+    answers: dict[int, Cognition] | dict[int, ActionChunk],
+    delays_ns: Sequence[int | None],
+) -> Iterator[Disagreement]:
+    is_lockstep = record.info.schedule.mode == Mode.LOCKSTEP
+    last_index, last_ready_ns = -1, None
+    for stamp in stamps:
+        if stamp.index <= last_index:
+            yield from compare(name, stamp.index, index=(f"above {last_index}, each once", stamp.index))
+        answer = answers.get(stamp.index)
+        if stamp.index >= len(asked) or answer is None:
+            yield from compare(name, stamp.index, answer=("the answer it admits", "none in the log"))
+            continue
+        delay_ns = delays_ns[stamp.index]
+        if delay_ns is None:  # measured: what it took (lockstep), or when it came (real time)
+            delay_ns = answer.infer_ns if is_lockstep else stamp.arrived_ns - answer.source_ns
+        ready_ns = in_order(max(answer.source_ns + delay_ns, stamp.arrived_ns), last_ready_ns)
+        is_transition = isinstance(answer, Cognition) and answer.is_transition
+        yield from compare(
+            name,
+            stamp.index,
+            source_ns=(answer.source_ns, stamp.source_ns),
+            ready_ns=(ready_ns, stamp.ready_ns),
+            is_transition=(is_transition, stamp.is_transition),
+        )
+        last_index, last_ready_ns = stamp.index, stamp.ready_ns
+
+
+def check_invocations(record: EpisodeRecord, answers: Answers) -> Iterator[Disagreement]:
+    """The paper's rule: which cognition, how old, and that POUNCE was given that very vector."""
+    schedule = record.info.schedule
+    window = -1
+    for index, invocation in enumerate(record.invocations):
+        yield from compare("Invocation", index, invocation=(index, invocation.invocation))
+        reference = refer(answers.ready, invocation.now_ns, schedule.delivery)
+        yield from compare(
+            "Invocation",
+            index,
+            ref_query=(reference.query, invocation.ref_query),
+            age_ns=(reference.age_ns, invocation.age_ns),
+            seed=(invocation_seed(schedule.seed, index), invocation.seed),
+        )
+        if reference.query is None and schedule.delivery.kind != DeliveryKind.NULL:
+            yield from compare("Invocation", index, now_ns=("after the first cognition", invocation.now_ns))
+        if reference.query is None:
+            yield from compare("Invocation", index, cognition=((0, 0), invocation.cognition.shape))
+        elif reference.query in answers.cognitions:
+            vector = answers.cognitions[reference.query].vector
+            yield from compare("Invocation", index, cognition=(vector, invocation.cognition))
+        if not record.ticks:
+            continue
+        start_ns = record.ticks[0].deadline_ns
+        tick = tick_at(start_ns, invocation.now_ns, schedule.control_hz)
+        if tick < 0:  # before the first tick there are no deadlines: at the poll instant
+            if schedule.wait != WaitKind.STAND_STILL:
+                yield from compare("Invocation", index, now_ns=(f"{start_ns} or later", invocation.now_ns))
+            continue
+        due_ns = deadline_ns(start_ns, tick, schedule.control_hz)
+        yield from compare("Invocation", index, now_ns=(due_ns, invocation.now_ns))
+        previous, window = window, tick // schedule.invoke_period_ticks
+        if window <= previous:
+            expected = f"the first of its {schedule.invoke_period_ticks} ticks, period {previous + 1} or later"
+            yield from compare("Invocation", index, period=(expected, f"period {window}"))
+        tail = _unplayed_rows(record, answers, tick)
+        if tail is not None:
+            yield from compare("Invocation", index, previous_rows=(tail, invocation.previous_rows))
+
+
+def _unplayed_rows(record: EpisodeRecord, answers: Answers, tick: int) -> Floats | None:
+    """What the chunk in use still had to say from ``tick`` on, (n * action_dim,); None if the log ends before."""
+    if tick >= len(record.ticks) or record.ticks[tick].level == Level.SKIPPED:
+        return None
+    chunks = covering(answers.admitted(record.ticks[tick].decided_ns), tick)
+    return chunks[-1].rows_NA[tick - chunks[-1].t_row0 :].ravel() if chunks else np.zeros(0, np.float32)
+
+
+def check_chunks(record: EpisodeRecord, answers: Answers) -> Iterator[Disagreement]:
+    """Every chunk that was admitted says what its invocation said."""
+    for index, chunk in answers.chunks.items():
+        invocation = record.invocations[index]
+        if index in answers.chunk_ready_ns:
+            yield from compare(
+                "ActionChunk",
+                index,
+                t_row0=(invocation.tick, chunk.t_row0),
+                ref_query=(invocation.ref_query, chunk.ref_query),
+                age_ns=(invocation.age_ns, chunk.age_ns),
+                seed=(invocation.seed, chunk.seed),
+            )

@@ -1,0 +1,138 @@
+"""Was the right row played at every tick? Deadlines, chunk, seam, limits, ladder, command: all derived again.
+
+The only state carried from tick to tick is what the rules themselves carry: the last command, the ladder's rung, and
+which chunk was played last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from clock.check_answers import Answers
+from clock.check_findings import Disagreement, compare
+from clock.ladder import Ladder
+from clock.limits import Hit, within_limits
+from clock.playback import Chunk, covering, deadline_ns, row_of, seam_policy, tick_at
+from clock.report import PLAYED
+from clock.timebase import NS_PER_MS
+from protocol.mcap_log import EpisodeRecord
+from protocol.messages import EpisodeInfo, Floats, Level, Mode, Tick
+
+_NO_FLOATS: Floats = np.zeros(0, np.float32)
+
+
+def check_deadlines(record: EpisodeRecord) -> Iterator[Disagreement]:
+    """Tick k, without gaps, is due k / hz after tick 0; in lockstep it is never late."""
+    schedule = record.info.schedule
+    for index, tick in enumerate(record.ticks):
+        yield from compare("Tick", index, tick=(index, tick.tick))
+        due_ns = deadline_ns(record.ticks[0].deadline_ns, index, schedule.control_hz)
+        yield from compare(
+            "Tick",
+            index,
+            deadline_ns=(due_ns, tick.deadline_ns),
+            late_ns=(tick.decided_ns - tick.deadline_ns, tick.late_ns),
+            late_ms=(tick.late_ns / NS_PER_MS, tick.late_ms),
+        )
+        if tick.late_ns < 0:
+            yield from compare("Tick", index, late_ns=("0 or more", tick.late_ns))
+        if schedule.mode == Mode.LOCKSTEP:
+            yield from compare("Tick", index, late_ns=(0, tick.late_ns))
+
+
+def check_rows(record: EpisodeRecord, answers: Answers) -> Iterator[Disagreement]:
+    """What each tick commanded, and that the Action sent is the same. Assumes that the deadlines agree."""
+    states = _logged_states(record)
+    actions = {action.tick: action for action in record.actions}
+    engaged = sorted(event.tick for event in record.events if event.name == "engaged")
+    playing = _Playing(record.info)
+    for index, tick in enumerate(record.ticks):
+        newest = tick_at(record.ticks[0].deadline_ns, tick.decided_ns, record.info.schedule.control_hz)
+        is_skipped = newest > index
+        if is_skipped or tick.level == Level.SKIPPED:  # nothing was commanded, nothing moves on
+            yield from compare("Tick", index, is_skipped=(is_skipped, tick.level == Level.SKIPPED))
+            yield from compare("Tick", index, action=(_NO_FLOATS, tick.action), sent=(False, index in actions))
+            continue
+        while engaged and engaged[0] <= index:
+            engaged.pop(0)
+            playing.ladder.engage()
+        if tick.observation_tick in states:
+            bits = {state.tobytes() for state in states[tick.observation_tick]}
+            if tick.state.tobytes() not in bits:
+                yield from compare("Tick", index, state=(states[tick.observation_tick][0], tick.state))
+        usable = [c for c in covering(answers.admitted(tick.decided_ns), index) if c.age_ns <= playing.stale_limit_ns]
+        yield from compare("Tick", index, **playing.step(tick, usable))
+        if index not in actions:
+            yield from compare("Action", index, sent=(True, False))
+        else:
+            sent = actions[index]
+            yield from compare(
+                "Action",
+                index,
+                deadline_ns=(tick.deadline_ns, sent.deadline_ns),
+                level=(tick.level, sent.level),
+                values=(tick.action, sent.values),
+            )
+
+
+@dataclass(slots=True)
+class _Playing:
+    """The rules, one tick after the other."""
+
+    info: EpisodeInfo
+    ladder: Ladder = field(init=False)
+    last_command: Floats = field(init=False)
+    played_invocation: int | None = None
+
+    def __post_init__(self) -> None:
+        self.ladder = Ladder(self.info.schedule)
+        self.last_command = self.info.robot.initial_command
+
+    @property
+    def stale_limit_ns(self) -> int:
+        return self.info.schedule.stale_limit_ns
+
+    def step(self, tick: Tick, usable: list[Chunk]) -> dict[str, tuple[Any, Any]]:
+        """(expected, found) of every field of ``tick``; ``usable``: chunks with a row for it, oldest first."""
+        raw, row, hit = _NO_FLOATS, None, Hit.NONE
+        if usable:
+            raw = seam_policy(self.info.schedule.seam)(usable, tick.tick)
+            row, hit = within_limits(raw, self.last_command, self.info.robot)
+        is_stale = bool(usable) and usable[-1].age_ns > self.info.schedule.max_age_ns
+        command = self.ladder.step(row, is_stale, self.last_command, tick.state)
+        level = self.ladder.level
+        if level in (Level.DECELERATE, Level.STOPPED):
+            limited, _ = within_limits(command, self.last_command, self.info.robot)
+            command = self.last_command if limited is None else limited
+        chunk = usable[-1] if level in PLAYED else None
+        jump = 0.0
+        if chunk is not None and chunk.invocation != self.played_invocation:
+            self.played_invocation = chunk.invocation
+            jump = float(np.abs(raw[:-1] - self.last_command[:-1]).max(initial=0.0))
+        self.last_command = command
+        age_ns = chunk.age_ns if chunk else 0
+        return {
+            "invocation": (chunk.invocation if chunk else None, tick.invocation),
+            "t_row0": (chunk.t_row0 if chunk else 0, tick.t_row0),
+            "row": (row_of(chunk, tick.tick) if chunk else 0, tick.row),
+            "ref_query": (chunk.ref_query if chunk else None, tick.ref_query),
+            "age_ns": (age_ns, tick.age_ns),
+            "age_ms": (age_ns / NS_PER_MS, tick.age_ms),
+            "raw_row": (raw, tick.raw_row),
+            "limits_hit": (int(hit), tick.limits_hit),
+            "level": (level, tick.level),
+            "action": (command, tick.action),
+            "seam_jump": (jump, tick.seam_jump),
+        }
+
+
+def _logged_states(record: EpisodeRecord) -> dict[int, list[Floats]]:
+    """Proprio of the observations, by tick; a robot may send one twice."""
+    states: dict[int, list[Floats]] = {}
+    for observation in record.observations:
+        states.setdefault(observation.tick, []).append(observation.proprio)
+    return states

@@ -1,0 +1,28 @@
+"""Options of ``clock-serve``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from clock.service import ServiceConfig
+from protocol.options import LinkOptions
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClockOptions:
+    """The clock service as a process of its own: opens episodes, issues every instant, plays rows at 20 Hz."""
+
+    link: LinkOptions = field(
+        default_factory=lambda: LinkOptions(
+            listen=("tcp/127.0.0.1:7447",), connect=("tcp/127.0.0.1:7448", "tcp/127.0.0.1:7449")
+        )
+    )
+    allow_starved: bool = False
+    """Start although the schedule leaves ticks without a row (see docs/clock.md)."""
+    max_clock_bound_ms: float = 5.0
+    """Refuse to start when another host's clock is known less exactly than this."""
+
+    def service(self) -> ServiceConfig:
+        return ServiceConfig(
+            allow_starved=self.allow_starved, max_clock_bound_ns=round(self.max_clock_bound_ms * 1_000_000)
+        )

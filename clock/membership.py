@@ -1,0 +1,131 @@
+"""A model server's part in an episode: the clock service opens and closes it, and tells a restarted one what it missed.
+
+Shared by both model servers; it calls two functions of theirs and keeps identity, heartbeat and refusals in one place.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+
+from protocol import messages as m
+from protocol.errors import CallFailed, ProtocolError
+from protocol.heartbeat import Heartbeat
+from protocol.link import Link
+from protocol.process import host_clock_id
+from protocol.topics import ACTIVE, CLOSE, JOURNAL, OPEN, TIME
+
+log = logging.getLogger(__name__)
+
+JOURNAL_PAGE = 4  # observations per call: 1.6 MB of two raw 256 px views
+_CALL_NS = 2_000_000_000
+_ASK_AGAIN_NS = 1_000_000_000
+
+Open = Callable[[m.OpenRequest], m.Contract]
+Close = Callable[[], None]
+
+
+class Membership:
+    """Keeps one server in the episode that the clock service runs.
+
+    Args:
+        open_episode: starts the episode in the engine and promises a contract; raises ValueError to refuse.
+        close_episode: forgets the episode; called also before a new one.
+    """
+
+    def __init__(self, link: Link, heartbeat: Heartbeat, open_episode: Open, close_episode: Close) -> None:
+        self._link = link
+        self._heartbeat = heartbeat
+        self._open_episode = open_episode
+        self._close_episode = close_episode
+        self._opening = link.serve(OPEN)
+        self._closing = link.serve(CLOSE)
+        self._timing = link.serve(TIME)
+        self._ask_again_ns = 0
+
+    def step(self) -> bool:
+        """Answers waiting calls."""
+        answered = self._opening.answer(self._on_open) + self._closing.answer(self._on_close)
+        return answered + self._timing.answer(_on_time) > 0
+
+    def rejoin(self) -> tuple[m.OpenRequest, int] | None:
+        """Asks the clock service which episode runs, at most once a second; opens it here.
+
+        Returns the episode and how many queries it has issued, or None if there is none or we are in it already.
+        """
+        now_ns = time.monotonic_ns()
+        if now_ns < self._ask_again_ns:
+            return None
+        self._ask_again_ns = now_ns + _ASK_AGAIN_NS
+        try:
+            reply = self._link.call(ACTIVE, "clock", m.ActiveRequest(), timeout_ns=_CALL_NS)
+        except CallFailed:
+            return None  # no clock service, hence no episode
+        if reply.error:
+            log.error("rejoin %s", reply.error)
+        if reply.open is None or reply.open.info.header.episode == self._link.episode:
+            return None
+        opened = self._on_open(reply.open, announce=False)
+        if opened.error:
+            log.error("rejoin refused=%s", opened.error)
+            return None
+        log.info("rejoin episode=%s queries=%d", self._link.episode, reply.num_queries)
+        return reply.open, reply.num_queries
+
+    def journal(self, num_queries: int) -> Iterator[m.JournalEntry]:
+        """The observations that the episode's queries were about, oldest first.
+
+        Raises:
+            CallFailed: the clock service stopped answering.
+            ProtocolError: it no longer runs this episode.
+        """
+        first = 0
+        while first < num_queries:
+            request = m.JournalRequest(first_query=first, max_queries=JOURNAL_PAGE)
+            reply = self._link.call(JOURNAL, "clock", request, timeout_ns=_CALL_NS)
+            if reply.error or not reply.entries:
+                raise ProtocolError(reply.error or f"the journal ends at query {first} of {num_queries}")
+            yield from reply.entries
+            first += len(reply.entries)
+
+    def announce(self) -> None:
+        """Tells the clock service that this server knows the episode."""
+        self._heartbeat.set(open_episode=self._link.episode)
+
+    def _on_open(self, request: m.OpenRequest, *, announce: bool = True) -> m.OpenReply:
+        header = request.info.header
+        if self._link.episode:
+            self._leave()
+        self._link.enter_episode(header.session, header.episode, header.epoch)
+        try:
+            contract = self._open_episode(request)
+        except ValueError as error:
+            self._leave()
+            return m.OpenReply(error=str(error))
+        if announce:
+            self.announce()
+        return m.OpenReply(contract=contract)
+
+    def _on_close(self, request: m.CloseRequest) -> m.CloseReply:
+        if self._link.episode:
+            self._leave()
+        return m.CloseReply()
+
+    def _leave(self) -> None:
+        self._close_episode()
+        self._link.leave_episode()
+        self._heartbeat.set(open_episode="")
+
+
+def _on_time(request: m.TimeRequest) -> m.TimeReply:
+    now_ns = time.monotonic_ns()
+    return m.TimeReply(clock_id=host_clock_id(), t1_ns=now_ns, t2_ns=now_ns)
+
+
+def percentile_ns(durations_ns: list[int], percent: float) -> int:
+    """Nearest-rank percentile; 0 of nothing."""
+    if not durations_ns:
+        return 0
+    rank = max(1, -(-len(durations_ns) * percent // 100))
+    return sorted(durations_ns)[int(rank) - 1]

@@ -1,0 +1,41 @@
+"""Named schedules: the paper's, and one that a real clock can keep."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from clock.timebase import NS_PER_MS, NS_PER_S
+from protocol.messages import Delay, DelayKind, Mode, Schedule, WaitKind
+
+CONTROL_HZ = 20
+HORIZON = 20
+MAX_TICKS = 1300  # RoboMME's limit as the paper uses it (B.1)
+
+MEASURED = Delay(kind=DelayKind.MEASURED)
+NONE = Delay(kind=DelayKind.FIXED, mean_ns=0)
+FIXED_300_MS = Delay(kind=DelayKind.FIXED, mean_ns=300 * NS_PER_MS)
+TRAINING_DELAY = Delay(kind=DelayKind.LOG_NORMAL, mean_ns=300 * NS_PER_MS, sigma=0.3)  # A.1
+
+
+def paper() -> Schedule:
+    """The paper's evaluation (B.1): both models at 1 Hz, 300 ms of modelled delay, 20 rows of 20 played, lockstep."""
+    return Schedule(
+        mode=Mode.LOCKSTEP,
+        control_hz=CONTROL_HZ,
+        horizon=HORIZON,
+        query_period_ns=NS_PER_S,
+        invoke_period_ticks=20,
+        query_delay=FIXED_300_MS,
+        invoke_delay=NONE,
+        wait=WaitKind.STAND_STILL,
+        max_age_ns=2 * NS_PER_S,  # a fire with text takes 0.87 s p95: 1.9 s is still normal at 1 Hz
+        stale_limit_ns=10 * NS_PER_S,
+        hold_limit_ticks=10,
+        decelerate_ticks=10,
+        max_ticks=MAX_TICKS,
+    )
+
+
+def realtime() -> Schedule:
+    """What a real clock can keep: POUNCE every 10 ticks, so that d <= 10 - 0 rows may pass while it thinks."""
+    return replace(paper(), mode=Mode.REALTIME, invoke_period_ticks=10, query_delay=MEASURED, invoke_delay=MEASURED)

@@ -1,0 +1,406 @@
+"""The clock service: the shell around the conductor, embedded in ``sim-client`` or running as ``clock-serve``.
+
+It is the authority on time: it opens the episode at both model servers, checks that they fit and that the schedule can
+be kept, issues every instant, watches who is alive, and keeps the journal from which a restarted PONDER rebuilds its
+context. One thread; nothing here blocks while an episode runs.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from clock.conductor import Conductor, Stage
+from clock.feasibility import check_feasible
+from clock.offset import Offset, from_exchange, narrowest
+from clock.timebase import MonotonicClock, VirtualClock
+from clock.watch import HEARTBEAT_TIMEOUT_NS, Watch
+from protocol import messages as m
+from protocol.errors import CallFailed, ProtocolError
+from protocol.link import Link, Service, is_of_episode
+from protocol.process import host_clock_id
+from protocol.topics import (
+    ACTION,
+    ACTIVE,
+    CHUNK,
+    CLOSE,
+    COGNITION,
+    ENGAGE,
+    EVENT,
+    HEALTH,
+    INFO,
+    INVOCATION,
+    JOURNAL,
+    OBSERVATION,
+    OPEN,
+    PHASE,
+    QUERY,
+    STAMP,
+    TICK,
+    TIME,
+    Topic,
+    alive_key,
+)
+
+log = logging.getLogger(__name__)
+
+SERVERS = ("ponder", "pounce")
+NUM_TIME_EXCHANGES = 8
+_CALL_NS = 2_000_000_000
+_OPEN_NS = 120_000_000_000  # a long demonstration is encoded inside this call
+_TOPIC_OF: dict[type, Topic[object]] = {
+    t.cls: t  # type: ignore[misc]
+    for t in (QUERY, STAMP, INVOCATION, ACTION, TICK, EVENT)
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServiceConfig:
+    """What the clock service insists on."""
+
+    allow_starved: bool = False
+    """Start although d <= s <= H - d fails; starved ticks are held and counted."""
+    max_clock_bound_ns: int = 5_000_000
+    """An episode does not start when a clock on another host is known less exactly than this."""
+    heartbeat_timeout_ns: int = HEARTBEAT_TIMEOUT_NS
+    journal_limit_bytes: int = 2 << 30
+    """Observations kept for a PONDER that restarts; beyond it, a restarted PONDER is refused and the ladder acts."""
+    watches: bool = True
+    """False when all parties share one thread and none can die alone."""
+
+
+@dataclass(slots=True)
+class _Episode:
+    request: m.OpenRequest
+    conductor: Conductor
+    clock: MonotonicClock | VirtualClock | None = None  # starts with the first observation: episode time 0
+    journal: list[m.JournalEntry] = field(default_factory=list)
+    journal_bytes: int = 0
+    newest_payload: bytes = b""
+    phase: str = ""
+
+    @property
+    def now_ns(self) -> int:
+        return self.clock.now_ns() if self.clock is not None else 0
+
+    @property
+    def is_lockstep(self) -> bool:
+        return self.request.info.schedule.mode == m.Mode.LOCKSTEP
+
+
+class ClockService:
+    """One robot's clock. ``step`` does what is due and says whether anything was; ``wait_ns``, how long to wait."""
+
+    def __init__(self, link: Link, config: ServiceConfig, *, host_clock: MonotonicClock | None = None) -> None:
+        self._link = link
+        self._config = config
+        self._host = host_clock or MonotonicClock(zero_ns=0)
+        self._watch = Watch(timeout_ns=config.heartbeat_timeout_ns)
+        self._episode: _Episode | None = None
+        self._last_epoch: dict[str, int] = {}
+        self._offsets: dict[str, Offset] = {}
+        self._is_stepping = False
+        self._observations = link.subscribe(OBSERVATION, keep=8)
+        self._cognitions = link.subscribe(COGNITION)
+        self._chunks = link.subscribe(CHUNK)
+        self._healths = link.subscribe(HEALTH)
+        self._tokens = link.bus.watch_alive(alive_key(link.robot, "*"))
+        self._services: list[tuple[Service, Callable[[Any], Any]]] = [
+            (link.serve(OPEN), self.open),
+            (link.serve(CLOSE), self.close),
+            (link.serve(ACTIVE), self._on_active),
+            (link.serve(JOURNAL), self._on_journal),
+            (link.serve(TIME), self._on_time),
+            (link.serve(ENGAGE), self._on_engage),
+        ]
+        link.bus.declare_alive(alive_key(link.robot, link.proc))
+
+    @property
+    def conductor(self) -> Conductor | None:
+        return self._episode.conductor if self._episode else None
+
+    def wait_ns(self, longest_ns: int) -> int:
+        """How long nothing is due, if no message comes."""
+        episode = self._episode
+        due_ns = episode.conductor.next_ns(episode.now_ns) if episode and episode.clock else None
+        if episode is None or due_ns is None or episode.is_lockstep:
+            return longest_ns
+        return max(0, min(longest_ns, due_ns - episode.now_ns))
+
+    def step(self) -> bool:
+        if self._is_stepping:  # called back while we wait for a server on a LocalBus
+            return False
+        self._is_stepping = True
+        try:
+            worked = any([service.answer(handler) > 0 for service, handler in self._services])  # all of them
+            worked |= self._take_messages()
+            self._look_around()
+            return self._conduct() or worked
+        finally:
+            self._is_stepping = False
+
+    # -- what comes in
+
+    def _take_messages(self) -> bool:
+        worked = False
+        for health in self._healths.drain():
+            self._watch.on_health(health, self._host.now_ns())
+        for sample in self._tokens.drain():
+            self._watch.on_token(sample.key.rpartition("/")[2], bool(sample.payload))
+        episode = self._episode
+        for observation, sample in self._observations.receive():
+            if episode is not None and is_of_episode(self._link, observation.header):
+                worked |= self._on_observation(episode, observation, sample.payload)
+        for cognition in self._cognitions.drain():
+            if episode is not None and is_of_episode(self._link, cognition.header):
+                taken = episode.conductor.on_cognition(cognition, episode.now_ns)
+                worked |= taken or self._unasked("cognition", cognition.query, cognition.header)
+        for chunk in self._chunks.drain():
+            if episode is not None and is_of_episode(self._link, chunk.header):
+                taken = episode.conductor.on_chunk(chunk, episode.now_ns)
+                worked |= taken or self._unasked("chunk", chunk.invocation, chunk.header)
+        return worked
+
+    def _on_observation(self, episode: _Episode, observation: m.Observation, payload: bytes) -> bool:
+        if len(observation.proprio) != episode.request.info.robot.num_proprio:
+            expected = episode.request.info.robot.num_proprio
+            detail = f"expected {expected} joints, came {len(observation.proprio)}"
+            self._link.drop(observation.header.proc, "wrong_shape", detail)
+            return False
+        if observation.header.clock_id != m.EPISODE_CLOCK:
+            offset = self._offsets.get(observation.header.proc)
+            if offset is None:
+                self._link.drop(observation.header.proc, "unknown_clock", observation.header.clock_id)
+                return False
+            zero_ns = episode.clock.zero_ns if isinstance(episode.clock, MonotonicClock) else self._host.now_ns()
+            observation = replace(observation, source_ns=offset.to_ours(observation.source_ns) - zero_ns)
+        if episode.clock is None:
+            episode.clock = VirtualClock() if episode.is_lockstep else MonotonicClock()
+        episode.conductor.on_observation(observation)
+        episode.newest_payload = payload
+        return True
+
+    def _unasked(self, what: str, index: int, header: m.Header) -> bool:
+        self._link.drop(f"{header.proc}#{header.boot_id}", "unasked", f"{what} {index}")
+        return False
+
+    def _look_around(self) -> None:
+        """Notices lost and returned servers; a lost robot ends the episode."""
+        episode = self._episode
+        if episode is None or not self._config.watches:
+            return
+        procs = SERVERS if episode.request.info.policy == "servers" else ()
+        for change in self._watch.poll(procs, self._link.episode, self._host.now_ns()):
+            if change.is_lost:
+                episode.conductor.on_lost(change.proc)
+                self._event(m.Severity.ERROR, f"{change.proc}_lost", f"{change.proc} is lost: {change.why}")
+            else:
+                episode.conductor.on_back(change.proc)
+                self._event(m.Severity.INFO, f"{change.proc}_back", f"{change.proc} is back: {change.why}")
+        if self._watch.is_gone("sim"):
+            self._event(m.Severity.ERROR, "sim_lost", "the robot side is gone: the episode is over")
+            self._finish(None)
+
+    # -- what goes out
+
+    def _conduct(self) -> bool:
+        episode = self._episode
+        if episode is None or episode.clock is None:
+            return False
+        now_ns = episode.now_ns
+        effects = episode.conductor.poll(now_ns)
+        for effect in effects:
+            if isinstance(effect, m.Query):
+                self._keep(episode, effect)
+            self._link.publish(_TOPIC_OF[type(effect)], effect, at_ns=now_ns)
+        self._show_phase(episode, now_ns)
+        if isinstance(episode.clock, VirtualClock) and not episode.conductor.is_waiting(now_ns):
+            due_ns = episode.conductor.next_ns(now_ns)
+            if due_ns is not None and due_ns > now_ns:
+                episode.clock.advance_to(due_ns)
+                return True
+        return bool(effects)
+
+    def _keep(self, episode: _Episode, query: m.Query) -> None:
+        episode.journal.append(
+            m.JournalEntry(
+                query=query.query, tick=query.tick, source_ns=query.source_ns, observation=episode.newest_payload
+            )
+        )
+        episode.journal_bytes += len(episode.newest_payload)
+
+    def _show_phase(self, episode: _Episode, now_ns: int) -> None:
+        stage = episode.conductor.stage
+        state = episode.conductor.ladder.level.name.lower() if stage == Stage.RUNNING else stage.value
+        if state != episode.phase:
+            episode.phase = state
+            self._link.publish(PHASE, m.Phase(state=state), at_ns=now_ns)
+
+    def _event(self, severity: m.Severity, name: str, text: str, **attributes: str) -> None:
+        log.log(logging.WARNING if severity > m.Severity.INFO else logging.INFO, "event name=%s %s", name, text)
+        episode = self._episode
+        tick = episode.conductor.tick if episode else 0
+        event = m.Event(severity=severity, name=name, text=text, tick=tick, attributes=attributes)
+        self._link.publish(EVENT, event, at_ns=episode.now_ns if episode else 0)
+
+    # -- calls
+
+    def open(self, request: m.OpenRequest) -> m.OpenReply:
+        """Opens an episode at both servers, or says why not; ``try_again`` if that may pass by itself."""
+        info = request.info
+        header = info.header
+        if header.epoch <= self._last_epoch.get(header.session, 0):
+            last = self._last_epoch[header.session]
+            return m.OpenReply(error=f"epoch {header.epoch} of session {header.session} is not after {last}")
+        if self._episode is not None and self._episode.request.info.header.session != header.session:
+            return m.OpenReply(
+                error=f"robot {self._link.robot} is busy with episode {self._link.episode}", try_again=True
+            )
+        if self._episode is not None:
+            self._finish(None)  # the same robot starts over: its old episode is abandoned
+        if info.policy != "servers":
+            return self._begin(request, contracts=(), warnings=(), committed_ticks=0)
+        not_ready = self._not_ready() if self._config.watches else ""
+        if not_ready:
+            return m.OpenReply(error=not_ready, try_again=True)
+        try:
+            self._measure_offsets(SERVERS if info.robot.is_simulated else (*SERVERS, "sim"))
+            contracts = tuple(self._open_at(proc, request) for proc in SERVERS)
+            warnings, committed_ticks = self._agree(info, contracts)
+        except (CallFailed, ProtocolError) as error:
+            self._close_servers(None)
+            return m.OpenReply(error=str(error))
+        return self._begin(request, contracts, warnings, committed_ticks)
+
+    def _begin(
+        self, request: m.OpenRequest, contracts: Sequence[m.Contract], warnings: Sequence[str], committed_ticks: int
+    ) -> m.OpenReply:
+        header = request.info.header
+        self._link.enter_episode(header.session, header.episode, header.epoch)
+        self._last_epoch[header.session] = header.epoch
+        self._episode = _Episode(request, Conductor(request.info, committed_ticks=committed_ticks))
+        self._watch.forget_losses()
+        self._link.publish(INFO, request.info, at_ns=0)
+        for warning in warnings:
+            self._event(m.Severity.WARNING, "warning", warning)
+        for proc, offset in self._offsets.items():
+            text = f"{proc}: {offset.offset_ns / 1e6:+.3f} ms, known to {offset.bound_ns / 1e6:.3f} ms"
+            self._event(m.Severity.INFO, "clock_offset", text, proc=proc)
+        return m.OpenReply(contracts=tuple(contracts), warnings=tuple(warnings))
+
+    def _not_ready(self) -> str:
+        for proc in SERVERS:
+            health = self._watch.health_of(proc)
+            if health is None:
+                return f"{proc} is not there: start {proc}-serve, or check its endpoint"
+            if health.state == m.ServingState.FAILED:
+                return f"{proc} failed: {health.detail}"
+            if health.state != m.ServingState.READY:
+                return f"{proc} is {health.state.name.lower()} ({health.progress:.0%}) {health.detail}".strip()
+        return ""
+
+    def _measure_offsets(self, procs: Sequence[str]) -> None:
+        """Raises ProtocolError when another host's clock is known too badly."""
+        self._offsets = {}
+        for proc in procs:
+            exchanges = []
+            clock_id = ""
+            for _ in range(NUM_TIME_EXCHANGES):
+                t0_ns = self._host.now_ns()
+                reply = self._link.call(TIME, proc, m.TimeRequest(t0_ns=t0_ns), timeout_ns=_CALL_NS)
+                exchanges.append(from_exchange(t0_ns, reply.t1_ns, reply.t2_ns, self._host.now_ns()))
+                clock_id = reply.clock_id
+            offset = narrowest(exchanges)
+            if clock_id != host_clock_id() and offset.bound_ns > self._config.max_clock_bound_ns:
+                raise ProtocolError(
+                    f"the clock of {proc} ({clock_id}) is known to {offset.bound_ns / 1e6:.2f} ms only, the limit is "
+                    f"{self._config.max_clock_bound_ns / 1e6:.2f} ms. Use a quieter link, or raise --max-clock-bound-ms."
+                )
+            self._offsets[proc] = offset
+
+    def _open_at(self, proc: str, request: m.OpenRequest) -> m.Contract:
+        """Raises ProtocolError if the server refuses, CallFailed if it does not answer."""
+        reply = self._link.call(OPEN, proc, request, timeout_ns=_OPEN_NS)
+        if reply.error or reply.contract is None:
+            raise ProtocolError(f"{proc} refuses the episode: {reply.error or 'it sent no contract'}")
+        return reply.contract
+
+    def _agree(self, info: m.EpisodeInfo, contracts: Sequence[m.Contract]) -> tuple[list[str], int]:
+        """Warnings and the ticks an invocation takes.
+
+        Raises:
+            ProtocolError: the parts do not fit, the schedule cannot be kept, or a fake model would drive a real robot.
+        """
+        ponder, pounce = contracts
+        fits = (
+            ("carriers K", ponder.num_carriers, pounce.num_carriers),
+            ("hidden size H", ponder.hidden_size, pounce.hidden_size),
+        )
+        for what, left, right in fits:
+            if pounce.num_carriers and left != right:
+                raise ProtocolError(
+                    f"{what}: PONDER gives {left}, POUNCE expects {right}. Load checkpoints trained together."
+                )
+        if (pounce.horizon, pounce.action_dim) != (info.schedule.horizon, info.robot.action_dim):
+            raise ProtocolError(
+                f"POUNCE gives chunks of ({pounce.horizon}, {pounce.action_dim}), the episode was opened for "
+                f"({info.schedule.horizon}, {info.robot.action_dim}). Set --horizon, or load another checkpoint."
+            )
+        fake = [c.proc for c in contracts if c.is_fake]
+        if fake and not info.robot.is_simulated:
+            raise ProtocolError(f"{' and '.join(fake)} run untrained weights; a real robot is not theirs to move.")
+        warnings = [f"{proc} runs untrained weights: expect motion, not skill" for proc in fake]
+        feasibility = check_feasible(info.schedule, pounce.infer_p99_ns)
+        if not feasibility.is_feasible:
+            if info.schedule.mode == m.Mode.REALTIME and not self._config.allow_starved:
+                raise ProtocolError(f"the schedule cannot be kept: {feasibility.sentence()}")
+            warnings.append(feasibility.sentence())
+        return warnings, feasibility.delay_ticks
+
+    def close(self, request: m.CloseRequest) -> m.CloseReply:
+        """Ends the episode here and at the servers."""
+        if self._episode is None or request.header.episode != self._link.episode:
+            return m.CloseReply(error=f"episode {request.header.episode!r} is not open here")
+        self._finish(request.result)
+        return m.CloseReply()
+
+    def _finish(self, result: m.EpisodeResult | None) -> None:
+        if self._episode is not None and self._episode.request.info.policy == "servers":
+            self._close_servers(result)
+        self._episode = None
+        self._link.leave_episode()
+
+    def _close_servers(self, result: m.EpisodeResult | None) -> None:
+        for proc in SERVERS:
+            if self._config.watches and self._watch.health_of(proc) is None:
+                continue
+            try:
+                self._link.call(CLOSE, proc, m.CloseRequest(result=result), timeout_ns=_CALL_NS)
+            except CallFailed as error:
+                log.warning("close proc=%s %s", proc, error)
+
+    def _on_active(self, request: m.ActiveRequest) -> m.ActiveReply:
+        if self._episode is None or self._episode.request.info.policy != "servers":
+            return m.ActiveReply()
+        if self._episode.journal_bytes > self._config.journal_limit_bytes:
+            return m.ActiveReply(error="the journal of this episode outgrew its limit: its context cannot be rebuilt")
+        return m.ActiveReply(open=self._episode.request, num_queries=len(self._episode.journal))
+
+    def _on_journal(self, request: m.JournalRequest) -> m.JournalReply:
+        if self._episode is None or request.header.episode != self._link.episode:
+            return m.JournalReply(error=f"episode {request.header.episode!r} is not open here")
+        first = request.first_query
+        return m.JournalReply(entries=tuple(self._episode.journal[first : first + request.max_queries]))
+
+    def _on_time(self, request: m.TimeRequest) -> m.TimeReply:
+        now_ns = self._host.now_ns()
+        return m.TimeReply(clock_id=host_clock_id(), t1_ns=now_ns, t2_ns=now_ns)
+
+    def _on_engage(self, request: m.EngageRequest) -> m.EngageReply:
+        if self._episode is None:
+            return m.EngageReply(error="no episode is open")
+        self._episode.conductor.engage()
+        self._event(m.Severity.WARNING, "engaged", f"motion may start again, says {request.operator or 'somebody'}")
+        return m.EngageReply(level=self._episode.conductor.ladder.level.name)

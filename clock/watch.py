@@ -1,0 +1,79 @@
+"""Who is alive: liveliness tokens for the process, heartbeats for the work. Pure: told what came and when."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from protocol.messages import Health, ServingState
+
+HEARTBEAT_TIMEOUT_NS = 700_000_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Change:
+    proc: str
+    is_lost: bool
+    why: str
+
+
+@dataclass(slots=True)
+class _Seen:
+    health: Health | None = None
+    heard_ns: int = 0
+    has_token: bool = True
+    is_lost: bool = False
+
+
+@dataclass(slots=True)
+class Watch:
+    """Notices within a second that a server died, froze or hangs, and that it is back *and knows the episode*."""
+
+    timeout_ns: int = HEARTBEAT_TIMEOUT_NS
+    _seen: dict[str, _Seen] = field(default_factory=dict)
+
+    def on_health(self, health: Health, now_ns: int) -> None:
+        seen = self._seen.setdefault(health.header.proc, _Seen())
+        seen.health, seen.heard_ns, seen.has_token = health, now_ns, True
+
+    def on_token(self, proc: str, is_alive: bool) -> None:
+        self._seen.setdefault(proc, _Seen()).has_token = is_alive
+
+    def health_of(self, proc: str) -> Health | None:
+        """The newest heartbeat of a server that is there; None if it is not."""
+        seen = self._seen.get(proc)
+        return seen.health if seen and seen.has_token and not seen.is_lost else None
+
+    def is_gone(self, proc: str) -> bool:
+        """Whether ``proc`` had a liveliness token and lost it."""
+        seen = self._seen.get(proc)
+        return seen is not None and not seen.has_token
+
+    def forget_losses(self) -> None:
+        """A new episode starts from what is there now."""
+        for seen in self._seen.values():
+            seen.is_lost = False
+
+    def poll(self, procs: tuple[str, ...], episode: str, now_ns: int) -> list[Change]:
+        """What changed for ``procs``, which have all opened ``episode``."""
+        changes = []
+        for proc in procs:
+            seen = self._seen.setdefault(proc, _Seen(heard_ns=now_ns))
+            trouble = self._trouble(seen, episode, now_ns)
+            if trouble and not seen.is_lost:
+                changes.append(Change(proc=proc, is_lost=True, why=trouble))
+            elif not trouble and seen.is_lost:
+                changes.append(Change(proc=proc, is_lost=False, why="ready and in the episode"))
+            seen.is_lost = bool(trouble)
+        return changes
+
+    def _trouble(self, seen: _Seen, episode: str, now_ns: int) -> str:
+        if not seen.has_token:
+            return "its liveliness token is gone: the process died, or does not run"
+        silent_ns = now_ns - seen.heard_ns
+        if silent_ns > self.timeout_ns:
+            return f"no heartbeat for {silent_ns / 1e6:.0f} ms: it is frozen, or its inference loop hangs"
+        if seen.health is not None and seen.health.state != ServingState.READY:
+            return f"it is {seen.health.state.name.lower()} {seen.health.detail}".strip()
+        if seen.health is not None and seen.health.open_episode != episode:
+            return "it was restarted and does not know the episode yet"
+        return ""

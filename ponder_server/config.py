@@ -1,0 +1,28 @@
+"""Options of ``ponder-serve``, and the engine that they describe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from protocol.options import LinkOptions
+
+NUM_TORCH_THREADS = 1  # on a CPU one thread per process beats two: a contended second one costs more than it gives
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PonderOptions:
+    """PONDER (System 2): keeps the episode in Qwen3.5's causal context and answers queries with a cognition."""
+
+    link: LinkOptions = field(default_factory=lambda: LinkOptions(listen=("tcp/127.0.0.1:7448",)))
+    checkpoint: Path | None = None
+    """Folder in the Hugging Face layout; none: a tiny network with random weights, which is no policy."""
+    seed: int = 0
+    """Of the random weights, if there is no checkpoint."""
+    device: str = "cpu"
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    max_context_tokens: int = 16_384
+    """Per session (paper, section 3.4)."""
+    max_sessions: int = 2
+    max_text_tokens: int = 256

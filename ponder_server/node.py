@@ -1,0 +1,109 @@
+"""When PONDER fires, and on which observation. Pure: messages in, work and messages out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from clock.rendezvous import Rendezvous
+from ponder_server.contract import EngineSpec, Fire, Frame
+from protocol import images
+from protocol import messages as m
+from protocol.errors import MalformedMessage
+
+KEEP_QUERIES = 8
+"""All of them matter: a query skipped is a gap in the context."""
+
+_KINDS = {"subgoal": m.SubgoalKind.SUBGOAL, "demo_reasoning": m.SubgoalKind.DEMO_REASONING}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Work:
+    """One fire to do: query t and the frames of its observation."""
+
+    query: m.Query
+    frames: tuple[Frame, ...]
+
+
+class PonderNode:
+    """Answers every query of the current episode once, in order."""
+
+    def __init__(self, spec: EngineSpec) -> None:
+        self._spec = spec
+        self._rendezvous: Rendezvous[m.Query] = Rendezvous(keep_requests=KEEP_QUERIES)
+        self.next_query = 0
+
+    def open(self, next_query: int = 0) -> None:
+        """Starts an episode; after a rebuild, queries before ``next_query`` are in the context already."""
+        self._rendezvous.clear()
+        self.next_query = next_query
+
+    def on_observation(self, observation: m.Observation) -> None:
+        self._rendezvous.on_observation(observation)
+
+    def on_query(self, query: m.Query) -> None:
+        if query.query >= self.next_query:
+            self._rendezvous.on_request(query)
+
+    def next_work(self) -> Work | None:
+        """The oldest query whose observation has come.
+
+        Raises:
+            MalformedMessage: its frames are not what the engine was built for; the query is then forgotten.
+        """
+        pair = self._rendezvous.next_pair()
+        if pair is None:
+            return None
+        query, observation = pair
+        return Work(query=query, frames=frames_of(observation, self._spec))
+
+    def missed(self) -> list[m.Query]:
+        """Queries whose observation was lost on the way."""
+        return list(self._rendezvous.give_up())
+
+    def answer(self, work: Work, fire: Fire, *, ready_ns: int, infer_ns: int) -> tuple[m.Cognition, list[m.Subgoal]]:
+        """What is published: the cognition, and for the log alone the texts that PONDER wrote to itself."""
+        query = work.query
+        self.next_query = query.query + 1
+        vector = np.ascontiguousarray(fire.cognition, np.float32)
+        cognition = m.Cognition(
+            query=query.query,
+            tick=query.tick,
+            source_ns=query.source_ns,
+            ready_ns=ready_ns,
+            vector=vector,
+            is_transition=fire.is_transition,
+            context_tokens=fire.context_tokens,
+            infer_ns=infer_ns,
+            norm=float(np.linalg.norm(vector)),
+            model_hash=self._spec.model_hash,
+            is_fake=self._spec.is_random,
+        )
+        texts = [
+            m.Subgoal(
+                kind=_KINDS[text.kind],
+                text=text.text,
+                tick=query.tick,
+                query=query.query,
+                token_ids=text.token_ids,
+                is_truncated=text.truncated,
+            )
+            for text in fire.texts
+        ]
+        return cognition, texts
+
+
+def frames_of(observation: m.Observation, spec: EngineSpec) -> tuple[Frame, ...]:
+    """Pixels of the cameras the engine was built for.
+
+    Raises:
+        MalformedMessage: too few cameras, another size, or bytes that are no picture.
+    """
+    if len(observation.images) != spec.num_cameras:
+        raise MalformedMessage("Observation", "images", f"{spec.num_cameras} cameras", f"{len(observation.images)}")
+    for image in observation.images:
+        if (image.height, image.width) != spec.image_px:
+            expected = f"{spec.image_px[0]} x {spec.image_px[1]} px"
+            raise MalformedMessage("Image", image.camera, expected, f"{image.height} x {image.width} px")
+    return tuple(images.unpack(image) for image in observation.images)

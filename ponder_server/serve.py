@@ -1,0 +1,149 @@
+"""The shell of ``ponder-serve``: drains the bus, runs the engine, publishes, and rebuilds a lost context."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+
+from clock.membership import Membership, percentile_ns
+from ponder_server.contract import ContextFull, Opening, PonderEngine, SessionError
+from ponder_server.node import PonderNode, Work
+from protocol import codec, images, topics
+from protocol import messages as m
+from protocol.errors import CallFailed, MalformedMessage, ProtocolError
+from protocol.heartbeat import Heartbeat
+from protocol.link import Link, is_of_episode
+from protocol.process import host_clock_id
+
+log = logging.getLogger(__name__)
+
+
+class PonderServer:
+    """PONDER on a bus. ``step`` does one piece of work and says whether there was any."""
+
+    def __init__(self, link: Link, engine: PonderEngine, heartbeat: Heartbeat, version: str) -> None:
+        self._link = link
+        self._engine = engine
+        self._heartbeat = heartbeat
+        self._version = version
+        self._node = PonderNode(engine.spec)
+        self._membership = Membership(link, heartbeat, self._open, self._close)
+        self._observations = link.subscribe(topics.OBSERVATION, keep=8)
+        self._queries = link.subscribe(topics.QUERY)
+        self._context_tokens = 0
+
+    def warm_up(self) -> None:
+        """Measures the engine before anybody relies on it; the first fires of a process are no measure."""
+        self._heartbeat.set(state=m.ServingState.WARMING)
+        durations_ns = self._engine.warm_up()
+        self._heartbeat.set(
+            state=m.ServingState.READY,
+            infer_p50_ns=percentile_ns(durations_ns, 50),
+            infer_p99_ns=percentile_ns(durations_ns, 99),
+            model_hash=self._engine.spec.model_hash,
+            is_fake=self._engine.spec.is_random,
+            progress=1.0,
+        )
+        log.info("ready infer_p50_ms=%.1f", percentile_ns(durations_ns, 50) / 1e6)
+
+    def step(self) -> bool:
+        self._heartbeat.beat()
+        worked = self._membership.step()
+        for observation in self._observations.drain():
+            if is_of_episode(self._link, observation.header):
+                self._node.on_observation(observation)
+        for query in self._queries.drain():
+            if query.header.episode != self._link.episode:
+                worked |= self.rejoin()  # restarted, or opened elsewhere: we are asked about an episode unknown to us
+            if is_of_episode(self._link, query.header):
+                self._node.on_query(query)
+        for query in self._node.missed():
+            self._tell(m.Severity.ERROR, "observation_missed", f"query {query.query}: tick {query.tick} never came")
+        try:
+            work = self._node.next_work()
+        except MalformedMessage as error:
+            self._link.drop("observation", "wrong_frames", str(error))
+            return True
+        if work is not None:
+            self._fire(work)
+        return worked or work is not None
+
+    def rejoin(self) -> bool:
+        """After a restart: asks for the episode and every observation that was queried, and thinks it all over."""
+        rejoined = self._membership.rejoin()
+        if rejoined is None:
+            return False
+        _, num_queries = rejoined
+        try:
+            for entry in self._membership.journal(num_queries):
+                observation = codec.decode(m.Observation, entry.observation)
+                self._node.on_observation(observation)
+                self._node.on_query(m.Query(query=entry.query, tick=entry.tick, source_ns=entry.source_ns))
+                work = self._node.next_work()
+                if work is not None:
+                    self._engine.fire(self._link.episode, work.frames, self._heartbeat.beat)
+        except (CallFailed, ProtocolError, ContextFull) as error:
+            log.error("rebuild failed episode=%s %s", self._link.episode, error)
+            self._close()
+            self._link.leave_episode()
+            return False
+        self._node.open(next_query=num_queries)
+        self._heartbeat.set(next_index=num_queries)
+        self._membership.announce()
+        self._tell(m.Severity.INFO, "context_rebuilt", f"PONDER rebuilt its context from {num_queries} observations")
+        return True
+
+    def _fire(self, work: Work) -> None:
+        self._phase("fire")
+        self._heartbeat.set(is_inferring=True)
+        start_ns = time.monotonic_ns()
+        try:
+            fire = self._engine.fire(self._link.episode, work.frames, self._heartbeat.beat)
+        except (ContextFull, SessionError, ValueError) as error:
+            # The engine is as it was. The clock sees no answer, cognition ages, and the ladder acts.
+            self._tell(m.Severity.ERROR, "fire_refused", f"query {work.query.query}: {error}")
+            return
+        finally:
+            self._heartbeat.set(is_inferring=False)
+        ready_ns = time.monotonic_ns()
+        cognition, subgoals = self._node.answer(work, fire, ready_ns=ready_ns, infer_ns=ready_ns - start_ns)
+        self._link.publish(topics.COGNITION, cognition, at_ns=ready_ns, clock_id=host_clock_id())
+        for subgoal in subgoals:
+            self._link.publish(topics.SUBGOAL, subgoal, at_ns=ready_ns, clock_id=host_clock_id())
+        self._phase("idle")
+        self._heartbeat.set(next_index=self._node.next_query, num_answered=self._heartbeat.health.num_answered + 1)
+
+    def _open(self, request: m.OpenRequest) -> m.Contract:
+        demo = tuple(tuple(images.unpack(image) for image in frame.images) for frame in request.demo)
+        opening = Opening(instruction=request.info.instruction, demo_frames=demo)
+        self._context_tokens = self._engine.open(self._link.episode, opening, self._heartbeat.beat)
+        self._node.open()
+        spec = self._engine.spec
+        return m.Contract(
+            proc="ponder",
+            num_carriers=spec.num_carriers,
+            hidden_size=spec.hidden_size,
+            preferred_codec=images.wire_codec(self._link.bus.is_local),
+            infer_p50_ns=self._heartbeat.health.infer_p50_ns,
+            infer_p99_ns=self._heartbeat.health.infer_p99_ns,
+            model_hash=spec.model_hash,
+            is_fake=spec.is_random,
+            version=self._version,
+            context_tokens=self._context_tokens,
+            max_context_tokens=spec.max_context_tokens,
+        )
+
+    def _close(self) -> None:
+        with contextlib.suppress(SessionError):  # the engine may have refused to open it
+            self._engine.close(self._link.episode)
+        self._node.open()
+
+    def _phase(self, state: str) -> None:
+        at_ns = time.monotonic_ns()
+        self._link.publish(topics.PHASE, m.Phase(state=state), at_ns=at_ns, clock_id=host_clock_id())
+
+    def _tell(self, severity: m.Severity, name: str, text: str) -> None:
+        log.log(logging.WARNING if severity > m.Severity.INFO else logging.INFO, "event name=%s %s", name, text)
+        event = m.Event(severity=severity, name=name, text=text)
+        self._link.publish(topics.EVENT, event, at_ns=time.monotonic_ns(), clock_id=host_clock_id())

@@ -1,0 +1,30 @@
+"""Options of ``pounce-serve``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from protocol.options import LinkOptions
+
+NUM_TORCH_THREADS = 1  # on a CPU one thread per process beats two: a contended second one costs more than it gives
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PounceOptions:
+    """POUNCE (System 1): turns an observation, a cognition and its age into a chunk of 20 rows."""
+
+    link: LinkOptions = field(default_factory=lambda: LinkOptions(listen=("tcp/127.0.0.1:7449",)))
+    checkpoint: Path | None = None
+    """Folder with config.json and model.safetensors (ours, openpi's or lerobot's pi0.5); none: random weights."""
+    tokenizer: Path | None = None
+    """SentencePiece file, if the checkpoint folder has none."""
+    seed: int = 0
+    """Of the random weights, if there is no checkpoint."""
+    num_carriers: int = 1
+    """K of the random weights; must be PONDER's."""
+    hidden_size: int | None = None
+    """H of the random weights; must be PONDER's. Default: the tiny PONDER's."""
+    device: str = "cpu"
+    dtype: Literal["float32", "bfloat16"] = "float32"

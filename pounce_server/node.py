@@ -1,0 +1,102 @@
+"""Which invocation POUNCE answers, and what the answer says. Pure: messages in, work and messages out.
+
+POUNCE keeps nothing between invocations: each one brings its own cognition and names its observation, so a restarted
+POUNCE is as good as one that never died.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from clock.rendezvous import Rendezvous
+from pounce_server.contract import EngineSpec, Request
+from protocol import images
+from protocol import messages as m
+from protocol.errors import MalformedMessage
+
+KEEP_INVOCATIONS = 1
+"""Only the newest is worth answering: an older chunk would be superseded before it is played."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Work:
+    """One chunk to make."""
+
+    invocation: m.Invocation
+    request: Request
+
+
+class PounceNode:
+    def __init__(self, spec: EngineSpec) -> None:
+        self._spec = spec
+        self._rendezvous: Rendezvous[m.Invocation] = Rendezvous(keep_requests=KEEP_INVOCATIONS)
+        self._info: m.EpisodeInfo | None = None
+
+    @property
+    def num_superseded(self) -> int:
+        return self._rendezvous.num_superseded
+
+    def open(self, info: m.EpisodeInfo | None) -> None:
+        """Starts an episode, or with None forgets it."""
+        self._rendezvous.clear()
+        self._info = info
+
+    def on_observation(self, observation: m.Observation) -> None:
+        self._rendezvous.on_observation(observation)
+
+    def on_invocation(self, invocation: m.Invocation) -> None:
+        self._rendezvous.on_request(invocation)
+
+    def missed(self) -> list[m.Invocation]:
+        """Invocations whose observation was lost on the way."""
+        return list(self._rendezvous.give_up())
+
+    def next_work(self) -> Work | None:
+        """The invocation whose observation has come.
+
+        Raises:
+            MalformedMessage: a frame is no picture, or the cognition is not (K, H); the invocation is then forgotten.
+        """
+        pair = self._rendezvous.next_pair()
+        if pair is None or self._info is None:
+            return None
+        invocation, observation = pair
+        expected = (self._spec.num_carriers, self._spec.cognition_size)
+        is_null = invocation.ref_query is None or self._spec.num_carriers == 0
+        if not is_null and invocation.cognition.shape != expected:
+            raise MalformedMessage("Invocation", "cognition", f"{expected}", f"{invocation.cognition.shape}")
+        request = Request(
+            instruction=self._info.instruction,
+            frames=tuple(images.unpack(image) for image in observation.images),
+            proprio=observation.proprio,
+            cognition=None if is_null else invocation.cognition,
+            age_ns=0 if is_null else invocation.age_ns,
+            seed=invocation.seed,
+        )
+        return Work(invocation=invocation, request=request)
+
+    def answer(self, work: Work, rows_NA: m.Floats, *, infer_ns: int) -> m.ActionChunk:
+        """The chunk of (horizon, action_dim) rows; row 0 belongs to the tick of the observation it was made from."""
+        info, invocation = self._info, work.invocation
+        rate_hz = info.schedule.control_hz if info is not None else 1
+        horizon, action_dim = rows_NA.shape
+        return m.ActionChunk(
+            invocation=invocation.invocation,
+            t_row0=invocation.tick,
+            horizon=horizon,
+            action_dim=action_dim,
+            dt_ns=1_000_000_000 // rate_hz,
+            rows=np.ascontiguousarray(rows_NA, np.float32).ravel(),
+            source_ns=invocation.now_ns,
+            ref_query=invocation.ref_query,
+            age_ns=invocation.age_ns,
+            infer_ns=infer_ns,
+            reference_state=work.request.proprio,
+            seed=invocation.seed,
+            model_hash=self._spec.model_hash,
+            is_fake=self._spec.is_random or self._spec.has_fresh_prefix,
+            previous_rows=invocation.previous_rows,
+            committed_rows=invocation.committed_rows,
+        )

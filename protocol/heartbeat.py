@@ -1,0 +1,43 @@
+"""A heartbeat that stops when the work stops.
+
+Zenoh's liveliness token belongs to the process: it survives a hung model thread. This heartbeat is sent by whoever does
+the work, from inside the work (between layers, tokens, flow steps), so its silence means that nothing moves.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+from protocol.link import Link
+from protocol.messages import Health, ServingState
+from protocol.topics import HEALTH, alive_key
+
+PERIOD_NS = 100_000_000
+
+
+class Heartbeat:
+    """Publishes ``Health``; ``beat`` is cheap enough to call anywhere and sends at most every 100 ms."""
+
+    def __init__(self, link: Link, version: str, clock_id: str) -> None:
+        self._link = link
+        self._clock_id = clock_id
+        self._next_ns = 0
+        self.health = Health(state=ServingState.LOADING, version=version)
+        link.bus.declare_alive(alive_key(link.robot, link.proc))
+
+    def set(self, **changes: object) -> None:
+        """Changes what is reported; a change of state is reported at once."""
+        is_news = changes.keys() & {"state", "open_episode"}
+        self.health = replace(self.health, **changes)  # type: ignore[arg-type]
+        if is_news:
+            self._next_ns = 0
+        self.beat()
+
+    def beat(self) -> None:
+        now_ns = time.monotonic_ns()
+        if now_ns < self._next_ns:
+            return
+        self._next_ns = now_ns + PERIOD_NS
+        health = replace(self.health, dropped=dict(self._link.dropped))
+        self._link.publish(HEALTH, health, at_ns=now_ns, clock_id=self._clock_id)

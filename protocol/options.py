@@ -1,0 +1,41 @@
+"""The options that every daemon shares: which robot, where to listen, whom to connect to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from protocol.errors import TransportError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkOptions:
+    """How a process reaches the others. Loopback needs nothing more; other hosts need the three TLS files."""
+
+    robot: str = "r0"
+    """Name of the robot; part of every key."""
+    listen: tuple[str, ...] = ()
+    """Zenoh endpoints to listen on, e.g. tcp/127.0.0.1:7448 or tls/0.0.0.0:7448."""
+    connect: tuple[str, ...] = ()
+    """Zenoh endpoints of the other processes; absent ones are tried again until they are there."""
+    tls_ca: Path | None = None
+    tls_certificate: Path | None = None
+    tls_key: Path | None = None
+    shared_memory: bool = True
+    """Raw frames between processes of one host go through shared memory."""
+
+    def tls_files(self) -> tuple[Path, Path, Path] | None:
+        """(ca, certificate, key), or None.
+
+        Raises:
+            TransportError: only some of the three were given, or one is not a file.
+        """
+        files = (self.tls_ca, self.tls_certificate, self.tls_key)
+        if not any(files):
+            return None
+        for name, file in zip(("ca", "certificate", "key"), files, strict=True):
+            if file is None or not file.is_file():
+                raise TransportError(
+                    f"--link.tls-{name} {file or '(missing)'} is not a file; mutual TLS needs all three"
+                )
+        return files  # type: ignore[return-value]

@@ -1,0 +1,46 @@
+"""How a daemon runs and leaves: one thread, a stop flag set by signals, log lines that a person can grep."""
+
+from __future__ import annotations
+
+import logging
+import platform
+import signal
+import sys
+from collections.abc import Callable
+from types import FrameType
+
+from protocol.bus import Bus
+
+IDLE_WAIT_NS = 20_000_000  # an idle daemon looks up this often: its heartbeat depends on it
+
+
+class StopFlag:
+    """True once SIGTERM or SIGINT came; the loop then leaves by the door."""
+
+    def __init__(self) -> None:
+        self.is_set = False
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._set)
+
+    def _set(self, number: int, frame: FrameType | None) -> None:
+        self.is_set = True
+
+    def __call__(self) -> bool:
+        return self.is_set
+
+
+def run(bus: Bus, step: Callable[[], bool], should_stop: Callable[[], bool]) -> None:
+    """Steps while there is work, waits for the bus while there is none."""
+    while not should_stop():
+        if not step():
+            bus.wait(IDLE_WAIT_NS)
+
+
+def set_up_logging(level: str = "INFO") -> None:
+    """One line per fact on stderr, key=value."""
+    logging.basicConfig(stream=sys.stderr, level=level, format="%(asctime)s %(levelname)s %(name)s %(message)s")
+
+
+def host_clock_id() -> str:
+    """Name of this host's monotonic clock: processes with the same id can compare instants."""
+    return f"{platform.node() or 'host'}/monotonic"

@@ -1,0 +1,12 @@
+"""Which program this is: the distribution's version."""
+
+from __future__ import annotations
+
+from importlib import metadata
+
+
+def version() -> str:
+    try:
+        return metadata.version("ponderpounce")
+    except metadata.PackageNotFoundError:  # run from a source tree that was never installed
+        return "0+source"

@@ -1,0 +1,159 @@
+"""The robot's side of one episode: say what is seen, do what is commanded, and be safe when the commands stop.
+
+The simulated world moves only by commanded ticks. The observation of tick k+1 is published as soon as it is rendered,
+with the instant it belongs to; the schedule uses it from that instant on, so transport and rendering lie between ticks.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from clock.playback import deadline_ns
+from clock.timebase import NS_PER_MS
+from ponderpounce.tasks.engine import Status
+from ponderpounce.tasks.environment import Environment, Snapshot
+from protocol import images
+from protocol import messages as m
+from protocol.link import Link, is_of_episode
+from protocol.topics import ACTION, EVENT, OBSERVATION, PHASE, SUBGOAL, TICK
+from sim_client.recorder import Recorder
+from sim_client.robot import observation, status_of
+
+CLOCK_SILENCE_NS = 500 * NS_PER_MS
+"""Real time: commands that stay away this long mean that the clock service is gone. The servos hold meanwhile."""
+HOLD_TICKS = 10
+"""What the robot still does then by itself: hold for half a second, and end the episode."""
+STOPPED_TICKS = 60
+"""An episode that the ladder stopped, and nobody engaged again for three seconds, is over."""
+
+Others = Callable[[int], None]
+"""Lets everybody else run: returns when something may have come, or after so many nanoseconds."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outcome:
+    """How an episode ended for the robot."""
+
+    status: m.TaskStatus
+    reason: str
+    num_ticks: int
+
+
+@dataclass(slots=True)
+class RobotSide:
+    """Runs one episode against whoever publishes actions."""
+
+    link: Link
+    environment: Environment
+    recorder: Recorder
+    let_others: Others
+    patience_ns: int
+    _tick: int = 0
+    _start_ns: int = 0
+    _command: m.Floats = field(default_factory=lambda: np.zeros(0, np.float32))
+    _texts: tuple[str, str] = ("", "")
+    _stopped_ticks: int = 0
+
+    def run(self, info: m.EpisodeInfo, first: Snapshot, on_tick: Callable[[int], None]) -> Outcome:
+        """Until the task ends, or the machine does."""
+        actions = self.link.subscribe(ACTION)
+        snapshot = first
+        self._command = info.robot.initial_command
+        self._show(snapshot, 0)
+        self.link.publish(PHASE, m.Phase(state="running"), at_ns=0)
+        heard_ns = time.monotonic_ns()
+        while True:
+            self.recorder.step()
+            for action in actions.drain():
+                if not is_of_episode(self.link, action.header) or action.tick < self._tick:
+                    continue
+                heard_ns = time.monotonic_ns()
+                snapshot = self._obey(info, action)
+                on_tick(self._tick)
+                if snapshot.status is not Status.ONGOING:
+                    return Outcome(status=status_of(snapshot), reason=snapshot.reason, num_ticks=self._tick)
+                if self._stopped_ticks > STOPPED_TICKS:
+                    return self._abort("stopped by the ladder, and nobody engaged it again")
+            silent_ns = time.monotonic_ns() - heard_ns
+            if silent_ns > self._limit_ns(info):
+                if self._tick == 0:
+                    return self._abort(f"no command came within {silent_ns / 1e9:.0f} s")
+                self._tell("clock_lost", f"no command for {silent_ns / 1e6:.0f} ms: holding the last one")
+                self._hold()
+                return self._abort("clock lost")
+            self.let_others(20 * NS_PER_MS)
+
+    def _limit_ns(self, info: m.EpisodeInfo) -> int:
+        waits = info.schedule.mode == m.Mode.LOCKSTEP or self._tick == 0
+        return self.patience_ns if waits else CLOCK_SILENCE_NS
+
+    def _obey(self, info: m.EpisodeInfo, action: m.Action) -> Snapshot:
+        """One commanded tick; before it, the ticks that the clock skipped, in which the servos held."""
+        if self._tick == 0 and action.tick == 0:
+            self._start_ns = action.deadline_ns
+        for _ in range(action.tick - self._tick):
+            if self.environment.step(self._command).status is not Status.ONGOING:
+                break
+        self._command = action.values
+        self._stopped_ticks = self._stopped_ticks + 1 if action.level == m.Level.STOPPED else 0
+        snapshot = self.environment.step(action.values)
+        self._tick = action.tick + 1
+        self._show(snapshot, deadline_ns(self._start_ns, self._tick, info.schedule.control_hz))
+        return snapshot
+
+    def _show(self, snapshot: Snapshot, source_ns: int) -> None:
+        codec = images.wire_codec(self.link.bus.is_local)
+        self.link.publish(OBSERVATION, observation(snapshot, self._tick, source_ns, codec), at_ns=source_ns)
+        texts = (snapshot.simple_subgoal, snapshot.grounded_subgoal)
+        kinds = (m.SubgoalKind.TASK_SIMPLE, m.SubgoalKind.TASK_GROUNDED)
+        for kind, text, before in zip(kinds, texts, self._texts, strict=True):
+            if text != before:
+                subgoal = m.Subgoal(kind=kind, text=text, tick=self._tick)
+                self.link.publish(SUBGOAL, subgoal, at_ns=source_ns)
+        self._texts = texts
+
+    def _hold(self) -> None:
+        for _ in range(HOLD_TICKS):
+            if self.environment.step(self._command).status is not Status.ONGOING:
+                return
+
+    def _abort(self, reason: str) -> Outcome:
+        return Outcome(status=m.TaskStatus.ABORTED, reason=reason, num_ticks=self._tick)
+
+    def _tell(self, name: str, text: str) -> None:
+        event = m.Event(severity=m.Severity.ERROR, name=name, text=text, tick=self._tick)
+        self.link.publish(EVENT, event, at_ns=self._start_ns + self._tick * 50 * NS_PER_MS)
+
+
+def play_oracle(
+    info: m.EpisodeInfo, side: RobotSide, first: Snapshot, on_tick: Callable[[int], None]
+) -> tuple[Outcome, list[m.Tick]]:
+    """The task's own script in place of the servers: the same log, without queries, invocations or chunks."""
+    ticks: list[m.Tick] = []
+    snapshot, script = first, _script(side.environment)
+    side._show(first, 0)
+    while snapshot.status is Status.ONGOING:
+        values = next(script, None)
+        if values is None:
+            return Outcome(status=m.TaskStatus.ABORTED, reason="the oracle gave up", num_ticks=len(ticks)), ticks
+        tick = len(ticks)
+        due_ns = deadline_ns(0, tick, info.schedule.control_hz)
+        action = m.Action(tick=tick, deadline_ns=due_ns, level=m.Level.PLAY, values=values)
+        account = m.Tick(
+            tick=tick, deadline_ns=due_ns, decided_ns=due_ns, late_ns=0, level=m.Level.PLAY, state=snapshot.state,
+            action=values, raw_row=values, observation_tick=tick,
+        )  # fmt: skip
+        side.link.publish(ACTION, action, at_ns=due_ns)
+        ticks.append(side.link.publish(TICK, account, at_ns=due_ns))
+        snapshot = side._obey(info, action)
+        side.recorder.step()
+        on_tick(tick + 1)
+    return Outcome(status=status_of(snapshot), reason=snapshot.reason, num_ticks=len(ticks)), ticks
+
+
+def _script(environment: Environment) -> Iterator[m.Floats]:
+    return iter(environment.oracle())

@@ -1,0 +1,101 @@
+"""Starts the servers that an episode needs on this machine, and takes them down again.
+
+They are started by module name: this package imports no other server's code, so a robot's computer needs no torch.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import IO
+
+_GRACE_S = 5.0
+
+
+def free_ports(count: int) -> list[int]:
+    """Loopback ports that nobody uses now (somebody may take one before we do: the server then says so)."""
+    sockets = [socket.socket() for _ in range(count)]
+    try:
+        for s in sockets:
+            s.bind(("127.0.0.1", 0))
+        return [int(s.getsockname()[1]) for s in sockets]
+    finally:
+        for s in sockets:
+            s.close()
+
+
+class Daemons:
+    """Server processes by name, each with its log file. A context manager: leaving it stops them all."""
+
+    def __init__(self, logs: Path) -> None:
+        self._logs = logs
+        self._files: list[IO[bytes]] = []
+        self.processes: dict[str, subprocess.Popen[bytes]] = {}
+
+    def start(self, name: str, module: str, arguments: Sequence[str]) -> subprocess.Popen[bytes]:
+        """Starts ``python -m module arguments`` with its output in ``<name>.log``."""
+        self._logs.mkdir(parents=True, exist_ok=True)
+        file = (self._logs / f"{name}.log").open("ab")
+        self._files.append(file)
+        environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
+        command = [sys.executable, "-m", module, *arguments]
+        self.processes[name] = subprocess.Popen(command, stdout=file, stderr=file, env=environment)
+        return self.processes[name]
+
+    def dead(self) -> str:
+        """A sentence about the first daemon that left on its own; "" if all run."""
+        for name, process in self.processes.items():
+            code = process.poll()
+            if code is not None:
+                log = self._logs / f"{name}.log"
+                lines = log.read_text(errors="replace").strip().splitlines()
+                return f"{name} left with exit code {code}: {lines[-1] if lines else 'no output'} (see {log})"
+        return ""
+
+    def __enter__(self) -> Daemons:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for process in self.processes.values():
+            process.terminate()
+        for process in self.processes.values():
+            try:
+                process.wait(_GRACE_S)
+            except subprocess.TimeoutExpired:  # frozen, for instance by a fault drill
+                process.kill()
+                process.wait()
+        for file in self._files:
+            file.close()
+
+
+def start_local(
+    daemons: Daemons,
+    *,
+    robot: str,
+    with_clock: bool,
+    allow_starved: bool = False,
+    ponder: Sequence[str],
+    pounce: Sequence[str],
+) -> tuple[str, ...]:
+    """Starts the servers on free loopback ports; returns the endpoints to connect to.
+
+    Every process listens on its own port and connects to the servers it talks to, so that the death of one leaves
+    the links among the others alone.
+    """
+    ports = free_ports(3)
+    at_clock, at_ponder, at_pounce = (f"tcp/127.0.0.1:{port}" for port in ports)
+    common = ["--link.robot", robot]
+    daemons.start("ponder", "ponder_server", [*common, "--link.listen", at_ponder, *ponder])
+    daemons.start("pounce", "pounce_server", [*common, "--link.listen", at_pounce, *pounce])
+    if not with_clock:
+        return at_ponder, at_pounce
+    arguments = [*common, "--link.listen", at_clock, "--link.connect", at_ponder, at_pounce]
+    daemons.start("clock", "clock", [*arguments, *(["--allow-starved"] if allow_starved else [])])
+    return at_clock, at_ponder, at_pounce

@@ -1,0 +1,78 @@
+"""Everything that was said, taken off the bus and handed to the log's writer thread.
+
+A passive observer: it subscribes like anybody else, so what lands in the file is what travelled, byte for byte.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Literal
+
+from protocol import messages as m
+from protocol.link import Link, Received, Stream
+from protocol.mcap_log import EpisodeLog
+from protocol.topics import INFO, OBSERVATION, RESULT, STREAMS, Topic
+
+KEEP = 512  # per topic, between two drains; drains come every tick
+
+
+class Recorder:
+    """Collects the ticks of the current episode and, if asked, writes its log."""
+
+    def __init__(self, link: Link, pixels: Literal["jpeg", "exact"]) -> None:
+        self._link = link
+        self._pixels: Literal["jpeg", "exact"] = pixels
+        self._streams: list[tuple[Topic[object], Stream[object]]] = [
+            (topic, link.subscribe(topic, keep=8 if topic is OBSERVATION else KEEP))
+            for topic in STREAMS
+            if topic is not INFO
+        ]
+        self._log: EpisodeLog | None = None
+        self.ticks: list[m.Tick] = []
+        self.stamps: list[m.Stamp] = []
+        self.invocations: list[m.Invocation] = []
+
+    def begin(self, info: m.EpisodeInfo, path: Path | None) -> None:
+        """Starts an episode; without a path nothing is written."""
+        self.ticks, self.stamps, self.invocations = [], [], []
+        waits = info.schedule.mode == m.Mode.LOCKSTEP  # there the world has time, and a log with gaps is no proof
+        self._log = (
+            EpisodeLog(path, info, pixels=self._pixels, when_full="wait" if waits else "drop") if path else None
+        )
+
+    def step(self) -> None:
+        """Takes what has come since the last call."""
+        received = [(topic, each) for topic, stream in self._streams for each in stream.receive()]
+        received.sort(key=lambda pair: _episode_ns(pair[1]))  # per topic the order is kept: sort is stable
+        for topic, (message, sample) in received:
+            if topic.name not in ("health", "phase") and not self._is_ours(message):
+                continue
+            self._remember(message)
+            if self._log is not None:
+                self._log.write(topic, message, sample.payload, time.time_ns())
+
+    def end(self, result: m.EpisodeResult) -> None:
+        """Writes the result and closes the log."""
+        if self._log is not None:
+            self._link.publish(RESULT, result, at_ns=max((t.decided_ns for t in self.ticks), default=0))
+            self.step()
+            self._log.close(result)
+            self._log = None
+
+    def _is_ours(self, message: object) -> bool:
+        header: m.Header = message.header  # type: ignore[attr-defined]
+        return header.episode == self._link.episode
+
+    def _remember(self, message: object) -> None:
+        if isinstance(message, m.Tick):
+            self.ticks.append(message)
+        elif isinstance(message, m.Stamp):
+            self.stamps.append(message)
+        elif isinstance(message, m.Invocation):
+            self.invocations.append(message)
+
+
+def _episode_ns(received: Received[object]) -> int:
+    header: m.Header = received.message.header  # type: ignore[attr-defined]
+    return header.at_ns if header.clock_id == m.EPISODE_CLOCK else 0

@@ -1,0 +1,58 @@
+"""The simulated Panda as the protocol sees it: its limits, its cameras, its observations."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ponderpounce.tasks import panda
+from ponderpounce.tasks.engine import Status
+from ponderpounce.tasks.environment import IMAGE_PX, Snapshot
+from protocol import images
+from protocol.messages import Image, ImageCodec, Observation, Robot, TaskStatus
+
+CAMERAS = ("front", "wrist")
+CONTROL_HZ = 20
+
+# Franka's datasheet: 2.175 rad/s (joints 1-4), 2.61 rad/s (5-7). RoboMME's own data reach 1.2 rad/s.
+_MAX_JOINT_RAD_S = np.array([2.175] * 4 + [2.61] * 3)
+_GRIPPER_UNLIMITED = 0.0  # a switch: the hand itself limits how fast it closes
+
+_STATUS = {
+    Status.ONGOING: TaskStatus.ONGOING,
+    Status.SUCCESS: TaskStatus.SUCCESS,
+    Status.FAIL: TaskStatus.FAIL,
+    Status.TIMEOUT: TaskStatus.TIMEOUT,
+}
+
+
+def simulated_panda(initial_state: np.ndarray) -> Robot:
+    """The robot at reset; its servos hold ``initial_state`` (8,) with the gripper open."""
+    return Robot(
+        name="panda_wristcam",
+        command_low=panda.ACTION_LOW.astype(np.float32),
+        command_high=panda.ACTION_HIGH.astype(np.float32),
+        max_step=np.append(_MAX_JOINT_RAD_S / CONTROL_HZ, _GRIPPER_UNLIMITED).astype(np.float32),
+        initial_command=np.append(initial_state[:7], 1.0).astype(np.float32),
+        cameras=CAMERAS,
+        image_height=IMAGE_PX,
+        image_width=IMAGE_PX,
+        num_proprio=8,
+        is_simulated=True,
+    )
+
+
+def observation(snapshot: Snapshot, tick: int, source_ns: int, codec: ImageCodec) -> Observation:
+    """What the robot says at ``tick``."""
+    packed: tuple[Image, ...] = images.pack({name: snapshot.frames[name] for name in CAMERAS}, codec)
+    return Observation(
+        tick=tick,
+        source_ns=source_ns,
+        proprio=snapshot.state,
+        images=packed,
+        status=_STATUS[snapshot.status],
+        reason=snapshot.reason,
+    )
+
+
+def status_of(snapshot: Snapshot) -> TaskStatus:
+    return _STATUS[snapshot.status]

@@ -1,0 +1,215 @@
+"""Many episodes: open each one, let the robot run it, and write down what happened in results.json."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import platform
+import secrets
+import time
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from clock.report import statistics, stream_sha256
+from clock.service import ClockService
+from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
+from protocol import messages as m
+from protocol.errors import CallFailed, TransportError
+from protocol.link import Link
+from protocol.topics import CLOSE, OPEN, alive_key
+from protocol.version import version
+from sim_client.config import SimOptions
+from sim_client.episode import Outcome, RobotSide, play_oracle
+from sim_client.recorder import Recorder
+from sim_client.robot import simulated_panda
+
+_OPEN_NS = 130_000_000_000
+_CLOSE_NS = 5_000_000_000
+_ASK_AGAIN_S = 0.2
+_LAST_TICKS_S = 1.0
+
+OnTick = Callable[[int, int], None]
+"""Called with (episode index, ticks played) as an episode goes on."""
+
+
+class Suite:
+    """A sequence of episodes of one task with one set of servers.
+
+    Args:
+        link: the robot's end of the bus.
+        clock: the clock service, if it is embedded here; it is stepped while this thread waits.
+        check_servers: a sentence if a server that we started is dead, else "".
+    """
+
+    def __init__(
+        self, options: SimOptions, link: Link, clock: ClockService | None, check_servers: Callable[[], str]
+    ) -> None:
+        self._options = options
+        self._link = link
+        self._clock = clock
+        self._check_servers = check_servers
+        self._recorder = Recorder(link, options.pixels)
+        self._session = f"{options.task}-{secrets.token_hex(4)}"
+        link.bus.declare_alive(alive_key(link.robot, link.proc))
+
+    def run(self, on_tick: OnTick = lambda episode, tick: None) -> dict[str, Any]:
+        """Runs all episodes and writes ``results.json`` after each, so that a crash loses at most one."""
+        out = self._options.out
+        out.mkdir(parents=True, exist_ok=True)
+        results: dict[str, Any] = {
+            "config": _as_json(dataclasses.asdict(self._options)),
+            "versions": versions(),
+            "episodes": [],
+        }
+        with make_environment(self._options.task, max_steps=self._options.max_steps) as environment:
+            for index in range(self._options.episodes):
+                results["episodes"].append(self._episode(environment, index, on_tick))
+                _write(out / "results.json", results)
+        return results
+
+    def _episode(self, environment: Environment, index: int, on_tick: OnTick) -> dict[str, Any]:
+        seed = self._options.seed + index
+        first = environment.reset(seed, self._options.difficulty)
+        self._link.enter_episode(self._session, f"{self._options.task}-{seed}-{secrets.token_hex(3)}", index + 1)
+        info = self._info(environment, first, seed)
+        path = self._log_path(info) if self._options.record else None
+        side = RobotSide(
+            self._link, environment, self._recorder, self._let_others, round(self._options.patience_s * 1e9)
+        )
+        warnings: tuple[str, ...] = ()
+        self._recorder.begin(info, path)
+        if info.policy == "oracle":
+            outcome, _ = play_oracle(info, side, first, lambda tick: on_tick(index, tick))
+        else:
+            try:
+                warnings = self._open(info)
+                outcome = side.run(info, first, lambda tick: on_tick(index, tick))
+            except TransportError as error:
+                outcome = Outcome(status=m.TaskStatus.ABORTED, reason=str(error), num_ticks=0)
+        self._await_last_ticks(outcome)
+        result = self._result(outcome)
+        self._recorder.end(result)
+        self._close(info, result)
+        return {
+            "task": info.task,
+            "seed": seed,
+            "difficulty": info.difficulty,
+            "success": result.is_success,
+            "status": result.status.name,
+            "reason": result.reason,
+            "steps": result.num_ticks,
+            "stream_sha256": result.stream_sha256,
+            "mcap": str(path.relative_to(self._options.out)) if path else None,
+            "warnings": list(warnings),
+            "schedule": result.statistics,
+        }
+
+    def _info(self, environment: Environment, first: Snapshot, seed: int) -> m.EpisodeInfo:
+        return m.EpisodeInfo(
+            header=self._link.header("info", 0),
+            task=self._options.task,
+            suite="RoboMME",
+            seed=seed,
+            difficulty=environment.difficulty,
+            instruction=environment.instruction,
+            schedule=self._options.schedule(seed),
+            robot=simulated_panda(first.state),
+            t0_unix_ns=time.time_ns(),
+            versions=versions(),
+            policy=self._options.policy,
+        )
+
+    def _open(self, info: m.EpisodeInfo) -> tuple[str, ...]:
+        """Asks the clock service until its servers are ready.
+
+        Raises:
+            TransportError: refused, or not ready within the patience.
+        """
+        deadline_s = time.monotonic() + self._options.patience_s
+        while True:
+            try:
+                reply = self._ask_clock(info)
+            except CallFailed as error:
+                reply = m.OpenReply(error=str(error), try_again=True)
+            if not reply.error:
+                return reply.warnings
+            dead = self._check_servers()
+            if dead or not reply.try_again or time.monotonic() > deadline_s:
+                raise TransportError(dead or reply.error)
+            self._let_others(round(_ASK_AGAIN_S * 1e9))
+
+    def _ask_clock(self, info: m.EpisodeInfo) -> m.OpenReply:
+        if self._clock is not None:  # our own thread: a call over the bus would wait for itself
+            return self._clock.open(m.OpenRequest(info=info))
+        reply: m.OpenReply = self._link.call(OPEN, "clock", m.OpenRequest(info=info), timeout_ns=_OPEN_NS)
+        return reply
+
+    def _close(self, info: m.EpisodeInfo, result: m.EpisodeResult) -> None:
+        if info.policy == "servers":
+            request = m.CloseRequest(header=self._link.header("close", 0), result=result)
+            if self._clock is not None:
+                self._clock.close(request)
+            else:
+                with contextlib.suppress(CallFailed):  # the log already says that the clock is lost
+                    self._link.call(CLOSE, "clock", request, timeout_ns=_CLOSE_NS)
+        self._link.leave_episode()
+
+    def _let_others(self, longest_ns: int) -> None:
+        """One turn for everybody else; with an embedded clock, no longer than until it has something to do."""
+        if self._clock is not None:
+            if self._clock.step():
+                return
+            longest_ns = self._clock.wait_ns(longest_ns)
+        self._link.bus.wait(longest_ns)
+
+    def _await_last_ticks(self, outcome: Outcome) -> None:
+        """Accounts of ticks travel behind their actions; the hash is over all of them."""
+        deadline_s = time.monotonic() + _LAST_TICKS_S
+        self._recorder.step()
+        while len(self._recorder.ticks) < outcome.num_ticks and time.monotonic() < deadline_s:
+            self._let_others(1_000_000)
+            self._recorder.step()
+
+    def _result(self, outcome: Outcome) -> m.EpisodeResult:
+        ticks = [t for t in self._recorder.ticks if t.tick < outcome.num_ticks]
+        return m.EpisodeResult(
+            status=outcome.status,
+            is_success=outcome.status == m.TaskStatus.SUCCESS,
+            reason=outcome.reason,
+            num_ticks=outcome.num_ticks,
+            stream_sha256=stream_sha256(ticks),
+            statistics=statistics(ticks, self._recorder.stamps, self._recorder.invocations),
+        )
+
+    def _log_path(self, info: m.EpisodeInfo) -> Path:
+        day = time.strftime("%Y-%m-%d", time.gmtime())
+        return self._options.out / day / info.task / f"{info.seed}-{info.header.episode}.mcap"
+
+
+def versions() -> dict[str, str]:
+    """What ran: part of every log and result."""
+    found = {"ponderpounce": version(), "python": platform.python_version(), "machine": platform.machine()}
+    for name in ("mujoco", "numpy", "eclipse-zenoh", "protobuf", "mcap"):
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def _as_json(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _as_json(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_as_json(item) for item in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def _write(path: Path, results: dict[str, Any]) -> None:
+    """Atomically: a reader never sees half a file."""
+    partial = path.with_suffix(".json.partial")
+    partial.write_text(json.dumps(results, indent=1) + "\n")
+    partial.replace(path)
