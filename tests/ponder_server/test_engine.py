@@ -204,7 +204,8 @@ def test_a_transition_that_does_not_fit_leaves_no_trace(ponder: Ponder, room_for
     engine.open("a", WITH_DEMO)
     engine.fire("a", observation(0))
     before = state_of(context_of(engine, "a"))
-    with pytest.raises(ContextFull, match=f"the limit is {limit}"):
+    needed = 12 + 1 + 1 + 2 + 2  # observation, T_yes, a token of DR, T_yes and a token of S, carriers
+    with pytest.raises(ContextFull, match=f"holds {opened + 14} tokens and needs {needed} more, the limit is {limit}"):
         engine.fire("a", observation(1))
     assert_untouched(context_of(engine, "a"), before)
 
@@ -341,6 +342,15 @@ def test_the_memory_of_a_closed_session_serves_the_next_one(engine: QwenEngine) 
     engine.close("a")
     engine.open("b", WITHOUT_DEMO)
     assert context_of(engine, "b") is memory
+
+
+def test_the_papers_fire_is_two_images_of_256_px_and_one_carrier() -> None:
+    engine = QwenEngine(Ponder.random(tiny_cpu(), seed=0), CONFIG)
+    opened = engine.open("a", WITHOUT_DEMO)
+    frames = (np.zeros((256, 256, 3), np.uint8), np.full((256, 256, 3), 255, np.uint8))
+    answer = engine.fire("a", frames)
+    assert answer.context_tokens == opened + 2 * (64 + 2) + 1
+    assert answer.cognition.shape == (1, 96)
 
 
 def test_an_opening_that_does_not_fit_is_refused(engine: QwenEngine) -> None:
