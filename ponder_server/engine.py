@@ -13,7 +13,6 @@ a session.
 
 import time
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
@@ -31,6 +30,7 @@ from ponder_server.contract import (
     no_progress,
 )
 from ponder_server.session import SavedState, Session
+from ponder_server.writer import TransitionWriter
 from ponderpounce.models.context import Segment
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import weights_hash
@@ -78,7 +78,6 @@ class QwenEngine:
         self._ponder = ponder
         self._config = config
         self._format = ponder.format
-        self._vocabulary = ponder.format.vocabulary
         self._episodes: dict[str, _Episode] = {}
         self._free: list[_Episode] = []
         self._spec = EngineSpec(
@@ -91,14 +90,7 @@ class QwenEngine:
             is_random=ponder.is_random,
             dtype=str(ponder.dtype).removeprefix("torch."),
         )
-        v = self._vocabulary
-        self._ends = frozenset({v.t_yes, v.t_no, v.end_of_text, v.im_end})
-        is_text_V = torch.zeros(ponder.vocab_size, dtype=torch.bool)
-        is_text_V[: v.num_tokens] = True
-        is_text_V[list(v.control_ids)] = False
-        may_end_V = is_text_V.clone()
-        may_end_V[list(self._ends)] = True
-        self._is_text_V, self._may_end_V = is_text_V.to(ponder.device), may_end_V.to(ponder.device)
+        self._writer = TransitionWriter(ponder, max_text_tokens=config.max_text_tokens)
 
     @property
     def spec(self) -> EngineSpec:
@@ -175,11 +167,18 @@ class QwenEngine:
             if force_text_tokens is None:
                 hidden_TH = context.append(ids, embeds_TH)
                 progress()
-                if self._gate(hidden_TH[len(observation) - 1]) != self._vocabulary.t_yes:
+                if self._gate(hidden_TH[len(observation) - 1]) != self._format.vocabulary.t_yes:
                     return self._answer(context, hidden_TH[len(observation) :], ())
                 context.restore(before)
-            observation_TH = embeds_TH[: len(observation)]
-            texts = self._write(episode, observation, observation_TH, progress, force_text_tokens)
+            texts = self._writer.write(
+                context,
+                before,
+                observation.ids,
+                embeds_TH[: len(observation)],
+                with_reasoning=episode.owes_reasoning and force_text_tokens is None,
+                exactly=force_text_tokens,
+                progress=progress,
+            )
             hidden_KH = context.append(carriers.ids, embeds_TH[len(observation) :])
             progress()
             answer = self._answer(context, hidden_KH, texts)
@@ -259,86 +258,6 @@ class QwenEngine:
             texts=texts,
             context_tokens=context.num_tokens,
         )
-
-    def _write(
-        self,
-        episode: _Episode,
-        observation: Segment,
-        observation_TH: Tensor,
-        progress: Progress,
-        force_text_tokens: int | None,
-    ) -> tuple[Text, ...]:
-        """Appends O_t and the transition's text; room for the carriers is kept.
-
-        The text is [T_yes, DR, T_yes, S] at the first transition after a demonstration, else [T_yes, S]. DR
-        is closed by the T_yes that opens S, or by its limit (S follows all the same); any other end ends the
-        transition.
-        """
-        context = episode.context
-        t_yes = self._vocabulary.t_yes
-        t_yes_TH = self._ponder.embed([t_yes])
-        hidden_H = context.append([*observation.ids, t_yes], torch.cat([observation_TH, t_yes_TH]))[-1]
-        progress()
-        keep = self._format.num_carriers
-        if force_text_tokens is not None:
-            text, _ = self._decode(episode, hidden_H, "subgoal", keep, progress, exactly=force_text_tokens)
-            return (text,)
-        texts = []
-        if episode.owes_reasoning:
-            keep_subgoal = 2  # T_yes and one token
-            text, end = self._decode(episode, hidden_H, "demo_reasoning", keep + keep_subgoal, progress)
-            texts.append(text)
-            if end not in (t_yes, None):
-                return tuple(texts)
-            hidden_H = context.append([t_yes], t_yes_TH)[-1]
-            progress()
-        text, _ = self._decode(episode, hidden_H, "subgoal", keep, progress)
-        return (*texts, text)
-
-    def _decode(
-        self,
-        episode: _Episode,
-        hidden_H: Tensor,
-        kind: Literal["subgoal", "demo_reasoning"],
-        num_kept: int,
-        progress: Progress,
-        *,
-        exactly: int | None = None,
-    ) -> tuple[Text, int | None]:
-        """Greedy text after the given hidden state, and the token that ended it (None: the limit did).
-
-        ``num_kept`` positions of the context stay free. The ending token is not appended; control tokens that
-        end nothing (images, carriers, padding rows) cannot be said, because a context cannot hold them as
-        text.
-        """
-        context = episode.context
-        room = context.room - num_kept
-        limit = min(self._config.max_text_tokens, room) if exactly is None else exactly
-        if not 1 <= limit <= room:
-            used = episode.before_fire.num_tokens  # what the session goes back to
-            wanted = context.num_tokens - used + max(limit, 1) + num_kept
-            raise ContextFull(session=context.name, used=used, wanted=wanted, limit=context.max_tokens)
-        sayable_V = self._may_end_V if exactly is None else self._is_text_V
-        ids: list[int] = []
-        end: int | None = None
-        while len(ids) != exactly:
-            logits_V = self._ponder.logits(hidden_H[None])[0]
-            token = int(logits_V.masked_fill(~sayable_V, float("-inf")).argmax())
-            if token in self._ends:
-                end = token
-                break
-            if len(ids) == limit:
-                break
-            ids.append(token)
-            hidden_H = context.append([token], self._ponder.embed([token]))[-1]
-            progress()
-        text = Text(
-            kind=kind,
-            text=self._vocabulary.decode(ids),
-            token_ids=tuple(ids),
-            truncated=end is None and exactly is None,
-        )
-        return text, end
 
 
 def _chunks(segments: tuple[Segment, ...], max_tokens: int) -> list[list[Segment]]:
