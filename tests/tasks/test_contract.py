@@ -16,8 +16,8 @@ import pytest
 
 from ponderpounce.tasks import panda, sight
 from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import IMAGE_PX, Environment, Snapshot
-from ponderpounce.tasks.scene import FRONT
+from ponderpounce.tasks.environment import IMAGE_PX, Environment, Snapshot, make_environment
+from ponderpounce.tasks.scene import CAMERAS, FRONT
 from ponderpounce.tasks.task import DIFFICULTIES, TaskError, task_names
 
 EnvironmentOf = Callable[[str], Environment]
@@ -50,6 +50,17 @@ def facts(snapshot: Snapshot) -> tuple[Any, ...]:
         snapshot.grounded_subgoal,
         snapshot.subtask_index,
     )
+
+
+def is_inside_outline(env: Environment, body: str, yx_px: tuple[int, int]) -> bool:
+    """True if a pixel lies in the picture of the body's bounding sphere, by upstream's own camera formula."""
+    entry = env.physics.model.body(body)
+    geom = int(entry.geomadr[0])
+    x, y, z = env.physics.data.geom_xpos[geom]
+    depth_m = -0.4472 * x - 0.8944 * z + 0.4919
+    center_yx_px = 128 + 128 * np.array([0.8944 * x - 0.4472 * z - 0.0894, y]) / depth_m
+    radius_px = 128 * env.physics.model.geom_rbound[geom] / depth_m
+    return bool(np.linalg.norm(np.add(yx_px, 0.5) - center_yx_px) <= radius_px + 2)
 
 
 @every_task
@@ -119,6 +130,7 @@ def test_fixed_coordinates_lie_on_the_object(environment: EnvironmentOf, name: s
             for body, point in zip(env.subtasks[index_before].grounds, points, strict=True):
                 pixels = sight.visible_pixels(env.physics, FRONT, body, IMAGE_PX)
                 assert np.abs(pixels - point).max(axis=1).min() <= 2
+                assert is_inside_outline(env, body, point)
                 num_checked += 1
         text_before, index_before = snapshot.grounded_subgoal, snapshot.subtask_index
     assert num_checked > 0
@@ -198,6 +210,19 @@ def test_snapshots_share_no_memory(environment: EnvironmentOf, name: str) -> Non
     for array in (b.state, b.tcp_pose):
         assert not np.shares_memory(array, env.physics.data.qpos)
         assert array.flags.owndata
+
+
+@every_task
+@pytest.mark.sim
+def test_frames_have_the_promised_shape_and_own_their_memory(name: str) -> None:
+    with make_environment(name) as env:
+        a, b = env.reset(SEED), env.step(HOME)
+        assert tuple(a.frames) == tuple(b.frames) == CAMERAS
+        for camera in CAMERAS:
+            assert a.frames[camera].shape == (IMAGE_PX, IMAGE_PX, 3)
+            assert a.frames[camera].dtype == np.uint8
+            assert a.frames[camera].std() > 10  # not blank
+            assert not np.shares_memory(a.frames[camera], b.frames[camera])
 
 
 @every_task

@@ -165,6 +165,28 @@ def test_an_opened_hand_lets_go(world: Physics) -> None:
     assert is_dropped(world, "cube")
 
 
+def test_what_is_loaded_is_what_was_saved(world: Physics) -> None:
+    grasp(world)  # contacts, so that the solver's warm start matters
+    advance(world, 3, np.append(panda.HOME_QPOS + 0.02, -1.0))
+    fork = world.save()
+    advance(world, 3)
+    world.load(fork)
+    np.testing.assert_array_equal(world.save().integration, fork.integration)
+
+
+def test_pushing_with_both_finger_tips_is_not_grasping(world: Physics) -> None:
+    closed = np.append(panda.HOME_QPOS, -1.0)
+    advance(world, 10, closed)
+    x_m, y_m, z_m = world.tcp_transform()[:3, 3]
+    world.place("cube", pose(x_m, y_m, z_m - 0.0295))
+    world.data.body("cube").xfrc_applied[2] = 0.064 * 9.81 + 5.0  # pressed against the tips from below
+    world.refresh()
+    advance(world, 2, closed)
+    touching = {world.model.body(world.model.geom_bodyid[geom]).name for geom in world.data.contact.geom.ravel()}
+    assert {"leftfinger", "rightfinger", "cube"} <= touching
+    assert not world.is_grasped("cube")
+
+
 def test_one_finger_alone_does_not_grasp(world: Physics) -> None:
     x_m, y_m, z_m = world.tcp_transform()[:3, 3]
     world.place("cube", pose(x_m, y_m + 0.0205, z_m))  # touches one finger of the open hand

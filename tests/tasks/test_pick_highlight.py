@@ -127,6 +127,15 @@ def test_one_target_of_two_is_not_enough(pick_highlight: Environment) -> None:
     assert play(env, motions.pick(f"cube_{env.layout.targets[0]}")).status is Status.ONGOING
 
 
+def test_an_oracle_that_takes_over_keeps_holding_the_cube(pick_highlight: Environment) -> None:
+    env = pick_highlight
+    env.reset(5, "medium")
+    for action in env.oracle():
+        if env.step(action).subtask_index == 2:  # just lifted
+            break
+    assert next(env.oracle())[7] == -1.0
+
+
 @pytest.mark.parametrize("difficulty", DIFFICULTIES)
 def test_the_list_alternates_picking_and_placing(pick_highlight: Environment, difficulty: str) -> None:
     pick_highlight.reset(2, difficulty)
