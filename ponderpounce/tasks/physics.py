@@ -10,6 +10,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from ponderpounce.tasks import panda
 from ponderpounce.tasks.geometry import Array, pose
@@ -28,14 +29,15 @@ class PhysicsState:
     """Everything that changes in a world: restoring it gives bit-identical steps from there on."""
 
     integration: Array  # mjSTATE_INTEGRATION; FULLPHYSICS alone forgets the solver's warm start and is not exact
-    geom_rgba: Any  # (ngeom, 4) float32
+    geom_rgba: NDArray[np.float32]  # (ngeom, 4)
 
 
 class Physics:
     """A compiled scene with the Panda in it.
 
-    Bodies are addressed by the names the scene gave them. After every public call the derived quantities (poses,
-    contact forces) belong to the current state, not, as after a bare mj_step, to the one a substep ago.
+    Bodies are addressed by the names the scene gave them. After `reset`, `advance`, `load` and `refresh` all derived
+    quantities (poses, contact forces) belong to the current state, not, as after a bare mj_step, to the one a substep
+    ago.
     """
 
     def __init__(self, spec: mujoco.MjSpec) -> None:
@@ -55,8 +57,6 @@ class Physics:
         self._compiled_rgba = model.geom_rgba.copy()
         self._props = [model.body(b).name for b in range(model.nbody) if _is_prop(model, b)]
         self.reset()
-
-    # -- set -------------------------------------------------------------------------------------------------------
 
     def reset(self) -> None:
         """Puts the arm at home with the gripper open, at rest, parks every prop and takes back every paint."""
@@ -93,15 +93,11 @@ class Physics:
         """Recomputes poses and contacts from the current state. No time passes."""
         mujoco.mj_forward(self.model, self.data)
 
-    # -- advance ---------------------------------------------------------------------------------------------------
-
     def advance(self, action: Array) -> None:
         """Drives the arm towards an action (8,) for one control step: exactly 50 ms."""
         self.data.ctrl[:] = panda.control_of(action)
         mujoco.mj_step(self.model, self.data, self.substeps)
         self.refresh()
-
-    # -- read ------------------------------------------------------------------------------------------------------
 
     def arm_qpos(self) -> Array:
         """Joint angles (7,) in rad."""
@@ -164,8 +160,6 @@ class Physics:
         magnitude = float(np.linalg.norm(force_n))
         return magnitude >= _GRASP_FORCE_N and float(force_n @ outward) >= magnitude * _GRASP_COS
 
-    # -- save and restore --------------------------------------------------------------------------------------------
-
     def save(self) -> PhysicsState:
         """Returns a copy of everything `load` needs to continue bit-exactly."""
         size = mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -176,12 +170,8 @@ class Physics:
     def load(self, state: PhysicsState) -> None:
         """Restores a saved state of the same scene."""
         self.model.geom_rgba[:] = state.geom_rgba
-        self._set_integration(state)
-        self.refresh()
-        self._set_integration(state)  # refresh moved the solver's warm start
-
-    def _set_integration(self, state: PhysicsState) -> None:
         mujoco.mj_setState(self.model, self.data, state.integration, mujoco.mjtState.mjSTATE_INTEGRATION)
+        self.refresh()  # leaves the solver's warm start as it is; only a step moves that
 
     def _set_pose(self, name: str, pose_7: Array) -> None:
         body = self.model.body(name)

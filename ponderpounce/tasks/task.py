@@ -55,7 +55,7 @@ class Subtask:
 class Task(ABC, Generic[LayoutT, MemoryT]):
     """One kind of episode. Subclasses carry `@task(family=...)`, one file each.
 
-    Every method but `arrange` and `stage` is a pure function of its arguments.
+    All methods but `furnish`, `arrange` and `stage` are pure functions of their arguments.
     """
 
     name: ClassVar[str]
