@@ -1,0 +1,70 @@
+# Two commands do everything on a fresh machine: `make demo` and `make test`. Plain pip; nothing outside .venv and out/.
+VENV ?= .venv
+PYTHON ?= python3
+# A CPU build is enough for the demo and the tests. On a machine with its own build, say TORCH=torch or TORCH=path.whl.
+TORCH ?= torch==2.13.0
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+PB := protocol/ponderpounce/v1
+export MUJOCO_GL ?= egl
+export OMP_NUM_THREADS ?= 1
+
+.PHONY: help setup demo test unit lint types proto bench clean
+help:
+	@sed -n 's/^## //p' $(MAKEFILE_LIST)
+
+## make setup   create .venv and install the pinned packages (the others call it when needed)
+setup: $(READY)
+
+$(READY): requirements.txt pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed; set PYTHON=python3.11"; exit 1; }
+	@$(PYTHON) -c 'import venv, ensurepip' || { echo "The venv module is missing: apt-get install python3-venv"; exit 1; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet "$(TORCH)"           # first and alone: a range elsewhere would fetch gigabytes of CUDA
+	$(BIN)/pip install --quiet -r requirements.txt
+	$(BIN)/pip install --quiet --no-deps robosuite==1.5.2 openpi-client==0.1.2  # their own pins contradict numpy 2
+	$(BIN)/pip install --quiet --no-deps --no-build-isolation --editable .
+	touch $@
+
+## make demo    three processes drive a Panda through PickHighlight; logs, checks and a picture in out/demo
+demo: setup
+	$(BIN)/pp-doctor --required-only
+	rm -rf out/demo
+	@echo "--- real time: ponder-serve, pounce-serve and clock-serve over zenoh, tiny random models (motion, not skill)"
+	$(BIN)/sim-client --local --mode realtime --episodes 1 --max-steps 400 --out out/demo/realtime
+	@echo "--- lockstep: the paper's schedule, both models at 1 Hz, 300 ms of delay"
+	$(BIN)/sim-client --local --mode lockstep --episodes 2 --max-steps 200 --out out/demo/lockstep
+	@echo "--- the task's own script, to see the task done"
+	$(BIN)/sim-client --policy oracle --episodes 3 --out out/demo/oracle
+	@echo "--- every reference, age, row and deadline again, from the logs alone"
+	$(BIN)/pp-check $$(find out/demo -name '*.mcap')
+	$(BIN)/pp-replay $$(find out/demo/realtime -name '*.mcap') --save out/demo/realtime.rrd
+	@echo "Watch one: $(BIN)/pp-replay $$(find out/demo/oracle -name '*.mcap' | head -1)"
+
+## make test    everything that needs no GPU; make unit: without processes and long runs
+test: setup
+	$(BIN)/python -m pytest -q -m "not gpu" --durations=10
+unit: setup
+	$(BIN)/python -m pytest -q -m "not gpu and not e2e and not slow"
+
+## make lint    style, types, import contracts, generated code up to date
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+## make proto   regenerate the protobuf modules (commit the result)
+proto: setup
+	$(BIN)/python -m grpc_tools.protoc -I . --python_out=. --pyi_out=. $(PB)/common.proto $(PB)/stream.proto $(PB)/episode.proto
+
+## make bench   every benchmark, then the tables (about ten minutes on a quiet machine)
+bench: setup
+	$(BIN)/python -m benchmarks.bus_latency
+	$(BIN)/python -m benchmarks.playback_jitter
+	$(BIN)/python -m benchmarks.episode_throughput
+	$(BIN)/python -m benchmarks.fault_drill
+	$(BIN)/python -m benchmarks.render
+
+clean:
+	rm -rf out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,0 +1,46 @@
+"""``pp-engage``: a person says that motion may start again after the ladder stopped the robot."""
+
+from __future__ import annotations
+
+import getpass
+import sys
+from dataclasses import dataclass, field
+
+import tyro
+
+from protocol.errors import TransportError
+from protocol.link import Link
+from protocol.messages import EngageRequest
+from protocol.options import LinkOptions
+from protocol.topics import ENGAGE
+from protocol.zenoh_bus import open_bus
+
+_CALL_NS = 2_000_000_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EngageOptions:
+    """Lets a stopped robot move again; the log keeps who said so."""
+
+    link: LinkOptions = field(default_factory=lambda: LinkOptions(connect=("tcp/127.0.0.1:7447",)))
+    operator: str = field(default_factory=getpass.getuser)
+
+
+def main(argv: list[str] | None = None) -> int:
+    options = tyro.cli(EngageOptions, args=argv, prog="pp-engage", description=EngageOptions.__doc__)
+    try:
+        bus = open_bus(options.link)
+        try:
+            link = Link(bus, robot=options.link.robot, proc="engage")
+            reply = link.call(ENGAGE, "clock", EngageRequest(operator=options.operator), timeout_ns=_CALL_NS)
+        finally:
+            bus.close()
+    except TransportError as error:
+        sys.stderr.write(f"pp-engage: {error}\n")
+        return 2
+    sys.stdout.write(f"{reply.error or reply.level}\n")
+    return 1 if reply.error else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
