@@ -200,16 +200,20 @@ def check_invocations(record: EpisodeRecord, answers: Answers) -> Iterator[Disag
         if window <= previous:
             expected = f"the first of its {schedule.invoke_period_ticks} ticks, period {previous + 1} or later"
             yield from compare("Invocation", index, period=(expected, f"period {window}"))
-        tail = _unplayed_rows(record, answers, tick)
+        tail = _unplayed_rows(record, answers, tick, index)
         if tail is not None:
             yield from compare("Invocation", index, previous_rows=(tail, invocation.previous_rows))
 
 
-def _unplayed_rows(record: EpisodeRecord, answers: Answers, tick: int) -> Floats | None:
-    """What the chunk in use still had to say from ``tick`` on, (n * action_dim,); None if the log ends before."""
+def _unplayed_rows(record: EpisodeRecord, answers: Answers, tick: int, invocation: int) -> Floats | None:
+    """What the chunk in use still had to say from ``tick`` on, (n * action_dim,); None if the log ends before.
+
+    Earlier invocations only: with a modelled delay of 0 an invocation's own chunk is admitted at the same instant.
+    """
     if tick >= len(record.ticks) or record.ticks[tick].level == Level.SKIPPED:
         return None
-    chunks = covering(answers.admitted(record.ticks[tick].decided_ns), tick)
+    admitted = answers.admitted(record.ticks[tick].decided_ns)
+    chunks = covering([c for c in admitted if c.invocation < invocation], tick)
     return chunks[-1].rows_NA[tick - chunks[-1].t_row0 :].ravel() if chunks else np.zeros(0, np.float32)
 
 

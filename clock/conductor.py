@@ -21,7 +21,7 @@ from clock.delays import in_order, modelled_ns
 from clock.ladder import Ladder
 from clock.limits import Hit, within_limits
 from clock.playback import Chunk, Join, covering, deadline_ns, row_of, seam_policy, tick_at
-from clock.reference import Ready, Reference, refer
+from clock.reference import Ready, Reference, latest_ready, refer
 from protocol.messages import (
     Action,
     ActionChunk,
@@ -244,7 +244,7 @@ class Conductor:
                 self._ask_ponder(newest, effects)
                 while self._query_due_ns <= tau_ns:
                     self._query_due_ns += self.info.schedule.query_period_ns
-        if self.tick >= self._invoke_due_tick and self._ready:
+        if self.tick >= self._invoke_due_tick and latest_ready(self._ready, tau_ns) is not None:
             if "pounce" in self._absent:
                 self._tell(
                     effects,
@@ -327,9 +327,12 @@ class Conductor:
         self._chunks = [c for c in self._chunks if c.t_row0 + len(c.rows_NA) > self.tick]
 
     def _forget_vectors(self) -> None:
-        """Keeps only vectors that a delivery can still refer to: the newest, the first, and the last transition's."""
+        """Keeps only vectors that a delivery can still refer to: the newest, the first, and the last transitions'.
+
+        Two transitions: the last one may have come after the tick's deadline and before this late poll.
+        """
         transitions = [r.query for r in self._ready if r.is_transition]
-        keep = {self._ready[0].query, *transitions[-1:], *(r.query for r in self._ready[-8:])}
+        keep = {self._ready[0].query, *transitions[-2:], *(r.query for r in self._ready[-8:])}
         for query in self._vectors.keys() - keep:
             del self._vectors[query]
 
