@@ -71,7 +71,7 @@ def main(argv: list[str] | None = None) -> int:
 
         server = PonderServer(link, engine, heartbeat, version())
         server.warm_up()
-        server.rejoin()
+        server.ready()
         run(bus, server.step, should_stop)
         heartbeat.set(state=ServingState.CLOSING)
     finally:

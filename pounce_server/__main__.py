@@ -65,7 +65,7 @@ def main(argv: list[str] | None = None) -> int:
 
         server = PounceServer(link, engine, heartbeat, version())
         server.warm_up()
-        server.rejoin()
+        server.ready()
         run(bus, server.step, should_stop)
         heartbeat.set(state=ServingState.CLOSING)
     finally:

@@ -21,4 +21,5 @@ def build(bus: Bus, robot: str, checkpoint: Path | None) -> Callable[[], bool]:
     heartbeat = Heartbeat(link, version(), host_clock_id())
     server = PounceServer(link, build_engine(PounceOptions(checkpoint=checkpoint)), heartbeat, version())
     server.warm_up()
+    server.ready()
     return server.step

@@ -37,14 +37,18 @@ class PounceServer:
         durations_ns = self._engine.warm_up()
         spec = self._engine.spec
         self._heartbeat.set(
-            state=m.ServingState.READY,
             infer_p50_ns=percentile_ns(durations_ns, 50),
             infer_p99_ns=percentile_ns(durations_ns, 99),
             model_hash=spec.model_hash,
             is_fake=spec.is_random or spec.has_fresh_prefix,
             progress=1.0,
         )
-        log.info("ready infer_p50_ms=%.1f", percentile_ns(durations_ns, 50) / 1e6)
+
+    def ready(self) -> None:
+        """Joins a running episode, if there is one, and only then says that it is ready."""
+        self.rejoin()
+        self._heartbeat.set(state=m.ServingState.READY)
+        log.info("ready infer_p50_ms=%.1f", self._heartbeat.health.infer_p50_ns / 1e6)
 
     def step(self) -> bool:
         self._heartbeat.beat()
