@@ -35,6 +35,7 @@ _VISIBLE = 1  # geom group that the cameras see; group 0 holds the arm's collisi
 _GROUND_Z_M = -0.92
 _TABLE_X_M, _TABLE_Y_M = (-0.74, 0.47), (-1.21, 1.20)
 _TABLE_FRICTION = [0.3, 0.005, 0.0001]
+_GRAIN_PX = 512
 
 
 class SceneFullError(RuntimeError):
@@ -233,9 +234,6 @@ def _add_cameras(spec: mujoco.MjSpec) -> None:
     spec.body("right_hand").add_camera(
         name=WRIST, pos=[0.0465, -0.02, 0.036], xyaxes=[0.0, 1.0, 0.0, 1.0, 0.0, 0.0], fovy=90.0
     )
-
-
-_GRAIN_PX = 512
 
 
 def wood_grain() -> NDArray[np.uint8]:

@@ -41,9 +41,8 @@ class Timing:
 def fastest(path: Array, *, max_speed: float, max_acceleration: float) -> Timing:
     """Returns the quickest timing of a joint path (n, joints) from rest to rest; n points evenly spaced along it.
 
-    Limits are for every joint, in units of the path per second and per second squared. They hold at the points; between
-    two points around which a joint turns back, its acceleration can be up to a tenth over. A path that goes nowhere
-    takes no time.
+    Limits hold for every joint, in units of the path per second and per second squared. A path that goes nowhere takes
+    no time.
     """
     n = len(path)
     ds = 1.0 / (n - 1)
@@ -57,6 +56,9 @@ def fastest(path: Array, *, max_speed: float, max_acceleration: float) -> Timing
     turning = np.where(np.abs(slope) > _MOVING, 0.0, np.abs(bend)).max(axis=1)
     x_cap = np.minimum(x_cap, max_acceleration / np.maximum(turning, 1e-9))
     x_cap[[0, -1]] = 0.0
+    # Limits are kept at both ends of a cell: at its far end x has become x + 2 u ds.
+    slope = np.concatenate([slope[:-1], slope[1:] + 2 * ds * bend[1:]], axis=1)
+    bend = np.concatenate([bend[:-1], bend[1:]], axis=1)
 
     x_max = np.zeros(n)
     for i in range(n - 2, -1, -1):

@@ -43,8 +43,8 @@ def test_sampled_scenes_obey_the_rules(difficulty: str) -> None:
         assert abs(layout.button_xy_m[1]) <= 0.2
         taken = [Footprint(center_m=layout.button_xy_m, half_m=BUTTON_HALF_M)]
         for cube in layout.cubes:
-            assert abs(cube.x_m + 0.1) <= 0.2
-            assert abs(cube.y_m) <= 0.2
+            assert abs(cube.x_m + 0.1) <= 0.18
+            assert abs(cube.y_m) <= 0.18
             assert cube.color in CUBE_COLORS
             spot = Footprint(center_m=(cube.x_m, cube.y_m), half_m=(CUBE_HALF_M,) * 2, yaw_rad=cube.yaw_rad)
             assert all(is_clear(spot, other, 0.04) for other in taken)
