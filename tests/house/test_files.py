@@ -1,0 +1,141 @@
+"""Facts about the files themselves: docstrings, lengths, pins, generated code, nothing of anybody's machine."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+MAX_LINES = 500
+LONGER = {
+    "protocol/messages.py": "one dataclass per message, field for field as in the .proto files",
+    "protocol/mcap_log.py": "the writer and the reader of one format, side by side",
+    "clock/conductor.py": "one state machine",
+}
+"""Files that may be longer, and why; no new ones."""
+MAX_LINES_LONGER = 600
+
+_MACHINE_PATH = re.compile(r"(?<![\w.~$})-])/(?:work|root|home|Users|mnt|scratch)/[\w.-]+")
+_SECRET = re.compile(
+    r"-----BEGIN [A-Z ]*PRIVATE KEY|\bgh[pousr]_[A-Za-z0-9]{30}|\bhf_[A-Za-z0-9]{30}|\bAKIA[0-9A-Z]{16}|://[^/\s:@]+:[^/\s:@]+@"
+)
+
+
+@pytest.fixture(scope="module")
+def texts(root: Path, files: tuple[str, ...]) -> dict[str, str]:
+    """Every text file of ours."""
+    found = {}
+    for name in files:
+        data = (root / name).read_bytes()
+        if b"\0" not in data[:8192]:
+            found[name] = data.decode("utf-8")
+    return found
+
+
+def test_every_module_says_in_a_docstring_what_it_is(root: Path, written: tuple[str, ...]) -> None:
+    silent = [
+        name
+        for name in written
+        if (source := (root / name).read_text(encoding="utf-8")).strip() and not ast.get_docstring(ast.parse(source))
+    ]
+    assert not silent
+
+
+def test_no_module_is_longer_than_one_idea(root: Path, written: tuple[str, ...]) -> None:
+    lengths = {name: len((root / name).read_text(encoding="utf-8").splitlines()) for name in written}
+    limits = {name: MAX_LINES_LONGER if name in LONGER else MAX_LINES for name in written}
+    assert not {name: length for name, length in lengths.items() if length > limits[name]}
+
+
+@pytest.mark.parametrize("name", LONGER)
+def test_an_exception_to_the_length_is_still_needed(root: Path, name: str) -> None:
+    assert len((root / name).read_text(encoding="utf-8").splitlines()) > MAX_LINES, f"take {name} out of LONGER"
+
+
+@pytest.mark.parametrize(
+    ("text", "is_found"),
+    [
+        ("see /ho" + "me/anna/models", True),
+        ("cd /ro" + "ot/x", True),
+        ("../shared/work/x", False),
+        ("pp/@v1/home/x", False),
+    ],
+)
+def test_a_machine_path_is_recognised(text: str, is_found: bool) -> None:
+    assert bool(_MACHINE_PATH.search(text)) is is_found
+
+
+def test_no_file_names_a_place_on_somebodys_machine(texts: dict[str, str]) -> None:
+    found = {name: match.group() for name, text in texts.items() if (match := _MACHINE_PATH.search(text))}
+    assert not found
+
+
+def test_no_file_holds_a_secret(texts: dict[str, str]) -> None:
+    assert not [name for name, text in texts.items() if _SECRET.search(text)]
+
+
+def test_generated_modules_are_what_the_generator_makes_of_the_schemas(root: Path, tmp_path: Path) -> None:
+    """The Makefile's ``proto`` target, into an empty folder."""
+    schemas = sorted(str(path.relative_to(root)) for path in (root / "protocol").rglob("*.proto"))
+    arguments = ["-I", ".", f"--python_out={tmp_path}", f"--pyi_out={tmp_path}", *schemas]
+    subprocess.run([sys.executable, "-m", "grpc_tools.protoc", *arguments], cwd=root, check=True, timeout=60)
+    made = {str(path.relative_to(tmp_path)): path.read_bytes() for path in tmp_path.rglob("*_pb2.py*")}
+    committed = {
+        str(path.relative_to(root)): path.read_bytes()
+        for pattern in ("*_pb2.py", "*_pb2.pyi")
+        for path in (root / "protocol").rglob(pattern)
+    }
+    assert made.keys() == committed.keys()
+    assert [name for name in made if made[name] != committed[name]] == [], "run `make proto` and commit"
+
+
+# -- versions: pyproject says what may be, requirements.txt what is
+
+
+def _bounds(root: Path) -> list[Requirement]:
+    project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"].values()
+    return [Requirement(line) for lines in (project["dependencies"], *extras) for line in lines]
+
+
+def _pins(root: Path) -> dict[str, str]:
+    """Name -> version of what CI installs: requirements.txt, and what the Makefile installs by itself."""
+    lines = (root / "requirements.txt").read_text().splitlines()
+    pinned = [line.partition("#")[0].strip() for line in lines]
+    pinned += re.findall(r"\b[\w-]+==[\w.]+", (root / "Makefile").read_text())
+    pins = {}
+    for line in filter(None, pinned):
+        requirement = Requirement(line)
+        (specifier,) = requirement.specifier
+        assert specifier.operator == "==", f"{line}: a pin is =="
+        pins[_canonical(requirement.name)] = specifier.version
+    return pins
+
+
+def _canonical(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def test_every_dependency_is_pinned(root: Path) -> None:
+    assert {_canonical(bound.name) for bound in _bounds(root)} - _pins(root).keys() == set()
+
+
+def test_every_pin_lies_within_its_bounds(root: Path) -> None:
+    pins = _pins(root)
+    outside = [
+        f"{bound} but pinned {pins[name]}"
+        for bound in _bounds(root)
+        if (name := _canonical(bound.name)) in pins and not bound.specifier.contains(pins[name])
+    ]
+    assert not outside
+
+
+def test_what_is_installed_beside_pip_s_resolver_is_no_dependency(root: Path) -> None:
+    """robosuite's own pins contradict numpy 2: as a dependency it would make the whole set unsolvable."""
+    assert not {_canonical(bound.name) for bound in _bounds(root)} & {"robosuite", "openpi-client", "opencv-python"}
