@@ -1,0 +1,320 @@
+"""How long does a policy call take when the policy costs nothing? Ours beside the real openpi-client, in one run.
+
+One call: two 256 x 256 pictures and 8 joint values as numpy arrays become a numpy chunk (20, 8) on the client;
+serialisation, transport, wake-ups and the server's decoding of both pictures are all inside. Every answer is compared
+with the one that only this request can have. Client and server are two processes of one host, on loopback.
+
+Like for like: openpi's client sends one message and gets one; so do our rows "observation -> chunk", through the same
+Link, codec and bus as the daemons. The rows "pounce-serve" are what an episode really pays: an observation, an
+invocation and a chunk, and the daemon's phases and heartbeats beside them.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import psutil
+import tyro
+from numpy.typing import NDArray
+
+from benchmarks.noop_policy import ACTION_DIM, EPISODE, HORIZON, INSTRUCTION, NUM_PROPRIO, ROBOT, Wire, answer
+from benchmarks.report import Report, Row, show, spread
+from clock.schedules import realtime
+from protocol import images, topics
+from protocol import messages as m
+from protocol.errors import CallFailed
+from protocol.link import Link
+from protocol.zenoh_bus import Endpoints, ZenohBus
+from sim_client.launch import free_ports
+
+SIDE_PX = 256
+_PATIENCE_S = 20.0
+
+Pictures = dict[str, NDArray[np.uint8]]
+Call = Callable[[Pictures, NDArray[np.float32]], NDArray[np.float32]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BusOptions:
+    """Latency of a policy call, back to back and at 20 Hz."""
+
+    rounds: int = 60
+    """Every row is measured once per round, in an order that rotates."""
+    calls: int = 40
+    """Per row and round."""
+    paced_rounds: int = 8
+    paced_calls: int = 25
+    paced_hz: int = 20
+    warm_up_calls: int = 100
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Way:
+    """One row: a wire, and what travels on it."""
+
+    name: str
+    wire: Wire
+    messages: int
+    shared_memory: bool = False
+    codec: m.ImageCodec = m.ImageCodec.RAW
+
+
+WAYS = (
+    Way(name="openpi-client 0.1.2: websocket, msgpack-numpy", wire="openpi", messages=2),
+    Way(name="zenoh TCP, observation -> chunk", wire="observation", messages=2),
+    Way(name="zenoh shared memory, observation -> chunk", wire="observation", messages=2, shared_memory=True),
+    Way(name="zenoh TCP, JPEG, observation -> chunk", wire="observation", messages=2, codec=m.ImageCodec.JPEG),
+    Way(name="zenoh TCP, pounce-serve", wire="pounce", messages=3),
+    Way(name="zenoh shared memory, pounce-serve", wire="pounce", messages=3, shared_memory=True),
+)
+
+
+class OverWebsocket:
+    """The real openpi-client, as its users call it."""
+
+    def __init__(self, port: int) -> None:
+        from openpi_client.websocket_client_policy import WebsocketClientPolicy
+
+        self._policy = WebsocketClientPolicy("127.0.0.1", port)
+
+    def __call__(self, pictures: Pictures, state: NDArray[np.float32]) -> NDArray[np.float32]:
+        request = {
+            "observation/image": pictures["front"],
+            "observation/wrist_image": pictures["wrist"],
+            "observation/state": state,
+            "prompt": INSTRUCTION,
+        }
+        rows: NDArray[np.float32] = self._policy.infer(request)["actions"]
+        return rows
+
+
+class OverLink:
+    """Our robot's side and, where it takes one, the clock's invocation."""
+
+    def __init__(self, bus: ZenohBus, codec: m.ImageCodec, *, invokes: bool) -> None:
+        self._bus = bus
+        self._codec = codec
+        self._invokes = invokes
+        self._tick = 0
+        self._link = Link(bus, robot=ROBOT, proc="sim")
+        self._link.enter_episode("bench", EPISODE, 1)
+        self._chunks = self._link.subscribe(topics.CHUNK)
+        if invokes:
+            self._open()
+
+    def __call__(self, pictures: Pictures, state: NDArray[np.float32]) -> NDArray[np.float32]:
+        self._tick += 1
+        tick, now_ns = self._tick, self._tick * 50_000_000
+        packed = images.pack(pictures, self._codec)
+        observation = m.Observation(tick=tick, source_ns=now_ns, proprio=state, images=packed)
+        self._link.publish(topics.OBSERVATION, observation, at_ns=now_ns)
+        if self._invokes:
+            invocation = m.Invocation(
+                invocation=tick, tick=tick, now_ns=now_ns, ref_query=None, age_ns=0, cognition=_NO_COGNITION
+            )
+            self._link.publish(topics.INVOCATION, invocation, at_ns=now_ns)
+        deadline_s = time.monotonic() + _PATIENCE_S
+        while time.monotonic() < deadline_s:
+            for chunk in self._chunks.drain():
+                if chunk.invocation == tick:
+                    return chunk.rows_NA
+            self._bus.wait(20_000_000)
+        raise TimeoutError(f"no chunk for tick {tick} within {_PATIENCE_S:.0f} s")
+
+    def _open(self) -> None:
+        request = m.OpenRequest(info=episode_info(self._link.header("info", 0)))
+        reply = self._link.call(topics.OPEN, "pounce", request, timeout_ns=5_000_000_000)
+        if reply.error:
+            raise CallFailed("open", 5_000, reply.error)
+
+
+def episode_info(header: m.Header) -> m.EpisodeInfo:
+    """The least that pounce-serve wants to know."""
+    bound = np.ones(ACTION_DIM, np.float32)
+    return m.EpisodeInfo(
+        header=header,
+        task="noop",
+        suite="benchmarks",
+        seed=0,
+        difficulty="none",
+        instruction=INSTRUCTION,
+        schedule=realtime(),
+        robot=m.Robot(
+            name="bench",
+            command_low=-bound,
+            command_high=bound,
+            max_step=bound,
+            initial_command=0 * bound,
+            cameras=("front", "wrist"),
+            image_height=SIDE_PX,
+            image_width=SIDE_PX,
+            num_proprio=NUM_PROPRIO,
+            is_simulated=True,
+        ),
+        t0_unix_ns=time.time_ns(),
+    )
+
+
+class Contestant:
+    """A way, its server's process, a connected client, and what its calls took."""
+
+    def __init__(self, way: Way, server: subprocess.Popen[str], call: Call) -> None:
+        self.way = way
+        self._call = call
+        self._server = psutil.Process(server.pid)
+        self._client = psutil.Process()
+        self.took_ms: list[float] = []
+        self.client_cpu_s = 0.0
+        self.server_cpu_s = 0.0
+
+    def measure(self, requests: list[tuple[Pictures, NDArray[np.float32]]], hz: int | None) -> None:
+        """Calls once per request, back to back or on absolute deadlines."""
+        client_s, server_s = _cpu_s(self._client), _cpu_s(self._server)
+        start_ns = time.perf_counter_ns()
+        for index, (pictures, state) in enumerate(requests):
+            if hz:
+                due_ns = start_ns + index * 1_000_000_000 // hz
+                time.sleep(max(0, due_ns - time.perf_counter_ns()) / 1e9)
+            before_ns = time.perf_counter_ns()
+            rows = self._call(pictures, state)
+            self.took_ms.append((time.perf_counter_ns() - before_ns) / 1e6)
+            self._check(rows, pictures, state)
+        self.client_cpu_s += _cpu_s(self._client) - client_s
+        self.server_cpu_s += _cpu_s(self._server) - server_s
+
+    def forget(self) -> None:
+        self.took_ms.clear()
+        self.client_cpu_s = self.server_cpu_s = 0.0
+
+    def row(self, baseline_ms: float) -> Row:
+        timing = spread(self.took_ms, "ms")
+        ratio = round(float(np.percentile(self.took_ms, 50)) / baseline_ms, 2)
+        return {
+            "way": self.way.name,
+            "messages": self.way.messages,
+            **timing,
+            "p50_vs_openpi": ratio,
+            "client_cpu_ms": round(self.client_cpu_s * 1e3 / len(self.took_ms), 2),
+            "server_cpu_ms": round(self.server_cpu_s * 1e3 / len(self.took_ms), 2),
+        }
+
+    def _check(self, rows: NDArray[np.float32], pictures: Pictures, state: NDArray[np.float32]) -> None:
+        seen = pictures if self.way.codec == m.ImageCodec.RAW else _through_jpeg(pictures)
+        expected = answer(seen["front"], seen["wrist"], state)
+        if rows.shape != (HORIZON, ACTION_DIM) or not np.array_equal(rows, expected):
+            raise AssertionError(f"{self.way.name}: the answer is not to what was asked")
+
+
+@contextmanager
+def contest() -> Iterator[list[Contestant]]:
+    """All servers up and all clients connected; all down again at the end."""
+    with ExitStack() as stack:
+        contestants = []
+        for way, port in zip(WAYS, free_ports(len(WAYS)), strict=True):
+            server = stack.enter_context(_serving(way, port))
+            contestants.append(Contestant(way, server, stack.enter_context(_connected(way, port))))
+        yield contestants
+
+
+@contextmanager
+def _serving(way: Way, port: int) -> Iterator[subprocess.Popen[str]]:
+    command = [sys.executable, "-m", "benchmarks.noop_policy", way.wire, "--port", str(port)]
+    command += ["--shared-memory"] if way.shared_memory else []
+    server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        if server.stdout is None or server.stdout.readline().strip() != "READY":
+            raise RuntimeError(f"the server of {way.name!r} did not start")
+        yield server
+    finally:
+        server.kill()
+        server.wait()
+
+
+@contextmanager
+def _connected(way: Way, port: int) -> Iterator[Call]:
+    if way.wire == "openpi":
+        yield OverWebsocket(port)
+        return
+    bus = ZenohBus(Endpoints(connect=(f"tcp/127.0.0.1:{port}",), shared_memory=way.shared_memory))
+    try:
+        time.sleep(1.0)  # links and subscriptions find each other
+        yield OverLink(bus, way.codec, invokes=way.wire == "pounce")
+    finally:
+        bus.close()
+
+
+def requests(count: int, seed: int) -> list[tuple[Pictures, NDArray[np.float32]]]:
+    """Pictures with a camera's statistics (smooth, some noise), and a state that no other request has."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[0:SIDE_PX, 0:SIDE_PX]
+    found = []
+    for _ in range(count):
+        pictures = {}
+        for camera in ("front", "wrist"):
+            phase = rng.uniform(0, 6, 3)
+            smooth = [120 + 60 * np.sin(x / 40 + p) + 40 * np.cos(y / 30 - p) for p in phase]
+            noisy = np.stack(smooth, axis=-1) + rng.normal(0, 2.5, (SIDE_PX, SIDE_PX, 3))
+            pictures[camera] = np.ascontiguousarray(noisy.clip(0, 255), np.uint8)
+        found.append((pictures, rng.standard_normal(NUM_PROPRIO).astype(np.float32)))
+    return found
+
+
+def _through_jpeg(pictures: Pictures) -> Pictures:
+    packed = images.pack(pictures, m.ImageCodec.JPEG)
+    return {image.camera: images.unpack(image) for image in packed}
+
+
+def _cpu_s(process: psutil.Process) -> float:
+    times = process.cpu_times()
+    return float(times.user + times.system)
+
+
+def _run(contestants: list[Contestant], rounds: int, calls: int, hz: int | None) -> list[Row]:
+    for contestant in contestants:
+        contestant.forget()
+    for index in range(rounds):
+        turn = index % len(contestants)
+        for contestant in contestants[turn:] + contestants[:turn]:
+            contestant.measure(requests(calls, seed=index), hz)
+    baseline_ms = float(np.percentile(contestants[0].took_ms, 50))
+    return [contestant.row(baseline_ms) for contestant in contestants]
+
+
+_NO_COGNITION: NDArray[np.float32] = np.zeros((0, 0), np.float32)
+
+
+def main(argv: list[str] | None = None) -> int:
+    options = tyro.cli(BusOptions, args=argv, prog="bus-latency")
+    report = Report(
+        name="bus_latency",
+        question="How long does a policy call take when the policy costs nothing? Numpy arrays to numpy chunk.",
+        config=options,
+        warm_up=f"the first {options.warm_up_calls} calls of each way.",
+    )
+    with contest() as contestants:
+        for contestant in contestants:
+            contestant.measure(requests(options.warm_up_calls, seed=10_000), None)
+        rows = _run(contestants, options.rounds, options.calls, None)
+        report.add_table("Back to back", rows)
+        rows = _run(contestants, options.paced_rounds, options.paced_calls, options.paced_hz)
+        report.add_table(f"At {options.paced_hz} Hz, as an episode pays it (cold caches, sleeping cores)", rows)
+    report.notes += [
+        f"One call: two {SIDE_PX} x {SIDE_PX} RGB pictures and {NUM_PROPRIO} joint values to {HORIZON} x {ACTION_DIM} "
+        "float32; the server reads both pictures. Every answer was checked against its request.",
+        "openpi row: the real openpi-client package against a server of ours that does on the wire what openpi's does "
+        "(websockets, compression off). CPU times are of the whole processes, transport threads included.",
+    ]
+    show(report)
+    print(f"\nwritten: {report.write().name}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,184 @@
+"""A policy that thinks nothing, as a server on three wires: what a call costs when the model costs nothing.
+
+    python -m benchmarks.noop_policy openpi --port 7001      websocket and msgpack-numpy, as openpi's server speaks them
+    python -m benchmarks.noop_policy observation --port ...  our Link: an observation is answered by a chunk
+    python -m benchmarks.noop_policy pounce --port ...       the whole of pounce-serve around an engine that does nothing
+
+Each decodes both pictures into arrays, reads them, and answers a chunk that only this request can have.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import time
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+
+from pounce_server.contract import EngineSpec, Progress, Request, no_progress
+from pounce_server.serve import PounceServer
+from protocol import images, topics
+from protocol import messages as m
+from protocol.heartbeat import Heartbeat
+from protocol.link import Link
+from protocol.process import host_clock_id, run, set_up_logging
+from protocol.zenoh_bus import Endpoints, ZenohBus
+
+HORIZON, ACTION_DIM, NUM_PROPRIO = 20, 8, 8
+ROBOT, EPISODE = "bench", "noop"
+INSTRUCTION = "press the button, pick all cubes that were highlighted, then press it again to stop"
+_CACHE_LINE_BYTES = 64
+
+Wire = Literal["openpi", "observation", "pounce"]
+
+
+def answer(front: NDArray[np.uint8], wrist: NDArray[np.uint8], state: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Chunk (20, 8): the state it was made from, and how bright the pictures were; reads every cache line of both."""
+    rows = np.tile(np.asarray(state, np.float32), (HORIZON, 1))
+    brightness = sum(int(frame.reshape(-1)[::_CACHE_LINE_BYTES].sum()) for frame in (front, wrist))
+    rows[0, 0] = np.float32(brightness)
+    return rows
+
+
+def serve_openpi(port: int) -> None:
+    """What openpi's websocket_policy_server does on the wire: metadata first, then one answer per request."""
+    import websockets.asyncio.server as websockets
+    from openpi_client import msgpack_numpy
+    from websockets.exceptions import ConnectionClosed
+
+    async def talk(socket: websockets.ServerConnection) -> None:
+        packer = msgpack_numpy.Packer()
+        await socket.send(packer.pack({}))
+        previous_ms: float | None = None
+        try:
+            while True:
+                start_ns = time.monotonic_ns()
+                request = msgpack_numpy.unpackb(await socket.recv())
+                infer_ns = time.monotonic_ns()
+                rows = answer(
+                    request["observation/image"], request["observation/wrist_image"], request["observation/state"]
+                )
+                timing = {"infer_ms": (time.monotonic_ns() - infer_ns) / 1e6}
+                if previous_ms is not None:
+                    timing["prev_total_ms"] = previous_ms
+                await socket.send(packer.pack({"actions": rows, "server_timing": timing}))
+                previous_ms = (time.monotonic_ns() - start_ns) / 1e6
+        except ConnectionClosed:
+            return
+
+    async def serve() -> None:
+        async with websockets.serve(talk, "127.0.0.1", port, compression=None, max_size=None):
+            _say_ready()
+            await asyncio.get_running_loop().create_future()
+
+    asyncio.run(serve())
+
+
+def serve_observation(bus: ZenohBus) -> None:
+    """One message in, one message out, like openpi's; everything between is what pounce-serve uses."""
+    link = Link(bus, robot=ROBOT, proc="pounce")
+    link.enter_episode("bench", EPISODE, 1)
+    observations = link.subscribe(topics.OBSERVATION)
+
+    def step() -> bool:
+        received = observations.drain()
+        for observation in received:
+            front, wrist = (images.unpack(image) for image in observation.images)
+            rows = answer(front, wrist, observation.proprio)
+            link.publish(topics.CHUNK, chunk_of(observation, rows), at_ns=observation.source_ns)
+        return bool(received)
+
+    _say_ready()
+    run(bus, step, lambda: False)
+
+
+def serve_pounce(bus: ZenohBus) -> None:
+    """pounce-serve as it ships, with heartbeat, phases and rendezvous; only the engine is ours."""
+    link = Link(bus, robot=ROBOT, proc="pounce")
+    server = PounceServer(link, NoopEngine(), Heartbeat(link, "0+bench", host_clock_id()), "0+bench")
+    server.warm_up()
+    server.ready()
+    _say_ready()
+    run(bus, server.step, lambda: False)
+
+
+def chunk_of(observation: m.Observation, rows_NA: NDArray[np.float32]) -> m.ActionChunk:
+    """As ``PounceNode.answer`` fills it."""
+    return m.ActionChunk(
+        invocation=observation.tick,
+        t_row0=observation.tick,
+        horizon=HORIZON,
+        action_dim=ACTION_DIM,
+        dt_ns=50_000_000,
+        rows=np.ascontiguousarray(rows_NA, np.float32).ravel(),
+        source_ns=observation.source_ns,
+        ref_query=None,
+        age_ns=0,
+        reference_state=observation.proprio,
+    )
+
+
+class NoopEngine:
+    """A ``PounceEngine`` without a model."""
+
+    spec = EngineSpec(
+        horizon=HORIZON,
+        action_dim=ACTION_DIM,
+        proprio_dim=NUM_PROPRIO,
+        num_carriers=0,
+        cognition_size=0,
+        image_px=256,
+        num_steps=1,
+        num_cameras=2,
+        model_hash="noop",
+        is_random=True,
+        has_fresh_prefix=False,
+        dtype="float32",
+    )
+
+    def invoke(self, request: Request, progress: Progress = no_progress) -> NDArray[np.float32]:
+        front, wrist = request.frames
+        assert front is not None
+        assert wrist is not None
+        progress()
+        return answer(front, wrist, request.proprio)
+
+    def warm_up(self) -> list[int]:
+        return [1] * 20
+
+
+def _say_ready() -> None:
+    print("READY", flush=True)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoopOptions:
+    """A policy server that costs nothing but its wire."""
+
+    wire: tyro.conf.Positional[Wire]
+    port: int
+    shared_memory: bool = False
+
+
+def main(argv: list[str] | None = None) -> int:
+    options = tyro.cli(NoopOptions, args=argv, prog="noop-policy")
+    set_up_logging("ERROR")
+    signal.signal(signal.SIGTERM, lambda number, frame: os._exit(0))
+    if options.wire == "openpi":
+        serve_openpi(options.port)
+        return 0
+    bus = ZenohBus(Endpoints(listen=(f"tcp/127.0.0.1:{options.port}",), shared_memory=options.shared_memory))
+    if options.wire == "observation":
+        serve_observation(bus)
+    else:
+        serve_pounce(bus)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,55 @@
+"""Turns ``reports/*.json`` into ``reports/README.md``, so that no table is ever typed by hand."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from benchmarks.report import REPORTS, lines_of
+
+HEAD = """# Measured
+
+Written by `python -m benchmarks.render` from the JSON files beside it; do not edit. Percentiles are observed values
+(nearest rank). Repeat one with `python -m benchmarks.<name>`.
+"""
+
+
+def render(reports: list[dict[str, Any]]) -> str:
+    """The whole page."""
+    return "\n".join([HEAD, *(section(report) for report in reports)])
+
+
+def section(report: dict[str, Any]) -> str:
+    machine, versions = report["machine"], report["versions"]
+    loads = f"{machine['load_average_before'][0]} before, {machine['load_average_after'][0]} after"
+    lines = [
+        f"## {report['name']}",
+        "",
+        report["question"],
+        "",
+        f"{report['date']}, commit `{report['git']}`, {machine['cpu']}, {machine['cores']} cores, load average {loads}, "
+        f"{machine['took_s']:.0f} s. Not counted: {report['warm_up']}",
+        "",
+    ]
+    for table in report["tables"]:
+        lines += [f"**{table['title']}**", "", *lines_of(table["rows"]), ""]
+    lines += [f"- {note}" for note in report["notes"]]
+    lines += ["", "Config: " + _inline(report["config"]) + "; " + _inline(versions) + ".", ""]
+    return "\n".join(lines)
+
+
+def _inline(values: dict[str, Any]) -> str:
+    return ", ".join(f"{key} {value}" for key, value in values.items())
+
+
+def main(folder: Path = REPORTS) -> int:
+    reports = [json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))]
+    (folder / "README.md").write_text(render(reports))
+    print(f"{len(reports)} reports in {(folder / 'README.md').name}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
