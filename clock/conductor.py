@@ -22,6 +22,7 @@ from clock.ladder import Ladder
 from clock.limits import Hit, within_limits
 from clock.playback import Chunk, Join, covering, deadline_ns, row_of, seam_policy, tick_at
 from clock.reference import Ready, Reference, latest_ready, refer
+from clock.timebase import NS_PER_S
 from protocol.messages import (
     Action,
     ActionChunk,
@@ -102,7 +103,8 @@ class Conductor:
     _query_due_ns: int = 0
     _invoke_due_tick: int = 0
     _queried_tick: int = -1
-    _begun_tick: int = -1
+    _queried_in: int = -1  # tick
+    _invoked_in: int = -1
     _played_invocation: int | None = None
     _told: set[str] = field(default_factory=set)
     _join: Join = field(init=False)
@@ -133,7 +135,9 @@ class Conductor:
         return _take(self._invocations, chunk.invocation, chunk, chunk.infer_ns, now_ns, self._is_lockstep)
 
     def on_lost(self, proc: str) -> None:
-        """A server is gone: what it still owed will not come."""
+        """A server is gone. In real time, what it still owed will not come; in lockstep the world waits for it."""
+        if self._is_lockstep:
+            return
         self._absent.add(proc)
         unanswered = self._queries if proc == "ponder" else self._invocations
         unanswered[:] = [asked for asked in unanswered if asked.answer is not None]
@@ -166,7 +170,8 @@ class Conductor:
             self._stamp_answers(now_ns, effects)
             if self._chunks:
                 self._start(now_ns)
-            elif not self._invocations:  # lost on its way, or POUNCE died: ask again
+            elif not self._is_lockstep and not self._is_busy(self._invocations, now_ns, self._chunk_ns):
+                # lost on its way, refused, or POUNCE died: ask again
                 self.stage = Stage.WAIT_COGNITION
         while self.stage == Stage.RUNNING and self.deadline_ns(self.tick) <= now_ns:
             if not self._run_tick(now_ns, effects):
@@ -200,26 +205,57 @@ class Conductor:
     def _is_owed_by(self, now_ns: int) -> bool:
         return any(a.answer is None and a.due_ns <= now_ns for a in (*self._queries, *self._invocations))
 
+    def _is_busy(self, asked: list[_Asked], now_ns: int, overdue_ns: int) -> bool:
+        """Real time: a server gets one request at a time, so that the next one is about a fresh observation.
+
+        An answer that is overdue (lost on its way, or refused) no longer holds up the next request; it is still taken
+        if it comes.
+        """
+        return any(a.answer is None and now_ns - a.source_ns < overdue_ns for a in asked)
+
+    @property
+    def _chunk_ns(self) -> int:
+        """Duration of a chunk: later than this after its invocation, none of its rows can be played."""
+        return self.info.schedule.horizon * NS_PER_S // self.info.schedule.control_hz
+
+    @property
+    def owed_query(self) -> int | None:
+        """The oldest query that still waits for an answer."""
+        return next((a.index for a in self._queries if a.answer is None), None)
+
     def _start(self, now_ns: int) -> None:
         self.stage, self.start_ns = Stage.RUNNING, now_ns
 
     def _run_tick(self, now_ns: int, effects: list[Effect]) -> bool:
-        """One tick; False if it has to wait (lockstep)."""
+        """One tick: ask PONDER, ask POUNCE, play. False if it has to wait before one of them (lockstep).
+
+        Whatever is ready at this very instant is seen by what comes next in it: tau_t + d_t <= tau_j includes equality.
+        """
         if self._is_lockstep and self._newest is not None and self._newest.tick < self.tick:
             return False
-        if self._begun_tick < self.tick:
-            if self._is_lockstep and self._is_owed_by(now_ns):  # an answer ready by now must be seen by what we ask now
-                return False
-            if not self._is_lockstep:
-                self._skip_missed(now_ns, effects)
-            self._stamp_answers(now_ns, effects)
-            self._begun_tick = self.tick
-            self._ask_if_due(effects)
+        if not self._is_lockstep:
+            self._skip_missed(now_ns, effects)
+        if not self._settle(now_ns, effects):
+            return False
+        if self._queried_in < self.tick:
+            self._queried_in = self.tick
+            self._ask_ponder_if_due(effects)
+        if not self._settle(now_ns, effects):
+            return False
+        if self._invoked_in < self.tick:
+            self._invoked_in = self.tick
+            self._ask_pounce_if_due(effects)
+        if not self._settle(now_ns, effects):
+            return False
+        self._play(now_ns, effects)
+        self.tick += 1
+        return True
+
+    def _settle(self, now_ns: int, effects: list[Effect]) -> bool:
+        """Admits what is ready; False if something that must be ready by now has not come (lockstep)."""
         if self._is_lockstep and self._is_owed_by(now_ns):
             return False
         self._stamp_answers(now_ns, effects)
-        self._play(now_ns, effects)
-        self.tick += 1
         return True
 
     def _skip_missed(self, now_ns: int, effects: list[Effect]) -> None:
@@ -232,18 +268,18 @@ class Conductor:
             effects.append(self._account(tick, now_ns, Level.SKIPPED, None, _NO_FLOATS, _NO_FLOATS, Hit.NONE, 0.0))
         self.tick = max(self.tick, newest)
 
-    def _ask_if_due(self, effects: list[Effect]) -> None:
-        tau_ns = self.deadline_ns(self.tick)
-        newest = self._newest
-        if newest is None:
-            return
-        if tau_ns >= self._query_due_ns and newest.tick > self._queried_tick:
+    def _ask_ponder_if_due(self, effects: list[Effect]) -> None:
+        tau_ns, newest = self.deadline_ns(self.tick), self._newest
+        if newest is not None and tau_ns >= self._query_due_ns and newest.tick > self._queried_tick:
             if "ponder" in self._absent:
                 self._tell(effects, Severity.WARNING, "query_skipped", "PONDER is away: no queries until it is back")
-            elif self._is_lockstep or not self._queries:  # real time: one at a time, the next sees a fresh observation
+            elif self._is_lockstep or not self._is_busy(self._queries, tau_ns, self.info.schedule.max_age_ns):
                 self._ask_ponder(newest, effects)
                 while self._query_due_ns <= tau_ns:
                     self._query_due_ns += self.info.schedule.query_period_ns
+
+    def _ask_pounce_if_due(self, effects: list[Effect]) -> None:
+        tau_ns = self.deadline_ns(self.tick)
         if self.tick >= self._invoke_due_tick and latest_ready(self._ready, tau_ns) is not None:
             if "pounce" in self._absent:
                 self._tell(
@@ -252,7 +288,7 @@ class Conductor:
                     "invocation_skipped",
                     "POUNCE is away: no invocations until it is back",
                 )
-            elif self._is_lockstep or not self._invocations:
+            elif self._is_lockstep or not self._is_busy(self._invocations, tau_ns, self._chunk_ns):
                 self._ask_pounce(self.tick, tau_ns, effects)
                 while self._invoke_due_tick <= self.tick:
                     self._invoke_due_tick += self.info.schedule.invoke_period_ticks
@@ -297,7 +333,7 @@ class Conductor:
 
     def _stamp_answers(self, now_ns: int, effects: list[Effect]) -> None:
         """Admits every answer that is ready; the stamp is the log's authority on it."""
-        for asked, stamp in _ripe(self._queries, StampKind.COGNITION, self._last_ready_ns, now_ns):
+        for asked, stamp in self._ripe(self._queries, StampKind.COGNITION, now_ns):
             answer = asked.answer
             assert isinstance(answer, Cognition)
             self._ready.append(
@@ -311,7 +347,7 @@ class Conductor:
             self._vectors[stamp.index] = answer.vector
             self._forget_vectors()
             effects.append(stamp)
-        for asked, stamp in _ripe(self._invocations, StampKind.CHUNK, self._last_ready_ns, now_ns):
+        for asked, stamp in self._ripe(self._invocations, StampKind.CHUNK, now_ns):
             answer = asked.answer
             assert isinstance(answer, ActionChunk)
             self._chunks.append(
@@ -325,6 +361,9 @@ class Conductor:
             )
             effects.append(stamp)
         self._chunks = [c for c in self._chunks if c.t_row0 + len(c.rows_NA) > self.tick]
+
+    def _ripe(self, asked: list[_Asked], kind: StampKind, now_ns: int) -> list[tuple[_Asked, Stamp]]:
+        return _ripe(asked, kind, self._last_ready_ns, now_ns, self._is_lockstep)
 
     def _forget_vectors(self) -> None:
         """Keeps only vectors that a delivery can still refer to: the newest, the first, and the last transitions'.
@@ -455,21 +494,24 @@ def _take(
 
 
 def _ripe(
-    asked: list[_Asked], kind: StampKind, last_ready_ns: dict[StampKind, int], now_ns: int
+    asked: list[_Asked], kind: StampKind, last_ready_ns: dict[StampKind, int], now_ns: int, is_lockstep: bool
 ) -> list[tuple[_Asked, Stamp]]:
     """Removes and stamps the answers that are ready at ``now_ns``, in the order they were asked for.
 
-    An answer that comes later than its modelled delay is ready when it came; none overtakes an earlier one.
+    An answer that comes later than its modelled delay is ready when it came; none is ready before an earlier one. In
+    real time an earlier one may never come, so nobody waits for it.
     """
     ripe: list[tuple[_Asked, Stamp]] = []
-    while asked and asked[0].answer is not None:
-        head = asked[0]
-        assert head.delay_ns is not None
+    for head in list(asked):
+        if head.answer is None or head.delay_ns is None:
+            if is_lockstep:
+                break
+            continue
         ready_ns = in_order(max(head.due_ns, head.arrived_ns), last_ready_ns.get(kind))
         if ready_ns > now_ns:
             break
         last_ready_ns[kind] = ready_ns
-        asked.pop(0)
+        asked.remove(head)
         stamp = Stamp(
             kind=kind,
             index=head.index,

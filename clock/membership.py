@@ -49,10 +49,10 @@ class Membership:
         answered = self._opening.answer(self._on_open) + self._closing.answer(self._on_close)
         return answered + self._timing.answer(_on_time) > 0
 
-    def rejoin(self) -> tuple[m.OpenRequest, int] | None:
+    def rejoin(self) -> m.ActiveReply | None:
         """Asks the clock service which episode runs, at most once a second; opens it here.
 
-        Returns the episode and how many queries it has issued, or None if there is none or we are in it already.
+        Returns what the clock service said of it, or None if there is none or we are in it already.
         """
         now_ns = time.monotonic_ns()
         if now_ns < self._ask_again_ns:
@@ -71,7 +71,7 @@ class Membership:
             log.error("rejoin refused=%s", opened.error)
             return None
         log.info("rejoin episode=%s queries=%d", self._link.episode, reply.num_queries)
-        return reply.open, reply.num_queries
+        return reply  # type: ignore[no-any-return]
 
     def journal(self, num_queries: int) -> Iterator[m.JournalEntry]:
         """The observations that the episode's queries were about, oldest first.

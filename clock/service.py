@@ -316,7 +316,7 @@ class ClockService:
             if clock_id != host_clock_id() and offset.bound_ns > self._config.max_clock_bound_ns:
                 raise ProtocolError(
                     f"the clock of {proc} ({clock_id}) is known to {offset.bound_ns / 1e6:.2f} ms only, the limit is "
-                    f"{self._config.max_clock_bound_ns / 1e6:.2f} ms. Use a quieter link, or raise --max-clock-bound-ms."
+                    f"{self._config.max_clock_bound_ns / 1e6:.2f} ms. Use a quieter link or --max-clock-bound-ms."
                 )
             self._offsets[proc] = offset
 
@@ -386,7 +386,10 @@ class ClockService:
             return m.ActiveReply()
         if self._episode.journal_bytes > self._config.journal_limit_bytes:
             return m.ActiveReply(error="the journal of this episode outgrew its limit: its context cannot be rebuilt")
-        return m.ActiveReply(open=self._episode.request, num_queries=len(self._episode.journal))
+        conductor = self._episode.conductor
+        return m.ActiveReply(
+            open=self._episode.request, num_queries=len(self._episode.journal), owed_query=conductor.owed_query
+        )
 
     def _on_journal(self, request: m.JournalRequest) -> m.JournalReply:
         if self._episode is None or request.header.episode != self._link.episode:

@@ -78,14 +78,16 @@ class PonderServer:
         rejoined = self._membership.rejoin()
         if rejoined is None:
             return False
-        _, num_queries = rejoined
+        num_queries = rejoined.num_queries
         try:
             for entry in self._membership.journal(num_queries):
                 observation = codec.decode(m.Observation, entry.observation)
                 self._node.on_observation(observation)
                 self._node.on_query(m.Query(query=entry.query, tick=entry.tick, source_ns=entry.source_ns))
                 work = self._node.next_work()
-                if work is not None:
+                if work is not None and entry.query == rejoined.owed_query:
+                    self._fire(work)  # the clock still waits for this one (lockstep)
+                elif work is not None:
                     self._engine.fire(self._link.episode, work.frames, self._heartbeat.beat)
         except (CallFailed, ProtocolError, ContextFull) as error:
             log.error("rebuild failed episode=%s %s", self._link.episode, error)

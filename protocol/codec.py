@@ -131,17 +131,17 @@ def _from_proto(cls: type, proto: Proto) -> Any:
 @cache
 def _fields(cls: Any) -> tuple[_Field, ...]:
     descriptor = proto_class(cls).DESCRIPTOR
-    names = [f.name for f in dataclasses.fields(cls)]
-    if set(names) != set(descriptor.fields_by_name):
-        odd = set(names) ^ set(descriptor.fields_by_name)
+    defaults = {f.name: f.default for f in dataclasses.fields(cls)}
+    if set(defaults) != set(descriptor.fields_by_name):
+        odd = set(defaults) ^ set(descriptor.fields_by_name)
         raise ProtocolError(f"{cls.__name__} and {descriptor.full_name} differ in {sorted(odd)}")
-    return tuple(_Field(name, *_kind(descriptor.fields_by_name[name])) for name in names)
+    return tuple(_Field(n, *_kind(descriptor.fields_by_name[n], default)) for n, default in defaults.items())
 
 
 _Pair = tuple[Callable[[Proto, str, Any], None], Callable[[Proto, str], Any]]
 
 
-def _kind(field: Any) -> _Pair:
+def _kind(field: Any, default: Any) -> _Pair:
     is_message = field.type == FieldDescriptor.TYPE_MESSAGE
     if is_message and field.message_type.GetOptions().map_entry:
         return _put_map, _get_map
@@ -151,10 +151,7 @@ def _kind(field: Any) -> _Pair:
         cls = getattr(m, field.message_type.name)
         if field.is_repeated:
             return _put_messages, lambda proto, name: tuple(_from_proto(cls, p) for p in getattr(proto, name))
-        return (
-            _put_message,
-            lambda proto, name: _from_proto(cls, getattr(proto, name)) if _has(proto, name) else None,
-        )
+        return _put_message, lambda proto, name: _get_message(cls, default, proto, name)
     if field.is_repeated:
         return (_put_floats, _get_floats) if field.type == FieldDescriptor.TYPE_FLOAT else (_put_scalars, _get_scalars)
     if field.type == FieldDescriptor.TYPE_ENUM:
@@ -223,6 +220,14 @@ def _put_message(proto: Proto, name: str, value: Any) -> None:
     if value is not None:
         getattr(proto, name).CopyFrom(_to_proto(value))
         getattr(proto, name).SetInParent()
+
+
+def _get_message(cls: type, default: Any, proto: Proto, name: str) -> Any:
+    if _has(proto, name):
+        return _from_proto(cls, getattr(proto, name))
+    if default is dataclasses.MISSING:
+        raise ValueError("nothing")
+    return default
 
 
 def _put_messages(proto: Proto, name: str, value: Any) -> None:

@@ -452,6 +452,7 @@ class ActiveReply:
     error: str = ""
     open: OpenRequest | None = None
     num_queries: int = 0
+    owed_query: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

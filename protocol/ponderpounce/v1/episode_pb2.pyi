@@ -286,14 +286,16 @@ class ActiveRequest(_message.Message):
     def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ...) -> None: ...
 
 class ActiveReply(_message.Message):
-    __slots__ = ("error", "open", "num_queries")
+    __slots__ = ("error", "open", "num_queries", "owed_query")
     ERROR_FIELD_NUMBER: _ClassVar[int]
     OPEN_FIELD_NUMBER: _ClassVar[int]
     NUM_QUERIES_FIELD_NUMBER: _ClassVar[int]
+    OWED_QUERY_FIELD_NUMBER: _ClassVar[int]
     error: str
     open: OpenRequest
     num_queries: int
-    def __init__(self, error: _Optional[str] = ..., open: _Optional[_Union[OpenRequest, _Mapping]] = ..., num_queries: _Optional[int] = ...) -> None: ...
+    owed_query: int
+    def __init__(self, error: _Optional[str] = ..., open: _Optional[_Union[OpenRequest, _Mapping]] = ..., num_queries: _Optional[int] = ..., owed_query: _Optional[int] = ...) -> None: ...
 
 class JournalRequest(_message.Message):
     __slots__ = ("header", "first_query", "max_queries")
