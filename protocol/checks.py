@@ -26,6 +26,8 @@ MAX_ID = 128
 MAX_INSTANT_NS = 10**18  # 31 years: more is a unit mistake
 MAX_INDEX = 2**53
 MAX_DEMO_FRAMES = 600
+MAX_DECAY = 10  # per chunk: exp(-10) is nothing
+MAX_JOURNAL_ENTRIES = 64
 
 
 def _require(ok: bool, message: object, field: str, expected: str, came: object) -> None:
@@ -43,6 +45,12 @@ def _instant(message: Any, *names: str) -> None:
     for name in names:
         value = getattr(message, name)
         _require(abs(value) <= MAX_INSTANT_NS, message, name, "nanoseconds within 31 years", value)
+
+
+def _duration(message: Any, *names: str) -> None:
+    for name in names:
+        value = getattr(message, name)
+        _require(0 <= value <= MAX_INSTANT_NS, message, name, "a duration within 31 years", value)
 
 
 def _vector(message: Any, name: str, *, low: int = 0, high: int = MAX_DIM) -> None:
@@ -120,8 +128,8 @@ def check_query(q: m.Query) -> None:
 
 def check_cognition(c: m.Cognition) -> None:
     _index(c, "query", "tick", "context_tokens")
-    _instant(c, "source_ns", "ready_ns", "infer_ns")
-    _require(c.infer_ns >= 0, c, "infer_ns", "a duration", c.infer_ns)
+    _instant(c, "source_ns", "ready_ns")
+    _duration(c, "infer_ns")
     _carriers(c, "vector", may_be_empty=False)
     _text(c, "model_hash", limit=MAX_ID)
 
@@ -135,7 +143,8 @@ def check_stamp(s: m.Stamp) -> None:
 
 def check_invocation(i: m.Invocation) -> None:
     _index(i, "invocation", "tick", "committed_rows", "num_samples")
-    _instant(i, "now_ns", "age_ns")
+    _instant(i, "now_ns")
+    _duration(i, "age_ns")
     _carriers(i, "cognition", may_be_empty=True)
     is_null = i.ref_query is None
     _require(
@@ -146,13 +155,13 @@ def check_invocation(i: m.Invocation) -> None:
         i.age_ns,
     )
     _require(is_null or i.cognition.size > 0, i, "cognition", "the vector of ref_query", "nothing")
-    _require(i.age_ns >= 0, i, "age_ns", ">= 0", i.age_ns)
     _vector(i, "previous_rows", high=MAX_HORIZON * MAX_DIM)
 
 
 def check_action_chunk(c: m.ActionChunk) -> None:
     _index(c, "invocation", "t_row0", "committed_rows")
-    _instant(c, "source_ns", "age_ns", "infer_ns")
+    _instant(c, "source_ns")
+    _duration(c, "age_ns", "infer_ns")
     _require(1 <= c.horizon <= MAX_HORIZON, c, "horizon", f"1..{MAX_HORIZON}", c.horizon)
     _require(1 <= c.action_dim <= MAX_DIM, c, "action_dim", f"1..{MAX_DIM}", c.action_dim)
     _require(c.dt_ns > 0, c, "dt_ns", "> 0", c.dt_ns)
@@ -161,7 +170,6 @@ def check_action_chunk(c: m.ActionChunk) -> None:
     _vector(c, "reference_state")
     _vector(c, "previous_rows", high=MAX_HORIZON * MAX_DIM)
     _chosen(c, "action_space")
-    _require(c.age_ns >= 0, c, "age_ns", ">= 0", c.age_ns)
     _require(len(c.features) <= 1 << 20, c, "features", "at most 1 MiB", len(c.features))
     _text(c, "model_hash", limit=MAX_ID)
 
@@ -226,11 +234,13 @@ def check_schedule(s: m.Schedule) -> None:
     _require(s.invoke_period_ticks >= 1, s, "invoke_period_ticks", ">= 1", s.invoke_period_ticks)
     for delay in (s.query_delay, s.invoke_delay):
         _chosen(delay, "kind")
-        _instant(delay, "mean_ns")
-        _require(delay.mean_ns >= 0, delay, "mean_ns", ">= 0", delay.mean_ns)
+        _duration(delay, "mean_ns")
         _require(0 <= delay.sigma <= 3, delay, "sigma", "0..3", delay.sigma)
     _chosen(s.delivery, "kind")
+    _duration(s.delivery, "reported_age_ns")
     _chosen(s.seam, "kind")
+    decay = s.seam.ensemble_decay
+    _require(abs(decay) <= MAX_DECAY, s.seam, "ensemble_decay", f"-{MAX_DECAY}..{MAX_DECAY}", decay)
     _instant(s, "max_age_ns", "stale_limit_ns")
     _index(s, "hold_limit_ticks", "decelerate_ticks", "max_ticks")
 
@@ -246,6 +256,7 @@ def check_robot(r: m.Robot) -> None:
 
 
 def check_episode_info(e: m.EpisodeInfo) -> None:
+    check_header(e.header)
     _text(e, "task", "suite", "difficulty", "policy", limit=MAX_ID)
     _text(e, "instruction")
     check_schedule(e.schedule)
@@ -268,9 +279,56 @@ def check_open_request(r: m.OpenRequest) -> None:
         _images(frame, frame.images)
 
 
+def check_contract(c: m.Contract) -> None:
+    _text(c, "proc", "model_hash", "version", limit=MAX_ID)
+    _duration(c, "infer_p50_ns", "infer_p99_ns")
+
+
+def check_open_reply(r: m.OpenReply) -> None:
+    _text(r, "error")
+    for contract in (r.contract, *r.contracts):
+        if contract is not None:
+            check_contract(contract)
+
+
+def check_close_request(r: m.CloseRequest) -> None:
+    if r.result is not None:
+        check_episode_result(r.result)
+
+
+def check_active_reply(r: m.ActiveReply) -> None:
+    _text(r, "error")
+    _index(r, "num_queries")
+    if r.open is not None:
+        check_open_request(r.open)
+
+
 def check_journal_request(r: m.JournalRequest) -> None:
     _index(r, "first_query")
-    _require(1 <= r.max_queries <= 64, r, "max_queries", "1..64", r.max_queries)
+    _require(1 <= r.max_queries <= MAX_JOURNAL_ENTRIES, r, "max_queries", f"1..{MAX_JOURNAL_ENTRIES}", r.max_queries)
+
+
+def check_journal_reply(r: m.JournalReply) -> None:
+    _text(r, "error")
+    _require(len(r.entries) <= MAX_JOURNAL_ENTRIES, r, "entries", f"at most {MAX_JOURNAL_ENTRIES}", len(r.entries))
+    for entry in r.entries:
+        _index(entry, "query", "tick")
+        _instant(entry, "source_ns")
+
+
+def check_time_request(r: m.TimeRequest) -> None:
+    _instant(r, "t0_ns")
+
+
+def check_time_reply(r: m.TimeReply) -> None:
+    _text(r, "error")
+    _text(r, "clock_id", limit=MAX_ID)
+    _instant(r, "t1_ns", "t2_ns")
+    _require(r.t1_ns <= r.t2_ns, r, "t2_ns", f">= t1_ns {r.t1_ns}", r.t2_ns)
+
+
+def check_engage_request(r: m.EngageRequest) -> None:
+    _text(r, "operator", limit=MAX_ID)
 
 
 def check_error_reply(r: Any) -> None:
@@ -293,12 +351,15 @@ CHECKS: dict[type, Callable[[Any], None]] = {
     m.EpisodeInfo: check_episode_info,
     m.EpisodeResult: check_episode_result,
     m.OpenRequest: check_open_request,
-    m.JournalRequest: check_journal_request,
-    m.OpenReply: check_error_reply,
+    m.OpenReply: check_open_reply,
+    m.CloseRequest: check_close_request,
     m.CloseReply: check_error_reply,
-    m.ActiveReply: check_error_reply,
-    m.JournalReply: check_error_reply,
-    m.TimeReply: check_error_reply,
+    m.ActiveReply: check_active_reply,
+    m.JournalRequest: check_journal_request,
+    m.JournalReply: check_journal_reply,
+    m.TimeRequest: check_time_request,
+    m.TimeReply: check_time_reply,
+    m.EngageRequest: check_engage_request,
     m.EngageReply: check_error_reply,
 }
 
