@@ -14,7 +14,7 @@ from pathlib import Path
 
 import tyro
 
-from clock.check_answers import answers_of, check_chunks, check_invocations, check_queries, check_stamps
+from clock.check_answers import answers_of, check_invocations, check_queries, check_stamps
 from clock.check_findings import Disagreement, compare
 from clock.check_ticks import check_deadlines, check_rows
 from clock.report import statistics, stream_sha256
@@ -43,7 +43,6 @@ def disagreements(record: EpisodeRecord) -> Iterator[Disagreement]:
         yield from check_queries(record)
         yield from check_stamps(record, answers)
         yield from check_invocations(record, answers)
-        yield from check_chunks(record, answers)
         yield from check_deadlines(record)
         yield from check_rows(record, answers)
     else:

@@ -16,13 +16,12 @@ from clock.check_findings import Disagreement, compare
 from clock.conductor import invocation_seed
 from clock.delays import in_order, modelled_ns
 from clock.playback import Chunk, covering, deadline_ns, tick_at
-from clock.reference import Ready, refer
+from clock.reference import Ready, latest_ready, refer
 from protocol.mcap_log import EpisodeRecord
 from protocol.messages import (
     EPISODE_CLOCK,
     ActionChunk,
     Cognition,
-    DeliveryKind,
     Floats,
     Invocation,
     Level,
@@ -30,7 +29,6 @@ from protocol.messages import (
     Query,
     Stamp,
     StampKind,
-    WaitKind,
 )
 
 
@@ -142,10 +140,13 @@ def _check_kind(
     delays_ns: Sequence[int | None],
 ) -> Iterator[Disagreement]:
     is_lockstep = record.info.schedule.mode == Mode.LOCKSTEP
-    last_index, last_ready_ns = -1, None
+    last_index, last_ready_ns, seen = -1, None, set[int]()
     for stamp in stamps:
-        if stamp.index <= last_index:
-            yield from compare(name, stamp.index, index=(f"above {last_index}, each once", stamp.index))
+        if stamp.index in seen:
+            yield from compare(name, stamp.index, times=("stamped once", "twice"))
+        if is_lockstep and stamp.index < last_index:  # in real time an overdue answer may come after a later one's
+            yield from compare(name, stamp.index, order=("before the later ones", f"after {last_index}"))
+        seen.add(stamp.index)
         answer = answers.get(stamp.index)
         if stamp.index >= len(asked) or answer is None:
             yield from compare(name, stamp.index, answer=("the answer it admits", "none in the log"))
@@ -166,43 +167,67 @@ def _check_kind(
 
 
 def check_invocations(record: EpisodeRecord, answers: Answers) -> Iterator[Disagreement]:
-    """The paper's rule: which cognition, how old, and that POUNCE was given that very vector."""
-    schedule = record.info.schedule
+    """The paper's rule: which cognition, how old, that POUNCE was given that very vector; and its chunk says so too."""
     window = -1
     for index, invocation in enumerate(record.invocations):
-        yield from compare("Invocation", index, invocation=(index, invocation.invocation))
-        reference = refer(answers.ready, invocation.now_ns, schedule.delivery)
-        yield from compare(
-            "Invocation",
-            index,
-            ref_query=(reference.query, invocation.ref_query),
-            age_ns=(reference.age_ns, invocation.age_ns),
-            seed=(invocation_seed(schedule.seed, index), invocation.seed),
-        )
-        if reference.query is None and schedule.delivery.kind != DeliveryKind.NULL:
-            yield from compare("Invocation", index, now_ns=("after the first cognition", invocation.now_ns))
-        if reference.query is None:
-            yield from compare("Invocation", index, cognition=((0, 0), invocation.cognition.shape))
-        elif reference.query in answers.cognitions:
-            vector = answers.cognitions[reference.query].vector
-            yield from compare("Invocation", index, cognition=(vector, invocation.cognition))
-        if not record.ticks:
-            continue
-        start_ns = record.ticks[0].deadline_ns
-        tick = tick_at(start_ns, invocation.now_ns, schedule.control_hz)
-        if tick < 0:  # before the first tick there are no deadlines: at the poll instant
-            if schedule.wait != WaitKind.STAND_STILL:
-                yield from compare("Invocation", index, now_ns=(f"{start_ns} or later", invocation.now_ns))
-            continue
-        due_ns = deadline_ns(start_ns, tick, schedule.control_hz)
-        yield from compare("Invocation", index, now_ns=(due_ns, invocation.now_ns))
-        previous, window = window, tick // schedule.invoke_period_ticks
-        if window <= previous:
-            expected = f"the first of its {schedule.invoke_period_ticks} ticks, period {previous + 1} or later"
-            yield from compare("Invocation", index, period=(expected, f"period {window}"))
-        tail = _unplayed_rows(record, answers, tick, index)
-        if tail is not None:
-            yield from compare("Invocation", index, previous_rows=(tail, invocation.previous_rows))
+        yield from _check_given(record, answers, index, invocation)
+        if record.ticks and (tick := _tick_of(record, invocation)) >= 0:
+            due_ns = deadline_ns(record.ticks[0].deadline_ns, tick, record.info.schedule.control_hz)
+            yield from compare("Invocation", index, now_ns=(due_ns, invocation.now_ns))
+            period = record.info.schedule.invoke_period_ticks
+            previous, window = window, tick // period
+            if window <= previous:
+                expected = f"the first of its {period} ticks, period {previous + 1} or later"
+                yield from compare("Invocation", index, period=(expected, f"period {window}"))
+            tail = _unplayed_rows(record, answers, tick, index)
+            if tail is not None:
+                yield from compare("Invocation", index, previous_rows=(tail, invocation.previous_rows))
+        chunk = answers.chunks.get(index)
+        if chunk is not None and index in answers.chunk_ready_ns:
+            yield from compare(
+                "ActionChunk",
+                index,
+                t_row0=(invocation.tick, chunk.t_row0),
+                ref_query=(invocation.ref_query, chunk.ref_query),
+                age_ns=(invocation.age_ns, chunk.age_ns),
+                seed=(invocation.seed, chunk.seed),
+            )
+
+
+def _check_given(record: EpisodeRecord, answers: Answers, index: int, invocation: Invocation) -> Iterator[Disagreement]:
+    """Reference, age, vector and noise, from the stamps admitted when it was made."""
+    schedule = record.info.schedule
+    polled_ns = _polled_ns(record, invocation)
+    admitted = [ready for ready in answers.ready if ready.ready_ns <= polled_ns]
+    reference = refer(admitted, invocation.now_ns, schedule.delivery)
+    yield from compare(
+        "Invocation",
+        index,
+        invocation=(index, invocation.invocation),
+        ref_query=(reference.query, invocation.ref_query),
+        age_ns=(reference.age_ns, invocation.age_ns),
+        seed=(invocation_seed(schedule.seed, index), invocation.seed),
+    )
+    if latest_ready(admitted, invocation.now_ns) is None:
+        yield from compare("Invocation", index, now_ns=("after the first cognition", invocation.now_ns))
+    if reference.query is None:
+        yield from compare("Invocation", index, cognition=((0, 0), invocation.cognition.shape))
+    elif reference.query in answers.cognitions:
+        vector = answers.cognitions[reference.query].vector
+        yield from compare("Invocation", index, cognition=(vector, invocation.cognition))
+
+
+def _tick_of(record: EpisodeRecord, invocation: Invocation) -> int:
+    """The tick at whose deadline it was made; negative before the first, when it is made as soon as it can be."""
+    return tick_at(record.ticks[0].deadline_ns, invocation.now_ns, record.info.schedule.control_hz)
+
+
+def _polled_ns(record: EpisodeRecord, invocation: Invocation) -> int:
+    """When the poll happened that made this invocation: its tick may have been decided late."""
+    if not record.ticks:
+        return invocation.now_ns
+    tick = _tick_of(record, invocation)
+    return record.ticks[tick].decided_ns if 0 <= tick < len(record.ticks) else invocation.now_ns
 
 
 def _unplayed_rows(record: EpisodeRecord, answers: Answers, tick: int, invocation: int) -> Floats | None:
@@ -215,18 +240,3 @@ def _unplayed_rows(record: EpisodeRecord, answers: Answers, tick: int, invocatio
     admitted = answers.admitted(record.ticks[tick].decided_ns)
     chunks = covering([c for c in admitted if c.invocation < invocation], tick)
     return chunks[-1].rows_NA[tick - chunks[-1].t_row0 :].ravel() if chunks else np.zeros(0, np.float32)
-
-
-def check_chunks(record: EpisodeRecord, answers: Answers) -> Iterator[Disagreement]:
-    """Every chunk that was admitted says what its invocation said."""
-    for index, chunk in answers.chunks.items():
-        invocation = record.invocations[index]
-        if index in answers.chunk_ready_ns:
-            yield from compare(
-                "ActionChunk",
-                index,
-                t_row0=(invocation.tick, chunk.t_row0),
-                ref_query=(invocation.ref_query, chunk.ref_query),
-                age_ns=(invocation.age_ns, chunk.age_ns),
-                seed=(invocation.seed, chunk.seed),
-            )
