@@ -390,7 +390,7 @@ class Conductor:
                 f"chunk {usable[-1].invocation} has a NaN row: held",
             )
         elif hit:
-            self._tell(effects, Severity.WARNING, "limit_hit", f"first row clipped to the robot's limits: {hit!s}")
+            self._tell(effects, Severity.WARNING, "limit_hit", f"first row clipped to the robot's limits: {hit.name}")
         before = self.ladder.level
         was_playing = self.ladder.has_played
         is_stale = bool(usable) and usable[-1].age_ns > schedule.max_age_ns
