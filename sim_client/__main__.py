@@ -5,11 +5,14 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Callable
+from typing import Any
 
 import tyro
 from tqdm import tqdm
 
-import sim_client.headless  # noqa: F401, I001 - before anything that imports mujoco
+import sim_client.headless  # noqa: F401 - before anything that imports mujoco
+
+# isort: split
 
 from clock.service import ClockService, ServiceConfig
 from ponderpounce.tasks.task import TaskError, make_task, task_names
@@ -49,7 +52,7 @@ def main(argv: list[str] | None = None) -> int:
     return 1 if any(e["status"] == "ABORTED" for e in episodes) else 0
 
 
-def _run(options: SimOptions, daemons: Daemons) -> dict[str, list[dict[str, object]]]:
+def _run(options: SimOptions, daemons: Daemons) -> dict[str, Any]:
     bus, others = _bus(options, daemons)
     try:
         clock = None

@@ -37,9 +37,7 @@ class Recorder:
         """Starts an episode; without a path nothing is written."""
         self.ticks, self.stamps, self.invocations = [], [], []
         waits = info.schedule.mode == m.Mode.LOCKSTEP  # there the world has time, and a log with gaps is no proof
-        self._log = (
-            EpisodeLog(path, info, pixels=self._pixels, when_full="wait" if waits else "drop") if path else None
-        )
+        self._log = EpisodeLog(path, info, pixels=self._pixels, when_full="wait" if waits else "drop") if path else None
 
     def step(self) -> None:
         """Takes what has come since the last call."""
