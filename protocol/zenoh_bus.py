@@ -18,6 +18,7 @@ import zenoh
 
 from protocol.bus import Bell, Inbox, Request, Sample, Subscription
 from protocol.errors import CallFailed, TransportError
+from protocol.memory import keep_freed_memory
 from protocol.options import LinkOptions
 from protocol.topics import Priority
 
@@ -124,6 +125,7 @@ class ZenohBus:
 
     def __init__(self, endpoints: Endpoints) -> None:
         zenoh.init_log_from_env_or("error")
+        keep_freed_memory()
         try:
             self._session = zenoh.open(zenoh_config(endpoints))
         except zenoh.ZError as error:
