@@ -42,8 +42,10 @@ def simulated_panda(initial_state: np.ndarray) -> Robot:
 
 
 def observation(snapshot: Snapshot, tick: int, source_ns: int, codec: ImageCodec) -> Observation:
-    """What the robot says at ``tick``."""
-    packed: tuple[Image, ...] = images.pack({name: snapshot.frames[name] for name in CAMERAS}, codec)
+    """What the robot says at ``tick``; without images where nothing was rendered."""
+    packed: tuple[Image, ...] = images.pack(
+        {name: snapshot.frames[name] for name in CAMERAS if name in snapshot.frames}, codec
+    )
     return Observation(
         tick=tick,
         source_ns=source_ns,

@@ -64,7 +64,8 @@ class Suite:
             "versions": versions(),
             "episodes": [],
         }
-        with make_environment(self._options.task, max_steps=self._options.max_steps) as environment:
+        is_seen = self._options.policy == "servers" or self._options.record  # the oracle alone needs no eyes
+        with make_environment(self._options.task, max_steps=self._options.max_steps, render=is_seen) as environment:
             for index in range(self._options.episodes):
                 results["episodes"].append(self._episode(environment, index, on_tick))
                 _write(out / "results.json", results)
