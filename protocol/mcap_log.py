@@ -24,7 +24,6 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, NamedTuple, TypeVar
 
@@ -41,6 +40,7 @@ from protocol import messages as m
 from protocol.checks import check
 from protocol.errors import ProtocolError
 from protocol.topics import Topic
+from protocol.version import version
 
 T = TypeVar("T")
 
@@ -217,11 +217,12 @@ class _Writer:
         self._log_ns = info.t0_unix_ns
         self._flushed_ns = info.t0_unix_ns
         self._num_flushes = 0
+        self._has_result = False
         self.num_messages = 0
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self._mcap = Writer(file)  # zstd chunks of 1 MiB, all indexes, CRCs: the library's defaults
-        self._mcap.start(profile="", library=f"ponderpounce/{_version()}")
+        self._mcap.start(profile="", library=f"ponderpounce/{version()}")
         self._mcap.add_metadata("ponderpounce.episode", _episode_metadata(info))
         self._mcap.add_metadata("ponderpounce.run", _run_metadata(info, pixels))
         for topic in topics.STREAMS:
@@ -242,6 +243,7 @@ class _Writer:
         if isinstance(message, m.Observation):
             payload = self._place_pixels(payload, wall_ns)
         self._add(log_topic(topic, header.proc), topic.cls, payload, wall_ns, header.seq)
+        self._has_result |= isinstance(message, m.EpisodeResult)
         if isinstance(message, m.Event):
             self._say(header.proc, _LEVELS[message.severity], f"{message.name}: {message.text}", wall_ns)
         elif isinstance(message, m.Subgoal):
@@ -262,7 +264,7 @@ class _Writer:
             with suppress(OSError):
                 self._file.close()
             return
-        if result is not None:
+        if result is not None and not self._has_result:
             self._add(log_topic(topics.RESULT, ""), m.EpisodeResult, codec.encode(result), self._log_ns, 0)
         self._mcap.add_metadata("ponderpounce.result", _result_metadata(result, dropped))
         self._mcap.finish()
@@ -547,13 +549,6 @@ def _described(file: Any) -> FileDescriptorSet:
 
     add(file)
     return described
-
-
-def _version() -> str:
-    try:
-        return version("ponderpounce")
-    except PackageNotFoundError:
-        return "unknown"
 
 
 def _fsync_folder(folder: Path) -> None:
