@@ -1,0 +1,114 @@
+"""``pp-doctor``: can this computer run what it is asked to, and if not, what to type."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import tyro
+
+from sim_client import doctor_probes as look
+from sim_client.doctor_probes import Finding, Level, Role
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Probe:
+    """What is looked at, for which computer, and whether episodes run without it."""
+
+    name: str
+    look: Callable[[], Finding]
+    is_required: bool = True
+    roles: tuple[Role, ...] = ("robot", "models")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DoctorConfig:
+    """Looks at this computer and says what is missing. Exit code 0: everything required is there, 1: it is not."""
+
+    role: Role = "all"
+    """robot: simulator and logs, no torch. models: PONDER and POUNCE, no MuJoCo. all: both, as --local needs."""
+    required_only: bool = False
+    """Leave out what no episode needs."""
+    json: bool = False
+    """One JSON object instead of a table."""
+    out: Path = Path("out")
+    """Folder that logs would go to."""
+    ponder_checkpoint: Path | None = None
+    """Look whether this folder has the files of a PONDER checkpoint."""
+    pounce_checkpoint: Path | None = None
+
+
+def probes(config: DoctorConfig) -> list[Probe]:
+    """All that this configuration asks for."""
+    backend = os.environ.get("MUJOCO_GL", "egl")
+    other = "osmesa" if backend == "egl" else "egl"
+    found = [
+        Probe(name="python", look=look.python),
+        Probe(name="packages", look=partial(look.packages, config.role)),
+        Probe(name="zenoh", look=look.zenoh_loopback),
+        Probe(name="torch", look=look.torch, roles=("models",)),
+        Probe(name=f"gl {backend}", look=partial(look.gl, backend), roles=("robot",)),
+        Probe(name="robosuite", look=look.robosuite, roles=("robot",)),
+        Probe(name="disk", look=partial(look.disk, config.out), roles=("robot",)),
+        Probe(name="ports", look=look.ports, is_required=False),
+        Probe(name="cpu", look=look.cpu, is_required=False),
+        Probe(name="clock", look=look.clock, is_required=False),
+        Probe(name=f"gl {other}", look=partial(look.gl, other), is_required=False, roles=("robot",)),
+        Probe(name="rerun", look=look.rerun, is_required=False, roles=("robot",)),
+    ]
+    for kind, folder in (("ponder", config.ponder_checkpoint), ("pounce", config.pounce_checkpoint)):
+        if folder is not None:
+            answer = partial(look.checkpoint, kind, folder)
+            found.append(Probe(name=f"{kind} checkpoint", look=answer, roles=("models",)))
+    return [
+        probe
+        for probe in found
+        if (config.role == "all" or config.role in probe.roles) and (probe.is_required or not config.required_only)
+    ]
+
+
+def examine(probes: Sequence[Probe]) -> Iterator[Finding]:
+    """Looks, one probe after the other. What is not required cannot fail, and a probe that raises has failed."""
+    for probe in probes:
+        try:
+            finding = probe.look()
+        except Exception as error:  # the doctor must not be the patient
+            text = f"the probe itself failed: {type(error).__name__}: {error}"
+            finding = Finding(probe.name, Level.FAILED, text)
+        level = finding.level
+        if level is Level.FAILED and not probe.is_required:
+            level = Level.WARNING
+        yield Finding(probe.name, level, finding.text, finding.way_out)
+
+
+def table(findings: Sequence[Finding]) -> str:
+    """One line a finding, its way out beneath."""
+    width = max((len(f.name) for f in findings), default=0)
+    lines = []
+    for finding in findings:
+        lines.append(f"{finding.level.value:<7}  {finding.name:<{width}}  {finding.text}")
+        if finding.way_out:
+            lines.append(f"{'':<7}  {'':<{width}}  -> {finding.way_out}")
+    failed = [f.name for f in findings if f.level is Level.FAILED]
+    lines.append(f"not fit: {', '.join(failed)}" if failed else "fit: everything required is there")
+    return "\n".join(lines) + "\n"
+
+
+def main(argv: list[str] | None = None) -> int:
+    config = tyro.cli(DoctorConfig, args=argv, prog="pp-doctor", description=DoctorConfig.__doc__)
+    findings = list(examine(probes(config)))
+    is_fit = not any(finding.level is Level.FAILED for finding in findings)
+    if config.json:
+        sys.stdout.write(json.dumps({"is_fit": is_fit, "findings": [f._asdict() for f in findings]}) + "\n")
+    else:
+        sys.stdout.write(table(findings))
+    return 0 if is_fit else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
