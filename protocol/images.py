@@ -64,10 +64,15 @@ def unpack(image: Image) -> NDArray[np.uint8]:
         return frame.reshape(image.height, image.width, 3)
     if image.codec != ImageCodec.JPEG:
         raise MalformedMessage("Image", "codec", "RAW or JPEG", image.codec.name)
+    data = bytes(image.data)
     try:
-        decoded: NDArray[np.uint8] = simplejpeg.decode_jpeg(bytes(image.data), colorspace="RGB")
+        height, width, *_ = simplejpeg.decode_jpeg_header(data)
+        if (height, width) != (image.height, image.width):  # before memory is taken: a few bytes can claim 12 GB
+            came = f"{height} x {width} px"
+            raise MalformedMessage("Image", "data", f"{image.height} x {image.width} px", came)
+        decoded: NDArray[np.uint8] = simplejpeg.decode_jpeg(data, colorspace="RGB")
+    except MalformedMessage:
+        raise
     except ValueError as error:
         raise MalformedMessage("Image", "data", "a JPEG picture", str(error)) from None
-    if decoded.shape != (image.height, image.width, 3):
-        raise MalformedMessage("Image", "data", f"{image.height} x {image.width} px", str(decoded.shape))
     return decoded
