@@ -59,9 +59,9 @@ def encode(message: Any) -> bytes:
     """
     check(message)
     if isinstance(message, m.Observation):
-        bare = dataclasses.replace(message, images=())
-        blobs = [(_to_proto(dataclasses.replace(i, data=b"")).SerializeToString(), i.data) for i in message.images]
-        return splice.join(_to_proto(bare).SerializeToString(), _OBSERVATION_IMAGES, _IMAGE_DATA, blobs)
+        small = _to_proto(message, but="images").SerializeToString()
+        blobs = [(_to_proto(image, but="data").SerializeToString(), image.data) for image in message.images]
+        return splice.join(small, _OBSERVATION_IMAGES, _IMAGE_DATA, blobs)
     return _to_proto(message).SerializeToString()
 
 
@@ -81,9 +81,7 @@ def decode(cls: type[T], payload: bytes) -> T:
         proto.ParseFromString(payload)
     except (DecodeError, ValueError) as error:
         raise MalformedMessage(cls.__name__, "*", f"{type_name(cls)} bytes", f"{error}") from None
-    message = _from_proto(cls, proto)
-    if images:
-        message = dataclasses.replace(message, images=tuple(_image(*i) for i in images))  # type: ignore[type-var]
+    message = _from_proto(cls, proto, **({"images": tuple(_image(*i) for i in images)} if images else {}))
     check(message)
     return message  # type: ignore[no-any-return]
 
@@ -94,7 +92,7 @@ def _image(meta: bytes, data: memoryview) -> m.Image:
         proto.ParseFromString(meta)
     except DecodeError as error:
         raise MalformedMessage("Image", "*", "ponderpounce.v1.Image bytes", f"{error}") from None
-    return dataclasses.replace(_from_proto(m.Image, proto), data=data)  # type: ignore[no-any-return]
+    return _from_proto(m.Image, proto, data=data)  # type: ignore[no-any-return]
 
 
 class _Field(NamedTuple):
@@ -105,26 +103,33 @@ class _Field(NamedTuple):
     get: Callable[[Proto, str], Any]
 
 
-def _to_proto(message: Any) -> Proto:
+def _to_proto(message: Any, *, but: str = "") -> Proto:
+    """All fields, or all but one."""
     proto = proto_class(type(message))()
-    for field in _fields(type(message)):  # type: ignore[arg-type]
-        try:
-            field.put(proto, field.name, getattr(message, field.name))
-        except (TypeError, ValueError) as error:
-            value = getattr(message, field.name)
-            raise MalformedMessage(
-                type(message).__name__, field.name, "a value of its type", f"{value!r:.60}"
-            ) from error
+    _fill(proto, message, but)
     return proto
 
 
-def _from_proto(cls: type, proto: Proto) -> Any:
-    values = {}
-    for field in _fields(cls):
-        try:
-            values[field.name] = field.get(proto, field.name)
-        except ValueError as error:
-            raise MalformedMessage(cls.__name__, field.name, "a value of its type", f"{error}") from None
+def _fill(proto: Proto, message: Any, but: str = "") -> None:
+    name = ""
+    try:
+        for name, put, _ in _fields(type(message)):  # type: ignore[arg-type]
+            if name != but:
+                put(proto, name, getattr(message, name))
+    except (TypeError, ValueError) as error:
+        came = f"{getattr(message, name)!r:.60}"
+        raise MalformedMessage(type(message).__name__, name, "a value of its type", came) from error
+
+
+def _from_proto(cls: type, proto: Proto, **values: Any) -> Any:
+    """``values``: fields that are known already."""
+    name = ""
+    try:
+        for name, _, get in _fields(cls):
+            if name not in values:
+                values[name] = get(proto, name)
+    except ValueError as error:
+        raise MalformedMessage(cls.__name__, name, "a value of its type", f"{error}") from None
     return cls(**values)
 
 
@@ -156,19 +161,23 @@ def _kind(field: Any, default: Any) -> _Pair:
         return (_put_floats, _get_floats) if field.type == FieldDescriptor.TYPE_FLOAT else (_put_scalars, _get_scalars)
     if field.type == FieldDescriptor.TYPE_ENUM:
         enum: type[IntEnum] = getattr(m, field.enum_type.name)
-        return _put_scalar, lambda proto, name: enum(getattr(proto, name))
+        return setattr, lambda proto, name: enum(getattr(proto, name))
     if field.has_presence:
-        return _put_scalar, lambda proto, name: getattr(proto, name) if _has(proto, name) else None
-    return _put_scalar, getattr
+        return _put_optional, lambda proto, name: getattr(proto, name) if _has(proto, name) else None
+    return (_put_bytes if field.type == FieldDescriptor.TYPE_BYTES else setattr), getattr
 
 
 def _has(proto: Proto, name: str) -> bool:
     return bool(proto.HasField(name))
 
 
-def _put_scalar(proto: Proto, name: str, value: Any) -> None:
+def _put_optional(proto: Proto, name: str, value: Any) -> None:
     if value is not None:
-        setattr(proto, name, bytes(value) if isinstance(value, memoryview) else value)
+        setattr(proto, name, value)
+
+
+def _put_bytes(proto: Proto, name: str, value: bytes | memoryview) -> None:
+    setattr(proto, name, bytes(value))
 
 
 def _put_scalars(proto: Proto, name: str, value: Any) -> None:
@@ -218,8 +227,9 @@ def _get_tensor(proto: Proto, name: str) -> m.Floats:
 
 def _put_message(proto: Proto, name: str, value: Any) -> None:
     if value is not None:
-        getattr(proto, name).CopyFrom(_to_proto(value))
-        getattr(proto, name).SetInParent()
+        sub = getattr(proto, name)
+        sub.SetInParent()
+        _fill(sub, value)
 
 
 def _get_message(cls: type, default: Any, proto: Proto, name: str) -> Any:
@@ -231,7 +241,8 @@ def _get_message(cls: type, default: Any, proto: Proto, name: str) -> Any:
 
 
 def _put_messages(proto: Proto, name: str, value: Any) -> None:
-    getattr(proto, name).extend(_to_proto(item) for item in value)
+    for item in value:
+        _fill(getattr(proto, name).add(), item)
 
 
 def _put_map(proto: Proto, name: str, value: Any) -> None:
