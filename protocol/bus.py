@@ -107,8 +107,9 @@ class Bus(Protocol):
 class LocalBus:
     """All parties in one process and one thread: a message is in its subscribers' rings when ``publish`` returns.
 
-    A call is answered by running the other parties' ``step`` functions (``add_party``) until one replies. Used by the
-    in-process lockstep mode and by tests; it is the whole difference between them and zenoh.
+    A call is answered by running the other parties' ``step`` functions (``add_party``) until one replies; a party that
+    waits for a call of its own is not stepped meanwhile, as it would not be over zenoh. Used by the in-process lockstep
+    mode and by tests; it is the whole difference between them and zenoh.
     """
 
     is_local = True
@@ -119,6 +120,7 @@ class LocalBus:
         self._alive: list[str] = []
         self._watchers: list[tuple[str, Subscription]] = []
         self._parties: list[Callable[[], bool]] = []
+        self._stepping: set[int] = set()
 
     def add_party(self, step: Callable[[], bool]) -> None:
         """``step`` does one piece of pending work and says whether there was any."""
@@ -151,7 +153,16 @@ class LocalBus:
 
     def run_parties(self) -> bool:
         """Lets every party do one piece of work; False if nobody had any."""
-        return any([step() for step in self._parties])  # a list: everybody gets a turn
+        return any([self._step(number) for number in range(len(self._parties))])  # a list: everybody gets a turn
+
+    def _step(self, number: int) -> bool:
+        if number in self._stepping:
+            return False
+        self._stepping.add(number)
+        try:
+            return self._parties[number]()
+        finally:
+            self._stepping.discard(number)
 
     def declare_alive(self, key: str) -> None:
         self._alive.append(key)
