@@ -127,6 +127,26 @@ def test_a_call_whose_server_is_idle_fails() -> None:
         bus.call("mute", b"", timeout_ns=1)
 
 
+def test_a_party_that_waits_for_an_answer_is_not_stepped_meanwhile() -> None:
+    bus, steps = LocalBus(), []
+    inbox = bus.serve("other")
+
+    def asking() -> bool:
+        steps.append("asking")
+        return bus.call("other", b"", timeout_ns=1) == b"done"
+
+    def answering() -> bool:
+        requests = inbox.drain()
+        for request in requests:
+            request.reply(b"done")
+        return bool(requests)
+
+    bus.add_party(asking)
+    bus.add_party(answering)
+    bus.run_parties()
+    assert steps == ["asking"]
+
+
 def test_every_party_gets_its_turn_whoever_was_busy() -> None:
     bus, turns = LocalBus(), []
     for name in "abc":
