@@ -1,0 +1,86 @@
+"""The examples run, and print what they promise."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from protocol.probe import HEALTHY
+from protocol.probe import main as probe
+from sim_client.launch import free_ports
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+ENVIRONMENT = {**os.environ, "MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl"), "OMP_NUM_THREADS": "1"}
+
+
+def printed(name: str, *arguments: str, cwd: Path) -> str:
+    command = [sys.executable, str(EXAMPLES / name), *arguments]
+    ran = subprocess.run(command, cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=120, check=False)
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout
+
+
+@pytest.fixture(scope="module")
+def episode(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """What the lockstep episode printed; its last line is the log's path."""
+    folder = tmp_path_factory.mktemp("episode")
+    return printed("02_lockstep_episode.py", str(folder / "out"), cwd=folder)
+
+
+def test_examples_are_numbered_without_gaps_and_explain_how_to_run_them() -> None:
+    names = sorted(path.name for path in EXAMPLES.glob("*.py"))
+    assert [int(name[:2]) for name in names] == list(range(1, len(names) + 1))
+    assert [name for name in names if f"python examples/{name}" not in (EXAMPLES / name).read_text()] == []
+
+
+def test_the_rule_sees_an_answer_from_the_instant_it_is_ready(tmp_path: Path) -> None:
+    lines = [re.split(r"\s{2,}", line.strip()) for line in printed("01_reference_rule.py", cwd=tmp_path).splitlines()]
+    every = {at: seen for at, seen, *_ in lines[1:]}
+    assert every["299 ms"] == "null, 0 ms old"
+    assert every["300 ms"] == "C_0, 300 ms old"
+    assert every["2869 ms"] == "C_1, 1869 ms old"
+    assert every["2870 ms"] == "C_2, 870 ms old"
+    assert {held for _, _, held, _ in lines[1:] if "C_1" in held or "C_3" in held} == set()
+
+
+@pytest.mark.sim
+def test_the_paper_s_schedule_gives_every_invocation_a_cognition_of_300_ms(episode: str) -> None:
+    ages = re.findall(r"sees C_(\d+), (\d+) ms old", episode)
+    assert ages == [("0", "300"), ("1", "300"), ("2", "300")]
+
+
+@pytest.mark.sim
+def test_a_log_is_read_back_and_agrees_with_itself(episode: str, tmp_path: Path) -> None:
+    told = printed("03_read_a_log.py", episode.splitlines()[-1], cwd=tmp_path)
+    assert "agrees with itself" in told
+    assert "ticks        60 play" in told
+    assert "61 from front (jpeg), 61 from wrist (jpeg)" in told  # one before every action, one after the last
+
+
+@pytest.mark.sim
+def test_a_policy_of_one_s_own_moves_the_arm(tmp_path: Path) -> None:
+    told = printed("04_your_own_policy.py", cwd=tmp_path)
+    low, high = map(float, re.findall(r"[+-]\d\.\d+", told))
+    assert told.startswith("40 ticks")
+    assert low < -0.05 < 0.05 < high
+
+
+@pytest.mark.e2e
+def test_a_policy_of_one_s_own_stands_in_for_pounce_serve(tmp_path: Path) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    command = [sys.executable, str(EXAMPLES / "04_your_own_policy.py"), "--serve", endpoint]
+    with subprocess.Popen(command, cwd=tmp_path, env=ENVIRONMENT) as server:
+        try:
+            deadline_s = time.monotonic() + 20
+            while probe(["pounce", "--link.connect", endpoint, "--within-ms", "500"]) != HEALTHY:
+                assert server.poll() is None
+                assert time.monotonic() < deadline_s
+        finally:
+            server.terminate()
+        assert server.wait(10) == 0
