@@ -30,6 +30,11 @@ from protocol.ponderpounce.v1 import common_pb2, episode_pb2, stream_pb2
 
 T = TypeVar("T")
 
+_PROTOS: dict[str, type[Proto]] = {
+    name: getattr(module, name)
+    for module in (common_pb2, stream_pb2, episode_pb2)
+    for name in module.DESCRIPTOR.message_types_by_name
+}
 _DTYPES = {common_pb2.DTYPE_F32: np.dtype("<f4"), common_pb2.DTYPE_F16: np.dtype("<f2")}
 
 
@@ -39,11 +44,10 @@ def proto_class(cls: type) -> type[Proto]:
     Raises:
         ProtocolError: ``cls`` is not a message of this protocol.
     """
-    for module in (common_pb2, stream_pb2, episode_pb2):
-        found = getattr(module, cls.__name__, None)
-        if found is not None:
-            return found  # type: ignore[no-any-return]
-    raise ProtocolError(f"{cls.__name__} is not a message of ponderpounce.v1")
+    found = _PROTOS.get(cls.__name__)
+    if found is None:
+        raise ProtocolError(f"{cls.__name__} is not a message of ponderpounce.v1")
+    return found
 
 
 def type_name(cls: type) -> str:

@@ -96,6 +96,8 @@ def zenoh_config(endpoints: Endpoints) -> zenoh.Config:
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 400, "period_increase_factor": 2},
         "transport/link/tx/lease": LEASE_MS,
         "transport/link/tx/keep_alive": 5,
+        # A raw observation is seven batches of 64 kB; with the default of two the sender must sleep before it is out.
+        "transport/link/tx/queue/size/data_high": 16,
         "transport/shared_memory/enabled": endpoints.shared_memory and endpoints.are_local,
     }
     if endpoints.tls:
