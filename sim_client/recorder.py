@@ -50,13 +50,19 @@ class Recorder:
             if self._log is not None:
                 self._log.write(topic, message, sample.payload, time.time_ns())
 
-    def end(self, result: m.EpisodeResult) -> None:
-        """Writes the result and closes the log."""
+    def end(self, result: m.EpisodeResult) -> list[str]:
+        """Writes the result and closes the log; says what is missing from it."""
+        missing: list[str] = []
         if self._log is not None:
             self._link.publish(RESULT, result, at_ns=max((t.decided_ns for t in self.ticks), default=0))
             self.step()
-            self._log.close(result)
+            closing = self._log.close(result)
             self._log = None
+            if closing.error:
+                missing.append(f"log {closing.path.name}: {closing.error}")
+            if closing.dropped:
+                missing.append(f"log {closing.path.name}: dropped {closing.dropped}")
+        return missing
 
     def _is_ours(self, message: object) -> bool:
         header: m.Header = message.header  # type: ignore[attr-defined]

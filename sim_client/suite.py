@@ -92,7 +92,7 @@ class Suite:
                 outcome = Outcome(status=m.TaskStatus.ABORTED, reason=str(error), num_ticks=0)
         self._await_last_ticks(outcome)
         result = self._result(outcome)
-        self._recorder.end(result)
+        missing = self._recorder.end(result)
         self._close(info, result)
         return {
             "task": info.task,
@@ -104,7 +104,7 @@ class Suite:
             "steps": result.num_ticks,
             "stream_sha256": result.stream_sha256,
             "mcap": str(path.relative_to(self._options.out)) if path else None,
-            "warnings": list(warnings),
+            "warnings": [*warnings, *missing],
             "schedule": result.statistics,
         }
 
