@@ -328,6 +328,7 @@ def check_time_reply(r: m.TimeReply) -> None:
 
 
 def check_engage_request(r: m.EngageRequest) -> None:
+    _require(bool(r.operator), r, "operator", "who says so", "nobody")  # proto3 reads zero bytes as a request
     _text(r, "operator", limit=MAX_ID)
 
 

@@ -67,7 +67,7 @@ GOOD: dict[type, Any] = {
         m.JournalReply(),
         m.TimeRequest(t0_ns=0),
         m.TimeReply(t1_ns=1, t2_ns=1),
-        m.EngageRequest(),
+        m.EngageRequest(operator="jane"),
         m.EngageReply(),
     )
 }
@@ -199,6 +199,7 @@ BROKEN: list[tuple[type, dict[str, Any], str]] = [
     (m.TimeRequest, {"t0_ns": 2 * 10**18}, r"TimeRequest\.t0_ns: "),
     (m.TimeReply, {"t2_ns": 0}, r"TimeReply\.t2_ns: expected >= t1_ns 1, came 0"),
     (m.TimeReply, {"clock_id": LONG_ID}, r"TimeReply\.clock_id: "),
+    (m.EngageRequest, {"operator": ""}, r"EngageRequest\.operator: expected who says so, came nobody"),
     (m.EngageRequest, {"operator": LONG_ID}, r"EngageRequest\.operator: "),
     (m.EngageReply, {"error": LONG_TEXT}, r"EngageReply\.error: "),
 ]

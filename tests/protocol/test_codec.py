@@ -245,7 +245,7 @@ MESSAGES: dict[type, st.SearchStrategy[Any]] = {
     m.JournalReply: st.builds(m.JournalReply, error=TEXT, entries=tuples_of(JOURNAL_ENTRY)),
     m.TimeRequest: st.builds(m.TimeRequest, header=HEADER, t0_ns=INSTANT),
     m.TimeReply: time_replies(),
-    m.EngageRequest: st.builds(m.EngageRequest, header=HEADER, operator=TEXT),
+    m.EngageRequest: st.builds(m.EngageRequest, header=HEADER, operator=st.text(min_size=1, max_size=30)),
     m.EngageReply: st.builds(m.EngageReply, error=TEXT, level=TEXT),
 }  # fmt: skip
 
