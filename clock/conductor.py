@@ -120,9 +120,12 @@ class Conductor:
 
     # -- what comes in
 
-    def on_observation(self, observation: Observation) -> None:
-        if self._newest is None or observation.tick >= self._newest.tick:
-            self._newest = observation
+    def on_observation(self, observation: Observation) -> bool:
+        """Takes what the robot sees; False if something newer is known."""
+        if self._newest is not None and observation.tick < self._newest.tick:
+            return False
+        self._newest = observation
+        return True
 
     def on_cognition(self, cognition: Cognition, now_ns: int) -> bool:
         """Takes PONDER's answer; False if nobody asked for it (late, doubled, unknown)."""
@@ -371,7 +374,8 @@ class Conductor:
         Two transitions: the last one may have come after the tick's deadline and before this late poll.
         """
         transitions = [r.query for r in self._ready if r.is_transition]
-        keep = {self._ready[0].query, *transitions[-2:], *(r.query for r in self._ready[-8:])}
+        first = min(r.query for r in self._ready)  # an overdue answer may have come after a later one
+        keep = {first, *transitions[-2:], *(r.query for r in self._ready[-8:])}
         for query in self._vectors.keys() - keep:
             del self._vectors[query]
 

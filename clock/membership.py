@@ -97,8 +97,8 @@ class Membership:
         header = request.info.header
         if self._link.episode:
             self._leave()
-        self._link.enter_episode(header.session, header.episode, header.epoch)
         try:
+            self._link.enter_episode(header.session, header.episode, header.epoch)
             contract = self._open_episode(request)
         except ValueError as error:
             self._leave()
@@ -108,6 +108,8 @@ class Membership:
         return m.OpenReply(contract=contract)
 
     def _on_close(self, request: m.CloseRequest) -> m.CloseReply:
+        if request.header.episode != self._link.episode:
+            return m.CloseReply(error=f"episode {request.header.episode!r} is not open here")
         if self._link.episode:
             self._leave()
         return m.CloseReply()

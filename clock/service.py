@@ -178,8 +178,8 @@ class ClockService:
             observation = replace(observation, source_ns=offset.to_ours(observation.source_ns) - zero_ns)
         if episode.clock is None:
             episode.clock = VirtualClock() if episode.is_lockstep else MonotonicClock()
-        episode.conductor.on_observation(observation)
-        episode.newest_payload = payload
+        if episode.conductor.on_observation(observation):
+            episode.newest_payload = payload
         return True
 
     def _unasked(self, what: str, index: int, header: m.Header) -> bool:
@@ -266,11 +266,13 @@ class ClockService:
         if not_ready:
             return m.OpenReply(error=not_ready, try_again=True)
         try:
+            self._link.enter_episode(header.session, header.episode, header.epoch)
             self._measure_offsets(SERVERS if info.robot.is_simulated else (*SERVERS, "sim"))
             contracts = tuple(self._open_at(proc, request) for proc in SERVERS)
             warnings, committed_ticks = self._agree(info, contracts)
         except (CallFailed, ProtocolError) as error:
             self._close_servers(None)
+            self._link.leave_episode()
             return m.OpenReply(error=str(error))
         return self._begin(request, contracts, warnings, committed_ticks)
 
@@ -310,7 +312,10 @@ class ClockService:
             for _ in range(NUM_TIME_EXCHANGES):
                 t0_ns = self._host.now_ns()
                 reply = self._link.call(TIME, proc, m.TimeRequest(t0_ns=t0_ns), timeout_ns=_CALL_NS)
-                exchanges.append(from_exchange(t0_ns, reply.t1_ns, reply.t2_ns, self._host.now_ns()))
+                try:
+                    exchanges.append(from_exchange(t0_ns, reply.t1_ns, reply.t2_ns, self._host.now_ns()))
+                except ValueError as error:
+                    raise ProtocolError(f"the clock of {proc} ({reply.clock_id}): {error}") from None
                 clock_id = reply.clock_id
             offset = narrowest(exchanges)
             if clock_id != host_clock_id() and offset.bound_ns > self._config.max_clock_bound_ns:
@@ -405,5 +410,5 @@ class ClockService:
         if self._episode is None:
             return m.EngageReply(error="no episode is open")
         self._episode.conductor.engage()
-        self._event(m.Severity.WARNING, "engaged", f"motion may start again, says {request.operator or 'somebody'}")
+        self._event(m.Severity.WARNING, "engaged", f"motion may start again, says {request.operator}")
         return m.EngageReply(level=self._episode.conductor.ladder.level.name)
