@@ -40,6 +40,12 @@ class PonderNode:
         self.next_query = next_query
 
     def on_observation(self, observation: m.Observation) -> None:
+        """Keeps what a query may name.
+
+        Raises:
+            MalformedMessage: not the cameras that the engine was built for; nothing good is displaced by it.
+        """
+        check_cameras(observation, self._spec)
         self._rendezvous.on_observation(observation)
 
     def on_query(self, query: m.Query) -> None:
@@ -50,13 +56,13 @@ class PonderNode:
         """The oldest query whose observation has come.
 
         Raises:
-            MalformedMessage: its frames are not what the engine was built for; the query is then forgotten.
+            MalformedMessage: a frame is no picture; the query is then forgotten.
         """
         pair = self._rendezvous.next_pair()
         if pair is None:
             return None
         query, observation = pair
-        return Work(query=query, frames=frames_of(observation, self._spec))
+        return Work(query=query, frames=tuple(images.unpack(image) for image in observation.images))
 
     def missed(self) -> list[m.Query]:
         """Queries whose observation was lost on the way."""
@@ -94,16 +100,11 @@ class PonderNode:
         return cognition, texts
 
 
-def frames_of(observation: m.Observation, spec: EngineSpec) -> tuple[Frame, ...]:
-    """Pixels of the cameras the engine was built for.
-
-    Raises:
-        MalformedMessage: too few cameras, another size, or bytes that are no picture.
-    """
+def check_cameras(observation: m.Observation, spec: EngineSpec) -> None:
+    """Raises MalformedMessage unless the images have the number and the size that the engine was built for."""
     if len(observation.images) != spec.num_cameras:
         raise MalformedMessage("Observation", "images", f"{spec.num_cameras} cameras", f"{len(observation.images)}")
     for image in observation.images:
         if (image.height, image.width) != spec.image_px:
             expected = f"{spec.image_px[0]} x {spec.image_px[1]} px"
             raise MalformedMessage("Image", image.camera, expected, f"{image.height} x {image.width} px")
-    return tuple(images.unpack(image) for image in observation.images)

@@ -56,7 +56,7 @@ class PonderServer:
         worked = self._membership.step()
         for observation in self._observations.drain():
             if is_of_episode(self._link, observation.header):
-                self._node.on_observation(observation)
+                self._see(observation)
         for query in self._queries.drain():
             if query.header.episode != self._link.episode:
                 worked |= self.rejoin()  # restarted, or opened elsewhere: we are asked about an episode unknown to us
@@ -67,11 +67,17 @@ class PonderServer:
         try:
             work = self._node.next_work()
         except MalformedMessage as error:
-            self._link.drop("observation", "wrong_frames", str(error))
+            self._link.drop("observation", "no_picture", str(error))
             return True
         if work is not None:
             self._fire(work)
         return worked or work is not None
+
+    def _see(self, observation: m.Observation) -> None:
+        try:
+            self._node.on_observation(observation)
+        except MalformedMessage as error:
+            self._link.drop(f"{observation.header.proc}#{observation.header.boot_id}", "wrong_shape", str(error))
 
     def rejoin(self) -> bool:
         """After a restart: asks for the episode and every observation that was queried, and thinks it all over."""

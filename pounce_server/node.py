@@ -44,6 +44,15 @@ class PounceNode:
         self._info = info
 
     def on_observation(self, observation: m.Observation) -> None:
+        """Keeps what an invocation may name.
+
+        Raises:
+            MalformedMessage: not the joints or cameras that the engine reads; nothing good is displaced by it.
+        """
+        for field, expected in (("proprio", self._spec.proprio_dim), ("images", self._spec.num_cameras)):
+            came = len(getattr(observation, field))
+            if came != expected:
+                raise MalformedMessage("Observation", field, f"{expected} of them", f"{came}")
         self._rendezvous.on_observation(observation)
 
     def on_invocation(self, invocation: m.Invocation) -> None:

@@ -55,7 +55,7 @@ class PounceServer:
         worked = self._membership.step()
         for observation in self._observations.drain():
             if is_of_episode(self._link, observation.header):
-                self._node.on_observation(observation)
+                self._see(observation)
         for invocation in self._invocations.drain():
             if invocation.header.episode != self._link.episode:
                 worked |= self.rejoin()
@@ -72,6 +72,12 @@ class PounceServer:
         if work is not None:
             self._invoke(work)
         return worked or work is not None
+
+    def _see(self, observation: m.Observation) -> None:
+        try:
+            self._node.on_observation(observation)
+        except MalformedMessage as error:
+            self._link.drop(f"{observation.header.proc}#{observation.header.boot_id}", "wrong_shape", str(error))
 
     def rejoin(self) -> bool:
         """After a restart: asks which episode runs. There is nothing to rebuild."""
