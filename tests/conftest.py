@@ -1,0 +1,313 @@
+"""A whole robot in one thread: clock service, both model servers with fake engines, a world of numbers."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+
+from clock import schedules
+from clock.service import ClockService, ServiceConfig
+from ponder_server import contract as ponder
+from ponder_server.serve import PonderServer
+from ponderpounce.tasks.engine import Status
+from ponderpounce.tasks.environment import Snapshot
+from pounce_server import contract as pounce
+from pounce_server.serve import PounceServer
+from protocol import images
+from protocol import messages as m
+from protocol.bus import LocalBus
+from protocol.heartbeat import Heartbeat
+from protocol.link import Link
+from protocol.topics import OBSERVATION
+from sim_client.episode import Outcome, RobotSide
+
+ROBOT, CAMERAS, PX, DIM, NUM_PROPRIO = "r0", ("front", "wrist"), 4, 3, 3
+K, H = 2, 8
+PONDER_SPEC = ponder.EngineSpec(
+    num_carriers=K, hidden_size=H, image_px=(PX, PX), num_cameras=len(CAMERAS), max_context_tokens=1000,
+    model_hash="fake-ponder", is_random=False, dtype="float32",
+)  # fmt: skip
+POUNCE_SPEC = pounce.EngineSpec(
+    horizon=20, action_dim=DIM, proprio_dim=NUM_PROPRIO, num_carriers=K, cognition_size=H, image_px=PX, num_steps=1,
+    num_cameras=len(CAMERAS), model_hash="fake-pounce", is_random=False, has_fresh_prefix=False, dtype="float32",
+)  # fmt: skip
+NO_WATCH = ServiceConfig(watches=False)
+
+
+def floats_of(digest: bytes, shape: tuple[int, ...]) -> m.Floats:
+    """Numbers in [-1, 1] that any change of ``digest`` changes."""
+    rng = np.random.default_rng(np.frombuffer(digest, np.uint64))
+    return rng.uniform(-1, 1, shape).astype(np.float32)
+
+
+@dataclass
+class FakePonder:
+    """A context is the hash of everything appended, so equal cognitions mean equal histories."""
+
+    spec: ponder.EngineSpec = PONDER_SPEC
+    contexts: dict[str, Any] = field(default_factory=dict)
+    num_tokens: dict[str, int] = field(default_factory=dict)
+    texts: tuple[ponder.Text, ...] = ()
+    on_fire: Callable[[], None] = lambda: None
+    durations_ns: tuple[int, ...] = (78_000_000,) * 20
+
+    def open(self, session: str, opening: ponder.Opening, progress: ponder.Progress = ponder.no_progress) -> int:
+        if session in self.contexts:
+            raise ponder.SessionError(f"session {session!r} is already open; close it first.")
+        self.contexts[session] = hashlib.sha256(opening.instruction.encode())
+        for views in opening.demo_frames:
+            for view in views:
+                self.contexts[session].update(view.tobytes())
+        self.num_tokens[session] = 10
+        return 10
+
+    def fire(
+        self, session: str, frames: tuple[ponder.Frame, ...], progress: ponder.Progress = ponder.no_progress
+    ) -> ponder.Fire:
+        if session not in self.contexts:
+            raise ponder.SessionError(f"session {session!r} is not open.")
+        if self.num_tokens[session] + 8 > self.spec.max_context_tokens:
+            raise ponder.ContextFull(
+                session=session, used=self.num_tokens[session], wanted=8, limit=self.spec.max_context_tokens
+            )
+        self.on_fire()
+        progress()
+        for frame in frames:
+            self.contexts[session].update(frame.tobytes())
+        self.num_tokens[session] += 8
+        digest = self.contexts[session].digest()
+        return ponder.Fire(
+            cognition=floats_of(digest, (K, H)),
+            is_transition=digest[0] % 4 == 0,
+            texts=self.texts,
+            context_tokens=self.num_tokens[session],
+        )
+
+    def close(self, session: str) -> None:
+        if self.contexts.pop(session, None) is None:
+            raise ponder.SessionError(f"session {session!r} is not open.")
+
+    def warm_up(self) -> list[int]:
+        return list(self.durations_ns)
+
+
+@dataclass
+class FakePounce:
+    """Rows that depend on every input, small enough for the robot's step limit."""
+
+    spec: pounce.EngineSpec = POUNCE_SPEC
+    requests: list[pounce.Request] = field(default_factory=list)
+    on_invoke: Callable[[], None] = lambda: None
+    durations_ns: tuple[int, ...] = (25_000_000,) * 20
+
+    def invoke(self, request: pounce.Request, progress: pounce.Progress = pounce.no_progress) -> m.Floats:
+        pounce.check_request(request, self.spec)
+        self.requests.append(request)
+        self.on_invoke()
+        progress()
+        digest = hashlib.sha256(request.instruction.encode())
+        for array in (*request.frames, request.proprio, request.cognition):
+            digest.update(b"null" if array is None else array.tobytes())
+        digest.update(f"{request.age_ns} {request.seed}".encode())
+        shape = (self.spec.horizon, self.spec.action_dim)
+        return (request.proprio + np.cumsum(0.01 * floats_of(digest.digest(), shape), axis=0)).astype(np.float32)
+
+    def warm_up(self) -> list[int]:
+        return list(self.durations_ns)
+
+
+@dataclass
+class NumberWorld:
+    """An environment whose joints are where they were commanded, and whose pictures show them."""
+
+    num_steps: int
+    commands: list[bytes] = field(default_factory=list)
+
+    def look(self) -> Snapshot:
+        state = np.frombuffer(self.commands[-1], np.float32) if self.commands else np.zeros(DIM, np.float32)
+        shade = hashlib.sha256(state.tobytes()).digest()
+        frame = np.frombuffer((shade * 2)[: PX * PX * 3], np.uint8).reshape(PX, PX, 3)
+        return Snapshot(
+            step=len(self.commands),
+            frames=dict.fromkeys(CAMERAS, frame),
+            state=state,
+            tcp_pose=np.zeros(7),
+            status=Status.SUCCESS if len(self.commands) >= self.num_steps else Status.ONGOING,
+            reason="",
+            simple_subgoal="",
+            grounded_subgoal="",
+            subtask_index=0,
+        )
+
+    def step(self, command: m.Floats) -> Snapshot:
+        self.commands.append(command.tobytes())
+        return self.look()
+
+
+class NoRecorder:
+    """Where the log would be."""
+
+    def step(self) -> None:
+        pass
+
+
+def make_robot(**changes: Any) -> m.Robot:
+    values: dict[str, Any] = {
+        "name": "arm",
+        "command_low": np.full(DIM, -3, np.float32),
+        "command_high": np.full(DIM, 3, np.float32),
+        "max_step": np.full(DIM, 0.2, np.float32),
+        "initial_command": np.zeros(DIM, np.float32),
+        "cameras": CAMERAS,
+        "image_height": PX,
+        "image_width": PX,
+        "num_proprio": NUM_PROPRIO,
+        "is_simulated": True,
+    }
+    return m.Robot(**(values | changes))
+
+
+def make_info(schedule: m.Schedule, *, epoch: int = 1, session: str = "s1", **changes: Any) -> m.EpisodeInfo:
+    values: dict[str, Any] = {
+        "header": m.Header(robot=ROBOT, session=session, episode=f"ep-{epoch}", epoch=epoch, proc="sim"),
+        "task": "PickHighlight",
+        "suite": "tests",
+        "seed": 3,
+        "difficulty": "easy",
+        "instruction": "pick the cubes that were highlighted",
+        "schedule": schedule,
+        "robot": make_robot(),
+        "t0_unix_ns": 0,
+    }
+    return m.EpisodeInfo(**(values | changes))
+
+
+@dataclass
+class Rig:
+    """Every process of a robot, in this thread. ``run`` plays one lockstep episode."""
+
+    config: ServiceConfig = NO_WATCH
+    bus: LocalBus = field(default_factory=LocalBus)
+    ponder_engine: FakePonder = field(default_factory=FakePonder)
+    pounce_engine: FakePounce = field(default_factory=FakePounce)
+    said: dict[type, list[Any]] = field(default_factory=dict)
+    meanwhile: Callable[[], None] = lambda: None
+
+    def __post_init__(self) -> None:
+        self.links = {proc: Link(self.bus, robot=ROBOT, proc=proc) for proc in ("clock", "ponder", "pounce", "sim")}
+        self.listener = Link(self.bus, robot=ROBOT, proc="listener")
+        self.clock = ClockService(self.links["clock"], self.config)
+        self.ponder = self.start_ponder(self.links["ponder"], self.ponder_engine)
+        self.pounce = self.start_pounce(self.links["pounce"], self.pounce_engine)
+        self.bus.add_party(self.clock.step)
+        self.bus.add_party(lambda: self.ponder.step())  # looked up each time: a test may put another in its place
+        self.bus.add_party(lambda: self.pounce.step())
+        self.bus.run_parties()
+
+    def start_ponder(self, link: Link, engine: FakePonder) -> PonderServer:
+        server = PonderServer(link, engine, Heartbeat(link, "test", "host/monotonic"), "test")
+        server.warm_up()
+        server.ready()
+        return server
+
+    def start_pounce(self, link: Link, engine: FakePounce) -> PounceServer:
+        server = PounceServer(link, engine, Heartbeat(link, "test", "host/monotonic"), "test")
+        server.warm_up()
+        server.ready()
+        return server
+
+    def listen(self, *topics: Any) -> Callable[[], None]:
+        """Keeps every message of ``topics`` in ``said`` whenever the returned function is called."""
+        streams = [(topic.cls, self.listener.subscribe(topic, keep=10_000)) for topic in topics]
+
+        def take() -> None:
+            for cls, stream in streams:
+                self.said.setdefault(cls, []).extend(stream.drain())
+
+        return take
+
+    def settle(self) -> None:
+        """Until nobody has anything to do."""
+        while self.bus.run_parties():
+            pass
+
+    def open(self, info: m.EpisodeInfo, demo: tuple[m.DemoFrame, ...] = ()) -> m.OpenReply:
+        return self.clock.open(m.OpenRequest(info=info, demo=demo))
+
+    def enter(self, info: m.EpisodeInfo) -> m.OpenReply:
+        """Opens an episode that must not be refused, and lets the robot join it."""
+        reply = self.open(info)
+        assert reply.error == ""
+        header = info.header
+        self.links["sim"].enter_episode(header.session, header.episode, header.epoch)
+        return reply
+
+    def run(self, info: m.EpisodeInfo, num_steps: int) -> tuple[Outcome, NumberWorld]:
+        """One episode; ``meanwhile`` runs before each turn of the servers."""
+        self.enter(info)
+        world = NumberWorld(num_steps)
+
+        def let_others(longest_ns: int) -> None:
+            self.meanwhile()
+            self.bus.run_parties()
+
+        side = RobotSide(self.links["sim"], world, NoRecorder(), let_others, 20_000_000_000)  # type: ignore[arg-type]
+        outcome = side.run(info, world.look(), lambda tick: None)
+        self.settle()
+        return outcome, world
+
+    def show(self, tick: int, source_ns: int, joints: Any = (0, 0, 0), **changes: Any) -> m.Observation:
+        """The robot publishes what it sees at ``tick``."""
+        values = self.observation(tick, source_ns, joints)
+        return self.links["sim"].publish(OBSERVATION, dataclasses.replace(values, **changes), at_ns=source_ns)
+
+    def observation(self, tick: int, source_ns: int, joints: Any = (0, 0, 0)) -> m.Observation:
+        frame = np.full((PX, PX, 3), tick % 256, np.uint8)
+        return m.Observation(
+            tick=tick,
+            source_ns=source_ns,
+            proprio=np.array(joints, np.float32),
+            images=images.pack(dict.fromkeys(CAMERAS, frame), m.ImageCodec.RAW),
+        )
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return Rig()
+
+
+@pytest.fixture(scope="session")
+def new_rig() -> Callable[..., Rig]:
+    """Another one, for twins and other configurations."""
+    return Rig
+
+
+@pytest.fixture(scope="session")
+def episode_info() -> Callable[..., m.EpisodeInfo]:
+    return make_info
+
+
+@pytest.fixture(scope="session")
+def robot_with() -> Callable[..., m.Robot]:
+    return make_robot
+
+
+@pytest.fixture
+def fake_ponder() -> FakePonder:
+    return FakePonder()
+
+
+@pytest.fixture
+def fake_pounce() -> FakePounce:
+    return FakePounce()
+
+
+@pytest.fixture
+def paper() -> m.Schedule:
+    return schedules.paper()
