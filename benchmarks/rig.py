@@ -1,0 +1,98 @@
+"""A whole machine for one experiment: daemons, a robot's process that plays episodes, and an ear on what they say.
+
+The ear subscribes like the recorder does, in the experiment's own process, so that an experiment also hears a run that
+writes no log, and a process that dies.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple
+
+from protocol import messages as m
+from protocol.link import Link
+from protocol.topics import EVENT, TICK
+from protocol.zenoh_bus import Endpoints, ZenohBus
+from sim_client.launch import Daemons, free_ports, start_local
+
+ROBOT = "r0"
+_KEEP = 4096
+_MODULES = {"ponder": "ponder_server", "pounce": "pounce_server", "clock": "clock"}
+
+
+class Heard(NamedTuple):
+    """A message and when the ear took it off the bus, on the host's monotonic clock."""
+
+    message: m.Tick | m.Event
+    at_ns: int
+
+
+class Rig:
+    """PONDER, POUNCE and, if it is not embedded in the robot's process, the clock service. A context manager."""
+
+    def __init__(self, folder: Path, *, with_clock: bool = True) -> None:
+        self.folder = folder
+        self.heard: list[Heard] = []
+        self.daemons = Daemons(folder)
+        self._players: list[subprocess.Popen[bytes]] = []
+        endpoints = start_local(self.daemons, robot=ROBOT, with_clock=with_clock, ponder=[], pounce=[])
+        names = ("clock", "ponder", "pounce") if with_clock else ("ponder", "pounce")
+        self._endpoints = dict(zip(names, endpoints, strict=True))
+        self._at_ear = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+        self._bus = ZenohBus(Endpoints(listen=(self._at_ear,), connect=endpoints))
+        link = Link(self._bus, robot=ROBOT, proc="ear")
+        self._streams = [link.subscribe(TICK, keep=_KEEP), link.subscribe(EVENT, keep=_KEEP)]
+
+    def play(self, arguments: Sequence[str]) -> subprocess.Popen[bytes]:
+        """Starts ``sim-client`` in real time against these daemons; its logs and results lie in ``folder``."""
+        command = [sys.executable, "-m", "sim_client", "--mode", "realtime", "--out", str(self.folder), "--no-progress"]
+        command += ["--link.connect", *self._endpoints.values(), self._at_ear, *arguments]
+        environment = os.environ | {"OMP_NUM_THREADS": "1", "MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl")}
+        player = subprocess.Popen(
+            command, env=environment, stdout=subprocess.DEVNULL, stderr=(self.folder / "sim.log").open("ab")
+        )
+        self._players.append(player)
+        return player
+
+    def restart(self, name: str) -> None:
+        """A killed daemon comes back where it was."""
+        arguments = ["--link.robot", ROBOT, "--link.listen", self._endpoints[name]]
+        if name == "clock":
+            arguments += ["--link.connect", self._endpoints["ponder"], self._endpoints["pounce"]]
+        self.daemons.start(name, _MODULES[name], arguments)
+
+    def listen(self, is_enough: Callable[[], bool], patience_s: float) -> bool:
+        """Hears until ``is_enough()``; False if that took longer than the patience."""
+        deadline_s = time.monotonic() + patience_s
+        while not is_enough():
+            if time.monotonic() > deadline_s:
+                return False
+            self._bus.wait(5_000_000)
+            now_ns = time.monotonic_ns()
+            self.heard += [Heard(message, now_ns) for stream in self._streams for message in stream.drain()]
+        return True
+
+    def ticks(self) -> list[m.Tick]:
+        return [h.message for h in self.heard if isinstance(h.message, m.Tick)]
+
+    def event(self, name: str) -> Heard | None:
+        """The first event of that name."""
+        return next((h for h in self.heard if isinstance(h.message, m.Event) and h.message.name == name), None)
+
+    def __enter__(self) -> Rig:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for player in self._players:
+            player.kill()
+            player.wait()
+        self._bus.close()
+        self.daemons.__exit__(kind, error, trace)
