@@ -50,12 +50,14 @@ def test_the_rule_sees_an_answer_from_the_instant_it_is_ready(tmp_path: Path) ->
 
 
 @pytest.mark.sim
+@pytest.mark.slow
 def test_the_paper_s_schedule_gives_every_invocation_a_cognition_of_300_ms(episode: str) -> None:
     ages = re.findall(r"sees C_(\d+), (\d+) ms old", episode)
     assert ages == [("0", "300"), ("1", "300"), ("2", "300")]
 
 
 @pytest.mark.sim
+@pytest.mark.slow
 def test_a_log_is_read_back_and_agrees_with_itself(episode: str, tmp_path: Path) -> None:
     told = printed("03_read_a_log.py", episode.splitlines()[-1], cwd=tmp_path)
     assert "agrees with itself" in told
@@ -64,6 +66,7 @@ def test_a_log_is_read_back_and_agrees_with_itself(episode: str, tmp_path: Path)
 
 
 @pytest.mark.sim
+@pytest.mark.slow
 def test_a_policy_of_one_s_own_moves_the_arm(tmp_path: Path) -> None:
     told = printed("04_your_own_policy.py", cwd=tmp_path)
     low, high = map(float, re.findall(r"[+-]\d\.\d+", told))
