@@ -43,7 +43,7 @@ class Way:
 
 WAYS = (
     Way(name="oracle, no servers", arguments=("--policy", "oracle")),
-    Way(name="oracle, no servers, no log", arguments=("--policy", "oracle", "--no-record")),
+    Way(name="oracle, no servers, no log, hence no pictures", arguments=("--policy", "oracle", "--no-record")),
     Way(name="lockstep in one process", arguments=("--in-process",)),
     Way(name="lockstep in one process, no log", arguments=("--in-process", "--no-record")),
     Way(name="lockstep over zenoh, three processes", arguments=("--local",)),

@@ -2,7 +2,7 @@
 
     python -m benchmarks.noop_policy openpi --port 7001      websocket and msgpack-numpy, as openpi's server speaks them
     python -m benchmarks.noop_policy observation --port ...  our Link: an observation is answered by a chunk
-    python -m benchmarks.noop_policy pounce --port ...       the whole of pounce-serve around an engine that does nothing
+    python -m benchmarks.noop_policy pounce --port ...       the whole of pounce-serve, its engine doing nothing
 
 Each decodes both pictures into arrays, reads them, and answers a chunk that only this request can have.
 """

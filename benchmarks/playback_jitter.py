@@ -6,6 +6,7 @@ off, and beside them what one writes first: ``while True: step(); time.sleep(0.0
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import tempfile
 import time
@@ -17,7 +18,9 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-import sim_client.headless  # noqa: F401, I001 - before mujoco
+import sim_client.headless  # noqa: F401 - before anything that imports mujoco
+
+# isort: split
 
 from benchmarks.report import Report, Row, show, spread
 from benchmarks.rig import Rig
@@ -72,14 +75,16 @@ def play(way: Way, options: JitterOptions) -> Played:
         with tempfile.TemporaryDirectory() as folder, Rig(Path(folder), with_clock=way.with_clock) as rig:
             arguments = ["--task", options.task, "--seed", str(len(episodes)), "--max-steps", str(max(wanted, 1300))]
             player = rig.play([*arguments, *way.arguments])
-            rig.listen(lambda: player.poll() is not None or len(rig.ticks()) >= wanted, options.seconds + 120.0)
-            if player.poll() is None:
-                player.terminate()
-            ticks = rig.ticks()
+            ticks = _hear(rig, player, wanted, options.seconds + 120.0)
         if len(ticks) <= options.warm_up_ticks:
             raise RuntimeError(f"{way.name}: the episode never ran")
         episodes.append(ticks)
     return _judge([ticks[options.warm_up_ticks :] for ticks in episodes], options.seconds * 20)
+
+
+def _hear(rig: Rig, player: subprocess.Popen[bytes], wanted: int, patience_s: float) -> list[m.Tick]:
+    rig.listen(lambda: player.poll() is not None or len(rig.ticks()) >= wanted, patience_s)
+    return rig.ticks()
 
 
 def _judge(episodes: Sequence[Sequence[m.Tick]], limit: int) -> Played:
@@ -125,7 +130,7 @@ def row_of(name: str, played: Played) -> Row:
 
 def histogram(played: dict[str, Played]) -> list[Row]:
     counts = {name: np.histogram(p.late_ms, BINS_MS)[0] for name, p in played.items()}
-    bounds = zip(BINS_MS, BINS_MS[1:], strict=False)
+    bounds = pairwise(BINS_MS)
     return [
         {"late_ms": f"{low:g} to {high:g}" if high < np.inf else f"{low:g} and more"}
         | {name: int(count[index]) for name, count in counts.items()}

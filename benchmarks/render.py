@@ -29,8 +29,8 @@ def section(report: dict[str, Any]) -> str:
         "",
         report["question"],
         "",
-        f"{report['date']}, commit `{report['git']}`, {machine['cpu']}, {machine['cores']} cores, load average {loads}, "
-        f"{machine['took_s']:.0f} s. Not counted: {report['warm_up']}",
+        f"{report['date']}, commit `{report['git']}`, {machine['cpu']}, {machine['cores']} cores, "
+        f"load average {loads}, {machine['took_s']:.0f} s. Not counted: {report['warm_up']}",
         "",
     ]
     for table in report["tables"]:
