@@ -154,7 +154,8 @@ def _check_kind(
         delay_ns = delays_ns[stamp.index]
         if delay_ns is None:  # measured: what it took (lockstep), or when it came (real time)
             delay_ns = answer.infer_ns if is_lockstep else stamp.arrived_ns - answer.source_ns
-        ready_ns = in_order(max(answer.source_ns + delay_ns, stamp.arrived_ns), last_ready_ns)
+        due_ns = answer.source_ns + delay_ns
+        ready_ns = in_order(due_ns if is_lockstep else max(due_ns, stamp.arrived_ns), last_ready_ns)
         is_transition = isinstance(answer, Cognition) and answer.is_transition
         yield from compare(
             name,

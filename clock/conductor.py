@@ -502,8 +502,9 @@ def _ripe(
 ) -> list[tuple[_Asked, Stamp]]:
     """Removes and stamps the answers that are ready at ``now_ns``, in the order they were asked for.
 
-    An answer that comes later than its modelled delay is ready when it came; none is ready before an earlier one. In
-    real time an earlier one may never come, so nobody waits for it.
+    None is ready before an earlier one. In real time an answer that comes later than its modelled delay is ready when it
+    came, and an earlier one may never come, so nobody waits for it. In lockstep time steps from tick to tick and then
+    waits, so when an answer happened to arrive in between must not show.
     """
     ripe: list[tuple[_Asked, Stamp]] = []
     for head in list(asked):
@@ -511,7 +512,8 @@ def _ripe(
             if is_lockstep:
                 break
             continue
-        ready_ns = in_order(max(head.due_ns, head.arrived_ns), last_ready_ns.get(kind))
+        came_ns = head.due_ns if is_lockstep else max(head.due_ns, head.arrived_ns)
+        ready_ns = in_order(came_ns, last_ready_ns.get(kind))
         if ready_ns > now_ns:
             break
         last_ready_ns[kind] = ready_ns
