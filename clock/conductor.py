@@ -502,9 +502,9 @@ def _ripe(
 ) -> list[tuple[_Asked, Stamp]]:
     """Removes and stamps the answers that are ready at ``now_ns``, in the order they were asked for.
 
-    None is ready before an earlier one. In real time an answer that comes later than its modelled delay is ready when it
-    came, and an earlier one may never come, so nobody waits for it. In lockstep time steps from tick to tick and then
-    waits, so when an answer happened to arrive in between must not show.
+    None is ready before an earlier one. In real time an answer that comes later than its modelled delay is ready when
+    it came, and an earlier one may never come, so nobody waits for it. In lockstep time steps from tick to tick and
+    then waits, so when an answer happened to arrive in between must not show.
     """
     ripe: list[tuple[_Asked, Stamp]] = []
     for head in list(asked):
