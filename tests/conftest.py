@@ -127,12 +127,13 @@ class NumberWorld:
     """An environment whose joints are where they were commanded, and whose pictures show them."""
 
     num_steps: int
+    px: int = PX
     commands: list[bytes] = field(default_factory=list)
 
     def look(self) -> Snapshot:
         state = np.frombuffer(self.commands[-1], np.float32) if self.commands else np.zeros(DIM, np.float32)
         shade = hashlib.sha256(state.tobytes()).digest()
-        frame = np.frombuffer((shade * 2)[: PX * PX * 3], np.uint8).reshape(PX, PX, 3)
+        frame = np.resize(np.frombuffer(shade, np.uint8), (self.px, self.px, 3))
         return Snapshot(
             step=len(self.commands),
             frames=dict.fromkeys(CAMERAS, frame),
@@ -196,6 +197,7 @@ class Rig:
     bus: LocalBus = field(default_factory=LocalBus)
     ponder_engine: FakePonder = field(default_factory=FakePonder)
     pounce_engine: FakePounce = field(default_factory=FakePounce)
+    px: int = PX
     said: dict[type, list[Any]] = field(default_factory=dict)
     meanwhile: Callable[[], None] = lambda: None
 
@@ -251,7 +253,7 @@ class Rig:
     def run(self, info: m.EpisodeInfo, num_steps: int) -> tuple[Outcome, NumberWorld]:
         """One episode; ``meanwhile`` runs before each turn of the servers."""
         self.enter(info)
-        world = NumberWorld(num_steps)
+        world = NumberWorld(num_steps, self.px)
 
         def let_others(longest_ns: int) -> None:
             self.meanwhile()
@@ -268,7 +270,7 @@ class Rig:
         return self.links["sim"].publish(OBSERVATION, dataclasses.replace(values, **changes), at_ns=source_ns)
 
     def observation(self, tick: int, source_ns: int, joints: Any = (0, 0, 0)) -> m.Observation:
-        frame = np.full((PX, PX, 3), tick % 256, np.uint8)
+        frame = np.full((self.px, self.px, 3), tick % 256, np.uint8)
         return m.Observation(
             tick=tick,
             source_ns=source_ns,
