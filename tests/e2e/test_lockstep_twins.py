@@ -1,0 +1,51 @@
+"""Lockstep is reproducible to the bit, and processes and transport change nothing in it."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clock.check import disagreements
+
+pytestmark = [pytest.mark.e2e, pytest.mark.sim, pytest.mark.slow]
+
+Run = Callable[..., "subprocess.CompletedProcess[str]"]
+EPISODE = ("--seed", "7", "--max-steps", "80", "--no-progress")
+AGE_NS = 300_000_000
+
+
+@pytest.fixture(scope="module")
+def twins(
+    run_module: Run, episode_in: Callable[[Path], Any], tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Any]:
+    """The same episode twice in one process, and once with three processes."""
+    found = {}
+    for name, how in (("first", "--in-process"), ("second", "--in-process"), ("zenoh", "--local")):
+        out = tmp_path_factory.mktemp(name)
+        done = run_module("sim_client", how, *EPISODE, "--out", str(out))
+        assert done.returncode == 0, done.stderr
+        found[name] = episode_in(out)
+    return found
+
+
+@pytest.mark.parametrize("other", ["second", "zenoh"])
+def test_one_seed_gives_one_stream(twins: dict[str, Any], other: str) -> None:
+    assert len(twins["first"].record.ticks) == 80
+    assert twins[other].result["stream_sha256"] == twins["first"].result["stream_sha256"]
+
+
+@pytest.mark.parametrize("name", ["first", "zenoh"])
+def test_the_papers_schedule_gives_every_invocation_a_cognition_of_300_ms(twins: dict[str, Any], name: str) -> None:
+    invocations = twins[name].record.invocations
+    assert [i.age_ns for i in invocations] == [AGE_NS] * 4
+    assert [i.ref_query for i in invocations] == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("name", ["first", "zenoh"])
+def test_every_decision_follows_from_the_log(twins: dict[str, Any], name: str) -> None:
+    assert not twins[name].record.recovered
+    assert next(disagreements(twins[name].record), None) is None
