@@ -191,7 +191,7 @@ class Environment:
 
     def _observe(self) -> Snapshot:
         """Stages, remembers, judges and captions the instant the physics is at."""
-        self._task.stage(self.physics, self._layout, self._step)
+        self._task.stage(self.physics, self._layout, self._memory, self._step)
         spoken_of = self._progress.index  # texts change one step after the engine does
         self._memory = self._task.remember(self._memory, self.physics, self._layout)
         self._progress = engine.judge(

@@ -78,6 +78,11 @@ def screw_exp(twist: Array) -> Array:
     return T
 
 
+def smoothstep(fraction: float) -> float:
+    """Returns how far a motion from rest to rest has come, 0 to 1, after a fraction of its time in [0, 1]."""
+    return fraction * fraction * (3.0 - 2.0 * fraction)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Footprint:
     """The rectangle an object covers on the table."""
@@ -90,6 +95,12 @@ class Footprint:
         """Returns the rectangle's two unit axes as rows (2, 2)."""
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         return np.array([[c, s], [-s, c]])
+
+
+def distance_m(point_m: tuple[float, float], footprint: Footprint) -> float:
+    """Returns how far a point on the table lies outside a rectangle; 0 inside."""
+    local = footprint.axes() @ np.subtract(point_m, footprint.center_m)
+    return float(np.linalg.norm(np.maximum(np.abs(local) - footprint.half_m, 0.0)))
 
 
 def is_clear(a: Footprint, b: Footprint, gap_m: float) -> bool:

@@ -31,6 +31,7 @@ class Kinematics:
         self._model = model
         self._scratch = mujoco.MjData(model)
         self._qpos = np.array([model.joint(name).qposadr[0] for name in panda.ARM_JOINTS])
+        self._fingers = np.array([model.joint(name).qposadr[0] for name in panda.FINGER_JOINTS])
         self._dof = np.array([model.joint(name).dofadr[0] for name in panda.ARM_JOINTS])
         self._tcp = model.site(panda.TCP_SITE).id
         self._jacobian = np.zeros((6, model.nv))
@@ -84,6 +85,21 @@ class Kinematics:
         for fraction in np.linspace(0.0, 1.0, num_points)[1:]:
             path.append(self.solve(origin @ screw_exp(fraction * twist), path[-1]))
         return np.array(path)
+
+    def overlap_m(self, world: Any, qpos: Array, ignored_body: str) -> float:
+        """Returns how deep the arm would cut into things at joint angles (7,) with open fingers; 0 if it has room.
+
+        Args: world is the MjData whose props are in the way, which is only read; one body of it does not count.
+        """
+        self._scratch.qpos[:] = world.qpos
+        self._scratch.mocap_pos[:], self._scratch.mocap_quat[:] = world.mocap_pos, world.mocap_quat
+        self._scratch.qpos[self._fingers] = panda.HOME_OPENING_M * np.array([1.0, -1.0])
+        self.tcp(qpos)
+        mujoco.mj_collision(self._model, self._scratch)
+        geoms = self._scratch.contact.geom
+        is_met = np.any(self._model.geom_contype[geoms] == panda.ROBOT_BIT, axis=1)
+        is_met &= np.all(self._model.geom_bodyid[geoms] != self._model.body(ignored_body).id, axis=1)
+        return float(-self._scratch.contact.dist[is_met].min(initial=0.0))
 
     def _jacobian_here(self) -> Array:
         mujoco.mj_comPos(self._model, self._scratch)  # mj_jacSite reads what it computes

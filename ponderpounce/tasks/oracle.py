@@ -7,7 +7,7 @@ the arm's speed and acceleration limits; a gripper command holds the arm still f
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,10 @@ OPEN, CLOSED = 1.0, -1.0
 
 _PATH_POINTS = 40
 _ABOVE_M = 0.15
+_HIGH_M, _BACK_OFF_M = 0.20, 0.1
+_SWING_M = 0.10
+_QUARTERS = ((1, 0), (0, 1), (0, -1), (-1, 0))  # cosine and sine of 0, 90, -90 and 180 degrees
+_LEFT = np.array([0.0, 1.0, 0.0])
 _DOWN = np.array([0.0, 0.0, -1.0])
 
 
@@ -62,24 +66,30 @@ class Motions:
         yield from self.hold(GRIPPER_STEPS)
 
     def press(self, button: str) -> Actions:
-        """Presses a button with the closed gripper and comes back up."""
-        x_m, y_m, _ = self._physics.position_m(button)
-        upright = _tool(np.array([0.0, -1.0, 0.0]))
-        yield from self.open_at(_at(upright, x_m, y_m, _ABOVE_M))
+        """Goes to a button, presses it with the closed gripper and comes back up."""
+        yield from self.open_at(self._above_button(button))
+        yield from self.push_down(button)
+
+    def hover(self, button: str) -> Actions:
+        """Waits above a button with the gripper closed."""
+        yield from self.move(self._above_button(button))
         yield from self.close()
-        yield from self.move(_at(upright, x_m, y_m, BUTTON_BASE_HEIGHT_M / 2))
-        yield from self.move(_at(upright, x_m, y_m, _ABOVE_M))
+
+    def push_down(self, button: str) -> Actions:
+        """Presses the button below with the closed gripper and comes back up."""
+        yield from self.close()
+        above = self._above_button(button)
+        yield from self.move(_at_height(above, BUTTON_BASE_HEIGHT_M / 2))
+        yield from self.move(above)
+
+    def wait_until(self, elapsed_steps: int) -> Actions:
+        """Stands still until so many control steps have passed since reset, in rounds of a gripper command's length."""
+        while self._physics.elapsed_steps() < elapsed_steps:
+            yield from self.hold(GRIPPER_STEPS)
 
     def pick(self, cube: str) -> Actions:
         """Grasps a cube from above and lifts it, turning as little as the arm's limits allow."""
-        yield from self.open()
-        x_m, y_m, z_m = self._physics.position_m(cube)
-        grasp, approach = self._reachable_grasp(cube, x_m, y_m)
-        yield from approach
-        yield from self.open()
-        yield from self.move(_at(grasp, x_m, y_m, z_m))
-        yield from self.close()
-        yield from self.move(_at(grasp, x_m, y_m, _ABOVE_M))
+        yield from self._grasp(cube, from_z_m=_ABOVE_M, grasp_z_m=self._physics.position_m(cube)[2])
 
     def put_down(self, release_z_m: float) -> Actions:
         """Lowers the tool straight down to a height, lets go, and comes back up."""
@@ -89,30 +99,86 @@ class Motions:
         yield from self.open()
         yield from self.move(_at(here, x_m, y_m, _ABOVE_M))
 
+    def place(self, target: str) -> Actions:
+        """Carries what is held over a target, sets it down there and comes back up."""
+        x_m, y_m, z_m = self._physics.position_m(target)
+        above = self._carried_to(x_m, y_m, _ABOVE_M)
+        yield from self.move(above)
+        yield from self.move(_at_height(above, z_m))
+        yield from self.open()
+        yield from self.move(above)
+
+    def drop_into(self, container: str) -> Actions:
+        """Carries what is held over a container, lets it fall, and backs off towards the robot."""
+        x_m, y_m, _ = self._physics.position_m(container)
+        yield from self.open_at(self._carried_to(x_m, y_m, _HIGH_M))
+        yield from self.move(self._carried_to(x_m - _BACK_OFF_M, y_m, _HIGH_M))
+
+    def swing_over(self, target: str) -> Actions:
+        """Carries what is held to a place low above a target."""
+        x_m, y_m, _ = self._physics.position_m(target)
+        yield from self.move(self._carried_to(x_m, y_m, _SWING_M))
+
     def open_at(self, target: Array) -> Actions:
         """Moves the tool to a transform (4, 4), then opens the gripper there."""
         yield from self.move(target)
         yield from self.open()
 
-    def _reachable_grasp(self, cube: str, x_m: float, y_m: float) -> tuple[Array, Actions]:
-        """The first grasp of a cube that can be approached, and the way there.
+    def _grasp(self, body: str, *, from_z_m: float, grasp_z_m: float) -> Actions:
+        yield from self.open()
+        above = self._above_block(body, from_z_m, grasp_z_m)
+        yield from self.open_at(above)
+        yield from self.move(_at_height(above, grasp_z_m))
+        yield from self.close()
+        yield from self.move(above)
 
-        A cube can be closed upon along four directions; the nearest to the present one is tried first.
+    def _above_button(self, button: str) -> Array:
+        """Where the tool waits above a button, fingers along y; the wrist is turned round if it must be."""
+        x_m, y_m, _ = self._physics.position_m(button)
+        return self._first_reachable([_at(_tool(side), x_m, y_m, _ABOVE_M) for side in (-_LEFT, _LEFT)])
+
+    def _above_block(self, body: str, from_z_m: float, grasp_z_m: float) -> Array:
+        """Where the tool waits above a square body, turned least among the grasps with most room for the open fingers.
+
+        A square can be closed upon along four directions.
         """
+        x_m, y_m, _ = self._physics.position_m(body)
         closing = self._physics.tcp_transform()[:3, 1]
-        sides = transform(self._physics.pose(cube))[:3, :2].T
+        sides = transform(self._physics.pose(body))[:3, :2].T
         directions = sorted([*sides, *-sides], key=lambda side: -float(side @ closing))
+        waiting = [_at(_tool(direction), x_m, y_m, from_z_m) for direction in directions]
+        return self._first_reachable(sorted(waiting, key=lambda above: self._overlap_m(above, grasp_z_m, body)))
+
+    def _overlap_m(self, above: Array, z_m: float, cube: str) -> float:
+        """How deep open fingers that come down upon a cube would cut into what lies around it.
+
+        It is 0 if the hand cannot get there: that is for `_first_reachable` to find out.
+        """
+        try:
+            qpos = self._kinematics.solve(above, self._physics.arm_qpos())
+            return self._kinematics.overlap_m(
+                self._physics.data, self._kinematics.solve(_at_height(above, z_m), qpos), cube
+            )
+        except UnreachableError:
+            return 0.0
+
+    def _carried_to(self, x_m: float, y_m: float, z_m: float) -> Array:
+        """The tool (4, 4) at a place as it is turned now, or by quarter turns if the wrist cannot get there so."""
+        held = self._physics.tcp_transform()
+        quarters = [np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) for c, s in _QUARTERS]
+        return self._first_reachable([_at(T @ held, x_m, y_m, z_m) for T in quarters])
+
+    def _first_reachable(self, targets: Sequence[Array]) -> Array:
+        """The first transform (4, 4) that a straight screw from here leads to. Raises UnreachableError if none does."""
         failures = []
-        for direction in directions:
-            grasp = _tool(direction)
-            above = _at(grasp, x_m, y_m, _ABOVE_M)
+        for target in targets:
             try:
-                self._kinematics.screw_path(self._physics.arm_qpos(), above, _PATH_POINTS)
+                self._kinematics.screw_path(self._physics.arm_qpos(), target, _PATH_POINTS)
             except UnreachableError as error:
                 failures.append(str(error))
                 continue
-            return grasp, self.move(above)
-        raise UnreachableError(f"no grasp of {cube!r} can be approached: " + "; ".join(failures))
+            return target
+        raise UnreachableError("no straight way leads there: " + "; ".join(failures))
 
     def _action(self, qpos: Array) -> NDArray[np.float32]:
         return np.append(qpos, self._gripper).astype(np.float32)
@@ -125,6 +191,12 @@ def _tool(closing: Array) -> Array:
     T = np.eye(4)
     T[:3, :3] = np.column_stack([np.cross(y, _DOWN), y, _DOWN])
     return T
+
+
+def _at_height(T: Array, z_m: float) -> Array:
+    moved = T.copy()
+    moved[2, 3] = z_m
+    return moved
 
 
 def _at(T: Array, x_m: float, y_m: float, z_m: float) -> Array:

@@ -99,6 +99,10 @@ class Physics:
         mujoco.mj_step(self.model, self.data, self.substeps)
         self.refresh()
 
+    def elapsed_steps(self) -> int:
+        """Control steps since `reset`. The one that settles the scene counts, so observation k has k + 1 behind it."""
+        return round(self.data.time * CONTROL_HZ)
+
     def arm_qpos(self) -> Array:
         """Joint angles (7,) in rad."""
         return self.data.qpos[self._arm_qpos]  # fancy indexing: a copy

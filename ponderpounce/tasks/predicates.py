@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
+import numpy as np
+
+from ponderpounce.tasks.geometry import Array
 from ponderpounce.tasks.physics import Physics
 
 _PICKED_Z_M = 0.05
 _DROPPED_Z_M = 0.035  # upstream's data-recording wrapper is laxer (0.2); evaluation, and we, use this one
 _PRESSED_M = 0.005
+_ONTO_M = 0.05
+_HOVER_M, _HOVER_Z_M = 0.03, 0.2
+_AWAY_M = _OPEN_M = 0.02
 
 
 def is_picked(physics: Physics, cube: str) -> bool:
@@ -22,3 +30,39 @@ def is_dropped(physics: Physics, cube: str) -> bool:
 def is_pressed(physics: Physics, button: str) -> bool:
     """The button's cap is more than 5 mm down at this instant."""
     return -physics.travel_m(f"{button}/cap") > _PRESSED_M
+
+
+def first_picked(physics: Physics, cubes: Iterable[str]) -> str | None:
+    """The first of the cubes that is picked at this instant, or None."""
+    return next((cube for cube in cubes if is_picked(physics, cube)), None)
+
+
+def is_near(physics: Physics, body: str, place: str, within_m: float) -> bool:
+    """Seen from above, the centres of two bodies are at most ``within_m`` apart."""
+    return _distance_on_table_m(physics.position_m(body), physics.position_m(place)) <= within_m
+
+
+def is_over(physics: Physics, body: str, place: str, *, within_m: float, below_z_m: float) -> bool:
+    """The body's centre is near the place seen from above, and lower than ``below_z_m``."""
+    return is_near(physics, body, place, within_m) and bool(physics.position_m(body)[2] < below_z_m)
+
+
+def is_dropped_onto(physics: Physics, cube: str, place: str) -> bool:
+    """The cube is dropped, at most 5 cm from the place's centre."""
+    return is_near(physics, cube, place, _ONTO_M) and is_dropped(physics, cube)
+
+
+def is_let_go(physics: Physics, body: str) -> bool:
+    """Both fingers are open by more than 2 cm and the tool point is more than 2 cm away from the body's centre."""
+    away_m = np.linalg.norm(physics.tcp_transform()[:3, 3] - physics.position_m(body))
+    return bool(physics.finger_openings_m().min() > _OPEN_M and away_m > _AWAY_M)
+
+
+def is_hovering(physics: Physics, button: str) -> bool:
+    """The tool point is within 3 cm of the button seen from above, and lower than 20 cm."""
+    tool_m = physics.tcp_transform()[:3, 3]
+    return _distance_on_table_m(tool_m, physics.position_m(button)) <= _HOVER_M and bool(tool_m[2] < _HOVER_Z_M)
+
+
+def _distance_on_table_m(a_m: Array, b_m: Array) -> float:
+    return float(np.hypot(*(a_m - b_m)[:2]))

@@ -85,10 +85,11 @@ class Task(ABC, Generic[LayoutT, MemoryT]):
     def remember(self, memory: MemoryT | None, physics: Physics, layout: LayoutT) -> MemoryT:
         """Returns the memory after one more observation; ``memory`` is None at the first."""
 
-    def stage(self, physics: Physics, layout: LayoutT, step: int) -> None:
+    def stage(self, physics: Physics, layout: LayoutT, memory: MemoryT | None, step: int) -> None:
         """Moves scripted things to where the observation of ``step`` shall show them. The default moves nothing.
 
-        Called after every control step with the number of control steps since reset, and at reset with 0.
+        Called after every control step with the number of control steps since reset, and at reset with 0. The memory
+        is that of the observation before: what is seen now can move things in the next one. It is None at reset.
         """
         return
 

@@ -15,7 +15,8 @@ import pytest
 
 from ponderpounce.tasks.environment import Environment, make_environment
 from ponderpounce.tasks.physics import Physics
-from ponderpounce.tasks.reference.pick_highlight import Layout, PlacedCube
+from ponderpounce.tasks.placing import PlacedCube
+from ponderpounce.tasks.reference.pick_highlight import Layout
 from ponderpounce.tasks.scene import add_button, add_cube, add_disc, table_scene
 
 

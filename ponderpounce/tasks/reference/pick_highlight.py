@@ -20,40 +20,21 @@ from ponderpounce.tasks import captions, predicates
 from ponderpounce.tasks.geometry import pose
 from ponderpounce.tasks.oracle import Actions, Motions
 from ponderpounce.tasks.physics import Physics
-from ponderpounce.tasks.scene import (
-    BUTTON_HALF_M,
-    CUBE_COLORS,
-    CUBE_HALF_M,
-    SceneFullError,
-    add_button,
-    add_cube,
-    add_disc,
-    sample_footprint,
-)
+from ponderpounce.tasks.placing import PlacedCube, draw_button, draw_cube, until_it_fits
+from ponderpounce.tasks.scene import CUBE_COLORS, add_button, add_cube, add_disc
 from ponderpounce.tasks.task import Subtask, Task, task
 
 HIGHLIGHT_STEPS = range(10, 101)  # the observations that show the discs
 
 _NUM_CUBES = {"easy": 3, "medium": 4, "hard": 6}
 _NUM_TARGETS = {"easy": 1, "medium": 2, "hard": 3}
-_BUTTON_CENTER_M, _BUTTON_REACH_M = (-0.2, 0.0), (0.05, 0.2)
-_CUBES_CENTER_M, _CUBES_REACH_M = (-0.1, 0.0), (0.18, 0.18)  # a 0.4 m square holds the whole cubes
+_CUBES_CENTER_M, _CUBES_HALF_M = (-0.1, 0.0), (0.2, 0.2)
 _GAP_M = 0.04
 _DISC_BELOW_CENTER_M = 0.01  # the cube hides its middle; a ring of 2 cm shows
 _RELEASE_Z_M = 0.01
 _BUTTON = "button"
 _CUBES = tuple(f"cube_{i}" for i in range(max(_NUM_CUBES.values())))
 _DISCS = tuple(f"highlight_{i}" for i in range(max(_NUM_TARGETS.values())))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlacedCube:
-    """One cube of the scene."""
-
-    x_m: float
-    y_m: float
-    yaw_rad: float
-    color: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,19 +66,14 @@ class PickHighlight(Task[Layout, Memory]):
             add_disc(spec, disc)
 
     def sample(self, rng: np.random.Generator, difficulty: str) -> Layout:
-        while True:  # a crowded draw can leave no room for the last cube; then the whole scene is drawn again
-            try:
-                return _draw(rng, difficulty)
-            except SceneFullError:
-                continue
+        return until_it_fits(lambda: _draw(rng, difficulty))
 
     def arrange(self, physics: Physics, layout: Layout) -> None:
         physics.place(_BUTTON, pose(*layout.button_xy_m, 0.0))
         for name, cube in zip(_CUBES, layout.cubes, strict=False):
-            physics.place(name, pose(cube.x_m, cube.y_m, CUBE_HALF_M, cube.yaw_rad))
-            physics.paint(name, CUBE_COLORS[cube.color])
+            cube.put(physics, name)
 
-    def stage(self, physics: Physics, layout: Layout, step: int) -> None:
+    def stage(self, physics: Physics, layout: Layout, memory: Memory | None, step: int) -> None:
         for disc, target in zip(_DISCS, layout.targets, strict=False):
             if step in HIGHLIGHT_STEPS:
                 x_m, y_m, z_m = physics.position_m(_CUBES[target])
@@ -153,29 +129,14 @@ class PickHighlight(Task[Layout, Memory]):
 
 
 def _draw(rng: np.random.Generator, difficulty: str) -> Layout:
-    button = sample_footprint(
-        rng,
-        center_m=_BUTTON_CENTER_M,
-        reach_m=_BUTTON_REACH_M,
-        half_m=BUTTON_HALF_M,
-        yaw_range_rad=(0.0, 0.0),
-        obstacles=(),
-        gap_m=0.0,
-    )
-    taken, cubes = [button], []
+    button = draw_button(rng)
+    cubes: list[PlacedCube] = []
     for _ in range(_NUM_CUBES[difficulty]):
         color = str(rng.choice(list(CUBE_COLORS)))
-        spot = sample_footprint(
-            rng,
-            center_m=_CUBES_CENTER_M,
-            reach_m=_CUBES_REACH_M,
-            half_m=(CUBE_HALF_M, CUBE_HALF_M),
-            yaw_range_rad=(0.0, 2 * np.pi),
-            obstacles=taken,
-            gap_m=_GAP_M,
+        taken = [button, *(cube.footprint for cube in cubes)]
+        cubes.append(
+            draw_cube(rng, color, center_m=_CUBES_CENTER_M, half_m=_CUBES_HALF_M, obstacles=taken, gap_m=_GAP_M)
         )
-        taken.append(spot)
-        cubes.append(PlacedCube(x_m=spot.center_m[0], y_m=spot.center_m[1], yaw_rad=spot.yaw_rad, color=color))
     targets = rng.permutation(len(cubes))[: _NUM_TARGETS[difficulty]]
     return Layout(button_xy_m=button.center_m, cubes=tuple(cubes), targets=tuple(int(i) for i in targets))
 

@@ -1,0 +1,111 @@
+"""Drawing where things lie: the button, cubes and targets of one episode, none upon another.
+
+The order of the draws is part of a task: change it, and every seed gives another scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from ponderpounce.tasks.geometry import Footprint, distance_m, pose
+from ponderpounce.tasks.physics import Physics
+from ponderpounce.tasks.scene import BUTTON_HALF_M, CUBE_COLORS, CUBE_HALF_M, SceneFullError, sample_footprint
+
+_BUTTON_CENTER_M, _BUTTON_REACH_M = (-0.2, 0.0), (0.05, 0.2)
+
+DrawnT = TypeVar("DrawnT")
+Point = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlacedCube:
+    """One cube of the scene."""
+
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    color: str
+
+    @property
+    def footprint(self) -> Footprint:
+        """What it covers of the table."""
+        return Footprint(center_m=(self.x_m, self.y_m), half_m=(CUBE_HALF_M, CUBE_HALF_M), yaw_rad=self.yaw_rad)
+
+    def put(self, physics: Physics, name: str) -> None:
+        """Places and paints a cube prop as this one."""
+        physics.place(name, pose(self.x_m, self.y_m, CUBE_HALF_M, self.yaw_rad))
+        physics.paint(name, CUBE_COLORS[self.color])
+
+
+def until_it_fits(draw: Callable[[], DrawnT]) -> DrawnT:
+    """Draws whole scenes until one has room for everything; a crowded draw can leave none for the last prop."""
+    while True:
+        try:
+            return draw()
+        except SceneFullError:
+            continue
+
+
+def draw_button(rng: np.random.Generator) -> Footprint:
+    """Draws the button's place beside the robot."""
+    return sample_footprint(
+        rng,
+        center_m=_BUTTON_CENTER_M,
+        reach_m=_BUTTON_REACH_M,
+        half_m=BUTTON_HALF_M,
+        yaw_range_rad=(0.0, 0.0),
+        obstacles=(),
+        gap_m=0.0,
+    )
+
+
+def draw_cube(
+    rng: np.random.Generator,
+    color: str,
+    *,
+    center_m: Point,
+    half_m: Point,
+    obstacles: Sequence[Footprint],
+    gap_m: float,
+) -> PlacedCube:
+    """Draws a cube, whole within the rectangle ``center_m`` +- ``half_m`` and ``gap_m`` from all obstacles."""
+    spot = sample_footprint(
+        rng,
+        center_m=center_m,
+        reach_m=(half_m[0] - CUBE_HALF_M, half_m[1] - CUBE_HALF_M),
+        half_m=(CUBE_HALF_M, CUBE_HALF_M),
+        yaw_range_rad=(0.0, 2 * np.pi),
+        obstacles=obstacles,
+        gap_m=gap_m,
+    )
+    return PlacedCube(x_m=spot.center_m[0], y_m=spot.center_m[1], yaw_rad=spot.yaw_rad, color=color)
+
+
+def draw_disc(
+    rng: np.random.Generator,
+    *,
+    radius_m: float,
+    center_m: Point,
+    half_m: Point,
+    obstacles: Sequence[Footprint],
+    gap_m: float,
+    max_tries: int = 256,
+) -> Point:
+    """Draws the centre of a disc, whole within ``center_m`` +- ``half_m`` and ``gap_m`` from all obstacles.
+
+    Raises SceneFullError after ``max_tries`` draws that all met an obstacle.
+    """
+    low = np.subtract(center_m, half_m) + radius_m
+    high = np.add(center_m, half_m) - radius_m
+    for _ in range(max_tries):
+        x_m, y_m = rng.uniform(low, high)
+        if all(distance_m((x_m, y_m), obstacle) >= radius_m + gap_m for obstacle in obstacles):
+            return float(x_m), float(y_m)
+    raise SceneFullError(
+        f"no free place for a disc of radius {radius_m:.3f} m after {max_tries} tries: {len(obstacles)} obstacles "
+        f"within {half_m} m of {center_m}, gap {gap_m} m. Draw the scene again."
+    )
