@@ -117,13 +117,13 @@ class PonderServer:
             self._tell(m.Severity.ERROR, "fire_refused", f"query {work.query.query}: {error}")
             return
         finally:
+            self._phase("idle")
             self._heartbeat.set(is_inferring=False)
         ready_ns = time.monotonic_ns()
         cognition, subgoals = self._node.answer(work, fire, ready_ns=ready_ns, infer_ns=ready_ns - start_ns)
         self._link.publish(topics.COGNITION, cognition, at_ns=ready_ns, clock_id=host_clock_id())
         for subgoal in subgoals:
             self._link.publish(topics.SUBGOAL, subgoal, at_ns=ready_ns, clock_id=host_clock_id())
-        self._phase("idle")
         self._heartbeat.set(next_index=self._node.next_query, num_answered=self._heartbeat.health.num_answered + 1)
 
     def _open(self, request: m.OpenRequest) -> m.Contract:

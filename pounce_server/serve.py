@@ -97,6 +97,7 @@ class PounceServer:
             self._tell(m.Severity.ERROR, "invocation_refused", f"invocation {work.invocation.invocation}: {error}")
             return
         finally:
+            self._phase("idle")
             self._heartbeat.set(is_inferring=False)
         ready_ns = time.monotonic_ns()
         chunk = self._node.answer(work, rows_NA, infer_ns=ready_ns - start_ns)
@@ -104,7 +105,6 @@ class PounceServer:
             self._link.publish(topics.CHUNK, chunk, at_ns=ready_ns, clock_id=host_clock_id())
         except MalformedMessage as error:
             self._tell(m.Severity.ERROR, "chunk_refused", f"invocation {work.invocation.invocation}: {error}")
-        self._phase("idle")
         self._heartbeat.set(
             next_index=work.invocation.invocation + 1, num_answered=self._heartbeat.health.num_answered + 1
         )
