@@ -99,6 +99,13 @@ def test_a_request_whose_observation_may_come_is_not_given_up(meeting: Rendezvou
     assert list(meeting.give_up()) == []
 
 
+def test_a_request_whose_observation_is_the_oldest_here_is_not_given_up(meeting: Rendezvous[Query]) -> None:
+    for tick in (3, 4):
+        meeting.on_observation(look(tick))
+    meeting.on_request(ask(0, 3))
+    assert list(meeting.give_up()) == []
+
+
 def test_a_cleared_rendezvous_knows_nothing(meeting: Rendezvous[Query]) -> None:
     meeting.on_request(ask(0, 3))
     meeting.on_observation(look(3))
