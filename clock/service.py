@@ -374,6 +374,7 @@ class ClockService:
     def _finish(self, result: m.EpisodeResult | None) -> None:
         if self._episode is not None and self._episode.request.info.policy == "servers":
             self._close_servers(result)
+        self._watch.forget_losses()  # whoever is restarted between episodes comes back to no episode, and is not lost
         self._episode = None
         self._link.leave_episode()
 
