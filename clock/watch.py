@@ -36,7 +36,12 @@ class Watch:
         seen.health, seen.heard_ns, seen.has_token = health, now_ns, True
 
     def on_token(self, proc: str, is_alive: bool) -> None:
-        self._seen.setdefault(proc, _Seen()).has_token = is_alive
+        seen = self._seen.setdefault(proc, _Seen())
+        seen.has_token = is_alive
+        if not is_alive:
+            seen.health = (
+                None  # of a process that is no more; its successor's token may come before its first heartbeat
+            )
 
     def health_of(self, proc: str) -> Health | None:
         """The newest heartbeat of a server that is there; None if it is not."""
@@ -72,8 +77,10 @@ class Watch:
         silent_ns = now_ns - seen.heard_ns
         if silent_ns > self.timeout_ns:
             return f"no heartbeat for {silent_ns / 1e6:.0f} ms: it is frozen, or its inference loop hangs"
-        if seen.health is not None and seen.health.state != ServingState.READY:
+        if seen.health is None:
+            return "it was restarted and has not said anything yet" if seen.is_lost else ""
+        if seen.health.state != ServingState.READY:
             return f"it is {seen.health.state.name.lower()} {seen.health.detail}".strip()
-        if seen.health is not None and seen.health.open_episode != episode:
+        if seen.health.open_episode != episode:
             return "it was restarted and does not know the episode yet"
         return ""

@@ -86,6 +86,16 @@ def test_a_server_never_heard_is_lost_after_the_timeout() -> None:
     assert [c.is_lost for c in watch.poll(PROCS, "e1", 10**12 + HEARTBEAT_TIMEOUT_NS + 1)] == [True]
 
 
+def test_a_successors_token_is_no_sign_that_it_knows_the_episode(watch: Watch) -> None:
+    """The token of a restarted process comes before its first heartbeat; its predecessor's says nothing about it."""
+    watch.on_token("ponder", False)
+    watch.poll(PROCS, "e1", 1)
+    watch.on_token("ponder", True)
+    assert watch.poll(PROCS, "e1", 2) == []
+    watch.on_health(health(episode="e1"), 3)
+    assert [change.is_lost for change in watch.poll(PROCS, "e1", 3)] == [False]
+
+
 def test_a_new_episode_forgets_old_losses(watch: Watch) -> None:
     watch.on_token("ponder", False)
     watch.poll(PROCS, "e1", 1)
