@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ponderpounce.tasks import captions, engine, panda, sight
+from ponderpounce.tasks import captions, demonstration, engine, panda, sight
 from ponderpounce.tasks.captions import Caption
+from ponderpounce.tasks.demonstration import Row
 from ponderpounce.tasks.engine import Progress, Status
 from ponderpounce.tasks.geometry import pose_of
 from ponderpounce.tasks.oracle import Motions
-from ponderpounce.tasks.physics import Physics, PhysicsState
+from ponderpounce.tasks.physics import CONTROL_HZ, Physics, PhysicsState
 from ponderpounce.tasks.rendering import Cameras
 from ponderpounce.tasks.scene import FRONT, table_scene
 from ponderpounce.tasks.task import DIFFICULTIES, Subtask, Task, TaskError, make_task
@@ -28,7 +29,7 @@ MAX_STEPS = 1300  # the paper's limit; upstream's own default is 10000
 class Snapshot:
     """What the robot and its cameras say at one instant, before the next action. Its arrays belong to it alone."""
 
-    step: int  # control steps since reset
+    step: int  # control steps since reset returned; in a demonstration, frames since it began
     frames: Mapping[str, NDArray[np.uint8]]  # camera name -> (image_px, image_px, 3) RGB; empty without rendering
     state: NDArray[np.float32]  # (8,): seven joints [rad], one finger's opening [m]
     tcp_pose: NDArray[np.float64]  # (7,): xyz [m], quaternion wxyz
@@ -37,6 +38,7 @@ class Snapshot:
     simple_subgoal: str
     grounded_subgoal: str
     subtask_index: int  # the engine's; the texts follow it one step later, as upstream delivers them
+    is_demonstration: bool = False  # a frame of the conditioning video; outcome and subtask are then those of a start
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,6 +53,7 @@ class EpisodeState:
     memory: Any
     progress: Progress
     caption: Caption
+    video: tuple[Row, ...]
 
 
 def make_environment(
@@ -79,6 +82,7 @@ class Environment:
         self._progress = Progress()
         self._caption: Caption | None = None
         self._step = 0
+        self._video: tuple[Row, ...] = ()
         self.difficulty = ""
 
     @property
@@ -100,7 +104,7 @@ class Environment:
         return self._subtasks
 
     def reset(self, seed: int, difficulty: str | None = None, *, layout: Any = None) -> Snapshot:
-        """Starts an episode and returns its first snapshot.
+        """Starts an episode and returns its first snapshot; a demonstration, if there is one, has been given by then.
 
         The seed alone decides the scene. Without a difficulty it is the seed's remainder by three: easy, medium,
         hard, as upstream. A ``layout`` takes the place of the drawn one. Raises TaskError for an unknown
@@ -112,9 +116,23 @@ class Environment:
         if layout is None:
             layout = self._task.sample(np.random.default_rng(seed), difficulty)
         self._begin(difficulty, layout)
+        parts = self._task.demonstration(layout)
+        self._video, last_action = demonstration.perform(self._task, layout, parts, self.physics, self._look_for)
         # Upstream's reset spends one control step too: the button's cap settles on its spring.
-        self.physics.advance(np.append(panda.HOME_QPOS, 1.0))
+        self.physics.advance(np.append(panda.HOME_QPOS, 1.0) if last_action is None else last_action)
         return self._observe()
+
+    def demonstration(self, rate_hz: int = CONTROL_HZ) -> Iterator[Snapshot]:
+        """Yields the conditioning video of this episode, the first frame and every so many after; nothing without one.
+
+        It can be watched at any time and as often as one likes: pictures are rendered as they are asked for, and the
+        episode itself stands still meanwhile. Raises ValueError unless the rate divides 20 Hz.
+        """
+        self._require_episode()
+        if rate_hz < 1 or CONTROL_HZ % rate_hz:
+            raise ValueError(f"a video of {CONTROL_HZ} Hz cannot be shown at {rate_hz} Hz; use 1, 2, 4, 5, 10 or 20")
+        shown = range(0, len(self._video), CONTROL_HZ // rate_hz)
+        return (self._demonstrated(step, self._video[step]) for step in shown)
 
     def step(self, action: ArrayLike) -> Snapshot:
         """Applies an action (8,) for exactly 50 ms and returns what is seen then.
@@ -155,6 +173,7 @@ class Environment:
             memory=self._memory,
             progress=self._progress,
             caption=self._caption,
+            video=self._video,
         )
 
     def restore(self, state: EpisodeState) -> Snapshot:
@@ -164,7 +183,7 @@ class Environment:
         self._begin(state.difficulty, state.layout)
         self.physics.load(state.physics)
         self._step, self._memory = state.step, state.memory
-        self._progress, self._caption = state.progress, state.caption
+        self._progress, self._caption, self._video = state.progress, state.caption, state.video
         return self._snapshot()
 
     def close(self) -> None:
@@ -191,7 +210,7 @@ class Environment:
 
     def _observe(self) -> Snapshot:
         """Stages, remembers, judges and captions the instant the physics is at."""
-        self._task.stage(self.physics, self._layout, self._memory, self._step)
+        self._task.stage(self.physics, self._layout, self._memory, self.physics.elapsed_steps() - 1)
         spoken_of = self._progress.index  # texts change one step after the engine does
         self._memory = self._task.remember(self._memory, self.physics, self._layout)
         self._progress = engine.judge(
@@ -205,19 +224,19 @@ class Environment:
             reason = f"not done after {self._max_steps} steps"
             self._progress = Progress(index=self._progress.index, status=Status.TIMEOUT, reason=reason)
         subtask = self._subtasks[spoken_of]
-        caption = captions.follow(self._caption, spoken_of, subtask.text, lambda: self._look_for(subtask))
+        caption = captions.follow(self._caption, spoken_of, subtask.text, lambda: self._look_for(subtask.grounds))
         if self._progress.status is Status.SUCCESS:
             caption = captions.completed(caption)
         self._caption = caption
         return self._snapshot()
 
-    def _look_for(self, subtask: Subtask) -> list[captions.Pixel] | None:
-        """Where the front camera sees the subtask's objects; None if one of them is hidden.
+    def _look_for(self, bodies: Sequence[str]) -> list[captions.Pixel] | None:
+        """Where the front camera sees bodies; None if one of them is hidden.
 
         Texts speak of a 256 px image, whatever size is rendered.
         """
         points = []
-        for body in subtask.grounds:
+        for body in bodies:
             pixels = sight.visible_pixels(self.physics, FRONT, body, IMAGE_PX)
             point = sight.mean_pixel(pixels)
             if point is None:
@@ -225,19 +244,31 @@ class Environment:
             points.append(point)
         return points
 
+    def _demonstrated(self, step: int, row: Row) -> Snapshot:
+        """A frame of the video, seen through a world that is put back as it was."""
+        now = self.physics.save()
+        self.physics.load(row.physics)
+        snapshot = self._seen(step, Progress(), row.caption, is_demonstration=True)
+        self.physics.load(now)
+        return snapshot
+
     def _snapshot(self) -> Snapshot:
         assert self._caption is not None
+        return self._seen(self._step, self._progress, self._caption)
+
+    def _seen(self, step: int, progress: Progress, caption: Caption, *, is_demonstration: bool = False) -> Snapshot:
         opening_m = self.physics.finger_openings_m()[:1]
         return Snapshot(
-            step=self._step,
+            step=step,
             frames={} if self._cameras is None else self._cameras.frames(),
             state=np.concatenate([self.physics.arm_qpos(), opening_m]).astype(np.float32),
             tcp_pose=pose_of(self.physics.tcp_transform()),
-            status=self._progress.status,
-            reason=self._progress.reason,
-            simple_subgoal=self._caption.simple,
-            grounded_subgoal=self._caption.grounded,
-            subtask_index=self._progress.index,
+            status=progress.status,
+            reason=progress.reason,
+            simple_subgoal=caption.simple,
+            grounded_subgoal=caption.grounded,
+            subtask_index=progress.index,
+            is_demonstration=is_demonstration,
         )
 
     def _require_episode(self) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ponderpounce.tasks import timing
+from ponderpounce.tasks.containers import GRIP_Z_M
 from ponderpounce.tasks.geometry import Array, transform
 from ponderpounce.tasks.kinematics import Kinematics, UnreachableError
 from ponderpounce.tasks.physics import CONTROL_HZ, Physics
@@ -90,6 +91,10 @@ class Motions:
     def pick(self, cube: str) -> Actions:
         """Grasps a cube from above and lifts it, turning as little as the arm's limits allow."""
         yield from self._grasp(cube, from_z_m=_ABOVE_M, grasp_z_m=self._physics.position_m(cube)[2])
+
+    def pick_container(self, container: str) -> Actions:
+        """Grasps a standing container by the block on its lid and lifts it high enough to show what it hid."""
+        yield from self._grasp(container, from_z_m=_HIGH_M, grasp_z_m=GRIP_Z_M)
 
     def put_down(self, release_z_m: float) -> Actions:
         """Lowers the tool straight down to a height, lets go, and comes back up."""

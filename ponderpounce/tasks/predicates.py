@@ -15,6 +15,7 @@ _PRESSED_M = 0.005
 _ONTO_M = 0.05
 _HOVER_M, _HOVER_Z_M = 0.03, 0.2
 _AWAY_M = _OPEN_M = 0.02
+_CONTAINER_LIFTED_Z_M, _CONTAINER_DOWN_Z_M, _TOOL_CLEAR_Z_M = 0.15, 0.07, 0.05
 
 
 def is_picked(physics: Physics, cube: str) -> bool:
@@ -62,6 +63,18 @@ def is_hovering(physics: Physics, button: str) -> bool:
     """The tool point is within 3 cm of the button seen from above, and lower than 20 cm."""
     tool_m = physics.tcp_transform()[:3, 3]
     return _distance_on_table_m(tool_m, physics.position_m(button)) <= _HOVER_M and bool(tool_m[2] < _HOVER_Z_M)
+
+
+def is_container_lifted(physics: Physics, container: str) -> bool:
+    """The container's origin is more than 15 cm above the table, whatever holds it there."""
+    return bool(physics.position_m(container)[2] > _CONTAINER_LIFTED_Z_M)
+
+
+def is_container_put_down(physics: Physics, container: str) -> bool:
+    """The container's origin is at most 7 cm above the table, not held, and the tool is clear of the table."""
+    is_low = physics.position_m(container)[2] <= _CONTAINER_DOWN_Z_M
+    is_tool_clear = physics.tcp_transform()[2, 3] > _TOOL_CLEAR_Z_M
+    return bool(is_low and is_tool_clear and not physics.is_grasped(container))
 
 
 def _distance_on_table_m(a_m: Array, b_m: Array) -> float:

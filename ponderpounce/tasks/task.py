@@ -52,6 +52,16 @@ class Subtask:
     grounds: tuple[str, ...] = ()  # bodies whose pixels fill the template's coordinates, in order
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shown:
+    """One part of a demonstration: what the robot does in it, and the text that goes with it. It cannot fail."""
+
+    text: str  # template, see `captions`
+    motion: Callable[[Motions], Iterator[NDArray[np.float32]]]
+    grounds: tuple[str, ...] = ()  # as in a subtask
+    is_recorded: bool = True  # False: it happens, but the video leaves it out
+
+
 class Task(ABC, Generic[LayoutT, MemoryT]):
     """One kind of episode. Subclasses carry `@task(family=...)`, one file each.
 
@@ -80,6 +90,13 @@ class Task(ABC, Generic[LayoutT, MemoryT]):
     @abstractmethod
     def subtasks(self, layout: LayoutT) -> tuple[Subtask, ...]:
         """Returns the ordered list of subtasks."""
+
+    def demonstration(self, layout: LayoutT) -> tuple[Shown, ...]:
+        """Returns what happens before the robot is asked to act. The default is nothing.
+
+        The clock of `stage` runs through it; the memory of it is gone when the episode proper begins.
+        """
+        return ()
 
     @abstractmethod
     def remember(self, memory: MemoryT | None, physics: Physics, layout: LayoutT) -> MemoryT:

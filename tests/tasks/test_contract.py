@@ -53,14 +53,14 @@ def facts(snapshot: Snapshot) -> tuple[Any, ...]:
 
 
 def is_inside_outline(env: Environment, body: str, yx_px: tuple[int, int]) -> bool:
-    """True if a pixel lies in the picture of the body's bounding sphere, by upstream's own camera formula."""
+    """True if a pixel lies in the picture of the bounding sphere of one of the body's geoms, by upstream's formula."""
     entry = env.physics.model.body(body)
-    geom = int(entry.geomadr[0])
-    x, y, z = env.physics.data.geom_xpos[geom]
+    geoms = range(int(entry.geomadr[0]), int(entry.geomadr[0] + entry.geomnum[0]))
+    x, y, z = env.physics.data.geom_xpos[geoms].T
     depth_m = -0.4472 * x - 0.8944 * z + 0.4919
-    center_yx_px = 128 + 128 * np.array([0.8944 * x - 0.4472 * z - 0.0894, y]) / depth_m
-    radius_px = 128 * env.physics.model.geom_rbound[geom] / depth_m
-    return bool(np.linalg.norm(np.add(yx_px, 0.5) - center_yx_px) <= radius_px + 2)
+    centers_yx_px = 128 + 128 * np.stack([0.8944 * x - 0.4472 * z - 0.0894, y], axis=1) / depth_m[:, None]
+    radii_px = 128 * env.physics.model.geom_rbound[geoms] / depth_m
+    return bool(np.any(np.linalg.norm(np.add(yx_px, 0.5) - centers_yx_px, axis=1) <= radii_px + 2))
 
 
 @every_task
@@ -269,12 +269,56 @@ def test_an_unknown_difficulty_is_refused(environment: EnvironmentOf, name: str)
 
 
 @every_task
+@every_difficulty
+def test_a_video_can_be_watched_at_any_time_and_changes_nothing(
+    environment: EnvironmentOf, name: str, difficulty: str
+) -> None:
+    env = environment(name)
+    env.reset(SEED, difficulty)
+    actions = list(islice(env.oracle(), 3))
+    unwatched = [facts(env.step(action)) for action in actions]
+    env.reset(SEED, difficulty)
+    every_second = [facts(frame) for frame in env.demonstration(1)]
+    frames, watched = env.demonstration(), []
+    for action in actions:
+        next(frames, None)  # half watched
+        watched.append(facts(env.step(action)))
+    assert watched == unwatched
+    saved = env.save()
+    env.reset(SEED + 1, difficulty)
+    env.restore(saved)
+    assert [facts(frame) for frame in env.demonstration()][::20] == every_second
+
+
+@every_task
+def test_frames_of_a_video_are_well_formed(environment: EnvironmentOf, name: str) -> None:
+    env = environment(name)
+    env.reset(SEED)
+    for step, frame in enumerate(env.demonstration()):
+        assert frame.is_demonstration
+        assert frame.step == step
+        assert frame.status is Status.ONGOING
+        assert np.isfinite(frame.state).all()
+        assert frame.simple_subgoal
+        assert "<>" not in frame.grounded_subgoal
+    assert not env.step(HOME).is_demonstration
+
+
+@every_task
+@pytest.mark.parametrize("rate_hz", [0, -1, 3, 40])
+def test_a_video_has_no_frames_between_its_frames(environment: EnvironmentOf, name: str, rate_hz: int) -> None:
+    environment(name).reset(SEED)
+    with pytest.raises(ValueError, match=f"20 Hz cannot be shown at {rate_hz} Hz; use 1, 2, 4, 5, 10 or 20"):
+        environment(name).demonstration(rate_hz)
+
+
+@every_task
 def test_another_process_walks_the_same_trajectory(environment: EnvironmentOf, name: str) -> None:
     script = f"""
 import hashlib, itertools
 from ponderpounce.tasks.environment import make_environment
 env = make_environment({name!r}, render=False)
-env.reset({SEED}, "medium")
+env.reset({SEED}, "hard")
 digest = hashlib.sha256()
 for action in itertools.islice(env.oracle(), 100):
     digest.update(env.step(action).state.tobytes() + env.physics.data.qpos.tobytes())
@@ -291,7 +335,7 @@ raise SystemExit(digest.hexdigest())
     assert re.fullmatch("[0-9a-f]{64}", first), first
 
     env = environment(name)
-    env.reset(SEED, "medium")
+    env.reset(SEED, "hard")
     digest = hashlib.sha256()
     for action in islice(env.oracle(), 100):
         digest.update(env.step(action).state.tobytes() + env.physics.data.qpos.tobytes())

@@ -1,0 +1,39 @@
+"""VideoUnmaskSwap: cubes are covered in a video, and then containers change places.
+
+What must be remembered is not a place but which container has gone where.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ponderpounce.tasks.permanence.scenes import NUM_SHUFFLED, Layout, shuffled
+from ponderpounce.tasks.permanence.unmask import Unmask, watching
+from ponderpounce.tasks.placing import until_it_fits
+from ponderpounce.tasks.task import Shown, task
+
+_TRIANGLE_M = ((-0.05, -0.1), (-0.05, 0.1), (0.1, 0.0))
+_LINE_M = ((0.0, -0.15), (0.0, 0.15), (0.0, 0.0))
+_SQUARE_M = ((-0.05, -0.1), (-0.05, 0.1), (0.1, 0.1), (0.1, -0.1))
+
+
+@task(family="permanence")
+class VideoUnmaskSwap(Unmask):
+    """Pick up the containers that hide cubes seen in the video, wherever they have moved since."""
+
+    max_containers = max(NUM_SHUFFLED.values())
+    num_buttons = 0
+    preamble = "watch the video carefully"
+
+    def sample(self, rng: np.random.Generator, difficulty: str) -> Layout:
+        return until_it_fits(lambda: _draw(rng, difficulty))
+
+    def demonstration(self, layout: Layout) -> tuple[Shown, ...]:
+        return watching(layout)
+
+
+def _draw(rng: np.random.Generator, difficulty: str) -> Layout:
+    threes = (_TRIANGLE_M, _LINE_M)
+    centers_m = _SQUARE_M if NUM_SHUFFLED[difficulty] == 4 else threes[int(rng.integers(2))]
+    c, s = np.cos(angle_rad := rng.uniform(0.0, 2 * np.pi)), np.sin(angle_rad)
+    return shuffled(rng, difficulty, [(float(c * x - s * y), float(s * x + c * y)) for x, y in centers_m])
