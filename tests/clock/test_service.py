@@ -245,6 +245,9 @@ def test_a_lost_server_is_told_and_told_when_it_is_back(watchful: Any, episode_i
     watchful.bus.end_alive(key)
     watchful.clock.step()
     watchful.bus.declare_alive(key)
+    watchful.links["pounce"].publish(
+        topics.HEALTH, m.Health(state=m.ServingState.READY, open_episode="ep-1"), at_ns=0, clock_id="host/monotonic"
+    )
     watchful.clock.step()
     take()
     names = [event.name for event in watchful.said[m.Event]]
