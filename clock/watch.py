@@ -39,9 +39,7 @@ class Watch:
         seen = self._seen.setdefault(proc, _Seen())
         seen.has_token = is_alive
         if not is_alive:
-            seen.health = (
-                None  # of a process that is no more; its successor's token may come before its first heartbeat
-            )
+            seen.health = None  # of a process that is no more: it cannot speak for its successor
 
     def health_of(self, proc: str) -> Health | None:
         """The newest heartbeat of a server that is there; None if it is not."""
