@@ -49,7 +49,7 @@ class Player:
         self.ticks: list[m.Tick] = []
         self.events: list[m.Event] = []
         self._machine = machine
-        machine.hush()
+        machine.forget_old_episodes()
         command = [sys.executable, "-m", "sim_client", "--mode", "realtime", "--no-progress", "--out", str(out)]
         command += ["--link.connect", *machine.endpoints.values(), machine.at_ear, *arguments]
         out.mkdir(parents=True, exist_ok=True)
@@ -91,6 +91,8 @@ class Machine:
         self._ticks: Stream[m.Tick] = link.subscribe(TICK, keep=4096)
         self._events: Stream[m.Event] = link.subscribe(EVENT, keep=4096)
         self._players: list[subprocess.Popen[bytes]] = []
+        self._heard: set[str] = set()
+        self._over: set[str] = set()
 
     def play(self, out: Path, *arguments: str) -> Player:
         player = Player(self, out, *arguments)
@@ -114,14 +116,18 @@ class Machine:
         self._daemons.start(name, _MODULES[name], arguments)
 
     def listen(self, ticks: list[m.Tick], events: list[m.Event]) -> None:
+        """Adds what is said in the newest episode."""
         self._bus.wait(10_000_000)
-        ticks += self._ticks.drain()
-        events += self._events.drain()
+        ticks += [tick for tick in self._ticks.drain() if self._is_new(tick.header.episode)]
+        events += [event for event in self._events.drain() if self._is_new(event.header.episode)]
 
-    def hush(self) -> None:
-        """Forgets what was said before."""
-        self._ticks.drain()
-        self._events.drain()
+    def forget_old_episodes(self) -> None:
+        """A thawed clock service still has something to say about an episode that is over."""
+        self._over |= self._heard
+
+    def _is_new(self, episode: str) -> bool:
+        self._heard.add(episode)
+        return episode not in self._over
 
     def end(self) -> None:
         for player in self._players:
