@@ -158,7 +158,7 @@ class Conductor:
         effects: list[Effect] = []
         if self._newest is not None and self._newest.status != TaskStatus.ONGOING:
             self.stage = Stage.ENDED
-        self._stamp_answers(now_ns, effects)
+        self._settle(now_ns, effects)
         if self.stage == Stage.WAIT_OBSERVATION and self._newest is not None:
             self._ask_ponder(self._newest, effects)
             self._query_due_ns = self._newest.source_ns + self.info.schedule.query_period_ns
@@ -170,7 +170,7 @@ class Conductor:
             self._invoke_due_tick = self.info.schedule.invoke_period_ticks
             self.stage = Stage.WAIT_CHUNK
         if self.stage == Stage.WAIT_CHUNK:
-            self._stamp_answers(now_ns, effects)
+            self._settle(now_ns, effects)
             if self._chunks:
                 self._start(now_ns)
             elif not self._is_lockstep and not self._is_busy(self._invocations, now_ns, self._chunk_ns):
