@@ -200,7 +200,8 @@ DELAYS = st.sampled_from(
 
 @given(seed=st.integers(0, 2**32 - 1), query_delay=DELAYS, invoke_delay=DELAYS, period=st.integers(1, 20))
 @example(seed=0, query_delay=schedules.MEASURED, invoke_delay=schedules.TRAINING_DELAY, period=1)  # due between ticks
-@settings(max_examples=25, deadline=None)
+@example(seed=4, query_delay=schedules.FIXED_300_MS, invoke_delay=schedules.FIXED_300_MS, period=2)  # due together
+@settings(max_examples=40, deadline=None)
 def test_lockstep_does_not_depend_on_when_answers_come(
     episode_info: Info, seed: int, query_delay: m.Delay, invoke_delay: m.Delay, period: int
 ) -> None:
