@@ -37,5 +37,5 @@ def paper() -> Schedule:
 
 
 def realtime() -> Schedule:
-    """What a real clock can keep: POUNCE every 10 ticks, so that d <= 10 - 0 rows may pass while it thinks."""
+    """What a real clock can keep: POUNCE every 10 ticks, so up to H - s = 10 ticks may pass while it thinks."""
     return replace(paper(), mode=Mode.REALTIME, invoke_period_ticks=10, query_delay=MEASURED, invoke_delay=MEASURED)

@@ -7,9 +7,12 @@ import platform
 import signal
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from types import FrameType
 
 from protocol.bus import Bus
+
+_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 IDLE_WAIT_NS = 20_000_000  # an idle daemon looks up this often: its heartbeat depends on it
 
@@ -42,5 +45,12 @@ def set_up_logging(level: str = "INFO") -> None:
 
 
 def host_clock_id() -> str:
-    """Name of this host's monotonic clock: processes with the same id can compare instants."""
-    return f"{platform.node() or 'host'}/monotonic"
+    """Name of this kernel's monotonic clock: processes with the same id can compare instants.
+
+    The kernel's boot id, because two hosts may share a name, and containers of one kernel do not.
+    """
+    try:
+        kernel = _BOOT_ID.read_text().strip()[:8]
+    except OSError:  # not Linux
+        kernel = platform.node() or "host"
+    return f"{kernel}/monotonic"

@@ -56,7 +56,7 @@ class Endpoints:
             if not is_loopback(endpoint) and not (endpoint.startswith(("tls/", "quic/")) and self.tls):
                 raise TransportError(
                     f"endpoint {endpoint} can be reached from other hosts and is not encrypted. "
-                    f"Use a loopback address, or tls/HOST:PORT with --tls.ca, --tls.certificate and --tls.key."
+                    "Use a loopback address, or tls/HOST:PORT with --link.tls-ca, --link.tls-certificate, --link.tls-key."
                 )
 
     @property
