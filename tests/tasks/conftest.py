@@ -5,15 +5,17 @@ from __future__ import annotations
 import functools
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("MUJOCO_GL", "egl")  # before anything imports mujoco
 
+import numpy as np
 import pytest
 
-from ponderpounce.tasks.environment import Environment, make_environment
+from ponderpounce.tasks.engine import Status
+from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
 from ponderpounce.tasks.physics import Physics
 from ponderpounce.tasks.placing import PlacedCube
 from ponderpounce.tasks.reference.pick_highlight import Layout
@@ -24,6 +26,20 @@ from ponderpounce.tasks.scene import add_button, add_cube, add_disc, table_scene
 def environment() -> Callable[[str], Environment]:
     """Returns one environment without cameras per task name; building a scene takes longer than resetting it."""
     return functools.cache(lambda name: make_environment(name, render=False))
+
+
+@pytest.fixture(scope="session")
+def play() -> Callable[[Environment, Iterable[np.ndarray]], Snapshot]:
+    """Steps an environment through actions until they or the episode end; returns the last snapshot."""
+
+    def through(env: Environment, actions: Iterable[np.ndarray]) -> Snapshot:
+        for action in actions:
+            snapshot = env.step(action)
+            if snapshot.status is not Status.ONGOING:
+                break
+        return snapshot
+
+    return through
 
 
 @pytest.fixture(scope="session")
