@@ -30,6 +30,7 @@ _PRIORITIES = {
     Priority.DATA: zenoh.Priority.DATA,
     Priority.BACKGROUND: zenoh.Priority.BACKGROUND,
 }
+_QUEUES = ("control", "real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background")
 _MAX_PUBLISHERS = 256
 
 
@@ -56,7 +57,8 @@ class Endpoints:
             if not is_loopback(endpoint) and not (endpoint.startswith(("tls/", "quic/")) and self.tls):
                 raise TransportError(
                     f"endpoint {endpoint} can be reached from other hosts and is not encrypted. "
-                    "Use a loopback address, or tls/HOST:PORT with --link.tls-ca, --link.tls-certificate, --link.tls-key."
+                    "Use a loopback address, or tls/HOST:PORT with --link.tls-ca, --link.tls-certificate and "
+                    "--link.tls-key."
                 )
 
     @property
@@ -96,8 +98,9 @@ def zenoh_config(endpoints: Endpoints) -> zenoh.Config:
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 400, "period_increase_factor": 2},
         "transport/link/tx/lease": LEASE_MS,
         "transport/link/tx/keep_alive": 5,
-        # A raw observation is seven batches of 64 kB; with the default of two the sender must sleep before it is out.
-        "transport/link/tx/queue/size/data_high": 16,
+        # Sixteen batches per class, the most there are; the default is two. A raw observation is seven of them, and the
+        # clock's poll says several small things at once: on a busy host the third would be dropped after 1 ms.
+        **{f"transport/link/tx/queue/size/{name}": 16 for name in _QUEUES},
         "transport/shared_memory/enabled": endpoints.shared_memory and endpoints.are_local,
     }
     if endpoints.tls:
