@@ -14,8 +14,10 @@ os.environ.setdefault("MUJOCO_GL", "egl")  # before anything imports mujoco
 import numpy as np
 import pytest
 
+from ponderpounce.tasks import panda
 from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
+from ponderpounce.tasks.geometry import pose
 from ponderpounce.tasks.physics import Physics
 from ponderpounce.tasks.placing import PlacedCube
 from ponderpounce.tasks.reference.pick_highlight import Layout
@@ -40,6 +42,32 @@ def play() -> Callable[[Environment, Iterable[np.ndarray]], Snapshot]:
         return snapshot
 
     return through
+
+
+@pytest.fixture(scope="session")
+def until_subtask() -> Callable[[Environment, int], Snapshot]:
+    """Plays the oracle's episode up to the step that makes a subtask current; returns that snapshot."""
+
+    def until(env: Environment, index: int) -> Snapshot:
+        for action in env.oracle():
+            snapshot = env.step(action)
+            if snapshot.subtask_index == index:
+                return snapshot
+        raise AssertionError(f"the oracle never came to subtask {index}")
+
+    return until
+
+
+@pytest.fixture(scope="session")
+def hoist() -> Callable[[Environment, str], Snapshot]:
+    """Lets a prop hang in the air for one step, as if somebody had lifted it; returns what is seen then."""
+
+    def hang(env: Environment, name: str) -> Snapshot:
+        env.physics.place(name, pose(0.3, 0.4, 0.3))
+        env.physics.refresh()
+        return env.step(np.append(panda.HOME_QPOS, 1.0))
+
+    return hang
 
 
 @pytest.fixture(scope="session")
