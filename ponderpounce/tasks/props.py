@@ -54,8 +54,13 @@ def add_bin(spec: mujoco.MjSpec, name: str) -> None:
     inner_m = BIN_HALF_M[0] - 2 * _BIN_WALL_HALF_M
     along_x = [BIN_HALF_M[0], _BIN_WALL_HALF_M, half_height_m]
     along_y = [_BIN_WALL_HALF_M, inner_m, half_height_m]
-    walls = (([0, offset_m, 0], along_x), ([0, -offset_m, 0], along_x), ([-offset_m, 0, 0], along_y))
-    for side, (pos, size) in enumerate((*walls, ([offset_m, 0, 0], along_y))):
+    walls = (
+        ([0.0, offset_m, 0.0], along_x),
+        ([0.0, -offset_m, 0.0], along_x),
+        ([offset_m, 0.0, 0.0], along_y),
+        ([-offset_m, 0.0, 0.0], along_y),
+    )
+    for side, (pos, size) in enumerate(walls):
         body.add_geom(
             name=f"{name}/{side}",
             type=mujoco.mjtGeom.mjGEOM_BOX,
@@ -71,7 +76,7 @@ def add_bin(spec: mujoco.MjSpec, name: str) -> None:
     body.add_geom(
         name=f"{name}/floor",
         type=mujoco.mjtGeom.mjGEOM_BOX,
-        pos=[0, 0, -half_height_m / 2],
+        pos=[0.0, 0.0, -half_height_m / 2],
         size=[inner_m, inner_m, half_height_m / 2],
         rgba=(0, 0, 0, 1),
         **_seen_only(),

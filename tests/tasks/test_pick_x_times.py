@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ponderpounce.tasks import panda
 from ponderpounce.tasks.counting.pick_x_times import PickXtimes
 from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import Environment, Snapshot
@@ -18,7 +17,6 @@ from ponderpounce.tasks.scene import BUTTON_HALF_M, CUBE_COLORS
 from ponderpounce.tasks.task import DIFFICULTIES
 
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]
-HOME = np.append(panda.HOME_QPOS, 1.0)
 NUM_CUBES = {"easy": 1, "medium": 3, "hard": 3}
 REPEATS = {"easy": {1, 2, 3}, "medium": {1, 2, 3}, "hard": {4, 5}}
 

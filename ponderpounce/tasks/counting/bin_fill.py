@@ -88,12 +88,14 @@ class BinFill(Task[Layout, Memory]):
                 cube.put(physics, name)
 
     def stage(self, physics: Physics, layout: Layout, memory: Memory | None, step: int) -> None:
-        for name, cube in zip(_CUBES, layout.cubes, strict=False):
-            if step > 0 and layout.appears_at_step(name) == step:
-                cube.put(physics, name)
-        for name in memory.binned if memory else ():
+        appearing = [name for name in _CUBES[: len(layout.cubes)] if layout.appears_at_step(name) == step > 0]
+        vanishing = memory.binned[-1:] if memory else ()  # those before it have gone already
+        for name in appearing:
+            layout.cubes[_CUBES.index(name)].put(physics, name)
+        for name in vanishing:
             physics.park(name)
-        physics.refresh()
+        if appearing or vanishing:
+            physics.refresh()
 
     def instruction(self, layout: Layout) -> str:
         counts = dict(layout.wanted)
