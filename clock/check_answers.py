@@ -40,6 +40,7 @@ class Answers:
     chunks: dict[int, ActionChunk] = field(default_factory=dict)
     ready: list[Ready] = field(default_factory=list)
     chunk_ready_ns: dict[int, int] = field(default_factory=dict)
+    first_ticks: dict[int, int] = field(default_factory=dict)  # by chunk: the first tick decided after it was ready
 
     def admitted(self, now_ns: int) -> list[Chunk]:
         """The chunks that could be played at ``now_ns``."""
@@ -50,6 +51,7 @@ class Answers:
                 rows_NA=chunk.rows_NA,
                 ref_query=chunk.ref_query,
                 age_ns=chunk.age_ns,
+                first_tick=self.first_ticks.get(index),
             )
             for index, chunk in self.chunks.items()
             if index in self.chunk_ready_ns and self.chunk_ready_ns[index] <= now_ns
@@ -71,6 +73,9 @@ def answers_of(record: EpisodeRecord) -> Answers:
     for stamp in record.stamps:
         if stamp.kind == StampKind.CHUNK:
             answers.chunk_ready_ns[stamp.index] = stamp.ready_ns
+            decided = (t.tick for t in record.ticks if t.level != Level.SKIPPED and t.decided_ns >= stamp.ready_ns)
+            if (first_tick := next(decided, None)) is not None:
+                answers.first_ticks[stamp.index] = first_tick
         else:
             answers.ready.append(
                 Ready(

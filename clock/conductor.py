@@ -12,7 +12,7 @@ and hold the initial command until then.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
@@ -64,6 +64,8 @@ class _Asked:
     index: int
     source_ns: int
     delay_ns: int | None
+    terms: tuple[int, int | None, int] = (0, None, 0)
+    """Of an invocation: tick of row 0, ref(j) and Delta(j), which its chunk must repeat."""
     answer: Cognition | ActionChunk | None = None
     arrived_ns: int = 0
 
@@ -132,8 +134,11 @@ class Conductor:
         return _take(self._queries, cognition.query, cognition, cognition.infer_ns, now_ns, self._is_lockstep)
 
     def on_chunk(self, chunk: ActionChunk, now_ns: int) -> bool:
-        """Takes POUNCE's answer; False if nobody asked for it, or it has another shape than agreed."""
+        """Takes POUNCE's answer; False if nobody asked for it, or its shape or terms are not those asked for."""
         if (chunk.horizon, chunk.action_dim) != (self.info.schedule.horizon, self.info.robot.action_dim):
+            return False
+        terms = (chunk.t_row0, chunk.ref_query, chunk.age_ns)
+        if not any(a.index == chunk.invocation and a.terms == terms for a in self._invocations):
             return False
         return _take(self._invocations, chunk.invocation, chunk, chunk.infer_ns, now_ns, self._is_lockstep)
 
@@ -173,7 +178,7 @@ class Conductor:
             self._settle(now_ns, effects)
             if self._chunks:
                 self._start(now_ns)
-            elif not self._is_lockstep and not self._is_busy(self._invocations, now_ns, self._chunk_ns):
+            elif not self._is_lockstep and not self._is_busy(self._invocations, now_ns, self._overdue_ns):
                 # lost on its way, refused, or POUNCE died: ask again
                 self.stage = Stage.WAIT_COGNITION
         while self.stage == Stage.RUNNING and self.deadline_ns(self.tick) <= now_ns:
@@ -217,9 +222,11 @@ class Conductor:
         return any(a.answer is None and now_ns - a.source_ns < overdue_ns for a in asked)
 
     @property
-    def _chunk_ns(self) -> int:
-        """Duration of a chunk: later than this after its invocation, none of its rows can be played."""
-        return self.info.schedule.horizon * NS_PER_S // self.info.schedule.control_hz
+    def _overdue_ns(self) -> int:
+        """An invocation is given up while the chunk before it still has rows enough to bridge the next one."""
+        schedule = self.info.schedule
+        ticks = max(schedule.invoke_period_ticks, schedule.horizon - schedule.invoke_period_ticks)
+        return ticks * NS_PER_S // schedule.control_hz
 
     @property
     def owed_query(self) -> int | None:
@@ -291,7 +298,7 @@ class Conductor:
                     "invocation_skipped",
                     "POUNCE is away: no invocations until it is back",
                 )
-            elif self._is_lockstep or not self._is_busy(self._invocations, tau_ns, self._chunk_ns):
+            elif self._is_lockstep or not self._is_busy(self._invocations, tau_ns, self._overdue_ns):
                 self._ask_pounce(self.tick, tau_ns, effects)
                 while self._invoke_due_tick <= self.tick:
                     self._invoke_due_tick += self.info.schedule.invoke_period_ticks
@@ -307,13 +314,14 @@ class Conductor:
     def _ask_pounce(self, tick: int, tau_ns: int, effects: list[Effect]) -> None:
         reference = refer(self._ready, tau_ns, self.info.schedule.delivery)
         delay = modelled_ns(self.info.schedule.invoke_delay, self._invoke_rng)
-        asked = _Asked(self.num_invocations, tau_ns, delay)
+        row0_tick = self._newest.tick if self._newest is not None else tick
+        asked = _Asked(self.num_invocations, tau_ns, delay, (row0_tick, reference.query, reference.age_ns))
         self._invocations.append(asked)
         tail = self._unplayed_rows(tick)
         effects.append(
             Invocation(
                 invocation=asked.index,
-                tick=self._newest.tick if self._newest is not None else tick,
+                tick=row0_tick,
                 now_ns=tau_ns,
                 ref_query=reference.query,
                 age_ns=reference.age_ns,
@@ -381,6 +389,7 @@ class Conductor:
 
     def _play(self, now_ns: int, effects: list[Effect]) -> None:
         schedule, robot = self.info.schedule, self.info.robot
+        self._chunks = [c if c.first_tick is not None else replace(c, first_tick=self.tick) for c in self._chunks]
         usable = [c for c in covering(self._chunks, self.tick) if c.age_ns <= schedule.stale_limit_ns]
         raw, row, hit = _NO_FLOATS, None, Hit.NONE
         if usable:

@@ -25,6 +25,7 @@ class Chunk:
     rows_NA: Floats
     ref_query: int | None
     age_ns: int
+    first_tick: int | None = None  # the first tick decided with it at hand: its rows before that were past when it came
 
 
 def deadline_ns(start_ns: int, tick: int, rate_hz: int) -> int:
@@ -60,8 +61,8 @@ def switch(chunks: Sequence[Chunk], tick: int) -> Floats:
 def offset_fade(fade_ticks: int) -> Join:
     """Cancels the jump at the switch and fades the correction out linearly over ``fade_ticks``.
 
-    The jump is what the previous chunk would have said at the new chunk's first played tick minus what the new one
-    says there, both pure functions of the chunks: no state, so the log re-derives it.
+    The jump is what the previous chunk says at the first tick that the new one can play, minus what the new one says
+    there: pure functions of the chunks and of when they came, so the log re-derives it.
     """
 
     def join(chunks: Sequence[Chunk], tick: int) -> Floats:
@@ -69,11 +70,12 @@ def offset_fade(fade_ticks: int) -> Join:
         if len(chunks) < 2:
             return row
         new, old = chunks[-1], chunks[-2]
-        since = tick - new.t_row0
+        switched = new.t_row0 if new.first_tick is None else max(new.t_row0, new.first_tick)
+        since = tick - switched
         weight = max(0.0, 1.0 - since / fade_ticks) if fade_ticks else 0.0
-        if weight == 0.0 or row_of(old, new.t_row0) is None:
+        if weight == 0.0 or row_of(old, switched) is None:
             return row
-        jump = _row(old, new.t_row0) - _row(new, new.t_row0)
+        jump = _row(old, switched) - _row(new, switched)
         jump[-1] = 0.0  # the gripper is a switch, not a coordinate
         return (row + np.float32(weight) * jump).astype(np.float32)
 

@@ -66,7 +66,7 @@ class Recorder:
 
     def _is_ours(self, message: object) -> bool:
         header: m.Header = message.header  # type: ignore[attr-defined]
-        return header.episode == self._link.episode
+        return (header.episode, header.epoch) == (self._link.episode, self._link.epoch)
 
     def _remember(self, message: object) -> None:
         if isinstance(message, m.Tick):

@@ -6,9 +6,9 @@ import numpy as np
 
 from ponderpounce.tasks import panda
 from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import IMAGE_PX, Snapshot
+from ponderpounce.tasks.environment import IMAGE_PX, Environment, Snapshot
 from protocol import images
-from protocol.messages import Image, ImageCodec, Observation, Robot, TaskStatus
+from protocol.messages import DemoFrame, Image, ImageCodec, Observation, Robot, TaskStatus
 
 CAMERAS = ("front", "wrist")
 CONTROL_HZ = 20
@@ -41,19 +41,28 @@ def simulated_panda(initial_state: np.ndarray) -> Robot:
     )
 
 
+DEMO_HZ = 1  # the paper's rate (B.1)
+
+
+def demonstration(environment: Environment, codec: ImageCodec) -> tuple[DemoFrame, ...]:
+    """The conditioning video as PONDER reads it, before the first query; () for tasks without one."""
+    return tuple(DemoFrame(images=_pictures(frame, codec)) for frame in environment.demonstration(DEMO_HZ))
+
+
 def observation(snapshot: Snapshot, tick: int, source_ns: int, codec: ImageCodec) -> Observation:
     """What the robot says at ``tick``; without images where nothing was rendered."""
-    packed: tuple[Image, ...] = images.pack(
-        {name: snapshot.frames[name] for name in CAMERAS if name in snapshot.frames}, codec
-    )
     return Observation(
         tick=tick,
         source_ns=source_ns,
         proprio=snapshot.state,
-        images=packed,
+        images=_pictures(snapshot, codec),
         status=_STATUS[snapshot.status],
         reason=snapshot.reason,
     )
+
+
+def _pictures(snapshot: Snapshot, codec: ImageCodec) -> tuple[Image, ...]:
+    return images.pack({name: snapshot.frames[name] for name in CAMERAS if name in snapshot.frames}, codec)
 
 
 def status_of(snapshot: Snapshot) -> TaskStatus:

@@ -9,6 +9,7 @@ import platform
 import secrets
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from typing import Any
 from clock.report import statistics, stream_sha256
 from clock.service import ClockService
 from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
+from protocol import images
 from protocol import messages as m
 from protocol.errors import CallFailed, TransportError
 from protocol.link import Link
@@ -24,7 +26,7 @@ from protocol.version import version
 from sim_client.config import SimOptions
 from sim_client.episode import Outcome, RobotSide, play_oracle
 from sim_client.recorder import Recorder
-from sim_client.robot import simulated_panda
+from sim_client.robot import demonstration, simulated_panda
 
 _OPEN_NS = 130_000_000_000
 _CLOSE_NS = 5_000_000_000
@@ -64,8 +66,8 @@ class Suite:
             "versions": versions(),
             "episodes": [],
         }
-        is_seen = self._options.policy == "servers" or self._options.record  # the oracle alone needs no eyes
-        with make_environment(self._options.task, max_steps=self._options.max_steps, render=is_seen) as environment:
+        has_eyes = self._options.policy == "servers" or self._options.record  # the oracle alone needs none
+        with make_environment(self._options.task, max_steps=self._options.max_steps, render=has_eyes) as environment:
             for index in range(self._options.episodes):
                 results["episodes"].append(self._episode(environment, index, on_tick))
                 _write(out / "results.json", results)
@@ -75,7 +77,8 @@ class Suite:
         seed = self._options.seed + index
         first = environment.reset(seed, self._options.difficulty)
         self._link.enter_episode(self._session, f"{self._options.task}-{seed}-{secrets.token_hex(3)}", index + 1)
-        info = self._info(environment, first, seed)
+        demo = self._demonstration(environment)
+        info = replace(self._info(environment, first, seed), has_demo=bool(demo))
         path = self._log_path(info) if self._options.record else None
         side = RobotSide(
             self._link, environment, self._recorder, self._let_others, round(self._options.patience_s * 1e9)
@@ -86,7 +89,7 @@ class Suite:
             outcome, _ = play_oracle(info, side, first, lambda tick: on_tick(index, tick))
         else:
             try:
-                warnings = self._open(info)
+                warnings = self._open(m.OpenRequest(info=info, demo=demo))
                 outcome = side.run(info, first, lambda tick: on_tick(index, tick))
             except TransportError as error:
                 outcome = Outcome(status=m.TaskStatus.ABORTED, reason=str(error), num_ticks=0)
@@ -123,7 +126,12 @@ class Suite:
             policy=self._options.policy,
         )
 
-    def _open(self, info: m.EpisodeInfo) -> tuple[str, ...]:
+    def _demonstration(self, environment: Environment) -> tuple[m.DemoFrame, ...]:
+        if self._options.policy != "servers":
+            return ()
+        return demonstration(environment, images.wire_codec(self._link.bus.is_local))
+
+    def _open(self, request: m.OpenRequest) -> tuple[str, ...]:
         """Asks the clock service until its servers are ready.
 
         Raises:
@@ -132,7 +140,7 @@ class Suite:
         deadline_s = time.monotonic() + self._options.patience_s
         while True:
             try:
-                reply = self._ask_clock(info)
+                reply = self._ask_clock(request)
             except CallFailed as error:
                 reply = m.OpenReply(error=str(error), try_again=True)
             if not reply.error:
@@ -142,10 +150,10 @@ class Suite:
                 raise TransportError(dead or reply.error)
             self._let_others(round(_ASK_AGAIN_S * 1e9))
 
-    def _ask_clock(self, info: m.EpisodeInfo) -> m.OpenReply:
+    def _ask_clock(self, request: m.OpenRequest) -> m.OpenReply:
         if self._clock is not None:  # our own thread: a call over the bus would wait for itself
-            return self._clock.open(m.OpenRequest(info=info))
-        reply: m.OpenReply = self._link.call(OPEN, "clock", m.OpenRequest(info=info), timeout_ns=_OPEN_NS)
+            return self._clock.open(request)
+        reply: m.OpenReply = self._link.call(OPEN, "clock", request, timeout_ns=_OPEN_NS)
         return reply
 
     def _close(self, info: m.EpisodeInfo, result: m.EpisodeResult) -> None:

@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: one thread beats two on two shared cores
+
+import hypothesis
 import numpy as np
 import pytest
+
+import sim_client.headless  # noqa: F401 - before mujoco is imported
+
+# isort: split
 
 from clock import schedules
 from clock.service import ClockService, ServiceConfig
@@ -26,6 +34,9 @@ from protocol.heartbeat import Heartbeat
 from protocol.link import Link
 from protocol.topics import OBSERVATION
 from sim_client.episode import Outcome, RobotSide
+
+hypothesis.settings.register_profile("house", deadline=None)  # a deadline reads the wall clock
+hypothesis.settings.load_profile("house")
 
 ROBOT, CAMERAS, PX, DIM, NUM_PROPRIO = "r0", ("front", "wrist"), 4, 3, 3
 K, H = 2, 8

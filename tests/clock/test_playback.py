@@ -28,12 +28,12 @@ TICKS = st.integers(0, 10**7)
 H, DIM = 8, 3
 
 
-def chunk(invocation: int, t_row0: int, rows_NA: Floats | None = None) -> Chunk:
+def chunk(invocation: int, t_row0: int, rows_NA: Floats | None = None, first_tick: int | None = None) -> Chunk:
     """Rows tell where they come from: (tick, invocation, gripper +-1)."""
     if rows_NA is None:
         gripper = 1.0 if invocation % 2 else -1.0
         rows_NA = np.array([[t_row0 + n, invocation, gripper] for n in range(H)], np.float32)
-    return Chunk(invocation=invocation, t_row0=t_row0, rows_NA=rows_NA, ref_query=0, age_ns=0)
+    return Chunk(invocation=invocation, t_row0=t_row0, rows_NA=rows_NA, ref_query=0, age_ns=0, first_tick=first_tick)
 
 
 ROWS = hnp.arrays(np.float32, (H, DIM), elements=st.floats(-10, 10, width=32))
@@ -110,6 +110,15 @@ def test_switch_plays_the_newest_row_as_it_is(chunks_tick: tuple[list[Chunk], in
 def test_a_fade_is_continuous_at_the_switch(old: Floats, new: Floats, at: int, fade: int) -> None:
     joined = offset_fade(fade)([chunk(0, 0, old), chunk(1, at, new)], at)
     assert joined[:-1] == pytest.approx(old[at, :-1], abs=1e-5)
+
+
+@given(old=ROWS, new=ROWS, at=st.integers(0, H - 2), late=st.integers(1, H - 1), fade=st.integers(1, 20))
+def test_a_fade_is_continuous_where_a_late_chunk_is_first_played(
+    old: Floats, new: Floats, at: int, late: int, fade: int
+) -> None:
+    first = min(at + late, H - 1)
+    joined = offset_fade(fade)([chunk(0, 0, old), chunk(1, at, new, first_tick=first)], first)
+    assert joined[:-1] == pytest.approx(old[first, :-1], abs=1e-5)
 
 
 @given(old=ROWS, new=ROWS, at=st.integers(1, H - 1), fade=st.integers(1, 6))
