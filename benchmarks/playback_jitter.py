@@ -74,7 +74,7 @@ def play(way: Way, options: JitterOptions) -> Played:
     while sum(map(len, episodes)) < options.seconds * 20:
         with tempfile.TemporaryDirectory() as folder, Rig(Path(folder), with_clock=way.with_clock) as rig:
             arguments = ["--task", options.task, "--seed", str(len(episodes)), "--max-steps", str(max(wanted, 1300))]
-            player = rig.play([*arguments, *way.arguments])
+            player = rig.play([*arguments, *way.arguments], Path(folder))
             ticks = _hear(rig, player, wanted, options.seconds + 120.0)
         if len(ticks) <= options.warm_up_ticks:
             raise RuntimeError(f"{way.name}: the episode never ran")

@@ -37,8 +37,9 @@ class Rig:
     """PONDER, POUNCE and, if it is not embedded in the robot's process, the clock service. A context manager."""
 
     def __init__(self, folder: Path, *, with_clock: bool = True) -> None:
-        self.folder = folder
         self.heard: list[Heard] = []
+        self._episodes: set[str] = set()
+        self._over: set[str] = set()
         self.daemons = Daemons(folder)
         self._players: list[subprocess.Popen[bytes]] = []
         endpoints = start_local(self.daemons, robot=ROBOT, with_clock=with_clock, ponder=[], pounce=[])
@@ -49,13 +50,20 @@ class Rig:
         link = Link(self._bus, robot=ROBOT, proc="ear")
         self._streams = [link.subscribe(TICK, keep=_KEEP), link.subscribe(EVENT, keep=_KEEP)]
 
-    def play(self, arguments: Sequence[str]) -> subprocess.Popen[bytes]:
-        """Starts ``sim-client`` in real time against these daemons; its logs and results lie in ``folder``."""
-        command = [sys.executable, "-m", "sim_client", "--mode", "realtime", "--out", str(self.folder), "--no-progress"]
+    def play(self, arguments: Sequence[str], out: Path) -> subprocess.Popen[bytes]:
+        """Starts ``sim-client`` in real time against these daemons; what was heard before is forgotten.
+
+        Args:
+            out: where its results and logs go.
+        """
+        self._over |= self._episodes  # a thawed clock service still has something to say about its old episode
+        self.heard.clear()
+        out.mkdir(parents=True, exist_ok=True)
+        command = [sys.executable, "-m", "sim_client", "--mode", "realtime", "--out", str(out), "--no-progress"]
         command += ["--link.connect", *self._endpoints.values(), self._at_ear, *arguments]
         environment = os.environ | {"OMP_NUM_THREADS": "1", "MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl")}
         player = subprocess.Popen(
-            command, env=environment, stdout=subprocess.DEVNULL, stderr=(self.folder / "sim.log").open("ab")
+            command, env=environment, stdout=subprocess.DEVNULL, stderr=(out / "sim.log").open("ab")
         )
         self._players.append(player)
         return player
@@ -75,8 +83,13 @@ class Rig:
                 return False
             self._bus.wait(5_000_000)
             now_ns = time.monotonic_ns()
-            self.heard += [Heard(message, now_ns) for stream in self._streams for message in stream.drain()]
+            for stream in self._streams:
+                self.heard += [Heard(message, now_ns) for message in stream.drain() if self._is_new(message)]
         return True
+
+    def _is_new(self, message: m.Tick | m.Event) -> bool:
+        self._episodes.add(message.header.episode)
+        return message.header.episode not in self._over
 
     def ticks(self) -> list[m.Tick]:
         return [h.message for h in self.heard if isinstance(h.message, m.Tick)]
