@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from ponderpounce.tasks.geometry import Array, Footprint, pose
+from ponderpounce.tasks.geometry import Footprint, Spot
 from ponderpounce.tasks.panda import ROBOT_BIT, STIFF_SOLIMP, STIFF_SOLREF, WORLD_BIT
 from ponderpounce.tasks.scene import CUBE_HALF_M, WHITE, SceneFullError, sample_footprint
 
@@ -31,24 +30,6 @@ _FRICTION = [0.3, 0.005, 0.0001]
 _VISIBLE, _UNSEEN = 1, 4  # geom groups
 _STUD_RADIUS_M, _STUD_OFFSET_M = 0.002, 0.01
 _FOOT_M = 0.0005  # how far feet reach below the walls
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Spot:
-    """Where something stands on the table, and how it is turned."""
-
-    x_m: float
-    y_m: float
-    yaw_rad: float = 0.0
-
-    @property
-    def xy_m(self) -> tuple[float, float]:
-        """The place without the turn."""
-        return self.x_m, self.y_m
-
-    def pose(self, z_m: float) -> Array:
-        """The pose (7,) of something upright here, its origin at a height."""
-        return pose(self.x_m, self.y_m, z_m, self.yaw_rad)
 
 
 def add_container(spec: mujoco.MjSpec, name: str) -> None:

@@ -84,6 +84,24 @@ def smoothstep(fraction: float) -> float:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Spot:
+    """Where something stands on the table, and how it is turned."""
+
+    x_m: float
+    y_m: float
+    yaw_rad: float = 0.0
+
+    @property
+    def xy_m(self) -> tuple[float, float]:
+        """The place without the turn."""
+        return self.x_m, self.y_m
+
+    def pose(self, z_m: float) -> Array:
+        """The pose (7,) of something upright here, its origin at a height."""
+        return pose(self.x_m, self.y_m, z_m, self.yaw_rad)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Footprint:
     """The rectangle an object covers on the table."""
 

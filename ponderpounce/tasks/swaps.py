@@ -10,8 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ponderpounce.tasks.containers import Spot
-from ponderpounce.tasks.geometry import smoothstep
+from ponderpounce.tasks.geometry import Spot, smoothstep
 
 SWAP_STEPS = 50  # control steps that one swap takes; the next begins when it ends
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ponderpounce.tasks import panda
-from ponderpounce.tasks.containers import EMPTY_Z_M, HIDDEN_HALF_M, HIDING_Z_M, Spot, add_container, draw_spots
-from ponderpounce.tasks.geometry import Footprint, is_clear, pose
+from ponderpounce.tasks.containers import EMPTY_Z_M, HIDDEN_HALF_M, HIDING_Z_M, add_container, draw_spots
+from ponderpounce.tasks.geometry import Footprint, Spot, is_clear, pose
 from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.physics import Physics
 from ponderpounce.tasks.scene import add_cube, table_scene

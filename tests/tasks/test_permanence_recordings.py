@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ponderpounce.tasks.containers import Spot
 from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import Environment, Snapshot
+from ponderpounce.tasks.geometry import Spot
 from ponderpounce.tasks.permanence.scenes import Hidden, Layout
 
 EnvironmentOf = Callable[[str], Environment]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ponderpounce.tasks.containers import Spot
+from ponderpounce.tasks.geometry import Spot
 from ponderpounce.tasks.swaps import SWAP_STEPS, nearest, spots_after
 
 SPOTS = (

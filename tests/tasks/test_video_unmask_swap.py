@@ -11,6 +11,7 @@ from ponderpounce.tasks import swaps
 from ponderpounce.tasks.containers import HIDING_Z_M
 from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import Environment, Snapshot
+from ponderpounce.tasks.geometry import Spot
 from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.permanence.scenes import LANE_M, Layout
 from ponderpounce.tasks.permanence.video_unmask_swap import VideoUnmaskSwap
@@ -30,7 +31,7 @@ def env(environment: Callable[[str], Environment]) -> Environment:
     return environment("VideoUnmaskSwap")
 
 
-def final_spots(layout: Layout) -> tuple[swaps.Spot, ...]:
+def final_spots(layout: Layout) -> tuple[Spot, ...]:
     return swaps.spots_after(layout.containers, layout.swaps, 1000, LANE_M)
 
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ponderpounce.tasks import swaps
-from ponderpounce.tasks.containers import Spot, draw_spots
-from ponderpounce.tasks.geometry import Footprint
+from ponderpounce.tasks.containers import draw_spots
+from ponderpounce.tasks.geometry import Footprint, Spot
 from ponderpounce.tasks.scene import BUTTON_HALF_M, CUBE_COLORS, SceneFullError, sample_footprint
 from ponderpounce.tasks.swaps import SWAP_STEPS, Swap
 

@@ -6,6 +6,9 @@ container when the last swap ends. Source: RoboMME's *Unmask tasks at 598e3b4, r
 
 Kept from upstream on purpose: before observation 32 the containers hover in the sky, and count as lifted. Whoever gets
 a button pressed by then has failed.
+
+Not kept: a swap starts from where the layout put the containers, and pairs the nearest of those places. Upstream reads
+where they are at that instant, which differs only if something has pushed them in the 1.6 s since they were put down.
 """
 
 from __future__ import annotations
@@ -17,8 +20,8 @@ from typing import ClassVar
 import mujoco
 
 from ponderpounce.tasks import predicates, swaps
-from ponderpounce.tasks.containers import EMPTY_Z_M, HIDDEN_HALF_M, HIDING_Z_M, Spot, add_container
-from ponderpounce.tasks.geometry import pose
+from ponderpounce.tasks.containers import EMPTY_Z_M, HIDDEN_HALF_M, HIDING_Z_M, add_container
+from ponderpounce.tasks.geometry import Spot, pose
 from ponderpounce.tasks.oracle import Actions, Motions
 from ponderpounce.tasks.permanence.scenes import LANE_M, SWAP_STEP, Hidden, Layout
 from ponderpounce.tasks.physics import Physics
