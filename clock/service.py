@@ -48,6 +48,7 @@ log = logging.getLogger(__name__)
 
 SERVERS = ("ponder", "pounce")
 NUM_TIME_EXCHANGES = 8
+ROBOT_SILENCE_NS = 1_000_000_000
 _CALL_NS = 2_000_000_000
 _OPEN_NS = 120_000_000_000  # a long demonstration is encoded inside this call
 _TOPIC_OF: dict[type, Topic[object]] = {
@@ -102,6 +103,7 @@ class ClockService:
         self._last_epoch: dict[str, int] = {}
         self._offsets: dict[str, Offset] = {}
         self._is_stepping = False
+        self._robot_heard_ns = 0
         self._observations = link.subscribe(OBSERVATION, keep=8)
         self._cognitions = link.subscribe(COGNITION)
         self._chunks = link.subscribe(CHUNK)
@@ -176,6 +178,7 @@ class ClockService:
                 return False
             zero_ns = episode.clock.zero_ns if isinstance(episode.clock, MonotonicClock) else self._host.now_ns()
             observation = replace(observation, source_ns=offset.to_ours(observation.source_ns) - zero_ns)
+        self._robot_heard_ns = self._host.now_ns()
         if episode.clock is None:
             episode.clock = VirtualClock() if episode.is_lockstep else MonotonicClock()
         if episode.conductor.on_observation(observation):
@@ -199,7 +202,8 @@ class ClockService:
             else:
                 episode.conductor.on_back(change.proc)
                 self._event(m.Severity.INFO, f"{change.proc}_back", f"{change.proc} is back: {change.why}")
-        if self._watch.is_gone("sim"):
+        silent_ns = self._host.now_ns() - self._robot_heard_ns
+        if self._watch.is_gone("sim") and silent_ns > ROBOT_SILENCE_NS:  # a starved process loses its token first
             self._event(m.Severity.ERROR, "sim_lost", "the robot side is gone: the episode is over")
             self._finish(None)
 
@@ -284,6 +288,7 @@ class ClockService:
         self._last_epoch[header.session] = header.epoch
         self._episode = _Episode(request, Conductor(request.info, committed_ticks=committed_ticks))
         self._watch.forget_losses()
+        self._robot_heard_ns = self._host.now_ns()
         self._link.publish(INFO, request.info, at_ns=0)
         for warning in warnings:
             self._event(m.Severity.WARNING, "warning", warning)

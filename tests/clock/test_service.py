@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from clock import membership, schedules
-from clock.service import ClockService, ServiceConfig
+from clock.service import ROBOT_SILENCE_NS, ClockService, ServiceConfig
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.link import Link
@@ -254,15 +254,18 @@ def test_a_lost_server_is_told_and_told_when_it_is_back(watchful: Any, episode_i
     assert [name for name in names if name.startswith("pounce")] == ["pounce_lost", "pounce_back"]
 
 
-def test_an_episode_ends_with_its_robot(watchful: Any, episode_info: Info, paper: m.Schedule) -> None:
+def test_an_episode_ends_with_its_robot(
+    watchful: Any, monotonic: Monotonic, episode_info: Info, paper: m.Schedule
+) -> None:
     watchful.bus.declare_alive(topics.alive_key("r0", "sim"))
     watchful.enter(episode_info(paper))
     watchful.clock.step()
     watchful.bus.end_alive(topics.alive_key("r0", "sim"))
     watchful.clock.step()
+    assert watchful.clock.conductor is not None  # a starved robot loses its token before it stops talking
+    monotonic.now_ns += ROBOT_SILENCE_NS
     watchful.settle()
     assert watchful.clock.conductor is None
-    assert {watchful.links[proc].episode for proc in ("clock", "ponder", "pounce")} == {""}
 
 
 # -- whose time
