@@ -9,7 +9,8 @@ PB := protocol/ponderpounce/v1
 export MUJOCO_GL ?= egl
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help setup demo test unit lint types proto bench clean
+# `make help` lists the rest.
+.PHONY: help setup demo test unit accept lint types proto bench clean
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
 
@@ -43,9 +44,13 @@ demo: setup
 
 ## make test    everything that needs no GPU; make unit: without processes and long runs
 test: setup
-	$(BIN)/python -m pytest -q -m "not gpu" --durations=10
+	$(BIN)/python -m pytest -q -m "not gpu and not acceptance" --durations=10
 unit: setup
-	$(BIN)/python -m pytest -q -m "not gpu and not e2e and not slow"
+	$(BIN)/python -m pytest -q -m "not gpu and not acceptance and not e2e and not slow"
+
+## make accept  a hundred oracle episodes of every task (about ten minutes)
+accept: setup
+	$(BIN)/python -m pytest -q -m acceptance
 
 ## make lint    style, types, import contracts, generated code up to date
 lint: setup

@@ -158,7 +158,7 @@ def test_a_cube_beside_the_bin_does_not_count(env: Environment, play: Play) -> N
     assert (snapshot.subtask_index, env.save().memory.binned) == (1, ())
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_the_oracle_solves_98_of_100_seeds_in_upstreams_time(env: Environment, play: Play) -> None:
     steps: dict[str, list[int]] = {difficulty: [] for difficulty in DIFFICULTIES}
     for seed in range(100):

@@ -101,7 +101,7 @@ def test_a_cube_put_down_elsewhere_does_not_count_but_may_be_fetched(env: Enviro
     assert play(env, motions.press("button")).status is Status.SUCCESS
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_the_oracle_solves_98_of_100_seeds_in_upstreams_time(env: Environment, play: Play) -> None:
     steps: dict[str, list[int]] = {difficulty: [] for difficulty in DIFFICULTIES}
     for seed in range(100):

@@ -118,7 +118,7 @@ def test_letting_the_visit_go_by_fails_as_soon_as_its_pass_is_over(env: Environm
     assert snapshot.step + 1 == 60 * 2 + 1  # one more control step has passed than observations
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_the_oracle_solves_95_of_100_seeds(env: Environment, play: Play) -> None:
     num_solved = 0
     for seed in range(100):

@@ -150,7 +150,7 @@ def test_the_left_target_first_does_not_advance_the_list(env: Environment, play:
     assert play(env, motions.swing_over("target_left")).subtask_index == 1
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_the_oracle_solves_98_of_100_seeds_in_upstreams_time(env: Environment, play: Play) -> None:
     steps: dict[str, list[int]] = {difficulty: [] for difficulty in DIFFICULTIES}
     for seed in range(100):

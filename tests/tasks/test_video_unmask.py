@@ -103,7 +103,7 @@ def test_only_the_video_tells_scenes_apart_that_hide_different_cubes() -> None:
     np.testing.assert_array_equal(now, other_now)
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_the_oracle_solves_100_seeds_in_upstreams_time(env: Environment, play: Play) -> None:
     steps: dict[str, list[int]] = {difficulty: [] for difficulty in DIFFICULTIES}
     for seed in range(100):

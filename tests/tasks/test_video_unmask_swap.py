@@ -122,7 +122,7 @@ def test_the_list_and_the_instruction(env: Environment) -> None:
     )
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_the_oracle_solves_100_seeds_in_upstreams_time(env: Environment, play: Play) -> None:
     steps: dict[str, list[int]] = {difficulty: [] for difficulty in DIFFICULTIES}
     for seed in range(100):
