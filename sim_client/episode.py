@@ -23,7 +23,7 @@ from protocol.topics import ACTION, EVENT, OBSERVATION, PHASE, SUBGOAL, TICK
 from sim_client.recorder import Recorder
 from sim_client.robot import observation, status_of
 
-CLOCK_SILENCE_NS = 800 * NS_PER_MS
+CLOCK_SILENCE_NS = 500 * NS_PER_MS
 """Real time: commands that stay away this long mean that the clock service is gone. The servos hold meanwhile."""
 HOLD_TICKS = 10
 """What the robot still does then by itself: hold for half a second, and end the episode."""
