@@ -23,17 +23,29 @@ import psutil
 import tyro
 from numpy.typing import NDArray
 
-from benchmarks.noop_policy import ACTION_DIM, EPISODE, HORIZON, INSTRUCTION, NUM_PROPRIO, ROBOT, Wire, answer
+from benchmarks.noop_policy import (
+    ACTION_DIM,
+    ANSWER_KEY,
+    EPISODE,
+    HORIZON,
+    INSTRUCTION,
+    NUM_PROPRIO,
+    REQUEST_KEY,
+    ROBOT,
+    SIDE_PX,
+    Wire,
+    answer,
+)
 from benchmarks.report import Report, Row, show, spread
 from clock.schedules import realtime
 from protocol import images, topics
 from protocol import messages as m
 from protocol.errors import CallFailed
 from protocol.link import Link
+from protocol.topics import Priority
 from protocol.zenoh_bus import Endpoints, ZenohBus
 from sim_client.launch import free_ports
 
-SIDE_PX = 256
 _PATIENCE_S = 20.0
 
 Pictures = dict[str, NDArray[np.uint8]]
@@ -69,6 +81,7 @@ WAYS = (
     Way(name="openpi-client 0.1.2: websocket, msgpack-numpy", wire="openpi", messages=2),
     Way(name="zenoh TCP, observation -> chunk", wire="observation", messages=2),
     Way(name="zenoh shared memory, observation -> chunk", wire="observation", messages=2, shared_memory=True),
+    Way(name="zenoh shared memory, bare bytes (floor of the row above)", wire="bytes", messages=2, shared_memory=True),
     Way(name="zenoh TCP, JPEG, observation -> chunk", wire="observation", messages=2, codec=m.ImageCodec.JPEG),
     Way(name="zenoh TCP, pounce-serve", wire="pounce", messages=3),
     Way(name="zenoh shared memory, pounce-serve", wire="pounce", messages=3, shared_memory=True),
@@ -92,6 +105,24 @@ class OverWebsocket:
         }
         rows: NDArray[np.float32] = self._policy.infer(request)["actions"]
         return rows
+
+
+class OverBus:
+    """Our bus without our messages."""
+
+    def __init__(self, bus: ZenohBus) -> None:
+        self._bus = bus
+        self._answers = bus.subscribe(ANSWER_KEY, keep=1)
+
+    def __call__(self, pictures: Pictures, state: NDArray[np.float32]) -> NDArray[np.float32]:
+        payload = b"".join([state.data.cast("B"), pictures["front"].data.cast("B"), pictures["wrist"].data.cast("B")])
+        self._bus.publish(REQUEST_KEY, payload, encoding="", attachment=b"", priority=Priority.DATA_HIGH)
+        deadline_s = time.monotonic() + _PATIENCE_S
+        while time.monotonic() < deadline_s:
+            for sample in self._answers.drain():
+                return np.frombuffer(sample.payload, np.float32).reshape(HORIZON, ACTION_DIM)
+            self._bus.wait(20_000_000)
+        raise TimeoutError(f"no answer within {_PATIENCE_S:.0f} s")
 
 
 class OverLink:
@@ -244,7 +275,7 @@ def _connected(way: Way, port: int) -> Iterator[Call]:
     bus = ZenohBus(Endpoints(connect=(f"tcp/127.0.0.1:{port}",), shared_memory=way.shared_memory))
     try:
         time.sleep(1.0)  # links and subscriptions find each other
-        yield OverLink(bus, way.codec, invokes=way.wire == "pounce")
+        yield OverBus(bus) if way.wire == "bytes" else OverLink(bus, way.codec, invokes=way.wire == "pounce")
     finally:
         bus.close()
 
@@ -280,8 +311,9 @@ def _run(contestants: list[Contestant], rounds: int, calls: int, hz: int | None)
         contestant.forget()
     for index in range(rounds):
         turn = index % len(contestants)
+        asked = requests(calls, seed=index)
         for contestant in contestants[turn:] + contestants[:turn]:
-            contestant.measure(requests(calls, seed=index), hz)
+            contestant.measure(asked, hz)
     baseline_ms = float(np.percentile(contestants[0].took_ms, 50))
     return [contestant.row(baseline_ms) for contestant in contestants]
 

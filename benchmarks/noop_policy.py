@@ -1,7 +1,8 @@
-"""A policy that thinks nothing, as a server on three wires: what a call costs when the model costs nothing.
+"""A policy that thinks nothing, as a server on four wires: what a call costs when the model costs nothing.
 
     python -m benchmarks.noop_policy openpi --port 7001      websocket and msgpack-numpy, as openpi's server speaks them
     python -m benchmarks.noop_policy observation --port ...  our Link: an observation is answered by a chunk
+    python -m benchmarks.noop_policy bytes --port ...        our bus alone: no messages, checks or identity
     python -m benchmarks.noop_policy pounce --port ...       the whole of pounce-serve, its engine doing nothing
 
 Each decodes both pictures into arrays, reads them, and answers a chunk that only this request can have.
@@ -27,14 +28,17 @@ from protocol import messages as m
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
 from protocol.process import host_clock_id, run, set_up_logging
+from protocol.topics import Priority
 from protocol.zenoh_bus import Endpoints, ZenohBus
 
-HORIZON, ACTION_DIM, NUM_PROPRIO = 20, 8, 8
+HORIZON, ACTION_DIM, NUM_PROPRIO, SIDE_PX = 20, 8, 8, 256
 ROBOT, EPISODE = "bench", "noop"
 INSTRUCTION = "press the button, pick all cubes that were highlighted, then press it again to stop"
 _CACHE_LINE_BYTES = 64
 
-Wire = Literal["openpi", "observation", "pounce"]
+REQUEST_KEY, ANSWER_KEY = "bench/request", "bench/answer"  # of the wire "bytes"
+
+Wire = Literal["openpi", "observation", "bytes", "pounce"]
 
 
 def answer(front: NDArray[np.uint8], wrist: NDArray[np.uint8], state: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -92,6 +96,24 @@ def serve_observation(bus: ZenohBus) -> None:
             rows = answer(front, wrist, observation.proprio)
             link.publish(topics.CHUNK, chunk_of(observation, rows), at_ns=observation.source_ns)
         return bool(received)
+
+    _say_ready()
+    run(bus, step, lambda: False)
+
+
+def serve_bytes(bus: ZenohBus) -> None:
+    """The floor under our rows: the same bytes on the same bus, as bare arrays."""
+    received = bus.subscribe(REQUEST_KEY, keep=1)
+    state_bytes, picture_bytes = 4 * NUM_PROPRIO, SIDE_PX * SIDE_PX * 3
+
+    def step() -> bool:
+        samples = received.drain()
+        for sample in samples:
+            state = np.frombuffer(sample.payload, np.float32, NUM_PROPRIO)
+            front, wrist = np.frombuffer(sample.payload, np.uint8, 2 * picture_bytes, state_bytes).reshape(2, -1)
+            rows = answer(front, wrist, state)
+            bus.publish(ANSWER_KEY, rows.tobytes(), encoding="", attachment=b"", priority=Priority.REAL_TIME)
+        return bool(samples)
 
     _say_ready()
     run(bus, step, lambda: False)
@@ -173,7 +195,9 @@ def main(argv: list[str] | None = None) -> int:
         serve_openpi(options.port)
         return 0
     bus = ZenohBus(Endpoints(listen=(f"tcp/127.0.0.1:{options.port}",), shared_memory=options.shared_memory))
-    if options.wire == "observation":
+    if options.wire == "bytes":
+        serve_bytes(bus)
+    elif options.wire == "observation":
         serve_observation(bus)
     else:
         serve_pounce(bus)
