@@ -341,6 +341,8 @@ def main(argv: list[str] | None = None) -> int:
         "float32; the server reads both pictures. Every answer was checked against its request.",
         "openpi row: the real openpi-client package against a server of ours that does on the wire what openpi's does "
         "(websockets, compression off). CPU times are of the whole processes, transport threads included.",
+        "All clients live in one process, so openpi's client too profits from our allocator setting "
+        "(protocol/memory.py); its server, like anybody's, does not.",
     ]
     show(report)
     print(f"\nwritten: {report.write().name}")
