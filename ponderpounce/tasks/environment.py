@@ -150,6 +150,20 @@ class Environment:
         self._step += 1
         return self._observe()
 
+    def reasoning(self) -> str:
+        """Returns what the current subtask needs from the past, in words (paper, Table 6); empty where nothing does.
+
+        Its coordinates are where things are seen now; the grounded subgoal stands at its end.
+        """
+        self._require_episode()
+        assert self._caption is not None
+        needed = self._task.reasoning(self._layout, self._caption.index)
+        if needed is None:
+            return ""
+        points = self._look_for(needed.grounds)
+        text = captions.simple(needed.text) if points is None else captions.grounded(needed.text, points)
+        return f"{text} Subgoal: {self._caption.grounded}."
+
     def oracle(self) -> Iterator[NDArray[np.float32]]:
         """Yields the actions (8,) that solve the episode, planned as the world is when each is asked for.
 

@@ -62,6 +62,14 @@ class Shown:
     is_recorded: bool = True  # False: it happens, but the video leaves it out
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reasoning:
+    """What must be kept in mind at one point of an episode, in words (paper, Table 6)."""
+
+    text: str  # template, see `captions`; the environment appends the current grounded subgoal
+    grounds: tuple[str, ...] = ()  # bodies whose pixels, now, fill the template's coordinates, in order
+
+
 class Task(ABC, Generic[LayoutT, MemoryT]):
     """One kind of episode. Subclasses carry `@task(family=...)`, one file each.
 
@@ -97,6 +105,13 @@ class Task(ABC, Generic[LayoutT, MemoryT]):
         The clock of `stage` runs through it; the memory of it is gone when the episode proper begins.
         """
         return ()
+
+    def reasoning(self, layout: LayoutT, index: int) -> Reasoning | None:
+        """Returns what subtask ``index`` needs from the past, by its family's schema in the paper's Table 6.
+
+        PONDER is taught to write it once, at the first transition after a demonstration.
+        """
+        return None
 
     @abstractmethod
     def remember(self, memory: MemoryT | None, physics: Physics, layout: LayoutT) -> MemoryT:
