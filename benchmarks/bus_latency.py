@@ -11,12 +11,16 @@ invocation and a chunk, and the daemon's phases and heartbeats beside them.
 
 from __future__ import annotations
 
+import multiprocessing
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from typing import Any
 
 import numpy as np
 import psutil
@@ -42,6 +46,7 @@ from protocol import images, topics
 from protocol import messages as m
 from protocol.errors import CallFailed
 from protocol.link import Link
+from protocol.memory import keep_freed_memory
 from protocol.topics import Priority
 from protocol.zenoh_bus import Endpoints, ZenohBus
 from sim_client.launch import free_ports
@@ -49,6 +54,7 @@ from sim_client.launch import free_ports
 _PATIENCE_S = 20.0
 
 Pictures = dict[str, NDArray[np.uint8]]
+Pipe = Connection
 Call = Callable[[Pictures, NDArray[np.float32]], NDArray[np.float32]]
 
 
@@ -75,10 +81,13 @@ class Way:
     messages: int
     shared_memory: bool = False
     codec: m.ImageCodec = m.ImageCodec.RAW
+    keeps_memory: bool = False
+    """openpi's client in a process with our allocator setting (protocol/memory.py); ours always have it."""
 
 
 WAYS = (
     Way(name="openpi-client 0.1.2: websocket, msgpack-numpy", wire="openpi", messages=2),
+    Way(name="openpi-client, our allocator setting lent to it", wire="openpi", messages=2, keeps_memory=True),
     Way(name="zenoh TCP, observation -> chunk", wire="observation", messages=2),
     Way(name="zenoh shared memory, observation -> chunk", wire="observation", messages=2, shared_memory=True),
     Way(name="zenoh shared memory, bare bytes (floor of the row above)", wire="bytes", messages=2, shared_memory=True),
@@ -193,29 +202,24 @@ def episode_info(header: m.Header) -> m.EpisodeInfo:
 
 
 class Contestant:
-    """A way, its server's process, a connected client, and what its calls took."""
+    """A way, the processes of its server and its client, and what its calls took."""
 
-    def __init__(self, way: Way, server: subprocess.Popen[str], call: Call) -> None:
+    def __init__(self, way: Way, server: subprocess.Popen[str], client: BaseProcess, pipe: Pipe) -> None:
         self.way = way
-        self._call = call
+        self._pipe = pipe
         self._server = psutil.Process(server.pid)
-        self._client = psutil.Process()
+        self._client = psutil.Process(client.pid)
         self.took_ms: list[float] = []
         self.client_cpu_s = 0.0
         self.server_cpu_s = 0.0
 
-    def measure(self, requests: list[tuple[Pictures, NDArray[np.float32]]], hz: int | None) -> None:
-        """Calls once per request, back to back or on absolute deadlines."""
+    def measure(self, calls: int, seed: int, hz: int | None) -> None:
+        """So many calls in the client's process, back to back or on absolute deadlines."""
+        self._pipe.send(("prepare", calls, seed))
+        self._answer()
         client_s, server_s = _cpu_s(self._client), _cpu_s(self._server)
-        start_ns = time.perf_counter_ns()
-        for index, (pictures, state) in enumerate(requests):
-            if hz:
-                due_ns = start_ns + index * 1_000_000_000 // hz
-                time.sleep(max(0, due_ns - time.perf_counter_ns()) / 1e9)
-            before_ns = time.perf_counter_ns()
-            rows = self._call(pictures, state)
-            self.took_ms.append((time.perf_counter_ns() - before_ns) / 1e6)
-            self._check(rows, pictures, state)
+        self._pipe.send(("measure", hz))
+        self.took_ms += self._answer()
         self.client_cpu_s += _cpu_s(self._client) - client_s
         self.server_cpu_s += _cpu_s(self._server) - server_s
 
@@ -235,11 +239,53 @@ class Contestant:
             "server_cpu_ms": round(self.server_cpu_s * 1e3 / len(self.took_ms), 2),
         }
 
-    def _check(self, rows: NDArray[np.float32], pictures: Pictures, state: NDArray[np.float32]) -> None:
-        seen = pictures if self.way.codec == m.ImageCodec.RAW else _through_jpeg(pictures)
-        expected = answer(seen["front"], seen["wrist"], state)
-        if rows.shape != (HORIZON, ACTION_DIM) or not np.array_equal(rows, expected):
-            raise AssertionError(f"{self.way.name}: the answer is not to what was asked")
+    def _answer(self) -> Any:
+        if not self._pipe.poll(120):
+            raise TimeoutError(f"the client of {self.way.name!r} does not answer")
+        answered = self._pipe.recv()
+        if isinstance(answered, str):
+            raise RuntimeError(f"the client of {self.way.name!r} failed: {answered}")
+        return answered
+
+
+def serve_client(way: Way, port: int, pipe: Pipe) -> None:
+    """One client in a process of its own: what one client's library sets for its process helps no other."""
+    asked: list[tuple[Pictures, NDArray[np.float32]]] = []
+    try:
+        with _connected(way, port) as call:
+            pipe.send([])
+            while True:
+                command, *arguments = pipe.recv()
+                if command == "prepare":
+                    asked = requests(*arguments)
+                    pipe.send([])
+                else:
+                    pipe.send(_measured(way, call, asked, *arguments))
+    except EOFError:
+        return
+    except Exception as error:  # the parent prints it: a child's traceback would be lost among those of others
+        pipe.send(f"{type(error).__name__}: {error}")
+
+
+def _measured(way: Way, call: Call, asked: list[tuple[Pictures, NDArray[np.float32]]], hz: int | None) -> list[float]:
+    took_ms = []
+    start_ns = time.perf_counter_ns()
+    for index, (pictures, state) in enumerate(asked):
+        if hz:
+            due_ns = start_ns + index * 1_000_000_000 // hz
+            time.sleep(max(0, due_ns - time.perf_counter_ns()) / 1e9)
+        before_ns = time.perf_counter_ns()
+        rows = call(pictures, state)
+        took_ms.append((time.perf_counter_ns() - before_ns) / 1e6)
+        _check(way, rows, pictures, state)
+    return took_ms
+
+
+def _check(way: Way, rows: NDArray[np.float32], pictures: Pictures, state: NDArray[np.float32]) -> None:
+    seen = pictures if way.codec == m.ImageCodec.RAW else _through_jpeg(pictures)
+    expected = answer(seen["front"], seen["wrist"], state)
+    if rows.shape != (HORIZON, ACTION_DIM) or not np.array_equal(rows, expected):
+        raise AssertionError(f"{way.name}: the answer is not to what was asked")
 
 
 @contextmanager
@@ -249,7 +295,8 @@ def contest() -> Iterator[list[Contestant]]:
         contestants = []
         for way, port in zip(WAYS, free_ports(len(WAYS)), strict=True):
             server = stack.enter_context(_serving(way, port))
-            contestants.append(Contestant(way, server, stack.enter_context(_connected(way, port))))
+            client, pipe = stack.enter_context(_client(way, port))
+            contestants.append(Contestant(way, server, client, pipe))
         yield contestants
 
 
@@ -268,8 +315,25 @@ def _serving(way: Way, port: int) -> Iterator[subprocess.Popen[str]]:
 
 
 @contextmanager
+def _client(way: Way, port: int) -> Iterator[tuple[BaseProcess, Pipe]]:
+    spawn = multiprocessing.get_context("spawn")  # a forked child would inherit the parent's allocator and threads
+    ours, theirs = spawn.Pipe()
+    client = spawn.Process(target=serve_client, args=(way, port, theirs), daemon=True)
+    client.start()
+    try:
+        if not ours.poll(60) or isinstance(ours.recv(), str):
+            raise RuntimeError(f"the client of {way.name!r} did not connect")
+        yield client, ours
+    finally:
+        client.kill()
+        client.join()
+
+
+@contextmanager
 def _connected(way: Way, port: int) -> Iterator[Call]:
     if way.wire == "openpi":
+        if way.keeps_memory:
+            keep_freed_memory()
         yield OverWebsocket(port)
         return
     bus = ZenohBus(Endpoints(connect=(f"tcp/127.0.0.1:{port}",), shared_memory=way.shared_memory))
@@ -311,9 +375,8 @@ def _run(contestants: list[Contestant], rounds: int, calls: int, hz: int | None)
         contestant.forget()
     for index in range(rounds):
         turn = index % len(contestants)
-        asked = requests(calls, seed=index)
         for contestant in contestants[turn:] + contestants[:turn]:
-            contestant.measure(asked, hz)
+            contestant.measure(calls, index, hz)
     baseline_ms = float(np.percentile(contestants[0].took_ms, 50))
     return [contestant.row(baseline_ms) for contestant in contestants]
 
@@ -331,7 +394,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     with contest() as contestants:
         for contestant in contestants:
-            contestant.measure(requests(options.warm_up_calls, seed=10_000), None)
+            contestant.measure(options.warm_up_calls, 10_000, None)
         rows = _run(contestants, options.rounds, options.calls, None)
         report.add_table("Back to back", rows)
         rows = _run(contestants, options.paced_rounds, options.paced_calls, options.paced_hz)
@@ -341,8 +404,8 @@ def main(argv: list[str] | None = None) -> int:
         "float32; the server reads both pictures. Every answer was checked against its request.",
         "openpi row: the real openpi-client package against a server of ours that does on the wire what openpi's does "
         "(websockets, compression off). CPU times are of the whole processes, transport threads included.",
-        "All clients live in one process, so openpi's client too profits from our allocator setting "
-        "(protocol/memory.py); its server, like anybody's, does not.",
+        "Each client and each server is a process of its own, as its users run it. Our bus sets glibc's allocator to "
+        "keep freed memory (protocol/memory.py); the second row lends openpi's client the same setting.",
     ]
     show(report)
     print(f"\nwritten: {report.write().name}")

@@ -11,7 +11,7 @@ once the list has come to the button, and then at once.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -25,7 +25,7 @@ from ponderpounce.tasks.physics import Physics
 from ponderpounce.tasks.placing import PlacedCube, draw_button, draw_cube, until_it_fits
 from ponderpounce.tasks.props import BIN_HALF_M, BIN_HEIGHT_M, add_bin
 from ponderpounce.tasks.scene import CUBE_COLORS, add_button, add_cube
-from ponderpounce.tasks.task import Subtask, Task, task
+from ponderpounce.tasks.task import Reasoning, Subtask, Task, task
 
 APPEARANCE_STEPS = 50
 
@@ -53,6 +53,10 @@ class Layout:
     def of_color(self, color: str) -> list[str]:
         """Names of the color's cubes, in the order they appear."""
         return [name for name, cube in zip(_CUBES, self.cubes, strict=False) if cube.color == color]
+
+    def colors_of(self, names: Sequence[str]) -> Counter[str]:
+        """How many of each color these cubes are."""
+        return Counter(self.cubes[_CUBES.index(name)].color for name in names)
 
     def appears_at_step(self, name: str) -> int:
         """The first observation that shows a cube."""
@@ -135,6 +139,18 @@ class BinFill(Task[Layout, Memory]):
         )
         return tuple(steps)
 
+    def reasoning(self, layout: Layout, index: int) -> Reasoning:
+        order = [name for color, count in layout.wanted for name in layout.of_color(color)[:count]]
+        done, left = order[: index // 2], order[index // 2 :]
+        count = "; ".join(
+            f"{what}: {_listed(layout.colors_of(names)) or 'none'}"
+            for what, names in (("Target", order), ("completed", done), ("remaining", left))
+        )
+        if not left:
+            return Reasoning(text=f"{count}. Next, press the button[ at <>].", grounds=(f"{_BUTTON}/cap",))
+        text = f"{count}. Next, move a {layout.cubes[_CUBES.index(left[0])].color} cube[ at <>] to the bin[ at <>]."
+        return Reasoning(text=text, grounds=(left[0], _BIN))
+
     def remember(self, memory: Memory | None, physics: Physics, layout: Layout) -> Memory:
         binned = memory.binned if memory else ()
         for name in _CUBES[: len(layout.cubes)]:
@@ -199,7 +215,7 @@ def _pressed_early(physics: Physics, memory: Memory) -> str | None:
 
 
 def _miscounted(layout: Layout, physics: Physics, memory: Memory) -> str | None:
-    binned = Counter(layout.cubes[_CUBES.index(name)].color for name in memory.binned)
+    binned = layout.colors_of(memory.binned)
     if binned == Counter(dict(layout.wanted)):
         return None
     had, asked = _listed(binned), _listed(dict(layout.wanted))

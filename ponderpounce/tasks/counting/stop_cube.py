@@ -19,11 +19,11 @@ import numpy as np
 from ponderpounce.tasks import captions, predicates
 from ponderpounce.tasks.geometry import Array, pose, smoothstep
 from ponderpounce.tasks.oracle import Actions, Motions
-from ponderpounce.tasks.physics import Physics
+from ponderpounce.tasks.physics import CONTROL_HZ, Physics
 from ponderpounce.tasks.placing import draw_button
 from ponderpounce.tasks.props import PURPLE, add_ghost_cube, add_target
 from ponderpounce.tasks.scene import CUBE_HALF_M, add_button, display_rgba
-from ponderpounce.tasks.task import Subtask, Task, task
+from ponderpounce.tasks.task import Reasoning, Subtask, Task, task
 
 NUM_PASSES = 5
 
@@ -61,6 +61,15 @@ class Layout:
     def last_step(self) -> int:
         """Control steps from reset to the end of the pass asked for."""
         return self.pass_steps * self.visit
+
+    def num_visited(self, elapsed_steps: int) -> int:
+        """How often the running cube has crossed the target so many control steps after reset."""
+        return (2 * elapsed_steps + self.pass_steps) // (2 * self.pass_steps)
+
+    @property
+    def checkpoint_steps(self) -> tuple[int, ...]:
+        """When the subtasks of waiting end, in control steps since reset."""
+        return (*range(_CHECKPOINT_STEPS, self.press_step, _CHECKPOINT_STEPS), self.press_step)
 
     @property
     def press_step(self) -> int:
@@ -116,7 +125,6 @@ class StopCube(Task[Layout, Memory]):
 
     def subtasks(self, layout: Layout) -> tuple[Subtask, ...]:
         failure = partial(_missed, layout)
-        checkpoints = (*range(_CHECKPOINT_STEPS, layout.press_step, _CHECKPOINT_STEPS), layout.press_step)
         return (
             Subtask(
                 text="move to the top of the button[ at <>] to prepare",
@@ -132,7 +140,7 @@ class StopCube(Task[Layout, Memory]):
                     failure=failure,
                     motion=_wait_until(checkpoint),
                 )
-                for checkpoint in checkpoints
+                for checkpoint in layout.checkpoint_steps
             ),
             Subtask(
                 text="press the button to stop the cube on the target[ at <>]",
@@ -142,6 +150,19 @@ class StopCube(Task[Layout, Memory]):
                 motion=lambda motions: motions.push_down(_BUTTON),
             ),
         )
+
+    def reasoning(self, layout: Layout, index: int) -> Reasoning:
+        # A subtask's number says when it ends, not when it began: how long the arm took to get there is another matter.
+        waits = layout.checkpoint_steps
+        is_waiting = 0 < index <= len(waits)
+        ends_step = 0 if index == 0 else waits[min(index, len(waits)) - 1]
+        done = layout.num_visited(ends_step)
+        count = (
+            f"Target: {layout.visit}; completed{' when this wait ends' if is_waiting else ''}: {done}; "
+            f"remaining: {layout.visit - done}. One visit every {layout.pass_steps / CONTROL_HZ:g} s. "
+        )
+        text = count + f"Next, stop the cube at the target[ at <>] on visit {layout.visit}."
+        return Reasoning(text=text, grounds=(_TARGET,))
 
     def remember(self, memory: Memory | None, physics: Physics, layout: Layout) -> Memory:
         is_near = predicates.is_near(physics, _CUBE, _TARGET, _STOPPED_M)

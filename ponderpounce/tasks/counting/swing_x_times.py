@@ -21,7 +21,7 @@ from ponderpounce.tasks.physics import Physics
 from ponderpounce.tasks.placing import PlacedCube, draw_button, draw_cube, draw_disc, until_it_fits
 from ponderpounce.tasks.props import GRAY, RED, TARGET_RADIUS_M, TARGET_THICKNESS_M, add_target
 from ponderpounce.tasks.scene import CUBE_COLORS, add_button, add_cube
-from ponderpounce.tasks.task import Subtask, Task, task
+from ponderpounce.tasks.task import Reasoning, Subtask, Task, task
 
 RED_STEPS = 20
 
@@ -148,6 +148,22 @@ class SwingXtimes(Task[Layout, Memory]):
                 motion=lambda motions: motions.press(_BUTTON),
             ),
         )
+
+    def reasoning(self, layout: Layout, index: int) -> Reasoning:
+        swings, color = index - 1, layout.cubes[layout.asked].color
+        done = min(max(swings, 0) // 2, layout.repeats)
+        count = f"Target: {layout.repeats}; completed: {done}; remaining: {layout.repeats - done}. "
+        if done == layout.repeats:
+            is_held = swings == 2 * layout.repeats
+            text, ground = (
+                (f"Next, put the {color} cube[ at <>] on the table.", _CUBES[layout.asked])
+                if is_held
+                else ("Next, press the button[ at <>].", f"{_BUTTON}/cap")
+            )
+            return Reasoning(text=count + text, grounds=(ground,))
+        side = _SIDES[max(swings, 0) % 2]
+        text = count + f"Next, move the {color} cube[ at <>] to the {side}-side target[ at <>]."
+        return Reasoning(text=text, grounds=(_CUBES[layout.asked], _target(side)))
 
     def remember(self, memory: Memory | None, physics: Physics, layout: Layout) -> Memory:
         before = memory or Memory(right=Visit(), left=Visit())

@@ -26,7 +26,7 @@ from ponderpounce.tasks.oracle import Actions, Motions
 from ponderpounce.tasks.permanence.scenes import LANE_M, SWAP_STEP, Hidden, Layout
 from ponderpounce.tasks.physics import Physics
 from ponderpounce.tasks.scene import CUBE_COLORS, add_button, add_cube
-from ponderpounce.tasks.task import Shown, Subtask, Task
+from ponderpounce.tasks.task import Reasoning, Shown, Subtask, Task
 
 COVER_STEP = 32  # the first observation that shows the containers
 
@@ -90,6 +90,17 @@ class Unmask(Task[Layout, Pressed]):
             steps.append(_picking_up(layout, cube))
         return tuple(steps)
 
+    def reasoning(self, layout: Layout, index: int) -> Reasoning:
+        if index < self.num_buttons:
+            return _before_the_gate(layout, index, self.num_buttons)
+        # Picking up and putting down take turns; a container that is put down has made way for the next.
+        target = layout.hidden[(index - self.num_buttons + 1) // 2]
+        hides = ", ".join(f"{_letter(layout, c.container)} hides the {c.color} cube" for c in layout.hidden)
+        pairs = ", ".join(f"{_letter(layout, first)} <-> {_letter(layout, second)}" for first, second in layout.swaps)
+        track = f"Track swaps {pairs}" if pairs else "No swaps"
+        text = f"Reveal: container {hides}. {track}; final target is {_letter(layout, target.container)}[ at <>]."
+        return Reasoning(text=text, grounds=(container_name(target.container),))
+
     def remember(self, memory: Pressed | None, physics: Physics, layout: Layout) -> Pressed:
         now = (button for button in button_names(self.num_buttons) if predicates.is_pressed(physics, button))
         return (memory or frozenset()).union(now)
@@ -124,6 +135,19 @@ def _stand_over_cubes(physics: Physics, layout: Layout, spots: Sequence[Spot]) -
     covering = {cube.container for cube in layout.hidden}
     for index, spot in enumerate(spots):
         physics.place(container_name(index), spot.pose(HIDING_Z_M if index in covering else EMPTY_Z_M))
+
+
+def _letter(layout: Layout, index: int) -> str:
+    """What texts call a container: A, B, C ... from the left of the front camera's picture as they first stood."""
+    y_m = [spot.xy_m[1] for spot in layout.containers]
+    return chr(ord("A") + sorted(y_m).index(y_m[index]))
+
+
+def _before_the_gate(layout: Layout, num_pressed: int, num_buttons: int) -> Reasoning:
+    """While buttons are still to be pressed, containers may be yet to come or on their way."""
+    lying = ", ".join(f"the {cube.color} cube[ at <>]" for cube in layout.hidden)
+    text = f"Reveal: {lying}. Track what covers each; buttons pressed: {num_pressed} of {num_buttons}."
+    return Reasoning(text=text, grounds=tuple(cube_name(cube.color) for cube in layout.hidden))
 
 
 def _presses(buttons: Sequence[str]) -> list[Subtask]:

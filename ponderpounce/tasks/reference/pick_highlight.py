@@ -22,7 +22,7 @@ from ponderpounce.tasks.oracle import Actions, Motions
 from ponderpounce.tasks.physics import Physics
 from ponderpounce.tasks.placing import PlacedCube, draw_button, draw_cube, until_it_fits
 from ponderpounce.tasks.scene import CUBE_COLORS, add_button, add_cube, add_disc
-from ponderpounce.tasks.task import Subtask, Task, task
+from ponderpounce.tasks.task import Reasoning, Subtask, Task, task
 
 HIGHLIGHT_STEPS = range(10, 101)  # the observations that show the discs
 
@@ -119,6 +119,17 @@ class PickHighlight(Task[Layout, Memory]):
                 )
             )
         return tuple(steps)
+
+    def reasoning(self, layout: Layout, index: int) -> Reasoning | None:
+        if index == 0:
+            return None  # pressing the button asks for nothing seen before
+        nth = index // 2  # of the target that is in hand or comes next
+        marked = " and ".join(f"the {layout.cubes[target].color} cube[ at <>]" for target in layout.targets)
+        chosen = layout.targets[nth]
+        text = f"Highlighted: {marked}; after {nth} of {len(layout.targets)}, choose the " + (
+            f"{layout.cubes[chosen].color} cube[ at <>]."
+        )
+        return Reasoning(text=text, grounds=tuple(_CUBES[target] for target in (*layout.targets, chosen)))
 
     def remember(self, memory: Memory | None, physics: Physics, layout: Layout) -> Memory:
         now = frozenset(name for name in _CUBES[: len(layout.cubes)] if predicates.is_picked(physics, name))
