@@ -123,13 +123,11 @@ class PickHighlight(Task[Layout, Memory]):
     def reasoning(self, layout: Layout, index: int) -> Reasoning | None:
         if index == 0:
             return None  # pressing the button asks for nothing seen before
-        nth = index // 2  # of the target that is in hand or comes next
-        marked = " and ".join(f"the {layout.cubes[target].color} cube[ at <>]" for target in layout.targets)
-        chosen = layout.targets[nth]
-        text = f"Highlighted: {marked}; after {nth} of {len(layout.targets)}, choose the " + (
-            f"{layout.cubes[chosen].color} cube[ at <>]."
-        )
-        return Reasoning(text=text, grounds=tuple(_CUBES[target] for target in (*layout.targets, chosen)))
+        num_chosen = index // 2  # one that is being put down counts
+        chosen = (*layout.targets, layout.targets[num_chosen])
+        *marked, next_one = (f"the {layout.cubes[target].color} cube[ at <>]" for target in chosen)
+        text = f"Highlighted: {', '.join(marked)}; after {num_chosen} of {len(marked)}, choose {next_one}."
+        return Reasoning(text=text, grounds=tuple(_CUBES[target] for target in chosen))
 
     def remember(self, memory: Memory | None, physics: Physics, layout: Layout) -> Memory:
         now = frozenset(name for name in _CUBES[: len(layout.cubes)] if predicates.is_picked(physics, name))
