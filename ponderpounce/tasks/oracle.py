@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ponderpounce.tasks import timing
+from ponderpounce.tasks import panda, timing
 from ponderpounce.tasks.containers import GRIP_Z_M
 from ponderpounce.tasks.geometry import Array, transform
 from ponderpounce.tasks.kinematics import Kinematics, UnreachableError
@@ -24,7 +24,9 @@ Actions = Iterator[NDArray[np.float32]]
 MAX_SPEED_RAD_S = 0.9
 MAX_ACCELERATION_RAD_S2 = 0.9
 GRIPPER_STEPS = 6
+HOMING_STEPS = 30
 OPEN, CLOSED = 1.0, -1.0
+REST_XYZ_M = (0.0, 0.0, 0.2)
 
 _PATH_POINTS = 40
 _ABOVE_M = 0.15
@@ -88,6 +90,21 @@ class Motions:
         while self._physics.elapsed_steps() < elapsed_steps:
             yield from self.hold(GRIPPER_STEPS)
 
+    def wait(self, num_steps: int) -> Actions:
+        """Stands still for at least so many control steps, in rounds of a gripper command's length."""
+        for _ in range(0, num_steps, GRIPPER_STEPS):
+            yield from self.hold(GRIPPER_STEPS)
+
+    def rest(self) -> Actions:
+        """Goes to a place low above the middle of the table, and opens the gripper there."""
+        yield from self.open_at(self._carried_to(*REST_XYZ_M))
+
+    def go_home(self) -> Actions:
+        """Opens the gripper, then commands the home posture at once and gives the arm time to get there."""
+        yield from self.open()
+        for _ in range(HOMING_STEPS):
+            yield self._action(panda.HOME_QPOS)
+
     def pick(self, cube: str) -> Actions:
         """Grasps a cube from above and lifts it, turning as little as the arm's limits allow."""
         yield from self._grasp(cube, from_z_m=_ABOVE_M, grasp_z_m=self._physics.position_m(cube)[2])
@@ -106,10 +123,13 @@ class Motions:
 
     def place(self, target: str) -> Actions:
         """Carries what is held over a target, sets it down there and comes back up."""
-        x_m, y_m, z_m = self._physics.position_m(target)
+        yield from self.place_at(*self._physics.position_m(target))
+
+    def place_at(self, x_m: float, y_m: float, release_z_m: float) -> Actions:
+        """Carries what is held over a point, lowers the tool to a height, lets go and comes back up."""
         above = self._carried_to(x_m, y_m, _ABOVE_M)
         yield from self.move(above)
-        yield from self.move(_at_height(above, z_m))
+        yield from self.move(_at_height(above, release_z_m))
         yield from self.open()
         yield from self.move(above)
 

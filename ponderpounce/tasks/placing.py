@@ -15,10 +15,11 @@ from ponderpounce.tasks.geometry import Footprint, distance_m, pose
 from ponderpounce.tasks.physics import Physics
 from ponderpounce.tasks.scene import BUTTON_HALF_M, CUBE_COLORS, CUBE_HALF_M, SceneFullError, sample_footprint
 
-_BUTTON_CENTER_M, _BUTTON_REACH_M = (-0.2, 0.0), (0.05, 0.2)
-
 DrawnT = TypeVar("DrawnT")
 Point = tuple[float, float]
+
+_BUTTON_CENTER_M: Point = (-0.2, 0.0)
+_BUTTON_REACH_M: Point = (0.05, 0.2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,12 +51,14 @@ def until_it_fits(draw: Callable[[], DrawnT]) -> DrawnT:
             continue
 
 
-def draw_button(rng: np.random.Generator) -> Footprint:
-    """Draws the button's place beside the robot."""
+def draw_button(
+    rng: np.random.Generator, *, center_m: Point = _BUTTON_CENTER_M, reach_m: Point = _BUTTON_REACH_M
+) -> Footprint:
+    """Draws the button's place, its centre uniform in ``center_m`` +- ``reach_m``; by default beside the robot."""
     return sample_footprint(
         rng,
-        center_m=_BUTTON_CENTER_M,
-        reach_m=_BUTTON_REACH_M,
+        center_m=center_m,
+        reach_m=reach_m,
         half_m=BUTTON_HALF_M,
         yaw_range_rad=(0.0, 0.0),
         obstacles=(),
