@@ -149,6 +149,7 @@ class NumberWorld:
             step=len(self.commands),
             frames=dict.fromkeys(CAMERAS, frame),
             state=state,
+            command=state,
             tcp_pose=np.zeros(7),
             status=Status.SUCCESS if len(self.commands) >= self.num_steps else Status.ONGOING,
             reason="",

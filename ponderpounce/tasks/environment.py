@@ -30,8 +30,9 @@ class Snapshot:
     """What the robot and its cameras say at one instant, before the next action. Its arrays belong to it alone."""
 
     step: int  # control steps since reset returned; in a demonstration, frames since it began
-    frames: Mapping[str, NDArray[np.uint8]]  # camera name -> (image_px, image_px, 3) RGB; empty without rendering
+    frames: Mapping[str, NDArray[np.uint8]]  # camera name -> (image_px, image_px, 3) RGB; empty if nobody looked
     state: NDArray[np.float32]  # (8,): seven joints [rad], one finger's opening [m]
+    command: NDArray[np.float32]  # (8,): the action that led here: joint targets [rad], gripper in [-1, 1]
     tcp_pose: NDArray[np.float64]  # (7,): xyz [m], quaternion wxyz
     status: Status
     reason: str  # why the episode ended; empty while it is ongoing
@@ -122,20 +123,20 @@ class Environment:
         self.physics.advance(np.append(panda.HOME_QPOS, 1.0) if last_action is None else last_action)
         return self._observe()
 
-    def demonstration(self, rate_hz: int = CONTROL_HZ) -> Iterator[Snapshot]:
+    def demonstration(self, rate_hz: int = CONTROL_HZ, *, look_hz: int | None = None) -> Iterator[Snapshot]:
         """Yields the conditioning video of this episode, the first frame and every so many after; nothing without one.
 
         It can be watched at any time and as often as one likes: pictures are rendered as they are asked for, and the
-        episode itself stands still meanwhile. Raises ValueError unless the rate divides 20 Hz.
+        episode itself stands still meanwhile. With ``look_hz`` only so many of its snapshots a second have pictures.
+        Raises ValueError unless the rates divide 20 Hz.
         """
         self._require_episode()
-        if rate_hz < 1 or CONTROL_HZ % rate_hz:
-            raise ValueError(f"a video of {CONTROL_HZ} Hz cannot be shown at {rate_hz} Hz; use 1, 2, 4, 5, 10 or 20")
-        shown = range(0, len(self._video), CONTROL_HZ // rate_hz)
-        return (self._demonstrated(step, self._video[step]) for step in shown)
+        every, look_every = _steps_between(rate_hz), _steps_between(look_hz or rate_hz)
+        shown = range(0, len(self._video), every)
+        return (self._demonstrated(step, self._video[step], look=step % look_every == 0) for step in shown)
 
-    def step(self, action: ArrayLike) -> Snapshot:
-        """Applies an action (8,) for exactly 50 ms and returns what is seen then.
+    def step(self, action: ArrayLike, *, look: bool = True) -> Snapshot:
+        """Applies an action (8,) for exactly 50 ms and returns what is seen then; without ``look``, no pictures.
 
         The action is seven absolute joint targets in rad and the gripper's command in [-1, 1], clipped there. Raises
         ValueError if it has another shape or is not finite, and RuntimeError if the episode is over or never began.
@@ -148,7 +149,7 @@ class Environment:
             )
         self.physics.advance(_checked(action))
         self._step += 1
-        return self._observe()
+        return self._observe(look=look)
 
     def reasoning(self) -> str:
         """Returns what the current subtask needs from the past, in words (paper, Table 6); empty where nothing does.
@@ -164,13 +165,14 @@ class Environment:
         text = captions.simple(needed.text) if points is None else captions.grounded(needed.text, points)
         return f"{text} Subgoal: {self._caption.grounded}."
 
-    def oracle(self) -> Iterator[NDArray[np.float32]]:
+    def oracle(self, motions: Motions | None = None) -> Iterator[NDArray[np.float32]]:
         """Yields the actions (8,) that solve the episode, planned as the world is when each is asked for.
 
-        Take one, step with it, take the next; stop when the episode ends.
+        Take one, step with it, take the next; stop when the episode ends. ``motions`` are the arm's skills, fresh
+        ones by default; one's own may be made to fail a grasp, and tell afterwards what they did.
         """
         self._require_episode()
-        motions = Motions(self.physics)
+        motions = Motions(self.physics) if motions is None else motions
         for subtask in self._subtasks[self._progress.index :]:
             yield from subtask.motion(motions)
 
@@ -222,7 +224,7 @@ class Environment:
         self._task.arrange(self.physics, layout)
         self.physics.refresh()
 
-    def _observe(self) -> Snapshot:
+    def _observe(self, *, look: bool = True) -> Snapshot:
         """Stages, remembers, judges and captions the instant the physics is at."""
         self._task.stage(self.physics, self._layout, self._memory, self.physics.elapsed_steps() - 1)
         spoken_of = self._progress.index  # texts change one step after the engine does
@@ -242,7 +244,7 @@ class Environment:
         if self._progress.status is Status.SUCCESS:
             caption = captions.completed(caption)
         self._caption = caption
-        return self._snapshot()
+        return self._snapshot(look=look)
 
     def _look_for(self, bodies: Sequence[str]) -> list[captions.Pixel] | None:
         """Where the front camera sees bodies; None if one of them is hidden.
@@ -258,25 +260,28 @@ class Environment:
             points.append(point)
         return points
 
-    def _demonstrated(self, step: int, row: Row) -> Snapshot:
+    def _demonstrated(self, step: int, row: Row, *, look: bool) -> Snapshot:
         """A frame of the video, seen through a world that is put back as it was."""
         now = self.physics.save()
         self.physics.load(row.physics)
-        snapshot = self._seen(step, Progress(), row.caption, is_demonstration=True)
+        snapshot = self._seen(step, Progress(), row.caption, look=look, is_demonstration=True)
         self.physics.load(now)
         return snapshot
 
-    def _snapshot(self) -> Snapshot:
+    def _snapshot(self, *, look: bool = True) -> Snapshot:
         assert self._caption is not None
-        return self._seen(self._step, self._progress, self._caption)
+        return self._seen(self._step, self._progress, self._caption, look=look)
 
-    def _seen(self, step: int, progress: Progress, caption: Caption, *, is_demonstration: bool = False) -> Snapshot:
+    def _seen(
+        self, step: int, progress: Progress, caption: Caption, *, look: bool, is_demonstration: bool = False
+    ) -> Snapshot:
         opening_m = self.physics.finger_openings_m()[:1]
         return Snapshot(
             step=step,
-            frames={} if self._cameras is None else self._cameras.frames(),
+            frames=self._cameras.frames() if look and self._cameras is not None else {},
             state=np.concatenate([self.physics.arm_qpos(), opening_m]).astype(np.float32),
             tcp_pose=pose_of(self.physics.tcp_transform()),
+            command=self.physics.command().astype(np.float32),
             status=progress.status,
             reason=progress.reason,
             simple_subgoal=caption.simple,
@@ -288,6 +293,12 @@ class Environment:
     def _require_episode(self) -> None:
         if self._layout is None:
             raise RuntimeError("no episode has begun; call reset first")
+
+
+def _steps_between(rate_hz: int) -> int:
+    if rate_hz < 1 or CONTROL_HZ % rate_hz:
+        raise ValueError(f"a video of {CONTROL_HZ} Hz cannot be shown at {rate_hz} Hz; use 1, 2, 4, 5, 10 or 20")
+    return CONTROL_HZ // rate_hz
 
 
 def _checked(action: ArrayLike) -> NDArray[np.float64]:

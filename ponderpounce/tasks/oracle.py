@@ -8,6 +8,7 @@ the arm's speed and acceleration limits; a gripper command holds the arm still f
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,15 +33,29 @@ _PATH_POINTS = 40
 _ABOVE_M = 0.15
 _HIGH_M, _BACK_OFF_M = 0.20, 0.1
 _SWING_M = 0.10
+_MISS_M, _MISS_CONTAINER_M = 0.04, 0.035
 _QUARTERS = ((1, 0), (0, 1), (0, -1), (-1, 0))  # cosine and sine of 0, 90, -90 and 180 degrees
 _LEFT = np.array([0.0, 1.0, 0.0])
 _DOWN = np.array([0.0, 0.0, -1.0])
 
 
-class Motions:
-    """What the oracle can do with one arm. Actions are (8,) float32: seven joint targets [rad], gripper in [-1, 1]."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FailedGrasp:
+    """A grasp that closes beside or above the thing before the right one is made: data that show how to recover."""
 
-    def __init__(self, physics: Physics) -> None:
+    before: int  # which of the script's grasps it precedes, from 0
+    offset: tuple[int, int, int]  # where it is aimed: -1, 0 or 1 times upstream's miss along x, y and z
+
+
+class Motions:
+    """What the oracle can do with one arm. Actions are (8,) float32: seven joint targets [rad], gripper in [-1, 1].
+
+    ``num_grasps`` counts the grasps begun so far, without the failed ones.
+    """
+
+    def __init__(self, physics: Physics, failed_grasp: FailedGrasp | None = None) -> None:
+        self.num_grasps = 0
+        self._failed_grasp = failed_grasp
         self._physics = physics
         self._kinematics = Kinematics(physics.model)
         self._gripper = physics.gripper_command()  # it may be holding something already
@@ -107,11 +122,11 @@ class Motions:
 
     def pick(self, cube: str) -> Actions:
         """Grasps a cube from above and lifts it, turning as little as the arm's limits allow."""
-        yield from self._grasp(cube, from_z_m=_ABOVE_M, grasp_z_m=self._physics.position_m(cube)[2])
+        yield from self._grasp(cube, from_z_m=_ABOVE_M, grasp_z_m=self._physics.position_m(cube)[2], miss_m=_MISS_M)
 
     def pick_container(self, container: str) -> Actions:
         """Grasps a standing container by the block on its lid and lifts it high enough to show what it hid."""
-        yield from self._grasp(container, from_z_m=_HIGH_M, grasp_z_m=GRIP_Z_M)
+        yield from self._grasp(container, from_z_m=_HIGH_M, grasp_z_m=GRIP_Z_M, miss_m=_MISS_CONTAINER_M)
 
     def put_down(self, release_z_m: float) -> Actions:
         """Lowers the tool straight down to a height, lets go, and comes back up."""
@@ -149,13 +164,26 @@ class Motions:
         yield from self.move(target)
         yield from self.open()
 
-    def _grasp(self, body: str, *, from_z_m: float, grasp_z_m: float) -> Actions:
+    def _grasp(self, body: str, *, from_z_m: float, grasp_z_m: float, miss_m: float) -> Actions:
         yield from self.open()
+        failed, self.num_grasps = self._failed_grasp, self.num_grasps + 1
+        if failed is not None and failed.before == self.num_grasps - 1:
+            yield from self._miss(body, from_z_m, grasp_z_m, miss_m * np.array(failed.offset))
         above = self._above_block(body, from_z_m, grasp_z_m)
         yield from self.open_at(above)
         yield from self.move(_at_height(above, grasp_z_m))
         yield from self.close()
         yield from self.move(above)
+
+    def _miss(self, body: str, from_z_m: float, grasp_z_m: float, offset_m: Array) -> Actions:
+        """Grasps beside or above a body, comes back up and opens; the body may have been pushed by then."""
+        above = self._above_block(body, from_z_m, grasp_z_m)
+        above[:2, 3] += offset_m[:2]
+        yield from self.open_at(above)
+        yield from self.move(_at_height(above, grasp_z_m + offset_m[2]))
+        yield from self.close()
+        yield from self.move(above)
+        yield from self.open()
 
     def _above_button(self, button: str) -> Array:
         """Where the tool waits above a button, fingers along y; the wrist is turned round if it must be."""

@@ -119,6 +119,10 @@ class Physics:
         """The gripper command in [-1, 1] that is in force; 1 is open."""
         return panda.gripper_command_of(self.data.ctrl)
 
+    def command(self) -> Array:
+        """The action (8,) that is in force: seven joint targets in rad and the gripper's command."""
+        return np.append(self.data.ctrl[:7], self.gripper_command())
+
     def tcp_transform(self) -> Array:
         """Tool centre point as a (4, 4) transform: z leaves the palm, the fingers open along y."""
         T = np.eye(4)
