@@ -1,4 +1,4 @@
-"""The simulated Panda as the protocol sees it: its limits, its cameras, its observations."""
+"""The simulated robots as the protocol sees them: their limits, their cameras, their observations."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CONTROL_HZ = 20
 
 # Franka's datasheet: 2.175 rad/s (joints 1-4), 2.61 rad/s (5-7). RoboMME's own data reach 1.2 rad/s.
 _MAX_JOINT_RAD_S = np.array([2.175] * 4 + [2.61] * 3)
-_GRIPPER_UNLIMITED = 0.0  # a switch: the hand itself limits how fast it closes
+_GRIPPER_UNLIMITED = 0.0  # a switch: the hand itself limits how fast it closes; a stick has nothing to limit
 
 _STATUS = {
     Status.ONGOING: TaskStatus.ONGOING,
@@ -25,14 +25,14 @@ _STATUS = {
 }
 
 
-def simulated_panda(initial_state: np.ndarray) -> Robot:
-    """The robot at reset; its servos hold ``initial_state`` (8,) with the gripper open."""
+def simulated_robot(robot: panda.Robot, initial_state: np.ndarray) -> Robot:
+    """The robot at reset; its servos hold ``initial_state`` (8,), with the gripper open if there is one."""
     return Robot(
-        name="panda_wristcam",
-        command_low=panda.ACTION_LOW.astype(np.float32),
-        command_high=panda.ACTION_HIGH.astype(np.float32),
+        name=robot.name,
+        command_low=robot.action_low.astype(np.float32),
+        command_high=robot.action_high.astype(np.float32),
         max_step=np.append(_MAX_JOINT_RAD_S / CONTROL_HZ, _GRIPPER_UNLIMITED).astype(np.float32),
-        initial_command=np.append(initial_state[:7], 1.0).astype(np.float32),
+        initial_command=np.append(initial_state[:7], robot.rest_command).astype(np.float32),
         cameras=CAMERAS,
         image_height=IMAGE_PX,
         image_width=IMAGE_PX,

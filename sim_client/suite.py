@@ -26,7 +26,7 @@ from protocol.version import version
 from sim_client.config import SimOptions
 from sim_client.episode import Outcome, RobotSide, play_oracle
 from sim_client.recorder import Recorder
-from sim_client.robot import demonstration, simulated_panda
+from sim_client.robot import demonstration, simulated_robot
 
 _OPEN_NS = 130_000_000_000
 _CLOSE_NS = 5_000_000_000
@@ -120,7 +120,7 @@ class Suite:
             difficulty=environment.difficulty,
             instruction=environment.instruction,
             schedule=self._options.schedule(seed),
-            robot=simulated_panda(first.state),
+            robot=simulated_robot(environment.physics.robot, first.state),
             t0_unix_ns=time.time_ns(),
             versions=versions(),
             policy=self._options.policy,

@@ -31,7 +31,7 @@ class Snapshot:
 
     step: int  # control steps since reset returned; in a demonstration, frames since it began
     frames: Mapping[str, NDArray[np.uint8]]  # camera name -> (image_px, image_px, 3) RGB; empty if nobody looked
-    state: NDArray[np.float32]  # (8,): seven joints [rad], one finger's opening [m]
+    state: NDArray[np.float32]  # (8,): seven joints [rad], one finger's opening [m], 0 without fingers
     command: NDArray[np.float32]  # (8,): the action that led here: joint targets [rad], gripper in [-1, 1]
     tcp_pose: NDArray[np.float64]  # (7,): xyz [m], quaternion wxyz
     status: Status
@@ -72,7 +72,7 @@ class Environment:
 
     def __init__(self, task: Task[Any, Any], *, image_px: int, render: bool, max_steps: int) -> None:
         self._task = task
-        spec = table_scene()
+        spec = table_scene(task.robot)
         task.furnish(spec)
         self.physics = Physics(spec)
         self._cameras = Cameras(self.physics, image_px) if render else None
@@ -120,7 +120,8 @@ class Environment:
         parts = self._task.demonstration(layout)
         self._video, last_action = demonstration.perform(self._task, layout, parts, self.physics, self._look_for)
         # Upstream's reset spends one control step too: the button's cap settles on its spring.
-        self.physics.advance(np.append(panda.HOME_QPOS, 1.0) if last_action is None else last_action)
+        at_rest = np.append(panda.HOME_QPOS, self.physics.robot.rest_command)
+        self.physics.advance(at_rest if last_action is None else last_action)
         return self._observe()
 
     def demonstration(self, rate_hz: int = CONTROL_HZ, *, look_hz: int | None = None) -> Iterator[Snapshot]:
@@ -275,11 +276,10 @@ class Environment:
     def _seen(
         self, step: int, progress: Progress, caption: Caption, *, look: bool, is_demonstration: bool = False
     ) -> Snapshot:
-        opening_m = self.physics.finger_openings_m()[:1]
         return Snapshot(
             step=step,
             frames=self._cameras.frames() if look and self._cameras is not None else {},
-            state=np.concatenate([self.physics.arm_qpos(), opening_m]).astype(np.float32),
+            state=self.physics.state().astype(np.float32),
             tcp_pose=pose_of(self.physics.tcp_transform()),
             command=self.physics.command().astype(np.float32),
             status=progress.status,

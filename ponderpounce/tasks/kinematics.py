@@ -31,7 +31,9 @@ class Kinematics:
         self._model = model
         self._scratch = mujoco.MjData(model)
         self._qpos = np.array([model.joint(name).qposadr[0] for name in panda.ARM_JOINTS])
-        self._fingers = np.array([model.joint(name).qposadr[0] for name in panda.FINGER_JOINTS])
+        robot = panda.robot_in(model)
+        self._fingers = np.array([model.joint(name).qposadr[0] for name in robot.finger_joints], dtype=int)
+        self._open_fingers_m = robot.open_fingers_m
         self._dof = np.array([model.joint(name).dofadr[0] for name in panda.ARM_JOINTS])
         self._tcp = model.site(panda.TCP_SITE).id
         self._jacobian = np.zeros((6, model.nv))
@@ -93,7 +95,7 @@ class Kinematics:
         """
         self._scratch.qpos[:] = world.qpos
         self._scratch.mocap_pos[:], self._scratch.mocap_quat[:] = world.mocap_pos, world.mocap_quat
-        self._scratch.qpos[self._fingers] = panda.HOME_OPENING_M * np.array([1.0, -1.0])
+        self._scratch.qpos[self._fingers] = self._open_fingers_m
         self.tcp(qpos)
         mujoco.mj_collision(self._model, self._scratch)
         geoms = self._scratch.contact.geom

@@ -1,4 +1,4 @@
-"""The arm: robosuite's Panda with RoboMME's gains, home pose, tool point and light meshes.
+"""The arm: robosuite's Panda with RoboMME's gains, home pose, tool points and light meshes; with a gripper or a stick.
 
 Only robosuite's asset files are used: the package is located, never imported (importing it compiles numba code, which
 has been seen to corrupt rendered frames, and pulls in a dozen packages).
@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import functools
 import importlib.util
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -22,16 +24,12 @@ FINGER_BODIES = ("leftfinger", "rightfinger")
 TCP_SITE = "tcp"
 HOME_QPOS = np.array([0.0, 0.0, 0.0, -np.pi / 2, 0.0, np.pi / 2, np.pi / 4])  # rad
 HOME_OPENING_M = 0.04
+OPEN, CLOSED = 1.0, -1.0  # gripper commands
 BASE_POSITION_M = (-0.615, 0.0, 0.0)
 
-# State and action are (8,): seven joints in rad, then the gripper. The state's last entry is one finger's opening in
-# metres; the action's is a command in [-1, 1], -1 closed. Joint limits are Franka's, as in robosuite's robot.xml.
+# Franka's, as in robosuite's robot.xml.
 JOINT_LOW_RAD = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
 JOINT_HIGH_RAD = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])
-STATE_LOW = np.append(JOINT_LOW_RAD, 0.0)
-STATE_HIGH = np.append(JOINT_HIGH_RAD, 0.04)
-ACTION_LOW = np.append(JOINT_LOW_RAD, -1.0)
-ACTION_HIGH = np.append(JOINT_HIGH_RAD, 1.0)
 
 ROBOT_BIT, WORLD_BIT = 2, 1  # contact bits: the robot touches the world, not itself
 # As stiff as the physics step allows. With MuJoCo's defaults the fingers sink millimetres into the light cube they
@@ -45,28 +43,99 @@ _FINGER_TARGET_M = (-0.01, 0.04)  # where commands -1 and +1 drive one finger; b
 _FINGER_ARMATURE_KG = 0.5
 _HAND_FROM_FLANGE_M = 0.107  # Franka's datasheet; robosuite mounts its hand half a millimetre short
 _FINGER_FROM_HAND_M = 0.0584  # likewise; robosuite's fingers start 6 mm short
-_TCP_FROM_HAND_M = 0.1034
+STICK_RADIUS_M = 0.008
+_STICK_FROM_HAND_M = (0.05, 0.15)  # where it begins, inside the hand, and where its tip is
 _HEAVY_FACES = 1000  # lighter meshes stay as they are; among them the fingers, which the wrist camera sees close up
 _CELL_M = 0.006  # clustering grid of the visual meshes: looks the same at 256 px, halves the cost of a frame
 
 
-def control_of(action: Array) -> Array:
-    """Returns actuator set points (9,) for an action (8,): seven joints [rad], two fingers [m]."""
-    opening_m = np.interp(action[7], (-1.0, 1.0), _FINGER_TARGET_M)  # clips
-    return np.concatenate([action[:7], [opening_m, -opening_m]])
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Robot:
+    """What the arm carries, and what states (8,) and actions (8,) therefore hold.
+
+    Both begin with the seven joints [rad]. With a gripper, the state ends with one finger's opening [m] and the action
+    with a command in [-1, 1], -1 closed. Without one, the state ends with 0 and the action with -1, which moves
+    nothing.
+    """
+
+    name: str  # upstream's
+    has_gripper: bool
+    tcp_from_hand_m: float
+    oracle_speed_rad_s: float  # how fast a joint turns in the scripted motions
+
+    @property
+    def state_low(self) -> Array:
+        """The least a state (8,) can be."""
+        return np.append(JOINT_LOW_RAD, 0.0)
+
+    @property
+    def state_high(self) -> Array:
+        """The most a state (8,) can be."""
+        return np.append(JOINT_HIGH_RAD, HOME_OPENING_M if self.has_gripper else 0.0)
+
+    @property
+    def action_low(self) -> Array:
+        """The least an action (8,) can ask for."""
+        return np.append(JOINT_LOW_RAD, CLOSED)
+
+    @property
+    def action_high(self) -> Array:
+        """The most an action (8,) can ask for."""
+        return np.append(JOINT_HIGH_RAD, self.rest_command)
+
+    @property
+    def rest_command(self) -> float:
+        """An action's last entry while nothing is done: the gripper is open, if there is one."""
+        return OPEN if self.has_gripper else CLOSED
+
+    @property
+    def finger_joints(self) -> tuple[str, ...]:
+        """The names of the fingers' joints; none without a gripper."""
+        return FINGER_JOINTS if self.has_gripper else ()
+
+    @property
+    def finger_bodies(self) -> tuple[str, ...]:
+        """The names of the fingers; none without a gripper."""
+        return FINGER_BODIES if self.has_gripper else ()
+
+    @property
+    def open_fingers_m(self) -> Array:
+        """Joint positions of the open fingers (2,), or (0,) without a gripper."""
+        return HOME_OPENING_M * np.array([1.0, -1.0] if self.has_gripper else [])
+
+    def control_of(self, action: Array) -> Array:
+        """Returns actuator set points for an action (8,): seven joints [rad], then the fingers if there are any [m]."""
+        if not self.has_gripper:
+            return action[:7]
+        opening_m = np.interp(action[7], (CLOSED, OPEN), _FINGER_TARGET_M)  # clips
+        return np.concatenate([action[:7], [opening_m, -opening_m]])
+
+    def gripper_command_of(self, control: Array) -> float:
+        """Returns the action's last entry behind set points (9,); always -1 without a gripper."""
+        if not self.has_gripper:
+            return CLOSED
+        return float(np.interp(control[7], _FINGER_TARGET_M, (CLOSED, OPEN)))
 
 
-def gripper_command_of(control: Array) -> float:
-    """Returns the gripper command in [-1, 1] behind set points (9,)."""
-    return float(np.interp(control[7], _FINGER_TARGET_M, (-1.0, 1.0)))
+PANDA_WRISTCAM = Robot(name="panda_wristcam", has_gripper=True, tcp_from_hand_m=0.1034, oracle_speed_rad_s=0.9)
+PANDA_STICK = Robot(
+    name="panda_stick", has_gripper=False, tcp_from_hand_m=_STICK_FROM_HAND_M[1], oracle_speed_rad_s=0.3
+)
+_ROBOTS = {robot.name: robot for robot in (PANDA_WRISTCAM, PANDA_STICK)}
 
 
-def panda_spec() -> mujoco.MjSpec:
-    """Returns a fresh, uncompiled model of the arm with its gripper, base at the origin of the world frame's table.
+def robot_in(model: Any) -> Robot:
+    """Returns the robot that a compiled scene was built around: the scene carries its name."""
+    return _ROBOTS[model.names.split(b"\0", 1)[0].decode()]
+
+
+def panda_spec(robot: Robot = PANDA_WRISTCAM) -> mujoco.MjSpec:
+    """Returns a fresh, uncompiled model of the arm with what it carries, base at the origin of the world frame's table.
 
     Raises FileNotFoundError if robosuite's assets are not installed.
     """
-    spec = _source_spec()
+    spec = _source_spec(robot)
+    spec.modelname = robot.name
     light_meshes = _light_meshes()
     for name, (vertices, faces) in light_meshes.items():
         spec.add_mesh(
@@ -83,8 +152,8 @@ def panda_spec() -> mujoco.MjSpec:
     return spec
 
 
-def _source_spec() -> mujoco.MjSpec:
-    """Robosuite's robot and gripper joined, corrected and given our gains, with the full visual meshes."""
+def _source_spec(robot: Robot) -> mujoco.MjSpec:
+    """Robosuite's robot and hand joined, corrected and given our gains, with the full visual meshes."""
     assets = _assets()
     spec = mujoco.MjSpec.from_file(str(assets / "robots/panda/robot.xml"))
     gripper = mujoco.MjSpec.from_file(str(assets / "grippers/panda_gripper.xml"))
@@ -96,19 +165,33 @@ def _source_spec() -> mujoco.MjSpec:
         spec.delete(camera)
     for sensor in list(spec.sensors):
         spec.delete(sensor)
-    hand.add_site(name=TCP_SITE, pos=[0.0, 0.0, _TCP_FROM_HAND_M], group=4)
+    hand.add_site(name=TCP_SITE, pos=[0.0, 0.0, robot.tcp_from_hand_m], group=4)
     spec.body("base").pos = BASE_POSITION_M
     for body in spec.bodies:
         body.gravcomp = 1.0  # upstream's arm feels no gravity; the real one compensates for it
+    for geom in spec.geoms:
+        if geom.contype or geom.conaffinity:
+            geom.contype, geom.conaffinity = ROBOT_BIT, WORLD_BIT
+    if robot.has_gripper:
+        _correct_fingers(spec)
+    else:
+        _replace_fingers_by_stick(spec)
+    for actuator in spec.actuators:
+        actuator.set_to_position(kp=_GAIN_KP, kv=_GAIN_KD)
+        actuator.ctrllimited = False
+        actuator.forcelimited = True
+        actuator.forcerange = [-_FORCE_LIMIT, _FORCE_LIMIT]
+    return spec
+
+
+def _correct_fingers(spec: mujoco.MjSpec) -> None:
+    """Mounts the fingers where Franka's are, as quick and as sticky as upstream's, with their black tips."""
     for body_name in FINGER_BODIES:
         spec.body(body_name).pos = [0.0, 0.0, _FINGER_FROM_HAND_M]
     for name in FINGER_JOINTS:
         # With robosuite's own damping and friction the fingers would close at half of upstream's speed.
         spec.joint(name).damping, spec.joint(name).frictionloss = [0.0] * 3, 0.0
         spec.joint(name).armature = _FINGER_ARMATURE_KG
-    for geom in spec.geoms:
-        if geom.contype or geom.conaffinity:
-            geom.contype, geom.conaffinity = ROBOT_BIT, WORLD_BIT
     for finger in (1, 2):
         for geom in (spec.geom(f"finger{finger}_collision"), spec.geom(f"finger{finger}_pad_collision")):
             geom.friction, geom.condim = [2.0, 0.05, 0.0001], 4
@@ -127,12 +210,25 @@ def _source_spec() -> mujoco.MjSpec:
         )
     for finger in (1, 2):
         spec.geom(f"finger{finger}_visual").rgba = [0.8, 0.8, 0.8, 1.0]
-    for actuator in spec.actuators:
-        actuator.set_to_position(kp=_GAIN_KP, kv=_GAIN_KD)
-        actuator.ctrllimited = False
-        actuator.forcelimited = True
-        actuator.forcerange = [-_FORCE_LIMIT, _FORCE_LIMIT]
-    return spec
+
+
+def _replace_fingers_by_stick(spec: mujoco.MjSpec) -> None:
+    """Takes the fingers off and puts a grey cylinder in their place, its tip the tool point."""
+    for name in FINGER_JOINTS:
+        spec.delete(spec.actuator(f"gripper_{name}"))
+    for name in FINGER_BODIES:
+        spec.delete(spec.body(name))
+    begin_m, tip_m = _STICK_FROM_HAND_M
+    spec.body("right_hand").add_geom(
+        name="stick",
+        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+        size=[STICK_RADIUS_M, (tip_m - begin_m) / 2, 0.0],
+        pos=[0.0, 0.0, (begin_m + tip_m) / 2],
+        rgba=[0.58, 0.58, 0.58, 1.0],
+        contype=ROBOT_BIT,
+        conaffinity=WORLD_BIT,
+        group=1,
+    )
 
 
 def _assets() -> Path:
@@ -148,7 +244,7 @@ def _assets() -> Path:
 @functools.cache
 def _light_meshes() -> dict[str, tuple[Array, NDArray[np.int32]]]:
     """Clustered visual meshes by name: vertices (n, 3) in metres, faces (m, 3). Takes a second, once."""
-    spec = _source_spec()
+    spec = _source_spec(PANDA_WRISTCAM)  # the stick robot's are among its
     names = {geom.meshname for geom in spec.geoms if geom.meshname and geom.group == 1}
     model = spec.compile()
     meshes = {}

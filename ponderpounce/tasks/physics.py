@@ -44,10 +44,11 @@ class Physics:
         self.model = model = spec.compile()
         self.data = mujoco.MjData(model)
         self.substeps = whole_substeps(model.opt.timestep, CONTROL_HZ)
+        self.robot = panda.robot_in(model)
         self._arm_qpos = np.array([model.joint(name).qposadr[0] for name in panda.ARM_JOINTS])
         self._arm_qvel = np.array([model.joint(name).dofadr[0] for name in panda.ARM_JOINTS])
-        self._finger_qpos = np.array([model.joint(name).qposadr[0] for name in panda.FINGER_JOINTS])
-        self._fingers = [model.body(name).id for name in panda.FINGER_BODIES]
+        self._finger_qpos = np.array([model.joint(name).qposadr[0] for name in self.robot.finger_joints], dtype=int)
+        self._fingers = [model.body(name).id for name in self.robot.finger_bodies]
         self._tcp = model.site(panda.TCP_SITE).id
         # A finger owns the bodies below it (its pad sits on a child body).
         self._owner = {body: body for body in self._fingers}
@@ -59,12 +60,12 @@ class Physics:
         self.reset()
 
     def reset(self) -> None:
-        """Puts the arm at home with the gripper open, at rest, parks every prop and takes back every paint."""
+        """Puts the arm at home with an open gripper, at rest, parks every prop and takes back every paint."""
         mujoco.mj_resetData(self.model, self.data)
         self.model.geom_rgba[:] = self._compiled_rgba
         self.data.qpos[self._arm_qpos] = panda.HOME_QPOS
-        self.data.qpos[self._finger_qpos] = [panda.HOME_OPENING_M, -panda.HOME_OPENING_M]
-        self.data.ctrl[:] = panda.control_of(np.append(panda.HOME_QPOS, 1.0))
+        self.data.qpos[self._finger_qpos] = self.robot.open_fingers_m
+        self.data.ctrl[:] = self.robot.control_of(np.append(panda.HOME_QPOS, self.robot.rest_command))
         for name in self._props:
             self.park(name)
         self.refresh()
@@ -95,7 +96,7 @@ class Physics:
 
     def advance(self, action: Array) -> None:
         """Drives the arm towards an action (8,) for one control step: exactly 50 ms."""
-        self.data.ctrl[:] = panda.control_of(action)
+        self.data.ctrl[:] = self.robot.control_of(action)
         mujoco.mj_step(self.model, self.data, self.substeps)
         self.refresh()
 
@@ -111,13 +112,17 @@ class Physics:
         """Joint speeds (7,) in rad/s."""
         return self.data.qvel[self._arm_qvel]
 
+    def state(self) -> Array:
+        """What the robot says of itself (8,): seven joints in rad, and one finger's opening in m, 0 without fingers."""
+        return np.append(self.arm_qpos(), self.finger_openings_m()[:1] if self.robot.has_gripper else 0.0)
+
     def finger_openings_m(self) -> Array:
-        """Both fingers' distances (2,) from the closed position."""
+        """Both fingers' distances (2,) from the closed position; (0,) without a gripper."""
         return np.abs(self.data.qpos[self._finger_qpos])
 
     def gripper_command(self) -> float:
-        """The gripper command in [-1, 1] that is in force; 1 is open."""
-        return panda.gripper_command_of(self.data.ctrl)
+        """The gripper command in [-1, 1] that is in force; 1 is open. Always -1 without a gripper."""
+        return self.robot.gripper_command_of(self.data.ctrl)
 
     def command(self) -> Array:
         """The action (8,) that is in force: seven joint targets in rad and the gripper's command."""
@@ -144,7 +149,10 @@ class Physics:
         return float(self.data.qpos[self.model.joint(joint).qposadr[0]])
 
     def is_grasped(self, name: str) -> bool:
-        """True if both fingers press on the body with at least 0.5 N, within 85 degrees of their opening axis."""
+        """True if both fingers press on the body with at least 0.5 N, within 85 degrees of their opening axis.
+
+        Never without a gripper.
+        """
         force_of_finger = {finger: np.zeros(3) for finger in self._fingers}
         body = self.model.body(name).id
         wrench = np.empty(6)
@@ -159,7 +167,7 @@ class Physics:
             # The contact frame's x axis points from the first geom to the second: flip it to point into the finger.
             into_finger = 1.0 if first == body else -1.0
             force_of_finger[finger] += into_finger * (wrench[:3] @ contact.frame.reshape(3, 3))
-        return all(self._presses(finger, force) for finger, force in force_of_finger.items())
+        return bool(force_of_finger) and all(self._presses(*item) for item in force_of_finger.items())
 
     def _presses(self, finger: int, force_n: Array) -> bool:
         outward = self.data.xmat[finger].reshape(3, 3)[:, 1]

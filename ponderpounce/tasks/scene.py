@@ -14,7 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ponderpounce.tasks.geometry import Footprint, is_clear
-from ponderpounce.tasks.panda import ROBOT_BIT, STIFF_SOLIMP, STIFF_SOLREF, WORLD_BIT, panda_spec
+from ponderpounce.tasks.panda import (
+    PANDA_WRISTCAM,
+    ROBOT_BIT,
+    STIFF_SOLIMP,
+    STIFF_SOLREF,
+    WORLD_BIT,
+    Robot,
+    panda_spec,
+)
 
 FRONT, WRIST = "front", "wrist"
 CAMERAS = (FRONT, WRIST)  # upstream calls them base_camera and hand_camera
@@ -52,9 +60,9 @@ def display_rgba(linear: RGBA) -> RGBA:
     return r, g, b, alpha
 
 
-def table_scene() -> mujoco.MjSpec:
-    """Returns the arm at its table with lights and the two cameras; tasks add their props before it is compiled."""
-    spec = panda_spec()
+def table_scene(robot: Robot = PANDA_WRISTCAM) -> mujoco.MjSpec:
+    """Returns a robot at its table with lights and the two cameras; tasks add their props before it is compiled."""
+    spec = panda_spec(robot)
     spec.option.timestep = PHYSICS_STEP_S
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     # Elliptic cones and a stiff friction ratio: with MuJoCo's defaults a held cube creeps out of the fingers.

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ponderpounce.tasks.oracle import Motions
+from ponderpounce.tasks.panda import PANDA_WRISTCAM, Robot
 from ponderpounce.tasks.physics import Physics
 
 DIFFICULTIES = ("easy", "medium", "hard")
@@ -78,6 +79,7 @@ class Task(ABC, Generic[LayoutT, MemoryT]):
 
     name: ClassVar[str]
     family: ClassVar[str]
+    robot: ClassVar[Robot] = PANDA_WRISTCAM
 
     @abstractmethod
     def furnish(self, spec: mujoco.MjSpec) -> None:

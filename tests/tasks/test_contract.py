@@ -83,8 +83,8 @@ def test_snapshots_are_well_formed(environment: EnvironmentOf, name: str, diffic
         assert snapshot.tcp_pose.shape == (7,)
         assert np.isfinite(snapshot.state).all()
         assert np.isfinite(snapshot.tcp_pose).all()
-        assert np.all(snapshot.state >= panda.STATE_LOW - 1e-3)
-        assert np.all(snapshot.state <= panda.STATE_HIGH + 1e-3)
+        assert np.all(snapshot.state >= env.physics.robot.state_low - 1e-3)
+        assert np.all(snapshot.state <= env.physics.robot.state_high + 1e-3)
         assert 0 <= snapshot.subtask_index <= len(env.subtasks)
 
 
@@ -96,8 +96,8 @@ def test_the_oracle_speaks_in_actions(environment: EnvironmentOf, name: str, dif
     for action in islice(env.oracle(), 150):
         assert action.shape == (8,)
         assert action.dtype == np.float32
-        assert np.all(action >= panda.ACTION_LOW)
-        assert np.all(action <= panda.ACTION_HIGH)
+        assert np.all(action >= env.physics.robot.action_low)
+        assert np.all(action <= env.physics.robot.action_high)
         assert np.abs(action[:7] - snapshot.state[:7]).max() < 0.25  # the arm can follow
         snapshot = env.step(action)
         if snapshot.status is not Status.ONGOING:

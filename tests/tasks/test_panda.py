@@ -43,21 +43,22 @@ def test_the_limits_are_the_models(world: Physics) -> None:
 
 
 def test_limits_have_the_shape_of_state_and_action() -> None:
-    for low, high in ((panda.STATE_LOW, panda.STATE_HIGH), (panda.ACTION_LOW, panda.ACTION_HIGH)):
+    robot = panda.PANDA_WRISTCAM
+    for low, high in ((robot.state_low, robot.state_high), (robot.action_low, robot.action_high)):
         assert low.shape == high.shape == (8,)
         assert np.all(low < high)
 
 
 @pytest.mark.parametrize(("command", "opening_m"), [(-1, -0.01), (1, 0.04), (0, 0.015), (-7, -0.01), (7, 0.04)])
 def test_gripper_command_is_a_clipped_finger_target(command: float, opening_m: float) -> None:
-    control = panda.control_of(np.append(panda.HOME_QPOS, command))
+    control = panda.PANDA_WRISTCAM.control_of(np.append(panda.HOME_QPOS, command))
     np.testing.assert_allclose(control[7:], [opening_m, -opening_m], atol=1e-15)
 
 
 @given(st.floats(-1, 1))
 def test_gripper_command_can_be_read_back(command: float) -> None:
-    control = panda.control_of(np.append(panda.HOME_QPOS, command))
-    assert panda.gripper_command_of(control) == pytest.approx(command, abs=1e-12)
+    control = panda.PANDA_WRISTCAM.control_of(np.append(panda.HOME_QPOS, command))
+    assert panda.PANDA_WRISTCAM.gripper_command_of(control) == pytest.approx(command, abs=1e-12)
 
 
 def test_gains_are_upstreams(world: Physics) -> None:
