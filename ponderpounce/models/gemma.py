@@ -42,9 +42,9 @@ class Rotation:
     sin: Tensor
 
     @classmethod
-    def at(cls, positions_BT: Tensor, head_dim: int) -> "Rotation":
+    def at(cls, positions_BT: Tensor, head_dim: int, base: float = ROPE_BASE) -> "Rotation":
         exponent = torch.arange(0, head_dim, 2, dtype=torch.float32, device=positions_BT.device) / head_dim
-        angle_B1TD = positions_BT[:, None, :, None].float() / ROPE_BASE**exponent
+        angle_B1TD = positions_BT[:, None, :, None].float() / base**exponent
         return cls(angle_B1TD.cos(), angle_B1TD.sin())
 
     def __call__(self, x_BhTD: Tensor) -> Tensor:

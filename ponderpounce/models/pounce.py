@@ -4,7 +4,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -57,6 +57,22 @@ class PounceConfig:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, came {getattr(self, name)}")
 
+    @property
+    def horizon(self) -> int:
+        return self.pi05.horizon
+
+    @property
+    def padded_action_dim(self) -> int:
+        return self.pi05.action_dim
+
+    @property
+    def image_px(self) -> int:
+        return self.pi05.vision.image_px
+
+    @property
+    def vocab_size(self) -> int:
+        return self.pi05.vocab_size
+
     def example_inputs(self, batch_size: int, *, num_tokens: int = 12, seed: int = 0) -> PounceInputs:
         """Fabricates a valid batch for tests and benchmarks: all views present, cognition 300 ms old."""
         generator = torch.Generator().manual_seed(seed)
@@ -82,6 +98,24 @@ class PounceConfig:
         return actions
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Backbone:
+    """The pretrained parts that a recipe may freeze."""
+
+    vision: tuple[nn.Module, ...]
+    """Image tower and its projector."""
+    language: nn.Module
+
+
+class Freezable(Protocol):
+    """A POUNCE of either family, as `freeze` sees it."""
+
+    @property
+    def backbone(self) -> Backbone: ...
+
+    def requires_grad_(self, requires_grad: bool = True) -> Any: ...
+
+
 class Pounce(nn.Module):
     """pi0.5 plus, for K >= 1, the cognition prefix."""
 
@@ -92,6 +126,10 @@ class Pounce(nn.Module):
         has_prefix = config.cognition.num_carriers > 0
         width = config.pi05.language.width
         self.cognition_prefix = CognitionPrefix(config.cognition, width) if has_prefix else None
+
+    @property
+    def backbone(self) -> Backbone:
+        return Backbone(vision=(self.pi05.vision, self.pi05.projector), language=self.pi05.language)
 
     def prefill(self, inputs: PounceInputs) -> PrefixCache:
         """Embeds [P][images][text] and runs it through the language layers once."""
@@ -138,19 +176,21 @@ class Pounce(nn.Module):
         return self.pi05.sample(noise_BNA, self.prefill(inputs), table)
 
 
-def freeze(model: Pounce, what: Freeze = "vlm") -> None:
+def freeze(model: Freezable, what: Freeze = "vlm") -> None:
     """Sets ``requires_grad`` of every parameter. Gradients still pass *through* frozen layers to C.
 
-    - ``vlm`` (the paper, B.1: "including the PaliGemma backbone"): vision, projector and language are frozen.
-    - ``vision`` (RoboMME's released pi0.5 recipe; the paper's wording differs): SigLIP and projector are.
+    - ``vlm`` (the paper, B.1: "including the PaliGemma backbone"; GR00T's own recipe keeps its language frozen
+      too): vision, projector and language are frozen.
+    - ``vision`` (RoboMME's released pi0.5 recipe; the paper's wording differs): vision and projector are.
     - ``none``: everything trains.
 
     Never run the prefix under ``no_grad`` or ``detach`` it to save memory: that is the path to PONDER.
     """
-    frozen: dict[Freeze, list[nn.Module]] = {
-        "none": [],
-        "vision": [model.pi05.vision, model.pi05.projector],
-        "vlm": [model.pi05.vision, model.pi05.projector, model.pi05.language],
+    backbone = model.backbone
+    frozen: dict[Freeze, tuple[nn.Module, ...]] = {
+        "none": (),
+        "vision": backbone.vision,
+        "vlm": (*backbone.vision, backbone.language),
     }
     if what not in frozen:
         raise ValueError(f"freeze must be one of {', '.join(frozen)}, came {what!r}")

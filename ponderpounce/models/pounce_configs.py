@@ -1,13 +1,23 @@
 """Named complete POUNCE configurations."""
 
+from ponderpounce.models.eagle import EagleConfig
 from ponderpounce.models.gemma import GemmaConfig
+from ponderpounce.models.groot import GrootConfig
+from ponderpounce.models.groot_blocks import BlockConfig
 from ponderpounce.models.interface import CognitionConfig
 from ponderpounce.models.pi05 import Pi05Config
 from ponderpounce.models.pounce import PounceConfig
+from ponderpounce.models.pounce_groot import GrootPounceConfig
+from ponderpounce.models.qwen3 import Qwen3Config
 from ponderpounce.models.siglip import VisionConfig
 
 ROBOMME_HORIZON = 20
 """One second of 20 Hz playback (paper B.1)."""
+GROOT_HORIZON = 16
+GROOT_PROJECTOR_STD = 1e-3
+"""Of a fresh W_c (the paper gives it for GR00T)."""
+TINY_IMAGE_TOKEN_ID = 261
+"""Of ``<IMG_CONTEXT>`` in `groot_prompt.tiny_tokenizer_for_random_weights`."""
 
 
 def pi05_base(*, num_carriers: int = 1, cognition_size: int = 4096, horizon: int = ROBOMME_HORIZON) -> PounceConfig:
@@ -38,4 +48,48 @@ def tiny_cpu(*, num_carriers: int = 1, cognition_size: int = 64, horizon: int = 
             horizon=horizon,
         ),
         cognition=CognitionConfig(num_carriers=num_carriers, cognition_size=cognition_size),
+    )
+
+
+def groot_n1_5(*, num_carriers: int = 1, cognition_size: int = 4096, horizon: int = GROOT_HORIZON) -> GrootPounceConfig:
+    """The public GR00T N1.5 (2.72 B with its unused LM head) with a prefix from a 9B PONDER."""
+    return GrootPounceConfig(
+        groot=GrootConfig(
+            eagle=EagleConfig(
+                vision=VisionConfig(width=1152, depth=27, num_heads=16, mlp_width=4304),
+                language=Qwen3Config(width=2048, depth=12, mlp_width=6144),
+            ),
+            mixer=BlockConfig(depth=4, num_heads=32, head_dim=64, mlp_width=8192),
+            dit=BlockConfig(depth=16, num_heads=32, head_dim=48, mlp_width=6144),
+            horizon=horizon,
+        ),
+        cognition=CognitionConfig(
+            num_carriers=num_carriers, cognition_size=cognition_size, projector_std=GROOT_PROJECTOR_STD
+        ),
+    )
+
+
+def tiny_groot(*, num_carriers: int = 1, cognition_size: int = 64, horizon: int = ROBOMME_HORIZON) -> GrootPounceConfig:
+    """`tiny_cpu` with GR00T's parts. Twenty rows, so that it plays the same schedules."""
+    return GrootPounceConfig(
+        groot=GrootConfig(
+            eagle=EagleConfig(
+                vision=VisionConfig(width=48, depth=2, num_heads=3, mlp_width=96, patch_px=28),
+                language=Qwen3Config(
+                    width=64, depth=2, mlp_width=128, num_heads=4, num_kv_heads=2, head_dim=16, vocab_size=512
+                ),
+                image_token_id=TINY_IMAGE_TOKEN_ID,
+            ),
+            mixer=BlockConfig(depth=1, num_heads=4, head_dim=16, mlp_width=128),
+            dit=BlockConfig(depth=4, num_heads=4, head_dim=12, mlp_width=96),
+            hidden_width=48,
+            num_embodiments=2,
+            num_future_tokens=4,
+            max_actions=64,
+            horizon=horizon,
+        ),
+        cognition=CognitionConfig(
+            num_carriers=num_carriers, cognition_size=cognition_size, projector_std=GROOT_PROJECTOR_STD
+        ),
+        embodiment=1,
     )

@@ -4,8 +4,12 @@ import torch
 from torch import nn
 
 from ponderpounce.models.gemma import RmsNorm
+from ponderpounce.models.groot import Groot
+from ponderpounce.models.groot_blocks import EmbodimentLinear
 from ponderpounce.models.pi05 import Pi05
 from ponderpounce.models.pounce import Pounce, PounceConfig
+from ponderpounce.models.pounce_groot import GrootPounce, GrootPounceConfig
+from ponderpounce.models.qwen3 import PlainRmsNorm
 
 
 def random_pounce(config: PounceConfig, seed: int) -> Pounce:
@@ -22,32 +26,62 @@ def random_pounce(config: PounceConfig, seed: int) -> Pounce:
     return model
 
 
-def initialise_prefix(model: Pounce, generator: torch.Generator) -> None:
+def random_groot_pounce(config: GrootPounceConfig, seed: int) -> GrootPounce:
+    """`random_pounce` with GR00T inside."""
+    with torch.device("meta"):
+        model = GrootPounce(config)
+    model.to_empty(device="cpu")
+    generator = torch.Generator().manual_seed(seed)
+    initialise_groot(model.groot, generator)
+    initialise_prefix(model, generator)
+    return model
+
+
+def initialise_prefix(model: Pounce | GrootPounce, generator: torch.Generator) -> None:
     """Draws a fresh cognition prefix to the scale of the model's text embeddings; nothing to do at K = 0."""
     if model.cognition_prefix is None:
         return
-    embedding = model.pi05.language.embed_tokens.weight.detach()
-    text_rms = embedding.float().square().mean().sqrt().item() * embedding.shape[1] ** 0.5
+    if isinstance(model, Pounce):
+        embedding = model.pi05.language.embed_tokens.weight.detach()
+        scale = embedding.shape[1] ** 0.5  # pi0.5 multiplies its text embeddings
+    else:
+        embedding = model.groot.eagle.language.embed_tokens.weight.detach()
+        scale = 1.0
+    text_rms = embedding.float().square().mean().sqrt().item() * scale
     model.cognition_prefix.to_empty(device=embedding.device)
     model.cognition_prefix.initialise(text_rms, generator)
 
 
-@torch.no_grad()
 def initialise_pi05(pi05: Pi05, generator: torch.Generator) -> None:
     """Keeps the variance of activations: weights N(0, 1 / fan-in), biases 0, norms the identity.
 
     The adaRMS layers are drawn like the rest. Public training starts them at zero, which shuts every gate:
     such a model does not look at its images, and a test on it would show nothing.
     """
-    for module in pi05.modules():
+    _draw(pi05, generator)
+
+
+def initialise_groot(groot: Groot, generator: torch.Generator) -> None:
+    """As `initialise_pi05`; every embodiment gets weights of its own."""
+    _draw(groot, generator)
+
+
+@torch.no_grad()
+def _draw(network: nn.Module, generator: torch.Generator) -> None:
+    for module in network.modules():
         if isinstance(module, nn.Linear | nn.Conv2d):
             module.weight.normal_(std=module.weight[0].numel() ** -0.5, generator=generator)
             if module.bias is not None:
                 module.bias.zero_()
+        elif isinstance(module, EmbodimentLinear):
+            module.W.normal_(std=module.W.shape[1] ** -0.5, generator=generator)
+            module.b.zero_()
         elif isinstance(module, nn.Embedding):
             module.weight.normal_(std=module.embedding_dim**-0.5, generator=generator)
         elif isinstance(module, nn.LayerNorm):
             module.weight.fill_(1.0)
             module.bias.zero_()
+        elif isinstance(module, PlainRmsNorm):
+            module.weight.fill_(1.0)
         elif isinstance(module, RmsNorm):
             module.weight.zero_()
