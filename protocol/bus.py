@@ -6,6 +6,7 @@ a subscriber drains its subscription when it is ready, so no model ever runs on 
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -195,15 +196,22 @@ class LocalBus:
 
 
 class Bell:
-    """Wakes one waiting thread when anything arrives on any subscription."""
+    """Wakes one waiting thread when anything arrives on any subscription.
+
+    A lock that is free while the bell has been rung: one system call to ring, one to wait, where ``threading.Event``
+    makes a new lock for every wait.
+    """
 
     def __init__(self) -> None:
-        self._event = threading.Event()
+        self._silence = threading.Lock()
+        self._silence.acquire()
 
     def ring(self) -> None:
-        self._event.set()
+        with contextlib.suppress(RuntimeError):  # rung already, and not yet heard
+            self._silence.release()
 
     def wait(self, timeout_ns: int) -> None:
-        if timeout_ns > 0 and not self._event.is_set():
-            self._event.wait(timeout_ns / 1e9)
-        self._event.clear()
+        if timeout_ns > 0:
+            self._silence.acquire(timeout=timeout_ns / 1e9)
+        else:
+            self._silence.acquire(blocking=False)

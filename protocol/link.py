@@ -12,6 +12,7 @@ import secrets
 import struct
 from collections import Counter
 from collections.abc import Callable
+from functools import cache
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from protocol import codec, topics
@@ -25,7 +26,6 @@ T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 _ATTACHMENT = struct.Struct("<QqQ")  # seq, source_ns, boot_id
-_ENCODING = "application/protobuf;"
 
 
 class Received(NamedTuple, Generic[T]):
@@ -93,7 +93,7 @@ class Link:
         self.bus.publish(
             topics.stream_key(topic, self.robot, self.episode or "none", self.proc),
             payload,
-            encoding=_ENCODING + codec.type_name(topic.cls),
+            encoding=_encoding(topic.cls),  # type: ignore[arg-type]
             attachment=_ATTACHMENT.pack(signed.header.seq, source_ns, self.boot_id),  # type: ignore[attr-defined]
             priority=topic.priority,
         )
@@ -136,7 +136,7 @@ class Stream(Generic[T]):
     def __init__(self, link: Link, topic: Topic[T], subscription: Subscription) -> None:
         self._link = link
         self._topic = topic
-        self._encoding = _ENCODING + codec.type_name(topic.cls)
+        self._encoding = _encoding(topic.cls)  # type: ignore[arg-type]
         self.subscription = subscription
 
     def drain(self) -> list[T]:
@@ -152,24 +152,32 @@ class Stream(Generic[T]):
         return accepted
 
     def _accept(self, sample: Sample) -> T | None:
-        source = f"{sample.key}#{_boot_of(sample)}"
         if sample.encoding != self._encoding:
-            self._link.drop(source, "wrong_encoding", f"expected {self._encoding}, came {sample.encoding}")
+            self._link.drop(_source(sample), "wrong_encoding", f"expected {self._encoding}, came {sample.encoding}")
             return None
         try:
             message = codec.decode(self._topic.cls, sample.payload)
         except ProtocolError as error:
-            self._link.drop(source, "malformed", str(error))
+            self._link.drop(_source(sample), "malformed", str(error))
             return None
         header: Header = message.header  # type: ignore[attr-defined]
         episode = topics.episode_of(sample.key)
         if header.robot != self._link.robot:
-            self._link.drop(source, "wrong_robot", f"expected {self._link.robot}, came {header.robot}")
+            self._link.drop(_source(sample), "wrong_robot", f"expected {self._link.robot}, came {header.robot}")
             return None
         if episode and header.episode != episode:
-            self._link.drop(source, "wrong_episode", f"key says {episode}, header says {header.episode}")
+            self._link.drop(_source(sample), "wrong_episode", f"key says {episode}, header says {header.episode}")
             return None
         return message
+
+
+@cache
+def _encoding(cls: Any) -> str:
+    return f"application/protobuf;{codec.type_name(cls)}"
+
+
+def _source(sample: Sample) -> str:
+    return f"{sample.key}#{_boot_of(sample)}"
 
 
 def _boot_of(sample: Sample) -> int:
