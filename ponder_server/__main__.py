@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-import logging
 import sys
 
 import tyro
 
+from clock.daemon import serve_model
 from ponder_server.config import NUM_TORCH_THREADS, PonderOptions
 from ponder_server.contract import PonderEngine
-from protocol.errors import TransportError
-from protocol.heartbeat import Heartbeat
-from protocol.link import Link
-from protocol.messages import ServingState
-from protocol.process import StopFlag, host_clock_id, run, set_up_logging
-from protocol.version import version
-from protocol.zenoh_bus import open_bus
-
-log = logging.getLogger("ponder-serve")
+from ponder_server.serve import PonderServer
 
 
 def build_engine(options: PonderOptions) -> PonderEngine:
@@ -50,33 +42,8 @@ def build_engine(options: PonderOptions) -> PonderEngine:
 
 def main(argv: list[str] | None = None) -> int:
     options = tyro.cli(PonderOptions, args=argv, prog="ponder-serve", description=PonderOptions.__doc__)
-    set_up_logging()
-    should_stop = StopFlag()
-    try:
-        bus = open_bus(options.link)
-    except TransportError as error:
-        print(f"ponder-serve: {error}", file=sys.stderr)
-        return 2
-    link = Link(bus, robot=options.link.robot, proc="ponder")
-    heartbeat = Heartbeat(link, version(), host_clock_id())
-    try:
-        heartbeat.set(state=ServingState.LOADING, detail=str(options.checkpoint or "random weights"))
-        try:
-            engine = build_engine(options)
-        except (OSError, ValueError) as error:
-            heartbeat.set(state=ServingState.FAILED, detail=str(error)[:2000])
-            print(f"ponder-serve: {error}", file=sys.stderr)
-            return 2
-        from ponder_server.serve import PonderServer
-
-        server = PonderServer(link, engine, heartbeat, version())
-        server.warm_up()
-        server.ready()
-        run(bus, server.step, should_stop)
-        heartbeat.set(state=ServingState.CLOSING)
-    finally:
-        bus.close()
-    return 0
+    weights = str(options.checkpoint or "random weights")
+    return serve_model("ponder", options.link, weights, lambda: build_engine(options), PonderServer)
 
 
 if __name__ == "__main__":
