@@ -17,9 +17,12 @@ class PounceOptions:
 
     link: LinkOptions = field(default_factory=lambda: LinkOptions(listen=("tcp/127.0.0.1:7449",)))
     checkpoint: Path | None = None
-    """Folder with config.json and model.safetensors (ours, openpi's or lerobot's pi0.5); none: random weights."""
+    """Folder with config.json and model.safetensors: ours, openpi's or lerobot's pi0.5, NVIDIA's or lerobot's GR00T
+    N1.5; none: random weights."""
+    family: Literal["pi05", "groot"] | None = None
+    """Action model of the random weights, pi0.5 by default; a checkpoint knows its own, and must be this one."""
     tokenizer: Path | None = None
-    """SentencePiece file, if the checkpoint folder has none."""
+    """tokenizer.model (pi0.5) or tokenizer.json (GR00T), if the checkpoint folder has none."""
     seed: int = 0
     """Of the random weights, if there is no checkpoint."""
     num_carriers: int = 1

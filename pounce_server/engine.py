@@ -1,18 +1,22 @@
-"""pi0.5 as an action engine: one request in, one chunk of absolute joint targets out."""
+"""A POUNCE of either family as an action engine: one request in, one chunk of absolute joint targets out."""
 
 # N horizon, A padded action dim
 
 import time
+from collections.abc import Callable, Iterator
+from typing import TypeAlias
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ponderpounce.models.images import camera_batch
-from ponderpounce.models.pounce import PounceInputs
+from ponderpounce.models.flow import EulerStep
+from ponderpounce.models.groot_prompt import EagleTokenizer
+from ponderpounce.models.pounce import Pounce
 from ponderpounce.models.pounce_checkpoint import PounceBundle
-from ponderpounce.models.prompt import prompt_text
+from ponderpounce.models.pounce_family import AnyPounce
+from ponderpounce.models.prompt import Tokenizer
 from pounce_server.contract import (
     DTypeName,
     EngineSpec,
@@ -24,29 +28,32 @@ from pounce_server.contract import (
     no_progress,
 )
 from pounce_server.precision import cast_for_serving
+from pounce_server.reading import groot_inputs, pi05_inputs
 
-__all__ = ["EngineSpec", "Pi05Engine", "PounceEngine", "Request"]
+__all__ = ["EagerEngine", "EngineSpec", "PounceEngine", "Request"]
+
+Sampler: TypeAlias = Callable[[Request, Tensor], Iterator[EulerStep]]
+"""Reads a request and yields the flow steps from a given noise, (1, N, A)."""
 
 WARM_UP_UNMEASURED = 3
 WARM_UP_MEASURED = 20
 
 
-class Pi05Engine:
+class EagerEngine:
     """Eager PyTorch, for one thread at a time. Takes over the bundle's model: casts and moves it in place."""
 
     def __init__(self, bundle: PounceBundle, *, device: str = "cpu", dtype: DTypeName = "float32") -> None:
         config = bundle.model.config
-        self._tokenizer = bundle.tokenizer
         self._statistics = bundle.statistics
-        self._config = config
+        self._padded_action_dim = config.padded_action_dim
         self._device = torch.device(device)
         self.spec = EngineSpec(
-            horizon=config.pi05.horizon,
+            horizon=config.horizon,
             action_dim=config.robot_action_dim,
             proprio_dim=bundle.statistics.state.num_dims,
             num_carriers=config.cognition.num_carriers,
             cognition_size=config.cognition.cognition_size,
-            image_px=config.pi05.vision.image_px,
+            image_px=config.image_px,
             num_steps=config.num_steps,
             num_cameras=config.num_cameras,
             model_hash=bundle.digest(),
@@ -54,9 +61,8 @@ class Pi05Engine:
             has_fresh_prefix=bundle.has_fresh_prefix,
             dtype=dtype,
         )
-        self._model = cast_for_serving(bundle.model, dtype).to(self._device).eval()
-        with torch.inference_mode():
-            self._table = self._model.step_table()
+        model = cast_for_serving(bundle.model, dtype).to(self._device).eval()
+        self._sample = _sampler(model, bundle, self._device)
 
     @torch.inference_mode()
     def invoke(self, request: Request, progress: Progress = no_progress) -> NDArray[np.float32]:
@@ -66,9 +72,8 @@ class Pi05Engine:
             ValueError: the request does not fit ``spec``, or holds a number that is not finite.
         """
         check_request(request, self.spec)
-        inputs = self._inputs(request)
         actions_BNA = noise_BNA = self._noise(request.seed)
-        for step in self._model.sample(inputs, noise_BNA, self._table):
+        for step in self._sample(request, noise_BNA):
             actions_BNA = step.actions
             progress()
         robot_actions_N8 = actions_BNA[0, :, : self.spec.action_dim].cpu().numpy()
@@ -84,31 +89,25 @@ class Pi05Engine:
             durations_ns.append(time.perf_counter_ns() - start_ns)
         return durations_ns[WARM_UP_UNMEASURED:]
 
-    def _inputs(self, request: Request) -> PounceInputs:
-        """A batch of one without padding, so that no mask hides anything but a missing camera."""
-        images, has_view = camera_batch(request.frames, self.spec.image_px)
-        state = self._statistics.state.normalise(request.proprio)
-        token_ids = self._tokenizer.encode(prompt_text(request.instruction, state))
-        if len(token_ids) > self._config.max_prompt_tokens:
-            raise ValueError(
-                f"prompt has {len(token_ids)} tokens, expected at most {self._config.max_prompt_tokens} "
-                f"(max_prompt_tokens); shorten the instruction {request.instruction[:60]!r}"
-            )
-        cognition = None
-        if request.cognition is not None:
-            # Copied into aligned memory: where a NumPy array happens to lie changes the last bit of a product.
-            cognition = torch.tensor(request.cognition, device=self._device)[None]
-        return PounceInputs(
-            images=images.to(self._device),
-            has_view=has_view.to(self._device),
-            token_ids=torch.tensor([token_ids], device=self._device),
-            is_token=torch.ones(1, len(token_ids), dtype=torch.bool, device=self._device),
-            age_ns=torch.tensor([request.age_ns], device=self._device),
-            cognition=cognition,
-        )
-
     def _noise(self, seed: int) -> Tensor:
         """Drawn on the CPU: one seed is one noise on every device."""
         generator = torch.Generator().manual_seed(seed)
-        shape = (1, self.spec.horizon, self._config.pi05.action_dim)
+        shape = (1, self.spec.horizon, self._padded_action_dim)
         return torch.randn(shape, generator=generator).to(self._device)
+
+
+@torch.inference_mode()
+def _sampler(model: AnyPounce, bundle: PounceBundle, device: torch.device) -> Sampler:
+    """Tabulates what depends on the flow step only, and returns the rest."""
+    statistics, tokenizer = bundle.statistics, bundle.tokenizer
+    if isinstance(model, Pounce):
+        assert isinstance(tokenizer, Tokenizer), "the bundle checks this"
+        pi05, text, table = model, tokenizer, model.step_table()
+        return lambda request, noise: pi05.sample(
+            pi05_inputs(request, pi05.config, text, statistics, device), noise, table
+        )
+    assert isinstance(tokenizer, EagleTokenizer), "the bundle checks this"
+    groot, eagle_text, groot_table = model, tokenizer, model.step_table()
+    return lambda request, noise: groot.sample(
+        groot_inputs(request, groot.config, eagle_text, statistics, device), noise, groot_table
+    )

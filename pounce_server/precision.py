@@ -2,19 +2,22 @@
 
 import torch
 
-from ponderpounce.models.pounce import Pounce
+from ponderpounce.models.pounce_family import AnyPounce
 from pounce_server.contract import DTypeName
 
-_STREAMS = ("pi05.vision.", "pi05.projector.", "pi05.language.", "pi05.expert.")
+_STREAMS = (
+    *("pi05.vision.", "pi05.projector.", "pi05.language.", "pi05.expert."),
+    *("groot.eagle.", "groot.mixer.", "groot.dit.blocks.", "groot.dit.proj_out_2."),
+)
 _FLOAT32_PARTS = ("norm", "patch_embedding", "position_embedding")
 
 
-def cast_for_serving(model: Pounce, dtype: DTypeName) -> Pounce:
+def cast_for_serving(model: AnyPounce, dtype: DTypeName) -> AnyPounce:
     """Casts ``model`` in place and returns it.
 
-    In bfloat16 the two streams' matrices are cast; norms (adaRMS layers with them), pixel and position
-    embeddings, the action and time projections and the cognition prefix stay float32, and each norm computes
-    in float32.
+    In bfloat16 the streams' matrices are cast (two in pi0.5; Eagle, mixer and transformer in GR00T); norms
+    (adaRMS and styled ones with their layers), pixel and position embeddings, state, action and time projections
+    and the cognition prefix stay float32, and each norm computes in float32.
     """
     if dtype not in ("float32", "bfloat16"):
         raise ValueError(f"dtype must be 'float32' or 'bfloat16', came {dtype!r}")

@@ -1,30 +1,50 @@
-"""A POUNCE checkpoint folder: config.json, model.safetensors and tokenizer.model, all that acting needs."""
+"""A POUNCE checkpoint folder: config.json, model.safetensors and a tokenizer, all that acting needs.
+
+The format in config.json says which family is inside; a public folder is told by its tensor names.
+"""
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal, TypeAlias
 
 import torch
 
 from ponderpounce.models.config_json import from_json
+from ponderpounce.models.groot_folder import groot_config_of
+from ponderpounce.models.groot_prompt import EagleTokenizer, tiny_eagle_tokenizer_for_random_weights
 from ponderpounce.models.normalisation import ROBOMME, RobotStatistics
-from ponderpounce.models.pi05_weights import load_weights, save_weights
-from ponderpounce.models.pounce import Pounce, PounceConfig
-from ponderpounce.models.pounce_configs import pi05_base
-from ponderpounce.models.pounce_init import initialise_prefix, random_pounce
+from ponderpounce.models.pounce import PounceConfig
+from ponderpounce.models.pounce_configs import groot_n1_5, pi05_base
+from ponderpounce.models.pounce_family import (
+    AnyPounce,
+    AnyPounceConfig,
+    blank_model,
+    family_of,
+    load_weights,
+    random_model,
+    save_weights,
+    tensor_shapes,
+)
+from ponderpounce.models.pounce_groot import GrootPounceConfig
+from ponderpounce.models.pounce_init import initialise_prefix
 from ponderpounce.models.prompt import Tokenizer, tiny_tokenizer_for_random_weights
+from ponderpounce.models.public_layout import weights_files
+
+AnyTokenizer: TypeAlias = Tokenizer | EagleTokenizer
 
 FORMAT: Final = "ponderpounce.pounce/1"
+GROOT_FORMAT: Final = "ponderpounce.pounce-groot/1"
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
 TOKENIZER_FILE = "tokenizer.model"
+EAGLE_TOKENIZER_FILE = "tokenizer.json"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredConfig:
-    """Contents of config.json."""
+    """Contents of config.json with pi0.5 inside."""
 
     format: Literal["ponderpounce.pounce/1"] = FORMAT
     is_random: bool
@@ -33,12 +53,26 @@ class StoredConfig:
     statistics: RobotStatistics
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredGrootConfig:
+    """Contents of config.json with GR00T inside."""
+
+    format: Literal["ponderpounce.pounce-groot/1"] = GROOT_FORMAT
+    is_random: bool
+    has_fresh_prefix: bool
+    config: GrootPounceConfig
+    statistics: RobotStatistics
+
+
+AnyStoredConfig: TypeAlias = StoredConfig | StoredGrootConfig
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PounceBundle:
     """A model with what surrounds it: how to read text, and what its numbers mean on the robot."""
 
-    model: Pounce
-    tokenizer: Tokenizer
+    model: AnyPounce
+    tokenizer: AnyTokenizer
     statistics: RobotStatistics = ROBOMME
     is_random: bool
     """True where the weights were drawn, not trained: nothing it does is skill."""
@@ -47,23 +81,38 @@ class PounceBundle:
 
     def __post_init__(self) -> None:
         config = self.model.config
-        if self.tokenizer.vocab_size > config.pi05.vocab_size:
-            raise ValueError(
-                f"tokenizer has {self.tokenizer.vocab_size} ids, the model embeds {config.pi05.vocab_size}"
-            )
+        expected = Tokenizer if isinstance(config, PounceConfig) else EagleTokenizer
+        if not isinstance(self.tokenizer, expected):
+            raise ValueError(f"the model reads with {expected.__name__}, came {type(self.tokenizer).__name__}")
+        if self.tokenizer.vocab_size > config.vocab_size:
+            raise ValueError(f"tokenizer has {self.tokenizer.vocab_size} ids, the model embeds {config.vocab_size}")
+        if isinstance(config, GrootPounceConfig) and isinstance(self.tokenizer, EagleTokenizer):
+            image_token_id = config.groot.eagle.image_token_id
+            if self.tokenizer.image_token_id != image_token_id:
+                raise ValueError(
+                    f"the tokenizer's image token is {self.tokenizer.image_token_id}, the model's {image_token_id}"
+                )
+            if self.statistics.state.num_dims != config.robot_state_dim:
+                raise ValueError(
+                    f"statistics describe {self.statistics.state.num_dims} state dims, "
+                    f"the config {config.robot_state_dim}"
+                )
         if self.statistics.action.num_dims != config.robot_action_dim:
             raise ValueError(
                 f"statistics describe {self.statistics.action.num_dims} action dims, "
                 f"the config {config.robot_action_dim}"
             )
 
-    def stored_config(self) -> StoredConfig:
-        return StoredConfig(
-            is_random=self.is_random,
-            has_fresh_prefix=self.has_fresh_prefix,
-            config=self.model.config,
-            statistics=self.statistics,
-        )
+    def stored_config(self) -> AnyStoredConfig:
+        config = self.model.config
+        facts: dict[str, Any] = {
+            "is_random": self.is_random,
+            "has_fresh_prefix": self.has_fresh_prefix,
+            "statistics": self.statistics,
+        }
+        if isinstance(config, PounceConfig):
+            return StoredConfig(config=config, **facts)
+        return StoredGrootConfig(config=config, **facts)
 
     def digest(self) -> str:
         """Returns 16 hex digits over weights, config, statistics and tokenizer: equal digests act equally."""
@@ -76,32 +125,35 @@ class PounceBundle:
         return digest.hexdigest()
 
 
-def random_bundle(config: PounceConfig, seed: int) -> PounceBundle:
-    """A bundle that needs no file: seeded random weights and the tiny tokenizer."""
+def random_bundle(config: AnyPounceConfig, seed: int) -> PounceBundle:
+    """A bundle that needs no file: seeded random weights and a tiny tokenizer."""
+    is_pi05 = isinstance(config, PounceConfig)
     return PounceBundle(
-        model=random_pounce(config, seed),
-        tokenizer=tiny_tokenizer_for_random_weights(),
+        model=random_model(config, seed),
+        tokenizer=tiny_tokenizer_for_random_weights() if is_pi05 else tiny_eagle_tokenizer_for_random_weights(),
         is_random=True,
         has_fresh_prefix=config.cognition.num_carriers > 0,
     )
 
 
 def save_bundle(bundle: PounceBundle, folder: Path) -> None:
-    """Writes the folder that `load_bundle` reads; its weights are in the public layout (`pi05_weights`)."""
+    """Writes the folder that `load_bundle` reads; its weights are in the family's public layout."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / CONFIG_FILE).write_text(json.dumps(asdict(bundle.stored_config()), indent=1) + "\n")
-    (folder / TOKENIZER_FILE).write_bytes(bundle.tokenizer.model_bytes)
+    (folder / _tokenizer_file(bundle.model.config)).write_bytes(bundle.tokenizer.model_bytes)
     save_weights(bundle.model, folder / WEIGHTS_FILE)
 
 
 def load_bundle(
-    folder: Path, *, config: PounceConfig | None = None, tokenizer: Path | None = None, prefix_seed: int = 0
+    folder: Path, *, config: AnyPounceConfig | None = None, tokenizer: Path | None = None, prefix_seed: int = 0
 ) -> PounceBundle:
-    """Reads our own folder, or a public pi0.5 one, which acts with RoboMME's statistics.
+    """Reads our own folder, or a public one, which acts with RoboMME's statistics.
+
+    Public folders: openpi's and lerobot's pi0.5; NVIDIA's GR00T N1.5, in shards or not, and lerobot's ``groot``.
 
     Args:
-        config: for a public folder, whose config.json is another dialect; default `pi05_base()`.
-        tokenizer: SentencePiece file; default the folder's tokenizer.model.
+        config: for a public folder; default `pi05_base()`, or for GR00T what the folder itself says.
+        tokenizer: its file; default the folder's tokenizer.model (pi0.5) or tokenizer.json (GR00T).
         prefix_seed: draws the cognition prefix where the folder has none.
 
     Raises:
@@ -110,33 +162,54 @@ def load_bundle(
         ValueError: our config.json does not parse, or ``config`` is given although the folder has its own.
     """
     weights_path = folder / WEIGHTS_FILE
-    if not weights_path.is_file():
-        raise FileNotFoundError(f"checkpoint {folder} has no {WEIGHTS_FILE}")
+    weights_files(weights_path)  # a folder without any is told so before anything else of it is judged
     stored = _read_config(folder / CONFIG_FILE)
     if stored is not None:
         if config is not None:
             raise ValueError(f"checkpoint {folder} has its own {CONFIG_FILE}; leave the config argument out")
         config = stored.config
-    with torch.device("meta"):
-        model = Pounce(config or pi05_base())
+    model = blank_model(config or _public_config(folder))
     has_prefix = load_weights(model, weights_path)
     if not has_prefix:
         initialise_prefix(model, torch.Generator().manual_seed(prefix_seed))
     is_prefix_trained = has_prefix and not (stored is not None and stored.has_fresh_prefix)
     return PounceBundle(
         model=model,
-        tokenizer=Tokenizer.from_file(tokenizer or folder / TOKENIZER_FILE),
+        tokenizer=_read_tokenizer(model.config, tokenizer or folder / _tokenizer_file(model.config)),
         statistics=ROBOMME if stored is None else stored.statistics,
         is_random=stored is not None and stored.is_random,
         has_fresh_prefix=model.cognition_prefix is not None and not is_prefix_trained,
     )
 
 
-def _read_config(path: Path) -> StoredConfig | None:
-    """Returns None for a public folder: no config.json, or one that is not in our format."""
+def _public_config(folder: Path) -> AnyPounceConfig:
+    weights_path = folder / WEIGHTS_FILE
+    if family_of(weights_path) == "pi05":
+        return pi05_base()
+    groot, num_steps = groot_config_of(tensor_shapes(weights_path), _json_of(folder / CONFIG_FILE), str(folder))
+    return replace(groot_n1_5(), groot=groot, num_steps=num_steps)
+
+
+def _tokenizer_file(config: AnyPounceConfig) -> str:
+    return TOKENIZER_FILE if isinstance(config, PounceConfig) else EAGLE_TOKENIZER_FILE
+
+
+def _read_tokenizer(config: AnyPounceConfig, path: Path) -> AnyTokenizer:
+    return Tokenizer.from_file(path) if isinstance(config, PounceConfig) else EagleTokenizer.from_file(path)
+
+
+def _json_of(path: Path) -> dict[str, Any] | None:
     if not path.is_file():
         return None
     values = json.loads(path.read_text())
-    if not isinstance(values, dict) or values.get("format") != FORMAT:
+    return values if isinstance(values, dict) else None
+
+
+def _read_config(path: Path) -> AnyStoredConfig | None:
+    """Returns None for a public folder: no config.json, or one that is not in our format."""
+    values = _json_of(path)
+    if values is None or values.get("format") not in (FORMAT, GROOT_FORMAT):
         return None
-    return from_json(StoredConfig, values, path.name)
+    if values["format"] == FORMAT:
+        return from_json(StoredConfig, values, path.name)
+    return from_json(StoredGrootConfig, values, path.name)

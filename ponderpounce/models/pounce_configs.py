@@ -17,7 +17,7 @@ GROOT_HORIZON = 16
 GROOT_PROJECTOR_STD = 1e-3
 """Of a fresh W_c (the paper gives it for GR00T)."""
 TINY_IMAGE_TOKEN_ID = 261
-"""Of ``<IMG_CONTEXT>`` in `groot_prompt.tiny_tokenizer_for_random_weights`."""
+"""Of ``<IMG_CONTEXT>`` in `groot_prompt.tiny_eagle_tokenizer_for_random_weights`."""
 
 
 def pi05_base(*, num_carriers: int = 1, cognition_size: int = 4096, horizon: int = ROBOMME_HORIZON) -> PounceConfig:

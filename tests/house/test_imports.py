@@ -22,7 +22,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "torch": ("ponderpounce/models/", "ponder_server/", "pounce_server/"),
     "transformers": ("ponderpounce/models/",),
     "safetensors": ("ponderpounce/models/",),
-    "tokenizers": ("ponderpounce/models/vocabulary.py",),
+    "tokenizers": ("ponderpounce/models/vocabulary.py", "ponderpounce/models/groot_prompt.py"),
     "sentencepiece": ("ponderpounce/models/prompt.py",),
 }
 """Package -> the only files or folders that may import it. An import by name, in a string, counts as well."""

@@ -14,20 +14,20 @@ from ponderpounce.models.normalisation import ROBOMME
 from ponderpounce.models.pounce_checkpoint import load_bundle, random_bundle, save_bundle
 from ponderpounce.models.pounce_configs import tiny_cpu
 from pounce_server.contract import PounceEngine, Request, example_request
-from pounce_server.engine import Pi05Engine
+from pounce_server.engine import EagerEngine
 
 
 @pytest.fixture(scope="module")
-def engine() -> Pi05Engine:
-    return Pi05Engine(random_bundle(tiny_cpu(num_carriers=2, cognition_size=24), seed=0))
+def engine() -> EagerEngine:
+    return EagerEngine(random_bundle(tiny_cpu(num_carriers=2, cognition_size=24), seed=0))
 
 
 @pytest.fixture
-def request_(engine: Pi05Engine) -> Request:
+def request_(engine: EagerEngine) -> Request:
     return example_request(engine.spec)
 
 
-def test_engine_is_a_pounce_engine_that_admits_to_be_random(engine: Pi05Engine) -> None:
+def test_engine_is_a_pounce_engine_that_admits_to_be_random(engine: EagerEngine) -> None:
     contract: PounceEngine = engine
     spec = contract.spec
     assert (spec.horizon, spec.action_dim, spec.proprio_dim) == (20, 8, 8)
@@ -40,7 +40,7 @@ def test_the_contract_needs_no_torch() -> None:
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
 
 
-def test_rows_are_finite_absolute_targets_that_vary(engine: Pi05Engine, request_: Request) -> None:
+def test_rows_are_finite_absolute_targets_that_vary(engine: EagerEngine, request_: Request) -> None:
     rows = engine.invoke(request_)
     assert rows.shape == (20, 8)
     assert rows.dtype == np.float32
@@ -52,15 +52,15 @@ def test_rows_are_finite_absolute_targets_that_vary(engine: Pi05Engine, request_
     assert (rows[:, :7].std(axis=0) > 1e-3).all()
 
 
-def test_same_request_same_bits(engine: Pi05Engine, request_: Request) -> None:
+def test_same_request_same_bits(engine: EagerEngine, request_: Request) -> None:
     first = engine.invoke(request_)
     engine.invoke(replace(request_, seed=99, cognition=None, age_ns=0))
     np.testing.assert_array_equal(engine.invoke(request_), first)
 
 
-def test_bits_survive_the_checkpoint_folder(engine: Pi05Engine, request_: Request, tmp_path: Path) -> None:
+def test_bits_survive_the_checkpoint_folder(engine: EagerEngine, request_: Request, tmp_path: Path) -> None:
     save_bundle(random_bundle(tiny_cpu(num_carriers=2, cognition_size=24), seed=0), tmp_path)
-    reloaded = Pi05Engine(load_bundle(tmp_path))
+    reloaded = EagerEngine(load_bundle(tmp_path))
     assert reloaded.spec == engine.spec
     np.testing.assert_array_equal(reloaded.invoke(request_), engine.invoke(request_))
 
@@ -78,14 +78,14 @@ CHANGES: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES.keys())
-def test_every_input_moves_the_rows(engine: Pi05Engine, request_: Request, change: dict[str, Any]) -> None:
+def test_every_input_moves_the_rows(engine: EagerEngine, request_: Request, change: dict[str, Any]) -> None:
     changed = replace(request_, **change)
     offset = changed.proprio[:7] - request_.proprio[:7]  # the trivial part: rows are relative to proprio
     moved = engine.invoke(changed)[:, :7] - engine.invoke(request_)[:, :7] - offset
     assert np.abs(moved).max() > 1e-4
 
 
-def test_bits_do_not_depend_on_where_an_array_lies(engine: Pi05Engine, request_: Request) -> None:
+def test_bits_do_not_depend_on_where_an_array_lies(engine: EagerEngine, request_: Request) -> None:
     first = engine.invoke(request_)
     for offset in range(1, 16):
         buffer = np.zeros(64 + offset, np.float32)
@@ -94,18 +94,18 @@ def test_bits_do_not_depend_on_where_an_array_lies(engine: Pi05Engine, request_:
         np.testing.assert_array_equal(engine.invoke(replace(request_, cognition=cognition)), first)
 
 
-def test_progress_beats_once_per_flow_step(engine: Pi05Engine, request_: Request) -> None:
+def test_progress_beats_once_per_flow_step(engine: EagerEngine, request_: Request) -> None:
     beats: list[None] = []
     engine.invoke(request_, lambda: beats.append(None))
     assert len(beats) == engine.spec.num_steps == 10
 
 
-def test_any_frame_size_is_accepted(engine: Pi05Engine, request_: Request) -> None:
+def test_any_frame_size_is_accepted(engine: EagerEngine, request_: Request) -> None:
     frames = (np.zeros((480, 640, 3), np.uint8), np.zeros((1, 1, 3), np.uint8))
     assert np.isfinite(engine.invoke(replace(request_, frames=frames))).all()
 
 
-def test_warm_up_measures_at_least_twenty(engine: Pi05Engine) -> None:
+def test_warm_up_measures_at_least_twenty(engine: EagerEngine) -> None:
     durations_ns = engine.warm_up()
     assert len(durations_ns) >= 20
     assert all(isinstance(duration_ns, int) and duration_ns > 0 for duration_ns in durations_ns)
@@ -142,14 +142,14 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
 
 @pytest.mark.parametrize(("change", "message"), REFUSED.values(), ids=REFUSED.keys())
 def test_misfits_are_refused_by_name(
-    engine: Pi05Engine, request_: Request, change: dict[str, Any], message: str
+    engine: EagerEngine, request_: Request, change: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
         engine.invoke(replace(request_, **change))
 
 
 def test_without_carriers_cognition_is_refused_and_null_accepted() -> None:
-    engine = Pi05Engine(random_bundle(tiny_cpu(num_carriers=0), seed=0))
+    engine = EagerEngine(random_bundle(tiny_cpu(num_carriers=0), seed=0))
     request = example_request(engine.spec)
     assert request.cognition is None
     assert engine.spec.has_fresh_prefix is False
@@ -158,8 +158,8 @@ def test_without_carriers_cognition_is_refused_and_null_accepted() -> None:
         engine.invoke(replace(request, cognition=np.zeros((1, 64), np.float32)))
 
 
-def test_bfloat16_rows_stay_near_float32(engine: Pi05Engine, request_: Request) -> None:
-    half = Pi05Engine(random_bundle(tiny_cpu(num_carriers=2, cognition_size=24), seed=0), dtype="bfloat16")
+def test_bfloat16_rows_stay_near_float32(engine: EagerEngine, request_: Request) -> None:
+    half = EagerEngine(random_bundle(tiny_cpu(num_carriers=2, cognition_size=24), seed=0), dtype="bfloat16")
     assert half.spec.dtype == "bfloat16"
     error = np.abs(half.invoke(request_) - engine.invoke(request_))
     assert 0.0 < error.mean() < 1e-2
@@ -167,4 +167,4 @@ def test_bfloat16_rows_stay_near_float32(engine: Pi05Engine, request_: Request) 
 
 def test_unknown_dtype_is_refused() -> None:
     with pytest.raises(ValueError, match="came 'float16'"):
-        Pi05Engine(random_bundle(tiny_cpu(), seed=0), dtype="float16")
+        EagerEngine(random_bundle(tiny_cpu(), seed=0), dtype="float16")
