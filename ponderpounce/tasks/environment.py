@@ -155,15 +155,17 @@ class Environment:
     def reasoning(self) -> str:
         """Returns what the current subtask needs from the past, in words (paper, Table 6); empty where nothing does.
 
-        Its coordinates are where things are seen now; the grounded subgoal stands at its end.
+        Its coordinates are where things are seen now, or were last seen in the video if they are hidden now and have
+        not moved since; the grounded subgoal stands at its end.
         """
         self._require_episode()
         assert self._caption is not None
         needed = self._task.reasoning(self._layout, self._caption.index)
         if needed is None:
             return ""
-        points = self._look_for(needed.grounds)
-        text = captions.simple(needed.text) if points is None else captions.grounded(needed.text, points)
+        points = [point for body in needed.grounds for point in self._look_for([body]) or self._recall(body)]
+        is_known = len(points) == len(needed.grounds)
+        text = captions.grounded(needed.text, points) if is_known else captions.simple(needed.text)
         return f"{text} Subgoal: {self._caption.grounded}."
 
     def oracle(self, motions: Motions | None = None) -> Iterator[NDArray[np.float32]]:
@@ -260,6 +262,18 @@ class Environment:
                 return None
             points.append(point)
         return points
+
+    def _recall(self, body: str) -> list[captions.Pixel]:
+        """Where the video's frames, one a second, last show a body that still stands there; empty if they do not."""
+        now, pose_7 = self.physics.save(), self.physics.pose(body)
+        points: list[captions.Pixel] | None = None
+        for row in reversed(self._video[::CONTROL_HZ]):
+            self.physics.load(row.physics)
+            if points or not np.array_equal(self.physics.pose(body), pose_7):
+                break
+            points = self._look_for([body])
+        self.physics.load(now)
+        return points or []
 
     def _demonstrated(self, step: int, row: Row, *, look: bool) -> Snapshot:
         """A frame of the video, seen through a world that is put back as it was."""

@@ -22,7 +22,6 @@ from ponderpounce.tasks.scene import BUTTON_BASE_HEIGHT_M
 
 Actions = Iterator[NDArray[np.float32]]
 
-MAX_SPEED_RAD_S = 0.9
 MAX_ACCELERATION_RAD_S2 = 0.9
 GRIPPER_STEPS = 6
 HOMING_STEPS = 30
@@ -33,6 +32,8 @@ _PATH_POINTS = 40
 _ABOVE_M = 0.15
 _HIGH_M, _BACK_OFF_M = 0.20, 0.1
 _SWING_M = 0.10
+_TIP_M = 0.07  # of the stick, over what it points at
+_ARC_POINTS, _ARC_PAUSE = 45, 5  # control steps
 _MISS_M, _MISS_CONTAINER_M = 0.04, 0.035
 _QUARTERS = ((1, 0), (0, 1), (0, -1), (-1, 0))  # cosine and sine of 0, 90, -90 and 180 degrees
 _LEFT = np.array([0.0, 1.0, 0.0])
@@ -58,12 +59,13 @@ class Motions:
         self._failed_grasp = failed_grasp
         self._physics = physics
         self._kinematics = Kinematics(physics.model)
+        self._max_speed_rad_s = physics.robot.oracle_speed_rad_s
         self._gripper = physics.gripper_command()  # it may be holding something already
 
     def move(self, target: Array) -> Actions:
         """Moves the tool along a straight screw to a transform (4, 4). Raises UnreachableError, before moving."""
         path = self._kinematics.screw_path(self._physics.arm_qpos(), target, _PATH_POINTS)
-        quickest = timing.fastest(path, max_speed=MAX_SPEED_RAD_S, max_acceleration=MAX_ACCELERATION_RAD_S2)
+        quickest = timing.fastest(path, max_speed=self._max_speed_rad_s, max_acceleration=MAX_ACCELERATION_RAD_S2)
         for qpos in timing.sample(path, quickest, 1 / CONTROL_HZ):
             yield self._action(qpos)
 
@@ -114,11 +116,11 @@ class Motions:
         """Goes to a place low above the middle of the table, and opens the gripper there."""
         yield from self.open_at(self._carried_to(*REST_XYZ_M))
 
-    def go_home(self) -> Actions:
-        """Opens the gripper, then commands the home posture at once and gives the arm time to get there."""
-        yield from self.open()
-        for _ in range(HOMING_STEPS):
-            yield self._action(panda.HOME_QPOS)
+    def go_home(self, num_steps: int = HOMING_STEPS) -> Actions:
+        """Opens the gripper if there is one, then commands the home posture and gives the arm time to get there."""
+        if self._physics.robot.has_gripper:
+            yield from self.open()
+        yield from self._stay_at(panda.HOME_QPOS, num_steps)
 
     def pick(self, cube: str) -> Actions:
         """Grasps a cube from above and lifts it, turning as little as the arm's limits allow."""
@@ -159,6 +161,36 @@ class Motions:
         x_m, y_m, _ = self._physics.position_m(target)
         yield from self.move(self._carried_to(x_m, y_m, _SWING_M))
 
+    def point_at(self, target: str) -> Actions:
+        """Brings the stick's tip low over a target, makes up for what the arm lagged, and rests there a moment."""
+        for _ in range(2):
+            yield from self.move(self._tip_over(target))
+        yield from self.hold(GRIPPER_STEPS)
+
+    def point_at_once(self, target: str, num_steps: int = HOMING_STEPS) -> Actions:
+        """Commands the posture in which the stick points at a target, and gives the arm time to get there."""
+        path = self._kinematics.screw_path(self._physics.arm_qpos(), self._tip_over(target), _PATH_POINTS)
+        yield from self._stay_at(path[-1], num_steps)
+
+    def sweep_to(self, target: str, bulge_m: float) -> Actions:
+        """Sweeps the stick's tip to a target and rests there a moment, one point of the way per control step.
+
+        The way is a parabola (a quadratic Bezier curve) in the plane; ``bulge_m`` is how far its control point lies to
+        the left of the chord's middle, seen in the direction of motion. Raises UnreachableError, before moving.
+        """
+        here, there = self._physics.tcp_transform(), self._tip_over(target)
+        start_m, end_m = here[:2, 3], there[:2, 3]
+        way_m = end_m - start_m
+        control_m = (start_m + end_m) / 2 + bulge_m * np.array([-way_m[1], way_m[0]]) / np.linalg.norm(way_m)
+        qpos, path = self._physics.arm_qpos(), []
+        for s in np.linspace(0.0, 1.0, _ARC_POINTS):
+            x_m, y_m = (1 - s) ** 2 * start_m + 2 * s * (1 - s) * control_m + s**2 * end_m
+            qpos = self._kinematics.solve(_at(here, x_m, y_m, _TIP_M), qpos)
+            path.append(qpos)
+        for qpos in path:
+            yield self._action(qpos)
+        yield from self._stay_at(path[-1], _ARC_PAUSE)
+
     def open_at(self, target: Array) -> Actions:
         """Moves the tool to a transform (4, 4), then opens the gripper there."""
         yield from self.move(target)
@@ -184,6 +216,15 @@ class Motions:
         yield from self.close()
         yield from self.move(above)
         yield from self.open()
+
+    def _stay_at(self, qpos: Array, num_steps: int) -> Actions:
+        for _ in range(num_steps):
+            yield self._action(qpos)
+
+    def _tip_over(self, target: str) -> Array:
+        """Where the stick points at a target (4, 4), turned as it is now."""
+        x_m, y_m, _ = self._physics.position_m(target)
+        return _at(self._physics.tcp_transform(), x_m, y_m, _TIP_M)
 
     def _above_button(self, button: str) -> Array:
         """Where the tool waits above a button, fingers along y; the wrist is turned round if it must be."""

@@ -224,7 +224,7 @@ def _replace_fingers_by_stick(spec: mujoco.MjSpec) -> None:
         type=mujoco.mjtGeom.mjGEOM_CYLINDER,
         size=[STICK_RADIUS_M, (tip_m - begin_m) / 2, 0.0],
         pos=[0.0, 0.0, (begin_m + tip_m) / 2],
-        rgba=[0.58, 0.58, 0.58, 1.0],
+        rgba=[1.0, 1.0, 1.0, 1.0],  # its sides get ambient light only, so that it looks grey, as upstream
         contype=ROBOT_BIT,
         conaffinity=WORLD_BIT,
         group=1,

@@ -61,8 +61,13 @@ def is_let_go(physics: Physics, body: str) -> bool:
 
 def is_hovering(physics: Physics, button: str) -> bool:
     """The tool point is within 3 cm of the button seen from above, and lower than 20 cm."""
+    return is_tool_over(physics, button, within_m=_HOVER_M, below_z_m=_HOVER_Z_M)
+
+
+def is_tool_over(physics: Physics, place: str, *, within_m: float, below_z_m: float) -> bool:
+    """The tool point is near the place seen from above, and lower than ``below_z_m``."""
     tool_m = physics.tcp_transform()[:3, 3]
-    return _distance_on_table_m(tool_m, physics.position_m(button)) <= _HOVER_M and bool(tool_m[2] < _HOVER_Z_M)
+    return _distance_on_table_m(tool_m, physics.position_m(place)) <= within_m and bool(tool_m[2] < below_z_m)
 
 
 def is_container_lifted(physics: Physics, container: str) -> bool:

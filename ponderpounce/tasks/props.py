@@ -20,6 +20,7 @@ BIN_HALF_M = (0.05, 0.05)
 BIN_HEIGHT_M = 0.05
 _BIN_WALL_HALF_M = 0.005
 _VISIBLE = 1  # geom group that the cameras see
+NUM_RINGS = 5
 _RING_RISE_M = 1e-5  # each inner ring stands out by this much; flush ones would flicker
 
 
@@ -32,15 +33,34 @@ def add_target(
     half_height_m: float = TARGET_THICKNESS_M / 2,
 ) -> None:
     """Adds five concentric rings, coloured and white by turns, that are only seen; the origin is their centre."""
-    body = spec.worldbody.add_body(name=name, mocap=True)
-    for ring in range(5):
+    add_rings(spec.worldbody.add_body(name=name, mocap=True), name, rgba, radius_m, half_height_m)
+
+
+def add_rings(
+    body: mujoco.MjsBody, prefix: str, rgba: RGBA, radius_m: float, half_height_m: float, z_m: float = 0.0
+) -> None:
+    """Adds a target's rings to a body, ``prefix``/0 the outermost and /4 the innermost, their centre at a height."""
+    for ring in range(NUM_RINGS):
         body.add_geom(
-            name=f"{name}/{ring}",
+            name=f"{prefix}/{ring}",
             type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-            size=[radius_m * (1 - ring / 5), half_height_m + ring * _RING_RISE_M, 0.0],
+            size=[radius_m * (1 - ring / NUM_RINGS), half_height_m + ring * _RING_RISE_M, 0.0],
+            pos=[0.0, 0.0, z_m],
             rgba=WHITE if ring % 2 else rgba,
             **_seen_only(),
         )
+
+
+def add_block(spec: mujoco.MjSpec, name: str, half_m: tuple[float, float, float]) -> None:
+    """Adds a box that stands where it is placed, whatever runs into it. Its origin is its centre."""
+    body = spec.worldbody.add_body(name=name, mocap=True)
+    body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=half_m, **_solid())
+
+
+def add_dot(spec: mujoco.MjSpec, name: str, radius_m: float) -> None:
+    """Adds a white ball that is only seen."""
+    body = spec.worldbody.add_body(name=name, mocap=True)
+    body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius_m, 0.0, 0.0], rgba=WHITE, **_seen_only())
 
 
 def add_bin(spec: mujoco.MjSpec, name: str) -> None:
@@ -67,11 +87,7 @@ def add_bin(spec: mujoco.MjSpec, name: str) -> None:
             pos=pos,
             size=size,
             rgba=display_rgba((0.8, 0.6, 0.4, 1)),
-            contype=WORLD_BIT,
-            conaffinity=WORLD_BIT | ROBOT_BIT,
-            group=_VISIBLE,
-            solref=STIFF_SOLREF,
-            solimp=STIFF_SOLIMP,
+            **_solid(),
         )
     body.add_geom(
         name=f"{name}/floor",
@@ -87,6 +103,16 @@ def add_ghost_cube(spec: mujoco.MjSpec, name: str, half_m: float) -> None:
     """Adds a cube that is moved by script and only seen: the arm passes through it. Its origin is its centre."""
     body = spec.worldbody.add_body(name=name, mocap=True)
     body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=[half_m] * 3, **_seen_only())
+
+
+def _solid() -> dict[str, Any]:
+    return {
+        "contype": WORLD_BIT,
+        "conaffinity": WORLD_BIT | ROBOT_BIT,
+        "group": _VISIBLE,
+        "solref": STIFF_SOLREF,
+        "solimp": STIFF_SOLIMP,
+    }
 
 
 def _seen_only() -> dict[str, Any]:

@@ -135,7 +135,7 @@ def test_fixed_coordinates_lie_on_the_object(environment: EnvironmentOf, name: s
                 assert is_inside_outline(env, body, point)
                 num_checked += 1
         text_before, index_before = snapshot.grounded_subgoal, snapshot.subtask_index
-    assert num_checked > 0
+    assert num_checked > 0 or not any(subtask.grounds for subtask in env.subtasks)
 
 
 @every_task
@@ -321,7 +321,10 @@ env = make_environment({name!r}, render=False)
 env.reset({SEED}, "hard")
 digest = hashlib.sha256()
 for action in itertools.islice(env.oracle(), 100):
-    digest.update(env.step(action).state.tobytes() + env.physics.data.qpos.tobytes())
+    snapshot = env.step(action)
+    digest.update(snapshot.state.tobytes() + env.physics.data.qpos.tobytes())
+    if snapshot.status.value != "ongoing":
+        break
 raise SystemExit(digest.hexdigest())
 """
 
@@ -338,5 +341,8 @@ raise SystemExit(digest.hexdigest())
     env.reset(SEED, "hard")
     digest = hashlib.sha256()
     for action in islice(env.oracle(), 100):
-        digest.update(env.step(action).state.tobytes() + env.physics.data.qpos.tobytes())
+        snapshot = env.step(action)
+        digest.update(snapshot.state.tobytes() + env.physics.data.qpos.tobytes())
+        if snapshot.status is not Status.ONGOING:
+            break
     assert digest.hexdigest() == first
