@@ -1,0 +1,159 @@
+"""L = w1 L_fm + w2 L_ground: both systems in one graph (paper, 3.2).
+
+PONDER reads every episode as one causal row, all queries in one pass. Every POUNCE invocation takes the cognition that
+the schedule referred it to, so many invocations share one; their action loss reaches PONDER only through it, scaled
+(A.3). The LM head runs only where a token is supervised.
+"""
+
+# B episodes, T tokens, H hidden, Q queries, I invocations of all episodes, K carriers, N horizon, A padded action dim
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ponderpounce.models import flow
+from ponderpounce.models.context import Row
+from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.pounce import Pounce, PounceInputs
+
+NO_QUERY = -1
+"""Reference of an invocation for which no cognition was ready: it sees the learned null."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PonderBatch:
+    """What PONDER reads of B episodes."""
+
+    rows: tuple[Row, ...]
+    frames: tuple[Tensor | None, ...]
+    """Per row, (num_images, height, width, 3) uint8 in the order of its image positions; None without images."""
+
+    def __post_init__(self) -> None:
+        if len(self.rows) != len(self.frames):
+            raise ValueError(f"{len(self.rows)} rows, frames for {len(self.frames)}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PounceBatch:
+    """I invocations of the same episodes, in any order."""
+
+    inputs: PounceInputs
+    """Images, prompts and ages; its cognition is filled in by the model."""
+    actions_INA: Tensor
+    """Normalised targets, zero beyond the robot's dims."""
+    episode_I: Tensor
+    """int64: which row of the PonderBatch."""
+    query_I: Tensor
+    """int64: which query of that row, or NO_QUERY."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Draws:
+    """The chance in one step, drawn by one generator: a step repeats exactly, whatever ran before it."""
+
+    noise_INA: Tensor
+    time_I: Tensor
+    is_dropped_I: Tensor
+    """bool: cognition dropout."""
+
+    @classmethod
+    def draw(cls, actions_INA: Tensor, dropout: float, generator: torch.Generator) -> Draws:
+        """Draws on the generator's device, which must be that of ``actions_INA``."""
+        count = len(actions_INA)
+        device = actions_INA.device
+        return cls(
+            noise_INA=torch.randn(actions_INA.shape, generator=generator, device=device),
+            time_I=flow.sample_times(count, generator),
+            is_dropped_I=torch.rand(count, generator=generator, device=device) < dropout,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class JointLoss:
+    """The parts of one step's loss, scalars on the graph."""
+
+    total: Tensor
+    flow_matching: Tensor
+    grounding: Tensor
+    num_supervised: int
+    """Tokens under the LM head's cross-entropy."""
+    num_null: int
+    """Invocations that saw the null cognition."""
+
+
+class JointModel(nn.Module):
+    """PONDER and POUNCE as one module, with the weights of the two losses."""
+
+    def __init__(self, ponder: Ponder, pounce: Pounce, *, w1: float = 1.0, w2: float = 0.1) -> None:
+        """Raises ValueError if POUNCE was built for another cognition than PONDER gives."""
+        super().__init__()
+        wanted = (pounce.config.cognition.num_carriers, pounce.config.cognition.cognition_size)
+        given = (ponder.format.num_carriers, ponder.hidden_size)
+        if wanted != given:
+            raise ValueError(f"POUNCE reads (K, H) = {wanted}, PONDER gives {given}; build them for each other")
+        self.ponder = ponder
+        self.pounce = pounce
+        self.w1, self.w2 = w1, w2
+
+    def forward(self, episodes: PonderBatch, invocations: PounceBatch, draws: Draws) -> JointLoss:
+        hidden = encode_rows(self.ponder, episodes)
+        grounding, num_supervised = self._grounding(episodes, hidden)
+        cognition_QKH, first_query = gather_cognition(episodes.rows, hidden)
+        is_null_I = (invocations.query_I == NO_QUERY) | draws.is_dropped_I
+        index_I = first_query[invocations.episode_I] + invocations.query_I.clamp(min=0)
+        inputs = replace(invocations.inputs, cognition=cognition_QKH[index_I], is_null=is_null_I)
+        matching = self.pounce.loss(inputs, invocations.actions_INA, draws.noise_INA, draws.time_I)
+        return JointLoss(
+            total=self.w1 * matching + self.w2 * grounding,
+            flow_matching=matching,
+            grounding=grounding,
+            num_supervised=num_supervised,
+            num_null=int(is_null_I.sum()),
+        )
+
+    def _grounding(self, episodes: PonderBatch, hidden: Sequence[Tensor]) -> tuple[Tensor, int]:
+        """Mean cross-entropy over every supervised token of the batch; zero, on the graph, if there is none."""
+        if self.w2 == 0:  # no annotations: the LM head is not even run
+            return hidden[0].new_zeros(()), 0
+        read, wanted = [], []
+        for row, hidden_TH in zip(episodes.rows, hidden, strict=True):
+            index = torch.from_numpy(row.supervised_index).to(hidden_TH.device)
+            read.append(hidden_TH[index])
+            wanted.append(torch.tensor(row.targets, device=hidden_TH.device)[index + 1])
+        targets = torch.cat(wanted)
+        logits_NV = self.ponder.logits(torch.cat(read))
+        if not len(targets):
+            return logits_NV.sum(), 0
+        return F.cross_entropy(logits_NV.float(), targets), len(targets)
+
+
+def encode_rows(ponder: Ponder, episodes: PonderBatch) -> list[Tensor]:
+    """Final hidden states (T, H) of each row, encoded together, padded on the right.
+
+    A row is causal, so what stands behind it cannot reach it: pads are never read.
+    """
+    embeds = [ponder.embed(row.ids, frames) for row, frames in zip(episodes.rows, episodes.frames, strict=True)]
+    longest = max(len(row.ids) for row in episodes.rows)
+    embeds_BTH = torch.stack([F.pad(embed, (0, 0, 0, longest - len(embed))) for embed in embeds])
+    positions = [torch.from_numpy(ponder.format.positions(row.ids)[0]).to(ponder.device) for row in episodes.rows]
+    positions_4BT = torch.stack([F.pad(p, (0, longest - p.shape[1])) for p in positions], dim=1)
+    hidden_BTH = ponder(embeds_BTH, positions_4BT)
+    return [hidden[: len(row.ids)] for hidden, row in zip(hidden_BTH, episodes.rows, strict=True)]
+
+
+def gather_cognition(rows: Sequence[Row], hidden: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Cognition of all queries of all rows, (Q, K, H), and the index of each row's first, (B,) int64."""
+    device = hidden[0].device
+    parts = [h[torch.from_numpy(row.carrier_index).to(device)] for row, h in zip(rows, hidden, strict=True)]
+    starts = [0]
+    for part in parts:
+        starts.append(starts[-1] + len(part))
+    if any(start == end for start, end in pairwise(starts)):
+        raise ValueError("a row without a query gives no cognition; leave such an episode out")
+    return torch.cat(parts), torch.tensor(starts[:-1], device=device)

@@ -1,0 +1,93 @@
+"""AdamW as the paper runs it: linear warm-up, then constant; joint gradient norm clipped; weights averaged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OptimConfig:
+    """Defaults are the paper's for RoboMME (B.1)."""
+
+    learning_rate: float = 2e-5
+    warmup_steps: int = 100
+    betas: tuple[float, float] = (0.9, 0.95)
+    eps: float = 1e-8
+    weight_decay: float = 1e-10
+    clip_norm: float = 1.0
+    ema_decay: float = 0.0
+    """0: no average is kept."""
+
+    def __post_init__(self) -> None:
+        if self.learning_rate <= 0 or self.clip_norm <= 0 or self.warmup_steps < 0:
+            raise ValueError("learning_rate and clip_norm must be above 0, warmup_steps at least 0")
+        if not 0 <= self.ema_decay < 1:
+            raise ValueError(f"ema_decay must be in [0, 1), came {self.ema_decay}")
+
+
+def learning_rate(config: OptimConfig, step: int) -> float:
+    """Of the ``step``-th update, from 0: the first one already moves."""
+    return config.learning_rate * min(1.0, (step + 1) / max(1, config.warmup_steps))
+
+
+class Optimiser:
+    """Updates the parameters that want gradients, and their average."""
+
+    def __init__(self, model: nn.Module, config: OptimConfig) -> None:
+        self._config = config
+        self._named = {name: p for name, p in model.named_parameters() if p.requires_grad}
+        if not self._named:
+            raise ValueError("nothing to train: every parameter is frozen")
+        self._adam = torch.optim.AdamW(
+            self._named.values(),
+            lr=config.learning_rate,
+            betas=config.betas,
+            eps=config.eps,
+            weight_decay=config.weight_decay,
+        )
+        self.average = {name: p.detach().clone() for name, p in self._named.items()} if config.ema_decay else {}
+
+    def update(self, step: int) -> float:
+        """Applies the gradients and clears them; returns their norm before clipping.
+
+        Raises:
+            FloatingPointError: the gradients are not finite; nothing was changed.
+        """
+        norm = float(nn.utils.clip_grad_norm_(self._named.values(), self._config.clip_norm))
+        if not torch.isfinite(torch.tensor(norm)):
+            worst = [n for n, p in self._named.items() if p.grad is not None and not p.grad.isfinite().all()][:3]
+            raise FloatingPointError(
+                f"step {step}: gradients are not finite (first in {', '.join(worst)}). Lower learning_rate, or train "
+                "in float32; the last checkpoint is untouched."
+            )
+        for group in self._adam.param_groups:
+            group["lr"] = learning_rate(self._config, step)
+        self._adam.step()
+        self._adam.zero_grad(set_to_none=True)
+        with torch.no_grad():
+            for name, average in self.average.items():
+                average.lerp_(self._named[name], 1 - self._config.ema_decay)
+        return norm
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything that the next update depends on besides the parameters."""
+        found = {f"average.{name}": tensor for name, tensor in self.average.items()}
+        for name, parameter in self._named.items():
+            for key, value in self._adam.state[parameter].items():
+                found[f"{key}.{name}"] = torch.as_tensor(value)
+        return found
+
+    def load(self, tensors: dict[str, Tensor]) -> None:
+        """Takes back what ``tensors`` gave. Raises ValueError if it is another model's."""
+        keys = ("step", "exp_avg", "exp_avg_sq")
+        expected = {f"{key}.{name}" for key in keys for name in self._named} | {f"average.{n}" for n in self.average}
+        if set(tensors) != expected:
+            odd = sorted(set(tensors) ^ expected)[:5]
+            raise ValueError(f"the optimiser's state is of another model or freeze mode; it differs in {odd}")
+        for name, parameter in self._named.items():
+            self._adam.state[parameter] = {key: tensors[f"{key}.{name}"].clone() for key in keys}
+        for name in self.average:
+            self.average[name] = tensors[f"average.{name}"].clone()

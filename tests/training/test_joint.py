@@ -1,0 +1,173 @@
+"""One graph: what reaches what, at which strength, and that batching changes nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from ponderpounce.models.context import Row, Transition
+from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
+from ponderpounce.models.pounce import Pounce, freeze
+from ponderpounce.models.pounce_configs import tiny_cpu as tiny_pounce
+from ponderpounce.models.pounce_init import random_pounce
+from ponderpounce.training.joint import NO_QUERY, Draws, JointModel, PonderBatch, PounceBatch, encode_rows
+
+CONFIG = replace(tiny_ponder(), image_px=(32, 32), num_carriers=2, num_layers=4)
+
+
+@pytest.fixture
+def model() -> JointModel:
+    ponder = Ponder.random(CONFIG, seed=1)
+    pounce = random_pounce(tiny_pounce(num_carriers=2, cognition_size=CONFIG.hidden_size, horizon=4), seed=2)
+    return JointModel(ponder, pounce)
+
+
+def row_of(ponder: Ponder, num_queries: int, *, says: str | None = "pick the cube") -> Row:
+    form = ponder.format
+    subgoal = None if says is None else Transition(subgoal=form.vocabulary.encode(says))
+    segments = list(form.opening("press", [1]))
+    for query in range(num_queries):
+        segments += form.query(2, subgoal if query == 0 else None)
+    return form.row(segments)
+
+
+def episodes(ponder: Ponder, *num_queries: int, says: str | None = "pick the cube") -> PonderBatch:
+    rows = tuple(row_of(ponder, n, says=says) for n in num_queries)
+    generator = torch.Generator().manual_seed(5)
+    frames = tuple(
+        torch.randint(0, 256, (row.num_images, 32, 32, 3), generator=generator, dtype=torch.uint8) for row in rows
+    )
+    return PonderBatch(rows=rows, frames=frames)
+
+
+def invocations(pounce: Pounce, *references: tuple[int, int]) -> PounceBatch:
+    """``references``: (episode, query) of each invocation."""
+    count = len(references)
+    return PounceBatch(
+        inputs=replace(pounce.config.example_inputs(count), cognition=None),
+        actions_INA=pounce.config.example_actions(count),
+        episode_I=torch.tensor([episode for episode, _ in references]),
+        query_I=torch.tensor([query for _, query in references]),
+    )
+
+
+def draws_of(batch: PounceBatch, *, dropout: float = 0.0, seed: int = 3) -> Draws:
+    return Draws.draw(batch.actions_INA, dropout, torch.Generator().manual_seed(seed))
+
+
+def gradients(loss: Tensor, model: JointModel) -> dict[str, Tensor]:
+    named = {n: p for n, p in model.named_parameters() if p.requires_grad}
+    found = torch.autograd.grad(loss, list(named.values()), allow_unused=True, retain_graph=True)
+    return {name: grad for name, grad in zip(named, found, strict=True) if grad is not None and grad.abs().max() > 0}
+
+
+def test_rows_of_a_batch_are_read_as_if_alone(model: JointModel) -> None:
+    both = episodes(model.ponder, 1, 3)
+    together = encode_rows(model.ponder, both)
+    for row, frames, hidden in zip(both.rows, both.frames, together, strict=True):
+        alone = model.ponder.encode_row(row, frames)
+        torch.testing.assert_close(hidden, alone, atol=2e-5, rtol=1e-4)
+
+
+def test_an_invocation_sees_the_cognition_it_was_referred_to(model: JointModel) -> None:
+    both = episodes(model.ponder, 2, 3)
+    batch = invocations(model.pounce, (1, 2), (0, 1), (1, 0), (0, NO_QUERY))
+    draws = draws_of(batch)
+    loss = model(both, batch, draws).flow_matching
+    hidden = encode_rows(model.ponder, both)
+    cognition = [
+        hidden[e][torch.from_numpy(both.rows[e].carrier_index[q])] for e, q in ((1, 2), (0, 1), (1, 0), (0, 0))
+    ]
+    inputs = replace(batch.inputs, cognition=torch.stack(cognition), is_null=torch.tensor([False, False, False, True]))
+    expected = model.pounce.loss(inputs, batch.actions_INA, draws.noise_INA, draws.time_I)
+    torch.testing.assert_close(loss, expected)
+
+
+def test_action_loss_reaches_ponder_at_half_strength_and_only_through_cognition(model: JointModel) -> None:
+    both, batch = episodes(model.ponder, 2), invocations(model.pounce, (0, 0), (0, 1))
+    draws = draws_of(batch)
+    half = gradients(model(both, batch, draws).flow_matching, model)
+    object.__setattr__(model.pounce.config.cognition, "gradient_scale", 1.0)
+    object.__setattr__(model.pounce.cognition_prefix.config, "gradient_scale", 1.0)  # type: ignore[union-attr]
+    full = gradients(model(both, batch, draws).flow_matching, model)
+    ponders = [name for name in full if name.startswith("ponder.")]
+    assert ponders
+    for name in full:
+        scale = 0.5 if name in ponders else 1.0
+        torch.testing.assert_close(half[name], scale * full[name], atol=1e-7, rtol=1e-3)
+    assert "ponder.qwen.lm_head.weight" not in full
+
+
+def test_null_cognition_tells_ponder_nothing(model: JointModel) -> None:
+    both, batch = episodes(model.ponder, 2), invocations(model.pounce, (0, NO_QUERY), (0, NO_QUERY))
+    reached = gradients(model(both, batch, draws_of(batch)).flow_matching, model)
+    assert not [name for name in reached if name.startswith("ponder.")]
+    assert "pounce.cognition_prefix.null_cognition" in reached
+
+
+def test_dropout_replaces_cognition_by_null(model: JointModel) -> None:
+    both, batch = episodes(model.ponder, 2), invocations(model.pounce, (0, 0), (0, 1))
+    dropped = model(both, batch, draws_of(batch, dropout=1.0))
+    null = model(both, replace(batch, query_I=torch.full((2,), NO_QUERY)), draws_of(batch))
+    assert dropped.num_null == 2
+    torch.testing.assert_close(dropped.flow_matching, null.flow_matching, rtol=0, atol=0)
+
+
+def test_grounding_trains_ponder_alone(model: JointModel) -> None:
+    both, batch = episodes(model.ponder, 2), invocations(model.pounce, (0, 0))
+    reached = gradients(model(both, batch, draws_of(batch)).grounding, model)
+    assert "ponder.qwen.lm_head.weight" in reached
+    assert not [name for name in reached if name.startswith("pounce.")]
+
+
+def test_the_lm_head_reads_supervised_positions_only(model: JointModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[int] = []
+    logits = model.ponder.logits
+
+    def counted(hidden_NH: Tensor) -> Tensor:
+        read.append(len(hidden_NH))
+        return logits(hidden_NH)
+
+    monkeypatch.setattr(model.ponder, "logits", counted)
+    both, batch = episodes(model.ponder, 2, 1), invocations(model.pounce, (0, 0))
+    loss = model(both, batch, draws_of(batch))
+    text = len(model.ponder.format.vocabulary.encode("pick the cube")) + 1
+    assert read == [loss.num_supervised] == [2 * text + 3]  # T_yes and text twice, T_no at each of three queries
+
+
+def test_without_annotations_the_lm_head_is_not_run(model: JointModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(model.ponder, "logits", lambda hidden: pytest.fail("the LM head ran"))
+    model.w2 = 0.0
+    both, batch = episodes(model.ponder, 2), invocations(model.pounce, (0, 0))
+    loss = model(both, batch, draws_of(batch))
+    assert (float(loss.grounding), loss.num_supervised) == (0.0, 0)
+
+
+def test_total_is_the_weighted_sum(model: JointModel) -> None:
+    both, batch = episodes(model.ponder, 2), invocations(model.pounce, (0, 0))
+    loss = model(both, batch, draws_of(batch))
+    torch.testing.assert_close(loss.total, 1.0 * loss.flow_matching + 0.1 * loss.grounding)
+
+
+def test_frozen_backbone_lets_gradients_pass(model: JointModel) -> None:
+    freeze(model.pounce, "vlm")
+    both, batch = episodes(model.ponder, 1), invocations(model.pounce, (0, 0))
+    reached = gradients(model(both, batch, draws_of(batch)).flow_matching, model)
+    assert [name for name in reached if name.startswith("ponder.")]
+    assert not [name for name in reached if name.startswith("pounce.pi05.language.")]
+
+
+def test_models_that_do_not_fit_are_refused() -> None:
+    pounce = random_pounce(tiny_pounce(num_carriers=1, cognition_size=CONFIG.hidden_size), seed=0)
+    with pytest.raises(ValueError, match=r"\(K, H\) = \(1, 96\), PONDER gives \(2, 96\)"):
+        JointModel(Ponder.random(CONFIG, seed=1), pounce)
+
+
+def test_an_episode_without_a_query_is_refused(model: JointModel) -> None:
+    batch = invocations(model.pounce, (0, 0))
+    with pytest.raises(ValueError, match="without a query"):
+        model(episodes(model.ponder, 0, 1), batch, draws_of(batch))
