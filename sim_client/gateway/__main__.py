@@ -1,0 +1,109 @@
+"""``pp-gateway``: clients of other protocols drive our robot."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import tyro
+
+import sim_client.headless  # noqa: F401 - before anything that imports mujoco
+
+# isort: split
+
+from clock.service import ClockService, ServiceConfig
+from protocol.errors import TransportError
+from protocol.link import Link
+from protocol.options import LinkOptions
+from protocol.process import StopFlag, set_up_logging
+from protocol.zenoh_bus import open_bus
+from sim_client.gateway.http_form import HttpSide
+from sim_client.gateway.machine import Machine
+from sim_client.gateway.options import GatewayOptions
+from sim_client.gateway.websocket import WebsocketSide
+from sim_client.launch import Daemons, start_local
+
+log = logging.getLogger("pp-gateway")
+
+
+def main(argv: list[str] | None = None) -> int:
+    options = tyro.cli(GatewayOptions, args=argv, prog="pp-gateway", description=GatewayOptions.__doc__)
+    set_up_logging()
+    should_stop = StopFlag()
+    try:
+        options.check()
+        with Daemons(options.out) as daemons, _machine(options, daemons) as machine, _serving(options, machine):
+            log.info("ready dialect=%s listen=%s mode=%s", options.dialect, options.listen, options.mode)
+            machine.run(should_stop)
+    except TransportError as error:
+        print(f"pp-gateway: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+@contextmanager
+def _machine(options: GatewayOptions, daemons: Daemons) -> Iterator[Machine]:
+    plan, link = options.plan(), options.link
+    if options.local:
+        endpoints = start_local(
+            daemons,
+            robot=link.robot,
+            with_clock=options.runs_clock_daemon,
+            ponder=["--checkpoint", str(options.ponder_checkpoint)] if options.ponder_checkpoint else [],
+            pounce=["--checkpoint", str(options.pounce_checkpoint)] if options.pounce_checkpoint else [],
+            allow_starved=options.allow_starved,
+        )
+        link = LinkOptions(robot=link.robot, connect=endpoints)
+    bus = open_bus(link)
+    try:
+        clock = None
+        if not options.runs_clock_daemon:
+            config = ServiceConfig(allow_starved=options.allow_starved)
+            clock = ClockService(Link(bus, robot=link.robot, proc="clock"), config)
+        yield Machine(plan, Link(bus, robot=link.robot, proc="sim"), clock, daemons.dead)
+    finally:
+        bus.close()
+
+
+@contextmanager
+def _serving(options: GatewayOptions, machine: Machine) -> Iterator[None]:
+    """Listens in a thread of its own for as long as the block lasts. Raises TransportError if it cannot."""
+    host, port = options.address
+    max_bytes, terms, dialect = options.max_message_mb << 20, options.terms(), options.dialect_class()
+    if options.dialect == "challenge-http":
+        http = HttpSide((host, port), machine, terms, dialect, max_bytes, options.api_key())
+        with _in_thread(http.serve_forever, http.shutdown):
+            yield
+        http.server_close()
+        return
+    side = WebsocketSide(machine, terms, dialect, max_bytes, options.api_key())
+    loop = asyncio.new_event_loop()
+    server = loop.run_until_complete(side.start(host, port))
+
+    def stop() -> None:
+        loop.call_soon_threadsafe(server.close)
+        asyncio.run_coroutine_threadsafe(server.wait_closed(), loop).result()
+        loop.call_soon_threadsafe(loop.stop)
+
+    with _in_thread(loop.run_forever, stop):
+        yield
+    loop.close()
+
+
+@contextmanager
+def _in_thread(work: Callable[[], None], stop: Callable[[], None]) -> Iterator[None]:
+    thread = threading.Thread(target=work, name="network", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop()
+        thread.join()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

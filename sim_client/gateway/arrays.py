@@ -1,0 +1,90 @@
+"""msgpack with numpy arrays, read as a stranger's bytes: no pickle, no objects, no size that the bytes do not have.
+
+Two spellings of an array are in use: openpi's, with keys of bytes, and vla-eval's, with keys of text; the latter also
+sends pictures as PNG or JPEG. Both are read, whichever comes.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Any, Literal
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_client.gateway.exchange import Refused
+from sim_client.gateway.pictures import EncodedPicture
+
+Spelling = Literal["openpi", "vla-eval"]
+
+MAX_DIMENSIONS = 8
+_DTYPE = re.compile(r"[<>|=]?(?:[iu][1248]|f[248]|b1)")
+"""Numbers and truth values. A dtype is only made of a text that matches: others can mean objects or structures."""
+_MAX_ITEMS = 1_000_000
+
+
+def pack(value: Any, spelling: Spelling) -> bytes:
+    """Packs plain values and numeric arrays as that dialect's clients read them."""
+    key: Any = str.encode if spelling == "openpi" else str
+
+    def spell(item: Any) -> Any:
+        if isinstance(item, np.generic):
+            return item.item()
+        if isinstance(item, np.ndarray) and _DTYPE.fullmatch(item.dtype.str):
+            fields = {"__ndarray__": True, "data": item.tobytes(), "dtype": item.dtype.str, "shape": list(item.shape)}
+            return {key(name): content for name, content in fields.items()}
+        raise TypeError(f"{type(item).__name__} has no place in a message")
+
+    return bytes(msgpack.packb(value, default=spell))
+
+
+def unpack(data: bytes) -> Any:
+    """The value in ``data``; arrays are read-only views.
+
+    Raises:
+        Refused: not msgpack, an array whose shape, type and bytes disagree, or a structure beyond any real message's.
+    """
+    try:
+        return msgpack.unpackb(data, object_hook=_unspell, max_map_len=10_000, max_array_len=_MAX_ITEMS, max_ext_len=0)
+    except (ValueError, TypeError, OverflowError, msgpack.UnpackException) as error:
+        raise Refused(f"{len(data)} bytes that are not a msgpack message: {error or type(error).__name__}") from None
+
+
+def _unspell(item: dict[Any, Any]) -> Any:
+    for key in (str, str.encode):
+        if key("__ndarray__") in item:
+            return _array(*(item.get(key(name)) for name in ("data", "dtype", "shape")))
+        if key("__npgeneric__") in item:
+            return item.get(key("data"))
+    if "__image__" in item:
+        return _picture(item)
+    return item
+
+
+def _picture(item: dict[Any, Any]) -> NDArray[Any] | EncodedPicture:
+    kind, data, shape = item.get("format"), item.get("data"), item.get("shape")
+    if kind == "raw":
+        return _array(data, item.get("dtype"), shape)
+    if kind not in ("png", "jpeg") or not isinstance(data, bytes):
+        raise Refused(f"a picture in format {kind!r}: expected raw, png or jpeg, and its bytes")
+    return EncodedPicture(kind, data, _shape(shape))
+
+
+def _array(data: Any, dtype: Any, shape: Any) -> NDArray[Any]:
+    if not isinstance(data, bytes) or not isinstance(dtype, str) or not _DTYPE.fullmatch(dtype):
+        raise Refused(f"an array of type {dtype!r}: expected the bytes of numbers or truth values")
+    sides, kind = _shape(shape), np.dtype(dtype)
+    if math.prod(sides) * kind.itemsize != len(data):
+        raise Refused(
+            f"an array {sides} of {dtype}: expected {math.prod(sides) * kind.itemsize} bytes, {len(data)} came"
+        )
+    return np.frombuffer(data, kind).reshape(sides)
+
+
+def _shape(shape: Any) -> tuple[int, ...]:
+    is_shape = isinstance(shape, list | tuple) and len(shape) <= MAX_DIMENSIONS
+    if not is_shape or not all(type(side) is int and side >= 0 for side in shape):
+        raise Refused(f"an array of shape {shape!r}: expected at most {MAX_DIMENSIONS} sizes")
+    return tuple(shape)

@@ -1,0 +1,79 @@
+"""The robot that a client drives, as the protocol describes it: ours, or one told by a TOML file."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ponderpounce.tasks.panda import PANDA_WRISTCAM
+from protocol import checks
+from protocol.errors import MalformedMessage, TransportError
+from protocol.messages import Floats, Robot
+from sim_client.robot import simulated_robot
+
+_OPTIONAL = {"initial_command"}
+_MEASURED = {"image_height", "image_width"}
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """How many numbers a state has; and from the joints at the beginning of an episode and the pictures' (height,
+    width) to the robot's description."""
+
+    num_proprio: int
+    describe: Callable[[Floats, tuple[int, int]], Robot]
+
+
+def _panda(state: Floats, image_px: tuple[int, int]) -> Robot:
+    return replace(simulated_robot(PANDA_WRISTCAM, state), image_height=image_px[0], image_width=image_px[1])
+
+
+PANDA = Body(8, _panda)
+"""The Panda of our tasks and of RoboMME: absolute joint targets and a gripper; with a stick, the last is ignored."""
+
+
+def read_body(path: Path) -> Body:
+    """A body from a file with the fields of ``protocol.messages.Robot``, but the pictures' size, which is measured.
+
+    Without ``initial_command`` the robot holds, until its first command, the first numbers of its state.
+
+    Raises:
+        TransportError: the file cannot be read, or does not describe a robot.
+    """
+    try:
+        told = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise TransportError(f"--robot-file {path}: {error}") from None
+    expected = {each.name for each in fields(Robot)} - _MEASURED
+    if told.keys() - expected or expected - _OPTIONAL - told.keys():
+        raise TransportError(
+            f"--robot-file {path}: expected {', '.join(sorted(expected))}; came {', '.join(sorted(told))}"
+        )
+    try:
+        num_proprio = int(told["num_proprio"])
+        checks.check_robot(_told(told, np.zeros(num_proprio, np.float32), (1, 1)))
+    except (MalformedMessage, TypeError, ValueError) as error:
+        raise TransportError(f"--robot-file {path}: {error}") from None
+    return Body(num_proprio, lambda state, image_px: _told(told, state, image_px))
+
+
+def _told(told: dict[str, Any], state: Floats, image_px: tuple[int, int]) -> Robot:
+    limits = {name: np.asarray(told[name], np.float32) for name in ("command_low", "command_high", "max_step")}
+    initial = told.get("initial_command")
+    if initial is None:
+        initial = np.clip(state[: len(limits["command_low"])], limits["command_low"], limits["command_high"])
+    return Robot(
+        name=str(told["name"]),
+        **limits,
+        initial_command=np.asarray(initial, np.float32),
+        cameras=tuple(told["cameras"]),
+        image_height=image_px[0],
+        image_width=image_px[1],
+        num_proprio=int(told["num_proprio"]),
+        is_simulated=bool(told["is_simulated"]),
+    )

@@ -1,0 +1,91 @@
+"""The RoboMME challenge's policy protocol: ``reset`` and ``infer``, over openpi's websocket framing or over HTTP.
+
+An episode begins with a reset and an ``infer`` that says ``is_first_step``; its lists hold the conditioning video and,
+last, what is seen now. Later calls bring everything that was seen since the last one: one observation for each row that
+was played, so a client that plays fewer rows than it was given is noticed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from protocol.messages import Floats
+from sim_client.gateway import reading
+from sim_client.gateway.arrays import pack
+from sim_client.gateway.exchange import Answer, Asked, Finish, Packet, Refused, Seen, Step, Terms
+from sim_client.gateway.openpi import actions_of, metadata
+
+CAMERAS = {"front": "front_rgb_list", "wrist": "wrist_rgb_list"}
+JOINTS_KEY, GRIPPER_KEY = "joint_state_list", "gripper_state_list"
+RESET_FINISHED = {"reset_finished": True}
+
+
+class ChallengeDialect:
+    """Joint-angle actions, the challenge's default. Depth and camera parameters may be sent; nobody reads them."""
+
+    def __init__(self, terms: Terms) -> None:
+        self._terms = terms
+
+    def greeting(self) -> bytes:
+        return pack(metadata(self._terms), "openpi")
+
+    def read(self, packet: Packet) -> Asked:
+        message = reading.message(packet)
+        if message.get("reset"):
+            return Asked(Finish(), reply=pack(RESET_FINISHED, "openpi"))
+        begins = bool(reading.field(message, "is_first_step", "whether an episode begins"))
+        lists = {name: _list(message, key) for name, key in self._terms.cameras.items()}
+        seen = reading.videos(lists)
+        if len(seen) == 0:
+            raise Refused("front_rgb_list: expected at least what is seen now, came an empty list")
+        if not begins and len(seen) != self._terms.rows:
+            raise Refused(
+                f"expected {self._terms.rows} observations, one for each row that was given last time, came "
+                f"{len(seen)}. If the client plays that many rows of each answer, start pp-gateway with "
+                f"--rows {len(seen)}."
+            )
+        instruction = reading.text(message, "task_goal")
+        if begins:  # the states of the video are nobody's to read
+            return Asked(
+                Step(
+                    instruction=instruction,
+                    frames=seen[-1],
+                    state=_states(message, 1, self._terms.num_proprio)[0],
+                    begins=True,
+                    demo=seen[:-1],
+                )
+            )
+        states = _states(message, len(seen), self._terms.num_proprio)
+        since = tuple(Seen(frames, state) for frames, state in zip(seen[:-1], states, strict=False))
+        return Asked(Step(instruction=instruction, frames=seen[-1], state=states[-1], begins=False, since=since))
+
+    def answer(self, asked: Asked, answer: Answer) -> bytes:
+        return pack(actions_of(answer), "openpi")
+
+    def refuse(self, sentence: str) -> str:
+        return sentence
+
+
+def _states(message: Mapping[Any, Any], count: int, num_proprio: int) -> list[Floats]:
+    """The joints and one finger of the last ``count`` observations.
+
+    The other finger mirrors the first, and a stick has none: 0.
+    """
+    joints, fingers = (_list(message, key)[-count:] for key in (JOINTS_KEY, GRIPPER_KEY))
+    if len(joints) != count or len(fingers) != count:
+        raise Refused(f"{JOINTS_KEY}, {GRIPPER_KEY}: expected {count}, came {len(joints)} and {len(fingers)}")
+    name = f"{JOINTS_KEY} and one finger"
+    return [
+        reading.numbers(np.append(np.ravel(joint), [*np.ravel(finger)[:1], 0.0][0]), name, num_proprio)
+        for joint, finger in zip(joints, fingers, strict=True)
+    ]
+
+
+def _list(message: Mapping[Any, Any], key: str) -> Sequence[Any]:
+    values = reading.field(message, key, "all that was seen since the last call")
+    if not isinstance(values, Sequence | np.ndarray) or isinstance(values, str | bytes):
+        raise Refused(f"{key}: expected a list, came {type(values).__name__}")
+    return values  # type: ignore[return-value]  # an array of stacked frames serves as well

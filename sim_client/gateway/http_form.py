@@ -1,0 +1,130 @@
+"""The challenge over HTTP: ``GET /healthz`` and ``/metadata``, ``POST /reset`` and ``/infer``, bodies in msgpack.
+
+The standard library's server: a handful of requests a second, a thread each, no dependency more. HTTP has no
+connection to tell clients apart by, so a client is a host with its key.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+from protocol.errors import TransportError
+from sim_client.gateway.arrays import pack
+from sim_client.gateway.challenge import RESET_FINISHED
+from sim_client.gateway.exchange import Busy, Dialect, Finish, Packet, Refused, Terms
+from sim_client.gateway.machine import Machine
+from sim_client.gateway.openpi import metadata
+from sim_client.gateway.websocket import KEY_WANTED, is_allowed
+
+log = logging.getLogger("pp-gateway")
+
+_SILENT_S = 60.0  # a body that stops arriving does not hold its thread
+
+
+class HttpSide(ThreadingHTTPServer):
+    """Serves the challenge's HTTP form until ``shutdown``.
+
+    Raises:
+        TransportError: the address cannot be listened on.
+    """
+
+    daemon_threads = True
+    allow_reuse_address = True
+
+    def __init__(
+        self,
+        address: tuple[str, int],
+        machine: Machine,
+        terms: Terms,
+        new_dialect: Callable[[Terms], Dialect],
+        max_bytes: int,
+        api_key: str = "",
+    ) -> None:
+        self.machine, self.terms, self.new_dialect = machine, terms, new_dialect
+        self.max_bytes, self.api_key = max_bytes, api_key
+        try:
+            super().__init__(address, _Handler)
+        except OSError as error:
+            raise TransportError(f"--listen {address[0]}:{address[1]}: {error}") from None
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    timeout = _SILENT_S
+    server: HttpSide
+
+    def do_GET(self) -> None:
+        if self.path == "/healthz":
+            self._say(HTTPStatus.OK, "OK\n")
+        elif not self._is_allowed():
+            self._say(HTTPStatus.UNAUTHORIZED, KEY_WANTED)
+        elif self.path == "/metadata":
+            self._say(HTTPStatus.OK, pack(metadata(self.server.terms), "openpi"))
+        else:
+            self._say(HTTPStatus.NOT_FOUND, "expected /healthz or /metadata\n")
+
+    def do_POST(self) -> None:
+        if not self._is_allowed():
+            self._leave_body(HTTPStatus.UNAUTHORIZED, KEY_WANTED)
+        elif self.path not in ("/reset", "/infer"):
+            self._leave_body(HTTPStatus.NOT_FOUND, "expected /reset or /infer\n")
+        elif (body := self._body()) is not None:
+            try:
+                self._say(HTTPStatus.OK, self._done(body))
+            except Busy as error:
+                self._say(HTTPStatus.SERVICE_UNAVAILABLE, f"{error}\n")
+            except Refused as error:
+                log.warning("client=%s refused: %s", self._client, error)
+                self._say(HTTPStatus.BAD_REQUEST, f"{error}\n")
+
+    def _done(self, body: bytes) -> Packet:
+        """Raises Refused."""
+        machine, dialect = self.server.machine, self.server.new_dialect(self.server.terms)
+        if self.path == "/reset":
+            machine.submit(self._client, Finish()).result()
+            return pack(RESET_FINISHED, "openpi")
+        asked = dialect.read(body)
+        answer = machine.submit(self._client, asked.request).result() if asked.request is not None else None
+        return dialect.answer(asked, answer) if answer is not None else asked.reply or b""
+
+    def _body(self) -> bytes | None:
+        """The request's bytes; None if it was refused already."""
+        length = self.headers.get("Content-Length", "")
+        if not length.isdecimal():
+            self._leave_body(HTTPStatus.LENGTH_REQUIRED, "expected a Content-Length\n")
+            return None
+        if int(length) > self.server.max_bytes:
+            limit = f"{self.server.max_bytes} bytes"
+            self._leave_body(
+                HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"expected at most {limit}, came {length}: see --max-message-mb\n"
+            )
+            return None
+        return self.rfile.read(int(length))
+
+    def _leave_body(self, status: HTTPStatus, text: str) -> None:
+        """Refuses without reading on: what follows on this connection could be anything, so it is closed."""
+        self.close_connection = True
+        self._say(status, text)
+
+    def _say(self, status: HTTPStatus, content: Packet) -> None:
+        body = content.encode() if isinstance(content, str) else content
+        self.send_response(status)
+        self.send_header("Content-Type", "text/plain" if isinstance(content, str) else "application/msgpack")
+        self.send_header("Content-Length", str(len(body)))
+        if self.close_connection:
+            self.send_header("Connection", "close")
+        self.end_headers()
+        self.wfile.write(body)
+
+    @property
+    def _client(self) -> str:
+        return f"{self.client_address[0]} over HTTP"
+
+    def _is_allowed(self) -> bool:
+        return is_allowed(self.headers.get("Authorization"), self.server.api_key)
+
+    def log_message(self, format: str, *args: object) -> None:
+        log.debug("client=%s %s", self._client, format % args)

@@ -1,0 +1,394 @@
+"""The gateway's working thread: the robot's end of the bus, driven by what clients ask.
+
+Network threads only submit requests and wait for futures; everything that touches the bus, the log and an embedded
+clock happens in the thread that calls ``run``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import queue
+import re
+import secrets
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, TypeVar
+
+from clock.report import statistics, stream_sha256
+from clock.service import ClockService
+from clock.timebase import MonotonicClock
+from protocol import images
+from protocol import messages as m
+from protocol.errors import CallFailed, MalformedMessage, TransportError
+from protocol.link import Link, Stream, is_of_episode
+from protocol.topics import ACTION, CHUNK, CLOSE, OBSERVATION, OPEN, TICK, alive_key
+from sim_client.episode import CLOCK_SILENCE_NS
+from sim_client.gateway.body import Body
+from sim_client.gateway.exchange import Answer, Finish, Frames, Refused, Step
+from sim_client.gateway.node import LiveNode, LockstepNode, Node, Shown
+from sim_client.gateway.pictures import resized
+from sim_client.gateway.rule import at_demo_rate
+from sim_client.gateway.seat import Seat
+from sim_client.recorder import Recorder
+from sim_client.suite import versions
+
+log = logging.getLogger("pp-gateway")
+
+_OPEN_NS = 130_000_000_000
+_CLOSE_NS = 5_000_000_000
+_ASK_AGAIN_NS = 200_000_000
+_LAST_TICKS_NS = 1_000_000_000
+_IDLE_NS = 20_000_000
+_LIVE_TURN_NS = 2_000_000  # a request cannot ring the bus's bell
+_STOPPED = "the gateway was stopped"
+T = TypeVar("T")
+
+_NO_ID = re.compile(r"[^A-Za-z0-9_.-]+")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """What every episode of this gateway has in common."""
+
+    schedule: Callable[[int], m.Schedule]  # from the episode's seed
+    num_rows: int
+    body: Body
+    suite: str
+    task: str = "gateway"
+    image_px: int | None = None  # side of the squares that pictures are resized to; None: as they come
+    seed: int = 0
+    out: Path | None = None  # None: no logs
+    pixels: Literal["jpeg", "exact"] = "jpeg"
+    patience_ns: int = 120_000_000_000
+    idle_ns: int = 300_000_000_000
+
+
+@dataclass(slots=True)
+class _Job:
+    client: str
+    request: Step | Finish
+    future: Future[Answer | None]
+
+
+@dataclass(slots=True)
+class _Episode:
+    client: str
+    info: m.EpisodeInfo
+    node: Node
+    clock: MonotonicClock  # of the host, from the first observation on
+    heard_ns: int = 0  # the newest command, on that clock
+    over: str = ""  # why it ended although the client did not end it
+
+
+class Machine:
+    """One robot for whoever has the seat.
+
+    Args:
+        link: the robot's end of the bus.
+        clock: the clock service, if it is embedded here; it is stepped by the working thread.
+        check_servers: a sentence if a server that we started is dead, else "".
+    """
+
+    def __init__(
+        self, plan: Plan, link: Link, clock: ClockService | None, check_servers: Callable[[], str] = lambda: ""
+    ) -> None:
+        self._plan = plan
+        self._link = link
+        self._clock = clock
+        self._check_servers = check_servers
+        self._recorder = Recorder(link, plan.pixels)
+        self._actions = link.subscribe(ACTION)
+        self._accounts = link.subscribe(TICK)
+        self._chunks = link.subscribe(CHUNK)
+        self._session = f"{_id_of(plan.suite)}-{secrets.token_hex(4)}"
+        self._num_episodes = 0
+        self._episode: _Episode | None = None
+        self._waiting: list[Future[Answer | None]] = []  # live: asked before the first command
+        self._jobs: queue.SimpleQueue[_Job] = queue.SimpleQueue()
+        self._seat = Seat(plan.idle_ns)
+        self._lock = threading.Lock()  # of the seat and the next line: network threads read them
+        self._is_closed = False
+        self._should_stop: Callable[[], bool] = lambda: False
+        link.bus.declare_alive(alive_key(link.robot, link.proc))
+
+    # -- called by network threads
+
+    def submit(self, client: str, request: Step | Finish) -> Future[Answer | None]:
+        """Hands in a request; the future holds its answer (None of a Finish), or raises Refused.
+
+        Raises:
+            Busy: another client has the robot.
+            Refused: the gateway was stopped.
+        """
+        job = _Job(client, request, Future())
+        with self._lock:
+            if self._is_closed:
+                raise Refused(_STOPPED)
+            if isinstance(request, Step):
+                self._seat.take(client, time.monotonic_ns())
+            self._jobs.put(job)
+        return job.future
+
+    # -- the working thread
+
+    def run(self, should_stop: Callable[[], bool]) -> None:
+        """Works until told to stop; an episode that is open then is ended."""
+        self._should_stop = should_stop
+        try:
+            while not should_stop():
+                self.step()
+        finally:
+            with self._lock:
+                self._is_closed = True
+            while not self._jobs.empty():
+                self._jobs.get().future.set_exception(Refused(_STOPPED))
+            self._end(m.TaskStatus.ABORTED, _STOPPED)
+
+    def step(self) -> None:
+        """One job if there is any, and one turn for everybody else."""
+        is_live = self._episode is not None and isinstance(self._episode.node, LiveNode)
+        with contextlib.suppress(queue.Empty):
+            self._work(self._jobs.get(block=not is_live, timeout=_IDLE_NS / 1e9))
+        self._turn(_LIVE_TURN_NS if is_live else 0)
+        if is_live:
+            self._look_after_live()
+
+    def _work(self, job: _Job) -> None:
+        try:
+            if isinstance(job.request, Finish):
+                self._finish(job.client, job.request)
+                job.future.set_result(None)
+            else:
+                self._step(job, job.request)
+        except (Refused, TransportError, MalformedMessage) as error:
+            log.warning("refused client=%r %s", job.client, error)
+            job.future.set_exception(error if isinstance(error, Refused) else Refused(str(error)))
+        except Exception as error:
+            log.exception("request failed client=%r", job.client)
+            job.future.set_exception(Refused(f"the gateway failed: {type(error).__name__}: {error}"))
+
+    def _finish(self, client: str, request: Finish) -> None:
+        if self._episode is not None and self._episode.client == client:
+            self._end(request.status, request.reason)
+        with self._lock:
+            self._seat.leave(client)
+
+    def _step(self, job: _Job, step: Step) -> None:
+        episode = self._episode
+        is_theirs = episode is not None and episode.client == job.client
+        frames = resized(step.frames, self._plan.image_px)
+        if step.begins or (step.may_begin and not is_theirs):
+            episode = self._begin(job.client, step, frames)
+        elif episode is None or not is_theirs:
+            raise Refused("no episode is open: expected the first observation of one, after a reset")
+        if episode.over:
+            raise Refused(f"the episode is over: {episode.over}. Reset, and begin another one.")
+        height, width = episode.info.robot.image_height, episode.info.robot.image_width
+        for name, frame in frames.items():
+            if frame.shape[:2] != (height, width):
+                came = f"{frame.shape[0]} x {frame.shape[1]}"
+                raise Refused(f"{name}: expected {height} x {width} px as at first, came {came}. See --image-px.")
+        now = Shown(self._packed(frames), step.state)
+        if isinstance(episode.node, LockstepNode):
+            px = self._plan.image_px
+            since = [Shown(self._packed(resized(seen.frames, px)), seen.state) for seen in step.since]
+            self._show(episode.node.show(since, now))
+            job.future.set_result(self._play(episode, episode.node))
+            return
+        self._show(episode.node.show(now, episode.clock.now_ns()))
+        self._waiting.append(job.future)
+        self._look_after_live()
+
+    def _play(self, episode: _Episode, node: LockstepNode) -> Answer:
+        """Lockstep: all ticks that the client has played since its last request, and the one that it asks about."""
+        asked_ns = time.monotonic_ns()
+        while True:
+            self._take_background(node)
+            for action in self._of_episode(self._actions):
+                if (shown := node.on_action(action)) is not None:
+                    self._show(shown)
+            if (answer := node.answer()) is not None:
+                return answer
+            if time.monotonic_ns() - asked_ns > self._plan.patience_ns:
+                self._give_up(episode, f"no command within {self._plan.patience_ns / 1e9:.0f} s")
+            if dead := self._check_servers():
+                self._give_up(episode, dead)
+            if self._should_stop():
+                raise Refused(_STOPPED)
+            self._turn(_IDLE_NS)
+
+    def _give_up(self, episode: _Episode, why: str) -> None:
+        episode.over = why
+        self._end(m.TaskStatus.ABORTED, why, keep=episode)
+        raise Refused(f"the episode is over: {why}")
+
+    def _look_after_live(self) -> None:
+        """Takes commands as they come, answers those who waited for the first, and notices the end."""
+        episode = self._episode
+        if episode is None or not isinstance(episode.node, LiveNode) or episode.over:
+            return
+        self._take_background(episode.node)
+        for action in self._of_episode(self._actions):
+            episode.node.on_action(action)
+            episode.heard_ns = episode.clock.now_ns()
+        answer = episode.node.answer()
+        silent_ns = episode.clock.now_ns() - episode.heard_ns
+        limit_ns = self._plan.patience_ns if answer is None else CLOCK_SILENCE_NS
+        why = episode.node.over() or (f"no command for {silent_ns / 1e6:.0f} ms" if silent_ns > limit_ns else "")
+        waiting, self._waiting = (self._waiting, []) if answer is not None or why else ([], self._waiting)
+        for future in waiting:
+            if answer is not None:
+                future.set_result(answer)
+            else:
+                future.set_exception(Refused(f"the episode is over: {why}"))
+        if why:
+            episode.over = why
+            self._end(m.TaskStatus.ABORTED, why, keep=episode)
+
+    def _take_background(self, node: Node) -> None:
+        """What a promise is made of: the accounts of ticks, and chunks."""
+        for account in self._of_episode(self._accounts):
+            node.commands.on_account(account)
+        for chunk in self._of_episode(self._chunks):
+            node.commands.on_chunk(chunk)
+
+    def _of_episode(self, stream: Stream[T]) -> list[T]:
+        return [each for each in stream.drain() if is_of_episode(self._link, each.header)]  # type: ignore[attr-defined]
+
+    def _turn(self, longest_ns: int) -> None:
+        """One turn for everybody else; with an embedded clock, no longer than until it has something to do."""
+        self._recorder.step()
+        if self._clock is not None:
+            if self._clock.step():
+                return
+            longest_ns = self._clock.wait_ns(longest_ns)
+        self._link.bus.wait(longest_ns)
+
+    def _show(self, observation: m.Observation) -> None:
+        self._link.publish(OBSERVATION, observation, at_ns=observation.source_ns)
+
+    # -- one episode
+
+    def _begin(self, client: str, step: Step, frames: Frames) -> _Episode:
+        """Raises Refused, TransportError: the servers do not take this episode."""
+        self._end(m.TaskStatus.ONGOING, "another episode was begun")
+        self._num_episodes += 1
+        seed = self._plan.seed + self._num_episodes - 1
+        task = _id_of(step.task) or self._plan.task
+        self._link.enter_episode(self._session, f"{task}-{seed}-{secrets.token_hex(3)}", self._num_episodes)
+        demo = tuple(
+            m.DemoFrame(images=self._packed(resized(shown, self._plan.image_px)))
+            for shown in at_demo_rate(step.demo, self._plan.schedule(seed).control_hz)
+        )
+        image_px = next(iter(frames.values())).shape[:2]
+        info = m.EpisodeInfo(
+            header=self._link.header("info", 0),
+            task=task,
+            suite=self._plan.suite,
+            seed=seed,
+            difficulty="",
+            instruction=step.instruction,
+            schedule=self._plan.schedule(seed),
+            robot=self._plan.body.describe(step.state, (image_px[0], image_px[1])),
+            t0_unix_ns=time.time_ns(),
+            versions=versions(),
+            has_demo=bool(demo),
+        )
+        path = self._log_path(info)
+        self._recorder.begin(info, path)
+        episode = _Episode(client, info, self._node(info), MonotonicClock())
+        self._episode = episode
+        try:
+            warnings = self._open(m.OpenRequest(info=info, demo=demo))
+        except (TransportError, MalformedMessage) as error:
+            self._end(m.TaskStatus.ABORTED, str(error))
+            with self._lock:
+                self._seat.leave(client)
+            raise
+        for stale in (self._actions, self._accounts, self._chunks):
+            stale.drain()
+        episode.clock, episode.heard_ns = MonotonicClock(), 0
+        log.info("episode=%s client=%r demo=%d log=%s", info.header.episode, client, len(demo), path)
+        for warning in warnings:
+            log.warning("episode=%s %s", info.header.episode, warning)
+        return episode
+
+    def _packed(self, frames: Frames) -> tuple[m.Image, ...]:
+        return images.pack(frames, images.wire_codec(self._link.bus.is_local))
+
+    def _node(self, info: m.EpisodeInfo) -> Node:
+        node = LiveNode if info.schedule.mode == m.Mode.REALTIME else LockstepNode
+        return node(info, self._plan.num_rows)
+
+    def _log_path(self, info: m.EpisodeInfo) -> Path | None:
+        if self._plan.out is None:
+            return None
+        day = time.strftime("%Y-%m-%d", time.gmtime())
+        return self._plan.out / day / info.task / f"{info.header.episode}.mcap"
+
+    def _open(self, request: m.OpenRequest) -> tuple[str, ...]:
+        """Asks the clock service until its servers are ready."""
+        deadline_ns = time.monotonic_ns() + self._plan.patience_ns
+        while True:
+            try:
+                if self._clock is not None:  # our own thread: a call over the bus would wait for itself
+                    reply = self._clock.open(request)
+                else:
+                    reply = self._link.call(OPEN, "clock", request, timeout_ns=_OPEN_NS)
+            except CallFailed as error:
+                reply = m.OpenReply(error=str(error), try_again=True)
+            if not reply.error:
+                return reply.warnings
+            dead = self._check_servers()
+            is_late = time.monotonic_ns() > deadline_ns or self._should_stop()
+            if dead or is_late or not reply.try_again:
+                raise TransportError(dead or reply.error)
+            self._turn(_ASK_AGAIN_NS)
+
+    def _end(self, status: m.TaskStatus, reason: str, keep: _Episode | None = None) -> None:
+        """Closes the log and the servers' episode. One that is kept stays known, to tell its client why it is over."""
+        episode, self._episode = self._episode, keep
+        if episode is None or not self._link.episode:
+            return
+        num_ticks = self._await_last_ticks(episode)
+        ticks = [tick for tick in self._recorder.ticks if tick.tick < num_ticks]
+        result = m.EpisodeResult(
+            status=status,
+            is_success=status == m.TaskStatus.SUCCESS,
+            reason=reason,
+            num_ticks=num_ticks,
+            stream_sha256=stream_sha256(ticks),
+            statistics=statistics(ticks, self._recorder.stamps, self._recorder.invocations),
+        )
+        missing = self._recorder.end(result)
+        request = m.CloseRequest(header=self._link.header("close", 0), result=result)
+        if self._clock is not None:
+            self._clock.close(request)
+        else:
+            with contextlib.suppress(CallFailed):  # the log already says that the clock is lost
+                self._link.call(CLOSE, "clock", request, timeout_ns=_CLOSE_NS)
+        for future in self._waiting:
+            future.set_exception(Refused(f"the episode is over: {reason}"))
+        self._waiting = []
+        told = " ".join([f"status={status.name} ticks={num_ticks} {reason}", *missing])
+        log.info("episode=%s over %s", self._link.episode, told)
+        self._link.leave_episode()
+
+    def _await_last_ticks(self, episode: _Episode) -> int:
+        """Accounts of ticks travel behind their commands; the hash is over all of them. Returns how many there are."""
+        deadline_ns = time.monotonic_ns() + _LAST_TICKS_NS
+        self._recorder.step()
+        while len(self._recorder.ticks) < episode.node.tick and time.monotonic_ns() < deadline_ns:
+            self._turn(1_000_000)
+        self._recorder.step()
+        return episode.node.tick
+
+
+def _id_of(name: str) -> str:
+    """A client's name for something, as far as it can be part of a key and of a file's name."""
+    return _NO_ID.sub("-", name).strip("-.")[:60]

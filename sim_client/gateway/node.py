@@ -1,0 +1,151 @@
+"""One episode between a client that asks and a clock that commands. Pure: requests, commands and instants in, messages
+out.
+
+An answer of several rows is a command and a promise. The command is the clock's, for the tick that the request shows;
+the promise is what the same chunk has for the ticks after it, within the robot's limits. In lockstep the client plays
+it all and then asks again: the ticks in between are commanded then, each on what was seen in it, and they are the rows
+that were promised, because no chunk is made in between. In live mode the clock waits for nobody, and a promise is a
+forecast.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from clock.playback import deadline_ns
+from protocol import messages as m
+from sim_client.episode import STOPPED_TICKS
+from sim_client.gateway.exchange import Answer
+from sim_client.gateway.rule import ahead
+
+_KEEP_CHUNKS = 8
+
+
+class Shown(NamedTuple):
+    """What a client saw at one tick, as it is published."""
+
+    pictures: tuple[m.Image, ...]
+    state: m.Floats
+
+
+@dataclass(slots=True)
+class Commands:
+    """The newest command, the clock's account of it, and the chunks that it may have come from."""
+
+    robot: m.Robot
+    newest: m.Action | None = None
+    _account: m.Tick | None = None
+    _chunks: dict[int, m.ActionChunk] = field(default_factory=dict)
+
+    def on_account(self, account: m.Tick) -> None:
+        self._account = account
+
+    def on_chunk(self, chunk: m.ActionChunk) -> None:
+        self._chunks[chunk.invocation] = chunk
+        while len(self._chunks) > _KEEP_CHUNKS:
+            del self._chunks[min(self._chunks)]
+
+    def answer(self, num_rows: int) -> Answer | None:
+        """The newest command and what is ahead of it; None while that cannot be told."""
+        newest, account = self.newest, self._account
+        if newest is None:
+            return None
+        chunk: m.ActionChunk | None = None
+        if num_rows > 1:
+            if account is None or account.tick != newest.tick:
+                return None
+            if account.invocation is not None and (chunk := self._chunks.get(account.invocation)) is None:
+                return None
+        rows, levels = ahead(newest, chunk, self.robot, num_rows)
+        return Answer(rows_NA=rows, tick=newest.tick, levels=levels)
+
+
+@dataclass(slots=True)
+class LockstepNode:
+    """Counts ticks. ``show`` what the client sees, hand in each command, take ``answer`` when it is complete."""
+
+    info: m.EpisodeInfo
+    num_rows: int
+    tick: int = 0
+    """The next one to be commanded."""
+    commands: Commands = field(init=False)
+    _start_ns: int = 0
+    _coming: list[Shown] = field(default_factory=list)
+    _last: Shown | None = None
+    _asked_tick: int = 0  # of the request under way
+
+    def __post_init__(self) -> None:
+        self.commands = Commands(self.info.robot)
+
+    def show(self, since: Sequence[Shown], now: Shown) -> m.Observation:
+        """A request: what was seen in each tick since the last one, and what is seen now. Returns what is published.
+
+        A client that does not tell what it saw in between is taken to have seen what it saw before.
+        """
+        if self._last is None:
+            self._coming = [now]
+        else:
+            untold = [self._last] * (self.num_rows - 1 - len(since))
+            self._coming = [*since, *untold, now]
+        self._last = now
+        self._asked_tick = self.tick + len(self._coming) - 1
+        return self._next()
+
+    def on_action(self, action: m.Action) -> m.Observation | None:
+        """Takes the command of the current tick; returns what is published for the next one, while there is more."""
+        if action.tick != self.tick or self._last is None:
+            return None
+        if self.tick == 0:
+            self._start_ns = action.deadline_ns
+        self.commands.newest = action
+        self.tick += 1
+        return self._next() if self._coming else None
+
+    def answer(self) -> Answer | None:
+        """The rows of the request, once its own tick has been commanded."""
+        return self.commands.answer(self.num_rows) if self.tick > self._asked_tick else None
+
+    def _next(self) -> m.Observation:
+        shown = self._coming.pop(0)
+        source_ns = deadline_ns(self._start_ns, self.tick, self.info.schedule.control_hz)
+        return m.Observation(tick=self.tick, source_ns=source_ns, proprio=shown.state, images=shown.pictures)
+
+
+@dataclass(slots=True)
+class LiveNode:
+    """Follows the clock's commands; ``answer`` is what holds at this moment."""
+
+    info: m.EpisodeInfo
+    num_rows: int
+    tick: int = 0
+    """The next one to be commanded."""
+    commands: Commands = field(init=False)
+    _stopped_ticks: int = 0
+
+    def __post_init__(self) -> None:
+        self.commands = Commands(self.info.robot)
+
+    def show(self, now: Shown, now_ns: int) -> m.Observation:
+        """What is published for a request that came at ``now_ns``, episode time: the first tick that it can serve."""
+        return m.Observation(tick=self.tick, source_ns=now_ns, proprio=now.state, images=now.pictures)
+
+    def on_action(self, action: m.Action) -> None:
+        if action.tick < self.tick:
+            return
+        self.commands.newest, self.tick = action, action.tick + 1
+        self._stopped_ticks = self._stopped_ticks + 1 if action.level == m.Level.STOPPED else 0
+
+    def answer(self) -> Answer | None:
+        """What is commanded now, and what is ahead of it; None before the first command."""
+        return self.commands.answer(self.num_rows)
+
+    def over(self) -> str:
+        """Why the episode cannot go on; "" while it can."""
+        if self._stopped_ticks > STOPPED_TICKS:
+            return "stopped by the ladder, and nobody engaged it again"
+        return ""
+
+
+Node = LockstepNode | LiveNode

@@ -1,0 +1,203 @@
+"""Options of ``pp-gateway``, and the plan of episodes that they describe."""
+
+from __future__ import annotations
+
+import ipaddress
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+from clock import schedules
+from clock.timebase import NS_PER_MS
+from protocol.errors import TransportError
+from protocol.messages import Delay, DelayKind, Schedule, WaitKind
+from protocol.options import LinkOptions
+from protocol.version import version
+from sim_client.gateway import body, challenge, openpi, vla_eval
+from sim_client.gateway.exchange import Dialect, Terms
+from sim_client.gateway.machine import Plan
+
+DialectName = Literal["openpi", "challenge", "challenge-http", "vla-eval"]
+_SPOKEN: dict[DialectName, tuple[type[Dialect], Mapping[str, str], str, int]] = {
+    # by name: who speaks it, where it has the cameras and the state, and how many rows an answer usually has
+    "openpi": (openpi.OpenpiDialect, openpi.CAMERAS, openpi.STATE_KEY, 1),
+    "challenge": (challenge.ChallengeDialect, challenge.CAMERAS, challenge.JOINTS_KEY, schedules.HORIZON),
+    "challenge-http": (challenge.ChallengeDialect, challenge.CAMERAS, challenge.JOINTS_KEY, schedules.HORIZON),
+    "vla-eval": (vla_eval.VlaEvalDialect, vla_eval.CAMERAS, "states", 1),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GatewayOptions:
+    """Lets clients of other protocols drive PONDER and POUNCE: openpi's, the RoboMME challenge's, vla-eval's."""
+
+    dialect: DialectName
+    """What the clients speak."""
+    listen: str = "127.0.0.1:8000"
+    """HOST:PORT for them. Beyond loopback it needs --api-key-file or --open-to-anyone."""
+    api_key_file: Path | None = None
+    """Clients must send the word in this file as "Authorization: Api-Key WORD", as openpi-client's api_key does."""
+    open_to_anyone: bool = False
+    """Listen beyond loopback without a key: whoever reaches the port drives the robot."""
+    mode: Literal["lockstep", "realtime"] = "lockstep"
+    """lockstep: a request is --rows ticks of virtual time, and models may take what they need. realtime: the schedule
+    runs by itself, and a request is answered at once with what is commanded at that moment."""
+    rows: int | None = None
+    """Rows in an answer: what the client plays before it asks again. None: 1, and 20 for the challenge."""
+    cameras: tuple[str, ...] = ()
+    """NAME=KEY for each camera of ours, e.g. front=observation/image wrist=observation/wrist_image. Empty: the
+    dialect's usual keys; in vla-eval the first picture is the front camera's and the second the wrist's."""
+    state_key: str | None = None
+    """Where the measured joints are. None: the dialect's usual key."""
+    image_px: int | None = None
+    """Resize pictures to squares of this side. None: as they come, and PONDER says if it wants another size."""
+    robot_file: Path | None = None
+    """TOML description of the robot, see docs/gateway.md. None: the Panda of our tasks and of RoboMME."""
+    task: str = "gateway"
+    """Name of the task in logs, where the client does not tell it."""
+    seed: int = 0
+    """Of the first episode; each further one uses the next."""
+
+    local: bool = False
+    """Start ponder-serve, pounce-serve (and in real time clock-serve) on this machine, and stop them at the end."""
+    clock: Literal["auto", "embedded", "daemon"] = "auto"
+    """Where the clock service runs. auto: its own process in real time, inside this one in lockstep."""
+    link: LinkOptions = field(
+        default_factory=lambda: LinkOptions(connect=("tcp/127.0.0.1:7447", "tcp/127.0.0.1:7448", "tcp/127.0.0.1:7449"))
+    )
+    ponder_checkpoint: Path | None = None
+    """With --local: weights of PONDER; none are random."""
+    pounce_checkpoint: Path | None = None
+    query_period_ms: int = 1000
+    """Between PONDER's looks (paper: 1 Hz)."""
+    invoke_every_ticks: int | None = None
+    """Between POUNCE's invocations. None: with every request of several rows; else 20 in lockstep, 10 in real time."""
+    delay_ms: int = 300
+    """Lockstep: PONDER's modelled delay (paper: 300 ms)."""
+    max_age_ms: int = 2000
+    """Cognition older than this is called stale (an alarm; its rows are still played)."""
+    stale_limit_ms: int = 10_000
+    """Rows made with a cognition older than this are not played: hold, then stop."""
+    allow_starved: bool = False
+    """Start although the schedule leaves ticks without a row."""
+
+    out: Path = Path("out")
+    """Folder for one MCAP per episode."""
+    record: bool = True
+    pixels: Literal["jpeg", "exact"] = "jpeg"
+    """jpeg: raw frames are logged as JPEG; exact: also bit for bit as the models saw them."""
+    patience_s: float = 120.0
+    """How long to wait for servers to be ready, and in lockstep for any command."""
+    idle_s: float = 300.0
+    """A client that has been silent for so long loses the robot to the next one that asks."""
+    max_message_mb: int = 1024
+    """Larger messages are refused. Two raw 256 px views of a 48 s video are 380 MB."""
+
+    def check(self) -> None:
+        """Raises TransportError for what cannot work together."""
+        host, _ = self.address
+        rows, horizon = self.terms().rows, schedules.HORIZON
+        if not 1 <= rows <= horizon:
+            raise TransportError(f"--rows {rows}: POUNCE's chunks have {horizon} rows, expected 1 to {horizon}")
+        if self.dialect == "vla-eval" and rows != 1:
+            raise TransportError(f"--rows {rows}: vla-eval asks at every step and plays one row; leave --rows out")
+        every_ticks = self.schedule(0).invoke_period_ticks
+        if self.mode == "lockstep" and every_ticks % rows:
+            raise TransportError(
+                f"--invoke-every-ticks {every_ticks} is no multiple of --rows {rows}: a new chunk would break the "
+                "promise of rows that the client is still playing"
+            )
+        if not self.api_key_file and not self.open_to_anyone and not _is_loopback(host):
+            raise TransportError(
+                f"--listen {self.listen} can be reached from other hosts: give --api-key-file, or say --open-to-anyone"
+            )
+        if self.api_key_file and self.dialect == "vla-eval":
+            raise TransportError("--api-key-file: vla-eval sends no key; use --open-to-anyone, or a tunnel")
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """Host and port of ``listen``. Raises TransportError if it is not HOST:PORT."""
+        host, _, port = self.listen.rpartition(":")
+        if not host or not port.isdecimal() or int(port) > 65535:
+            raise TransportError(f"--listen {self.listen!r}: expected HOST:PORT, e.g. 127.0.0.1:8000")
+        return host.strip("[]"), int(port)
+
+    @property
+    def runs_clock_daemon(self) -> bool:
+        return self.clock == "daemon" or (self.clock == "auto" and self.mode == "realtime")
+
+    def api_key(self) -> str:
+        """The word that clients must know; "" if none. Raises TransportError if the file has none."""
+        if self.api_key_file is None:
+            return ""
+        try:
+            word = self.api_key_file.read_text(encoding="utf-8").strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise TransportError(f"--api-key-file {self.api_key_file}: {error}") from None
+        if not word:
+            raise TransportError(f"--api-key-file {self.api_key_file} is empty: expected one word")
+        return word
+
+    def dialect_class(self) -> type[Dialect]:
+        return _SPOKEN[self.dialect][0]
+
+    def terms(self) -> Terms:
+        """What the dialect is told. Raises TransportError for a camera that is not NAME=KEY."""
+        _, cameras, state_key, rows = _SPOKEN[self.dialect]
+        pairs = [each.partition("=") for each in self.cameras]
+        if any(not name or not key for name, _, key in pairs):
+            raise TransportError(f"--cameras {' '.join(self.cameras)}: expected NAME=KEY, e.g. front=observation/image")
+        return Terms(
+            mode=self.schedule(0).mode,
+            rows=self.rows if self.rows is not None else rows,
+            control_hz=schedules.CONTROL_HZ,
+            cameras={name: key for name, _, key in pairs} or cameras,
+            state_key=self.state_key or state_key,
+            num_proprio=self.body().num_proprio,
+            version=version(),
+        )
+
+    def schedule(self, seed: int) -> Schedule:
+        """The schedule of the episode with this seed."""
+        base = schedules.realtime() if self.mode == "realtime" else schedules.paper()
+        rows = self.rows or _SPOKEN[self.dialect][3]
+        every_ticks = rows if self.mode == "lockstep" and rows > 1 else base.invoke_period_ticks
+        fixed = Delay(kind=DelayKind.FIXED, mean_ns=self.delay_ms * NS_PER_MS)
+        return replace(
+            base,
+            query_period_ns=self.query_period_ms * NS_PER_MS,
+            invoke_period_ticks=self.invoke_every_ticks or every_ticks,
+            query_delay=base.query_delay if self.mode == "realtime" else fixed,
+            wait=WaitKind.STAND_STILL,
+            max_age_ns=self.max_age_ms * NS_PER_MS,
+            stale_limit_ns=self.stale_limit_ms * NS_PER_MS,
+            seed=seed,
+        )
+
+    def body(self) -> body.Body:
+        """The robot that clients drive. Raises TransportError if its file does not describe one."""
+        return body.read_body(self.robot_file) if self.robot_file else body.PANDA
+
+    def plan(self) -> Plan:
+        """What all episodes have in common. Raises TransportError as ``body``."""
+        return Plan(
+            schedule=self.schedule,
+            num_rows=self.terms().rows,
+            body=self.body(),
+            suite=self.dialect,
+            task=self.task,
+            image_px=self.image_px,
+            seed=self.seed,
+            out=self.out if self.record else None,
+            pixels=self.pixels,
+            patience_ns=round(self.patience_s * 1e9),
+            idle_ns=round(self.idle_s * 1e9),
+        )
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

@@ -1,0 +1,56 @@
+"""Pictures as strangers send them: compressed until somebody looks, of no other size than announced, resized if asked.
+
+Of a video that was sent at 20 Hz, PONDER reads one frame in twenty; the others are never decoded.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from protocol.checks import MAX_IMAGE_SIDE_PX
+from sim_client.gateway.exchange import Frames, Refused
+
+
+@dataclass(frozen=True, slots=True)
+class EncodedPicture:
+    """A PNG or JPEG as it came, and the shape that it claims to have."""
+
+    format: str
+    data: bytes
+    shape: tuple[int, ...]
+
+    def decode(self) -> NDArray[np.uint8]:
+        """Pixels (height, width, 3) uint8 RGB.
+
+        Raises:
+            Refused: the bytes are not the picture that was announced.
+        """
+        height, width, *_ = *self.shape, 0, 0
+        if not (0 < height <= MAX_IMAGE_SIDE_PX and 0 < width <= MAX_IMAGE_SIDE_PX):
+            raise Refused(f"a picture of shape {self.shape}: expected sides of 1 to {MAX_IMAGE_SIDE_PX} px")
+        try:
+            with Image.open(io.BytesIO(self.data), formats=("PNG", "JPEG")) as picture:
+                if picture.size != (width, height):  # before memory is taken: a few bytes can claim gigabytes
+                    came = f"{picture.size[1]} x {picture.size[0]}"
+                    raise Refused(f"a picture that claims {height} x {width} px holds {came} px")
+                return np.asarray(picture.convert("RGB"))
+        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+            raise Refused(f"a picture that cannot be read as {self.format}: {error}") from None
+
+
+def resized(frames: Frames, side_px: int | None) -> Frames:
+    """The frames as squares of ``side_px``, bilinearly; as they are if it is None or if they fit."""
+    if side_px is None:
+        return frames
+    return {name: _resized(frame, side_px) for name, frame in frames.items()}
+
+
+def _resized(frame: NDArray[np.uint8], side_px: int) -> NDArray[np.uint8]:
+    if frame.shape[:2] == (side_px, side_px):
+        return frame
+    return np.asarray(Image.fromarray(frame).resize((side_px, side_px), Image.Resampling.BILINEAR))

@@ -1,0 +1,110 @@
+"""Taking things out of a client's message: every miss is told with what was expected, what came, and the way out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.messages import Floats
+from sim_client.gateway.arrays import unpack
+from sim_client.gateway.exchange import Frames, Packet, Refused
+from sim_client.gateway.pictures import EncodedPicture
+
+
+def message(packet: Packet) -> dict[Any, Any]:
+    """The map that every dialect's packets are. Raises Refused for anything else."""
+    if isinstance(packet, str):
+        raise Refused("expected a binary message of msgpack, came text")
+    value = unpack(packet)
+    if not isinstance(value, dict):
+        raise Refused(f"expected a msgpack map, came {type(value).__name__}")
+    return value
+
+
+def field(values: Mapping[Any, Any], key: str, why: str) -> Any:
+    """``values[key]``, or with slashes in the key the entry of a map within. Raises Refused if there is none."""
+    found: Any = values
+    for name in (key,) if key in values else key.split("/"):
+        if not isinstance(found, Mapping) or name not in found:
+            raise Refused(f"expected {key!r} ({why}), came {_names(values)}")
+        found = found[name]
+    return found
+
+
+def text(values: Mapping[Any, Any], key: str) -> str:
+    """A sentence; of a list of wordings the first, as the benchmark's own policies do."""
+    value = field(values, key, "what the robot is to do")
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes) and value:
+        value = value[0]
+    if not isinstance(value, str) or not value.strip():
+        raise Refused(f"{key}: expected a sentence that says what to do, came {str(value)[:80]!r}")
+    return value
+
+
+def numbers(value: Any, name: str, expected: int) -> Floats:
+    """One vector of ``expected`` finite numbers, as float32."""
+    try:
+        vector = np.asarray(value, np.float32).ravel()
+    except (TypeError, ValueError, OverflowError):
+        raise Refused(f"{name}: expected {expected} numbers, came {type(value).__name__}") from None
+    if len(vector) != expected:
+        raise Refused(
+            f"{name}: expected {expected} numbers, came {len(vector)}. A robot of another build needs --robot-file."
+        )
+    if not np.isfinite(vector).all():
+        raise Refused(f"{name}: expected finite numbers, came {vector.tolist()}")
+    return vector
+
+
+def picture(value: Any, name: str) -> NDArray[np.uint8]:
+    """Pixels (height, width, 3) uint8."""
+    frame = value.decode() if isinstance(value, EncodedPicture) else value
+    if not isinstance(frame, np.ndarray) or frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
+        came = f"{frame.shape} of {frame.dtype}" if isinstance(frame, np.ndarray) else type(frame).__name__
+        raise Refused(f"{name}: expected a picture (height, width, 3) of uint8, came {came}")
+    return frame
+
+
+def frames(pictures: Mapping[Any, Any], cameras: Mapping[str, str]) -> Frames:
+    """One picture per camera of ours: under its key, or, where the key is empty, the next one in the client's order."""
+    rest = iter(pictures.items())
+    found: dict[str, NDArray[np.uint8]] = {}
+    for camera, key in cameras.items():
+        if key:
+            found[camera] = picture(field(pictures, key, f"the {camera} camera"), key)
+            continue
+        name, value = next(rest, (None, None))
+        if name is None:
+            expected = f"{len(cameras)} ({', '.join(cameras)})"
+            raise Refused(f"pictures: expected {expected}, came {len(pictures)} ({_names(pictures)})")
+        found[camera] = picture(value, str(name))
+    return found
+
+
+def videos(streams: Mapping[str, Any]) -> Sequence[Frames]:
+    """Lists of frames, one per camera, as one list of instants; its pictures are decoded when they are read."""
+    lengths = {name: len(stream) for name, stream in streams.items() if isinstance(stream, Sequence | np.ndarray)}
+    if len(lengths) != len(streams) or len(set(lengths.values())) > 1:
+        came = ", ".join(f"{name}: {lengths.get(name, 'no list')}" for name in streams)
+        raise Refused(f"expected a list of frames per camera, equally long, came {came}")
+    return _Video(streams, next(iter(lengths.values()), 0))
+
+
+class _Video(Sequence[Frames]):
+    def __init__(self, streams: Mapping[str, Any], length: int) -> None:
+        self._streams, self._length = streams, length
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [self[position] for position in range(*index.indices(self._length))]
+        return {name: picture(stream[index], name) for name, stream in self._streams.items()}
+
+
+def _names(values: Mapping[Any, Any]) -> str:
+    return ", ".join(repr(key) for key in list(values)[:12]) or "nothing"

@@ -1,0 +1,36 @@
+"""The arithmetic of the gateway: which frames of a video PONDER reads, and what lies ahead of a command."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from clock.limits import within_limits
+from protocol.messages import Action, ActionChunk, Floats, Level, Robot
+from sim_client.gateway.exchange import Frames
+
+DEMO_HZ = 1  # the paper's rate (B.1)
+
+
+def at_demo_rate(video: Sequence[Frames], control_hz: int) -> Sequence[Frames]:
+    """The frames of a video at the control rate that PONDER reads: the first, and one a second after it."""
+    return video[:: control_hz // DEMO_HZ]
+
+
+def ahead(command: Action, chunk: ActionChunk | None, robot: Robot, num_rows: int) -> tuple[Floats, tuple[Level, ...]]:
+    """What will be commanded from a tick on if nothing new comes: (num_rows, action_dim), and the rungs.
+
+    First the command itself, then the rows that ``chunk`` has for the following ticks, within the robot's limits, then
+    the last of them held. A robot that is not playing is promised nothing but its command.
+    """
+    rows, levels = [command.values], [command.level]
+    is_playing = command.level in (Level.PLAY, Level.STALE)
+    while len(rows) < num_rows:
+        due_tick = command.tick + len(rows)
+        row: Floats | None = None
+        if chunk is not None and is_playing and 0 <= due_tick - chunk.t_row0 < chunk.horizon:
+            row, _ = within_limits(chunk.rows_NA[due_tick - chunk.t_row0], rows[-1], robot)
+        levels.append(Level.HOLD if is_playing and row is None else command.level)
+        rows.append(rows[-1] if row is None else row)
+    return np.stack(rows), tuple(levels)

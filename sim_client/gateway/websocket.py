@@ -1,0 +1,123 @@
+"""The websocket side: one task per connection, which reads, submits, and sends what comes of it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hmac
+import http
+import json
+import logging
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+
+from protocol.errors import TransportError
+from protocol.messages import Mode
+from sim_client.gateway.exchange import Answer, Asked, Dialect, Finish, Packet, Refused, Terms
+from sim_client.gateway.machine import Machine
+from sim_client.gateway.openpi import metadata
+
+log = logging.getLogger("pp-gateway")
+
+_PING_S = 20.0
+_PONG_S = 120.0
+"""A client's simulator may hold its thread for as long as this; a cable that was pulled is noticed after it."""
+
+
+@dataclass(frozen=True, slots=True)
+class WebsocketSide:
+    """Serves one dialect. ``api_key``: what clients must know; "" if anybody may come."""
+
+    machine: Machine
+    terms: Terms
+    new_dialect: Callable[[Terms], Dialect]
+    max_bytes: int
+    api_key: str = ""
+
+    async def start(self, host: str, port: int) -> Server:
+        """Listens until the server is closed.
+
+        Raises:
+            TransportError: the address cannot be listened on.
+        """
+        try:
+            return await serve(
+                self._converse,
+                host,
+                port,
+                process_request=self._answer_http,
+                compression=None,  # pixels: deflate costs more than it saves
+                max_size=self.max_bytes,
+                ping_interval=_PING_S,
+                ping_timeout=_PONG_S,
+            )
+        except OSError as error:
+            raise TransportError(f"--listen {host}:{port}: {error}") from None
+
+    def _answer_http(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Health checks and metadata for whoever comes with plain HTTP; None lets the websocket begin."""
+        if request.path in ("/healthz", "/health"):
+            return connection.respond(http.HTTPStatus.OK, "OK\n")
+        if not is_allowed(request.headers.get("Authorization"), self.api_key):
+            return connection.respond(http.HTTPStatus.UNAUTHORIZED, KEY_WANTED)
+        if request.path == "/metadata":
+            return connection.respond(http.HTTPStatus.OK, json.dumps(metadata(self.terms)) + "\n")
+        return None
+
+    async def _converse(self, connection: ServerConnection) -> None:
+        host, port, *_ = connection.remote_address
+        client = f"{host}:{port}"
+        dialect = self.new_dialect(self.terms)
+        under_way: set[asyncio.Task[None]] = set()
+        log.info("client=%s connected", client)
+        try:
+            if (greeting := dialect.greeting()) is not None:
+                await connection.send(greeting)
+            async for packet in connection:
+                try:
+                    asked = await asyncio.to_thread(dialect.read, packet)
+                    future = self.machine.submit(client, asked.request) if asked.request is not None else None
+                except Refused as error:
+                    log.warning("client=%s refused: %s", client, error)
+                    await connection.send(dialect.refuse(str(error)))
+                    continue
+                task = asyncio.create_task(self._reply(connection, dialect, asked, future))
+                under_way.add(task)
+                task.add_done_callback(under_way.discard)
+                if self.terms.mode == Mode.LOCKSTEP:  # live, nobody waits: the next observation is read at once
+                    await task
+        except ConnectionClosed as error:
+            log.info("client=%s closed: %s", client, error)
+        finally:
+            for task in under_way:
+                task.cancel()
+            with contextlib.suppress(Refused):  # the gateway is being stopped, and ends the episode itself
+                self.machine.submit(client, Finish(reason="the client left"))
+            log.info("client=%s left", client)
+
+    async def _reply(
+        self, connection: ServerConnection, dialect: Dialect, asked: Asked, future: Future[Answer | None] | None
+    ) -> None:
+        try:
+            answer = await asyncio.wrap_future(future) if future is not None else None
+            packet: Packet | None = asked.reply if answer is None else dialect.answer(asked, answer)
+        except Refused as error:
+            packet = dialect.refuse(str(error))
+        if packet is not None:
+            try:
+                await connection.send(packet)
+            except ConnectionClosed:
+                return  # the conversation's own loop says so
+
+
+KEY_WANTED = "expected the header Authorization: Api-Key WORD, with the word in --api-key-file\n"
+
+
+def is_allowed(authorization: str | None, api_key: str) -> bool:
+    """Whether a client may come in."""
+    return not api_key or hmac.compare_digest((authorization or "").encode(), f"Api-Key {api_key}".encode())

@@ -1,0 +1,220 @@
+"""The gateway's end of the bus: clients' episodes against the clock service and both servers, in one thread."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from clock import schedules
+from clock.check import disagreements
+from protocol import messages as m
+from protocol.mcap_log import read_log
+from protocol.topics import QUERY, TICK
+from sim_client.gateway.exchange import Busy, Finish, Refused, Seen, Step
+
+StepOf = Callable[..., Step]
+
+
+def play(bench: Any, step_of: StepOf, num_requests: int, **first: Any) -> list[Any]:
+    """An episode of a client whose joints go where they are commanded."""
+    answers = [bench.ask(step_of(0, begins=True, **first))]
+    for request in range(1, num_requests):
+        answers.append(bench.ask(step_of(request, state=answers[-1].rows_NA[-1])))
+    return answers
+
+
+def test_one_row_per_request_is_the_episode_that_a_simulated_robot_would_have_had(
+    bench: Any, new_rig: Callable[..., Any], episode_info: Callable[..., m.EpisodeInfo], step_of: StepOf
+) -> None:
+    """Bit for bit: whoever steps the world, and over whichever protocol, the schedule is the same."""
+    instruction, num_ticks = "put the cube in the bin", 45
+    twin = new_rig()
+    info = episode_info(schedules.paper(), instruction=instruction, seed=0)
+    _, world = twin.run(info, num_ticks)
+    replayed = type(world)(num_ticks)
+    rows = []
+    for tick in range(num_ticks):
+        seen = replayed.look()
+        step = step_of(frames=seen.frames, state=seen.state, begins=tick == 0, instruction=instruction)
+        rows.append(bench.ask(step).rows_NA[0])
+        replayed.step(rows[-1])
+    assert [row.tobytes() for row in rows] == world.commands
+
+
+def test_a_client_that_tells_all_it_saw_gets_that_episode_in_chunks_too(
+    bench_with: Callable[..., Any], new_rig: Callable[..., Any], episode_info: Callable[..., m.EpisodeInfo],
+    step_of: StepOf,
+) -> None:  # fmt: skip
+    """Every row is promised before the ticks in which it is commanded, and nothing differs."""
+    instruction, num_ticks = "put the cube in the bin", 81
+    twin = new_rig()
+    _, world = twin.run(episode_info(schedules.paper(), instruction=instruction, seed=0), num_ticks)
+    bench = bench_with(num_rows=20)
+    replayed = type(world)(num_ticks)
+    seen = [Seen(replayed.look().frames, replayed.look().state)]
+    while len(replayed.commands) < num_ticks:
+        begins = not replayed.commands
+        step = step_of(
+            frames=seen[-1].frames, state=seen[-1].state, begins=begins, since=seen[:-1], instruction=instruction
+        )
+        seen = []
+        for row in bench.ask(step).rows_NA:
+            snapshot = replayed.step(row)
+            seen.append(Seen(snapshot.frames, snapshot.state))
+    assert replayed.commands[:num_ticks] == world.commands
+
+
+@pytest.mark.parametrize("num_rows", [1, 7, 16, 20])
+def test_the_log_of_an_episode_follows_from_itself(
+    bench_with: Callable[..., Any], step_of: StepOf, tmp_path: Path, num_rows: int
+) -> None:
+    schedule = schedules.paper() if num_rows == 1 else _every(num_rows)
+    bench = bench_with(schedule, num_rows=num_rows, out=tmp_path)
+    answers = play(bench, step_of, 45 if num_rows == 1 else 4, task="Some Task/1")
+    bench.tell(Finish(status=m.TaskStatus.SUCCESS, reason="says the test"))
+    (path,) = tmp_path.rglob("*.mcap")
+    record = read_log(path)
+    assert not record.recovered
+    assert next(disagreements(record), None) is None
+    promised = np.concatenate([answer.rows_NA for answer in answers])
+    sent = np.stack([action.values for action in record.actions])
+    assert sent.tobytes() == promised[: len(sent)].tobytes()
+    assert len(promised) - len(sent) == num_rows - 1  # of the last answer nobody heard what became of it
+    assert record.info.task == "Some-Task-1"
+    assert record.result is not None
+    assert (record.result.status, record.result.is_success) == (m.TaskStatus.SUCCESS, True)
+    assert len(record.invocations) == (3 if num_rows == 1 else 4)
+
+
+def _every(num_ticks: int) -> m.Schedule:
+    return replace(schedules.paper(), invoke_period_ticks=num_ticks)
+
+
+def test_the_video_reaches_ponder_once_a_second(bench: Any, step_of: StepOf) -> None:
+    opened: list[Any] = []
+    open_engine = bench.rig.ponder_engine.open
+    bench.rig.ponder_engine.open = lambda session, opening, progress: (
+        opened.append(opening),
+        open_engine(session, opening, progress),
+    )[1]
+    video = [step_of(shade).frames for shade in range(45)]
+    bench.ask(step_of(begins=True, demo=video))
+    (opening,) = opened
+    assert opening.instruction == "put the cube in the bin"
+    assert [int(views[0][0, 0, 0]) for views in opening.demo_frames] == [0, 20, 40]
+    assert [len(views) for views in opening.demo_frames] == [2, 2, 2]
+
+
+def test_a_second_client_is_told_who_has_the_robot_until_that_one_finishes(bench: Any, step_of: StepOf) -> None:
+    bench.ask(step_of(begins=True), client="anna")
+    with pytest.raises(Busy, match="driven by anna"):
+        bench.ask(step_of(begins=True), client="berta")
+    bench.ask(step_of(1), client="anna")  # untouched by it
+    bench.tell(Finish(), client="berta")  # says nothing about anna's
+    bench.ask(step_of(2), client="anna")
+    bench.tell(Finish(), client="anna")
+    assert bench.ask(step_of(begins=True), client="berta").tick == 0
+
+
+def test_a_client_that_fell_silent_loses_the_robot(bench_with: Callable[..., Any], step_of: StepOf) -> None:
+    bench = bench_with(idle_ns=0)
+    bench.ask(step_of(begins=True), client="anna")
+    assert bench.ask(step_of(begins=True), client="berta").tick == 0
+    with pytest.raises(Refused, match="no episode is open"):
+        bench.ask(step_of(1), client="anna")
+
+
+def test_an_episode_that_was_never_begun_is_refused(bench: Any, step_of: StepOf) -> None:
+    with pytest.raises(Refused, match="no episode is open"):
+        bench.ask(step_of())
+    assert bench.ask(step_of(may_begin=True)).tick == 0
+    assert bench.ask(step_of(may_begin=True)).tick == 1
+
+
+def test_each_beginning_is_an_episode_of_its_own(bench: Any, step_of: StepOf) -> None:
+    hear = bench.rig.listen(TICK, QUERY)
+    for _ in range(3):
+        assert [answer.tick for answer in play(bench, step_of, 3)] == [0, 1, 2]
+    bench.tell(Finish())
+    hear()
+    assert len({tick.header.episode for tick in bench.rig.said[m.Tick]}) == 3
+    assert [query.query for query in bench.rig.said[m.Query]] == [0, 0, 0]
+    assert bench.rig.clock.conductor is None
+
+
+def test_pictures_that_change_their_size_are_refused_and_the_episode_goes_on(bench: Any, step_of: StepOf) -> None:
+    bench.ask(step_of(begins=True))
+    big = np.zeros((8, 8, 3), np.uint8)
+    with pytest.raises(Refused, match="expected 4 x 4 px as at first, came 8 x 8"):
+        bench.ask(step_of(frames={"front": big, "wrist": big}))
+    assert bench.ask(step_of()).tick == 1
+
+
+def test_pictures_are_resized_where_that_was_asked_for(bench_with: Callable[..., Any], step_of: StepOf) -> None:
+    bench = bench_with(image_px=4)
+    big = np.zeros((8, 6, 3), np.uint8)
+    assert bench.ask(step_of(begins=True, frames={"front": big, "wrist": big})).tick == 0
+
+
+def test_what_the_servers_refuse_is_told_and_the_next_may_try(
+    bench_with: Callable[..., Any], step_of: StepOf, robot_with: Callable[..., m.Robot]
+) -> None:
+    bench = bench_with(_every(0))  # no schedule at all
+    with pytest.raises(Refused, match="invoke_period_ticks"):
+        bench.ask(step_of(begins=True), client="anna")
+    with pytest.raises(Refused, match="invoke_period_ticks"):
+        bench.ask(step_of(begins=True), client="berta")
+
+
+def test_a_silent_machine_ends_the_episode_and_says_so_until_the_next(
+    bench_with: Callable[..., Any], step_of: StepOf
+) -> None:
+    bench = bench_with(patience_ns=0)
+    bench.rig.pounce_engine.invoke = _refuse
+    with pytest.raises(Refused, match="no command within"):
+        bench.ask(step_of(begins=True))
+    with pytest.raises(Refused, match="the episode is over"):
+        bench.ask(step_of(may_begin=True))
+
+
+def test_live_an_answer_waits_for_the_first_command_only(bench_with: Callable[..., Any], step_of: StepOf) -> None:
+    bench = bench_with(schedules.realtime(), num_rows=3)
+    first = bench.ask(step_of(begins=True))
+    second = bench.machine.submit("anna", step_of(1))
+    bench.machine.step()
+    answer = second.result(0)
+    assert answer is not None
+    assert answer.tick >= first.tick
+    assert answer.rows_NA.shape == (3, 3)
+    bench.tell(Finish())
+
+
+def test_live_commands_that_stay_away_end_the_episode(bench_with: Callable[..., Any], step_of: StepOf) -> None:
+    bench = bench_with(schedules.realtime())
+    bench.ask(step_of(begins=True))
+    bench.rig.clock.step = lambda: False
+    bench.rig.bus._parties[0] = lambda: False
+    with pytest.raises(Refused, match="the episode is over: no command for"):
+        _ask_for_ever(bench, step_of)
+
+
+def _refuse(*arguments: Any) -> Any:
+    raise ValueError("not today")
+
+
+def _ask_for_ever(bench: Any, step_of: StepOf) -> None:
+    while True:
+        bench.ask(step_of(1))
+
+
+def test_what_comes_after_the_end_is_refused(bench: Any, step_of: StepOf, working: Callable[..., Any]) -> None:
+    with working(bench.machine):
+        assert bench.machine.submit("anna", step_of(begins=True)).result(20) is not None
+    with pytest.raises(Refused, match="the gateway was stopped"):
+        bench.machine.submit("anna", step_of())
+    assert bench.rig.clock.conductor is None
