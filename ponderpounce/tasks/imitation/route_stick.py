@@ -212,7 +212,7 @@ def _mishap(layout: Layout, move: int, physics: Physics, memory: Memory) -> str 
     for target in range(len(_TARGETS)):
         if target not in (start, end) and _is_over(physics, target, _TOUCH_M, _TOUCH_Z_M):
             return f"touched {_TARGETS[target]} on the way from {_TARGETS[start]} to {_TARGETS[end]}"
-    leaning_m2 = memory.leaning_m2(layout) * (1.0 if side == CLOCKWISE else -1.0)
-    if memory.has_arrived and leaning_m2 <= 0:
+    outward = 1.0 if side == CLOCKWISE else -1.0
+    if memory.has_arrived and outward * memory.leaning_m2(layout) <= 0:
         return f"came from {_TARGETS[start]} to {_TARGETS[end]} on the wrong side of the post; {side} was shown"
     return None
