@@ -66,6 +66,11 @@ def follow(previous: Caption | None, index: int, template: str, look: Callable[[
     return Caption(index=index, simple=simple(template), grounded=text, is_latched=points is not None)
 
 
+def letter(index: int, y_m: Sequence[float]) -> str:
+    """Returns what texts call one of several alike: A, B, C ... from the left of the front camera's picture."""
+    return chr(ord("A") + sorted(y_m).index(y_m[index]))
+
+
 def completed(previous: Caption) -> Caption:
     """Returns the texts after the last subtask: the grounded one keeps the last instruction."""
     return replace(previous, simple=ALL_DONE)

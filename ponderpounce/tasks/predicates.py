@@ -15,6 +15,7 @@ _PRESSED_M = 0.005
 _ONTO_M = 0.05
 _HOVER_M, _HOVER_Z_M = 0.03, 0.2
 _AWAY_M = _OPEN_M = 0.02
+_STILL_RAD_S = 0.2
 _CONTAINER_LIFTED_Z_M, _CONTAINER_DOWN_Z_M, _TOOL_CLEAR_Z_M = 0.15, 0.07, 0.05
 
 
@@ -68,6 +69,11 @@ def is_tool_over(physics: Physics, place: str, *, within_m: float, below_z_m: fl
     """The tool point is near the place seen from above, and lower than ``below_z_m``."""
     tool_m = physics.tcp_transform()[:3, 3]
     return _distance_on_table_m(tool_m, physics.position_m(place)) <= within_m and bool(tool_m[2] < below_z_m)
+
+
+def is_still(physics: Physics) -> bool:
+    """Every joint of the arm turns by at most 0.2 rad/s."""
+    return bool(np.abs(physics.arm_qvel()).max() <= _STILL_RAD_S)
 
 
 def is_container_lifted(physics: Physics, container: str) -> bool:

@@ -9,11 +9,9 @@ import numpy as np
 
 from ponderpounce.tasks.permanence.scenes import NUM_SHUFFLED, Layout, shuffled
 from ponderpounce.tasks.permanence.unmask import Unmask, watching
-from ponderpounce.tasks.placing import until_it_fits
+from ponderpounce.tasks.placing import draw_threesome, turned_at_random, until_it_fits
 from ponderpounce.tasks.task import Shown, task
 
-_TRIANGLE_M = ((-0.05, -0.1), (-0.05, 0.1), (0.1, 0.0))
-_LINE_M = ((0.0, -0.15), (0.0, 0.15), (0.0, 0.0))
 _SQUARE_M = ((-0.05, -0.1), (-0.05, 0.1), (0.1, 0.1), (0.1, -0.1))
 
 
@@ -33,7 +31,5 @@ class VideoUnmaskSwap(Unmask):
 
 
 def _draw(rng: np.random.Generator, difficulty: str) -> Layout:
-    threes = (_TRIANGLE_M, _LINE_M)
-    centers_m = _SQUARE_M if NUM_SHUFFLED[difficulty] == 4 else threes[int(rng.integers(2))]
-    c, s = np.cos(angle_rad := rng.uniform(0.0, 2 * np.pi)), np.sin(angle_rad)
-    return shuffled(rng, difficulty, [(float(c * x - s * y), float(s * x + c * y)) for x, y in centers_m])
+    centers_m = _SQUARE_M if NUM_SHUFFLED[difficulty] == 4 else draw_threesome(rng)
+    return shuffled(rng, difficulty, turned_at_random(rng, centers_m))
