@@ -81,13 +81,21 @@ class Optimiser:
         return found
 
     def load(self, tensors: dict[str, Tensor]) -> None:
-        """Takes back what ``tensors`` gave. Raises ValueError if it is another model's."""
-        keys = ("step", "exp_avg", "exp_avg_sq")
-        expected = {f"{key}.{name}" for key in keys for name in self._named} | {f"average.{n}" for n in self.average}
-        if set(tensors) != expected:
-            odd = sorted(set(tensors) ^ expected)[:5]
-            raise ValueError(f"the optimiser's state is of another model or freeze mode; it differs in {odd}")
-        for name, parameter in self._named.items():
-            self._adam.state[parameter] = {key: tensors[f"{key}.{name}"].clone() for key in keys}
+        """Takes back what ``tensors`` gave: the state of every parameter that had a gradient so far.
+
+        Raises:
+            ValueError: it is another model's, or of another freeze mode.
+        """
+        states: dict[str, dict[str, Tensor]] = {}
+        for full_name, tensor in tensors.items():
+            key, name = full_name.split(".", 1)
+            parameter = self._named.get(name)
+            fits = parameter is not None and (tensor.shape == parameter.shape or (key == "step" and tensor.ndim == 0))
+            if not fits or (key == "average" and name not in self.average):
+                raise ValueError(f"the optimiser's state is of another model or freeze mode: it has {full_name}")
+            states.setdefault(name, {})[key] = tensor.clone()
         for name in self.average:
-            self.average[name] = tensors[f"average.{name}"].clone()
+            self.average[name] = states[name].pop("average")
+        for name, state in states.items():
+            if state:
+                self._adam.state[self._named[name]] = state

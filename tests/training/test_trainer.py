@@ -1,0 +1,145 @@
+"""A run can be cut anywhere and goes on as if it had not been."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from ponderpounce.models.context import Transition
+from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
+from ponderpounce.models.pounce_configs import tiny_cpu as tiny_pounce
+from ponderpounce.models.pounce_init import random_pounce
+from ponderpounce.training.joint import JointModel, PonderBatch, PounceBatch
+from ponderpounce.training.optim import OptimConfig, Optimiser, learning_rate
+from ponderpounce.training.trainer import CheckpointError, TrainConfig, Trainer
+
+CONFIG = replace(tiny_ponder(), image_px=(32, 32), num_layers=4)
+TRAIN = TrainConfig(seed=1, dropout=0.3, optim=OptimConfig(learning_rate=1e-3, warmup_steps=3, ema_decay=0.9))
+
+
+def joint(seed: int = 1) -> JointModel:
+    pounce = random_pounce(tiny_pounce(num_carriers=1, cognition_size=CONFIG.hidden_size, horizon=4), seed=seed)
+    return JointModel(Ponder.random(CONFIG, seed=seed), pounce)
+
+
+def batch(step: int) -> tuple[PonderBatch, PounceBatch]:
+    """One short episode of noise and three invocations, another one for every step."""
+    model = joint()
+    form, pounce = model.ponder.format, model.pounce
+    said = Transition(subgoal=form.vocabulary.encode("pick the cube"))
+    row = form.row([*form.opening("press"), *form.query(1, said), *form.query(1)])
+    generator = torch.Generator().manual_seed(step)
+    frames = torch.randint(0, 256, (row.num_images, 32, 32, 3), generator=generator, dtype=torch.uint8)
+    invocations = PounceBatch(
+        inputs=replace(pounce.config.example_inputs(3, seed=step), cognition=None),
+        actions_INA=pounce.config.example_actions(3, seed=step),
+        episode_I=torch.zeros(3, dtype=torch.int64),
+        query_I=torch.tensor([-1, 0, 1]),
+    )
+    return PonderBatch(rows=(row,), frames=(frames,)), invocations
+
+
+def weights(trainer: Trainer) -> dict[str, Tensor]:
+    return {name: p.detach().clone() for name, p in trainer.model.named_parameters()}
+
+
+def test_two_steps_and_a_resume_and_two_steps_are_four_steps(tmp_path: Path) -> None:
+    whole = Trainer(joint(), batch, TRAIN)
+    reports = list(whole.run(4))
+    first = Trainer(joint(), batch, TRAIN)
+    cut = list(first.run(2))
+    first.save(tmp_path / "checkpoint")
+    second = Trainer(joint(seed=9), batch, TRAIN)  # other weights: everything must come from the checkpoint
+    assert second.resume(tmp_path / "checkpoint")
+    cut += second.run(4)
+    assert cut == reports
+    for name, tensor in weights(whole).items():
+        assert torch.equal(tensor, weights(second)[name]), name
+    for name, tensor in whole._optimiser.tensors().items():
+        assert torch.equal(tensor, second._optimiser.tensors()[name]), name
+
+
+def test_training_lowers_the_loss() -> None:
+    same = Trainer(joint(), lambda step: batch(0), replace(TRAIN, dropout=0.0))
+    losses = [report.total for report in same.run(25)]
+    assert sum(losses[-5:]) < 0.8 * sum(losses[:5])
+
+
+def test_without_a_checkpoint_there_is_nothing_to_resume(tmp_path: Path) -> None:
+    assert not Trainer(joint(), batch, TRAIN).resume(tmp_path / "none")
+
+
+def test_a_save_replaces_the_one_before(tmp_path: Path) -> None:
+    trainer = Trainer(joint(), batch, TRAIN)
+    trainer.save(tmp_path / "checkpoint")
+    list(trainer.run(1))
+    trainer.save(tmp_path / "checkpoint")
+    assert json.loads((tmp_path / "checkpoint" / "facts.json").read_text())["step"] == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint"]
+
+
+@pytest.mark.parametrize("killed", ["while writing", "between the renames"])
+def test_a_kill_while_saving_loses_nothing(tmp_path: Path, killed: str) -> None:
+    trainer = Trainer(joint(), batch, TRAIN)
+    list(trainer.run(1))
+    trainer.save(tmp_path / "checkpoint")
+    if killed == "while writing":
+        (tmp_path / "checkpoint.tmp").mkdir()
+        (tmp_path / "checkpoint.tmp" / "weights.safetensors").write_bytes(b"half")
+    else:
+        (tmp_path / "checkpoint").rename(tmp_path / "checkpoint.old")
+    again = Trainer(joint(), batch, TRAIN)
+    assert again.resume(tmp_path / "checkpoint")
+    assert again.step == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "data_hash", "said"),
+    [({"seed": 2}, "a", "made with config"), ({}, "b", "made with data_hash a, this run has b")],
+)
+def test_a_checkpoint_of_another_run_is_refused(
+    tmp_path: Path, changes: dict[str, int], data_hash: str, said: str
+) -> None:
+    Trainer(joint(), batch, TRAIN, data_hash="a").save(tmp_path / "checkpoint")
+    other = Trainer(joint(), batch, replace(TRAIN, **changes), data_hash=data_hash)  # type: ignore[arg-type]
+    with pytest.raises(CheckpointError, match=said):
+        other.resume(tmp_path / "checkpoint")
+
+
+def test_a_loss_that_is_not_finite_stops_before_any_weight_moves() -> None:
+    def broken(step: int) -> tuple[PonderBatch, PounceBatch]:
+        episodes, invocations = batch(step)
+        return episodes, replace(invocations, actions_INA=invocations.actions_INA * float("nan"))
+
+    trainer = Trainer(joint(), broken, TRAIN)
+    before = weights(trainer)
+    with pytest.raises(FloatingPointError, match="step 0: the loss is nan"):
+        list(trainer.run(1))
+    assert all(torch.equal(tensor, before[name]) for name, tensor in weights(trainer).items())
+
+
+def test_warm_up_is_linear_then_constant() -> None:
+    config = OptimConfig(learning_rate=1.0, warmup_steps=4)
+    assert [learning_rate(config, step) for step in range(6)] == [0.25, 0.5, 0.75, 1.0, 1.0, 1.0]
+
+
+def test_frozen_parameters_stay() -> None:
+    model = joint()
+    model.ponder.requires_grad_(False)
+    trainer = Trainer(model, batch, TRAIN)
+    before = weights(trainer)
+    list(trainer.run(2))
+    moved = {name for name, tensor in weights(trainer).items() if not torch.equal(tensor, before[name])}
+    assert moved
+    assert not [name for name in moved if name.startswith("ponder.")]
+
+
+def test_nothing_to_train_is_said() -> None:
+    with pytest.raises(ValueError, match="every parameter is frozen"):
+        Optimiser(joint().requires_grad_(False), OptimConfig())
