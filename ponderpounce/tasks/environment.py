@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ponderpounce.tasks import captions, demonstration, engine, panda, sight
+from ponderpounce.tasks import captions, demonstration, engine, forks, panda, sight
 from ponderpounce.tasks.captions import Caption
 from ponderpounce.tasks.demonstration import Row
 from ponderpounce.tasks.engine import Progress, Status
-from ponderpounce.tasks.geometry import pose_of
+from ponderpounce.tasks.forks import Fork
+from ponderpounce.tasks.geometry import Array, pose_of
 from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.physics import CONTROL_HZ, Physics, PhysicsState
 from ponderpounce.tasks.rendering import Cameras
@@ -55,6 +56,7 @@ class EpisodeState:
     progress: Progress
     caption: Caption
     video: tuple[Row, ...]
+    actions: tuple[Array, ...]  # (8,) each, all since reset
 
 
 def make_environment(
@@ -84,6 +86,7 @@ class Environment:
         self._caption: Caption | None = None
         self._step = 0
         self._video: tuple[Row, ...] = ()
+        self._actions: list[Array] = []
         self.difficulty = ""
 
     @property
@@ -148,7 +151,8 @@ class Environment:
                 f"the episode ended with {self._progress.status.value} at step {self._step} "
                 f"({self._progress.reason}); call reset before stepping on"
             )
-        self.physics.advance(_checked(action))
+        self._actions.append(_checked(action))
+        self.physics.advance(self._actions[-1])
         self._step += 1
         return self._observe(look=look)
 
@@ -193,9 +197,10 @@ class Environment:
             progress=self._progress,
             caption=self._caption,
             video=self._video,
+            actions=tuple(self._actions),
         )
 
-    def restore(self, state: EpisodeState) -> Snapshot:
+    def restore(self, state: EpisodeState, *, look: bool = True) -> Snapshot:
         """Continues a saved episode and returns its snapshot. Raises TaskError if it is another task's."""
         if state.task != self._task.name:
             raise TaskError(f"the saved episode is of task {state.task!r}; this environment runs {self._task.name!r}")
@@ -203,7 +208,16 @@ class Environment:
         self.physics.load(state.physics)
         self._step, self._memory = state.step, state.memory
         self._progress, self._caption, self._video = state.progress, state.caption, state.video
-        return self._snapshot()
+        self._actions = list(state.actions)
+        return self._snapshot(look=look)
+
+    def fork(self, variant: int = 0) -> Fork:
+        """Returns this episode and a twin that looks the same now and had another past; see `forks`.
+
+        The episode itself stands still meanwhile. Raises ForkError where there is no such twin, or not so many.
+        """
+        self._require_episode()
+        return forks.fork(self, self._task, variant)
 
     def close(self) -> None:
         """Frees the renderer. May be called twice."""
@@ -223,6 +237,7 @@ class Environment:
         self.difficulty, self._layout = difficulty, layout
         self._subtasks = self._task.subtasks(layout)
         self._step, self._memory, self._caption, self._progress = 0, None, None, Progress()
+        self._actions = []
         self.physics.reset()
         self._task.arrange(self.physics, layout)
         self.physics.refresh()
@@ -294,8 +309,8 @@ class Environment:
             step=step,
             frames=self._cameras.frames() if look and self._cameras is not None else {},
             state=self.physics.state().astype(np.float32),
-            tcp_pose=pose_of(self.physics.tcp_transform()),
             command=self.physics.command().astype(np.float32),
+            tcp_pose=pose_of(self.physics.tcp_transform()),
             status=progress.status,
             reason=progress.reason,
             simple_subgoal=caption.simple,

@@ -31,6 +31,12 @@ class PhysicsState:
     integration: Array  # mjSTATE_INTEGRATION; FULLPHYSICS alone forgets the solver's warm start and is not exact
     geom_rgba: NDArray[np.float32]  # (ngeom, 4)
 
+    def at_the_time_of(self, other: PhysicsState) -> PhysicsState:
+        """Returns this world with the other's clock."""
+        integration = self.integration.copy()
+        integration[0] = other.integration[0]  # mjSTATE_TIME comes first
+        return PhysicsState(integration=integration, geom_rgba=self.geom_rgba)
+
 
 class Physics:
     """A compiled scene with the Panda in it.
@@ -188,6 +194,19 @@ class Physics:
         self.model.geom_rgba[:] = state.geom_rgba
         mujoco.mj_setState(self.model, self.data, state.integration, mujoco.mjtState.mjSTATE_INTEGRATION)
         self.refresh()  # leaves the solver's warm start as it is; only a step moves that
+
+    def gap(self, a: PhysicsState, b: PhysicsState) -> float:
+        """How far apart things are in two states: the largest difference of a joint's position, in rad or m."""
+        parts = mujoco.mjtState.mjSTATE_QPOS | mujoco.mjtState.mjSTATE_MOCAP_POS | mujoco.mjtState.mjSTATE_MOCAP_QUAT
+        positions = np.empty((2, mujoco.mj_stateSize(self.model, parts)))
+        for row, state in zip(positions, (a, b), strict=True):
+            mujoco.mj_extractState(self.model, state.integration, mujoco.mjtState.mjSTATE_INTEGRATION, row, parts)
+        return float(np.abs(positions[0] - positions[1]).max())
+
+    def painted_apart(self, a: PhysicsState, b: PhysicsState) -> tuple[str, ...]:
+        """Returns the bodies that have another colour in one state than in the other."""
+        geoms = np.flatnonzero(np.any(a.geom_rgba != b.geom_rgba, axis=1))
+        return tuple(self.model.body(body).name for body in np.unique(self.model.geom_bodyid[geoms]))
 
     def _set_pose(self, name: str, pose_7: Array) -> None:
         body = self.model.body(name)

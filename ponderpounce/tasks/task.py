@@ -115,6 +115,15 @@ class Task(ABC, Generic[LayoutT, MemoryT]):
         """
         return None
 
+    def retold(self, layout: LayoutT) -> tuple[LayoutT, ...] | None:
+        """Returns layouts whose episodes show other things at first and look the same later; see `forks`.
+
+        The instruction is the same, and so is the physics under the same actions, bit for bit, but for things that are
+        only shown. Once nothing is shown any more only memory tells which of them one is in, and what must be done
+        next is wrong in the others. The default is None: the past of such a task is not told, but repeats itself.
+        """
+        return None
+
     @abstractmethod
     def remember(self, memory: MemoryT | None, physics: Physics, layout: LayoutT) -> MemoryT:
         """Returns the memory after one more observation; ``memory`` is None at the first."""

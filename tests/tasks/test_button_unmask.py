@@ -52,7 +52,7 @@ def test_cubes_are_bare_until_31_and_covered_from_32_whatever_the_robot_does(env
     for _ in range(40):
         for cube in env.layout.hidden:
             spot = env.layout.containers[cube.container]
-            cube_m = env.physics.position_m(f"cube_{cube.color}")
+            cube_m = env.physics.position_m(f"cube_{cube.container}")
             np.testing.assert_allclose(cube_m, [*spot.xy_m, HIDDEN_HALF_M], atol=3e-4)
         for index, spot in enumerate(env.layout.containers):
             container_m = env.physics.position_m(f"container_{index}")

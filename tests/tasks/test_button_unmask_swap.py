@@ -54,7 +54,7 @@ def test_containers_swap_by_the_clock_and_cubes_are_away_meanwhile(env: Environm
             container_m = env.physics.position_m(f"container_{index}")
             np.testing.assert_allclose(container_m, [*spot.xy_m, HIDING_Z_M if covers else EMPTY_Z_M], atol=3e-4)
         for cube in layout.hidden:
-            assert (np.abs(env.physics.position_m(f"cube_{cube.color}")).max() < 1) == is_over
+            assert (np.abs(env.physics.position_m(f"cube_{cube.container}")).max() < 1) == is_over
 
 
 def test_the_buttons_may_be_pressed_in_any_order(env: Environment, play: Play) -> None:

@@ -60,9 +60,15 @@ class Episode:
     positions_m: list[np.ndarray]  # (n, 3) per instant, from the first frame of the video on
 
 
+def body_of(thing: str, recording: Recording) -> str:
+    """What we call something that the recording names; its cubes go by their colours, ours by what covers them."""
+    under = {f"cube_{color}": f"cube_{container}" for color, container in recording["layout"]["hidden"]}
+    return under.get(thing, thing)
+
+
 def played(env: Environment, recording: Recording, actions: Callable[[], Iterable[np.ndarray]]) -> Episode:
     snapshots = [env.reset(recording["seed"], recording["difficulty"], layout=layout_of(recording))]
-    names = recording["track"]["names"]
+    names = [body_of(thing, recording) for thing in recording["track"]["names"]]
     first = env.save()
     positions_m = []
     for row in first.video:

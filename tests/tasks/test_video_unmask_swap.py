@@ -70,7 +70,7 @@ def test_every_cube_is_back_under_its_own_container(env: Environment, seed: int)
     for cube in env.layout.hidden:
         container_m = env.physics.position_m(f"container_{cube.container}")
         np.testing.assert_allclose(container_m, [*spots[cube.container].xy_m, HIDING_Z_M], atol=5e-4)
-        np.testing.assert_allclose(env.physics.position_m(f"cube_{cube.color}")[:2], container_m[:2], atol=5e-4)
+        np.testing.assert_allclose(env.physics.position_m(f"cube_{cube.container}")[:2], container_m[:2], atol=5e-4)
 
 
 def test_who_goes_by_the_place_and_not_by_the_container_loses(env: Environment, play: Play) -> None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import mujoco
@@ -150,6 +150,22 @@ class BinFill(Task[Layout, Memory]):
             return Reasoning(text=f"{count}. Next, press the button[ at <>].", grounds=(f"{_BUTTON}/cap",))
         text = f"{count}. Next, move a {layout.cubes[_CUBES.index(left[0])].color} cube[ at <>] to the bin[ at <>]."
         return Reasoning(text=text, grounds=(left[0], _BIN))
+
+    def retold(self, layout: Layout) -> tuple[Layout, ...]:
+        """The first cube that goes into the bin was of the other color, which is asked for once.
+
+        One cube before the end the one color is still missing here, and the other one there.
+        """
+        if len(layout.wanted) != 2 or layout.wanted[1][1] != 1:
+            return ()
+        (color, count), (other, _) = layout.wanted
+        first = _CUBES.index(layout.of_color(color)[0])
+        cubes = list(layout.cubes)
+        cubes[first] = replace(cubes[first], color=other)
+        twin = replace(layout, cubes=tuple(cubes), wanted=((other, 1), (color, count)))
+        is_possible = twin.of_color(other)[0] == _CUBES[first] and len(twin.of_color(color)) >= count
+        times = [[told.appears_at_step(name) for name in _CUBES[: len(cubes)]] for told in (layout, twin)]
+        return (twin,) if is_possible and times[0] == times[1] else ()
 
     def remember(self, memory: Memory | None, physics: Physics, layout: Layout) -> Memory:
         binned = memory.binned if memory else ()

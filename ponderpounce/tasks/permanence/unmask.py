@@ -14,12 +14,13 @@ where they are at that instant, which differs only if something has pushed them 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import ClassVar
 
 import mujoco
 
-from ponderpounce.tasks import predicates, swaps
+from ponderpounce.tasks import captions, predicates, swaps
 from ponderpounce.tasks.containers import EMPTY_Z_M, HIDDEN_HALF_M, HIDING_Z_M, add_container
 from ponderpounce.tasks.geometry import Spot, pose
 from ponderpounce.tasks.oracle import Actions, Motions
@@ -50,14 +51,14 @@ class Unmask(Task[Layout, Pressed]):
             add_button(spec, button)
         for index in range(self.max_containers):
             add_container(spec, container_name(index))
-        for color in CUBE_COLORS:
-            add_cube(spec, cube_name(color), HIDDEN_HALF_M)
+        for index in range(len(CUBE_COLORS)):
+            add_cube(spec, cube_name(index), HIDDEN_HALF_M)
 
     def arrange(self, physics: Physics, layout: Layout) -> None:
         for button, xy_m in zip(button_names(self.num_buttons), layout.buttons_xy_m, strict=True):
             physics.place(button, pose(*xy_m, 0.0))
         for cube in layout.hidden:
-            physics.paint(cube_name(cube.color), CUBE_COLORS[cube.color])
+            physics.paint(cube_name(cube.container), CUBE_COLORS[cube.color])
         _lay_cubes(physics, layout, layout.containers)
 
     def stage(self, physics: Physics, layout: Layout, memory: Pressed | None, step: int) -> None:
@@ -67,7 +68,7 @@ class Unmask(Task[Layout, Pressed]):
             spots = swaps.spots_after(layout.containers, layout.swaps, step - SWAP_STEP, LANE_M)
             if step < layout.last_event_step:
                 for cube in layout.hidden:
-                    physics.park(cube_name(cube.color))
+                    physics.park(cube_name(cube.container))
                 for index, spot in enumerate(spots):
                     physics.place(container_name(index), spot.pose(EMPTY_Z_M))
             else:
@@ -101,6 +102,20 @@ class Unmask(Task[Layout, Pressed]):
         text = f"Reveal: container {hides}. {track}; final target is {_letter(layout, target.container)}[ at <>]."
         return Reasoning(text=text, grounds=(container_name(target.container),))
 
+    def retold(self, layout: Layout) -> tuple[Layout, ...]:
+        """The same containers hid the same cubes in another order; every colour was under another one."""
+        places = [cube.container for cube in layout.hidden]
+        return tuple(
+            replace(
+                layout,
+                hidden=tuple(
+                    replace(cube, container=places[(nth + shift) % len(places)])
+                    for nth, cube in enumerate(layout.hidden)
+                ),
+            )
+            for shift in range(1, len(places))
+        )
+
     def remember(self, memory: Pressed | None, physics: Physics, layout: Layout) -> Pressed:
         now = (button for button in button_names(self.num_buttons) if predicates.is_pressed(physics, button))
         return (memory or frozenset()).union(now)
@@ -121,14 +136,17 @@ def container_name(index: int) -> str:
     return f"container_{index}"
 
 
-def cube_name(color: str) -> str:
-    """Returns the name of the cube of a colour."""
-    return f"cube_{color}"
+def cube_name(container: int) -> str:
+    """Returns the name of the cube under a container, one of the first three.
+
+    It goes by its place: the same cubes painted otherwise are, to the last bit, the same world.
+    """
+    return f"cube_{container}"
 
 
 def _lay_cubes(physics: Physics, layout: Layout, spots: Sequence[Spot]) -> None:
     for cube in layout.hidden:
-        physics.place(cube_name(cube.color), pose(*spots[cube.container].xy_m, HIDDEN_HALF_M))
+        physics.place(cube_name(cube.container), pose(*spots[cube.container].xy_m, HIDDEN_HALF_M))
 
 
 def _stand_over_cubes(physics: Physics, layout: Layout, spots: Sequence[Spot]) -> None:
@@ -138,16 +156,15 @@ def _stand_over_cubes(physics: Physics, layout: Layout, spots: Sequence[Spot]) -
 
 
 def _letter(layout: Layout, index: int) -> str:
-    """What texts call a container: A, B, C ... from the left of the front camera's picture as they first stood."""
-    y_m = [spot.xy_m[1] for spot in layout.containers]
-    return chr(ord("A") + sorted(y_m).index(y_m[index]))
+    """What texts call a container, by where it first stood."""
+    return captions.letter(index, [spot.y_m for spot in layout.containers])
 
 
 def _before_the_gate(layout: Layout, num_pressed: int, num_buttons: int) -> Reasoning:
     """While buttons are still to be pressed, containers may be yet to come or on their way."""
     lying = ", ".join(f"the {cube.color} cube[ at <>]" for cube in layout.hidden)
     text = f"Reveal: {lying}. Track what covers each; buttons pressed: {num_pressed} of {num_buttons}."
-    return Reasoning(text=text, grounds=tuple(cube_name(cube.color) for cube in layout.hidden))
+    return Reasoning(text=text, grounds=tuple(cube_name(cube.container) for cube in layout.hidden))
 
 
 def _presses(buttons: Sequence[str]) -> list[Subtask]:

@@ -10,8 +10,9 @@ even if the button was never pressed; and lifting a wrong cube fails only once t
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import combinations
 
 import mujoco
 import numpy as np
@@ -128,6 +129,10 @@ class PickHighlight(Task[Layout, Memory]):
         *marked, next_one = (f"the {layout.cubes[target].color} cube[ at <>]" for target in chosen)
         text = f"Highlighted: {', '.join(marked)}; after {num_chosen} of {len(marked)}, choose {next_one}."
         return Reasoning(text=text, grounds=tuple(_CUBES[target] for target in chosen))
+
+    def retold(self, layout: Layout) -> tuple[Layout, ...]:
+        others = [index for index in range(len(layout.cubes)) if index not in layout.targets]
+        return tuple(replace(layout, targets=lit) for lit in combinations(others, len(layout.targets)))
 
     def remember(self, memory: Memory | None, physics: Physics, layout: Layout) -> Memory:
         now = frozenset(name for name in _CUBES[: len(layout.cubes)] if predicates.is_picked(physics, name))

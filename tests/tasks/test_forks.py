@@ -1,0 +1,167 @@
+"""Two pasts of one present: the branches look the same to the last bit, and what must be done next is not the same."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from ponderpounce.tasks.environment import Environment, make_environment
+from ponderpounce.tasks.forks import MAX_SEAM, ForkError
+from ponderpounce.tasks.pairs import Pair, find_pair, oracle_chunk
+from ponderpounce.tasks.task import DIFFICULTIES, make_task, task_names
+
+EnvironmentOf = Callable[[str], Environment]
+
+RETOLD = tuple(
+    name
+    for name in task_names()
+    if make_task(name).retold(make_task(name).sample(np.random.default_rng(0), "hard")) is not None
+)
+SEEDS = {"PickHighlight": 1, "BinFill": 8, "PickXtimes": 1, "SwingXtimes": 1, "StopCube": 0, "VideoUnmaskSwap": 2}
+"""Where pairs are known to be."""
+
+every_kind = pytest.mark.parametrize("name", SEEDS)
+
+
+@pytest.fixture(scope="module")
+def pair_of(environment: EnvironmentOf) -> Callable[[str], Pair]:
+    """One pair per task, without pictures."""
+
+    @cache
+    def find(name: str) -> Pair:
+        pair = find_pair(environment(name), make_environment(name, render=False), name, SEEDS[name])
+        assert pair is not None
+        return pair
+
+    return find
+
+
+def played(env: Environment, num_steps: int, seed: int = 2, difficulty: str = "hard") -> Environment:
+    env.reset(seed, difficulty)
+    for action in islice(env.oracle(), num_steps):
+        env.step(action)
+    return env
+
+
+@pytest.mark.parametrize("name", RETOLD)
+def test_retold_layouts_are_of_the_same_task_and_instruction(name: str) -> None:
+    task = make_task(name)
+    for difficulty in DIFFICULTIES:
+        for seed in range(20):
+            layout = task.sample(np.random.default_rng(seed), difficulty)
+            for other in task.retold(layout) or ():
+                assert other != layout
+                assert task.instruction(other) == task.instruction(layout)
+
+
+def test_the_twin_was_shown_other_things_under_the_same_actions(environment: EnvironmentOf) -> None:
+    fork = played(environment("PickHighlight"), 110).fork()
+    assert not fork.is_cut
+    assert fork.seam == 0
+    assert len(fork.own.past) == len(fork.twin.past) == 110
+    assert fork.own.now.physics.integration.tobytes() == fork.twin.now.physics.integration.tobytes()
+    assert set(fork.own.now.layout.targets).isdisjoint(fork.twin.now.layout.targets)
+    for own, twin in zip(fork.own.past, fork.twin.past, strict=True):
+        is_lit = 10 <= own.step <= 100
+        assert (own.physics.integration.tobytes() != twin.physics.integration.tobytes()) == is_lit
+        np.testing.assert_array_equal(own.actions, twin.actions)
+
+
+def test_forking_changes_nothing(environment: EnvironmentOf) -> None:
+    env = played(environment("PickHighlight"), 110)
+    before = env.save()
+    env.fork()
+    after = env.save()
+    assert after.physics.integration.tobytes() == before.physics.integration.tobytes()
+    for what in ("step", "layout", "memory", "progress", "caption"):
+        assert getattr(after, what) == getattr(before, what)
+
+
+@pytest.mark.parametrize(
+    ("name", "num_steps", "variant", "complaint"),
+    [
+        ("PickHighlight", 5, 0, "by step 5 nothing has been shown yet"),
+        ("PickHighlight", 60, 0, "at step 60 one still sees which past it was"),
+        ("ButtonUnmask", 20, 0, "at step 20 one still sees which past it was"),
+        ("PickHighlight", 110, 1, "no variant 1 of this episode's past at step 110; there are 1"),
+        ("PickXtimes", 150, 0, "no variant 0 of this episode's past at step 150; there are 0"),
+    ],
+)
+def test_there_is_no_twin(environment: EnvironmentOf, name: str, num_steps: int, variant: int, complaint: str) -> None:
+    with pytest.raises(ForkError, match=complaint):
+        played(environment(name), num_steps).fork(variant)
+
+
+def test_what_did_not_come_from_its_reset_is_not_forked(environment: EnvironmentOf) -> None:
+    env = played(environment("PickHighlight"), 110)
+    env.physics.place("cube_0", np.array([0.1, 0.1, 0.02, 1, 0, 0, 0]))
+    env.physics.refresh()
+    with pytest.raises(ForkError, match="did not come here from its own reset"):
+        env.fork()
+
+
+@every_kind
+def test_the_scripts_of_a_pair_go_apart(pair_of: Callable[[str], Pair], name: str) -> None:
+    pair = pair_of(name)
+    assert pair.own.oracle.shape == pair.twin.oracle.shape == (20, 8)
+    assert np.abs(pair.own.oracle - pair.twin.oracle).max() > 0.02
+    assert pair.own.subgoal != pair.twin.subgoal
+    assert pair.own.reasoning != pair.twin.reasoning
+
+
+@every_kind
+def test_only_what_repeats_itself_is_cut(pair_of: Callable[[str], Pair], name: str) -> None:
+    pair = pair_of(name)
+    assert pair.is_cut == (name not in RETOLD)
+    assert pair.seam <= MAX_SEAM * pair.is_cut
+    if pair.is_cut:
+        assert len(pair.own.steps) > len(pair.twin.steps)  # a round takes more than a second
+    else:
+        np.testing.assert_array_equal(pair.own.states, pair.twin.states)
+
+
+@pytest.mark.parametrize("name", ["PickXtimes", "SwingXtimes", "StopCube"])
+def test_a_cut_twin_has_a_whole_round_less_behind_it(pair_of: Callable[[str], Pair], name: str) -> None:
+    left = [telling.reasoning.partition("remaining: ")[2][0] for telling in (pair_of(name).own, pair_of(name).twin)]
+    assert int(left[1]) > int(left[0])
+
+
+@pytest.mark.parametrize("name", ["PickHighlight", "PickXtimes"])
+def test_each_branch_can_be_played_to_its_own_success(environment: EnvironmentOf, name: str) -> None:
+    env = environment(name)
+    env.reset(0, "easy")
+    fork = None
+    for action in env.oracle():
+        if env.step(action).step % 10 == 0:
+            try:
+                fork = env.fork()
+            except ForkError:
+                continue
+            if not np.allclose(oracle_chunk(env, fork.own.now), oracle_chunk(env, fork.twin.now)):
+                break
+            env.restore(fork.own.now)
+    assert fork is not None
+    for branch in (fork.own, fork.twin):
+        env.restore(branch.now)
+        for action in env.oracle():
+            if (last := env.step(action)).status.value != "ongoing":
+                break
+        assert last.status.value == "success", last.reason
+
+
+@pytest.mark.sim
+def test_the_two_presents_are_one_picture_and_the_pasts_are_not() -> None:
+    with make_environment("PickHighlight", image_px=64) as env:
+        pair = find_pair(env, make_environment("PickHighlight", render=False), "PickHighlight", 1)
+        assert pair is not None
+        assert pair.frames["front"].shape == (64, 64, 3)
+        assert pair.own.frames["front"].shape == (len(pair.own.steps), 64, 64, 3)
+        is_same = [
+            np.array_equal(*frames) for frames in zip(pair.own.frames["front"], pair.twin.frames["front"], strict=True)
+        ]
+        lit = [10 <= step <= 100 for step in pair.own.steps]
+        assert is_same == [not shown for shown in lit]
