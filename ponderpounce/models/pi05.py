@@ -58,20 +58,20 @@ class Prefix:
     """P and (images, text) do not see each other; the actions see both."""
 
     def positions(self) -> Tensor:
-        """Returns (B, T) int64, counting real tokens only."""
-        return self.is_real.long().cumsum(dim=1) - 1
+        """Returns (B, T) int64, counting real tokens only. P stands before 0: the rest is where it is without P."""
+        return self.is_real.long().cumsum(dim=1) - 1 - self.num_cognition
 
-    def visible(self) -> Tensor:
-        """Returns which keys a row may see, broadcastable to (B, 1, T, T).
+    def streams(self) -> tuple["Prefix", ...]:
+        """Returns the parts that see only themselves, in order: the whole, or P and the rest.
 
-        Rows of padding see the real keys too: nobody reads such a row, and one that saw nothing would be NaN.
+        Isolated parts are run apart rather than masked: images and text then go through the very same products
+        as without P, and keep every bit.
         """
-        visible_B11T = self.is_real[:, None, None, :]
-        if not self.is_isolated:
-            return visible_B11T
-        is_cognition_T = torch.arange(self.is_real.shape[1], device=self.is_real.device) < self.num_cognition
-        same_part_TT = is_cognition_T[:, None] == is_cognition_T[None, :]
-        return visible_B11T & same_part_TT
+        count = self.num_cognition
+        if not (self.is_isolated and count):
+            return (self,)
+        cognition = Prefix(embeds=self.embeds[:, :count], is_real=self.is_real[:, :count], num_cognition=count)
+        return cognition, Prefix(embeds=self.embeds[:, count:], is_real=self.is_real[:, count:])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -83,8 +83,8 @@ class PrefixCache:
     values: tuple[Tensor, ...]
     visible: Tensor
     """(B, T) bool: which prefix tokens the actions may see."""
-    num_real: Tensor
-    """(B,) int64: the position of the first action token."""
+    next_position: Tensor
+    """(B,) int64: of the first action token."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -160,12 +160,18 @@ class Pi05(nn.Module):
 
         Of the last layer only keys and values are computed: its output feeds nothing.
         """
-        keys, values, _ = self._run_prefix(prefix, last_layer_output=False)
-        return PrefixCache(keys=keys, values=values, visible=prefix.is_real, num_real=prefix.is_real.sum(dim=1))
+        runs = [self._run_prefix(stream, last_layer_output=False) for stream in prefix.streams()]
+        keys, values = (
+            tuple(torch.cat(parts, dim=2) if len(parts) > 1 else parts[0] for parts in zip(*layers, strict=True))
+            for layers in ([run[0] for run in runs], [run[1] for run in runs])
+        )
+        next_position_B = prefix.is_real.sum(dim=1) - prefix.num_cognition
+        return PrefixCache(keys=keys, values=values, visible=prefix.is_real, next_position=next_position_B)
 
     def prefix_hidden(self, prefix: Prefix) -> Tensor:
         """Returns (B, T, W) after the last norm. Acting needs it nowhere; parity tests and probes do."""
-        _, _, hidden_BTW = self._run_prefix(prefix, last_layer_output=True)
+        runs = [self._run_prefix(stream, last_layer_output=True) for stream in prefix.streams()]
+        hidden_BTW = torch.cat([hidden for _, _, hidden in runs], dim=1)
         normed_BTW: Tensor = self.language.norm(hidden_BTW)
         return normed_BTW
 
@@ -173,7 +179,8 @@ class Pi05(nn.Module):
         self, prefix: Prefix, *, last_layer_output: bool
     ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...], Tensor]:
         rotation = Rotation.at(prefix.positions(), self.config.language.head_dim)
-        visible = prefix.visible()
+        # Rows of padding see the real keys too: nobody reads such a row, and one that saw nothing would be NaN.
+        visible_B11T = prefix.is_real[:, None, None, :]
         hidden_BTW = prefix.embeds
         keys: list[Tensor] = []
         values: list[Tensor] = []
@@ -183,7 +190,7 @@ class Pi05(nn.Module):
             values.append(v_BgTD)
             if len(keys) == self.config.language.depth and not last_layer_output:
                 break
-            hidden_BTW = hidden_BTW + layer.self_attn.o_proj(attend(q_BhTD, k_BgTD, v_BgTD, visible))
+            hidden_BTW = hidden_BTW + layer.self_attn.o_proj(attend(q_BhTD, k_BgTD, v_BgTD, visible_B11T))
             hidden_BTW = hidden_BTW + layer.mlp(layer.post_attention_layernorm(hidden_BTW))
         return tuple(keys), tuple(values), hidden_BTW
 
@@ -206,7 +213,7 @@ class Pi05(nn.Module):
         """
         num_actions = x_BNA.shape[1]
         offsets_N = torch.arange(num_actions, device=x_BNA.device)
-        rotation = Rotation.at(cache.num_real[:, None] + offsets_N, self.config.expert.head_dim)
+        rotation = Rotation.at(cache.next_position[:, None] + offsets_N, self.config.expert.head_dim)
         is_action_BN = cache.visible.new_ones(x_BNA.shape[:2])
         visible = torch.cat([cache.visible, is_action_BN], dim=1)[:, None, None, :]
         x_BNE = self.action_in_proj(x_BNA).to(self.stream_dtype)

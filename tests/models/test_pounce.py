@@ -122,11 +122,35 @@ def test_isolated_cognition_does_not_see_the_images(model: Pounce, inputs: Pounc
     assert torch.equal(keys, other_keys)
 
 
+def test_isolated_images_and_text_keep_every_bit_of_the_public_model(inputs: PounceInputs) -> None:
+    config = _isolated(tiny_cpu(num_carriers=2))
+    isolated = random_pounce(config, seed=0).requires_grad_(False)
+    public = Pounce(replace(config, cognition=replace(config.cognition, num_carriers=0))).requires_grad_(False)
+    public.load_state_dict(isolated.state_dict(), strict=False)
+    some_missing = replace(
+        inputs,
+        has_view=torch.tensor([[True, False], [True, True]]),
+        is_token=torch.arange(12) < torch.tensor([[9], [12]]),
+    )
+    num_cognition = config.cognition.num_tokens
+    ours, theirs = isolated.prefill(some_missing), public.prefill(some_missing)
+    for layer in range(config.pi05.language.depth):
+        assert torch.equal(ours.keys[layer][:, :, num_cognition:], theirs.keys[layer])
+        assert torch.equal(ours.values[layer][:, :, num_cognition:], theirs.values[layer])
+    assert torch.equal(ours.next_position, theirs.next_position)
+
+
 def test_positions_count_real_tokens_only() -> None:
     is_real = torch.tensor([[True, False, True, True], [False, False, True, False]])
     prefix = Prefix(embeds=torch.zeros(2, 4, 1), is_real=is_real)
     positions = prefix.positions()
     assert positions[is_real].tolist() == [0, 1, 2, 0]
+
+
+def test_cognition_stands_before_position_zero() -> None:
+    is_real = torch.tensor([[True, True, True, False, True]])
+    prefix = Prefix(embeds=torch.zeros(1, 5, 1), is_real=is_real, num_cognition=2)
+    assert prefix.positions()[is_real].tolist() == [-2, -1, 0, 1]
 
 
 @pytest.mark.parametrize("attention", ["full", "isolated"])
