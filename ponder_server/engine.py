@@ -29,7 +29,7 @@ from ponder_server.contract import (
     Text,
     no_progress,
 )
-from ponder_server.session import SavedState, Session
+from ponder_server.runner import BUCKETS, Runner, SavedState, Session
 from ponder_server.writer import TransitionWriter
 from ponderpounce.models.context import Segment
 from ponderpounce.models.ponder import Ponder
@@ -49,16 +49,21 @@ class EngineConfig:
     max_context_tokens: int = 16_384
     """Per session (paper, section 3.4: 16K holds 100 fires of two cameras and more)."""
     max_sessions: int = 4
-    """Contexts held at once; each is allocated in full when first opened."""
+    """Contexts held at once; all of them are allocated when the engine is built."""
     max_text_tokens: int = 256
     """Limit of one text. A text that reaches it is closed as it is and flagged ``truncated``."""
-    prefill_chunk_tokens: int = 512
+    prefill_chunk_tokens: int = 2048
     """Opening tokens per forward: more is faster, fewer lets ``progress`` be heard more often."""
+    buckets: tuple[int, ...] = BUCKETS
+    """Lengths that a forward's rows are padded to, growing."""
 
     def __post_init__(self) -> None:
         for name in self.__slots__:
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1.")
+            value = getattr(self, name)
+            if isinstance(value, int) and value < 1:
+                raise ValueError(f"{name} is {value}; it must be at least 1.")
+        if not self.buckets or self.buckets[0] < 1 or list(self.buckets) != sorted(set(self.buckets)):
+            raise ValueError(f"buckets are {self.buckets}; they must be at least 1 and grow.")
 
 
 @dataclass(slots=True, kw_only=True)
@@ -79,7 +84,12 @@ class QwenEngine:
         self._config = config
         self._format = ponder.format
         self._episodes: dict[str, _Episode] = {}
-        self._free: list[_Episode] = []
+        self._runner = Runner(
+            ponder,
+            num_slots=config.max_sessions,
+            max_tokens=config.max_context_tokens,
+            buckets=config.buckets,
+        )
         self._spec = EngineSpec(
             num_carriers=self._format.num_carriers,
             hidden_size=ponder.hidden_size,
@@ -116,23 +126,20 @@ class QwenEngine:
         wanted = sum(len(segment) for segment in segments)
         if wanted > self._config.max_context_tokens:
             raise ContextFull(session=session, used=0, wanted=wanted, limit=self._config.max_context_tokens)
-        episode = self._free.pop() if self._free else self._allocate()
-        episode.context.clear()
-        episode.context.name = session
-        episode.owes_reasoning = opening.has_demo
+        context = self._runner.open(session)
         frames = [frame for views in opening.demo_frames for frame in views]
         try:
             for chunk in _chunks(segments, self._config.prefill_chunk_tokens):
                 ids = [token for segment in chunk for token in segment.ids]
                 num_images = sum(segment.num_images for segment in chunk)
-                episode.context.append(ids, self._embed(ids, frames[:num_images]))
+                context.append(ids, self._embed(ids, frames[:num_images]), num_wanted=0)
                 del frames[:num_images]
                 progress()
         except BaseException:
-            self._free.append(episode)
+            self._runner.close(context)
             raise
-        self._episodes[session] = episode
-        return episode.context.num_tokens
+        self._episodes[session] = _Episode(context=context, before_fire=context.save(), owes_reasoning=opening.has_demo)
+        return context.num_tokens
 
     @torch.inference_mode()
     def fire(
@@ -165,10 +172,10 @@ class QwenEngine:
         before = context.save(episode.before_fire)
         try:
             if force_text_tokens is None:
-                hidden_TH = context.append(ids, embeds_TH)
+                hidden_NH = context.append(ids, embeds_TH, num_wanted=1 + len(carriers))
                 progress()
-                if self._gate(hidden_TH[len(observation) - 1]) != self._format.vocabulary.t_yes:
-                    return self._answer(context, hidden_TH[len(observation) :], ())
+                if self._gate(hidden_NH[0]) != self._format.vocabulary.t_yes:
+                    return self._answer(context, hidden_NH[1:], ())
                 context.restore(before)
             texts = self._writer.write(
                 context,
@@ -190,9 +197,8 @@ class QwenEngine:
 
     def close(self, session: str) -> None:
         """Keeps the memory for the next session; see ``PonderEngine.close``."""
-        episode = self._episode(session)
+        self._runner.close(self._episode(session).context)
         del self._episodes[session]
-        self._free.append(episode)
 
     @torch.inference_mode()
     def warm_up(self) -> list[int]:
@@ -216,10 +222,6 @@ class QwenEngine:
         finally:
             self.close(WARM_UP_SESSION)
         return durations_ns[NUM_UNMEASURED_FIRES:]
-
-    def _allocate(self) -> _Episode:
-        context = Session(self._ponder, max_tokens=self._config.max_context_tokens)
-        return _Episode(context=context, before_fire=context.save(), owes_reasoning=False)
 
     def _episode(self, session: str) -> _Episode:
         episode = self._episodes.get(session)

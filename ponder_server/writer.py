@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ponder_server.contract import ContextFull, Progress, Text
-from ponder_server.session import SavedState, Session
+from ponder_server.runner import SavedState, Session
 from ponderpounce.models.ponder import Ponder
 
 
@@ -55,7 +55,9 @@ class TransitionWriter:
         """
         num_carriers = self._ponder.format.num_carriers
         t_yes_TH = self._ponder.embed([self._t_yes])
-        hidden_H = context.append([*observation_ids, self._t_yes], torch.cat([observation_TH, t_yes_TH]))[-1]
+        hidden_H = context.append([*observation_ids, self._t_yes], torch.cat([observation_TH, t_yes_TH]), num_wanted=1)[
+            -1
+        ]
         progress()
         texts = []
         if with_reasoning:

@@ -1,15 +1,15 @@
 """PONDER: Qwen3.5 read as a context engine; its hidden states at the carrier positions are the cognition C_t.
 
 Paper, section 3.1. The network is transformers' ``Qwen3_5ForConditionalGeneration`` (Gated DeltaNet and
-attention layers, vision tower); this file only decides how it is called: explicit positions, explicit cache,
-and the LM head at asked positions only (at 248,320 rows, logits of a whole episode are gigabytes). Training
-calls it without a cache on a whole row, serving with one on a few tokens; nothing else differs.
+attention layers, vision tower); this file only decides how it is called: explicit positions, whole rows,
+and the LM head at asked positions only (at 248,320 rows, logits of a whole episode are gigabytes). Serving runs
+the same modules over a few tokens at a time; how is the daemon's business (``ponder_server/decoder.py``).
 
 # B batch, T tokens, H hidden, N positions asked for, V vocabulary
 """
 
 from collections.abc import Sequence
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -23,24 +23,6 @@ from ponderpounce.models.context import ContextFormat, Row
 from ponderpounce.models.ponder_configs import PonderConfig
 from ponderpounce.models.ponder_images import patchify
 from ponderpounce.models.vocabulary import Vocabulary
-
-
-class LayerCache(Protocol):
-    """What the decoder layers call on a cache; everything else about it is its owner's business.
-
-    ``layers``, ``has_previous_state`` and the two ``get_*_state`` serve the same reader in different
-    releases: transformers 5.17 looks into ``layers``, 5.23 asks.
-    """
-
-    @property
-    def layers(self) -> Sequence[object]: ...
-    def update(self, keys: Tensor, values: Tensor, layer_idx: int) -> tuple[Tensor, Tensor]: ...
-    def update_conv_state(self, inputs: Tensor, layer_idx: int, conv_kernel_size: int) -> Tensor: ...
-    def update_recurrent_state(self, state: Tensor, layer_idx: int) -> Tensor: ...
-    def get_conv_state(self, layer_idx: int, state_idx: int = 0) -> Tensor: ...
-    def get_recurrent_state(self, layer_idx: int, state_idx: int = 0) -> Tensor: ...
-    def has_previous_state(self, layer_idx: int, state_idx: int = 0) -> bool: ...
-    def is_recording_past(self, layer_idx: int) -> bool: ...
 
 
 class Ponder(nn.Module):
@@ -165,30 +147,17 @@ class Ponder(nn.Module):
         features = self.image_features(frames_NHW3).to(embeds_TH.dtype)
         return embeds_TH.masked_scatter(is_image_T[:, None], features)
 
-    def forward(
-        self,
-        embeds_BTH: Tensor,
-        positions_4BT: Tensor,
-        *,
-        cache: LayerCache | None = None,
-        visible_BTS: Tensor | None = None,
-    ) -> Tensor:
-        """Final hidden states (B, T, H), after the last norm.
+    def forward(self, embeds_BTH: Tensor, positions_4BT: Tensor) -> Tensor:
+        """Final hidden states (B, T, H), after the last norm, of whole contexts; causal.
 
-        Without a cache a row is a whole context, causal. With one, T new tokens are appended and ``visible``
-        says which of the cache's S positions each may attend to (bool; None when they may attend to all).
-        Rows may be padded on the right only where nothing follows: a pad still moves the recurrent state.
+        Rows may be padded on the right, where nothing follows.
         """
-        if cache is None:
-            assert visible_BTS is None, "visibility is the cache's; without one a row is causal"
-        mask = None if visible_BTS is None else visible_BTS[:, None]
         output = self.qwen.model.language_model(
             inputs_embeds=embeds_BTH,
             position_ids=positions_4BT,
-            past_key_values=cache,
-            use_cache=cache is not None,
-            # A dict goes to the layers as it is: transformers neither builds a mask nor measures the cache.
-            attention_mask={"full_attention": mask, "linear_attention": None},
+            use_cache=False,
+            # A dict goes to the layers as it is: transformers neither builds a mask nor guesses that rows are packed.
+            attention_mask={"full_attention": None, "linear_attention": None},
         )
         hidden_BTH: Tensor = output.last_hidden_state
         return hidden_BTH

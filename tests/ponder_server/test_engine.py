@@ -8,7 +8,7 @@ import torch
 
 from ponder_server.contract import ContextFull, Frame, Opening, SessionError
 from ponder_server.engine import EngineConfig, QwenEngine
-from ponder_server.session import Session
+from ponder_server.runner import Session
 from ponderpounce.models.context import Row, Transition
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
@@ -321,6 +321,8 @@ def test_a_missing_camera_is_refused(engine: QwenEngine) -> None:
 def test_a_limit_of_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="max_text_tokens is 0"):
         replace(CONFIG, max_text_tokens=0)
+    with pytest.raises(ValueError, match=r"buckets are \(16, 1\)"):
+        replace(CONFIG, buckets=(16, 1))
 
 
 def test_sessions_have_names_and_a_number(engine: QwenEngine) -> None:
@@ -338,10 +340,10 @@ def test_sessions_have_names_and_a_number(engine: QwenEngine) -> None:
 
 def test_the_memory_of_a_closed_session_serves_the_next_one(engine: QwenEngine) -> None:
     engine.open("a", WITHOUT_DEMO)
-    memory = context_of(engine, "a")
+    slot = context_of(engine, "a").slot
     engine.close("a")
     engine.open("b", WITHOUT_DEMO)
-    assert context_of(engine, "b") is memory
+    assert context_of(engine, "b").slot == slot
 
 
 def test_the_papers_fire_is_two_images_of_256_px_and_one_carrier() -> None:

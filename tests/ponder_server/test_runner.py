@@ -1,4 +1,4 @@
-"""Numerical twins of a session: however it was appended, it holds what one cacheless encode would."""
+"""A session: append, save, restore, fork, refuse; memory is allocated once and counted beforehand."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -9,11 +9,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ponder_server.contract import ContextFull
-from ponder_server.session import Session
+from ponder_server.contract import ContextFull, SessionError
+from ponder_server.runner import Append, Runner, Session
+from ponder_server.slots import slot_size
 from ponderpounce.models.context import Row, Transition
 from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
+from ponderpounce.models.ponder_configs import qwen35_9b, tiny_cpu
 from ponderpounce.models.vocabulary import Vocabulary
 
 TOLERANCE = 1e-4  # float32, hidden states of size 4
@@ -39,7 +40,7 @@ CUTS = [i for i in range(1, T) if VOCABULARY.image_pad not in (ROW.ids[i], ROW.i
 
 
 def new_session(max_tokens: int = 512) -> Session:
-    return Session(PONDER, max_tokens=max_tokens)
+    return Runner(PONDER, num_slots=1, max_tokens=max_tokens).open("a")
 
 
 def feed(session: Session, first: int, end: int) -> torch.Tensor:
@@ -97,29 +98,41 @@ def test_a_state_can_be_restored_twice() -> None:
     assert torch.equal(first, second)
 
 
-def test_a_fork_continues_alike_and_independently() -> None:
-    trunk, fork = new_session(), new_session()
+def test_forks_of_one_prefix_continue_alike_and_independently() -> None:
+    runner = Runner(PONDER, num_slots=3, max_tokens=512)
     middle = CUTS[len(CUTS) // 2]
+    trunk = runner.open("trunk")
     feed(trunk, 0, middle)
-    trunk.fork_into(fork)
+    prefix = trunk.copy()
     with torch.inference_mode():
         trunk.append([5, 6, 7], PONDER.embed([5, 6, 7]))
-    continued = feed(fork, middle, T)
+    forks = [runner.open(name).start_from(prefix) for name in ("left", "right")]
+    continued = [feed(fork, middle, T) for fork in forks]
     straight = new_session()
     feed(straight, 0, middle)
-    assert torch.equal(continued, feed(straight, middle, T))
+    expected = feed(straight, middle, T)
+    assert all(torch.equal(one, expected) for one in continued)
+    assert [fork.ids for fork in forks] == [straight.ids] * 2
     assert trunk.num_tokens == middle + 3
+
+
+def test_a_prefix_costs_what_its_length_says() -> None:
+    size = slot_size(PONDER.qwen.config.text_config, torch.float32)
+    session = new_session()
+    feed(session, 0, CUTS[20])
+    assert session.copy().num_bytes == size.slot_bytes(CUTS[20])
 
 
 def test_a_fork_that_does_not_fit_is_refused() -> None:
     trunk = new_session()
     feed(trunk, 0, T)
     with pytest.raises(ContextFull):
-        trunk.fork_into(new_session(max_tokens=T - 1))
+        new_session(max_tokens=T - 1).start_from(trunk.copy())
 
 
 def test_sessions_do_not_disturb_each_other() -> None:
-    left, right = new_session(), new_session()
+    runner = Runner(PONDER, num_slots=2, max_tokens=512)
+    left, right = runner.open("left"), runner.open("right")
     bounds = [0, *CUTS[10::25], T]
     interleaved = [(feed(left, a, b), feed(right, a, b)) for a, b in pairwise(bounds)]
     for pieces in zip(*interleaved, strict=True):
@@ -127,20 +140,70 @@ def test_sessions_do_not_disturb_each_other() -> None:
     assert PONDER.qwen.model.rope_deltas is None
 
 
-def test_a_cleared_session_is_a_new_one_to_the_last_bit() -> None:
-    used = new_session()
+def test_a_slot_that_was_used_is_a_new_one_to_the_last_bit() -> None:
+    runner = Runner(PONDER, num_slots=1, max_tokens=512)
+    used = runner.open("used")
     feed(used, 0, T)
-    used.clear()
-    assert torch.equal(feed(used, 0, T), feed(new_session(), 0, T))
+    runner.close(used)
+    again = runner.open("again")
+    assert again.slot == used.slot
+    assert torch.equal(feed(again, 0, T), feed(new_session(), 0, T))
+
+
+def test_there_are_as_many_sessions_as_slots() -> None:
+    runner = Runner(PONDER, num_slots=2, max_tokens=512)
+    sessions = [runner.open(name) for name in "ab"]
+    assert sessions[0].slot != sessions[1].slot
+    with pytest.raises(SessionError, match="'c' does not fit: all 2 slots are in use"):
+        runner.open("c")
 
 
 def test_an_append_keeps_every_address() -> None:
-    session = new_session()
-    tensors = session._cache.recurrent_tensors()
+    runner = Runner(PONDER, num_slots=2, max_tokens=512)
+    addresses = [t.data_ptr() for slot in range(2) for t in runner.memory.states(slot)]
+    session = runner.open("a")
     feed(session, 0, T)
     session.restore(session.save())
-    session.clear()
-    assert [t.data_ptr() for t in session._cache.recurrent_tensors()] == [t.data_ptr() for t in tensors]
+    assert [t.data_ptr() for slot in range(2) for t in runner.memory.states(slot)] == addresses
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_memory_is_known_before_it_is_allocated(dtype: torch.dtype) -> None:
+    ponder = Ponder.random(tiny_cpu(), VOCABULARY, seed=1, dtype=dtype)
+    size = slot_size(ponder.qwen.config.text_config, dtype)
+    memory = Runner(ponder, num_slots=1, max_tokens=100).memory
+    assert size.slot_bytes(100) == sum(t.nbytes for t in (*memory.states(0), *memory.keys_and_values(0, 100)))
+
+
+def test_the_papers_session_is_562_mib() -> None:
+    size = slot_size(qwen35_9b().qwen().text_config, torch.bfloat16)
+    assert size.bytes_per_token == 32 * 1024
+    assert round(size.slot_bytes(16_384) / 2**20) == 562
+
+
+@pytest.mark.parametrize("num_wanted", [0, 1, 3, T])
+def test_wanted_are_the_last_hidden_states_also_across_forwards(num_wanted: int) -> None:
+    session = Runner(PONDER, num_slots=1, max_tokens=512, buckets=(1, 2, 50)).open("a")
+    with torch.inference_mode():
+        hidden = session.append(ROW.ids, EMBEDS, num_wanted=num_wanted)
+    assert hidden.shape == (num_wanted, PONDER.hidden_size)
+    torch.testing.assert_close(hidden, FULL[T - num_wanted :], rtol=0, atol=TOLERANCE)
+
+
+def test_an_append_that_does_not_fit_leaves_its_neighbours_alone() -> None:
+    runner = Runner(PONDER, num_slots=2, max_tokens=20)
+    left, right = runner.open("left"), runner.open("right")
+    with torch.inference_mode():
+        embeds_TH = PONDER.embed([5] * 21)
+        with pytest.raises(ContextFull, match="'right' holds 0 tokens"):
+            runner.append(
+                [
+                    Append(session=left, ids=[5] * 4, embeds_TH=embeds_TH[:4]),
+                    Append(session=right, ids=[5] * 21, embeds_TH=embeds_TH),
+                ]
+            )
+    assert (left.num_tokens, right.num_tokens) == (0, 0)
+    assert not any(state.any() for state in runner.memory.states(left.slot))
 
 
 def test_an_overflow_is_refused_before_anything_happens() -> None:

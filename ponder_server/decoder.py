@@ -1,0 +1,126 @@
+"""One forward of Qwen3.5's text stack over several contexts: the network's own modules, our memory.
+
+transformers' decoder has one length for all rows, moves the recurrent state by padding and attends to whatever a cache
+returns. Here every row is a slot with a length of its own, padding on the right is inert, and attention reads valid
+positions only. The modules and the delta-rule functions are transformers' (which take fla's kernels where those are
+installed); the tests hold this file to transformers' own forward.
+
+# B rows, T tokens of a row with its padding, H hidden, D head dimension, C conv channels, W conv width
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from ponder_server.attention import attend
+from ponder_server.slots import AttentionMemory, RecurrentMemory, SlotMemory
+from ponderpounce.models.ponder_kernels import delta_rule_of_many, delta_rule_of_one, rotate
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Place:
+    """Where a row's tokens go, and for how many of them the caller wants hidden states."""
+
+    slot: int
+    num_past: int
+    num_new: int
+    """Valid tokens of the row; 0 is an idle row. The rest up to T is padding."""
+    num_wanted: int
+    """The last so many of the new tokens."""
+
+
+def decode(
+    text_model: Any, memory: SlotMemory, places: Sequence[Place], embeds_BTH: Tensor, positions_3BT: Tensor
+) -> list[Tensor]:
+    """Appends each row to its slot; final hidden states (num_wanted, H) of each.
+
+    Rows must be of different slots, and padding must be finite.
+    """
+    assert len({place.slot for place in places}) == len(places), "two rows of one slot"
+    num_new_B = torch.tensor([place.num_new for place in places], device=embeds_BTH.device)
+    slot_B = torch.tensor([place.slot for place in places], device=embeds_BTH.device)
+    cos_sin = text_model.rotary_emb(embeds_BTH, positions_3BT)
+    hidden = embeds_BTH
+    last = len(text_model.layers) - 1
+    for index, layer in enumerate(text_model.layers):
+        normed_BTH = layer.input_layernorm(hidden)
+        if index in memory.attention:
+            # What nobody wants to know of the last layer need not look around: its keys and values are enough.
+            num_queries = [place.num_wanted if index == last else place.num_new for place in places]
+            mixed_BTH = _attention(layer.self_attn, memory.attention[index], places, num_queries, normed_BTH, cos_sin)
+        else:
+            mixed_BTH = _gated_delta(layer.linear_attn, memory.recurrent[index], slot_B, num_new_B, normed_BTH)
+        hidden = hidden + mixed_BTH
+        if index == last:
+            wanted = [slice(place.num_new - place.num_wanted, place.num_new) for place in places]
+            hidden = torch.cat([row_TH[part] for row_TH, part in zip(hidden, wanted, strict=True)])
+        hidden = hidden + layer.mlp(layer.post_attention_layernorm(hidden))
+    return list(text_model.norm(hidden).split([place.num_wanted for place in places]))
+
+
+def _attention(
+    attention: Any,
+    memory: AttentionMemory,
+    places: Sequence[Place],
+    num_queries: Sequence[int],
+    hidden_BTH: Tensor,
+    cos_sin: tuple[Tensor, Tensor],
+) -> Tensor:
+    """Stores every row's keys and values; (B, T, H), zero but for the last ``num_queries`` valid tokens of a row."""
+    batch, length, _ = hidden_BTH.shape
+    heads = (batch, length, -1, attention.head_dim)
+    queries, gate = attention.q_proj(hidden_BTH).view(batch, length, -1, 2 * attention.head_dim).chunk(2, dim=-1)
+    queries = attention.q_norm(queries).transpose(1, 2)
+    keys = attention.k_norm(attention.k_proj(hidden_BTH).view(heads)).transpose(1, 2)
+    values = attention.v_proj(hidden_BTH).view(heads).transpose(1, 2)
+    queries, keys = rotate(queries, keys, *cos_sin)
+    seen = torch.zeros_like(gate)
+    for row, (place, count) in enumerate(zip(places, num_queries, strict=True)):
+        first, end = place.num_past, place.num_past + place.num_new
+        memory.keys[place.slot, :, first:end] = keys[row, :, : place.num_new]
+        memory.values[place.slot, :, first:end] = values[row, :, : place.num_new]
+        if count:
+            asking = slice(place.num_new - count, place.num_new)
+            seen[row, asking] = attend(
+                queries[row, :, asking], memory.keys[place.slot, :, :end], memory.values[place.slot, :, :end]
+            ).transpose(0, 1)
+    mixed_BTH: Tensor = attention.o_proj((seen * gate.sigmoid()).flatten(2))
+    return mixed_BTH
+
+
+def _gated_delta(delta: Any, memory: RecurrentMemory, slot_B: Tensor, num_new_B: Tensor, hidden_BTH: Tensor) -> Tensor:
+    """Advances every row's states by its valid tokens; (B, T, H)."""
+    batch, length, _ = hidden_BTH.shape
+    width = delta.conv_kernel_size
+    inputs_BCT = torch.cat([memory.conv[slot_B], delta.in_proj_qkv(hidden_BTH).transpose(1, 2)], dim=-1)
+    # The last W inputs of each row end at its last valid token, not at its padding.
+    kept_BW = num_new_B[:, None] + torch.arange(width, device=hidden_BTH.device)
+    memory.conv[slot_B] = inputs_BCT.gather(2, kept_BW[:, None].expand(-1, inputs_BCT.shape[1], -1))
+    mixed_BCT = F.silu(F.conv1d(inputs_BCT, delta.conv1d.weight, delta.conv1d.bias, groups=inputs_BCT.shape[1]))
+    sizes = [delta.key_dim, delta.key_dim, delta.value_dim]
+    queries, keys, values = mixed_BCT[..., -length:].transpose(1, 2).split(sizes, dim=-1)
+
+    # Beta 0 writes nothing, decay exp(0) forgets nothing: a pad leaves the state as it is, to the last bit.
+    is_valid_BT1 = (torch.arange(length, device=hidden_BTH.device) < num_new_B[:, None])[..., None]
+    beta = delta.in_proj_b(hidden_BTH).sigmoid() * is_valid_BT1
+    decay = -delta.A_log.float().exp() * F.softplus(delta.in_proj_a(hidden_BTH).float() + delta.dt_bias)
+    rule = delta_rule_of_one if length == 1 else delta_rule_of_many
+    read, state = rule(
+        queries.reshape(batch, length, -1, delta.head_k_dim),
+        keys.reshape(batch, length, -1, delta.head_k_dim),
+        values.reshape(batch, length, -1, delta.head_v_dim),
+        g=decay * is_valid_BT1,
+        beta=beta,
+        initial_state=memory.state[slot_B],
+        output_final_state=True,
+        use_qk_l2norm_in_kernel=True,
+    )
+    memory.state[slot_B] = state
+    gate = delta.in_proj_z(hidden_BTH).reshape(-1, delta.head_v_dim)
+    normed = delta.norm(read.reshape(-1, delta.head_v_dim), gate)
+    mixed_BTH: Tensor = delta.out_proj(normed.reshape(batch, length, -1))
+    return mixed_BTH

@@ -1,0 +1,220 @@
+"""Contexts on a device: append to several at once, save, restore, fork.
+
+Append-only with one exception: the state saved before an append can be restored. That costs little, because only the
+recurrent layers forget what they were: their state is copied out and back, while keys and values past the restored
+length are simply no longer looked at.
+
+Rows are padded on the right to one of a few *buckets*, so that a forward has one of a few shapes; what is longer than
+the largest bucket goes in several forwards. All memory is allocated at construction, and everything writes in place.
+
+# T new tokens, H hidden
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ponder_server.contract import ContextFull, SessionError
+from ponder_server.decoder import Place, decode
+from ponder_server.slots import SlotMemory
+from ponderpounce.models.ponder import Ponder
+
+BUCKETS = (1, 16, 160, 512, 2048)
+"""Tokens of a row: a decoded token, a verified draft, a fire of two 256 px cameras, pieces of a demonstration."""
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class SavedState:
+    """A point in a session to come back to: lengths, and copies of the recurrent tensors."""
+
+    num_tokens: int
+    next_position: int
+    tensors: list[Tensor]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Prefix:
+    """A whole context, copied out: what forks start from. It costs memory by its length."""
+
+    ids: tuple[int, ...]
+    next_position: int
+    keys_and_values: tuple[Tensor, ...]
+    states: tuple[Tensor, ...]
+
+    @property
+    def num_bytes(self) -> int:
+        return sum(tensor.nbytes for tensor in (*self.keys_and_values, *self.states))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Append:
+    """Tokens for one session, and how many of their hidden states are wanted: the last so many, None for all."""
+
+    session: "Session"
+    ids: Sequence[int]
+    embeds_TH: Tensor
+    num_wanted: int | None = None
+
+
+class Runner:
+    """Appends to sessions of one network. Calls must run under ``torch.inference_mode``."""
+
+    def __init__(self, ponder: Ponder, *, num_slots: int, max_tokens: int, buckets: tuple[int, ...] = BUCKETS) -> None:
+        self._ponder = ponder
+        self._text_model = ponder.qwen.model.language_model
+        self._buckets = buckets
+        text_config = ponder.qwen.config.text_config
+        self.memory = SlotMemory(
+            text_config, num_slots=num_slots, max_tokens=max_tokens, device=ponder.device, dtype=ponder.dtype
+        )
+        self._free_slots = list(reversed(range(num_slots)))
+
+    def open(self, name: str) -> "Session":
+        """An empty context in a free slot. Raises SessionError if there is none."""
+        if not self._free_slots:
+            raise SessionError(f"session {name!r} does not fit: all {self.memory.num_slots} slots are in use.")
+        session = Session(self, name, self._free_slots.pop())
+        self.memory.clear(session.slot)
+        return session
+
+    def close(self, session: "Session") -> None:
+        """Gives the slot back; the session must not be used again."""
+        assert session.slot not in self._free_slots, "closed twice"
+        self._free_slots.append(session.slot)
+
+    def append(self, appends: Sequence[Append]) -> list[Tensor]:
+        """Appends to different sessions in common forwards; the wanted hidden states (num_wanted, H) of each.
+
+        Raises ContextFull before anything changes if one of them does not fit.
+        """
+        for one in appends:
+            one.session.check_room(len(one.ids))
+        rows = [_Row(one, self._ponder) for one in appends]
+        while active := [row for row in rows if row.num_left]:
+            self._forward(active)
+        for one, row in zip(appends, rows, strict=True):
+            one.session.ids.extend(one.ids)
+            one.session.next_position = row.next_position
+        return [torch.cat(row.hidden) if row.hidden else row.embeds_TH[:0] for row in rows]
+
+    def _forward(self, rows: "Sequence[_Row]") -> None:
+        longest = max(row.num_left for row in rows)
+        length = next((bucket for bucket in self._buckets if bucket >= longest), self._buckets[-1])
+        embeds_BTH = rows[0].embeds_TH.new_zeros(len(rows), length, rows[0].embeds_TH.shape[1])
+        positions_3BT = np.zeros((3, len(rows), length), dtype=np.int64)
+        places = []
+        for index, row in enumerate(rows):
+            first, end = row.num_done, min(row.num_done + length, row.num_tokens)
+            embeds_BTH[index, : end - first] = row.embeds_TH[first:end]
+            positions_3BT[:, index, : end - first] = row.positions_3T[:, first:end]
+            place = Place(
+                slot=row.slot,
+                num_past=row.num_past + first,
+                num_new=end - first,
+                num_wanted=max(0, end - max(first, row.first_wanted)),
+            )
+            places.append(place)
+            row.num_done = end
+        positions = torch.from_numpy(positions_3BT).to(embeds_BTH.device)
+        for row, hidden_NH in zip(
+            rows, decode(self._text_model, self.memory, places, embeds_BTH, positions), strict=True
+        ):
+            row.hidden.append(hidden_NH)
+
+
+class _Row:
+    """An append on its way."""
+
+    def __init__(self, append: Append, ponder: Ponder) -> None:
+        session = append.session
+        self.embeds_TH = append.embeds_TH
+        self.num_tokens, self.num_done = len(append.ids), 0
+        self.slot, self.num_past = session.slot, session.num_tokens
+        self.first_wanted = 0 if append.num_wanted is None else self.num_tokens - append.num_wanted
+        positions_4T, self.next_position = ponder.format.positions(
+            append.ids, first_index=session.num_tokens, first_position=session.next_position
+        )
+        self.positions_3T = positions_4T[1:]
+        self.hidden: list[Tensor] = []
+
+    @property
+    def num_left(self) -> int:
+        return self.num_tokens - self.num_done
+
+
+class Session:
+    """One context in a slot of its runner, which opens and closes it."""
+
+    def __init__(self, runner: Runner, name: str, slot: int) -> None:
+        self._runner = runner
+        self._memory = runner.memory
+        self.name = name
+        self.slot = slot
+        self.next_position = 0
+        """mRoPE position of the next token."""
+        self.ids: list[int] = []
+        """Every token of the context, as the training row of this episode would have it."""
+
+    @property
+    def num_tokens(self) -> int:
+        return len(self.ids)
+
+    @property
+    def max_tokens(self) -> int:
+        return self._memory.max_tokens
+
+    @property
+    def room(self) -> int:
+        return self.max_tokens - len(self.ids)
+
+    def check_room(self, num_new: int) -> None:
+        """Raises ContextFull if so many more tokens do not fit."""
+        if num_new > self.room:
+            raise ContextFull(session=self.name, used=self.num_tokens, wanted=num_new, limit=self.max_tokens)
+
+    def append(self, ids: Sequence[int], embeds_TH: Tensor, *, num_wanted: int | None = None) -> Tensor:
+        """:meth:`Runner.append` to this session alone."""
+        append = Append(session=self, ids=ids, embeds_TH=embeds_TH, num_wanted=num_wanted)
+        return self._runner.append([append])[0]
+
+    def save(self, into: SavedState | None = None) -> SavedState:
+        """Copies the state out, into ``into`` if given (no allocation)."""
+        tensors = self._memory.states(self.slot)
+        if into is None:
+            into = SavedState(num_tokens=0, next_position=0, tensors=[torch.empty_like(t) for t in tensors])
+        for kept, tensor in zip(into.tensors, tensors, strict=True):
+            kept.copy_(tensor)
+        into.num_tokens, into.next_position = self.num_tokens, self.next_position
+        return into
+
+    def restore(self, saved: SavedState) -> None:
+        """Goes back to a state saved in the present episode; what was appended since never happened."""
+        assert saved.num_tokens <= self.num_tokens, "a session can only go back"
+        for tensor, kept in zip(self._memory.states(self.slot), saved.tensors, strict=True):
+            tensor.copy_(kept)
+        del self.ids[saved.num_tokens :]
+        self.next_position = saved.next_position
+
+    def copy(self) -> Prefix:
+        """Everything in this context, for any number of sessions to start from."""
+        return Prefix(
+            ids=tuple(self.ids),
+            next_position=self.next_position,
+            keys_and_values=tuple(t.clone() for t in self._memory.keys_and_values(self.slot, self.num_tokens)),
+            states=tuple(t.clone() for t in self._memory.states(self.slot)),
+        )
+
+    def start_from(self, prefix: Prefix) -> Self:
+        """Replaces the contents of this session by a copied context. Raises ContextFull if it does not fit."""
+        if len(prefix.ids) > self.max_tokens:
+            raise ContextFull(session=self.name, used=0, wanted=len(prefix.ids), limit=self.max_tokens)
+        own = (*self._memory.keys_and_values(self.slot, len(prefix.ids)), *self._memory.states(self.slot))
+        for tensor, kept in zip(own, (*prefix.keys_and_values, *prefix.states), strict=True):
+            tensor.copy_(kept)
+        self.ids[:] = prefix.ids
+        self.next_position = prefix.next_position
+        return self

@@ -1,0 +1,111 @@
+"""The memory of several contexts at once: one slot each, allocated when the engine starts and never again.
+
+A slot holds, for every attention layer, the keys and values of its tokens, and for every Gated DeltaNet layer one
+state that sums up all tokens. Keys and values only grow, so going back is a matter of length; the states are
+overwritten by every append, and going back needs a copy of them. (transformers' own caches have one length for all
+rows, and cannot go back.) How many tokens a slot holds is its session's business.
+
+# N slots, G key heads, S most tokens of a slot, D head dimension, C conv channels, W conv width
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SlotSize:
+    """What one context of a given network costs in memory."""
+
+    bytes_per_token: int
+    """Keys and values, all attention layers together."""
+    state_bytes: int
+    """Recurrent and convolution states, all other layers together; whatever the length."""
+
+    def slot_bytes(self, max_tokens: int) -> int:
+        return self.bytes_per_token * max_tokens + self.state_bytes
+
+
+def slot_size(text_config: Any, dtype: torch.dtype) -> SlotSize:
+    """Computed from the configuration alone; nothing is allocated."""
+    num_attention = sum(kind == "full_attention" for kind in text_config.layer_types)
+    num_recurrent = len(text_config.layer_types) - num_attention
+    token_elements = 2 * text_config.num_key_value_heads * text_config.head_dim
+    conv_elements = _conv_channels(text_config) * text_config.linear_conv_kernel_dim
+    recurrent_elements = (
+        text_config.linear_num_value_heads * text_config.linear_key_head_dim * text_config.linear_value_head_dim
+    )
+    return SlotSize(
+        bytes_per_token=num_attention * token_elements * dtype.itemsize,
+        state_bytes=num_recurrent * (conv_elements * dtype.itemsize + recurrent_elements * torch.float32.itemsize),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AttentionMemory:
+    """Of one attention layer; what lies beyond a slot's length is garbage."""
+
+    keys: Tensor
+    """(N, G, S, D)"""
+    values: Tensor
+    """(N, G, S, D)"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecurrentMemory:
+    """Of one Gated DeltaNet layer. Zeros are the state of an empty context, so there is no special first append."""
+
+    conv: Tensor
+    """(N, C, W): the last W inputs of the convolution."""
+    state: Tensor
+    """(N, value heads, key dim, value dim) float32 in every dtype of model: it sums up thousands of tokens."""
+
+
+class SlotMemory:
+    """N slots of at most ``max_tokens`` tokens each."""
+
+    def __init__(
+        self, text_config: Any, *, num_slots: int, max_tokens: int, device: torch.device, dtype: torch.dtype
+    ) -> None:
+        self.num_slots = num_slots
+        self.max_tokens = max_tokens
+        self.attention: dict[int, AttentionMemory] = {}
+        self.recurrent: dict[int, RecurrentMemory] = {}
+        kv_shape = (num_slots, text_config.num_key_value_heads, max_tokens, text_config.head_dim)
+        conv_shape = (num_slots, _conv_channels(text_config), text_config.linear_conv_kernel_dim)
+        state_shape = (
+            num_slots,
+            text_config.linear_num_value_heads,
+            text_config.linear_key_head_dim,
+            text_config.linear_value_head_dim,
+        )
+        for index, kind in enumerate(text_config.layer_types):
+            if kind == "full_attention":
+                keys, values = (torch.empty(kv_shape, device=device, dtype=dtype) for _ in range(2))
+                self.attention[index] = AttentionMemory(keys, values)
+            else:
+                conv = torch.zeros(conv_shape, device=device, dtype=dtype)
+                self.recurrent[index] = RecurrentMemory(conv, torch.zeros(state_shape, device=device))
+
+    def states(self, slot: int) -> list[Tensor]:
+        """Views of everything in a slot that an append overwrites."""
+        return [tensor[slot] for layer in self.recurrent.values() for tensor in (layer.conv, layer.state)]
+
+    def keys_and_values(self, slot: int, num_tokens: int) -> list[Tensor]:
+        """Views (G, num_tokens, D) of everything in a slot that an append only adds to."""
+        return [
+            tensor[slot, :, :num_tokens] for layer in self.attention.values() for tensor in (layer.keys, layer.values)
+        ]
+
+    def clear(self, slot: int) -> None:
+        """Makes a slot the empty context."""
+        for tensor in self.states(slot):
+            tensor.zero_()
+
+
+def _conv_channels(text_config: Any) -> int:
+    key_size = text_config.linear_num_key_heads * text_config.linear_key_head_dim
+    value_size = text_config.linear_num_value_heads * text_config.linear_value_head_dim
+    return int(2 * key_size + value_size)
