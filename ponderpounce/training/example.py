@@ -1,0 +1,168 @@
+"""One recorded episode under one drawn schedule: PONDER's row, and what each POUNCE invocation saw and should do.
+
+Serving builds the same row segment by segment (``context``), reads the same pixels and prompts (``images``, ``prompt``)
+and refers by the same rule (``clock.reference``); tests hold them equal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from clock.sampling import Clocks, SampledInvocation, SampledSchedule, sample_schedule
+from ponderpounce.models import prompt
+from ponderpounce.models.context import ContextFormat, Row, Transition
+from ponderpounce.models.images import camera_batch
+from ponderpounce.models.normalisation import RobotStatistics
+from ponderpounce.models.ponder_coordinates import normalised_text
+from ponderpounce.models.pounce import PounceConfig, PounceInputs
+from ponderpounce.models.prompt import Tokenizer
+from ponderpounce.training.joint import NO_QUERY, PonderBatch, PounceBatch
+
+Frame = NDArray[np.uint8]  # (height, width, 3) RGB
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrainingEpisode:
+    """What training reads of an episode of T ticks. Row k is the world before action k."""
+
+    instruction: str
+    demo: tuple[tuple[Frame, ...], ...]
+    """The demonstration's views at 1 Hz; () without one."""
+    frames: Sequence[tuple[Frame, ...]]
+    """T ticks of views, in the order of the robot's cameras."""
+    state_T8: NDArray[np.float32]
+    action_T8: NDArray[np.float32]
+    """Absolute joint targets and the gripper's command."""
+    subgoals: Sequence[str]
+    """T grounded texts; empty texts for data without annotations."""
+    reasoning: str = ""
+    """What PONDER writes at the first transition after a demonstration; empty without one."""
+
+    def __post_init__(self) -> None:
+        sizes = {len(self.frames), len(self.state_T8), len(self.action_T8), len(self.subgoals)}
+        if len(sizes) != 1 or 0 in sizes:
+            raise ValueError(
+                f"an episode needs one frame, state, action and text per tick; it has {len(self.frames)}, "
+                f"{len(self.state_T8)}, {len(self.action_T8)}, {len(self.subgoals)}"
+            )
+
+    @property
+    def num_ticks(self) -> int:
+        return len(self.subgoals)
+
+    @property
+    def transition_ticks(self) -> frozenset[int]:
+        """Ticks at which another subgoal begins, the first among them; none without annotations."""
+        texts = self.subgoals
+        return frozenset(t for t in range(len(texts)) if texts[t] and (t == 0 or texts[t] != texts[t - 1]))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExampleConfig:
+    """How an episode becomes a training example."""
+
+    clocks: Clocks
+    max_invocations: int = 16
+    """Of those that the schedule has, so many are drawn: they cost most."""
+    is_grounded: bool = True
+    """False: texts are left out of the row, as in RoboCasa-DC."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Example:
+    """An episode under a schedule."""
+
+    row: Row
+    frames: Tensor
+    """(num_images, height, width, 3) uint8"""
+    invocations: tuple[SampledInvocation, ...]
+    episode: TrainingEpisode
+
+
+def make_example(
+    episode: TrainingEpisode, form: ContextFormat, config: ExampleConfig, rng: np.random.Generator
+) -> Example:
+    """Draws a schedule and lays the episode out under it."""
+    schedule = sample_schedule(rng, config.clocks, episode.num_ticks, transition_ticks=episode.transition_ticks)
+    count = min(config.max_invocations, len(schedule.invocations))
+    chosen = np.sort(rng.choice(len(schedule.invocations), size=count, replace=False))
+    return Example(
+        row=episode_row(episode, form, schedule, is_grounded=config.is_grounded),
+        frames=row_frames(episode, schedule),
+        invocations=tuple(schedule.invocations[index] for index in chosen),
+        episode=episode,
+    )
+
+
+def episode_row(
+    episode: TrainingEpisode, form: ContextFormat, schedule: SampledSchedule, *, is_grounded: bool = True
+) -> Row:
+    """The tokens of the episode. The first transition of a demonstration episode begins with its reasoning."""
+    segments = list(form.opening(episode.instruction, [len(views) for views in episode.demo]))
+    encode = form.vocabulary.encode
+    reasoning = encode(normalised_text(episode.reasoning)) if episode.reasoning else None
+    for query in schedule.queries:
+        transition = None
+        text = episode.subgoals[query.tick]
+        if is_grounded and query.stamp.is_transition and text:
+            transition = Transition(subgoal=encode(normalised_text(text)), reasoning=reasoning)
+            reasoning = None
+        segments += form.query(len(episode.frames[query.tick]), transition)
+    return form.row(segments)
+
+
+def row_frames(episode: TrainingEpisode, schedule: SampledSchedule) -> Tensor:
+    """All pictures of the row in order: the demonstration's, then every query's; (N, height, width, 3) uint8."""
+    views = [view for instant in episode.demo for view in instant]
+    views += [view for query in schedule.queries for view in episode.frames[query.tick]]
+    return torch.from_numpy(np.stack(views))
+
+
+def target_rows(episode: TrainingEpisode, tick: int, horizon: int) -> NDArray[np.float32]:
+    """Commands (horizon, 8) from ``tick`` on; after the end the last one stays in force, as on the robot."""
+    ticks = np.minimum(tick + np.arange(horizon), episode.num_ticks - 1)
+    return episode.action_T8[ticks]
+
+
+def collate(
+    examples: Sequence[Example], config: PounceConfig, tokenizer: Tokenizer, statistics: RobotStatistics
+) -> tuple[PonderBatch, PounceBatch]:
+    """Examples as the joint model takes them; prompts are padded on the right and masked.
+
+    Raises:
+        ValueError: a prompt is longer than ``max_prompt_tokens``.
+    """
+    moments = [(index, example, asked) for index, example in enumerate(examples) for asked in example.invocations]
+    pictures, prompts, actions = [], [], []
+    for _, example, asked in moments:
+        episode, state = example.episode, example.episode.state_T8[asked.tick]
+        pictures.append(camera_batch(episode.frames[asked.tick], config.image_px))
+        text = prompt.prompt_text(episode.instruction, statistics.state.normalise(state))
+        prompts.append(tokenizer.encode(text))
+        actions.append(statistics.normalise_targets(target_rows(episode, asked.tick, config.horizon), state))
+    longest = max(len(ids) for ids in prompts)
+    if longest > config.max_prompt_tokens:
+        raise ValueError(f"a prompt has {longest} tokens, expected at most {config.max_prompt_tokens}")
+    actions_INA = torch.zeros(len(moments), config.horizon, config.padded_action_dim)
+    actions_INA[..., : config.robot_action_dim] = torch.from_numpy(np.stack(actions))
+    references = [asked.reference for _, _, asked in moments]
+    inputs = PounceInputs(
+        images=torch.cat([images for images, _ in pictures]),
+        has_view=torch.cat([has_view for _, has_view in pictures]),
+        token_ids=torch.tensor([ids + [0] * (longest - len(ids)) for ids in prompts]),
+        is_token=torch.tensor([[place < len(ids) for place in range(longest)] for ids in prompts]),
+        age_ns=torch.tensor([reference.age_ns for reference in references]),
+    )
+    episodes = PonderBatch(rows=tuple(e.row for e in examples), frames=tuple(e.frames for e in examples))
+    return episodes, PounceBatch(
+        inputs=inputs,
+        actions_INA=actions_INA,
+        episode_I=torch.tensor([index for index, _, _ in moments]),
+        query_I=torch.tensor([NO_QUERY if r.query is None else r.query for r in references]),
+    )

@@ -1,0 +1,154 @@
+"""What training makes of an episode is what serving would have shown."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from clock.sampling import EVALUATION, ROBOMME, sample_schedule
+from ponderpounce.models.normalisation import ROBOMME as STATISTICS
+from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
+from ponderpounce.models.pounce_configs import tiny_cpu as tiny_pounce
+from ponderpounce.models.prompt import tiny_tokenizer_for_random_weights
+from ponderpounce.training.example import (
+    ExampleConfig,
+    TrainingEpisode,
+    collate,
+    episode_row,
+    make_example,
+    row_frames,
+    target_rows,
+)
+from pounce_server.contract import Request
+from pounce_server.reading import pi05_inputs
+
+PONDER = Ponder.random(replace(tiny_ponder(), image_px=(64, 64), num_layers=4), seed=1)
+FORM = PONDER.format
+POUNCE = tiny_pounce(horizon=6)
+TOKENIZER = tiny_tokenizer_for_random_weights()
+
+
+def episode(num_ticks: int, *, num_demo: int = 0, seed: int = 0, changes: tuple[int, ...] = (0,)) -> TrainingEpisode:
+    """Noise with a subgoal that changes at the given ticks."""
+    rng = np.random.default_rng(seed)
+
+    def views() -> tuple[np.ndarray, ...]:
+        return tuple(rng.integers(0, 256, (64, 64, 3), np.uint8) for _ in range(2))
+
+    count = 0
+    texts = []
+    for tick in range(num_ticks):
+        count += tick in changes
+        texts.append(f"pick cube {count} at <{count}, 20>")
+    return TrainingEpisode(
+        instruction="press the button, then pick",
+        demo=tuple(views() for _ in range(num_demo)),
+        frames=[views() for _ in range(num_ticks)],
+        state_T8=rng.uniform(-0.2, 0.2, (num_ticks, 8)).astype(np.float32),
+        action_T8=rng.uniform(-0.2, 0.2, (num_ticks, 8)).astype(np.float32),
+        subgoals=texts,
+        reasoning="Demo selected <77, 103>." if num_demo else "",
+    )
+
+
+@given(num_ticks=st.integers(1, 60), seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=15, deadline=None)
+def test_an_invocation_is_read_as_pounce_serve_reads_it(num_ticks: int, seed: int) -> None:
+    recorded = episode(num_ticks, seed=3)
+    config = ExampleConfig(clocks=ROBOMME, max_invocations=4)
+    example = make_example(recorded, FORM, config, np.random.default_rng(seed))
+    _, batch = collate([example], POUNCE, TOKENIZER, STATISTICS)
+    for place, asked in enumerate(example.invocations):
+        request = Request(
+            frames=recorded.frames[asked.tick],
+            proprio=recorded.state_T8[asked.tick],
+            instruction=recorded.instruction,
+            cognition=np.zeros((1, 64), np.float32),
+            age_ns=asked.reference.age_ns,
+            seed=0,
+        )
+        served = pi05_inputs(request, POUNCE, TOKENIZER, STATISTICS, torch.device("cpu"))
+        num_tokens = served.token_ids.shape[1]
+        assert torch.equal(batch.inputs.images[place], served.images[0])
+        assert torch.equal(batch.inputs.has_view[place], served.has_view[0])
+        assert torch.equal(batch.inputs.token_ids[place, :num_tokens], served.token_ids[0])
+        assert batch.inputs.is_token[place].sum() == num_tokens
+        assert batch.inputs.age_ns[place] == served.age_ns[0]
+        assert batch.query_I[place] == asked.reference.query
+
+
+def test_targets_turn_back_into_the_commands() -> None:
+    recorded = episode(30)
+    example = make_example(recorded, FORM, ExampleConfig(clocks=EVALUATION), np.random.default_rng(0))
+    _, batch = collate([example], POUNCE, TOKENIZER, STATISTICS)
+    for place, asked in enumerate(example.invocations):
+        rows = STATISTICS.absolute_targets(batch.actions_INA[place, :, :8].numpy(), recorded.state_T8[asked.tick])
+        np.testing.assert_allclose(rows, target_rows(recorded, asked.tick, 6), atol=1e-5)
+        assert not batch.actions_INA[place, :, 8:].any()
+
+
+def test_after_the_end_the_last_command_stays_in_force() -> None:
+    recorded = episode(5)
+    assert np.array_equal(target_rows(recorded, 3, 4), recorded.action_T8[[3, 4, 4, 4]])
+
+
+def test_the_row_says_what_the_annotations_say() -> None:
+    recorded = episode(70, num_demo=3, changes=(0, 30))
+    schedule = sample_schedule(np.random.default_rng(0), EVALUATION, 70, transition_ticks=recorded.transition_ticks)
+    row = episode_row(recorded, FORM, schedule)
+    v = FORM.vocabulary
+    said = [i for i in row.ids if i == v.t_yes]
+    assert len(said) == 3  # reasoning and first subgoal, second subgoal
+    assert row.num_images == 2 * (3 + len(schedule.queries)) == len(row_frames(recorded, schedule))
+    texts = v.decode([t for t in row.targets if t >= 0 and t not in (v.t_yes, v.t_no)])
+    assert texts == "Demo selected [402, 301].pick cube 1 at [78, 4]pick cube 2 at [78, 8]"
+
+
+def test_pictures_stand_in_the_order_of_the_row() -> None:
+    recorded = episode(45, num_demo=2)
+    schedule = sample_schedule(np.random.default_rng(0), EVALUATION, 45)
+    frames = row_frames(recorded, schedule)
+    assert np.array_equal(frames[1], recorded.demo[0][1])
+    assert np.array_equal(frames[4 + 2], recorded.frames[schedule.queries[1].tick][0])
+
+
+def test_without_grounding_the_row_has_no_text() -> None:
+    recorded = episode(45, num_demo=2)
+    config = ExampleConfig(clocks=EVALUATION, is_grounded=False)
+    example = make_example(recorded, FORM, config, np.random.default_rng(0))
+    assert FORM.vocabulary.t_yes not in example.row.ids
+
+
+def test_no_more_invocations_than_asked_for_and_in_order() -> None:
+    config = ExampleConfig(clocks=ROBOMME, max_invocations=5)
+    ticks = [i.tick for i in make_example(episode(60), FORM, config, np.random.default_rng(0)).invocations]
+    assert len(ticks) == 5
+    assert ticks == sorted(set(ticks))
+
+
+def test_examples_of_a_batch_keep_apart() -> None:
+    config = ExampleConfig(clocks=ROBOMME, max_invocations=2)
+    rng = np.random.default_rng(0)
+    examples = [make_example(episode(n, seed=n), FORM, config, rng) for n in (25, 50)]
+    episodes, batch = collate(examples, POUNCE, TOKENIZER, STATISTICS)
+    assert batch.episode_I.tolist() == [0, 0, 1, 1]
+    assert [len(row.carrier_index) for row in episodes.rows] == [2, 3]
+    assert torch.equal(batch.inputs.images[2:], collate(examples[1:], POUNCE, TOKENIZER, STATISTICS)[1].inputs.images)
+
+
+def test_an_episode_with_missing_rows_is_refused() -> None:
+    whole = episode(5)
+    with pytest.raises(ValueError, match="one frame, state, action and text per tick; it has 5, 4, 5, 5"):
+        replace(whole, state_T8=whole.state_T8[:4])
+
+
+def test_a_prompt_that_is_too_long_is_refused() -> None:
+    example = make_example(episode(5), FORM, ExampleConfig(clocks=EVALUATION), np.random.default_rng(0))
+    with pytest.raises(ValueError, match="expected at most 3"):
+        collate([example], replace(POUNCE, max_prompt_tokens=3), TOKENIZER, STATISTICS)
