@@ -43,7 +43,7 @@ _FINGER_TARGET_M = (-0.01, 0.04)  # where commands -1 and +1 drive one finger; b
 _FINGER_ARMATURE_KG = 0.5
 _HAND_FROM_FLANGE_M = 0.107  # Franka's datasheet; robosuite mounts its hand half a millimetre short
 _FINGER_FROM_HAND_M = 0.0584  # likewise; robosuite's fingers start 6 mm short
-STICK_RADIUS_M = 0.008
+_STICK_RADIUS_M = 0.008
 _STICK_FROM_HAND_M = (0.05, 0.15)  # where it begins, inside the hand, and where its tip is
 _HEAVY_FACES = 1000  # lighter meshes stay as they are; among them the fingers, which the wrist camera sees close up
 _CELL_M = 0.006  # clustering grid of the visual meshes: looks the same at 256 px, halves the cost of a frame
@@ -222,7 +222,7 @@ def _replace_fingers_by_stick(spec: mujoco.MjSpec) -> None:
     spec.body("right_hand").add_geom(
         name="stick",
         type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-        size=[STICK_RADIUS_M, (tip_m - begin_m) / 2, 0.0],
+        size=[_STICK_RADIUS_M, (tip_m - begin_m) / 2, 0.0],
         pos=[0.0, 0.0, (begin_m + tip_m) / 2],
         rgba=[1.0, 1.0, 1.0, 1.0],  # its sides get ambient light only, so that it looks grey, as upstream
         contype=ROBOT_BIT,

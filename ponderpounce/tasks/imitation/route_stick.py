@@ -5,6 +5,8 @@ between them; clockwise is on the left of the line between the targets, seen in 
 judged when the tip arrives, by the mean of where it has been since it arrived before. Source: RoboMME's RouteStick at
 598e3b4, rules restated.
 
+Not kept: upstream counts the places under the posts among the targets that must not be touched. No tip gets there.
+
 "Left" in the texts is the robot's: towards larger y, and on the right of the front camera's picture.
 """
 

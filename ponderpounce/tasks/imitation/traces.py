@@ -1,7 +1,7 @@
 """What the stick leaves behind: targets it touched are red for two seconds, and white dots show where its tip has been.
 
 Source: RoboMME's PatternLock and RouteStick at 598e3b4, rules restated. A touch is seen in the next observation, as
-upstream.
+upstream; a dot is seen at once, upstream one observation later.
 """
 
 from __future__ import annotations
