@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import platform
 import signal
 import sys
@@ -17,11 +18,16 @@ _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 IDLE_WAIT_NS = 20_000_000  # an idle daemon looks up this often: its heartbeat depends on it
 
 
+PARENT_VARIABLE = "PONDERPOUNCE_PARENT_PID"
+"""Who started a daemon for its own use writes its process id here, and the daemon leaves when that process is gone."""
+
+
 class StopFlag:
-    """True once SIGTERM or SIGINT came; the loop then leaves by the door."""
+    """True once SIGTERM or SIGINT came, or whoever wanted this process died; the loop then leaves by the door."""
 
     def __init__(self) -> None:
         self.is_set = False
+        self._parent_pid = int(os.environ.get(PARENT_VARIABLE, "0"))
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._set)
 
@@ -29,7 +35,7 @@ class StopFlag:
         self.is_set = True
 
     def __call__(self) -> bool:
-        return self.is_set
+        return self.is_set or (self._parent_pid > 0 and os.getppid() != self._parent_pid)
 
 
 def run(bus: Bus, step: Callable[[], bool], should_stop: Callable[[], bool]) -> None:

@@ -14,6 +14,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO
 
+from protocol.process import PARENT_VARIABLE
+
 _GRACE_S = 5.0
 
 
@@ -42,7 +44,11 @@ class Daemons:
         self._logs.mkdir(parents=True, exist_ok=True)
         file = (self._logs / f"{name}.log").open("ab")
         self._files.append(file)
-        environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
+        environment = os.environ | {
+            "OMP_NUM_THREADS": "1",
+            "PYTHONUNBUFFERED": "1",
+            PARENT_VARIABLE: str(os.getpid()),  # if we are killed, they leave by themselves
+        }
         command = [sys.executable, "-m", module, *arguments]
         self.processes[name] = subprocess.Popen(command, stdout=file, stderr=file, env=environment)
         return self.processes[name]
