@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ponderpounce.tasks.captions import ALL_DONE, Caption, completed, follow, grounded, num_coordinates, simple
+from ponderpounce.tasks.captions import ALL_DONE, Caption, completed, follow, grounded, letter, num_coordinates, simple
 
 HOOK = "Hook the cube[ at <>] to the target[ at <>] with the peg"
 pixels = st.tuples(st.integers(0, 255), st.integers(0, 255))
@@ -61,3 +61,7 @@ def test_a_fixed_text_looks_no_more() -> None:
 def test_at_the_end_the_grounded_text_keeps_the_last_instruction() -> None:
     end = completed(Caption(index=3, simple="pick", grounded="pick at <1, 2>", is_latched=True))
     assert (end.simple, end.grounded) == (ALL_DONE, "pick at <1, 2>")
+
+
+def test_letters_go_from_the_left_of_the_picture_to_the_right() -> None:
+    assert [letter(index, [0.1, -0.2, 0.0]) for index in range(3)] == ["C", "A", "B"]

@@ -72,3 +72,9 @@ def test_of_several_cubes_the_picked_one_is_named(world: Physics) -> None:
         world.advance(np.append(panda.HOME_QPOS, -1.0))
     assert predicates.first_picked(world, ["cube"]) == "cube"
     assert predicates.first_picked(world, []) is None
+
+
+@pytest.mark.parametrize(("speed_rad_s", "expected"), [(0.19, True), (-0.19, True), (0.21, False), (-0.21, False)])
+def test_an_arm_is_still_if_no_joint_turns_fast(world: Physics, speed_rad_s: float, expected: bool) -> None:
+    world.data.joint(panda.ARM_JOINTS[3]).qvel = speed_rad_s
+    assert predicates.is_still(world) == expected
