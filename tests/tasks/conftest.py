@@ -106,6 +106,11 @@ def recording() -> dict[str, Any]:
 
 @pytest.fixture(scope="session")
 def recorded_layout(recording: dict[str, Any]) -> Layout:
+    return pick_highlight_layout(recording)
+
+
+def pick_highlight_layout(recording: dict[str, Any]) -> Layout:
+    """The recorded scene in our terms."""
     return Layout(
         button_xy_m=tuple(recording["button_xy_m"]),
         cubes=tuple(PlacedCube(**cube) for cube in recording["cubes"]),
