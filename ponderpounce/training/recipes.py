@@ -1,0 +1,97 @@
+"""Named recipes: everything that fixes a training run but the data and the machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from difflib import get_close_matches
+
+from clock import sampling
+from ponderpounce.models import ponder_configs, pounce_configs
+from ponderpounce.models.ponder_configs import PonderConfig
+from ponderpounce.models.pounce import Freeze
+from ponderpounce.models.pounce_family import AnyPounceConfig
+from ponderpounce.training.example import ExampleConfig
+from ponderpounce.training.optim import OptimConfig
+from ponderpounce.training.trainer import TrainConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recipe:
+    """A training run, apart from its data."""
+
+    name: str
+    ponder: PonderConfig
+    pounce: AnyPounceConfig
+    freeze: Freeze
+    """Which of POUNCE's pretrained parts stay as they are."""
+    example: ExampleConfig
+    train: TrainConfig
+    num_steps: int
+    batch_episodes: int
+    w1: float = 1.0
+    w2: float = 0.1
+    from_scratch: bool = False
+    """True: weights are drawn. False: both systems start from pretrained checkpoints, given to the program."""
+
+    def __post_init__(self) -> None:
+        if self.example.is_grounded != (self.w2 > 0):
+            raise ValueError(f"recipe {self.name}: is_grounded is {self.example.is_grounded}, but w2 is {self.w2}")
+
+
+def robomme() -> Recipe:
+    """The paper's RoboMME run (B.1): Qwen3.5-9B and pi0.5, K = 1, 4,320 steps of 32 episodes on 8 B200."""
+    return Recipe(
+        name="robomme",
+        ponder=ponder_configs.qwen35_9b(),
+        pounce=pounce_configs.pi05_base(),
+        freeze="vlm",
+        example=ExampleConfig(clocks=sampling.ROBOMME),
+        train=TrainConfig(seed=42, dropout=0.0, optim=OptimConfig()),
+        num_steps=4320,
+        batch_episodes=32,
+    )
+
+
+def robocasa_dc() -> Recipe:
+    """The paper's RoboCasa-DC run (B.2): GR00T N1.5, actions only, cognition dropout 0.15. Its seed is not told: 42."""
+    return Recipe(
+        name="robocasa_dc",
+        ponder=ponder_configs.qwen35_9b(),
+        pounce=pounce_configs.groot_n1_5(),
+        freeze="vlm",
+        example=ExampleConfig(clocks=sampling.ROBOCASA_DC, is_grounded=False),
+        train=TrainConfig(seed=42, dropout=0.15, optim=OptimConfig(learning_rate=1e-5)),
+        num_steps=4000,
+        batch_episodes=32,
+        w2=0.0,
+    )
+
+
+def tiny() -> Recipe:
+    """Both architectures at the smallest size, from scratch: exercises every part on one CPU core, learns little."""
+    ponder = replace(ponder_configs.tiny_cpu(), image_px=(64, 64))
+    return Recipe(
+        name="tiny",
+        ponder=ponder,
+        pounce=pounce_configs.tiny_cpu(cognition_size=ponder.hidden_size),
+        freeze="none",
+        example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=8),
+        train=TrainConfig(seed=0, dropout=0.15, optim=OptimConfig(learning_rate=3e-4, warmup_steps=50, ema_decay=0.99)),
+        num_steps=200,
+        batch_episodes=2,
+        w2=0.3,  # the paper's 0.1 is for a pretrained LM head
+        from_scratch=True,
+    )
+
+
+RECIPES: dict[str, Callable[[], Recipe]] = {"robomme": robomme, "robocasa_dc": robocasa_dc, "tiny": tiny}
+
+
+def recipe(name: str) -> Recipe:
+    """Returns a named recipe. Raises ValueError with the nearest name if there is none."""
+    if name not in RECIPES:
+        close = get_close_matches(name, RECIPES, n=1)
+        hint = f"Did you mean {close[0]!r}? " if close else ""
+        raise ValueError(f"unknown recipe {name!r}. {hint}There are {', '.join(RECIPES)}.")
+    return RECIPES[name]()
