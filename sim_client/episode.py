@@ -56,6 +56,7 @@ class RobotSide:
     _start_ns: int = 0
     _command: m.Floats = field(default_factory=lambda: np.zeros(0, np.float32))
     _texts: tuple[str, str] = ("", "")
+    _subgoal_index: int = -1
     _stopped_ticks: int = 0
 
     def run(self, info: m.EpisodeInfo, first: Snapshot, on_tick: Callable[[int], None]) -> Outcome:
@@ -110,11 +111,12 @@ class RobotSide:
         self.link.publish(OBSERVATION, observation(snapshot, self._tick, source_ns, codec), at_ns=source_ns)
         texts = (snapshot.simple_subgoal, snapshot.grounded_subgoal)
         kinds = (m.SubgoalKind.TASK_SIMPLE, m.SubgoalKind.TASK_GROUNDED)
+        is_new = snapshot.subgoal_index != self._subgoal_index  # said again even if its words are the ones before
         for kind, text, before in zip(kinds, texts, self._texts, strict=True):
-            if text != before:
+            if is_new or text != before:
                 subgoal = m.Subgoal(kind=kind, text=text, tick=self._tick)
                 self.link.publish(SUBGOAL, subgoal, at_ns=source_ns)
-        self._texts = texts
+        self._texts, self._subgoal_index = texts, snapshot.subgoal_index
 
     def _hold(self) -> None:
         for _ in range(HOLD_TICKS):

@@ -156,6 +156,7 @@ class NumberWorld:
             simple_subgoal="",
             grounded_subgoal="",
             subtask_index=0,
+            subgoal_index=0,
         )
 
     def step(self, command: m.Floats) -> Snapshot:

@@ -40,6 +40,7 @@ class Snapshot:
     simple_subgoal: str
     grounded_subgoal: str
     subtask_index: int  # the engine's; the texts follow it one step later, as upstream delivers them
+    subgoal_index: int  # the subtask that the texts speak of; two in a row may have the same text
     is_demonstration: bool = False  # a frame of the conditioning video; outcome and subtask are then those of a start
 
 
@@ -316,6 +317,7 @@ class Environment:
             simple_subgoal=caption.simple,
             grounded_subgoal=caption.grounded,
             subtask_index=progress.index,
+            subgoal_index=caption.index,
             is_demonstration=is_demonstration,
         )
 

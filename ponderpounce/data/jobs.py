@@ -1,0 +1,79 @@
+"""What is to be collected: one job per kept episode, each with its own row of seeds.
+
+Jobs know nothing of each other, so any number of workers in any order make the same set: a job tries its seeds in turn
+until the oracle solves one. As in RoboMME two of four episodes are easy, one is medium and one hard, and of every
+hundred episodes three begin with a grasp that closes too high and three with one that closes aside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+import ponderpounce.data.headless  # noqa: F401 - before mujoco is imported
+from ponderpounce.data.episode import Recovery
+from ponderpounce.data.video import FPS
+from ponderpounce.tasks.oracle import FailedGrasp
+
+TRAIN_SEED = 2_000_000
+"""Training seeds begin here; those below are for evaluation."""
+ATTEMPTS = 100
+DIFFICULTY_CYCLE = ("easy", "easy", "medium", "hard")
+_RECOVERY_CYCLE: tuple[Recovery, ...] = ("z",) * 3 + ("xy",) * 3 + ("none",) * 94
+_RECOVERY_STREAM = 1  # of a seed's random numbers; the scene draws from another
+_ASIDE = tuple((x, y, 0) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Look:
+    """How often pictures are rendered; rows are 20 Hz whatever is looked at. Rates divide 20 Hz."""
+
+    demonstration_hz: int = FPS
+    execution_hz: int = FPS
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Job:
+    """One episode to collect."""
+
+    task: str
+    slot: int  # which of the task's episodes, from 0
+    image_px: int
+    max_steps: int
+    look: Look
+
+    @property
+    def key(self) -> str:
+        """Where the episode lies: unique, and sorted as jobs are."""
+        return f"{self.task}/{self.slot:06d}"
+
+    @property
+    def difficulty(self) -> str:
+        return DIFFICULTY_CYCLE[self.slot % len(DIFFICULTY_CYCLE)]
+
+    @property
+    def recovery(self) -> Recovery:
+        return _RECOVERY_CYCLE[self.slot % len(_RECOVERY_CYCLE)]
+
+    def seed(self, attempt: int) -> int:
+        """The scene's seed of an attempt from 0 to 99; no two jobs of a task share one."""
+        return TRAIN_SEED + ATTEMPTS * self.slot + attempt
+
+
+def jobs_of(tasks: Sequence[str], num_episodes: int, *, image_px: int, max_steps: int, look: Look) -> Iterator[Job]:
+    """Yields the jobs task by task, in the order their episodes have in the dataset."""
+    for task in tasks:
+        for slot in range(num_episodes):
+            yield Job(task=task, slot=slot, image_px=image_px, max_steps=max_steps, look=look)
+
+
+def failed_grasp(recovery: Recovery, seed: int, num_grasps: int) -> FailedGrasp | None:
+    """Returns which of a script's grasps fails first and where it is aimed; None if there is nothing to fail."""
+    if recovery == "none" or num_grasps == 0:
+        return None
+    rng = np.random.default_rng((seed, _RECOVERY_STREAM))
+    before = int(rng.integers(num_grasps))
+    offset = (0, 0, 1) if recovery == "z" else _ASIDE[rng.integers(len(_ASIDE))]
+    return FailedGrasp(before=before, offset=offset)

@@ -1,0 +1,145 @@
+"""The oracle plays an episode and it is packed: what one worker does for one job."""
+
+from __future__ import annotations
+
+import atexit
+import functools
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+import ponderpounce.data.headless  # noqa: F401 - before mujoco is imported
+from ponderpounce.data.episode import About, EpisodeWriter, Package, Rejection, Row
+from ponderpounce.data.jobs import ATTEMPTS, Job, failed_grasp
+from ponderpounce.data.video import FPS, Frame
+from ponderpounce.tasks.engine import Status
+from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
+from ponderpounce.tasks.geometry import pose_of
+from ponderpounce.tasks.kinematics import Kinematics, UnreachableError
+from ponderpounce.tasks.oracle import FailedGrasp, Motions
+from ponderpounce.tasks.scene import SceneFullError
+
+UNSOLVED = "unsolved.json"
+"""The only file of a package whose job found no seed that the oracle solves: the list of what was tried."""
+Action = NDArray[np.float32]
+Take = Callable[[Row, dict[str, Frame]], None]
+
+
+class UnsolvedError(Exception):
+    """The oracle did not solve this episode. The message says why."""
+
+
+class Narrator:
+    """Turns what an environment shows into rows."""
+
+    def __init__(self, environment: Environment) -> None:
+        self._environment = environment
+        self._kinematics = Kinematics(environment.physics.model)
+
+    def tcp_pose(self, state: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The tool's pose (7,) at the joints of a state (8,)."""
+        return pose_of(self._kinematics.tcp(state[:7].astype(np.float64))).astype(np.float32)
+
+    def demonstration(self, look_hz: int) -> Iterator[tuple[Row, dict[str, Frame]]]:
+        """The rows of the conditioning video, with pictures ``look_hz`` times a second."""
+        for snapshot in self._environment.demonstration(FPS, look_hz=look_hz):
+            yield replace(self.row(snapshot, snapshot.command), is_demonstration=True), dict(snapshot.frames)
+
+    def reasoning(self) -> str:
+        """What the demonstration has shown, in words; empty without one. Ask when it has just ended."""
+        has_demonstration = next(self._environment.demonstration(1, look_hz=1), None) is not None
+        return self._environment.reasoning() if has_demonstration else ""
+
+    def row(self, snapshot: Snapshot, action: Action) -> Row:
+        """What was seen, and what was done then."""
+        return Row(
+            state=snapshot.state,
+            action=np.asarray(action, np.float32),
+            tcp_pose=self.tcp_pose(snapshot.state),
+            subgoal=snapshot.simple_subgoal,
+            grounded_subgoal=snapshot.grounded_subgoal,
+        )
+
+
+def work_out(job: Job) -> Package:
+    """Tries the job's seeds in turn; returns the first solved episode, or why there is none."""
+    environment = _environment(job.task, job.image_px, job.max_steps)
+    rejected: list[Rejection] = []
+    for attempt in range(ATTEMPTS):
+        seed = job.seed(attempt)
+        try:
+            return _solve(environment, job, seed, tuple(rejected))
+        except (UnsolvedError, UnreachableError, SceneFullError) as error:
+            rejected.append(Rejection(seed=seed, reason=str(error)))
+    return {UNSOLVED: (json.dumps([asdict(each) for each in rejected]) + "\n").encode()}
+
+
+def _solve(environment: Environment, job: Job, seed: int, rejected: tuple[Rejection, ...]) -> Package:
+    """One attempt. Raises UnsolvedError, or what the scene or the oracle raises."""
+    fails: FailedGrasp | None = None
+    if job.recovery != "none":  # a rehearsal without pictures counts the grasps that could fail
+        fails = failed_grasp(job.recovery, seed, play(environment, job, seed).num_grasps)
+    writer = EpisodeWriter(job.image_px)
+    play(environment, job, seed, fails, writer.add)
+    return writer.pack(
+        About(
+            task=job.task,
+            instruction=environment.instruction,
+            seed=seed,
+            difficulty=job.difficulty,
+            origin="oracle",
+            is_success=True,
+            image_px=job.image_px,
+            recovery=job.recovery if fails else "none",
+            rejected=rejected,
+        )
+    )
+
+
+def play(
+    environment: Environment, job: Job, seed: int, fails: FailedGrasp | None = None, take: Take | None = None
+) -> Motions:
+    """Plays an episode with the oracle and hands its rows to ``take``; without one, nobody looks.
+
+    Returns what the arm did. Raises UnsolvedError unless it ends with success.
+    """
+    look_every = FPS // job.look.execution_hz
+    snapshot = environment.reset(seed, job.difficulty)
+    narrator = Narrator(environment)
+    reasoning = ""
+    if take is not None:
+        for row, frames in narrator.demonstration(job.look.demonstration_hz):
+            take(row, frames)
+        reasoning = narrator.reasoning()
+    motions = Motions(environment.physics, fails)
+    script = environment.oracle(motions)
+    subgoal_index = -1
+    while snapshot.status is Status.ONGOING:
+        action = next(script, None)
+        if action is None:
+            raise UnsolvedError(f"the script ended after {snapshot.step} steps and the episode did not")
+        if take is not None:
+            is_transition = snapshot.subgoal_index != subgoal_index
+            row = replace(
+                narrator.row(snapshot, action), is_transition=is_transition, demonstration_reasoning=reasoning
+            )
+            take(row, dict(snapshot.frames))
+            subgoal_index, reasoning = snapshot.subgoal_index, ""
+        looks = take is not None and (snapshot.step + 1) % look_every == 0
+        snapshot = environment.step(action, look=looks)
+    if snapshot.status is not Status.SUCCESS:
+        raise UnsolvedError(f"{snapshot.status.value} after {snapshot.step} steps: {snapshot.reason}")
+    return motions
+
+
+@functools.lru_cache(maxsize=1)  # building a scene takes seconds, and jobs come task by task
+def _environment(task: str, image_px: int, max_steps: int) -> Environment:
+    environment = make_environment(task, image_px=image_px, max_steps=max_steps)
+    atexit.unregister(_environment.cache_clear)
+    atexit.register(
+        _environment.cache_clear
+    )  # after MuJoCo has registered its own: the last one in is the first to run
+    return environment

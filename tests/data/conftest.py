@@ -1,0 +1,68 @@
+"""Episodes that cost nothing: a few rows of numbers and tiny pictures, all decided by a seed."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ponderpounce.data.episode import CAMERAS, About, EpisodeWriter, Package, Row
+from ponderpounce.data.jobs import Job
+
+PX = 16
+
+
+def make_row(rng: np.random.Generator, **changes: Any) -> Row:
+    row = Row(
+        state=rng.normal(size=8).astype(np.float32),
+        action=rng.normal(size=8).astype(np.float32),
+        tcp_pose=rng.normal(size=7).astype(np.float32),
+        subgoal="press the button",
+        grounded_subgoal="press the button at <3, 4>",
+    )
+    return dataclasses.replace(row, **changes)
+
+
+def make_package(seed: int, *, num_rows: int = 5, num_demonstration_rows: int = 2, **about: Any) -> Package:
+    """An episode that begins with a demonstration; every second row is rendered."""
+    rng = np.random.default_rng(seed)
+    writer = EpisodeWriter(PX)
+    for index in range(num_rows):
+        is_demonstration = index < num_demonstration_rows
+        pictures = {camera: rng.integers(0, 256, (PX, PX, 3), np.uint8) for camera in CAMERAS}
+        reasoning = "it was the second one" if index == num_demonstration_rows > 0 else ""
+        row = make_row(
+            rng,
+            is_demonstration=is_demonstration,
+            is_transition=index == num_demonstration_rows,
+            demonstration_reasoning=reasoning,
+        )
+        writer.add(row, pictures if index % 2 == 0 else {})
+    values: dict[str, Any] = {
+        "task": "Numbers",
+        "instruction": f"count to {seed % 2}",
+        "seed": seed,
+        "difficulty": "easy",
+        "origin": "oracle",
+        "is_success": True,
+        "image_px": PX,
+    }
+    return writer.pack(About(**values | about))
+
+
+def work_out(job: Job) -> Package:
+    """What the oracle would have made of a job."""
+    return make_package(job.seed(0), num_rows=3 + job.slot % 3, task=job.task, difficulty=job.difficulty)
+
+
+@pytest.fixture(scope="session")
+def package() -> Callable[..., Package]:
+    return make_package
+
+
+@pytest.fixture(scope="session")
+def pretend() -> Callable[[Job], Package]:
+    return work_out

@@ -1,0 +1,103 @@
+"""A recorded oracle episode, exported, has the rows that collecting the same episode has, tick by tick."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ponderpounce.data.dataset import Dataset
+from ponderpounce.data.episode import CAMERAS, Row
+from ponderpounce.data.errors import DatasetError
+from ponderpounce.data.export import ExportOptions, export, main, read_episode
+from ponderpounce.data.jobs import Job, Look
+from ponderpounce.data.rollout import play
+from ponderpounce.tasks.environment import make_environment
+from protocol.bus import LocalBus
+from protocol.link import Link
+from protocol.mcap_log import EpisodeRecord, read_log
+from sim_client.config import SimOptions
+from sim_client.suite import Suite
+
+SEED, TASK = 3, "VideoUnmask"
+JOB = Job(task=TASK, slot=0, image_px=256, max_steps=1300, look=Look())
+
+pytestmark = pytest.mark.sim
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What sim-client writes about an oracle episode."""
+    out = tmp_path_factory.mktemp("recorded")
+    options = SimOptions(task=TASK, seed=SEED, difficulty="easy", policy="oracle", out=out, pixels="exact")
+    bus = LocalBus()
+    results = Suite(options, Link(bus, robot="r0", proc="sim"), None, lambda: "").run()
+    bus.close()
+    return out / results["episodes"][0]["mcap"]
+
+
+@pytest.fixture(scope="module")
+def record(log: Path) -> EpisodeRecord:
+    return read_log(log)
+
+
+@pytest.fixture(scope="module")
+def exported(log: Path, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    out = tmp_path_factory.mktemp("exported") / "dataset"
+    assert export(ExportOptions(files=(log,), out=out, progress=False)) == 1
+    return Dataset(out)
+
+
+@pytest.fixture(scope="module")
+def collected() -> list[Row]:
+    rows: list[Row] = []
+    with make_environment(TASK, render=False) as environment:
+        play(environment, JOB, SEED, take=lambda row, frames: rows.append(row))
+    return rows
+
+
+def test_every_row_is_the_collected_one(exported: Dataset, collected: list[Row]) -> None:
+    rows = exported.rows(0)
+    assert len(rows) == len(collected)
+    for name in ("state", "action", "tcp_pose", "is_demonstration", "is_transition"):
+        expected = np.stack([getattr(row, name) for row in collected])
+        np.testing.assert_array_equal(getattr(rows, name), expected, err_msg=name)
+    for name in ("subgoal", "grounded_subgoal", "demonstration_reasoning"):
+        assert getattr(rows, name) == tuple(getattr(row, name) for row in collected)
+    assert rows.is_rendered.all()
+
+
+def test_it_says_where_the_episode_is_from(exported: Dataset) -> None:
+    (entry,) = exported.episodes
+    assert (entry.task, entry.seed, entry.difficulty, entry.origin) == (TASK, SEED, "easy", "oracle")
+    assert entry.is_success
+
+
+def test_pictures_are_the_ones_of_their_ticks(exported: Dataset, record: EpisodeRecord) -> None:
+    num_shown = exported.episodes[0].num_demonstration_rows
+    last = len(record.ticks) - 1
+    for camera_index, camera in enumerate(CAMERAS):
+        for tick, picture in zip((0, last), exported.frames(0, camera, [num_shown, num_shown + last]), strict=True):
+            image = record.observations[tick].images[camera_index]
+            exact = np.frombuffer(image.data, np.uint8).reshape(256, 256, 3)
+            assert np.abs(picture.astype(float) - exact).mean() < 4  # what the codec takes
+
+
+def test_a_log_with_a_gap_is_refused(log: Path, record: EpisodeRecord) -> None:
+    holed = dataclasses.replace(record, ticks=record.ticks[:7] + record.ticks[8:])
+    with pytest.raises(DatasetError, match=r"ticks \[7\]"):
+        read_episode(log, holed)
+
+
+def test_a_log_of_another_scene_is_refused(log: Path, record: EpisodeRecord) -> None:
+    moved = dataclasses.replace(record.observations[0], proprio=record.observations[0].proprio + 1e-3)
+    other = dataclasses.replace(record, observations=[moved, *record.observations[1:]])
+    with pytest.raises(DatasetError, match="export it with those versions"):
+        read_episode(log, other)
+
+
+def test_nothing_is_overwritten(log: Path, exported: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(log), "--out", str(exported.root), "--no-progress"]) == 2
+    assert "another --out" in capsys.readouterr().err

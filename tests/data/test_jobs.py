@@ -1,0 +1,52 @@
+"""Jobs: seeds of their own, RoboMME's shares of difficulties and failed grasps."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ponderpounce.data.jobs import ATTEMPTS, TRAIN_SEED, Look, failed_grasp, jobs_of
+
+JOBS = list(jobs_of(("A", "B"), 900, image_px=256, max_steps=1300, look=Look()))
+
+
+def test_no_two_attempts_of_a_task_share_a_seed() -> None:
+    seeds = [job.seed(attempt) for job in JOBS if job.task == "A" for attempt in range(ATTEMPTS)]
+    assert len(set(seeds)) == len(seeds)
+    assert min(seeds) == TRAIN_SEED
+
+
+def test_keys_sort_as_jobs_do() -> None:
+    keys = [job.key for job in JOBS]
+    assert keys == sorted(set(keys))
+
+
+def test_shares_are_the_benchmark_s() -> None:
+    hundred = JOBS[:100]
+    assert Counter(job.difficulty for job in hundred) == {"easy": 50, "medium": 25, "hard": 25}
+    assert [job.recovery for job in hundred[:7]] == ["z"] * 3 + ["xy"] * 3 + ["none"]
+    assert Counter(job.recovery for job in hundred) == {"none": 94, "z": 3, "xy": 3}
+
+
+@given(st.sampled_from(["z", "xy"]), st.integers(0, 2**40), st.integers(1, 9))
+def test_one_of_the_grasps_fails_high_or_aside(recovery: str, seed: int, num_grasps: int) -> None:
+    fails = failed_grasp(recovery, seed, num_grasps)
+    assert fails is not None
+    assert fails == failed_grasp(recovery, seed, num_grasps)
+    assert 0 <= fails.before < num_grasps
+    assert (fails.offset == (0, 0, 1)) == (recovery == "z")
+    assert np.any(fails.offset)
+
+
+def test_every_grasp_and_every_direction_comes_up() -> None:
+    found = [failed_grasp("xy", seed, 3) for seed in range(300)]
+    assert {fails.before for fails in found if fails} == {0, 1, 2}
+    assert len({fails.offset for fails in found if fails}) == 8
+
+
+def test_there_may_be_nothing_to_fail() -> None:
+    assert failed_grasp("z", 1, 0) is None
+    assert failed_grasp("none", 1, 3) is None
