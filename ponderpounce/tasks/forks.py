@@ -71,8 +71,8 @@ def fork(environment: Environment, task: Task[Any, Any], variant: int) -> Fork:
         own = _replayed(environment, now.layout, now)
         if _is_another_world(environment.physics, own.now.physics, now.physics):
             raise ForkError("this episode did not come here from its own reset; fork the one that it was forked from")
-        layouts = task.retold(now.layout)
-        if layouts is not None:
+        if not task.repeats_itself:
+            layouts = task.retold(now.layout)
             told = _replayed(environment, _nth(layouts, variant, now.step), now)
             if _is_another_world(environment.physics, told.now.physics, now.physics):
                 raise ForkError(f"at step {now.step} one still sees which past it was; step on until nothing is shown")

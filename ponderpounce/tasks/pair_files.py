@@ -51,7 +51,7 @@ class PairsOptions:
     """Folder to write to; must not hold pairs yet."""
     pairs: int = 100
     task: tuple[str, ...] = ()
-    """Only these of the family's tasks."""
+    """Only these of the family's tasks; by default all that can be forked."""
     seed: int = 0
     """The first to be tried."""
     image_px: int = IMAGE_PX
@@ -142,10 +142,15 @@ def main(argv: list[str] | None = None) -> int:
     if (options.out / INDEX).exists():
         sys.stderr.write(f"pp-pairs: {options.out} holds pairs already; give another --out\n")
         return 2
-    tasks = options.task or tuple(name for name in task_names() if make_task(name).family == options.family)
+    tasks = options.task or tuple(
+        name for name in task_names() if make_task(name).family == options.family and make_task(name).can_be_forked()
+    )
     strangers = [name for name in tasks if make_task(name).family != options.family]
     if strangers:
         sys.stderr.write(f"pp-pairs: {', '.join(strangers)}: not of the {options.family} family\n")
+        return 2
+    if not tasks:
+        sys.stderr.write(f"pp-pairs: no task of the {options.family} family can be forked yet; see docs/tasks.md\n")
         return 2
     options.out.mkdir(parents=True, exist_ok=True)
     entries: list[dict[str, Any]] = []

@@ -67,10 +67,10 @@ def find_pair(own: Environment, other: Environment, task: str, seed: int, varian
     """
     kind = make_task(task)
     own.reset(seed)
-    told = kind.retold(own.layout)
-    if told is None:
+    if kind.repeats_itself:
         fork = _cut(own, variant)
     else:
+        told = kind.retold(own.layout)
         fork = _retold(own, other, told[variant], variant) if variant < len(told) else None
     if fork is None:
         return None

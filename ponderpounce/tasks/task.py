@@ -80,6 +80,7 @@ class Task(ABC, Generic[LayoutT, MemoryT]):
     name: ClassVar[str]
     family: ClassVar[str]
     robot: ClassVar[Robot] = PANDA_WRISTCAM
+    repeats_itself: ClassVar[bool] = False  # its episodes have rounds that look alike, see `forks`
 
     @abstractmethod
     def furnish(self, spec: mujoco.MjSpec) -> None:
@@ -115,14 +116,19 @@ class Task(ABC, Generic[LayoutT, MemoryT]):
         """
         return None
 
-    def retold(self, layout: LayoutT) -> tuple[LayoutT, ...] | None:
+    def retold(self, layout: LayoutT) -> tuple[LayoutT, ...]:
         """Returns layouts whose episodes show other things at first and look the same later; see `forks`.
 
         The instruction is the same, and so is the physics under the same actions, bit for bit, but for things that are
         only shown. Once nothing is shown any more only memory tells which of them one is in, and what must be done
-        next is wrong in the others. The default is None: the past of such a task is not told, but repeats itself.
+        next is wrong in the others. The default is none.
         """
-        return None
+        return ()
+
+    @classmethod
+    def can_be_forked(cls) -> bool:
+        """True if there may be other pasts that lead to the same present."""
+        return cls.repeats_itself or cls.retold is not Task.retold
 
     @abstractmethod
     def remember(self, memory: MemoryT | None, physics: Physics, layout: LayoutT) -> MemoryT:

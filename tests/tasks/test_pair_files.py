@@ -11,6 +11,7 @@ import pytest
 from ponderpounce.analysis.counterfactual import p_own
 from ponderpounce.tasks.pair_files import INDEX, main, read_pairs, write_index, write_pair
 from ponderpounce.tasks.pairs import Pair, Telling
+from ponderpounce.tasks.task import Task
 
 rng = np.random.default_rng(0)
 
@@ -87,3 +88,11 @@ def test_a_task_of_another_family_is_refused(tmp_path: Path, capsys: pytest.Capt
     arguments = ["--family", "counting", "--task", "PickHighlight", "--out", str(tmp_path)]
     assert main(arguments) == 2
     assert "PickHighlight: not of the counting family" in capsys.readouterr().err
+
+
+def test_a_family_without_forks_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Task, "can_be_forked", classmethod(lambda cls: False))
+    assert main(["--family", "imitation", "--out", str(tmp_path)]) == 2
+    assert "no task of the imitation family can be forked yet" in capsys.readouterr().err

@@ -45,6 +45,8 @@ class Layout:
 class PickXtimes(Task[Layout, None]):
     """Pick and place one cube a given number of times, then press the button."""
 
+    repeats_itself = True
+
     def furnish(self, spec: mujoco.MjSpec) -> None:
         add_button(spec, _BUTTON)
         add_target(spec, _TARGET, PURPLE)

@@ -90,6 +90,8 @@ class Memory:
 class StopCube(Task[Layout, Memory]):
     """Stop the shuttling cube on the target on a given visit."""
 
+    repeats_itself = True
+
     def furnish(self, spec: mujoco.MjSpec) -> None:
         add_button(spec, _BUTTON)
         add_target(spec, _TARGET, PURPLE, radius_m=_TARGET_RADIUS_M, half_height_m=_TARGET_HALF_HEIGHT_M)

@@ -72,6 +72,8 @@ class Memory:
 class SwingXtimes(Task[Layout, Memory]):
     """Swing one cube between two targets a given number of times, put it down, then press the button."""
 
+    repeats_itself = True
+
     def furnish(self, spec: mujoco.MjSpec) -> None:
         add_button(spec, _BUTTON)
         for side in _SIDES:
