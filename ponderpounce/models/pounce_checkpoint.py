@@ -15,7 +15,8 @@ from ponderpounce.models.config_json import from_json
 from ponderpounce.models.groot_folder import groot_config_of
 from ponderpounce.models.groot_prompt import EagleTokenizer, tiny_eagle_tokenizer_for_random_weights
 from ponderpounce.models.normalisation import ROBOMME, RobotStatistics
-from ponderpounce.models.pounce import PounceConfig
+from ponderpounce.models.openpi_jax import METADATA_FILE, load_jax_weights
+from ponderpounce.models.pounce import Pounce, PounceConfig
 from ponderpounce.models.pounce_configs import groot_n1_5, pi05_base
 from ponderpounce.models.pounce_family import (
     AnyPounce,
@@ -37,6 +38,7 @@ AnyTokenizer: TypeAlias = Tokenizer | EagleTokenizer
 FORMAT: Final = "ponderpounce.pounce/1"
 GROOT_FORMAT: Final = "ponderpounce.pounce-groot/1"
 CONFIG_FILE = "config.json"
+JAX_FOLDER = "params"
 WEIGHTS_FILE = "model.safetensors"
 TOKENIZER_FILE = "tokenizer.model"
 EAGLE_TOKENIZER_FILE = "tokenizer.json"
@@ -149,7 +151,8 @@ def load_bundle(
 ) -> PounceBundle:
     """Reads our own folder, or a public one, which acts with RoboMME's statistics.
 
-    Public folders: openpi's and lerobot's pi0.5; NVIDIA's GR00T N1.5, in shards or not, and lerobot's ``groot``.
+    Public folders: openpi's pi0.5 (PyTorch, or JAX in ``params/``) and lerobot's; NVIDIA's GR00T N1.5, in shards or
+    not, and lerobot's ``groot``.
 
     Args:
         config: for a public folder; default `pi05_base()`, or for GR00T what the folder itself says.
@@ -161,15 +164,16 @@ def load_bundle(
         WeightsError: the tensors do not fit the configuration.
         ValueError: our config.json does not parse, or ``config`` is given although the folder has its own.
     """
-    weights_path = folder / WEIGHTS_FILE
-    weights_files(weights_path)  # a folder without any is told so before anything else of it is judged
+    is_jax = (folder / JAX_FOLDER / METADATA_FILE).is_file()
+    if not is_jax:
+        weights_files(folder / WEIGHTS_FILE)  # a folder without any is told so before anything else of it is judged
     stored = _read_config(folder / CONFIG_FILE)
     if stored is not None:
         if config is not None:
             raise ValueError(f"checkpoint {folder} has its own {CONFIG_FILE}; leave the config argument out")
         config = stored.config
-    model = blank_model(config or _public_config(folder))
-    has_prefix = load_weights(model, weights_path)
+    model = blank_model(config or (pi05_base() if is_jax else _public_config(folder)))
+    has_prefix = _load_jax(model, folder) if is_jax else load_weights(model, folder / WEIGHTS_FILE)
     if not has_prefix:
         initialise_prefix(model, torch.Generator().manual_seed(prefix_seed))
     is_prefix_trained = has_prefix and not (stored is not None and stored.has_fresh_prefix)
@@ -180,6 +184,14 @@ def load_bundle(
         is_random=stored is not None and stored.is_random,
         has_fresh_prefix=model.cognition_prefix is not None and not is_prefix_trained,
     )
+
+
+def _load_jax(model: AnyPounce, folder: Path) -> bool:
+    """Returns False: openpi knows no cognition prefix."""
+    if not isinstance(model, Pounce):
+        raise ValueError(f"checkpoint {folder} is openpi's JAX pi0.5, its config is GR00T's")
+    load_jax_weights(model, folder / JAX_FOLDER)
+    return False
 
 
 def _public_config(folder: Path) -> AnyPounceConfig:
