@@ -7,13 +7,15 @@ The node and the shell need this file only, so they can be tested with a fake en
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal, Protocol, TypeAlias
+from typing import Generic, Literal, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 Frame: TypeAlias = npt.NDArray[np.uint8]
 """One camera image, (h, w, 3) uint8 RGB."""
+
+Result = TypeVar("Result")
 
 Progress: TypeAlias = Callable[[], None]
 """Called between pieces of work, so that a heartbeat comes from the loop that works and not from a timer."""
@@ -97,6 +99,22 @@ class Fire:
     """Tokens in the session after this fire."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome(Generic[Result]):
+    """How a query ended: with an answer, or with the error that kept it from leaving a trace."""
+
+    session: str
+    result: Result | None
+    error: Exception | None = None
+
+    def unwrap(self) -> Result:
+        """The result; raises the error if there is one."""
+        if self.error is not None:
+            raise self.error
+        assert self.result is not None
+        return self.result
+
+
 class PonderEngine(Protocol):
     """An engine answers one call at a time; it is not thread-safe."""
 
@@ -117,3 +135,16 @@ class PonderEngine(Protocol):
 
     def warm_up(self) -> list[int]:
         """Runs throwaway fires; durations in ns of at least 20, the first few left unmeasured."""
+
+
+class BatchingEngine(PonderEngine, Protocol):
+    """Thinks about queries of several sessions at once; ``fire`` is for when it thinks about nothing else."""
+
+    def begin(self, session: str, frames: tuple[Frame, ...]) -> None:
+        """Takes on one query of a session that has none. Raises as ``fire`` does, and changes nothing then."""
+
+    def step(self, progress: Progress = no_progress) -> list[Outcome[Fire]]:
+        """A piece of work, about as long as one forward; the queries that it answered or that failed in it.
+
+        Sessions take turns; a query begun between two steps joins the next one. Empty and at once if none is begun.
+        """

@@ -12,25 +12,29 @@ a session.
 """
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ponder_server.batching import Batch
 from ponder_server.contract import (
     ContextFull,
     EngineSpec,
     Fire,
     Frame,
     Opening,
+    Outcome,
     Progress,
     SessionError,
     Text,
     no_progress,
 )
-from ponder_server.runner import BUCKETS, Runner, SavedState, Session
-from ponder_server.writer import TransitionWriter
+from ponder_server.draft import Draft, NoDraft
+from ponder_server.runner import BUCKETS, Append, Runner, Session
+from ponder_server.writer import Steps, TransitionWriter
 from ponderpounce.models.context import Segment
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import weights_hash
@@ -54,6 +58,8 @@ class EngineConfig:
     """Limit of one text. A text that reaches it is closed as it is and flagged ``truncated``."""
     prefill_chunk_tokens: int = 2048
     """Opening tokens per forward: more is faster, fewer lets ``progress`` be heard more often."""
+    max_batch_rows: int = 8
+    """Sessions that share a forward at most."""
     buckets: tuple[int, ...] = BUCKETS
     """Lengths that a forward's rows are padded to, growing."""
 
@@ -71,15 +77,23 @@ class _Episode:
     """A session in use, and the one thing about it that is not in its tokens."""
 
     context: Session
-    before_fire: SavedState
     owes_reasoning: bool
     """A demonstration was shown and its reasoning (DR) not yet written; the first transition writes it."""
 
 
-class QwenEngine:
-    """A ``PonderEngine`` on one device, one call at a time."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Query:
+    """A query that was begun."""
 
-    def __init__(self, ponder: Ponder, config: EngineConfig) -> None:
+    episode: _Episode
+    frames: tuple[Frame, ...]
+    force_text_tokens: int | None
+
+
+class QwenEngine:
+    """A ``BatchingEngine`` on one device, one call at a time."""
+
+    def __init__(self, ponder: Ponder, config: EngineConfig, draft: Draft | None = None) -> None:
         self._ponder = ponder
         self._config = config
         self._format = ponder.format
@@ -100,7 +114,10 @@ class QwenEngine:
             is_random=ponder.is_random,
             dtype=str(ponder.dtype).removeprefix("torch."),
         )
-        self._writer = TransitionWriter(ponder, max_text_tokens=config.max_text_tokens)
+        self._writer = TransitionWriter(ponder, draft or NoDraft(), max_text_tokens=config.max_text_tokens)
+        self._query_ids = (*self._format.observation(config.num_cameras).ids, *self._format.carrier_ids)
+        self._begun: dict[str, _Query] = {}
+        self._batch: Batch[Fire] = Batch(self._runner, max_rows=config.max_batch_rows)
 
     @property
     def spec(self) -> EngineSpec:
@@ -138,10 +155,9 @@ class QwenEngine:
         except BaseException:
             self._runner.close(context)
             raise
-        self._episodes[session] = _Episode(context=context, before_fire=context.save(), owes_reasoning=opening.has_demo)
+        self._episodes[session] = _Episode(context=context, owes_reasoning=opening.has_demo)
         return context.num_tokens
 
-    @torch.inference_mode()
     def fire(
         self,
         session: str,
@@ -150,54 +166,88 @@ class QwenEngine:
         *,
         force_text_tokens: int | None = None,
     ) -> Fire:
-        """One query; see ``PonderEngine.fire``.
+        """One query, alone; see ``PonderEngine.fire``.
 
         ``force_text_tokens`` makes it a transition with a subgoal of exactly so many tokens, whatever the
         model wants to say (the paper's 45-token workload, appendix D). For benchmarks: the text is
         meaningless.
         """
+        if self._begun or self._batch:
+            busy = (*self._begun, *self._batch.sessions)
+            raise SessionError(f"queries of {busy} are being thought about; step until they are done.")
+        self.begin(session, frames, force_text_tokens=force_text_tokens)
+        while True:
+            for outcome in self.step(progress):
+                return outcome.unwrap()
+
+    def begin(self, session: str, frames: tuple[Frame, ...], *, force_text_tokens: int | None = None) -> None:
+        """Takes on one query, to be answered by :meth:`step`; see ``BatchingEngine.begin``."""
         episode = self._episode(session)
         context = episode.context
+        if session in (*self._begun, *self._batch.sessions):
+            raise SessionError(f"session {session!r} is thinking about a query already; one at a time.")
         if len(frames) != self._config.num_cameras:
             raise ValueError(f"fire got {len(frames)} frames, this engine has num_cameras {self._config.num_cameras}")
         self._check_frames(frames, "observation")
         if force_text_tokens is not None and force_text_tokens < 1:
             raise ValueError(f"force_text_tokens is {force_text_tokens}; at least 1, or None")
-        observation, carriers = self._format.observation(len(frames)), self._format.carriers()
-        wanted = len(observation) + len(carriers)
-        if wanted > context.room:
-            raise ContextFull(session=session, used=context.num_tokens, wanted=wanted, limit=context.max_tokens)
-        ids = [*observation.ids, *carriers.ids]
-        embeds_TH = self._embed(ids, frames)
-        before = context.save(episode.before_fire)
-        try:
-            if force_text_tokens is None:
-                hidden_NH = context.append(ids, embeds_TH, num_wanted=1 + len(carriers))
-                progress()
-                if self._gate(hidden_NH[0]) != self._format.vocabulary.t_yes:
-                    return self._answer(context, hidden_NH[1:], ())
-                context.restore(before)
-            texts = self._writer.write(
-                context,
-                before,
-                observation.ids,
-                embeds_TH[: len(observation)],
-                with_reasoning=episode.owes_reasoning and force_text_tokens is None,
-                exactly=force_text_tokens,
-                progress=progress,
-            )
-            hidden_KH = context.append(carriers.ids, embeds_TH[len(observation) :])
-            progress()
-            answer = self._answer(context, hidden_KH, texts)
-        except BaseException:
-            context.restore(before)
-            raise
-        episode.owes_reasoning = False
-        return answer
+        context.check_room(len(self._query_ids))
+        self._begun[session] = _Query(episode=episode, frames=frames, force_text_tokens=force_text_tokens)
 
+    @torch.inference_mode()
+    def step(self, progress: Progress = no_progress) -> list[Outcome[Fire]]:
+        """One forward for the queries that were begun; those answered by it. See ``BatchingEngine.step``."""
+        begun, self._begun = self._begun, {}
+        if begun:
+            frames = [frame for query in begun.values() for frame in query.frames]
+            embeds_TH = self._embed(self._query_ids * len(begun), frames)
+            pieces = embeds_TH.split(len(self._query_ids))
+            for (session, query), query_TH in zip(begun.items(), pieces, strict=True):
+                self._batch.add(session, self._think(query, query_TH))
+        return self._batch.step(progress)
+
+    def _think(self, query: _Query, embeds_TH: Tensor) -> Steps[Fire]:
+        """One query's way through the network; whatever ends it early, the context is as it was."""
+        episode, exactly = query.episode, query.force_text_tokens
+        context = episode.context
+        num_observed = len(self._query_ids) - self._format.num_carriers
+        observation_TH, carriers_KH = embeds_TH[:num_observed], embeds_TH[num_observed:]
+        before = context.save(context.before_fire)
+        is_answered = False
+        try:
+            texts: tuple[Text, ...] = ()
+            is_transition = exactly is not None
+            if not is_transition:
+                wanted = 1 + self._format.num_carriers
+                hidden_NH = yield Append(session=context, ids=self._query_ids, embeds_TH=embeds_TH, num_wanted=wanted)
+                is_transition = self._gate(hidden_NH[0]) == self._format.vocabulary.t_yes
+                hidden_KH = hidden_NH[1:]
+            if is_transition:
+                context.restore(before)
+                texts = yield from self._writer.write(
+                    context,
+                    before,
+                    self._query_ids[:num_observed],
+                    observation_TH,
+                    with_reasoning=episode.owes_reasoning and exactly is None,
+                    exactly=exactly,
+                )
+                hidden_KH = yield Append(session=context, ids=self._format.carrier_ids, embeds_TH=carriers_KH)
+            answer = self._answer(context, hidden_KH, texts)
+            episode.owes_reasoning &= not is_transition
+            is_answered = True
+            return answer
+        finally:
+            if not is_answered:
+                context.restore(before)
+
+    @torch.inference_mode()
     def close(self, session: str) -> None:
         """Keeps the memory for the next session; see ``PonderEngine.close``."""
-        self._runner.close(self._episode(session).context)
+        episode = self._episode(session)
+        self._begun.pop(session, None)
+        self._batch.drop(session)
+        self._runner.close(episode.context)
         del self._episodes[session]
 
     @torch.inference_mode()
@@ -237,7 +287,7 @@ class QwenEngine:
                     f"{where}, frame {index}: {frame.dtype} of shape {frame.shape}; expected uint8 {expected}"
                 )
 
-    def _embed(self, ids: list[int], frames: tuple[Frame, ...] | list[Frame]) -> Tensor:
+    def _embed(self, ids: Sequence[int], frames: Sequence[Frame]) -> Tensor:
         if not frames:
             return self._ponder.embed(ids)
         return self._ponder.embed(ids, torch.from_numpy(np.stack(frames)).to(self._ponder.device))

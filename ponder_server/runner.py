@@ -23,6 +23,9 @@ from ponder_server.decoder import Place, decode
 from ponder_server.slots import SlotMemory
 from ponderpounce.models.ponder import Ponder
 
+NUM_SAVED_STATES = 2
+"""Per slot, allocated with it: before a query, and before a draft."""
+
 BUCKETS = (1, 16, 160, 512, 2048)
 """Tokens of a row: a decoded token, a verified draft, a fire of two 256 px cameras, pieces of a demonstration."""
 
@@ -72,19 +75,24 @@ class Runner:
             text_config, num_slots=num_slots, max_tokens=max_tokens, device=ponder.device, dtype=ponder.dtype
         )
         self._free_slots = list(reversed(range(num_slots)))
+        self._saved = [tuple(self._blank_state(slot) for _ in range(NUM_SAVED_STATES)) for slot in range(num_slots)]
 
     def open(self, name: str) -> "Session":
         """An empty context in a free slot. Raises SessionError if there is none."""
         if not self._free_slots:
             raise SessionError(f"session {name!r} does not fit: all {self.memory.num_slots} slots are in use.")
-        session = Session(self, name, self._free_slots.pop())
-        self.memory.clear(session.slot)
-        return session
+        slot = self._free_slots.pop()
+        self.memory.clear(slot)
+        return Session(self, name, slot, *self._saved[slot])
 
     def close(self, session: "Session") -> None:
         """Gives the slot back; the session must not be used again."""
         assert session.slot not in self._free_slots, "closed twice"
         self._free_slots.append(session.slot)
+
+    def bucket(self, num_tokens: int) -> int:
+        """Length of the next forward of a row that has so many tokens left."""
+        return next((bucket for bucket in self._buckets if bucket >= num_tokens), self._buckets[-1])
 
     def append(self, appends: Sequence[Append]) -> list[Tensor]:
         """Appends to different sessions in common forwards; the wanted hidden states (num_wanted, H) of each.
@@ -101,9 +109,13 @@ class Runner:
             one.session.next_position = row.next_position
         return [torch.cat(row.hidden) if row.hidden else row.embeds_TH[:0] for row in rows]
 
+    def _blank_state(self, slot: int) -> SavedState:
+        return SavedState(
+            num_tokens=0, next_position=0, tensors=[torch.empty_like(t) for t in self.memory.states(slot)]
+        )
+
     def _forward(self, rows: "Sequence[_Row]") -> None:
-        longest = max(row.num_left for row in rows)
-        length = next((bucket for bucket in self._buckets if bucket >= longest), self._buckets[-1])
+        length = self.bucket(max(row.num_left for row in rows))
         embeds_BTH = rows[0].embeds_TH.new_zeros(len(rows), length, rows[0].embeds_TH.shape[1])
         positions_3BT = np.zeros((3, len(rows), length), dtype=np.int64)
         places = []
@@ -149,7 +161,9 @@ class _Row:
 class Session:
     """One context in a slot of its runner, which opens and closes it."""
 
-    def __init__(self, runner: Runner, name: str, slot: int) -> None:
+    def __init__(self, runner: Runner, name: str, slot: int, before_fire: SavedState, before_draft: SavedState) -> None:
+        self.before_fire = before_fire
+        self.before_draft = before_draft
         self._runner = runner
         self._memory = runner.memory
         self.name = name

@@ -1,17 +1,28 @@
 """The text of a transition, decoded greedily and written into the context that it belongs to.
 
-# T tokens, H hidden, V vocabulary
+Written as a generator: it yields what it wants appended and is sent the wanted hidden states, so that somebody else
+decides whose tokens share a forward.
+
+# T tokens, N wanted ones, H hidden, V vocabulary
 """
 
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Generator, Sequence
+from typing import Literal, TypeAlias, TypeVar
 
 import torch
 from torch import Tensor
 
-from ponder_server.contract import ContextFull, Progress, Text
-from ponder_server.runner import SavedState, Session
+from ponder_server.contract import ContextFull, Text
+from ponder_server.draft import Draft
+from ponder_server.runner import Append, SavedState, Session
 from ponderpounce.models.ponder import Ponder
+
+Result = TypeVar("Result")
+Steps: TypeAlias = Generator[Append, Tensor, Result]
+"""Yields appends, is sent their wanted hidden states (N, H), returns a result."""
+
+MAX_CHECKED_TOKENS = 16
+"""Tokens of one forward while text is decoded: the bucket beyond a single token."""
 
 
 class TransitionWriter:
@@ -22,8 +33,9 @@ class TransitionWriter:
     limit is closed as it is.
     """
 
-    def __init__(self, ponder: Ponder, *, max_text_tokens: int) -> None:
+    def __init__(self, ponder: Ponder, draft: Draft, *, max_text_tokens: int) -> None:
         self._ponder = ponder
+        self._draft = draft
         self._max_text_tokens = max_text_tokens
         v = ponder.format.vocabulary
         self._t_yes = v.t_yes
@@ -44,8 +56,7 @@ class TransitionWriter:
         *,
         with_reasoning: bool,
         exactly: int | None,
-        progress: Progress,
-    ) -> tuple[Text, ...]:
+    ) -> Steps[tuple[Text, ...]]:
         """Writes a transition into ``context``, which is at ``before``; DR first if ``with_reasoning``.
 
         DR is closed by the T_yes that opens S, or by its limit, and then S follows all the same; T_no after DR ends
@@ -55,22 +66,19 @@ class TransitionWriter:
         """
         num_carriers = self._ponder.format.num_carriers
         t_yes_TH = self._ponder.embed([self._t_yes])
-        hidden_H = context.append([*observation_ids, self._t_yes], torch.cat([observation_TH, t_yes_TH]), num_wanted=1)[
-            -1
-        ]
-        progress()
+        opened = torch.cat([observation_TH, t_yes_TH])
+        hidden_NH = yield Append(session=context, ids=[*observation_ids, self._t_yes], embeds_TH=opened, num_wanted=1)
         texts = []
         if with_reasoning:
             num_kept = 2 + num_carriers  # T_yes and one token of S
             limit = self._limit(context, before, num_kept, None)
-            text, end = self._decode(context, hidden_H, "demo_reasoning", limit, None, progress)
+            text, end = yield from self._decode(context, hidden_NH, "demo_reasoning", limit, None)
             texts.append(text)
             if end not in (self._t_yes, None):
                 return tuple(texts)
-            hidden_H = context.append([self._t_yes], t_yes_TH)[-1]
-            progress()
+            hidden_NH = yield Append(session=context, ids=[self._t_yes], embeds_TH=t_yes_TH)
         limit = self._limit(context, before, num_carriers, exactly)
-        text, _ = self._decode(context, hidden_H, "subgoal", limit, exactly, progress)
+        text, _ = yield from self._decode(context, hidden_NH, "subgoal", limit, exactly)
         return (*texts, text)
 
     def _limit(self, context: Session, before: SavedState, num_kept: int, exactly: int | None) -> int:
@@ -86,27 +94,44 @@ class TransitionWriter:
     def _decode(
         self,
         context: Session,
-        hidden_H: Tensor,
+        hidden_NH: Tensor,
         kind: Literal["subgoal", "demo_reasoning"],
         limit: int,
         exactly: int | None,
-        progress: Progress,
-    ) -> tuple[Text, int | None]:
-        """Greedy text after the given hidden state, and the token that ended it (None: the limit did)."""
+    ) -> Steps[tuple[Text, int | None]]:
+        """Greedy text after the given hidden state, and the token that ended it (None: the limit did).
+
+        A draft rides behind the token that is certain. Where it is wrong the state is restored, which forgets the
+        right tokens too: they are ``pending``, and ride along with the next forward.
+        """
         sayable_V = self._may_end_V if exactly is None else self._is_text_V
         ids: list[int] = []
+        pending: list[int] = []
         end: int | None = None
-        while len(ids) != exactly:
-            logits_V = self._ponder.logits(hidden_H[None])[0]
-            token = int(logits_V.masked_fill(~sayable_V, float("-inf")).argmax())
+        (token,) = self._greedy(hidden_NH, sayable_V)
+        while True:
             if token in self._ends:
                 end = token
                 break
             if len(ids) == limit:
                 break
             ids.append(token)
-            hidden_H = context.append([token], self._ponder.embed([token]))[-1]
-            progress()
+            pending.append(token)
+            room = min(limit - len(ids), MAX_CHECKED_TOKENS - len(pending))
+            draft = self._draft.propose(ids, room) if room > 0 else ()
+            before_draft = context.save(context.before_draft) if draft else None
+            hidden_NH = yield self._append(context, [*pending, *draft], num_wanted=1 + len(draft))
+            said = self._greedy(hidden_NH, sayable_V)
+            num_right = next((i for i, guess in enumerate(draft) if guess != said[i]), len(draft))
+            ids += draft[:num_right]
+            token = said[num_right]
+            if before_draft is not None and num_right < len(draft):
+                context.restore(before_draft)
+                pending += draft[:num_right]
+            else:
+                pending = []
+        if pending:
+            yield self._append(context, pending, num_wanted=0)
         text = Text(
             kind=kind,
             text=self._ponder.format.vocabulary.decode(ids),
@@ -114,3 +139,11 @@ class TransitionWriter:
             truncated=end is None and exactly is None,
         )
         return text, end
+
+    def _append(self, context: Session, ids: Sequence[int], *, num_wanted: int) -> Append:
+        return Append(session=context, ids=ids, embeds_TH=self._ponder.embed(ids), num_wanted=num_wanted)
+
+    def _greedy(self, hidden_NH: Tensor, sayable_V: Tensor) -> list[int]:
+        """The most likely token that can be said after each of N."""
+        logits_NV = self._ponder.logits(hidden_NH).masked_fill(~sayable_V, float("-inf"))
+        return logits_NV.argmax(dim=-1).tolist()  # type: ignore[no-any-return]

@@ -1,0 +1,113 @@
+"""Several robots on one engine: each gets what it would get alone, in turn, and nobody pays for another's error."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ponder_server.contract import ContextFull, Fire, Frame, Opening, SessionError
+from ponder_server.engine import EngineConfig, QwenEngine
+from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.ponder_configs import tiny_cpu
+from ponderpounce.models.vocabulary import Vocabulary
+
+TOLERANCE = 1e-4
+PONDER = Ponder.random(replace(tiny_cpu(), image_px=(64, 64)), Vocabulary.tiny(), seed=1)
+CONFIG = EngineConfig(num_cameras=2, max_context_tokens=300, max_sessions=4, buckets=(1, 16, 64))
+ROBOTS = "abc"
+
+
+def frames(robot: str, query: int) -> tuple[Frame, Frame]:
+    first, second = np.random.default_rng((ord(robot), query)).integers(0, 256, (2, 64, 64, 3), dtype=np.uint8)
+    return first, second
+
+
+def opened(robots: str = ROBOTS, config: EngineConfig = CONFIG) -> QwenEngine:
+    engine = QwenEngine(PONDER, config)
+    for robot in robots:
+        engine.open(robot, Opening(instruction=f"press button {robot}"))
+    return engine
+
+
+def settle(engine: QwenEngine) -> dict[str, Fire | Exception | None]:
+    """Steps until nothing is owed; how each query ended, in that order."""
+    ended: dict[str, Fire | Exception | None] = {}
+    for _ in range(60):
+        for outcome in engine.step():
+            ended[outcome.session] = outcome.error or outcome.result
+    return ended
+
+
+def test_together_every_robot_gets_what_it_gets_alone() -> None:
+    alone, together = opened(), opened()
+    for query in range(3):
+        expected = {r: alone.fire(r, frames(r, query), force_text_tokens=(query * 4) or None) for r in ROBOTS}
+        for robot in ROBOTS:
+            together.begin(robot, frames(robot, query), force_text_tokens=(query * 4) or None)
+        ended = settle(together)
+        for robot in ROBOTS:
+            answer = ended[robot]
+            assert isinstance(answer, Fire)
+            assert answer.texts == expected[robot].texts
+            assert answer.context_tokens == expected[robot].context_tokens
+            np.testing.assert_allclose(answer.cognition, expected[robot].cognition, rtol=0, atol=TOLERANCE)
+
+
+def test_queries_begun_together_are_answered_by_one_forward() -> None:
+    engine = opened()
+    for robot in ROBOTS:
+        engine.begin(robot, frames(robot, 0))
+    assert [outcome.session for outcome in engine.step()] == list(ROBOTS)
+    assert engine.step() == []
+
+
+def test_a_query_that_comes_during_a_long_text_waits_for_one_forward_only() -> None:
+    engine = opened()
+    engine.begin("a", frames("a", 0), force_text_tokens=40)
+    engine.step()
+    engine.begin("b", frames("b", 0))
+    ended = [outcome.session for _ in range(2) for outcome in engine.step()]
+    assert ended == ["b"]
+
+
+def test_robots_take_turns_when_a_forward_has_one_row() -> None:
+    engine = opened(config=replace(CONFIG, max_batch_rows=1))
+    num_steps = {}
+    for robot, length in zip(ROBOTS, (9, 6, 3), strict=True):
+        engine.begin(robot, frames(robot, 0), force_text_tokens=length)
+    for step in range(1, 30):
+        num_steps |= {outcome.session: step for outcome in engine.step()}
+    # A text of n tokens takes n + 2 forwards: rounds of three robots, then of two, then of one.
+    assert num_steps == {"c": 3 * 5, "b": 3 * 5 + 2 * 3, "a": 3 * 5 + 2 * 3 + 3}
+
+
+def test_a_query_that_fails_does_not_touch_the_others() -> None:
+    engine = opened()
+    engine.begin("a", frames("a", 0), force_text_tokens=20)
+    engine.begin("b", frames("b", 0), force_text_tokens=300)  # does not fit beside its instruction
+    ended = settle(engine)
+    assert isinstance(ended["b"], ContextFull)
+    assert isinstance(ended["a"], Fire)
+    assert isinstance(engine.fire("b", frames("b", 0)), Fire)
+
+
+def test_a_session_thinks_about_one_query_at_a_time() -> None:
+    engine = opened()
+    engine.begin("a", frames("a", 0))
+    with pytest.raises(SessionError, match="'a' is thinking about a query already"):
+        engine.begin("a", frames("a", 1))
+    with pytest.raises(SessionError, match=r"\('a',\) are being thought about"):
+        engine.fire("b", frames("b", 0))
+
+
+def test_a_session_closed_while_it_thinks_is_forgotten() -> None:
+    engine = opened()
+    engine.begin("a", frames("a", 0), force_text_tokens=9)
+    engine.begin("b", frames("b", 0), force_text_tokens=9)
+    engine.step()
+    engine.begin("c", frames("c", 0))
+    engine.close("a")
+    engine.close("c")
+    assert list(settle(engine)) == ["b"]
+    engine.open("a", Opening(instruction="again"))
+    assert isinstance(engine.fire("a", frames("a", 0)), Fire)
