@@ -79,7 +79,8 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         self._spaces: dict[str, spaces.Space[Any]] = dict.fromkeys(CAMERAS if cameras else (), picture)
         self._spaces["state"] = _box(robot.state_low - slack, robot.state_high + slack)
         self.observation_space = spaces.Dict(self._spaces)
-        self.action_space = _box(robot.action_low, robot.action_high)
+        # Without a gripper the last entry moves nothing, and Gymnasium wants a space that is not flat.
+        self.action_space = _box(robot.action_low, np.append(robot.action_high[:7], 1.0))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
         """Starts an episode. Without a seed the next is drawn from the generator of the last one given.

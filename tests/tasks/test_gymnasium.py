@@ -44,7 +44,7 @@ def test_the_checker_is_content() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*we recommend using a symmetric and normalized space")
-@pytest.mark.parametrize("name", ["PickXtimes", "VideoUnmask"])
+@pytest.mark.parametrize("name", ["PickXtimes", "VideoUnmask", "PatternLock"])
 def test_the_checker_is_content_without_cameras(name: str) -> None:
     env = gymnasium.make(environment_id(name), cameras=False)
     check_env(env.unwrapped, skip_render_check=True)
