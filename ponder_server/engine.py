@@ -33,6 +33,7 @@ from ponder_server.contract import (
     no_progress,
 )
 from ponder_server.draft import Draft, NoDraft
+from ponder_server.prefixes import Prefixes
 from ponder_server.runner import BUCKETS, Append, Runner, Session
 from ponder_server.writer import Steps, TransitionWriter
 from ponderpounce.models.context import Segment
@@ -60,14 +61,17 @@ class EngineConfig:
     """Opening tokens per forward: more is faster, fewer lets ``progress`` be heard more often."""
     max_batch_rows: int = 8
     """Sessions that share a forward at most."""
+    max_prefixes: int = 2
+    """Demonstrations kept encoded for further episodes that begin with the same one."""
     buckets: tuple[int, ...] = BUCKETS
     """Lengths that a forward's rows are padded to, growing."""
 
     def __post_init__(self) -> None:
         for name in self.__slots__:
             value = getattr(self, name)
-            if isinstance(value, int) and value < 1:
-                raise ValueError(f"{name} is {value}; it must be at least 1.")
+            least = 0 if name == "max_prefixes" else 1
+            if isinstance(value, int) and value < least:
+                raise ValueError(f"{name} is {value}; it must be at least {least}.")
         if not self.buckets or self.buckets[0] < 1 or list(self.buckets) != sorted(set(self.buckets)):
             raise ValueError(f"buckets are {self.buckets}; they must be at least 1 and grow.")
 
@@ -116,6 +120,7 @@ class QwenEngine:
         )
         self._writer = TransitionWriter(ponder, draft or NoDraft(), max_text_tokens=config.max_text_tokens)
         self._query_ids = (*self._format.observation(config.num_cameras).ids, *self._format.carrier_ids)
+        self._prefixes = Prefixes(config.max_prefixes)
         self._begun: dict[str, _Query] = {}
         self._batch: Batch[Fire] = Batch(self._runner, max_rows=config.max_batch_rows)
 
@@ -144,19 +149,30 @@ class QwenEngine:
         if wanted > self._config.max_context_tokens:
             raise ContextFull(session=session, used=0, wanted=wanted, limit=self._config.max_context_tokens)
         context = self._runner.open(session)
-        frames = [frame for views in opening.demo_frames for frame in views]
         try:
-            for chunk in _chunks(segments, self._config.prefill_chunk_tokens):
-                ids = [token for segment in chunk for token in segment.ids]
-                num_images = sum(segment.num_images for segment in chunk)
-                context.append(ids, self._embed(ids, frames[:num_images]), num_wanted=0)
-                del frames[:num_images]
-                progress()
+            self._encode(context, opening, segments, progress)
         except BaseException:
             self._runner.close(context)
             raise
         self._episodes[session] = _Episode(context=context, owes_reasoning=opening.has_demo)
         return context.num_tokens
+
+    def _encode(self, context: Session, opening: Opening, segments: tuple[Segment, ...], progress: Progress) -> None:
+        """Fills an empty context: from an equal opening of before, or in a few large forwards."""
+        prefix = self._prefixes.find(opening) if opening.has_demo else None
+        if prefix is not None:
+            context.start_from(prefix)
+            progress()
+            return
+        frames = [frame for views in opening.demo_frames for frame in views]
+        for chunk in _chunks(segments, self._config.prefill_chunk_tokens):
+            ids = [token for segment in chunk for token in segment.ids]
+            num_images = sum(segment.num_images for segment in chunk)
+            context.append(ids, self._embed(ids, frames[:num_images]), num_wanted=0)
+            del frames[:num_images]
+            progress()
+        if opening.has_demo:
+            self._prefixes.keep(opening, context)
 
     def fire(
         self,

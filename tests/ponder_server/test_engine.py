@@ -1,5 +1,6 @@
 """The engine: a fire is one query of the training row, whatever path it took; errors leave no trace."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -104,6 +105,7 @@ def test_serving_regenerates_the_training_row(ponder: Ponder, engine: QwenEngine
     engine.open("a", WITH_DEMO)
     answers = [engine.fire("a", observation(query)) for query in range(len(SCRIPT))]
     assert context_of(engine, "a").ids == list(row.ids)
+    assert context_of(engine, "a").next_position == ponder.format.positions(row.ids)[1]
     assert [a.is_transition for a in answers] == [False, True, False, True]
     assert [(t.kind, t.token_ids, t.truncated) for t in answers[1].texts] == [
         ("demo_reasoning", REASONING, False),
@@ -247,6 +249,37 @@ def test_the_chunks_of_the_opening_do_not_matter(ponder: Ponder) -> None:
         engine.open("a", WITH_DEMO)
         answers.append(engine.fire("a", observation(0)).cognition)
     np.testing.assert_allclose(answers[1:], [answers[0]] * 2, rtol=0, atol=TOLERANCE)
+
+
+def test_a_demonstration_is_encoded_once_and_shared(ponder: Ponder, monkeypatch: pytest.MonkeyPatch) -> None:
+    engine = QwenEngine(ponder, CONFIG)
+    num_encoded = []
+    embed = ponder.embed
+
+    def count(ids: Sequence[int], frames: torch.Tensor | None = None) -> torch.Tensor:
+        num_encoded.append(len(ids))
+        return embed(ids, frames)
+
+    monkeypatch.setattr(ponder, "embed", count)
+    num_tokens = engine.open("a", WITH_DEMO)
+    assert sum(num_encoded) == num_tokens
+    first = engine.fire("a", observation(0))
+    num_encoded.clear()
+    assert engine.open("b", WITH_DEMO) == num_tokens
+    assert num_encoded == []
+    np.testing.assert_array_equal(engine.fire("b", observation(0)).cognition, first.cognition)
+    engine.open("c", replace(WITH_DEMO, demo_frames=(*DEMO[:-1], (frame(77),))))
+    assert len(num_encoded) > 1, "another demonstration must not be taken for this one"
+    assert np.abs(engine.fire("c", observation(0)).cognition - first.cognition).max() > TOLERANCE
+
+
+def test_a_long_demonstration_takes_a_few_forwards(ponder: Ponder) -> None:
+    """48 s of two views at 1 Hz; never frame by frame."""
+    engine = QwenEngine(ponder, replace(CONFIG, max_context_tokens=1000))
+    calls: list[int] = []
+    demo = tuple((frame(2 * i), frame(2 * i + 1)) for i in range(48))
+    assert engine.open("a", Opening(instruction="x", demo_frames=demo), lambda: calls.append(1)) > 48 * 2 * 6
+    assert len(calls) == 1
 
 
 def test_forced_text_has_exactly_so_many_plain_tokens(engine: QwenEngine) -> None:
