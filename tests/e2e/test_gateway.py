@@ -22,7 +22,7 @@ pytestmark = [
     pytest.mark.e2e,
     pytest.mark.sim,
     pytest.mark.slow,
-    pytest.mark.filterwarnings("ignore:connect.. must be used as a context manager:DeprecationWarning"),  # openpi-client
+    pytest.mark.filterwarnings("ignore:connect.. must be used as a context:DeprecationWarning"),  # openpi-client's
 ]
 
 NUM_REQUESTS, NUM_ROWS = 4, 10
