@@ -54,4 +54,7 @@ def perform(
             if part.is_recorded:
                 caption = captions.follow(caption, index, part.text, partial(look, part.grounds))
                 rows.append(Row(physics=physics.save(), caption=caption))
+        if part.afterwards is not None:
+            part.afterwards(physics)
+            physics.refresh()
     return tuple(rows), action

@@ -52,22 +52,19 @@ class Kinematics:
         self.tcp(qpos)
         return self._jacobian_here()
 
-    def solve(self, target: Array, start: Array) -> Array:
+    def solve(self, target: Array, start: Array, *, stopping_at_limits: bool = False) -> Array:
         """Returns joint angles (7,) near ``start`` (7,) that put the tool at ``target`` (4, 4).
 
-        Raises UnreachableError if 40 steps do not get within 0.01 mm and 1e-4 rad, or lead out of the joint limits.
+        With ``stopping_at_limits`` a joint that would leave its limits stays there, if the other six can do without
+        it. Raises UnreachableError if 40 steps do not get within 0.01 mm and 1e-4 rad, or lead out of the limits.
         """
-        qpos = start.copy()
-        for _ in range(_MAX_ITERATIONS):
-            here = self.tcp(qpos)
-            error = np.concatenate([target[:3, 3] - here[:3, 3], rotation_log(target[:3, :3] @ here[:3, :3].T)])
-            if np.abs(error[:3]).max() < _POSITION_TOLERANCE_M and np.abs(error[3:]).max() < _ROTATION_TOLERANCE_RAD:
-                break
-            J = self._jacobian_here()
-            qpos = qpos + J.T @ np.linalg.solve(J @ J.T + _DAMPING * np.eye(6), error)
-        else:
-            raise UnreachableError(f"the arm cannot reach {target[:3, 3].round(4)} m from {start.round(3)} rad")
-        beyond = np.maximum(panda.JOINT_LOW_RAD - qpos, qpos - panda.JOINT_HIGH_RAD)
+        qpos = self._descend(target, start, np.ones(len(start)))
+        if stopping_at_limits and _beyond_limits(qpos).max() > 0:
+            joint = int(_beyond_limits(qpos).argmax())
+            held = qpos.clip(panda.JOINT_LOW_RAD, panda.JOINT_HIGH_RAD)[joint]
+            is_free = np.arange(len(qpos)) != joint
+            qpos = self._descend(target, np.where(is_free, start, held), is_free.astype(np.float64))
+        beyond = _beyond_limits(qpos)
         if beyond.max() > 0:
             joint = int(beyond.argmax())
             raise UnreachableError(
@@ -76,17 +73,31 @@ class Kinematics:
             )
         return qpos
 
-    def screw_path(self, start: Array, target: Array, num_points: int) -> Array:
+    def screw_path(self, start: Array, target: Array, num_points: int, *, stopping_at_limits: bool = False) -> Array:
         """Returns joint angles (num_points, 7) along the constant screw from ``start`` (7,) to ``target`` (4, 4).
 
-        The first row is ``start``. Raises UnreachableError if a point of the way is.
+        The first row is ``start``. Raises UnreachableError if a point of the way is; see `solve`.
         """
         origin = self.tcp(start)
         twist = screw_log(np.linalg.inv(origin) @ target)
         path = [start]
         for fraction in np.linspace(0.0, 1.0, num_points)[1:]:
-            path.append(self.solve(origin @ screw_exp(fraction * twist), path[-1]))
+            path.append(
+                self.solve(origin @ screw_exp(fraction * twist), path[-1], stopping_at_limits=stopping_at_limits)
+            )
         return np.array(path)
+
+    def _descend(self, target: Array, start: Array, mobility: Array) -> Array:
+        """Damped least squares from ``start`` (7,); joints whose mobility (7,) is 0 stay, the others' is 1."""
+        qpos = start.copy()
+        for _ in range(_MAX_ITERATIONS):
+            here = self.tcp(qpos)
+            error = np.concatenate([target[:3, 3] - here[:3, 3], rotation_log(target[:3, :3] @ here[:3, :3].T)])
+            if np.abs(error[:3]).max() < _POSITION_TOLERANCE_M and np.abs(error[3:]).max() < _ROTATION_TOLERANCE_RAD:
+                return qpos
+            J = self._jacobian_here() * mobility
+            qpos = qpos + J.T @ np.linalg.solve(J @ J.T + _DAMPING * np.eye(6), error)
+        raise UnreachableError(f"the arm cannot reach {target[:3, 3].round(4)} m from {start.round(3)} rad")
 
     def overlap_m(self, world: Any, qpos: Array, ignored_body: str) -> float:
         """Returns how deep the arm would cut into things at joint angles (7,) with open fingers; 0 if it has room.
@@ -107,3 +118,8 @@ class Kinematics:
         mujoco.mj_comPos(self._model, self._scratch)  # mj_jacSite reads what it computes
         mujoco.mj_jacSite(self._model, self._scratch, self._jacobian[:3], self._jacobian[3:], self._tcp)
         return self._jacobian[:, self._dof]
+
+
+def _beyond_limits(qpos: Array) -> Array:
+    """How far joint angles (7,) are out of their limits [rad]; negative within."""
+    return np.maximum(panda.JOINT_LOW_RAD - qpos, qpos - panda.JOINT_HIGH_RAD)

@@ -35,6 +35,10 @@ _SWING_M = 0.10
 _TIP_M = 0.07  # of the stick, over what it points at
 _ARC_POINTS, _ARC_PAUSE = 45, 5  # control steps
 _MISS_M, _MISS_CONTAINER_M = 0.04, 0.035
+_BAR_LIFTS_M = (0.20, 0.16, 0.13)  # a bar counts as lifted above 0.10
+_PUSH_FROM_M, _PUSH_SHORT_M, _PUSH_BACK_M = 0.05, 0.02, 0.02  # of the tool: behind the body, before the target
+_HOOK_FROM_M, _HOOK_SHORT_M, _HOOK_ASIDE_M, _HOOK_ABOVE_M = 0.1, 0.03, 0.1, 0.1
+_MIDDLE_M = (-0.15, 0.0, 0.25)  # from here the arm gets nearly everywhere
 _QUARTERS = ((1, 0), (0, 1), (0, -1), (-1, 0))  # cosine and sine of 0, 90, -90 and 180 degrees
 _LEFT = np.array([0.0, 1.0, 0.0])
 _DOWN = np.array([0.0, 0.0, -1.0])
@@ -64,7 +68,7 @@ class Motions:
 
     def move(self, target: Array) -> Actions:
         """Moves the tool along a straight screw to a transform (4, 4). Raises UnreachableError, before moving."""
-        path = self._kinematics.screw_path(self._physics.arm_qpos(), target, _PATH_POINTS)
+        path = self._kinematics.screw_path(self._physics.arm_qpos(), target, _PATH_POINTS, stopping_at_limits=True)
         quickest = timing.fastest(path, max_speed=self._max_speed_rad_s, max_acceleration=MAX_ACCELERATION_RAD_S2)
         for qpos in timing.sample(path, quickest, 1 / CONTROL_HZ):
             yield self._action(qpos)
@@ -138,6 +142,11 @@ class Motions:
         yield from self.open()
         yield from self.move(_at(here, x_m, y_m, _ABOVE_M))
 
+    def let_go(self) -> Actions:
+        """Opens the gripper where it is and comes straight up."""
+        yield from self.open()
+        yield from self.move(_at_height(self._physics.tcp_transform(), _ABOVE_M))
+
     def place(self, target: str) -> Actions:
         """Carries what is held over a target, sets it down there and comes back up."""
         yield from self.place_at(*self._physics.position_m(target))
@@ -191,10 +200,84 @@ class Motions:
             yield self._action(qpos)
         yield from self._stay_at(path[-1], _ARC_PAUSE)
 
+    def pick_bar(self, end: str, onward: Sequence[Array] = ()) -> Actions:
+        """Grasps a lying bar from above across one of its ends, and lifts it as high as the arm can there.
+
+        ``onward`` are poses (4, 4) that the end will be carried to. The bar is grasped the way round that leads there.
+        """
+        yield from self.open()
+        lying = transform(self._physics.pose(end))
+        grasps = [_at(_tool(side * lying[:3, 1]), *lying[:3, 3]) for side in (-1.0, 1.0)]
+        above, grasp, *_ = self._first_way(
+            [
+                [_at_height(grasp, height_m), grasp, _at_height(grasp, height_m), *way]
+                for height_m in _BAR_LIFTS_M
+                for grasp in grasps
+                for way in _ways_of_carrying(lying, grasp, onward)
+            ]
+        )
+        yield from self.move(above)
+        yield from self.move(grasp)
+        yield from self.close()
+        yield from self.move(above)
+        yield from self.close()
+
+    def carry(self, body: str, poses: Sequence[Array]) -> Actions:
+        """Carries a held body to poses (4, 4), one after another, however it lies in the hand."""
+        way = self._first_way(
+            _ways_of_carrying(transform(self._physics.pose(body)), self._physics.tcp_transform(), poses)
+        )
+        for detour in way[: -len(poses)]:
+            yield from self.move(detour)
+        for pose in poses:
+            in_hand = np.linalg.inv(transform(self._physics.pose(body))) @ self._physics.tcp_transform()
+            yield from self.move(pose @ in_hand)
+
+    def push(self, body: str, target: str) -> Actions:
+        """Pushes a body over the table onto a target with the closed gripper, and opens it there."""
+        start_m, ahead, left = self._straight_to(body, target)
+        start_m -= _PUSH_FROM_M * ahead
+        end_m = self._physics.position_m(target) - _PUSH_SHORT_M * ahead
+        end_m[2] = start_m[2]
+        tools = sorted((_tool(left), _tool(-left)), key=lambda T: -float(T[0, 0]))  # rather facing away from the robot
+        above, behind, _ = self._first_way(
+            [[_at_height(_at(T, *start_m), _ABOVE_M), _at(T, *start_m), _at(T, *end_m)] for T in tools]
+        )
+        yield from self.open()
+        yield from self.move(above)
+        yield from self.move(behind)
+        yield from self.close()
+        yield from self.move(_at(behind, *end_m))
+        yield from self.move(_at(behind, *(end_m - _PUSH_BACK_M * ahead)))  # opening fingers would kick the body
+        yield from self.open()
+
+    def hook(self, end: str, body: str, target: str) -> Actions:
+        """Draws a body over the table onto a target with a bar held at one end, and lets go of the bar there."""
+        yield from self.carry(end, self.hooking(body, target))
+        yield from self.open()
+
+    def hooking(self, body: str, target: str) -> list[Array]:
+        """Where (4, 4) the tail of a bar is carried to draw a body onto a target: above, down behind it, and along.
+
+        The bar lies across the way; the hand stays on the robot's side of it.
+        """
+        start_m, ahead, left = self._straight_to(body, target)
+        across = left if left[0] > 0 else -left
+        behind = _at(_lying(across), *(start_m - _HOOK_FROM_M * ahead - _HOOK_ASIDE_M * across))
+        end_m = self._physics.position_m(target) - _HOOK_SHORT_M * ahead - _HOOK_ASIDE_M * across
+        return [_at_height(behind, _HOOK_ABOVE_M), behind, _at(behind, end_m[0], end_m[1], start_m[2])]
+
     def open_at(self, target: Array) -> Actions:
         """Moves the tool to a transform (4, 4), then opens the gripper there."""
         yield from self.move(target)
         yield from self.open()
+
+    def _straight_to(self, body: str, target: str) -> tuple[Array, Array, Array]:
+        """Where a body is (3,), and the unit directions (3,) straight ahead to a target and to the left of that."""
+        start_m = self._physics.position_m(body)
+        ahead = (self._physics.position_m(target) - start_m) * [1.0, 1.0, 0.0]
+        ahead /= np.linalg.norm(ahead)
+        return start_m, ahead, np.cross(-_DOWN, ahead)
 
     def _grasp(self, body: str, *, from_z_m: float, grasp_z_m: float, miss_m: float) -> Actions:
         yield from self.open()
@@ -264,14 +347,26 @@ class Motions:
 
     def _first_reachable(self, targets: Sequence[Array]) -> Array:
         """The first transform (4, 4) that a straight screw from here leads to. Raises UnreachableError if none does."""
+        return self._first_way([[target] for target in targets])[0]
+
+    def _first_way(self, ways: Sequence[Sequence[Array]]) -> Sequence[Array]:
+        """The first sequence of transforms (4, 4) that straight screws lead along. Raises UnreachableError if none.
+
+        Ways on which a joint has to stop at its limit are looked at when all others have failed.
+        """
         failures = []
-        for target in targets:
-            try:
-                self._kinematics.screw_path(self._physics.arm_qpos(), target, _PATH_POINTS)
-            except UnreachableError as error:
-                failures.append(str(error))
-                continue
-            return target
+        for stopping_at_limits in (False, True):
+            for way in ways:
+                qpos = self._physics.arm_qpos()
+                try:
+                    for target in way:
+                        qpos = self._kinematics.screw_path(
+                            qpos, target, _PATH_POINTS, stopping_at_limits=stopping_at_limits
+                        )[-1]
+                except UnreachableError as error:
+                    failures.append(str(error))
+                    continue
+                return way
         raise UnreachableError("no straight way leads there: " + "; ".join(failures))
 
     def _action(self, qpos: Array) -> NDArray[np.float32]:
@@ -297,3 +392,19 @@ def _at(T: Array, x_m: float, y_m: float, z_m: float) -> Array:
     moved = T.copy()
     moved[:3, 3] = x_m, y_m, z_m
     return moved
+
+
+def _lying(along: Array) -> Array:
+    """A transform (4, 4) at the origin, upright and with its x axis along a horizontal unit direction (3,)."""
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([along, np.cross(-_DOWN, along), -_DOWN])
+    return T
+
+
+def _ways_of_carrying(body: Array, tool: Array, poses: Sequence[Array]) -> list[list[Array]]:
+    """Where the tool (4, 4) goes so that a body held by it comes to poses (4, 4): straight, or by way of the middle."""
+    targets = [pose @ np.linalg.inv(body) @ tool for pose in poses]
+    if not targets:
+        return [[]]
+    detours: tuple[list[Array], ...] = ([], [_at(targets[0], *_MIDDLE_M)], [_at(_tool(-_LEFT), *_MIDDLE_M)])
+    return [[*detour, *targets] for detour in detours]

@@ -90,7 +90,7 @@ class Physics:
         self._set_pose(name, pose(x_m, *_PARK_XYZ_M[1:]))
         if body.mocapid[0] < 0:
             # An upward push equal to its weight; unlike model.body_gravcomp it is part of the saved state.
-            self.data.xfrc_applied[body.id, :3] = -body.mass[0] * self.model.opt.gravity
+            self.data.xfrc_applied[body.id, :3] = -self.model.body_subtreemass[body.id] * self.model.opt.gravity
 
     def paint(self, geom: str, rgba: RGBA) -> None:
         """Colours a geom until the next `reset`."""

@@ -13,6 +13,8 @@ _PICKED_Z_M = 0.05
 _DROPPED_Z_M = 0.035  # upstream's data-recording wrapper is laxer (0.2); evaluation, and we, use this one
 _PRESSED_M = 0.005
 _ONTO_M = 0.05
+_PUSHED_ONTO_M = 0.048
+_END_LIFTED_Z_M, _INSERTED_M = 0.1, 0.05
 _HOVER_M, _HOVER_Z_M = 0.03, 0.2
 _AWAY_M = _OPEN_M = 0.02
 _STILL_RAD_S = 0.2
@@ -57,7 +59,31 @@ def is_dropped_onto(physics: Physics, cube: str, place: str) -> bool:
 def is_let_go(physics: Physics, body: str) -> bool:
     """Both fingers are open by more than 2 cm and the tool point is more than 2 cm away from the body's centre."""
     away_m = np.linalg.norm(physics.tcp_transform()[:3, 3] - physics.position_m(body))
-    return bool(physics.finger_openings_m().min() > _OPEN_M and away_m > _AWAY_M)
+    return is_gripper_open(physics) and bool(away_m > _AWAY_M)
+
+
+def is_pushed_onto(physics: Physics, body: str, place: str) -> bool:
+    """Seen from above, the body's centre is at most 4.8 cm from the place's."""
+    return is_near(physics, body, place, _PUSHED_ONTO_M)
+
+
+def is_gripper_open(physics: Physics) -> bool:
+    """Both fingers are open by more than 2 cm."""
+    return bool(physics.finger_openings_m().min() > _OPEN_M)
+
+
+def is_lifted_by(physics: Physics, end: str, other_end: str) -> bool:
+    """An end of a bar is more than 10 cm above the table and nearer to the tool point than the other one."""
+    tool_m, end_m = physics.tcp_transform()[:3, 3], physics.position_m(end)
+    is_nearer = np.linalg.norm(end_m - tool_m) < np.linalg.norm(physics.position_m(other_end) - tool_m)
+    return bool(end_m[2] > _END_LIFTED_Z_M and is_nearer)
+
+
+def is_inserted(physics: Physics, end: str, other_end: str, box: str) -> bool:
+    """An end of a bar is less than 5 cm from a box's centre, and nearer to it than the other end."""
+    box_m = physics.position_m(box)
+    inside_m, outside_m = (float(np.linalg.norm(physics.position_m(name) - box_m)) for name in (end, other_end))
+    return inside_m < min(_INSERTED_M, outside_m)
 
 
 def is_hovering(physics: Physics, button: str) -> bool:

@@ -61,6 +61,7 @@ class Shown:
     motion: Callable[[Motions], Iterator[NDArray[np.float32]]]
     grounds: tuple[str, ...] = ()  # as in a subtask
     is_recorded: bool = True  # False: it happens, but the video leaves it out
+    afterwards: Callable[[Physics], None] | None = None  # what is moved in the scene when the part is over
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,7 +75,8 @@ class Reasoning:
 class Task(ABC, Generic[LayoutT, MemoryT]):
     """One kind of episode. Subclasses carry `@task(family=...)`, one file each.
 
-    All methods but `furnish`, `arrange` and `stage` are pure functions of their arguments.
+    All methods but `furnish`, `arrange` and `stage` are pure functions of their arguments. Of a demonstration's parts
+    only `Shown.afterwards` changes the physics.
     """
 
     name: ClassVar[str]

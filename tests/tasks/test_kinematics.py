@@ -82,3 +82,18 @@ def test_a_joint_beyond_its_limit_is_refused(arm: Kinematics) -> None:
     turned[6] = panda.JOINT_HIGH_RAD[6] + 0.2
     with pytest.raises(UnreachableError, match=r"turns joint 7 to 3\.\d+ rad"):
         arm.solve(arm.tcp(turned), turned)
+
+
+@given(yaw_rad=st.floats(-2.3, -2.17))
+@settings(max_examples=20, deadline=None)
+def test_a_joint_can_stop_at_its_limit_while_the_others_reach(arm: Kinematics, yaw_rad: float) -> None:
+    target = arm.tcp(panda.HOME_QPOS)
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    target[:3, :3] = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ target[:3, :3]
+    target[:3, 3] = 0.0, 0.0, 0.2
+    with pytest.raises(UnreachableError, match="turns joint 7 to"):
+        arm.screw_path(panda.HOME_QPOS, target, 30)
+    path = arm.screw_path(panda.HOME_QPOS, target, 30, stopping_at_limits=True)
+    assert np.all(path >= panda.JOINT_LOW_RAD)
+    assert np.all(path <= panda.JOINT_HIGH_RAD)
+    np.testing.assert_allclose(arm.tcp(path[-1]), target, atol=2e-4)
