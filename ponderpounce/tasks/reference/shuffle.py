@@ -14,7 +14,7 @@ import numpy as np
 from ponderpounce.tasks import predicates, swaps
 from ponderpounce.tasks.captions import letter
 from ponderpounce.tasks.geometry import Spot, transform
-from ponderpounce.tasks.oracle import REST_XYZ_M
+from ponderpounce.tasks.oracle import REST_XYZ_M, Actions, Motions
 from ponderpounce.tasks.physics import Physics
 from ponderpounce.tasks.swaps import SWAP_STEPS, Swap
 
@@ -31,6 +31,12 @@ class Rest:
     num_steps: int = 0
     first_swap_step: int | None = None
     spots: tuple[Spot, ...] = ()
+
+
+def rest(motions: Motions) -> Actions:
+    """What a demonstration does before things move: the arm rests where it hides nothing, and long enough."""
+    yield from motions.rest()
+    yield from motions.wait(REST_STEPS)
 
 
 def watch(before: Rest | None, physics: Physics, names: Sequence[str]) -> Rest | None:
@@ -55,7 +61,7 @@ def watch(before: Rest | None, physics: Physics, names: Sequence[str]) -> Rest |
 
 def move(
     physics: Physics,
-    rest: Rest | None,
+    rested: Rest | None,
     names: Sequence[str],
     pairs: Sequence[Swap],
     *,
@@ -67,11 +73,11 @@ def move(
 
     Before and after that nothing is touched. ``lane_m`` is as in `swaps.spots_after`, ``z_m`` their origins' height.
     """
-    if rest is None or rest.first_swap_step is None or not pairs:
+    if rested is None or rested.first_swap_step is None or not pairs:
         return
-    elapsed_steps = step - rest.first_swap_step
+    elapsed_steps = step - rested.first_swap_step
     if 0 <= elapsed_steps <= SWAP_STEPS * len(pairs):
-        for name, spot in zip(names, swaps.spots_after(rest.spots, pairs, elapsed_steps, lane_m), strict=True):
+        for name, spot in zip(names, swaps.spots_after(rested.spots, pairs, elapsed_steps, lane_m), strict=True):
             physics.place(name, spot.pose(z_m))
         physics.refresh()
 

@@ -34,7 +34,7 @@ from ponderpounce.tasks.placing import (
 )
 from ponderpounce.tasks.props import PURPLE, TARGET_RADIUS_M, TARGET_THICKNESS_M, add_target
 from ponderpounce.tasks.reference import shuffle
-from ponderpounce.tasks.reference.shuffle import REST_STEPS, Rest
+from ponderpounce.tasks.reference.shuffle import Rest
 from ponderpounce.tasks.scene import CUBE_COLORS, SceneFullError, add_button, add_cube
 from ponderpounce.tasks.swaps import Swap
 from ponderpounce.tasks.task import Reasoning, Shown, Subtask, Task
@@ -128,7 +128,7 @@ class VideoPlace(Task[Layout, Rest | None]):
                 text="drop the cube onto table",
                 motion=lambda motions: motions.place_at(*layout.parking_xy_m, _ASIDE_RELEASE_Z_M),
             ),
-            Shown(text="static", motion=_rest),
+            Shown(text="static", motion=shuffle.rest),
             Shown(text="static", motion=lambda motions: motions.wait(_HOLD_STEPS)),
             Shown(text="NO RECORD", motion=lambda motions: motions.go_home(), is_recorded=False),
         )
@@ -225,11 +225,6 @@ def _place(target: str) -> Callable[[Motions], Actions]:
 
 def _press(motions: Motions) -> Actions:
     yield from motions.press(_BUTTON)
-
-
-def _rest(motions: Motions) -> Actions:
-    yield from motions.rest()
-    yield from motions.wait(REST_STEPS)
 
 
 def _wrong_cube(layout: Layout) -> Callable[[Physics, Rest | None], str | None]:

@@ -35,7 +35,7 @@ from ponderpounce.tasks.placing import (
     until_it_fits,
 )
 from ponderpounce.tasks.reference import shuffle
-from ponderpounce.tasks.reference.shuffle import REST_STEPS, Rest
+from ponderpounce.tasks.reference.shuffle import Rest
 from ponderpounce.tasks.scene import CUBE_COLORS, CUBE_HALF_M, SceneFullError, add_button, add_cube
 from ponderpounce.tasks.swaps import SWAP_STEPS, Swap
 from ponderpounce.tasks.task import Reasoning, Shown, Subtask, Task, task
@@ -112,7 +112,7 @@ class VideoRepick(Task[Layout, Memory]):
             Shown(text="drop the cube on the table", motion=_put_down(_SHOWN_RELEASE_Z_M)),
         ]
         if layout.swaps:
-            parts.append(Shown(text="static", motion=_rest))
+            parts.append(Shown(text="static", motion=shuffle.rest))
             parts += [Shown(text="static", motion=lambda motions: motions.wait(SWAP_STEPS)) for _ in layout.swaps]
         parts.append(Shown(text="NO RECORD", motion=lambda motions: motions.go_home(), is_recorded=False))
         return tuple(parts)
@@ -237,11 +237,6 @@ def _pick(cube: str) -> Callable[[Motions], Actions]:
 
 def _put_down(release_z_m: float) -> Callable[[Motions], Actions]:
     return lambda motions: motions.put_down(release_z_m)
-
-
-def _rest(motions: Motions) -> Actions:
-    yield from motions.rest()
-    yield from motions.wait(REST_STEPS)
 
 
 def _mishap(layout: Layout, steps_since_set: Callable[[Memory], int | None]) -> Callable[[Physics, Memory], str | None]:
