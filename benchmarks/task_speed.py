@@ -20,6 +20,8 @@ import tyro
 from benchmarks.report import Report, Row, show
 from ponderpounce.tasks.task import task_names
 
+_PEER_KEYS = ("simulated_s", "wall_s", "cpu_s")
+_OUR_KEYS = ("stepped_s", "step_wall_s", "step_cpu_s")
 LOOK_HZ = {0: "no pictures", 4: "two cameras at 1 Hz + 4 Hz", 20: "two cameras at 20 Hz"}
 
 
@@ -62,15 +64,21 @@ def row_of(name: str, episodes: list[dict[str, Any]]) -> Row:
     }
 
 
-def step_row(name: str, simulated_s: float, wall_s: float, peer_rate: float | None) -> Row:
-    rate = simulated_s / wall_s
-    return {
+def step_row(name: str, runs: list[dict[str, Any]], keys: tuple[str, str, str], peer: Row | None) -> Row:
+    """One row; ``keys`` name simulated, wall and processor seconds, ``peer`` is the row to compare with."""
+    simulated_s, wall_s, cpu_s = (sum(run[key] for run in runs) for key in keys)
+    steps = round(simulated_s * 20)
+    row: Row = {
         "step": name,
-        "steps": round(simulated_s * 20),
-        "wall_ms_per_step": round(wall_s * 1e3 / (simulated_s * 20), 2),
-        "simulated_s_per_wall_s": round(rate, 2),
-        "times_robosuite": None if peer_rate is None else round(rate / peer_rate, 1),
+        "steps": steps,
+        "wall_ms_per_step": round(wall_s * 1e3 / steps, 2),
+        "cpu_ms_per_step": round(cpu_s * 1e3 / steps, 2),
     }
+    for what in ("wall", "cpu"):
+        theirs = None if peer is None else float(peer[f"{what}_ms_per_step"] or 0)
+        ours = float(row[f"{what}_ms_per_step"] or 0)
+        row[f"robosuite_takes_times_{what}"] = None if theirs is None else round(theirs / ours, 1)
+    return row
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -100,13 +108,11 @@ def main(argv: list[str] | None = None) -> int:
     report.add_table("The same by task, no pictures", [row_of(task, ours[task, 0]) for task in tasks])
     rows: list[Row] = []
     for hz in (0, 20):
-        peer_rate = None
+        peer_row = None
         if peers[hz > 0]:
-            simulated_s, wall_s = (sum(e[what] for e in peers[hz > 0]) for what in ("simulated_s", "wall_s"))
-            peer_rate = simulated_s / wall_s
-            rows.append(step_row(f"robosuite Lift, {LOOK_HZ[hz]}", simulated_s, wall_s, peer_rate))
-        simulated_s, wall_s = (sum(e[what] for e in by_rate[hz]) for what in ("stepped_s", "step_wall_s"))
-        rows.append(step_row(f"ours, {LOOK_HZ[hz]}", simulated_s, wall_s, peer_rate))
+            peer_row = step_row(f"robosuite Lift, {LOOK_HZ[hz]}", peers[hz > 0], _PEER_KEYS, None)
+            rows.append(peer_row)
+        rows.append(step_row(f"ours, {LOOK_HZ[hz]}", by_rate[hz], _OUR_KEYS, peer_row))
     report.add_table("env.step alone", rows)
     report.notes += [
         "Every process is pinned to one core; pictures are rendered in software, so a GPU would change these numbers.",

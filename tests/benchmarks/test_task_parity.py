@@ -55,4 +55,7 @@ def test_speeds_are_sums_over_sums() -> None:
     row = row_of("ours", [episode, episode | {"wall_s": 4.0}])
     assert (row["simulated_s_per_wall_s"], row["simulated_s_per_cpu_s"], row["slowest_episode"]) == (4.0, 20.0, 2.5)
     assert row["episodes_per_hour"] == 1440
-    assert step_row("ours", 10.0, 2.0, peer_rate=0.5)["times_robosuite"] == 10.0
+    peer = step_row("theirs", [episode], ("simulated_s", "wall_s", "cpu_s"), None)
+    assert (peer["wall_ms_per_step"], peer["robosuite_takes_times_wall"]) == (5.0, None)
+    ours = step_row("ours", [episode | {"wall_s": 0.5}], ("simulated_s", "wall_s", "cpu_s"), peer)
+    assert (ours["robosuite_takes_times_wall"], ours["robosuite_takes_times_cpu"]) == (2.0, 1.0)
