@@ -26,7 +26,7 @@ from protocol import images
 from protocol import messages as m
 from protocol.errors import CallFailed, MalformedMessage, TransportError
 from protocol.link import Link, Stream, is_of_episode
-from protocol.topics import ACTION, CHUNK, CLOSE, OBSERVATION, OPEN, TICK, alive_key
+from protocol.topics import ACTION, CHUNK, CLOSE, HEALTH, OBSERVATION, OPEN, TICK, alive_key
 from sim_client.episode import CLOCK_SILENCE_NS
 from sim_client.gateway.body import Body
 from sim_client.gateway.exchange import Answer, Finish, Frames, Refused, Step
@@ -45,6 +45,7 @@ _ASK_AGAIN_NS = 200_000_000
 _LAST_TICKS_NS = 1_000_000_000
 _IDLE_NS = 20_000_000
 _LIVE_TURN_NS = 2_000_000  # a request cannot ring the bus's bell
+_MISSHAPEN = "wrong_shape"  # the servers' own word in Health.dropped
 _STOPPED = "the gateway was stopped"
 T = TypeVar("T")
 
@@ -105,6 +106,8 @@ class Machine:
         self._actions = link.subscribe(ACTION)
         self._accounts = link.subscribe(TICK)
         self._chunks = link.subscribe(CHUNK)
+        self._healths = link.subscribe(HEALTH)
+        self._misshapen: dict[str, int] = {}  # by server: observations it had dropped for their shape at the beginning
         self._session = f"{_id_of(plan.suite)}-{secrets.token_hex(4)}"
         self._num_episodes = 0
         self._episode: _Episode | None = None
@@ -216,8 +219,8 @@ class Machine:
                 return answer
             if time.monotonic_ns() - asked_ns > self._plan.patience_ns:
                 self._give_up(episode, f"no command within {self._plan.patience_ns / 1e9:.0f} s")
-            if dead := self._check_servers():
-                self._give_up(episode, dead)
+            if why := self._check_servers() or self._objection():
+                self._give_up(episode, why)
             if self._should_stop():
                 raise Refused(_STOPPED)
             self._turn(_IDLE_NS)
@@ -239,7 +242,9 @@ class Machine:
         answer = episode.node.answer()
         silent_ns = episode.clock.now_ns() - episode.heard_ns
         limit_ns = self._plan.patience_ns if answer is None else CLOCK_SILENCE_NS
-        why = episode.node.over() or (f"no command for {silent_ns / 1e6:.0f} ms" if silent_ns > limit_ns else "")
+        why = episode.node.over() or self._objection()
+        if not why and silent_ns > limit_ns:
+            why = f"no command for {silent_ns / 1e6:.0f} ms"
         waiting, self._waiting = (self._waiting, []) if answer is not None or why else ([], self._waiting)
         for future in waiting:
             if answer is not None:
@@ -249,6 +254,14 @@ class Machine:
         if why:
             episode.over = why
             self._end(m.TaskStatus.ABORTED, why, keep=episode)
+
+    def _objection(self) -> str:
+        """A sentence if a server drops what it is shown: it was built for other pictures or joints."""
+        for health in self._healths.drain():
+            if health.dropped.get(_MISSHAPEN, 0) > self._misshapen.get(health.header.proc, 0):
+                proc = health.header.proc
+                return f"{proc} was built for other pictures, and says in its log for which. See --image-px"
+        return ""
 
     def _take_background(self, node: Node) -> None:
         """What a promise is made of: the accounts of ticks, and chunks."""
@@ -312,6 +325,8 @@ class Machine:
             raise
         for stale in (self._actions, self._accounts, self._chunks):
             stale.drain()
+        for health in self._healths.drain():
+            self._misshapen[health.header.proc] = health.dropped.get(_MISSHAPEN, 0)
         episode.clock, episode.heard_ns = MonotonicClock(), 0
         log.info("episode=%s client=%r demo=%d log=%s", info.header.episode, client, len(demo), path)
         for warning in warnings:

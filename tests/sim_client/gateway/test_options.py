@@ -1,0 +1,131 @@
+"""What ``pp-gateway`` is told on its command line: what fits together, and what is refused before anybody connects."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from protocol.errors import TransportError
+from protocol.messages import DelayKind, Mode
+from sim_client.gateway.body import PANDA, read_body
+from sim_client.gateway.options import GatewayOptions
+
+ROBOT = """
+name = "arm"
+command_low = [-1.0, -1.0]
+command_high = [1.0, 0.5]
+max_step = [0.1, 0.0]
+cameras = ["front"]
+num_proprio = 3
+is_simulated = true
+"""
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"rows": 21}, "--rows 21.*20 rows"),
+        ({"rows": 0}, "--rows 0"),
+        ({"dialect": "vla-eval", "rows": 5}, "plays one row"),
+        ({"rows": 8, "invoke_every_ticks": 20}, "no multiple of --rows 8"),
+        ({"listen": "8000"}, "expected HOST:PORT"),
+        ({"listen": "127.0.0.1:99999"}, "expected HOST:PORT"),
+        ({"listen": "0.0.0.0:8000"}, "can be reached from other hosts"),
+        ({"listen": "robot.example:8000"}, "can be reached from other hosts"),
+        ({"dialect": "vla-eval", "api_key_file": Path("key")}, "vla-eval sends no key"),
+        ({"cameras": ("front",)}, "expected NAME=KEY"),
+    ],
+)
+def test_what_cannot_work_is_refused(options: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(TransportError, match=sentence):
+        GatewayOptions(**({"dialect": "openpi"} | options)).check()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"rows": 10},
+        {"rows": 5, "invoke_every_ticks": 10},
+        {"rows": 7, "mode": "realtime"},
+        {"listen": "[::1]:8000"},
+        {"listen": "localhost:8000"},
+        {"listen": "0.0.0.0:8000", "open_to_anyone": True},
+        {"listen": "0.0.0.0:8000", "api_key_file": Path("key")},
+        {"cameras": ("front=image", "wrist=images/hand")},
+    ],
+)
+def test_what_works_is_accepted(options: dict[str, Any]) -> None:
+    GatewayOptions(**({"dialect": "openpi"} | options)).check()
+
+
+@pytest.mark.parametrize(
+    ("dialect", "rows", "every_ticks"), [("openpi", 1, 20), ("challenge", 20, 20), ("challenge-http", 20, 20)]
+)
+def test_by_default_pounce_is_asked_as_in_the_paper(dialect: Any, rows: int, every_ticks: int) -> None:
+    options = GatewayOptions(dialect=dialect)
+    schedule = options.schedule(7)
+    assert (options.terms().rows, schedule.invoke_period_ticks, schedule.seed) == (rows, every_ticks, 7)
+    assert (schedule.mode, schedule.query_delay.mean_ns) == (Mode.LOCKSTEP, 300_000_000)
+
+
+def test_a_client_that_plays_fewer_rows_gets_chunks_as_often() -> None:
+    assert GatewayOptions(dialect="challenge", rows=16).schedule(0).invoke_period_ticks == 16
+
+
+def test_in_real_time_delays_are_measured() -> None:
+    schedule = GatewayOptions(dialect="vla-eval", mode="realtime").schedule(0)
+    assert (schedule.mode, schedule.query_delay.kind, schedule.invoke_period_ticks) == (
+        Mode.REALTIME,
+        DelayKind.MEASURED,
+        10,
+    )
+
+
+def test_a_key_file_must_hold_a_word(tmp_path: Path) -> None:
+    file = tmp_path / "key"
+    with pytest.raises(TransportError, match="No such file"):
+        GatewayOptions(dialect="openpi", api_key_file=file).api_key()
+    file.write_text("\n")
+    with pytest.raises(TransportError, match="expected one word"):
+        GatewayOptions(dialect="openpi", api_key_file=file).api_key()
+    file.write_text("open sesame\n")
+    assert GatewayOptions(dialect="openpi", api_key_file=file).api_key() == "open sesame"
+
+
+def test_the_panda_holds_where_it_is_until_its_first_command() -> None:
+    state = np.append(np.full(7, 0.3), 0.04).astype(np.float32)
+    robot = PANDA.describe(state, (224, 224))
+    assert (robot.image_height, robot.image_width, robot.num_proprio) == (224, 224, PANDA.num_proprio)
+    assert robot.initial_command.tolist() == pytest.approx([0.3] * 7 + [1.0])
+
+
+def test_a_robot_can_be_told_by_a_file(tmp_path: Path) -> None:
+    file = tmp_path / "robot.toml"
+    file.write_text(ROBOT)
+    body = read_body(file)
+    robot = body.describe(np.array([0.4, 0.9, 5.0], np.float32), (48, 64))
+    assert (body.num_proprio, robot.action_dim, robot.cameras) == (3, 2, ("front",))
+    assert robot.initial_command.tolist() == pytest.approx([0.4, 0.5])  # within the limits
+    file.write_text(ROBOT + "initial_command = [0.0, 0.1]\n")
+    assert read_body(file).describe(np.ones(3, np.float32), (1, 1)).initial_command.tolist() == pytest.approx([0, 0.1])
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("name = ", "robot.toml"),
+        (ROBOT.replace("max_step", "max_stop"), "expected .*max_step"),
+        (ROBOT.replace("[0.1, 0.0]", "[0.1]"), "max_step"),
+        (ROBOT.replace("[1.0, 0.5]", "[-2.0, 0.5]"), "command_low"),
+        (ROBOT.replace("num_proprio = 3", 'num_proprio = "three"'), "robot.toml"),
+    ],
+)
+def test_a_file_that_describes_no_robot_is_refused(tmp_path: Path, text: str, sentence: str) -> None:
+    file = tmp_path / "robot.toml"
+    file.write_text(text)
+    with pytest.raises(TransportError, match=sentence):
+        read_body(file)
