@@ -71,9 +71,7 @@ class PatternLock(Task[Layout, Touches]):
     robot = PANDA_STICK
 
     def furnish(self, spec: mujoco.MjSpec) -> None:
-        for button in _BUTTONS:
-            traces.add_touch_target(spec, button)
-        traces.add_trail(spec)
+        traces.add_traces(spec, _BUTTONS)
 
     def sample(self, rng: np.random.Generator, difficulty: str) -> Layout:
         side, (shortest, longest) = _SIDE[difficulty], _LENGTH[difficulty]

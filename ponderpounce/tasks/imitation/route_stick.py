@@ -88,11 +88,9 @@ class RouteStick(Task[Layout, Memory]):
     robot = PANDA_STICK
 
     def furnish(self, spec: mujoco.MjSpec) -> None:
-        for target in _TARGETS:
-            traces.add_touch_target(spec, target)
+        traces.add_traces(spec, _TARGETS)
         for post in _POSTS:
             add_block(spec, post, _POST_HALF_M)
-        traces.add_trail(spec)
 
     def sample(self, rng: np.random.Generator, difficulty: str) -> Layout:
         turn_rad = float(rng.uniform(-_MAX_TURN_RAD, _MAX_TURN_RAD))

@@ -23,26 +23,26 @@ LOW_Z_M = 0.1  # a tip that is higher leaves no dots
 _RADIUS_M, _HALF_HEIGHT_M = 0.02, 0.005
 _RED_RADIUS_M, _RED_HALF_HEIGHT_M, _RED_BELOW_M = 0.02 * 1.002, 0.02 * 1.002, 0.01
 _DOT_RADIUS_M, _DOT_Z_M = 0.005, 0.01
+_FACETS = (16, 8)  # around and along; the targets are small in the picture
 _UNSEEN: RGBA = (0, 0, 0, 0)  # neither camera nor coordinates meet a geom without opacity
 
 Touches = tuple[int | None, ...]  # steps since each target was last touched, 0 while it is, None before it ever was
 
 
-def add_touch_target(spec: mujoco.MjSpec, name: str) -> None:
-    """Adds a grey target that can turn red; its origin is the grey one's centre.
+def add_traces(spec: mujoco.MjSpec, targets: Sequence[str]) -> None:
+    """Adds grey targets that can turn red, their origins the grey ones' centres, and the dots.
 
     Red is a second, taller set of rings on the same body, so that a red target has coordinates too.
     """
-    add_target(spec, name, GRAY, radius_m=_RADIUS_M, half_height_m=_HALF_HEIGHT_M)
-    add_rings(spec.body(name), _red(name), RED, _RED_RADIUS_M, _RED_HALF_HEIGHT_M, z_m=-_RED_BELOW_M)
-    for ring in range(NUM_RINGS):
-        spec.geom(f"{_red(name)}/{ring}").rgba = _UNSEEN
-
-
-def add_trail(spec: mujoco.MjSpec) -> None:
-    """Adds the dots."""
+    for target in targets:
+        add_target(spec, target, GRAY, radius_m=_RADIUS_M, half_height_m=_HALF_HEIGHT_M)
+        add_rings(spec.body(target), _red(target), RED, _RED_RADIUS_M, _RED_HALF_HEIGHT_M, z_m=-_RED_BELOW_M)
+        for ring in range(NUM_RINGS):
+            spec.geom(f"{_red(target)}/{ring}").rgba = _UNSEEN
     for index in range(TRAIL_STEPS):
         add_dot(spec, _dot(index), _DOT_RADIUS_M)
+    # Fewer facets than MuJoCo's 28 and 16: twenty-five targets of five rings would treble the cost of a frame.
+    spec.visual.quality.numslices, spec.visual.quality.numstacks = _FACETS
 
 
 def followed(before: Touches | None, is_touched: Sequence[bool]) -> Touches:
