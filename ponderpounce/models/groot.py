@@ -19,14 +19,15 @@ from ponderpounce.models import groot_flow
 from ponderpounce.models.eagle import Eagle, EagleConfig
 from ponderpounce.models.flow import EulerStep
 from ponderpounce.models.groot_blocks import (
+    BLOCK_NORM_EPS,
     Affine,
     BlockConfig,
     EmbodimentLinear,
     EmbodimentMlp,
-    Float32Norm,
     MixerBlock,
 )
 from ponderpounce.models.groot_dit import Dit, action_time_features
+from ponderpounce.models.siglip import Float32LayerNorm
 from ponderpounce.models.stack import Stack
 
 
@@ -114,7 +115,7 @@ class Groot(nn.Module):
         self.config = config
         width, hidden = config.dit.width, config.hidden_width
         self.eagle = Eagle(config.eagle)
-        self.vl_norm = Float32Norm(config.mixer.width)
+        self.vl_norm = Float32LayerNorm(config.mixer.width, BLOCK_NORM_EPS)
         self.mixer = Stack[MixerBlock](MixerBlock(config.mixer) for _ in range(config.mixer.depth))
         self.state_encoder = EmbodimentMlp(config.num_embodiments, config.state_dim, hidden, width)
         self.action_encoder = ActionEncoder(config.num_embodiments, config.action_dim, width)

@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ponderpounce.models.gemma import attend
+from ponderpounce.models.siglip import Float32LayerNorm
 
 BLOCK_NORM_EPS = 1e-5
 
@@ -62,24 +63,14 @@ class BlockMlp(nn.Module):
         return out_BTW
 
 
-class Float32Norm(nn.LayerNorm):
-    """An affine LayerNorm that computes in float32, whatever the stream."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__(width, eps=BLOCK_NORM_EPS)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return super().forward(x.float()).to(x.dtype)
-
-
 class MixerBlock(nn.Module):
     """Self-attention over vision-language features, the trainable adapter between the frozen Eagle and the head."""
 
     def __init__(self, config: BlockConfig) -> None:
         super().__init__()
-        self.norm1 = Float32Norm(config.width)
+        self.norm1 = Float32LayerNorm(config.width, BLOCK_NORM_EPS)
         self.attn1 = BlockAttention(config, config.width)
-        self.norm3 = Float32Norm(config.width)
+        self.norm3 = Float32LayerNorm(config.width, BLOCK_NORM_EPS)
         self.ff = BlockMlp(config)
 
     def forward(self, x_BTW: Tensor) -> Tensor:

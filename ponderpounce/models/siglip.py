@@ -38,8 +38,8 @@ class VisionConfig:
 class Float32LayerNorm(nn.LayerNorm):
     """LayerNorm whose parameters stay float32 while the stream may be bfloat16, as in openpi."""
 
-    def __init__(self, width: int) -> None:
-        super().__init__(width, eps=LAYER_NORM_EPS)
+    def __init__(self, width: int, eps: float = LAYER_NORM_EPS) -> None:
+        super().__init__(width, eps=eps)
 
     def forward(self, x: Tensor) -> Tensor:
         return super().forward(x.float()).to(x.dtype)

@@ -1,23 +1,19 @@
 """Our pi0.5 against numbers from the public implementations: every tensor the goldens hold, float32, 1e-4."""
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import pytest
 import torch
-from safetensors.torch import load_file
 from torch import Tensor
 
 from ponderpounce.models import flow
-from ponderpounce.models.gemma import GemmaConfig
+from ponderpounce.models.golden import read_golden
 from ponderpounce.models.interface import CognitionConfig
-from ponderpounce.models.pi05 import Pi05Config, Prefix
-from ponderpounce.models.pi05_weights import load_weights
-from ponderpounce.models.pounce import Pounce, PounceConfig, PounceInputs
+from ponderpounce.models.pi05 import Prefix
+from ponderpounce.models.pounce import Pounce, PounceInputs
 from ponderpounce.models.pounce_init import random_pounce
-from ponderpounce.models.siglip import VisionConfig
 
 TOLERANCE = 1e-4
 COMMITTED = Path(__file__).parent / "data" / "goldens"
@@ -36,52 +32,14 @@ class Golden:
         return self.model.pi05.embed_prefix(inputs.images, inputs.has_view, inputs.token_ids, inputs.is_token)
 
 
-def _gemma(sizes: dict[str, Any]) -> GemmaConfig:
-    return GemmaConfig(
-        width=sizes["width"],
-        depth=sizes["depth"],
-        mlp_width=sizes["mlp"],
-        num_heads=sizes["heads"],
-        num_kv_heads=sizes["kv_heads"],
-        head_dim=sizes["head_dim"],
-    )
-
-
-def _config(sizes: dict[str, Any]) -> PounceConfig:
-    vision = sizes["vision"]
-    return PounceConfig(
-        pi05=Pi05Config(
-            vision=VisionConfig(
-                width=vision["hidden"],
-                depth=vision["depth"],
-                num_heads=vision["heads"],
-                mlp_width=vision["mlp"],
-                image_px=vision["image_size"],
-                patch_px=vision["patch"],
-            ),
-            language=_gemma(sizes["llm"]),
-            expert=_gemma(sizes["expert"]),
-            vocab_size=sizes["llm"]["vocab"],
-            action_dim=sizes["action_dim"],
-            horizon=sizes["horizon"],
-        ),
-        cognition=CognitionConfig(num_carriers=0),
-        robot_action_dim=sizes["real_action_dim"],
-        num_cameras=sizes["views"],
-        num_steps=sizes["num_steps"],
-    )
-
-
 @pytest.fixture(scope="module", params=["pi05_base", "pi05_three_views"])
 def golden(request: pytest.FixtureRequest) -> Golden:
     folder = next((root / request.param for root in (COMMITTED, SHARED) if (root / request.param).is_dir()), None)
     if folder is None:
         pytest.skip(f"golden {request.param} is neither committed nor in ../shared/goldens beside the checkout")
-    sizes = json.loads((folder / "config.json").read_text())
-    with torch.device("meta"):
-        model = Pounce(_config(sizes))
-    load_weights(model, folder / "weights.safetensors")
-    given = load_file(folder / "inputs.safetensors")
+    golden = read_golden(folder)
+    assert isinstance(golden.model, Pounce)
+    given = golden.given
     inputs = PounceInputs(
         images=given["images"],
         has_view=given["image_masks"],
@@ -89,12 +47,7 @@ def golden(request: pytest.FixtureRequest) -> Golden:
         is_token=given["token_mask"],
         age_ns=torch.zeros(len(given["time"]), dtype=torch.int64),
     )
-    return Golden(
-        model=model.eval().requires_grad_(False),
-        inputs=inputs,
-        given=given,
-        expected=load_file(folder / "expected.safetensors"),
-    )
+    return Golden(model=golden.model, inputs=inputs, given=given, expected=golden.expected)
 
 
 def _assert_close(ours: Tensor, expected: Tensor) -> None:
