@@ -10,8 +10,9 @@ the schedule referred it to, so many invocations share one; their action loss re
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -38,6 +39,9 @@ class PonderBatch:
         if len(self.rows) != len(self.frames):
             raise ValueError(f"{len(self.rows)} rows, frames for {len(self.frames)}")
 
+    def to(self, device: torch.device | str) -> PonderBatch:
+        return replace(self, frames=tuple(None if f is None else f.to(device) for f in self.frames))
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PounceBatch:
@@ -51,6 +55,18 @@ class PounceBatch:
     """int64: which row of the PonderBatch."""
     query_I: Tensor
     """int64: which query of that row, or NO_QUERY."""
+
+    def to(self, device: torch.device | str) -> PounceBatch:
+        moved: dict[str, Any] = {}
+        for each in fields(self.inputs):
+            value = getattr(self.inputs, each.name)
+            moved[each.name] = None if value is None else value.to(device)
+        return PounceBatch(
+            inputs=PounceInputs(**moved),
+            actions_INA=self.actions_INA.to(device),
+            episode_I=self.episode_I.to(device),
+            query_I=self.query_I.to(device),
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -72,6 +72,12 @@ class Optimiser:
                 average.lerp_(self._named[name], 1 - self._config.ema_decay)
         return norm
 
+    @torch.no_grad()
+    def take_average(self) -> None:
+        """Copies the averaged weights into the model; nothing where no average is kept."""
+        for name, average in self.average.items():
+            self._named[name].copy_(average)
+
     def tensors(self) -> dict[str, Tensor]:
         """Everything that the next update depends on besides the parameters."""
         found = {f"average.{name}": tensor for name, tensor in self.average.items()}

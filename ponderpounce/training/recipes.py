@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from difflib import get_close_matches
 
 from clock import sampling
@@ -70,7 +70,7 @@ def robocasa_dc() -> Recipe:
 
 def tiny() -> Recipe:
     """Both architectures at the smallest size, from scratch: exercises every part on one CPU core, learns little."""
-    ponder = replace(ponder_configs.tiny_cpu(), image_px=(64, 64))
+    ponder = ponder_configs.tiny_cpu()
     return Recipe(
         name="tiny",
         ponder=ponder,

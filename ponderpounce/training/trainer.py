@@ -98,6 +98,10 @@ class Trainer:
         self.step += 1
         return report
 
+    def take_average(self) -> None:
+        """Puts the averaged weights in place of the last ones, at the end of a run; nothing where none are kept."""
+        self._optimiser.take_average()
+
     def save(self, folder: Path) -> None:
         """Writes a checkpoint; a kill at any instant leaves the old one or the new one, whole."""
         fresh = folder.with_name(folder.name + ".tmp")

@@ -22,9 +22,9 @@ HOMES: dict[str, tuple[str, ...]] = {
     "pyarrow": ("ponderpounce/data/",),
     "ray": ("ponderpounce/data/workers.py",),
     "mujoco": ("ponderpounce/tasks/",),
-    "torch": ("ponderpounce/models/", "ponder_server/", "pounce_server/"),
+    "torch": ("ponderpounce/models/", "ponderpounce/training/", "ponder_server/", "pounce_server/"),
     "transformers": ("ponderpounce/models/",),
-    "safetensors": ("ponderpounce/models/",),
+    "safetensors": ("ponderpounce/models/", "ponderpounce/training/"),
     "tokenizers": ("ponderpounce/models/vocabulary.py", "ponderpounce/models/groot_prompt.py"),
     "sentencepiece": ("ponderpounce/models/prompt.py",),
 }

@@ -1,0 +1,120 @@
+"""A collected dataset as training reads it: whole episodes, decoded once and kept while there is room."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import OrderedDict
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ponderpounce.data.dataset import Dataset
+from ponderpounce.data.episode import CAMERAS, Rows
+from ponderpounce.data.video import FPS
+from ponderpounce.models.normalisation import NUM_ARM_JOINTS, Quantiles, RobotStatistics
+from ponderpounce.training.example import Frame, TrainingEpisode
+
+_QUANTILES = (0.01, 0.99)
+_MIN_SPAN = 1e-3
+"""A dimension that hardly moves is not blown up to fill [-1, 1]."""
+
+
+class TrainingSet:
+    """Episodes by number. ``pp-collect`` and ``pp-export`` make the folder.
+
+    Where the dataset holds only some pictures (``--frames training``), a tick without its own has the one before it,
+    as in the video.
+    """
+
+    def __init__(self, root: Path, *, tasks: Sequence[str] = (), cache_mb: int = 4000) -> None:
+        """Reads the episodes of ``tasks``, or all.
+
+        Raises:
+            DatasetError: the folder holds no dataset of ours.
+            ValueError: no episode of these tasks is in it.
+        """
+        self._dataset = Dataset(root)
+        entries = self._dataset.episodes
+        self._entries = [e for e in entries if e.is_success and (not tasks or e.task in tasks)]
+        if not self._entries:
+            there = ", ".join(sorted({e.task for e in entries}))
+            raise ValueError(f"{root} has no successful episode of {', '.join(tasks) or 'any task'}; it has {there}")
+        self.image_px = self._dataset.image_px
+        self._cache: OrderedDict[int, TrainingEpisode] = OrderedDict()
+        self._cache_bytes = cache_mb * 1_000_000
+        self._cached_bytes = 0
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    @property
+    def hash(self) -> str:
+        """16 hex digits over which episodes these are and what was done in them."""
+        digest = hashlib.blake2b(digest_size=8)
+        for entry in self._entries:
+            digest.update(f"{entry.task} {entry.seed} {entry.instruction}".encode())
+            digest.update(self._dataset.rows(entry.index).action.tobytes())
+        return digest.hexdigest()
+
+    def __getitem__(self, number: int) -> TrainingEpisode:
+        if number in self._cache:
+            self._cache.move_to_end(number)
+            return self._cache[number]
+        episode = self._read(number)
+        self._cache[number] = episode
+        self._cached_bytes += _num_bytes(episode)
+        while self._cached_bytes > self._cache_bytes and len(self._cache) > 1:
+            _, dropped = self._cache.popitem(last=False)
+            self._cached_bytes -= _num_bytes(dropped)
+        return episode
+
+    def _read(self, number: int) -> TrainingEpisode:
+        entry = self._entries[number]
+        rows = self._dataset.rows(entry.index)
+        start = entry.num_demonstration_rows
+        shown = [*range(0, start, FPS), *range(start, entry.num_rows)]
+        pictures = [self._dataset.frames(entry.index, camera, shown) for camera in CAMERAS]
+        views: list[tuple[Frame, ...]] = list(zip(*pictures, strict=True))
+        num_shown = len(range(0, start, FPS))
+        return TrainingEpisode(
+            instruction=entry.instruction,
+            demo=tuple(views[:num_shown]),
+            frames=views[num_shown:],
+            state_T8=rows.state[start:],
+            action_T8=rows.action[start:],
+            subgoals=rows.grounded_subgoal[start:],
+            reasoning=rows.demonstration_reasoning[start],
+        )
+
+    def statistics(self, horizon: int) -> RobotStatistics:
+        """Quantiles of the states, and of the actions as the network learns them: relative to the chunk's first state.
+
+        Pooled over all rows of a chunk, as the released RoboMME statistics are.
+        """
+        states, actions = [], []
+        for entry in self._entries:
+            rows = self._dataset.rows(entry.index)
+            state, action = _own(rows, rows.state), _own(rows, rows.action)
+            states.append(state)
+            for offset in range(horizon):
+                relative = action[np.minimum(np.arange(len(action)) + offset, len(action) - 1)].copy()
+                relative[:, :NUM_ARM_JOINTS] -= state[:, :NUM_ARM_JOINTS]
+                actions.append(relative)
+        return RobotStatistics(state=_quantiles(np.concatenate(states)), action=_quantiles(np.concatenate(actions)))
+
+
+def _own(rows: Rows, column: NDArray[np.float32]) -> NDArray[np.float32]:
+    """What the robot itself did, without the demonstration."""
+    return column[~rows.is_demonstration]
+
+
+def _quantiles(values: NDArray[np.float32]) -> Quantiles:
+    low, high = np.quantile(values.astype(np.float64), _QUANTILES, axis=0)
+    middle, half = (low + high) / 2, np.maximum(high - low, _MIN_SPAN) / 2
+    return Quantiles(q01=tuple((middle - half).tolist()), q99=tuple((middle + half).tolist()))
+
+
+def _num_bytes(episode: TrainingEpisode) -> int:
+    return sum(view.nbytes for views in (*episode.demo, *episode.frames) for view in views)

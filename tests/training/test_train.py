@@ -1,0 +1,174 @@
+"""``pp-train`` from a dataset's folder to folders that the servers load."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ponderpounce.data.episode import About, EpisodeWriter, Row, unpack
+from ponderpounce.data.lerobot_v3 import DatasetWriter
+from ponderpounce.models.ponder_checkpoint import load_ponder
+from ponderpounce.models.pounce_checkpoint import load_bundle
+from ponderpounce.training import recipes, train
+from ponderpounce.training.data import TrainingSet
+from ponderpounce.training.train import TrainOptions
+
+PX = 64
+NUM_DEMO_ROWS = 41
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two episodes of noise, the second after a demonstration."""
+    root = tmp_path_factory.mktemp("data") / "set"
+    writer = DatasetWriter(root)
+    for number, num_demo in enumerate((0, NUM_DEMO_ROWS)):
+        writer.add(unpack(_episode(number, num_demo)))
+    writer.finish()
+    return root
+
+
+def _episode(seed: int, num_demo: int) -> dict[str, bytes]:
+    rng = np.random.default_rng(seed)
+    episode = EpisodeWriter(PX)
+    for index in range(num_demo + 45):
+        row = Row(
+            state=rng.uniform(-0.2, 0.2, 8).astype(np.float32),
+            action=rng.uniform(-0.2, 0.2, 8).astype(np.float32),
+            tcp_pose=np.zeros(7, np.float32),
+            subgoal="pick it",
+            grounded_subgoal=f"pick it at <{1 + index // 60}, 7>",
+            is_demonstration=index < num_demo,
+            demonstration_reasoning="Demo selected <3, 4>." if num_demo and index == num_demo else "",
+        )
+        picture = np.full((PX, PX, 3), 20 + index, np.uint8)
+        episode.add(row, {"front": picture, "wrist": 255 - picture})
+    about = About(
+        task="PickHighlight", instruction="pick what was shown", seed=seed, difficulty="easy", origin="oracle",
+        is_success=True, image_px=PX,
+    )  # fmt: skip
+    return episode.pack(about)
+
+
+@pytest.fixture(autouse=True)
+def small_recipe(monkeypatch: pytest.MonkeyPatch) -> None:
+    run = recipes.tiny()
+    ponder = replace(run.ponder, image_px=(PX, PX), num_layers=4)
+    small = replace(run, ponder=ponder, example=replace(run.example, max_invocations=2), batch_episodes=2)
+    monkeypatch.setitem(recipes.RECIPES, "tiny", lambda: small)
+
+
+def options(folder: Path, out: Path, **changes: object) -> TrainOptions:
+    return replace(
+        TrainOptions(recipe="tiny", data=folder, out=out, steps=2, save_every=1, progress=False),
+        **changes,  # type: ignore[arg-type]
+    )
+
+
+def test_an_episode_is_read_as_it_was_written(folder: Path) -> None:
+    episode = TrainingSet(folder)[1]
+    written = unpack(_episode(1, NUM_DEMO_ROWS)).rows
+    assert [len(episode.demo), episode.num_ticks] == [3, 45]  # 1 Hz: rows 0, 20, 40
+    np.testing.assert_array_equal(episode.state_T8, written.state[NUM_DEMO_ROWS:])
+    np.testing.assert_array_equal(episode.action_T8, written.action[NUM_DEMO_ROWS:])
+    assert episode.reasoning == "Demo selected <3, 4>."
+    assert episode.transition_ticks == {0, 60 - NUM_DEMO_ROWS}
+    brightness = [int(views[0].mean()) for views in (*episode.demo, episode.frames[0], episode.frames[44])]
+    assert brightness == pytest.approx([20, 40, 60, 20 + NUM_DEMO_ROWS, 64 + NUM_DEMO_ROWS], abs=2)  # H.264 rounds
+    assert int(episode.frames[0][1].mean()) == pytest.approx(255 - 20 - NUM_DEMO_ROWS, abs=2)
+
+
+def test_a_small_cache_reads_the_same(folder: Path) -> None:
+    large, small = TrainingSet(folder), TrainingSet(folder, cache_mb=0)
+    for number in (0, 1, 0):
+        assert np.array_equal(large[number].frames[3][0], small[number].frames[3][0])
+    assert len(small._cache) == 1
+
+
+def test_statistics_put_what_happened_into_the_networks_range(folder: Path) -> None:
+    data = TrainingSet(folder)
+    statistics = data.statistics(horizon=4)
+    states = np.concatenate([statistics.state.normalise(data[number].state_T8) for number in range(len(data))])
+    assert np.mean(np.abs(states) <= 1.0) == pytest.approx(0.98, abs=0.02)
+
+
+def test_a_run_leaves_folders_that_the_servers_load(folder: Path, tmp_path: Path) -> None:
+    train.train(options(folder, tmp_path / "run"))
+    steps = [json.loads(line)["step"] for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert steps == [0, 1]
+    assert not load_ponder(tmp_path / "run" / "ponder").is_random
+    bundle = load_bundle(tmp_path / "run" / "pounce")
+    assert not bundle.is_random
+    assert not bundle.has_fresh_prefix
+    assert bundle.statistics == TrainingSet(folder).statistics(bundle.model.config.horizon)
+
+
+def test_a_run_that_was_killed_ends_as_one_that_was_not(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train.train(options(folder, tmp_path / "whole"))
+    update, done = train.Trainer._update, []
+
+    def dies_at_the_second(self: train.Trainer) -> train.StepReport:
+        if done:
+            raise KeyboardInterrupt
+        done.append(True)
+        return update(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(train.Trainer, "_update", dies_at_the_second)
+        with pytest.raises(KeyboardInterrupt):
+            train.train(options(folder, tmp_path / "cut"))
+    train.train(options(folder, tmp_path / "cut"))
+    for name in ("log.jsonl", "ponder/model.safetensors", "pounce/model.safetensors"):
+        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "cut" / name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"recipe": "tinny"}, "Did you mean 'tiny'?"),
+        ({"recipe": "robomme"}, "--ponder, --pounce"),
+        ({"tasks": ("StopCube",)}, "has no successful episode of StopCube; it has PickHighlight"),
+    ],
+)
+def test_what_does_not_fit_is_said_in_one_sentence(
+    folder: Path, tmp_path: Path, changes: dict[str, object], said: str
+) -> None:
+    with pytest.raises(ValueError, match=said):
+        train.train(options(folder, tmp_path / "run", **changes))
+
+
+def test_pictures_of_another_size_are_refused(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    small = recipes.recipe("tiny")
+    larger = replace(small, ponder=replace(small.ponder, image_px=(96, 96)))
+    monkeypatch.setitem(recipes.RECIPES, "tiny", lambda: larger)
+    with pytest.raises(ValueError, match="collect with --image-px 96"):
+        train.train(options(folder, tmp_path / "run"))
+
+
+def test_the_program_says_what_is_wrong_and_returns_two(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--recipe", "tiny", "--data", str(tmp_path / "none"), "--out", str(tmp_path / "out")]
+    assert train.main(arguments) == 2
+    assert "holds no dataset" in capsys.readouterr().err
+
+
+def test_a_finished_run_is_not_overwritten(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "run" / "pounce").mkdir(parents=True)
+    with pytest.raises(train.CheckpointError, match="finished run"):
+        train.train(options(folder, tmp_path / "run"))
+
+
+def test_a_step_draws_the_same_batch_whenever_it_is_asked(folder: Path, tmp_path: Path) -> None:
+    run, data = recipes.recipe("tiny"), TrainingSet(folder)
+    model, bundle = train.build(run, data, options(folder, tmp_path))
+    batches = train.Batches(data, run, model, bundle, "cpu")
+    first, again = batches(5), batches(5)
+    assert [r.ids for r in first[0].rows] == [r.ids for r in again[0].rows]
+    assert torch.equal(first[1].actions_INA, again[1].actions_INA)
+    assert not torch.equal(first[1].actions_INA, batches(6)[1].actions_INA)
