@@ -129,6 +129,7 @@ class Machine:
             Refused: the gateway was stopped.
         """
         job = _Job(client, request, Future())
+        job.future.set_running_or_notify_cancel()  # a client that leaves cancels its wait, not our work
         with self._lock:
             if self._is_closed:
                 raise Refused(_STOPPED)

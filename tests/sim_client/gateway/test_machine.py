@@ -206,6 +206,17 @@ def test_live_an_answer_waits_for_the_first_command_only(bench_with: Callable[..
     bench.tell(Finish())
 
 
+def test_live_a_client_that_waits_no_longer_does_not_stop_the_work(
+    bench_with: Callable[..., Any], step_of: StepOf
+) -> None:
+    bench = bench_with(schedules.realtime())
+    waiting = bench.machine.submit("anna", step_of(begins=True))
+    assert not waiting.cancel()
+    assert bench.ask(step_of(1)).rows_NA.shape == (1, 3)
+    assert waiting.done()
+    bench.tell(Finish())
+
+
 def test_live_commands_that_stay_away_end_the_episode(bench_with: Callable[..., Any], step_of: StepOf) -> None:
     bench = bench_with(schedules.realtime())
     bench.ask(step_of(begins=True))
