@@ -8,11 +8,14 @@ import tyro
 
 from clock.daemon import serve_model
 from ponder_server.config import NUM_TORCH_THREADS, PonderOptions
-from ponder_server.contract import PonderEngine
+from ponder_server.contract import BatchingEngine
+from ponder_server.fleet import PonderFleet
 from ponder_server.serve import PonderServer
+from protocol.heartbeat import Heartbeat
+from protocol.link import Link
 
 
-def build_engine(options: PonderOptions) -> PonderEngine:
+def build_engine(options: PonderOptions) -> BatchingEngine:
     """Loads or draws the model.
 
     Raises:
@@ -20,12 +23,16 @@ def build_engine(options: PonderOptions) -> PonderEngine:
     """
     import torch  # here, so that --help and a mistyped option answer at once
 
+    from ponder_server.draft import NoDraft, TrieDraft
     from ponder_server.engine import EngineConfig, QwenEngine
     from ponderpounce.models.ponder import Ponder
     from ponderpounce.models.ponder_checkpoint import load_ponder
     from ponderpounce.models.ponder_configs import tiny_cpu
     from ponderpounce.models.vocabulary import Vocabulary
 
+    num_robots = 1 + len(options.other_robots)
+    if options.max_sessions < num_robots:
+        raise ValueError(f"{num_robots} robots need as many sessions: --max-sessions is {options.max_sessions}.")
     torch.set_num_threads(NUM_TORCH_THREADS)
     dtype = {"float32": torch.float32, "bfloat16": torch.bfloat16}[options.dtype]
     if options.checkpoint is not None:
@@ -37,13 +44,30 @@ def build_engine(options: PonderOptions) -> PonderEngine:
         max_sessions=options.max_sessions,
         max_text_tokens=options.max_text_tokens,
     )
-    return QwenEngine(ponder, config)
+    draft: NoDraft | TrieDraft = NoDraft()
+    if options.draft_texts is not None:
+        lines = options.draft_texts.read_text(encoding="utf-8").splitlines()
+        draft = TrieDraft(ponder.format.vocabulary.encode(line) for line in lines if line.strip())
+    return QwenEngine(ponder, config, draft)
 
 
 def main(argv: list[str] | None = None) -> int:
     options = tyro.cli(PonderOptions, args=argv, prog="ponder-serve", description=PonderOptions.__doc__)
     weights = str(options.checkpoint or "random weights")
-    return serve_model("ponder", options.link, weights, lambda: build_engine(options), PonderServer)
+
+    def make(link: Link, engine: BatchingEngine, heartbeat: Heartbeat, version: str) -> PonderServer | PonderFleet:
+        if not options.other_robots:
+            return PonderServer(link, engine, heartbeat, version)
+        return PonderFleet(
+            link,
+            engine,
+            heartbeat,
+            version,
+            other_robots=options.other_robots,
+            latency_budget_ns=options.latency_budget_ms * 1_000_000,
+        )
+
+    return serve_model("ponder", options.link, weights, lambda: build_engine(options), make)
 
 
 if __name__ == "__main__":

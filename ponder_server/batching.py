@@ -10,9 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
+import torch
 from torch import Tensor
 
-from ponder_server.contract import Outcome, Progress
+from ponder_server.contract import Outcome, Progress, SessionError
 from ponder_server.runner import Append, Runner
 from ponder_server.writer import Steps
 
@@ -97,6 +98,8 @@ class Batch(Generic[Result]):
 
     def _abandon(self, group: Sequence[_Thought[Result]], error: BaseException) -> None:
         self._waiting = [thought for thought in self._waiting if thought not in group]
+        if isinstance(error, torch.OutOfMemoryError):
+            error = SessionError("the device had no memory left for this forward; the session is as it was.")
         for thought in group:
             thought.steps.close()
             if isinstance(error, Exception):

@@ -26,3 +26,9 @@ class PonderOptions:
     """Per session (paper, section 3.4)."""
     max_sessions: int = 2
     max_text_tokens: int = 256
+    other_robots: tuple[str, ...] = ()
+    """Robots to serve beside --link.robot, with the same weights and in common forwards."""
+    latency_budget_ms: int = 1000
+    """With other robots: from a query to its cognition when all ask at once; an episode that breaks it is refused."""
+    draft_texts: Path | None = None
+    """File of example texts, one a line: texts like them are written several tokens a forward."""

@@ -60,6 +60,8 @@ class EngineSpec:
     """The carriers were never trained: every cognition is noise, and reports must say so."""
     dtype: str
     """Of weights and activations, e.g. "float32"; cognition is float32 always."""
+    session_bytes: int = 0
+    """Memory of one session at its longest; that of all of them is allocated at start."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -34,7 +34,8 @@ from ponder_server.contract import (
 )
 from ponder_server.draft import Draft, NoDraft
 from ponder_server.prefixes import Prefixes
-from ponder_server.runner import BUCKETS, Append, Runner, Session
+from ponder_server.runner import BUCKETS, NUM_SAVED_STATES, Append, Runner, Session
+from ponder_server.slots import slot_size
 from ponder_server.writer import Steps, TransitionWriter
 from ponderpounce.models.context import Segment
 from ponderpounce.models.ponder import Ponder
@@ -102,12 +103,21 @@ class QwenEngine:
         self._config = config
         self._format = ponder.format
         self._episodes: dict[str, _Episode] = {}
-        self._runner = Runner(
-            ponder,
-            num_slots=config.max_sessions,
-            max_tokens=config.max_context_tokens,
-            buckets=config.buckets,
-        )
+        size = slot_size(ponder.qwen.config.text_config, ponder.dtype)
+        session_bytes = size.slot_bytes(config.max_context_tokens) + NUM_SAVED_STATES * size.state_bytes
+        try:
+            self._runner = Runner(
+                ponder,
+                num_slots=config.max_sessions,
+                max_tokens=config.max_context_tokens,
+                buckets=config.buckets,
+            )
+        except (RuntimeError, MemoryError) as error:  # torch's own on a GPU and on a CPU
+            raise ValueError(
+                f"{config.max_sessions} sessions of {config.max_context_tokens} tokens need "
+                f"{config.max_sessions * session_bytes / 2**20:,.0f} MiB beside the weights, more than {ponder.device} "
+                "has. Lower max_sessions or max_context_tokens."
+            ) from error
         self._spec = EngineSpec(
             num_carriers=self._format.num_carriers,
             hidden_size=ponder.hidden_size,
@@ -117,6 +127,7 @@ class QwenEngine:
             model_hash=weights_hash(ponder),
             is_random=ponder.is_random,
             dtype=str(ponder.dtype).removeprefix("torch."),
+            session_bytes=session_bytes,
         )
         self._writer = TransitionWriter(ponder, draft or NoDraft(), max_text_tokens=config.max_text_tokens)
         self._query_ids = (*self._format.observation(config.num_cameras).ids, *self._format.carrier_ids)
@@ -151,8 +162,10 @@ class QwenEngine:
         context = self._runner.open(session)
         try:
             self._encode(context, opening, segments, progress)
-        except BaseException:
+        except BaseException as error:
             self._runner.close(context)
+            if isinstance(error, torch.OutOfMemoryError):
+                raise SessionError(f"session {session!r}: the device has no memory left to encode it.") from error
             raise
         self._episodes[session] = _Episode(context=context, owes_reasoning=opening.has_demo)
         return context.num_tokens

@@ -7,7 +7,7 @@ import logging
 import time
 
 from clock.membership import Membership, percentile_ns
-from ponder_server.contract import ContextFull, Opening, PonderEngine, SessionError
+from ponder_server.contract import ContextFull, Fire, Opening, PonderEngine, SessionError
 from ponder_server.node import PonderNode, Work
 from protocol import codec, images, topics
 from protocol import messages as m
@@ -52,6 +52,14 @@ class PonderServer:
         log.info("ready infer_p50_ms=%.1f", self._heartbeat.health.infer_p50_ns / 1e6)
 
     def step(self) -> bool:
+        worked = self._listen()
+        work = self._next_work()
+        if work is not None:
+            self._fire(work)
+        return worked or work is not None
+
+    def _listen(self) -> bool:
+        """Takes in everything that came; whether there was a call among it."""
         self._heartbeat.beat()
         worked = self._membership.step()
         for observation in self._observations.drain():
@@ -64,14 +72,14 @@ class PonderServer:
                 self._node.on_query(query)
         for query in self._node.missed():
             self._tell(m.Severity.ERROR, "observation_missed", f"query {query.query}: tick {query.tick} never came")
-        try:
-            work = self._node.next_work()
-        except MalformedMessage as error:
-            self._link.drop("observation", "no_picture", str(error))
-            return True
-        if work is not None:
-            self._fire(work)
-        return worked or work is not None
+        return worked
+
+    def _next_work(self) -> Work | None:
+        while True:
+            try:
+                return self._node.next_work()
+            except MalformedMessage as error:
+                self._link.drop("observation", "no_picture", str(error))
 
     def _see(self, observation: m.Observation) -> None:
         try:
@@ -107,18 +115,31 @@ class PonderServer:
         return True
 
     def _fire(self, work: Work) -> None:
-        self._phase("fire")
-        self._heartbeat.set(is_inferring=True)
-        start_ns = time.monotonic_ns()
+        start_ns = self._start()
         try:
             fire = self._engine.fire(self._link.episode, work.frames, self._heartbeat.beat)
         except (ContextFull, SessionError, ValueError) as error:
-            # The engine is as it was. The clock sees no answer, cognition ages, and the ladder acts.
-            self._tell(m.Severity.ERROR, "fire_refused", f"query {work.query.query}: {error}")
-            return
+            self._refuse(work, error)
+        else:
+            self._answer(work, fire, start_ns)
         finally:
-            self._phase("idle")
-            self._heartbeat.set(is_inferring=False)
+            self._stop()
+
+    def _start(self) -> int:
+        """Says that a query is being thought about; since when."""
+        self._phase("fire")
+        self._heartbeat.set(is_inferring=True)
+        return time.monotonic_ns()
+
+    def _stop(self) -> None:
+        self._phase("idle")
+        self._heartbeat.set(is_inferring=False)
+
+    def _refuse(self, work: Work, error: Exception) -> None:
+        """The engine is as it was. The clock sees no answer, cognition ages, and the ladder acts."""
+        self._tell(m.Severity.ERROR, "fire_refused", f"query {work.query.query}: {error}")
+
+    def _answer(self, work: Work, fire: Fire, start_ns: int) -> None:
         ready_ns = time.monotonic_ns()
         cognition, subgoals = self._node.answer(work, fire, ready_ns=ready_ns, infer_ns=ready_ns - start_ns)
         self._link.publish(topics.COGNITION, cognition, at_ns=ready_ns, clock_id=host_clock_id())

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from ponder_server.contract import ContextFull, Fire, Frame, Opening, SessionError
 from ponder_server.engine import EngineConfig, QwenEngine
@@ -111,3 +112,38 @@ def test_a_session_closed_while_it_thinks_is_forgotten() -> None:
     assert list(settle(engine)) == ["b"]
     engine.open("a", Opening(instruction="again"))
     assert isinstance(engine.fire("a", frames("a", 0)), Fire)
+
+
+def test_out_of_memory_refuses_the_queries_of_that_forward_and_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    engine = opened()
+    for robot in ROBOTS:
+        engine.begin(robot, frames(robot, 0))
+    with monkeypatch.context() as patch:
+        patch.setattr(engine._runner, "append", fail)
+        ended = settle(engine)
+    assert [str(ended[robot]) for robot in ROBOTS] == [
+        "the device had no memory left for this forward; the session is as it was."
+    ] * 3
+    twin = opened()
+    for robot in ROBOTS:
+        expected = twin.fire(robot, frames(robot, 0)).cognition
+        np.testing.assert_array_equal(engine.fire(robot, frames(robot, 0)).cognition, expected)
+
+
+def fail(appends: object) -> None:
+    raise torch.OutOfMemoryError
+
+
+def test_sessions_that_do_not_fit_into_memory_are_refused_before_anybody_relies_on_them() -> None:
+    with pytest.raises(ValueError, match=r"4 sessions of 1000000000000 tokens need .* MiB beside the weights"):
+        QwenEngine(PONDER, replace(CONFIG, max_context_tokens=10**12))
+
+
+def test_an_opening_without_memory_is_a_refused_session(monkeypatch: pytest.MonkeyPatch) -> None:
+    engine = opened("ab")
+    with monkeypatch.context() as patch:
+        patch.setattr(engine._runner, "append", fail)
+        with pytest.raises(SessionError, match="'c': the device has no memory left"):
+            engine.open("c", Opening(instruction="press"))
+    for robot in "cd":  # the slot was given back
+        engine.open(robot, Opening(instruction="press"))

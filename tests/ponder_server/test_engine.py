@@ -2,11 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from ponder_server.__main__ import build_engine
+from ponder_server.config import PonderOptions
 from ponder_server.contract import ContextFull, Frame, Opening, SessionError
 from ponder_server.engine import EngineConfig, QwenEngine
 from ponder_server.runner import Session
@@ -427,3 +430,17 @@ def test_the_spec_says_what_the_engine_is() -> None:
     engine.open("a", WITH_DEMO)
     cognition = engine.fire("a", observation(0)).cognition
     assert (cognition.shape, cognition.dtype) == ((2, 96), np.float32)
+
+
+def test_example_texts_are_read_into_a_draft(tmp_path: Path) -> None:
+    texts = tmp_path / "texts"
+    texts.write_text("press the left button\n\npress the left lamp\n")
+    options = PonderOptions(draft_texts=texts, max_context_tokens=400)
+    engine = build_engine(options)
+    assert isinstance(engine, QwenEngine)
+    assert VOCABULARY.decode(engine._writer._draft.propose((), 99)).startswith("press the left")
+
+
+def test_every_robot_needs_a_session() -> None:
+    with pytest.raises(ValueError, match="3 robots need as many sessions: --max-sessions is 2"):
+        build_engine(PonderOptions(other_robots=("r1", "r2")))

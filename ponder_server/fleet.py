@@ -1,0 +1,188 @@
+"""Several robots, one network: a server per robot, all of them thinking in common forwards.
+
+Every robot has its own link, heartbeat and node, exactly as if it were alone; they share the engine, and with it the
+weights and the turns. A robot is admitted to an episode if everybody's latency budget still holds with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from clock.membership import percentile_ns
+from ponder_server.admission import Admission
+from ponder_server.contract import (
+    BatchingEngine,
+    EngineSpec,
+    Fire,
+    Frame,
+    Opening,
+    Outcome,
+    Progress,
+    SessionError,
+    no_progress,
+)
+from ponder_server.node import Work
+from ponder_server.serve import PonderServer
+from protocol import messages as m
+from protocol.heartbeat import Heartbeat
+from protocol.link import Link
+from protocol.process import host_clock_id
+
+
+class SharedEngine:
+    """One engine, and what it has answered that nobody has fetched yet."""
+
+    def __init__(self, engine: BatchingEngine) -> None:
+        self.engine = engine
+        self.outcomes: dict[str, Outcome[Fire]] = {}
+
+    def step(self, progress: Progress) -> None:
+        for outcome in self.engine.step(progress):
+            self.outcomes[outcome.session] = outcome
+
+
+class RobotEngine:
+    """The shared engine as one robot sees it: a ``PonderEngine`` whose sessions are its own."""
+
+    def __init__(self, shared: SharedEngine, robot: str, durations_ns: Sequence[int]) -> None:
+        self._shared = shared
+        self._robot = robot
+        self._durations_ns = list(durations_ns)
+
+    @property
+    def spec(self) -> EngineSpec:
+        return self._shared.engine.spec
+
+    def open(self, session: str, opening: Opening, progress: Progress = no_progress) -> int:
+        return self._shared.engine.open(self._name(session), opening, progress)
+
+    def begin(self, session: str, frames: tuple[Frame, ...]) -> None:
+        self._shared.engine.begin(self._name(session), frames)
+
+    def fetch(self, session: str) -> Outcome[Fire] | None:
+        """How the query that was begun ended, if it did."""
+        return self._shared.outcomes.pop(self._name(session), None)
+
+    def fire(self, session: str, frames: tuple[Frame, ...], progress: Progress = no_progress) -> Fire:
+        """Begins and waits; the others' queries go on meanwhile."""
+        self.begin(session, frames)
+        while (outcome := self.fetch(session)) is None:
+            self._shared.step(progress)
+        return outcome.unwrap()
+
+    def close(self, session: str) -> None:
+        self._shared.outcomes.pop(self._name(session), None)
+        self._shared.engine.close(self._name(session))
+
+    def warm_up(self) -> list[int]:
+        """The engine was warmed up once for all."""
+        return self._durations_ns
+
+    def _name(self, session: str) -> str:
+        return f"{self._robot}/{session}"
+
+
+class RobotServer(PonderServer):
+    """PONDER for one of several robots: a query is begun in one step and answered in a later one."""
+
+    def __init__(
+        self, link: Link, engine: RobotEngine, heartbeat: Heartbeat, version: str, admission: Admission
+    ) -> None:
+        super().__init__(link, engine, heartbeat, version)
+        self._robot_engine = engine
+        self._admission = admission
+        self._thinking: tuple[Work, int] | None = None
+
+    @property
+    def is_thinking(self) -> bool:
+        return self._thinking is not None
+
+    def step(self) -> bool:
+        """Takes in what came and hands over what was answered; the fleet does the thinking in between."""
+        worked = self._listen()
+        return self._finish() or self._begin() or worked
+
+    def _begin(self) -> bool:
+        if self._thinking is not None or (work := self._next_work()) is None:
+            return False
+        try:
+            self._robot_engine.begin(self._link.episode, work.frames)
+        except (SessionError, ValueError) as error:
+            self._refuse(work, error)
+        else:
+            self._thinking = work, self._start()
+        return True
+
+    def _finish(self) -> bool:
+        if self._thinking is None or (outcome := self._robot_engine.fetch(self._link.episode)) is None:
+            return False
+        work, start_ns = self._thinking
+        self._thinking = None
+        if outcome.result is not None:
+            self._answer(work, outcome.result, start_ns)
+        elif isinstance(outcome.error, ValueError):
+            self._refuse(work, outcome.error)
+        else:
+            outcome.unwrap()
+        self._stop()
+        return True
+
+    def _open(self, request: m.OpenRequest) -> m.Contract:
+        self._admission.admit(self._link.robot, request.info.schedule.query_period_ns)
+        return super()._open(request)
+
+    def _close(self) -> None:
+        if self._thinking is not None:
+            self._thinking = None
+            self._stop()
+        self._admission.release(self._link.robot)
+        super()._close()
+
+
+class PonderFleet:
+    """A ``ModelServer`` for several robots on one bus."""
+
+    def __init__(
+        self,
+        link: Link,
+        engine: BatchingEngine,
+        heartbeat: Heartbeat,
+        version: str,
+        *,
+        other_robots: Sequence[str],
+        latency_budget_ns: int,
+    ) -> None:
+        """``link`` and ``heartbeat`` are the first robot's; the others' are made here."""
+        self._shared = SharedEngine(engine)
+        self._version = version
+        self._latency_budget_ns = latency_budget_ns
+        self._ends = [(link, heartbeat)]
+        for robot in other_robots:
+            other = Link(link.bus, robot=robot, proc=link.proc)
+            self._ends.append((other, Heartbeat(other, version, host_clock_id())))
+        self._servers: list[RobotServer] = []
+
+    def warm_up(self) -> None:
+        for _, heartbeat in self._ends:
+            heartbeat.set(state=m.ServingState.WARMING)
+        durations_ns = self._shared.engine.warm_up()
+        admission = Admission(fire_ns=percentile_ns(durations_ns, 99), latency_budget_ns=self._latency_budget_ns)
+        for link, heartbeat in self._ends:
+            engine = RobotEngine(self._shared, link.robot, durations_ns)
+            self._servers.append(RobotServer(link, engine, heartbeat, self._version, admission))
+        for server in self._servers:
+            server.warm_up()
+
+    def ready(self) -> None:
+        for server in self._servers:
+            server.ready()
+
+    def step(self) -> bool:
+        """Every robot is heard, then one forward for all of those that asked."""
+        worked = [server.step() for server in self._servers]
+        self._shared.step(self._beat)
+        return any(worked) or any(server.is_thinking for server in self._servers)
+
+    def _beat(self) -> None:
+        for _, heartbeat in self._ends:
+            heartbeat.beat()
