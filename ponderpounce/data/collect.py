@@ -32,7 +32,7 @@ from ponderpounce.tasks.task import TaskError, make_task, task_names
 SCALES = {"1x": 1, "9x": 9}
 COLLECTING, JOINED, COLLECTION_PATH = ".collecting", "joined", "meta/collection.json"
 DONE, INCOMPLETE, REFUSED, INTERRUPTED = 0, 1, 2, 130
-ROWS_PER_EPISODE, BYTES_PER_ROW = 450, 2700  # before anything is measured: both cameras at 256 px and 20 Hz, all tasks
+ROWS_PER_EPISODE, BYTES_PER_ROW = 500, 4200  # before anything is measured: both cameras at 256 px and 20 Hz, all tasks
 MEASURED_EPISODES = 5  # from so many on, the estimate is theirs
 
 
@@ -175,7 +175,8 @@ def disk_needed(num_missing: int, sizes: Sequence[int], image_px: int) -> int:
     if len(sizes) >= MEASURED_EPISODES:
         mean = sum(sizes) / len(sizes)
     else:
-        mean = ROWS_PER_EPISODE * BYTES_PER_ROW * (image_px / 256) ** 2
+        scale = image_px / 256
+        mean = ROWS_PER_EPISODE * BYTES_PER_ROW * max(scale, scale**2)  # small pictures compress less, texts not at all
     return round(2 * num_missing * mean + sum(sizes))
 
 

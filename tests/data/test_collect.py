@@ -161,7 +161,7 @@ def test_a_small_disk_is_refused_with_numbers_before_anything_starts(
 ) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=1_000_000))
     idle = InOrder(pretend)
-    with pytest.raises(DatasetError, match=r"14\.6 GB are still needed and 0\.0 GB are free"):
+    with pytest.raises(DatasetError, match=r"25\.2 GB are still needed and 0\.0 GB are free"):
         collect(options(tmp_path, episodes=3000), idle)
     assert idle.done == []
 
@@ -188,7 +188,7 @@ def test_a_disk_that_fills_up_stops_the_work_and_keeps_it(
 
 def test_the_estimate_is_what_was_measured_as_soon_as_something_was() -> None:
     assert disk_needed(10, [100] * 5, 256) == 10 * 100 * 2 + 500
-    assert disk_needed(10, [], 128) == disk_needed(10, [], 256) // 4
+    assert disk_needed(10, [], 128) == disk_needed(10, [], 256) // 2
 
 
 @pytest.mark.parametrize("changes", [{"image_px": 65}, {"episodes": 0}, {"workers": 0}])
