@@ -346,6 +346,7 @@ BROKEN: dict[str, tuple[Callable[[Path], None], str]] = {
     "no size": (lambda folder: _set(folder, "llm.mlp", None), "no llm.mlp"),
     "another family": (lambda folder: _set(folder, "family", "gr00t_n1_7"), "family is 'gr00t_n1_7', expected 'pi05'"),
     "another gelu": (lambda folder: _set(folder, "vision.activation", "gelu"), "vision.activation is 'gelu', built"),
+    "heads that do not fit": (lambda folder: _set(folder, "vision.heads", 7), "does not split into 7 heads"),
     "another width": (lambda folder: _set(folder, "llm.mlp", 5), "misshapen"),
     "inputs lack one": (lambda folder: _without(folder, "inputs.safetensors", "noise"), "no noise"),
     "nothing expected": (lambda folder: _without(folder, "expected.safetensors", "velocity"), "no velocity"),
