@@ -171,10 +171,10 @@ class Machine:
                 self._step(job, job.request)
         except (Refused, TransportError, MalformedMessage) as error:
             log.warning("refused client=%r %s", job.client, error)
-            job.future.set_exception(error if isinstance(error, Refused) else Refused(str(error)))
+            _refuse(job.future, str(error))
         except Exception as error:
             log.exception("request failed client=%r", job.client)
-            job.future.set_exception(Refused(f"the gateway failed: {type(error).__name__}: {error}"))
+            _refuse(job.future, f"the gateway failed: {type(error).__name__}: {error}")
 
     def _finish(self, client: str, request: Finish) -> None:
         if self._episode is not None and self._episode.client == client:
@@ -403,6 +403,11 @@ class Machine:
             self._turn(1_000_000)
         self._recorder.step()
         return episode.node.tick
+
+
+def _refuse(future: Future[Answer | None], sentence: str) -> None:
+    if not future.done():  # what failed may have come after the answer
+        future.set_exception(Refused(sentence))
 
 
 def _id_of(name: str) -> str:
