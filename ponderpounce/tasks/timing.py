@@ -15,6 +15,7 @@ import numpy as np
 from ponderpounce.tasks.geometry import Array
 
 _MOVING = 1e-6  # slopes below this are a joint at rest
+_SHORT = 1e-3  # [rad] a path of this travel has no shape worth timing: its bends are the solver's noise
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,6 +52,10 @@ def fastest(path: Array, *, max_speed: float, max_acceleration: float) -> Timing
     steepest = np.abs(slope).max(axis=1)
     if steepest.max() < 1e-9:
         return Timing(times_s=np.zeros(n), speeds_hz=np.zeros(n))
+    if np.abs(np.diff(path, axis=0)).sum(axis=0).max() < _SHORT:
+        fraction = np.linspace(0.0, 1.0, n)
+        x_short = 2 * max_acceleration / steepest.max() * np.minimum(fraction, 1 - fraction)
+        return _timed(x_short, ds)
     x_cap = np.square(max_speed / np.maximum(steepest, 1e-9))
     # A joint that is just turning round bounds x alone; the bounds on u below leave it out.
     turning = np.where(np.abs(slope) > _MOVING, 0.0, np.abs(bend)).max(axis=1)
@@ -66,7 +71,12 @@ def fastest(path: Array, *, max_speed: float, max_acceleration: float) -> Timing
     x = np.zeros(n)
     for i in range(n - 1):
         _, (offset, rate) = _acceleration_bounds(slope[i], bend[i], max_acceleration)
-        x[i + 1] = min(x_max[i + 1], x[i] + 2 * ds * float(np.min(offset + rate * x[i])))
+        x[i + 1] = min(x_max[i + 1], x[i] + 2 * ds * float(np.min(offset + rate * x[i], initial=np.inf)))
+    return _timed(x, ds)
+
+
+def _timed(x: Array, ds: float) -> Timing:
+    """The timing that has the squared speeds (n,) at the grid points."""
     speeds_hz = np.sqrt(np.maximum(x, 0.0))
     cell_s = 2 * ds / np.maximum(speeds_hz[:-1] + speeds_hz[1:], 1e-9)  # exact for constant u within a cell
     return Timing(times_s=np.concatenate([[0.0], np.cumsum(cell_s)]), speeds_hz=speeds_hz)

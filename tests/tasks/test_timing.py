@@ -75,3 +75,20 @@ def test_standing_still_takes_no_time() -> None:
     timing = fastest(path, max_speed=LIMIT, max_acceleration=LIMIT)
     assert timing.duration_s == 0
     np.testing.assert_array_equal(sample(path, timing, 0.05), path[:2])
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(-12, -5), st.integers(20, 120))
+@settings(max_examples=60, deadline=None)
+def test_a_path_of_noise_takes_hardly_any_time(seed: int, exponent: float, num_points: int) -> None:
+    path = 10.0**exponent * np.random.default_rng(seed).normal(size=(num_points, 7))
+    assert fastest(path, max_speed=LIMIT, max_acceleration=LIMIT).duration_s < 1.0
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(-9, 0), st.integers(20, 120))
+@settings(max_examples=60, deadline=None)
+def test_a_motion_of_any_size_ends(seed: int, exponent: float, num_points: int) -> None:
+    rng = np.random.default_rng(seed)
+    path = 10.0**exponent * curve(rng.normal(size=3).tolist(), rng.normal(size=3).tolist(), num_points)
+    travel = np.abs(np.diff(path, axis=0)).sum(axis=0).max()
+    duration_s = fastest(path, max_speed=LIMIT, max_acceleration=LIMIT).duration_s
+    assert duration_s <= 4 * (2 * np.sqrt(travel / LIMIT) + travel / LIMIT) + 1e-3
