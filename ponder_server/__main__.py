@@ -41,6 +41,7 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
         ponder = Ponder.random(tiny_cpu(), Vocabulary.tiny(), seed=options.seed, device=options.device, dtype=dtype)
     config = EngineConfig(
         max_context_tokens=options.max_context_tokens,
+        when_full=options.when_full,
         max_sessions=options.max_sessions,
         max_text_tokens=options.max_text_tokens,
     )

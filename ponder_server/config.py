@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from ponder_server.context_policy import PolicyName
 from protocol.options import LinkOptions
 
 NUM_TORCH_THREADS = 1  # on a CPU one thread per process beats two: a contended second one costs more than it gives
@@ -24,6 +25,8 @@ class PonderOptions:
     dtype: Literal["float32", "bfloat16"] = "float32"
     max_context_tokens: int = 16_384
     """Per session (paper, section 3.4)."""
+    when_full: PolicyName = "refuse"
+    """Refuse the query; forget the oldest queries but not the demonstration; or forget old pictures, keep carriers."""
     max_sessions: int = 2
     max_text_tokens: int = 256
     other_robots: tuple[str, ...] = ()

@@ -35,8 +35,8 @@ class ContextFull(ValueError):
     def __init__(self, *, session: str, used: int, wanted: int, limit: int) -> None:
         super().__init__(
             f"session {session!r} holds {used} tokens and needs {wanted} more, the limit is {limit}. "
-            "Close it and open a new one with a shorter history, or raise max_context_tokens; an append-only "
-            "context cannot drop its oldest tokens."
+            "Close it and open a new one with a shorter history, raise max_context_tokens, or let it forget "
+            "(when_full)."
         )
         self.session, self.used, self.wanted, self.limit = session, used, wanted, limit
 

@@ -14,12 +14,14 @@ a session.
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ponder_server.batching import Batch
+from ponder_server.context_policy import POLICIES, PolicyName, Span
 from ponder_server.contract import (
     ContextFull,
     EngineSpec,
@@ -37,7 +39,7 @@ from ponder_server.prefixes import Prefixes
 from ponder_server.runner import BUCKETS, NUM_SAVED_STATES, Append, Runner, Session
 from ponder_server.slots import slot_size
 from ponder_server.writer import Steps, TransitionWriter
-from ponderpounce.models.context import Segment
+from ponderpounce.models.context import Segment, SegmentKind
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import weights_hash
 
@@ -56,6 +58,8 @@ class EngineConfig:
     """Per session (paper, section 3.4: 16K holds 100 fires of two cameras and more)."""
     max_sessions: int = 4
     """Contexts held at once; all of them are allocated when the engine is built."""
+    when_full: PolicyName = "refuse"
+    """See ``context_policy``."""
     max_text_tokens: int = 256
     """Limit of one text. A text that reaches it is closed as it is and flagged ``truncated``."""
     prefill_chunk_tokens: int = 2048
@@ -82,6 +86,8 @@ class _Episode:
     """A session in use, and the one thing about it that is not in its tokens."""
 
     context: Session
+    spans: list[Span]
+    """What the cached tokens are."""
     owes_reasoning: bool
     """A demonstration was shown and its reasoning (DR) not yet written; the first transition writes it."""
 
@@ -167,7 +173,11 @@ class QwenEngine:
             if isinstance(error, torch.OutOfMemoryError):
                 raise SessionError(f"session {session!r}: the device has no memory left to encode it.") from error
             raise
-        self._episodes[session] = _Episode(context=context, owes_reasoning=opening.has_demo)
+        self._episodes[session] = _Episode(
+            context=context,
+            spans=[Span(segment.kind, len(segment)) for segment in segments],
+            owes_reasoning=opening.has_demo,
+        )
         return context.num_tokens
 
     def _encode(self, context: Session, opening: Opening, segments: tuple[Segment, ...], progress: Progress) -> None:
@@ -220,6 +230,7 @@ class QwenEngine:
         self._check_frames(frames, "observation")
         if force_text_tokens is not None and force_text_tokens < 1:
             raise ValueError(f"force_text_tokens is {force_text_tokens}; at least 1, or None")
+        self._make_room(episode)
         context.check_room(len(self._query_ids))
         self._begun[session] = _Query(episode=episode, frames=frames, force_text_tokens=force_text_tokens)
 
@@ -263,6 +274,12 @@ class QwenEngine:
                 )
                 hidden_KH = yield Append(session=context, ids=self._format.carrier_ids, embeds_TH=carriers_KH)
             answer = self._answer(context, hidden_KH, texts)
+            num_written = len(context.ids) - before.num_ids - len(self._query_ids)
+            episode.spans += [
+                Span(SegmentKind.OBSERVATION, num_observed),
+                Span(SegmentKind.TEXT, num_written),
+                Span(SegmentKind.CARRIERS, self._format.num_carriers),
+            ]
             episode.owes_reasoning &= not is_transition
             is_answered = True
             return answer
@@ -320,6 +337,27 @@ class QwenEngine:
         if not frames:
             return self._ponder.embed(ids)
         return self._ponder.embed(ids, torch.from_numpy(np.stack(frames)).to(self._ponder.device))
+
+    @torch.inference_mode()
+    def _make_room(self, episode: _Episode) -> None:
+        """Asks the policy, early enough that a transition with texts of full length would still fit."""
+        context = episode.context
+        num_wanted = len(self._query_ids) + 2 * (1 + self._config.max_text_tokens)
+        if num_wanted <= context.room:
+            return
+        stays = POLICIES[self._config.when_full](episode.spans, num_wanted - context.room)
+        if all(stays):
+            return
+        ends = list(accumulate(span.num_tokens for span in episode.spans))
+        assert ends[-1] == context.num_tokens, "spans and cache disagree"
+        context.keep(
+            [
+                range(end - span.num_tokens, end)
+                for span, end, stay in zip(episode.spans, ends, stays, strict=True)
+                if stay
+            ]
+        )
+        episode.spans = [span for span, stay in zip(episode.spans, stays, strict=True) if stay]
 
     def _gate(self, hidden_H: Tensor) -> int:
         """The most likely next token, of all tokens: only exact T_yes is a transition."""

@@ -34,7 +34,7 @@ BUCKETS = (1, 16, 160, 512, 2048)
 class SavedState:
     """A point in a session to come back to: lengths, and copies of the recurrent tensors."""
 
-    num_tokens: int
+    num_ids: int
     next_position: int
     tensors: list[Tensor]
 
@@ -110,9 +110,7 @@ class Runner:
         return [torch.cat(row.hidden) if row.hidden else row.embeds_TH[:0] for row in rows]
 
     def _blank_state(self, slot: int) -> SavedState:
-        return SavedState(
-            num_tokens=0, next_position=0, tensors=[torch.empty_like(t) for t in self.memory.states(slot)]
-        )
+        return SavedState(num_ids=0, next_position=0, tensors=[torch.empty_like(t) for t in self.memory.states(slot)])
 
     def _forward(self, rows: "Sequence[_Row]") -> None:
         length = self.bucket(max(row.num_left for row in rows))
@@ -171,11 +169,14 @@ class Session:
         self.next_position = 0
         """mRoPE position of the next token."""
         self.ids: list[int] = []
-        """Every token of the context, as the training row of this episode would have it."""
+        """Every token of the episode, as its training row would have it."""
+        self.num_forgotten = 0
+        """Of them, those whose keys and values are gone (:meth:`keep`)."""
 
     @property
     def num_tokens(self) -> int:
-        return len(self.ids)
+        """Tokens that attention sees, and that take room."""
+        return len(self.ids) - self.num_forgotten
 
     @property
     def max_tokens(self) -> int:
@@ -183,7 +184,7 @@ class Session:
 
     @property
     def room(self) -> int:
-        return self.max_tokens - len(self.ids)
+        return self.max_tokens - self.num_tokens
 
     def check_room(self, num_new: int) -> None:
         """Raises ContextFull if so many more tokens do not fit."""
@@ -199,22 +200,30 @@ class Session:
         """Copies the state out, into ``into`` if given (no allocation)."""
         tensors = self._memory.states(self.slot)
         if into is None:
-            into = SavedState(num_tokens=0, next_position=0, tensors=[torch.empty_like(t) for t in tensors])
+            into = SavedState(num_ids=0, next_position=0, tensors=[torch.empty_like(t) for t in tensors])
         for kept, tensor in zip(into.tensors, tensors, strict=True):
             kept.copy_(tensor)
-        into.num_tokens, into.next_position = self.num_tokens, self.next_position
+        into.num_ids, into.next_position = len(self.ids), self.next_position
         return into
 
     def restore(self, saved: SavedState) -> None:
-        """Goes back to a state saved in the present episode; what was appended since never happened."""
-        assert saved.num_tokens <= self.num_tokens, "a session can only go back"
+        """Goes back to a state saved since the last :meth:`keep`; what was appended since never happened."""
+        assert self.num_forgotten <= saved.num_ids <= len(self.ids), "a session can only go back"
         for tensor, kept in zip(self._memory.states(self.slot), saved.tensors, strict=True):
             tensor.copy_(kept)
-        del self.ids[saved.num_tokens :]
+        del self.ids[saved.num_ids :]
         self.next_position = saved.next_position
+
+    def keep(self, ranges: Sequence[range]) -> None:
+        """Attention forgets all cached tokens but these, in growing order; the recurrent states stay as they are."""
+        kept = torch.tensor([index for indices in ranges for index in indices], dtype=torch.long)
+        for tensor in self._memory.keys_and_values(self.slot, self.num_tokens):
+            tensor[:, : len(kept)] = tensor[:, kept.to(tensor.device)]
+        self.num_forgotten += self.num_tokens - len(kept)
 
     def copy(self) -> Prefix:
         """Everything in this context, for any number of sessions to start from."""
+        assert self.num_forgotten == 0, "a context with holes is nobody's beginning"
         return Prefix(
             ids=tuple(self.ids),
             next_position=self.next_position,

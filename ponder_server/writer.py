@@ -86,7 +86,7 @@ class TransitionWriter:
         room = context.room - num_kept
         limit = min(self._max_text_tokens, room) if exactly is None else exactly
         if not 1 <= limit <= room:
-            used = before.num_tokens  # what the session goes back to
+            used = before.num_ids - context.num_forgotten  # what the session goes back to
             wanted = context.num_tokens - used + max(limit, 1) + num_kept
             raise ContextFull(session=context.name, used=used, wanted=wanted, limit=context.max_tokens)
         return limit

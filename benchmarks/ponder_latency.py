@@ -1,0 +1,165 @@
+"""How long does PONDER think about one query, and how does that grow with what it has in mind?
+
+One fire: two 256 px frames on the host become a cognition on the host; vision tower, append, T gate and copies are all
+inside. The same query is asked at every context length, after which the context goes back, so lengths do not drift.
+Beside it what a server without an append-only context pays, the whole context encoded again in one forward, and a
+transition with a text of 45 tokens (the paper's), decoded one by one and with a draft that knows it.
+
+The networks have random weights: their speed is a trained one's, what they say is not.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+import tyro
+
+from benchmarks.report import Report, Row, show, spread
+from ponder_server.contract import Opening
+from ponder_server.draft import NoDraft, TrieDraft
+from ponder_server.engine import EngineConfig, QwenEngine
+from ponderpounce.models import ponder_configs
+from ponderpounce.models.context import Row as EpisodeRow
+from ponderpounce.models.ponder import Ponder
+
+SESSION = "bench"
+TEXT_TOKENS = 45
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LatencyOptions:
+    """One fire at growing contexts."""
+
+    size: Literal["tiny_cpu", "qwen35_0p8b", "qwen35_2b", "qwen35_4b", "qwen35_9b"] = "tiny_cpu"
+    device: str = "cpu"
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    threads: int = 1
+    contexts: tuple[int, ...] = (800, 4_000, 14_000)
+    """Tokens in the context before the fire, about."""
+    fires: int = 60
+    """Per context length, after ten that are not counted."""
+    encodes: int = 3
+    """Of the longest context, from nothing."""
+    texts: int = 5
+
+
+def main(argv: list[str] | None = None) -> int:
+    options = tyro.cli(LatencyOptions, args=argv, prog="ponder-latency")
+    torch.set_num_threads(options.threads)
+    report = Report(
+        name="ponder_latency",
+        question="How long does PONDER think about one query, and how does that grow with its context?",
+        config=options,
+        warm_up="ten fires per context length; one encode; one text.",
+    )
+    config = getattr(ponder_configs, options.size)()
+    ponder = Ponder.random(config, seed=0, device=options.device, dtype=getattr(torch, options.dtype))
+    engines = {
+        name: QwenEngine(ponder, EngineConfig(max_context_tokens=max(options.contexts) + 600, max_sessions=1), draft)
+        for name, draft in (("one by one", NoDraft()), ("with a draft", TrieDraft([_own_text(ponder)])))
+    }
+    with torch.inference_mode():
+        rows, fire_p50_ms = _fires(engines["one by one"], options)
+        report.add_table("A cognition fire: two frames in, C_t out", rows)
+        encode_ms = _encodes(ponder, options)
+        report.add_table(
+            f"The longest context encoded again, every token of it ({max(options.contexts)} tokens)",
+            [spread(encode_ms, "ms") | {"fires_per_encode": round(float(np.median(encode_ms)) / fire_p50_ms, 1)}],
+        )
+        report.add_table(
+            f"A transition: the same, and a text of {TEXT_TOKENS} tokens",
+            [{"decoded": name} | _texts(engine, options) for name, engine in engines.items()],
+        )
+    size = engines["one by one"].spec.session_bytes
+    report.notes += [
+        f"{options.size} with random weights, {options.dtype} on {options.device}, {options.threads} thread(s); a "
+        f"session of {max(options.contexts) + 600} tokens takes {size / 2**20:.1f} MiB.",
+        "The draft knows the text beforehand, which is the best a draft can do.",
+    ]
+    show(report)
+    print(f"\nwritten: {report.write().name}")
+    return 0
+
+
+def _fires(engine: QwenEngine, options: LatencyOptions) -> tuple[list[Row], float]:
+    """A row per context length, and the p50 of the longest."""
+    frames = _frames(engine, 2, seed=0)
+    rows: list[Row] = []
+    p50_ms: list[float] = []
+    for context_tokens in options.contexts:
+        _open(engine, context_tokens)
+        took_ms = _timed(lambda: engine.fire(SESSION, frames), engine, 10, options.fires)
+        engine.close(SESSION)
+        p50_ms.append(float(np.median(took_ms)))
+        rows.append(
+            {"context_tokens": context_tokens}
+            | spread(took_ms, "ms")
+            | {"p50_against_first": round(p50_ms[-1] / p50_ms[0], 2)}
+        )
+    return rows, p50_ms[-1]
+
+
+def _texts(engine: QwenEngine, options: LatencyOptions) -> Row:
+    frames = _frames(engine, 2, seed=0)
+    _open(engine, options.contexts[0])
+    fire = lambda: engine.fire(SESSION, frames, force_text_tokens=TEXT_TOKENS)  # noqa: E731
+    took_ms = _timed(fire, engine, 1, options.texts)
+    engine.close(SESSION)
+    return spread(took_ms, "ms")
+
+
+def _encodes(ponder: Ponder, options: LatencyOptions) -> list[float]:
+    """The whole context at once, through transformers' own forward and without a cache."""
+    form = ponder.format
+    queries = max(1, max(options.contexts) // sum(len(segment) for segment in form.query(2)))
+    row: EpisodeRow = form.row([*form.opening("go"), *(s for _ in range(queries) for s in form.query(2))])
+    frames = torch.zeros(row.num_images, *ponder.image_px, 3, dtype=torch.uint8, device=ponder.device)
+    took_ms = []
+    for _ in range(1 + options.encodes):
+        start_ns = time.perf_counter_ns()
+        ponder.encode_row(row, frames)[-1].float().cpu()
+        took_ms.append((time.perf_counter_ns() - start_ns) / 1e6)
+    return took_ms[1:]
+
+
+def _own_text(ponder: Ponder) -> tuple[int, ...]:
+    """What this network says when it is made to speak, at the shortest context."""
+    engine = QwenEngine(ponder, EngineConfig(max_context_tokens=2048, max_sessions=1))
+    _open(engine, 800)
+    return engine.fire(SESSION, _frames(engine, 2, seed=0), force_text_tokens=TEXT_TOKENS).texts[0].token_ids
+
+
+def _open(engine: QwenEngine, context_tokens: int) -> None:
+    """A session of about so many tokens: a demonstration of one view, as long as it takes."""
+    view_tokens = engine._format.num_image_tokens + 2
+    demo = tuple((frame,) for frame in _frames(engine, max(1, context_tokens // view_tokens), seed=1))
+    engine.open(SESSION, Opening(instruction="pick up the red cube", demo_frames=demo))
+
+
+def _frames(
+    engine: QwenEngine, count: int, *, seed: int
+) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.uint8]], ...]:
+    height, width = engine.spec.image_px
+    return tuple(np.random.default_rng(seed).integers(0, 256, (count, height, width, 3), dtype=np.uint8))
+
+
+def _timed(fire: Callable[[], object], engine: QwenEngine, num_unmeasured: int, num_measured: int) -> list[float]:
+    context = engine._episode(SESSION).context
+    opened = context.save()
+    took_ms = []
+    for _ in range(num_unmeasured + num_measured):
+        context.restore(opened)
+        start_ns = time.perf_counter_ns()
+        fire()
+        took_ms.append((time.perf_counter_ns() - start_ns) / 1e6)
+    return took_ms[num_unmeasured:]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

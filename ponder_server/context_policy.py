@@ -1,0 +1,65 @@
+"""What to do when a context is full. Pure: which spans of it stay.
+
+Beyond ``refuse``, attention forgets spans for good: their keys and values leave the cache, later tokens keep their
+positions, and the recurrent layers keep what they had summed up of them. No token is computed again, so a full context
+costs one copy and never a second's pause. Training never saw contexts with holes: these are for episodes that would
+otherwise end, and a model should be trained or at least tested with the one it is served with.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+from ponderpounce.models.context import SegmentKind
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """Consecutive cached tokens of one kind."""
+
+    kind: SegmentKind
+    num_tokens: int
+
+
+Policy: TypeAlias = Callable[[Sequence[Span], int], list[bool]]
+"""(the context's spans, tokens that must go) to which spans stay. It may free less, and the query is refused then."""
+
+PolicyName: TypeAlias = Literal["refuse", "pin-and-slide", "carriers-only"]
+
+_OF_A_QUERY = (SegmentKind.OBSERVATION, SegmentKind.TEXT, SegmentKind.CARRIERS)
+
+
+def refuse(spans: Sequence[Span], num_excess: int) -> list[bool]:
+    """Everything stays: the query is refused, cognition ages, and the ladder acts."""
+    return [True] * len(spans)
+
+
+def pin_and_slide(spans: Sequence[Span], num_excess: int) -> list[bool]:
+    """Instruction and demonstration stay; whole queries go, oldest first, at least half of them."""
+    return _forget_oldest(spans, num_excess, _OF_A_QUERY)
+
+
+def carriers_only(spans: Sequence[Span], num_excess: int) -> list[bool]:
+    """Of old queries only texts and carriers stay, which saw the observations that go, at least half of these."""
+    return _forget_oldest(spans, num_excess, (SegmentKind.OBSERVATION,))
+
+
+POLICIES: dict[PolicyName, Policy] = {
+    "refuse": refuse,
+    "pin-and-slide": pin_and_slide,
+    "carriers-only": carriers_only,
+}
+
+
+def _forget_oldest(spans: Sequence[Span], num_excess: int, kinds: Sequence[SegmentKind]) -> list[bool]:
+    """Half at once, so that it happens seldom; and up to the end of a query, so that none is cut."""
+    num_candidates = sum(span.num_tokens for span in spans if span.kind in kinds)
+    num_to_go = max(num_excess, num_candidates // 2)
+    stays: list[bool] = []
+    for span in spans:
+        starts_query = span.kind is SegmentKind.OBSERVATION
+        if starts_query and num_to_go <= 0:
+            kinds = ()
+        stays.append(span.kind not in kinds)
+        num_to_go -= 0 if stays[-1] else span.num_tokens
+    return stays
