@@ -1,7 +1,8 @@
 """Are our tasks the public benchmark's? Each is played in the scene of a recorded episode, and both are compared.
 
-Our oracle's episode: goal, ordered texts of video and execution, coordinates in them, length. Our world under the
-recorded actions: where things are that move by script, at every step until the last of them has come to rest.
+Our oracle's episode: goal, ordered texts of video and execution, length. Our world under the recorded actions: texts
+and coordinates of the execution, and where things are that move by script, at every step until the last of them has
+come to rest. (Coordinates are fixed when a thing is first seen. Under other actions a hand may hide it at that moment.)
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import re
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -47,14 +49,14 @@ def compare(env: Environment, recording: Recording) -> Row:
     first = env.reset(facts["seed"], facts["difficulty"], layout=layout)
     same_goal = env.instruction == facts["goals"][0]
     video = texts(env.demonstration())
-    snapshots = [first]
-    for action in env.oracle():
-        snapshots.append(env.step(action))
-        if snapshots[-1].status is not Status.ONGOING:
-            break
-    ours = {"demo": video, "exec": texts(snapshots)}
+    snapshots = played(env, first, env.oracle())
+    first = env.reset(facts["seed"], facts["difficulty"], layout=layout)
+    ours = {"demo": video, "exec": texts(played(env, first, recording.arrays["exec_action"]))}
     theirs = {phase: [entry for entry in facts["subgoals"] if entry["phase"] == phase] for phase in ours}
     same_texts = all([plain for plain, _ in ours[p]] == [entry["simple_subgoal"] for entry in theirs[p]] for p in ours)
+    same_texts &= without_repeats(s.simple_subgoal for s in snapshots) == without_repeats(
+        entry["simple_subgoal"] for entry in theirs["exec"]
+    )
     apart_px = [
         px
         for phase in ours
@@ -86,6 +88,21 @@ def compare(env: Environment, recording: Recording) -> Row:
         "worst_px": max(apart_px, default=None),
         "worst_drift_mm": None if drift_m is None else round(1e3 * drift_m, 2),
     }
+
+
+def played(env: Environment, first: Snapshot, actions: Iterable[NDArray[np.float32]]) -> list[Snapshot]:
+    """What is seen under some actions until the episode is over."""
+    snapshots = [first]
+    for action in actions:
+        snapshots.append(env.step(action))
+        if snapshots[-1].status is not Status.ONGOING:
+            break
+    return snapshots
+
+
+def without_repeats(said: Iterable[str]) -> list[str]:
+    """The texts in order, each once until another one comes."""
+    return [text for text, _ in groupby(said)]
 
 
 def texts(snapshots: Iterable[Snapshot]) -> list[tuple[str, str]]:
