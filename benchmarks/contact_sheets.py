@@ -16,6 +16,7 @@ import tyro
 from numpy.typing import NDArray
 from PIL import Image
 
+import ponderpounce.tasks.headless  # noqa: F401 - before anything that imports mujoco
 from benchmarks.recorded import Recording, layout_of, read, recorded_tasks
 from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import Environment, EpisodeState, make_environment

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-import sim_client.headless  # noqa: F401 - before anything that imports mujoco
+import ponderpounce.tasks.headless  # noqa: F401 - before anything that imports mujoco
 
 # isort: split
 

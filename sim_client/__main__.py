@@ -10,7 +10,7 @@ from typing import Any
 import tyro
 from tqdm import tqdm
 
-import sim_client.headless  # noqa: F401 - before anything that imports mujoco
+import ponderpounce.tasks.headless  # noqa: F401 - before anything that imports mujoco
 
 # isort: split
 

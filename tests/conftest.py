@@ -15,7 +15,7 @@ import hypothesis
 import numpy as np
 import pytest
 
-import sim_client.headless  # noqa: F401 - before mujoco is imported
+import ponderpounce.tasks.headless  # noqa: F401 - before mujoco is imported
 
 # isort: split
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-import ponderpounce.data.headless  # noqa: F401 - before mujoco is imported
+import ponderpounce.tasks.headless  # noqa: F401 - before mujoco is imported
 from ponderpounce.data.episode import Recovery
 from ponderpounce.data.video import FPS
 from ponderpounce.tasks.oracle import FailedGrasp

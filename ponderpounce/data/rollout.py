@@ -11,7 +11,7 @@ from dataclasses import asdict, replace
 import numpy as np
 from numpy.typing import NDArray
 
-import ponderpounce.data.headless  # noqa: F401 - before mujoco is imported
+import ponderpounce.tasks.headless  # noqa: F401 - before mujoco is imported
 from ponderpounce.data.episode import About, EpisodeWriter, Package, Rejection, Row
 from ponderpounce.data.jobs import ATTEMPTS, Job, failed_grasp
 from ponderpounce.data.video import FPS, Frame
