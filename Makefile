@@ -66,6 +66,8 @@ proto: setup
 ## make bench   every benchmark, then the tables (about ten minutes on a quiet machine)
 bench: setup
 	$(BIN)/python -m benchmarks.bus_latency
+	$(BIN)/python -m benchmarks.ponder_latency
+	$(BIN)/python -m benchmarks.ponder_concurrency
 	$(BIN)/python -m benchmarks.playback_jitter
 	$(BIN)/python -m benchmarks.episode_throughput
 	$(BIN)/python -m benchmarks.fault_drill
