@@ -78,7 +78,8 @@ def go_astray(ponder: Ponder, session: Session) -> None:
     session.restore(saved)
 
 
-@settings(deadline=None, max_examples=25)
+# Always the same draws: a rare network of random weights amplifies one rounding of its input to half the tolerance.
+@settings(deadline=None, max_examples=25, derandomize=True)
 @given(
     config=configs(),
     buckets=st.sampled_from([(1, 16, 64), (4, 40), (1, 7), (512,)]),
