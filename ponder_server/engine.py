@@ -83,7 +83,7 @@ class EngineConfig:
 
 @dataclass(slots=True, kw_only=True)
 class _Episode:
-    """A session in use, and the one thing about it that is not in its tokens."""
+    """A session in use, and what its tokens do not say about it."""
 
     context: Session
     spans: list[Span]
