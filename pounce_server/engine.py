@@ -1,9 +1,9 @@
-"""A POUNCE of either family as an action engine: one request in, one chunk of absolute joint targets out."""
+"""A POUNCE of either family as an action engine: requests in, a chunk of absolute joint targets out for each."""
 
-# N horizon, A padded action dim
+# B requests, N horizon, A padded action dim
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -13,10 +13,12 @@ from torch import Tensor
 
 from ponderpounce.models.flow import EulerStep
 from ponderpounce.models.groot_prompt import EagleTokenizer
-from ponderpounce.models.pounce import Pounce
+from ponderpounce.models.pounce import Pounce, PounceInputs
 from ponderpounce.models.pounce_checkpoint import PounceBundle
 from ponderpounce.models.pounce_family import AnyPounce
+from ponderpounce.models.pounce_groot import GrootInputs, GrootPounce
 from ponderpounce.models.prompt import Tokenizer
+from pounce_server.batching import joined_groot, joined_pi05, of_equal_length
 from pounce_server.contract import (
     DTypeName,
     EngineSpec,
@@ -32,8 +34,8 @@ from pounce_server.reading import groot_inputs, pi05_inputs
 
 __all__ = ["EagerEngine", "EngineSpec", "PounceEngine", "Request"]
 
-Sampler: TypeAlias = Callable[[Request, Tensor], Iterator[EulerStep]]
-"""Reads a request and yields the flow steps from a given noise, (1, N, A)."""
+Sampler: TypeAlias = Callable[[Sequence[Request], Tensor], Iterator[tuple[list[int], EulerStep]]]
+"""Reads requests and yields flow steps from given noise, (B, N, A), each with the indices of the requests it moves."""
 
 WARM_UP_UNMEASURED = 3
 WARM_UP_MEASURED = 20
@@ -72,12 +74,40 @@ class EagerEngine:
             ValueError: the request does not fit ``spec``, or holds a number that is not finite.
         """
         check_request(request, self.spec)
-        actions_BNA = noise_BNA = self._noise(request.seed)
-        for step in self._sample(request, noise_BNA):
-            actions_BNA = step.actions
+        (rows_N8,) = self._invoke((request,), progress)
+        return rows_N8
+
+    @torch.inference_mode()
+    def invoke_many(self, requests: Sequence[Request], progress: Progress = no_progress) -> list[NDArray[np.float32]]:
+        """Several robots' invocations at once; rows for each, in order.
+
+        They are those of `invoke` to float32 rounding (products of another size round otherwise), whatever the
+        others ask: prompts may differ in length and cameras may be missing. GR00T runs prompts of different
+        lengths one after the other.
+
+        Raises:
+            ValueError: there is no request, or one does not fit ``spec``; nothing is then computed for the others.
+        """
+        if not requests:
+            raise ValueError("expected at least one request, came none")
+        for index, request in enumerate(requests):
+            try:
+                check_request(request, self.spec)
+            except ValueError as error:
+                raise ValueError(f"request {index}: {error}") from error
+        return self._invoke(requests, progress)
+
+    def _invoke(self, requests: Sequence[Request], progress: Progress) -> list[NDArray[np.float32]]:
+        noise_BNA = torch.cat([self._noise(request.seed) for request in requests])
+        actions_BNA = noise_BNA.clone()
+        for moved, step in self._sample(requests, noise_BNA):
+            actions_BNA[moved] = step.actions
             progress()
-        robot_actions_N8 = actions_BNA[0, :, : self.spec.action_dim].cpu().numpy()
-        return self._statistics.absolute_targets(robot_actions_N8, request.proprio)
+        robot_actions_BN8 = actions_BNA[..., : self.spec.action_dim].cpu().numpy()
+        return [
+            self._statistics.absolute_targets(actions_N8, request.proprio)
+            for actions_N8, request in zip(robot_actions_BN8, requests, strict=True)
+        ]
 
     def warm_up(self) -> list[int]:
         """See `PounceEngine.warm_up`. The rows end on the CPU, so a duration includes the device's work."""
@@ -102,12 +132,29 @@ def _sampler(model: AnyPounce, bundle: PounceBundle, device: torch.device) -> Sa
     statistics, tokenizer = bundle.statistics, bundle.tokenizer
     if isinstance(model, Pounce):
         assert isinstance(tokenizer, Tokenizer), "the bundle checks this"
-        pi05, text, table = model, tokenizer, model.step_table()
-        return lambda request, noise: pi05.sample(
-            pi05_inputs(request, pi05.config, text, statistics, device), noise, table
-        )
+        return _pi05_sampler(model, lambda request: pi05_inputs(request, model.config, tokenizer, statistics, device))
     assert isinstance(tokenizer, EagleTokenizer), "the bundle checks this"
-    groot, eagle_text, groot_table = model, tokenizer, model.step_table()
-    return lambda request, noise: groot.sample(
-        groot_inputs(request, groot.config, eagle_text, statistics, device), noise, groot_table
-    )
+    return _groot_sampler(model, lambda request: groot_inputs(request, model.config, tokenizer, statistics, device))
+
+
+def _pi05_sampler(pi05: Pounce, read: Callable[[Request], PounceInputs]) -> Sampler:
+    table = pi05.step_table()
+
+    def sample(requests: Sequence[Request], noise_BNA: Tensor) -> Iterator[tuple[list[int], EulerStep]]:
+        everyone = list(range(len(requests)))
+        for step in pi05.sample(joined_pi05([read(request) for request in requests]), noise_BNA, table):
+            yield everyone, step
+
+    return sample
+
+
+def _groot_sampler(groot: GrootPounce, read: Callable[[Request], GrootInputs]) -> Sampler:
+    table = groot.step_table()
+
+    def sample(requests: Sequence[Request], noise_BNA: Tensor) -> Iterator[tuple[list[int], EulerStep]]:
+        inputs = [read(request) for request in requests]
+        for alike in of_equal_length(inputs):
+            for step in groot.sample(joined_groot([inputs[index] for index in alike]), noise_BNA[alike], table):
+                yield alike, step
+
+    return sample
