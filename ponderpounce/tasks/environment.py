@@ -128,6 +128,18 @@ class Environment:
         self.physics.advance(at_rest if last_action is None else last_action)
         return self._observe()
 
+    def begin_in(self, found: PhysicsState) -> Snapshot:
+        """Lets the robot find another world after the demonstration than that has left; returns the first snapshot.
+
+        This is how two videos come to lead to one present, see `forks`. Raises RuntimeError after the first step.
+        """
+        self._require_episode()
+        if self._step:
+            raise RuntimeError(f"the episode is at step {self._step}; another world can only be found at step 0")
+        self.physics.load(found)
+        self._memory, self._caption, self._progress = None, None, Progress()
+        return self._observe(look=False)
+
     def demonstration(self, rate_hz: int = CONTROL_HZ, *, look_hz: int | None = None) -> Iterator[Snapshot]:
         """Yields the conditioning video of this episode, the first frame and every so many after; nothing without one.
 

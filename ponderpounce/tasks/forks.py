@@ -1,10 +1,15 @@
 """Two episodes that look the same now and had different pasts: what only memory can tell apart.
 
 Both branches of a fork go on from one world: joints, speeds, things and motors are the same bits in both, and so is
-every frame. There are two ways to come by the other past, and a task uses one of them.
+every frame. There are three ways to come by the other past, and a task uses one of them.
 
 *Retold*: the same actions, played from reset under another layout of `Task.retold`. Only what was shown is different:
 another cube was lit, other colours were covered. Nothing is cut and nothing jumps.
+
+*Another video*: retold too, where all that differs is what the conditioning video shows. Another motion leaves the arm
+and the things elsewhere by a hair, so after its own video the twin finds the world that the episode found, whose clock
+included; from there on the actions are the same. What leads from the video's last frame to the first observation is
+seen by nobody, and `Fork.seam` says by how much things jump there.
 
 *Cut*: where the past repeats itself, as in counting, there is an earlier moment at which the world looked like now, and
 everything since is taken out of the twin's past: it had one round less. The twin keeps the memory, the texts and the
@@ -55,7 +60,7 @@ class Fork:
     own: Branch
     twin: Branch
     is_cut: bool  # else it is retold
-    seam: float  # rad or m: how far things jump on the twin's last step; 0 when retold
+    seam: float  # rad or m: how far things jump, on a cut twin's last step or after another video; 0 without either
 
 
 def fork(environment: Environment, task: Task[Any, Any], variant: int) -> Fork:
@@ -68,23 +73,42 @@ def fork(environment: Environment, task: Task[Any, Any], variant: int) -> Fork:
     if now.progress.status is not Status.ONGOING:
         raise ForkError(f"the episode ended at step {now.step}; fork it before it does")
     try:
-        own = _replayed(environment, now.layout, now)
+        environment.reset(0, now.difficulty, layout=now.layout)
+        own = _replayed(environment, now)
         if _is_another_world(environment.physics, own.now.physics, now.physics):
             raise ForkError("this episode did not come here from its own reset; fork the one that it was forked from")
         if not task.repeats_itself:
             layouts = task.retold(now.layout)
-            told = _replayed(environment, _nth(layouts, variant, now.step), now)
+            seam = retell(environment, task, _nth(layouts, variant, now.step), (*own.past, own.now)[0])
+            told = _replayed(environment, now)
             if _is_another_world(environment.physics, told.now.physics, now.physics):
                 raise ForkError(f"at step {now.step} one still sees which past it was; step on until nothing is shown")
             if not _was_shown_apart(environment.physics, own, told):
                 raise ForkError(f"by step {now.step} nothing has been shown yet that could tell two pasts apart")
             twin = replace(told, now=_in_the_world_of(now, told.now))
-            return Fork(own=own, twin=twin, is_cut=False, seam=0.0)
+            return Fork(own=own, twin=twin, is_cut=False, seam=seam)
         moment, seam = _nth(earlier_moments_like(environment.physics, own.past, now), variant, now.step)
         twin = Branch(past=own.past[:moment], now=_in_the_world_of(now, own.past[moment]))
         return Fork(own=own, twin=twin, is_cut=True, seam=seam)
     finally:
         environment.restore(now, look=False)
+
+
+def retell(environment: Environment, task: Task[Any, Any], layout: Any, first: EpisodeState) -> float:
+    """Begins the other telling of an episode whose first observation is given; returns the seam in rad or m.
+
+    Raises ForkError if it has another video that leaves things too far from where the episode found them.
+    """
+    environment.reset(0, first.difficulty, layout=layout)
+    if not task.retells_video:
+        return 0.0
+    seam = environment.physics.gap(environment.save().physics, first.physics, scripted=False)
+    if seam > MAX_SEAM:
+        raise ForkError(
+            f"the other video leaves things {seam:.3f} rad or m elsewhere; at most {MAX_SEAM} are passed over"
+        )
+    environment.begin_in(first.physics)
+    return seam
 
 
 def _is_another_world(physics: Physics, a: PhysicsState, b: PhysicsState) -> bool:
@@ -102,9 +126,12 @@ def _is_another_world(physics: Physics, a: PhysicsState, b: PhysicsState) -> boo
 
 
 def _was_shown_apart(physics: Physics, a: Branch, b: Branch) -> bool:
-    """True if two pasts of the same length, conditioning videos included, could be told apart while they lasted."""
-    pairs = zip(_shown(a)[::_LOOK_STEPS], _shown(b)[::_LOOK_STEPS], strict=True)
-    return any(_is_another_world(physics, one, other) for one, other in pairs)
+    """True if two pasts, conditioning videos included, could be told apart while they lasted."""
+    one, other = _shown(a), _shown(b)
+    if len(one) != len(other):
+        return True
+    pairs = zip(one[::_LOOK_STEPS], other[::_LOOK_STEPS], strict=True)
+    return any(_is_another_world(physics, *pair) for pair in pairs)
 
 
 def _shown(branch: Branch) -> list[PhysicsState]:
@@ -130,9 +157,8 @@ def earlier_moments_like(
     return tuple((step, gap) for gap, step in sorted(best.values(), key=lambda found: -found[1]))
 
 
-def _replayed(environment: Environment, layout: Any, now: EpisodeState) -> Branch:
-    """The actions behind a state again from reset, under a layout. Raises ForkError if it is over before the end."""
-    environment.reset(0, now.difficulty, layout=layout)
+def _replayed(environment: Environment, now: EpisodeState) -> Branch:
+    """The actions behind a state again, in an episode that has just begun. Raises ForkError if it is over too early."""
     states = [environment.save()]
     for action in now.actions:
         if states[-1].progress.status is not Status.ONGOING:

@@ -1,8 +1,8 @@
 """Counterfactual pairs: moments at which two episodes look the same, and their scripts go different ways.
 
 A pair is found by playing. Of a task that can be retold, both tellings are played with the same actions until their
-scripts part; then the robot waits until nothing shown tells them apart. Of a task that repeats itself, the script is
-played until a twin with a round less would do something else next.
+scripts part; then the robot waits until nothing shown tells them apart, which after another video nothing does. Of a
+task that repeats itself, the script is played until a twin with a round less would do something else next.
 """
 
 from __future__ import annotations
@@ -10,16 +10,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import Environment, EpisodeState, Snapshot
-from ponderpounce.tasks.forks import Branch, Fork, ForkError
+from ponderpounce.tasks.forks import Branch, Fork, ForkError, retell
 from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.physics import CONTROL_HZ
-from ponderpounce.tasks.task import make_task
+from ponderpounce.tasks.task import DIFFICULTIES, Task, make_task
 
 PAST_HZ = 1  # the rate at which PONDER looks
 ORACLE_STEPS = 20  # one chunk
@@ -51,7 +52,7 @@ class Pair:
     difficulty: str
     variant: int
     is_cut: bool  # see `forks`
-    seam: float  # rad or m; 0 unless cut
+    seam: float  # rad or m; 0 unless cut, or after another video
     instruction: str
     frames: dict[str, NDArray[np.uint8]]  # now: camera name -> (image_px, image_px, 3); the same bytes in both
     state: NDArray[np.float32]  # (8,) now; likewise
@@ -59,8 +60,10 @@ class Pair:
     twin: Telling
 
 
-def find_pair(own: Environment, other: Environment, task: str, seed: int, variant: int = 0) -> Pair | None:
+def find_pair(own: Environment, other: Environment, task: str, seed: int, variant: int | None = None) -> Pair | None:
     """Plays one episode until its twin would go another way; None if there is no such moment in it.
+
+    Without a variant, those of `Task.retold` take turns by seed, and cuts are the latest.
 
     Both environments must be of the task; only the first needs cameras. Raises RuntimeError if the two branches turn
     out not to look the same, which would be a defect.
@@ -68,10 +71,13 @@ def find_pair(own: Environment, other: Environment, task: str, seed: int, varian
     kind = make_task(task)
     own.reset(seed)
     if kind.repeats_itself:
+        variant = variant or 0
         fork = _cut(own, variant)
     else:
         told = kind.retold(own.layout)
-        fork = _retold(own, other, told[variant], variant) if variant < len(told) else None
+        if variant is None:
+            variant = seed // len(DIFFICULTIES) % max(len(told), 1)  # the remainder decides the difficulty
+        fork = _retold(own, other, kind, told[variant], variant) if variant < len(told) else None
     if fork is None:
         return None
     now, twin_now = own.restore(fork.own.now), own.restore(fork.twin.now)
@@ -104,8 +110,11 @@ def oracle_chunk(environment: Environment, state: EpisodeState, num_steps: int =
     return np.stack(rows + rows[-1:] * (num_steps - len(rows)))
 
 
-def _retold(own: Environment, other: Environment, layout: object, variant: int) -> Fork | None:
-    other.reset(0, own.difficulty, layout=layout)
+def _retold(own: Environment, other: Environment, kind: Task[Any, Any], layout: Any, variant: int) -> Fork | None:
+    try:
+        retell(other, kind, layout, own.save())
+    except ForkError:
+        return None
     for action, others_action in zip(own.oracle(), other.oracle(), strict=False):
         if not np.array_equal(action, others_action):
             break

@@ -195,9 +195,14 @@ class Physics:
         mujoco.mj_setState(self.model, self.data, state.integration, mujoco.mjtState.mjSTATE_INTEGRATION)
         self.refresh()  # leaves the solver's warm start as it is; only a step moves that
 
-    def gap(self, a: PhysicsState, b: PhysicsState) -> float:
-        """How far apart things are in two states: the largest difference of a joint's position, in rad or m."""
-        parts = mujoco.mjtState.mjSTATE_QPOS | mujoco.mjtState.mjSTATE_MOCAP_POS | mujoco.mjtState.mjSTATE_MOCAP_QUAT
+    def gap(self, a: PhysicsState, b: PhysicsState, *, scripted: bool = True) -> float:
+        """How far apart things are in two states: the largest difference of a joint's position, in rad or m.
+
+        Without ``scripted``, things that only a task's stage moves do not count.
+        """
+        parts = mujoco.mjtState.mjSTATE_QPOS
+        if scripted:
+            parts |= mujoco.mjtState.mjSTATE_MOCAP_POS | mujoco.mjtState.mjSTATE_MOCAP_QUAT
         positions = np.empty((2, mujoco.mj_stateSize(self.model, parts)))
         for row, state in zip(positions, (a, b), strict=True):
             mujoco.mj_extractState(self.model, state.integration, mujoco.mjtState.mjSTATE_INTEGRATION, row, parts)

@@ -83,6 +83,7 @@ class Task(ABC, Generic[LayoutT, MemoryT]):
     family: ClassVar[str]
     robot: ClassVar[Robot] = PANDA_WRISTCAM
     repeats_itself: ClassVar[bool] = False  # its episodes have rounds that look alike, see `forks`
+    retells_video: ClassVar[bool] = False  # `retold` changes the video and nothing of the scene after it
 
     @abstractmethod
     def furnish(self, spec: mujoco.MjSpec) -> None:
@@ -123,7 +124,8 @@ class Task(ABC, Generic[LayoutT, MemoryT]):
 
         The instruction is the same, and so is the physics under the same actions, bit for bit, but for things that are
         only shown. Once nothing is shown any more only memory tells which of them one is in, and what must be done
-        next is wrong in the others. The default is none.
+        next is wrong in the others. Where only the video is another, `retells_video`, the physics need be the same but
+        for what motion leaves behind. The default is none.
         """
         return ()
 

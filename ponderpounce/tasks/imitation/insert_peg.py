@@ -13,7 +13,7 @@ and box lie clear of each other and of the hand, where the arm can reach them, a
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -106,6 +106,8 @@ class Memory:
 class InsertPeg(Task[Layout, Memory]):
     """Grasp the same end of the same peg as in the video and insert it into the same side of the box."""
 
+    retells_video = True
+
     def furnish(self, spec: mujoco.MjSpec) -> None:
         add_box_with_hole(spec, _BOX)
         for peg in _PEGS:
@@ -174,6 +176,11 @@ class InsertPeg(Task[Layout, Memory]):
             grounds=(layout.held_end, _BOX),
         )
 
+    def retold(self, layout: Layout) -> tuple[Layout, ...]:
+        """The peg was grasped at the other end, or inserted from the other side, or both, as far as there is room."""
+        others = (replace(layout, grasped=grasped, side=side) for side in SIDES for grasped in ENDS)
+        return tuple(other for other in others if other != layout and _has_room(other))
+
     def remember(self, memory: Memory | None, physics: Physics, layout: Layout) -> Memory:
         if _is_in(layout, physics):
             return Memory(steps_since_in=0)
@@ -195,7 +202,8 @@ def _draw(rng: np.random.Generator) -> Layout:
         grasped=str(rng.choice(list(ENDS))),
         side=str(rng.choice(list(SIDES))),
     )
-    _require_room(layout)
+    if not _has_room(layout):
+        raise SceneFullError("the hand cannot get at the peg or to the box. Draw the scene again.")
     return layout
 
 
@@ -214,8 +222,8 @@ def _draw_peg(rng: np.random.Generator, box: Spot, others: list[Spot]) -> Spot:
     raise SceneFullError(f"no place for a peg after {_MAX_TRIES} tries. Draw the scene again.")
 
 
-def _require_room(layout: Layout) -> None:
-    """Raises SceneFullError unless the arm reaches the peg and the box, and the open hand finds room to grasp."""
+def _has_room(layout: Layout) -> bool:
+    """True if the arm reaches the peg and the box, and the open hand finds room to grasp."""
     peg, *others = layout.pegs
     axis = np.array([np.cos(peg.yaw_rad), np.sin(peg.yaw_rad)])
     held = np.array(peg.xy_m) + (1.0 if layout.grasped == "head" else -1.0) * _BETWEEN_ENDS_M / 2 * axis
@@ -223,12 +231,11 @@ def _require_room(layout: Layout) -> None:
     fingers, hand = (
         Footprint(center_m=grasp_xy_m, half_m=half_m, yaw_rad=peg.yaw_rad) for half_m in (_FINGERS_HALF_M, _HAND_HALF_M)
     )
-    has_room = is_clear(hand, _box_footprint(layout.box), _GAP_M) and all(
+    is_free = is_clear(hand, _box_footprint(layout.box), _GAP_M) and all(
         is_clear(fingers, peg_footprint(other, _PEG_HALF_LENGTH_M), _GAP_M) for other in others
     )
     farthest_m = max(_apart_m(xy_m, BASE_POSITION_M[:2]) for xy_m in (grasp_xy_m, outermost_xy_m))
-    if not has_room or farthest_m > _ARM_REACH_M:
-        raise SceneFullError("the hand cannot get at the peg or to the box. Draw the scene again.")
+    return is_free and farthest_m <= _ARM_REACH_M
 
 
 def _box_footprint(box: Spot) -> Footprint:

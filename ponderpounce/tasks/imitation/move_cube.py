@@ -13,7 +13,7 @@ target and of the hand that follows it, and the script comes down from above ins
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -71,6 +71,8 @@ class Layout:
 class MoveCube(Task[Layout, None]):
     """Move the cube to the target in the manner that the video shows."""
 
+    retells_video = True
+
     def furnish(self, spec: mujoco.MjSpec) -> None:
         add_target(spec, _TARGET, PURPLE)
         add_cube(spec, _CUBE)
@@ -107,6 +109,10 @@ class MoveCube(Task[Layout, None]):
             f"Reproduce exactly; next is: {captions.simple(self.subtasks(layout)[index].text)}.",
             grounds=(*([_TAIL] if with_peg else []), _CUBE, _TARGET),
         )
+
+    def retold(self, layout: Layout) -> tuple[Layout, ...]:
+        """The cube of the same video was moved in another manner."""
+        return tuple(replace(layout, manner=manner) for manner in MANNERS if manner != layout.manner)
 
     def remember(self, memory: None, physics: Physics, layout: Layout) -> None:
         return None

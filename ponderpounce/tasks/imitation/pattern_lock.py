@@ -12,9 +12,9 @@ far has touched nothing else, because any other button is a failure at once.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, product
 
 import mujoco
 import numpy as np
@@ -69,6 +69,7 @@ class PatternLock(Task[Layout, Touches]):
     """
 
     robot = PANDA_STICK
+    retells_video = True
 
     def furnish(self, spec: mujoco.MjSpec) -> None:
         traces.add_traces(spec, _BUTTONS)
@@ -128,6 +129,14 @@ class PatternLock(Task[Layout, Touches]):
             grounds=_named(layout),
         )
 
+    def retold(self, layout: Layout) -> tuple[Layout, ...]:
+        """The pattern began alike, and from one of its buttons on the rest was turned, mirrored or both."""
+        return tuple(
+            replace(layout, pattern=other)
+            for shared in range(1, len(layout.pattern))
+            for other in _turned_away(layout.side, layout.pattern, shared)
+        )
+
     def remember(self, memory: Touches | None, physics: Physics, layout: Layout) -> Touches:
         return traces.followed(memory, [_is_touched(physics, button) for button in layout.pattern])
 
@@ -143,6 +152,20 @@ def _wander(rng: np.random.Generator, side: int, start: int, end: int) -> tuple[
         else:
             way.pop()
     return tuple(way)
+
+
+def _turned_away(side: int, pattern: tuple[int, ...], shared: int) -> list[tuple[int, ...]]:
+    """The patterns that part from this one after so many buttons, with the same rest in other poses within the grid."""
+    kept, rest = pattern[:shared], np.array([divmod(button, side) for button in pattern[shared - 1 :]])
+    found = []
+    for flips, is_transposed in product(product((1, -1), (1, -1)), (False, True)):
+        moves = (rest - rest[0]) * flips
+        places = rest[0] + (moves[:, ::-1] if is_transposed else moves)
+        way = tuple(int(row * side + column) for row, column in places[1:])
+        has_room = bool(np.all((places >= 0) & (places < side))) and not set(way) & set(kept)
+        if has_room and way[0] != pattern[shared] and (*kept, *way) not in found:
+            found.append((*kept, *way))
+    return found
 
 
 def _neighbours(side: int, button: int) -> list[int]:

@@ -13,7 +13,7 @@ Not kept: upstream counts the places under the posts among the targets that must
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 
@@ -32,6 +32,7 @@ from ponderpounce.tasks.scene import display_rgba
 from ponderpounce.tasks.task import Reasoning, Shown, Subtask, Task, task
 
 CLOCKWISE, COUNTERCLOCKWISE = "clockwise", "counterclockwise"
+_OPPOSITE = {CLOCKWISE: COUNTERCLOCKWISE, COUNTERCLOCKWISE: CLOCKWISE}
 
 _NUM_MOVES = {"easy": (2, 3), "medium": (4, 5), "hard": (4, 7)}  # both ends included
 _MAY_TURN_BACK = {"easy": False, "medium": False, "hard": True}  # elsewhere only at an end of the row
@@ -86,6 +87,7 @@ class RouteStick(Task[Layout, Memory]):
     """Follow with the stick a way between posts that was shown."""
 
     robot = PANDA_STICK
+    retells_video = True
 
     def furnish(self, spec: mujoco.MjSpec) -> None:
         traces.add_traces(spec, _TARGETS)
@@ -152,6 +154,13 @@ class RouteStick(Task[Layout, Memory]):
                 "between."
             ),
             grounds=tuple(_TARGETS[at] for at in layout.route),
+        )
+
+    def retold(self, layout: Layout) -> tuple[Layout, ...]:
+        """One of the posts was passed on the other side."""
+        return tuple(
+            replace(layout, sides=(*layout.sides[:move], _OPPOSITE[side], *layout.sides[move + 1 :]))
+            for move, side in enumerate(layout.sides)
         )
 
     def remember(self, memory: Memory | None, physics: Physics, layout: Layout) -> Memory:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -85,6 +85,8 @@ class VideoPlace(Task[Layout, Rest | None]):
 
     The memory is the arm's rest in the demonstration; there is none after it.
     """
+
+    retells_video = True
 
     def furnish(self, spec: mujoco.MjSpec) -> None:
         add_button(spec, _BUTTON)
@@ -165,6 +167,11 @@ class VideoPlace(Task[Layout, Rest | None]):
             text += f"the {layout.color} cube[ at <>] for target {name}[ at <>]."
             return Reasoning(text=text, grounds=(cube, target))
         return Reasoning(text=text + f"target {name}[ at <>].", grounds=(target,))
+
+    def retold(self, layout: Layout) -> tuple[Layout, ...]:
+        """The cube was placed on the same targets, beginning with another one of them."""
+        visits = layout.visits
+        return tuple(replace(layout, visits=visits[nth:] + visits[:nth]) for nth in range(1, len(visits)))
 
     def remember(self, memory: Rest | None, physics: Physics, layout: Layout) -> Rest | None:
         return shuffle.watch(memory, physics, _targets(layout))

@@ -13,8 +13,8 @@ differs only if the cube that was put down again has a nearly equidistant choice
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -79,6 +79,8 @@ class Memory:
 @task(family="reference")
 class VideoRepick(Task[Layout, Memory]):
     """Pick up the cube that was picked up in the video, a given number of times, then press the button."""
+
+    retells_video = True
 
     def furnish(self, spec: mujoco.MjSpec) -> None:
         add_button(spec, _BUTTON)
@@ -160,6 +162,15 @@ class VideoRepick(Task[Layout, Memory]):
             then, ground = f"choose {name}[ at <>]: {verb}, time {nth + 1} of {layout.repeats}.", _CUBES[layout.asked]
         return Reasoning(text=shown + after + then, grounds=(ground,))
 
+    def retold(self, layout: Layout) -> tuple[Layout, ...]:
+        """Another cube of the same colour was picked up. The same cubes changed places, in whichever order they did."""
+        asked = layout.cubes[layout.asked]
+        return tuple(
+            replace(layout, asked=index)
+            for index, cube in enumerate(layout.cubes)
+            if index != layout.asked and cube.color == asked.color and _can_be_picked_up(layout.cubes, index)
+        )
+
     def remember(self, memory: Memory | None, physics: Physics, layout: Layout) -> Memory:
         is_picked = predicates.is_picked(physics, _CUBES[layout.asked])
         if memory is None:
@@ -186,8 +197,7 @@ def _draw(rng: np.random.Generator, difficulty: str) -> Layout:
     asked = int(rng.integers(len(cubes)))
     # Cubes that swap come to lie where others lay.
     for index in (asked,) if difficulty == "hard" else range(len(cubes)):
-        cube, others = cubes[index], cubes[:index] + cubes[index + 1 :]
-        if not (is_in_reach((cube.x_m, cube.y_m)) and has_finger_room(cube, others)):
+        if not _can_be_picked_up(cubes, index):
             raise SceneFullError(f"cube {index} cannot be picked up among the others. Draw the scene again.")
     return Layout(
         button_xy_m=button.center_m,
@@ -196,6 +206,11 @@ def _draw(rng: np.random.Generator, difficulty: str) -> Layout:
         repeats=int(rng.integers(*_REPEATS, endpoint=True)),
         swaps=() if difficulty == "hard" else _draw_swaps(rng, cubes, asked, _SWAPS[difficulty]),
     )
+
+
+def _can_be_picked_up(cubes: Sequence[PlacedCube], index: int) -> bool:
+    cube = cubes[index]
+    return is_in_reach((cube.x_m, cube.y_m)) and has_finger_room(cube, [*cubes[:index], *cubes[index + 1 :]])
 
 
 Area = tuple[str, tuple[float, float], tuple[float, float]]  # a colour, and the centre and half size of a rectangle
