@@ -6,7 +6,7 @@ from typing import Literal, TypeAlias
 import torch
 from safetensors import SafetensorError, safe_open
 
-from ponderpounce.models import groot_weights, pi05_weights
+from ponderpounce.models import flow, groot_flow, groot_weights, pi05_weights
 from ponderpounce.models.pounce import Pounce, PounceConfig
 from ponderpounce.models.pounce_groot import GrootPounce, GrootPounceConfig
 from ponderpounce.models.pounce_init import random_groot_pounce, random_pounce
@@ -32,6 +32,12 @@ def blank_model(config: AnyPounceConfig) -> AnyPounce:
 
 def random_model(config: AnyPounceConfig, seed: int) -> AnyPounce:
     return random_pounce(config, seed) if isinstance(config, PounceConfig) else random_groot_pounce(config, seed)
+
+
+def sample_times(model: AnyPounce, count: int, generator: torch.Generator) -> torch.Tensor:
+    """Draws training times, (count,) float32, as the family was pretrained with; their directions are opposite."""
+    draw = flow.sample_times if isinstance(model, Pounce) else groot_flow.sample_times
+    return draw(count, generator)
 
 
 def load_weights(model: AnyPounce, path: Path) -> bool:

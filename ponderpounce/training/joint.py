@@ -9,19 +9,21 @@ the schedule referred it to, so many invocations share one; their action loss re
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ponderpounce.models import flow
 from ponderpounce.models.context import Row
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.pounce import Pounce, PounceInputs
+
+SampleTimes = Callable[[int, torch.Generator], Tensor]
+"""Draws so many flow times."""
 
 NO_QUERY = -1
 """Reference of an invocation for which no cognition was ready: it sees the learned null."""
@@ -79,20 +81,25 @@ class Draws:
     """bool: cognition dropout."""
 
     @classmethod
-    def draw(cls, actions_INA: Tensor, dropout: float, generator: torch.Generator) -> Draws:
-        """Draws on the generator's device, which must be that of ``actions_INA``."""
-        count = len(actions_INA)
-        device = actions_INA.device
+    def draw(
+        cls, batch: PounceBatch, times: SampleTimes, dropout: float, generators: Sequence[torch.Generator]
+    ) -> Draws:
+        """One CPU generator for each episode: what is drawn for it depends on no other, nor on the device."""
+        count, episode_I = len(batch.actions_INA), batch.episode_I.cpu()
+        noise_INA, time_I, chance_I = torch.empty(batch.actions_INA.shape), torch.empty(count), torch.empty(count)
+        for episode, generator in enumerate(generators):
+            (mine,) = torch.where(episode_I == episode)
+            noise_INA[mine] = torch.randn(len(mine), *noise_INA.shape[1:], generator=generator)
+            time_I[mine] = times(len(mine), generator)
+            chance_I[mine] = torch.rand(len(mine), generator=generator)
+        device = batch.actions_INA.device
         return cls(
-            noise_INA=torch.randn(actions_INA.shape, generator=generator, device=device),
-            time_I=flow.sample_times(count, generator),
-            is_dropped_I=torch.rand(count, generator=generator, device=device) < dropout,
+            noise_INA=noise_INA.to(device), time_I=time_I.to(device), is_dropped_I=(chance_I < dropout).to(device)
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class JointLoss:
-    """The parts of one step's loss, scalars on the graph."""
+class JointLoss(NamedTuple):
+    """The parts of one step's loss, scalars on the graph. A tuple: FSDP2 looks for its tensors."""
 
     total: Tensor
     flow_matching: Tensor
@@ -126,12 +133,16 @@ class JointModel(nn.Module):
         inputs = replace(invocations.inputs, cognition=cognition_QKH[index_I], is_null=is_null_I)
         matching = self.pounce.loss(inputs, invocations.actions_INA, draws.noise_INA, draws.time_I)
         return JointLoss(
-            total=self.w1 * matching + self.w2 * grounding,
+            total=self.weigh(matching, grounding),
             flow_matching=matching,
             grounding=grounding,
             num_supervised=num_supervised,
             num_null=int(is_null_I.sum()),
         )
+
+    def weigh(self, matching: Tensor, grounding: Tensor) -> Tensor:
+        """L of its two parts."""
+        return self.w1 * matching + self.w2 * grounding
 
     def _grounding(self, episodes: PonderBatch, hidden: Sequence[Tensor]) -> tuple[Tensor, int]:
         """Mean cross-entropy over every supervised token of the batch; zero, on the graph, if there is none."""
@@ -152,9 +163,12 @@ class JointModel(nn.Module):
 def encode_rows(ponder: Ponder, episodes: PonderBatch) -> list[Tensor]:
     """Final hidden states (T, H) of each row, encoded together, padded on the right.
 
-    A row is causal, so what stands behind it cannot reach it: pads are never read.
+    A row is causal, so what stands behind it cannot reach it: pads are never read. All pictures are read in one call,
+    however many rows there are: with FSDP2 every process must call the vision tower equally often.
     """
-    embeds = [ponder.embed(row.ids, frames) for row, frames in zip(episodes.rows, episodes.frames, strict=True)]
+    frames = [each for each in episodes.frames if each is not None]
+    ids = [token for row in episodes.rows for token in row.ids]
+    embeds = ponder.embed(ids, torch.cat(frames) if frames else None).split([len(row.ids) for row in episodes.rows])
     longest = max(len(row.ids) for row in episodes.rows)
     embeds_BTH = torch.stack([F.pad(embed, (0, 0, 0, longest - len(embed))) for embed in embeds])
     positions = [torch.from_numpy(ponder.format.positions(row.ids)[0]).to(ponder.device) for row in episodes.rows]

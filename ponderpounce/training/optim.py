@@ -7,6 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from ponderpounce.training.parallel import local, whole
+from ponderpounce.training.shards import RowReader
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OptimConfig:
@@ -56,9 +59,9 @@ class Optimiser:
         Raises:
             FloatingPointError: the gradients are not finite; nothing was changed.
         """
-        norm = float(nn.utils.clip_grad_norm_(self._named.values(), self._config.clip_norm))
+        norm = float(whole(nn.utils.clip_grad_norm_(self._named.values(), self._config.clip_norm)))
         if not torch.isfinite(torch.tensor(norm)):
-            worst = [n for n, p in self._named.items() if p.grad is not None and not p.grad.isfinite().all()][:3]
+            worst = [n for n, p in self._named.items() if p.grad is not None and not local(p.grad).isfinite().all()][:3]
             raise FloatingPointError(
                 f"step {step}: gradients are not finite (first in {', '.join(worst)}). Lower learning_rate, or train "
                 "in float32; the last checkpoint is untouched."
@@ -69,7 +72,7 @@ class Optimiser:
         self._adam.zero_grad(set_to_none=True)
         with torch.no_grad():
             for name, average in self.average.items():
-                average.lerp_(self._named[name], 1 - self._config.ema_decay)
+                local(average).lerp_(local(self._named[name]), 1 - self._config.ema_decay)
         return norm
 
     @torch.no_grad()
@@ -86,22 +89,28 @@ class Optimiser:
                 found[f"{key}.{name}"] = torch.as_tensor(value)
         return found
 
-    def load(self, tensors: dict[str, Tensor]) -> None:
+    def load(self, stored: RowReader) -> None:
         """Takes back what ``tensors`` gave: the state of every parameter that had a gradient so far.
 
         Raises:
             ValueError: it is another model's, or of another freeze mode.
         """
         states: dict[str, dict[str, Tensor]] = {}
-        for full_name, tensor in tensors.items():
+        for full_name in stored.names():
             key, name = full_name.split(".", 1)
             parameter = self._named.get(name)
-            fits = parameter is not None and (tensor.shape == parameter.shape or (key == "step" and tensor.ndim == 0))
-            if not fits or (key == "average" and name not in self.average):
+            is_step = key == "step" and stored.shape(full_name) == ()
+            fits = parameter is not None and (stored.shape(full_name) == tuple(parameter.shape) or is_step)
+            if parameter is None or not fits or (key == "average" and name not in self.average):
                 raise ValueError(f"the optimiser's state is of another model or freeze mode: it has {full_name}")
-            states.setdefault(name, {})[key] = tensor.clone()
-        for name in self.average:
-            self.average[name] = states[name].pop("average")
-        for name, state in states.items():
-            if state:
-                self._adam.state[self._named[name]] = state
+            rows = stored.read(full_name, parameter)
+            if is_step:
+                states.setdefault(name, {})[key] = rows
+            elif key == "average":
+                local(self.average[name]).copy_(rows)
+            else:
+                state = torch.zeros_like(parameter, requires_grad=False)
+                local(state).copy_(rows)
+                states.setdefault(name, {})[key] = state
+        for name, found in states.items():
+            self._adam.state[self._named[name]] = found

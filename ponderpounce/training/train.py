@@ -10,10 +10,13 @@ The same command again resumes.
 from __future__ import annotations
 
 import json
+import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TextIO
 
 import numpy as np
 import torch
@@ -29,8 +32,9 @@ from ponderpounce.models.prompt import Tokenizer
 from ponderpounce.training.data import TrainingSet
 from ponderpounce.training.example import collate, make_example
 from ponderpounce.training.joint import JointModel, PonderBatch, PounceBatch
+from ponderpounce.training.parallel import World, gather, joined, shard
 from ponderpounce.training.recipes import Recipe, recipe
-from ponderpounce.training.trainer import CheckpointError, StepReport, Trainer
+from ponderpounce.training.trainer import CheckpointError, SaveError, StepReport, Trainer
 
 DONE, REFUSED, INTERRUPTED = 0, 2, 130
 _EPISODE_STREAM = 7  # of a step's random numbers: which episodes, which schedules
@@ -56,6 +60,10 @@ class TrainOptions:
     """Instead of the recipe's."""
     seed: int | None = None
     """Instead of the recipe's."""
+    batch_episodes: int | None = None
+    """Instead of the recipe's: episodes a step, of all processes together."""
+    max_invocations: int | None = None
+    """Instead of the recipe's: POUNCE's invocations an episode."""
     save_every: int = 100
     """Steps between checkpoints."""
     device: Literal["cpu", "cuda"] = "cpu"
@@ -65,19 +73,29 @@ class TrainOptions:
 
 
 class Batches:
-    """The batch of a step: which episodes, under which schedules; a function of (seed, step) alone."""
+    """This process's share of a step's batch: which episodes, under which schedules.
 
-    def __init__(self, data: TrainingSet, run: Recipe, model: JointModel, bundle: PounceBundle, device: str) -> None:
+    Each schedule follows from (seed, step, place in the batch), so the shares of N processes are the batch of one.
+    """
+
+    def __init__(self, data: TrainingSet, run: Recipe, model: JointModel, bundle: PounceBundle, world: World) -> None:
+        """Raises ValueError if the batch has fewer episodes than there are processes."""
         if not isinstance(bundle.tokenizer, Tokenizer):
             raise ValueError("training GR00T jointly is not built yet; use a recipe with pi0.5")
         self._data, self._run, self._model = data, run, model
-        self._bundle, self._tokenizer, self._device = bundle, bundle.tokenizer, device
+        self._bundle, self._tokenizer, self._device = bundle, bundle.tokenizer, world.device
+        self._places = world.share(run.batch_episodes)
 
     def __call__(self, step: int) -> tuple[PonderBatch, PounceBatch]:
-        rng = np.random.default_rng([self._run.train.seed, _EPISODE_STREAM, step])
+        chance = (self._run.train.seed, _EPISODE_STREAM, step)
         form, config = self._model.ponder.format, self._model.pounce.config
-        numbers = rng.integers(len(self._data), size=self._run.batch_episodes)
-        examples = [make_example(self._data[int(number)], form, self._run.example, rng) for number in numbers]
+        numbers = np.random.default_rng(chance).integers(len(self._data), size=self._run.batch_episodes)
+        examples = [
+            make_example(
+                self._data[int(numbers[place])], form, self._run.example, np.random.default_rng([*chance, place])
+            )
+            for place in self._places
+        ]
         episodes, invocations = collate(examples, config, self._tokenizer, self._bundle.statistics)
         return episodes.to(self._device), invocations.to(self._device)
 
@@ -86,8 +104,11 @@ def main(argv: list[str] | None = None) -> int:
     options = tyro.cli(TrainOptions, args=argv, prog="pp-train", description=TrainOptions.__doc__)
     try:
         train(options)
-    except (DatasetError, CheckpointError, FileNotFoundError, ValueError, FloatingPointError) as error:
+    except (DatasetError, CheckpointError, SaveError, FileNotFoundError, ValueError, FloatingPointError) as error:
         sys.stderr.write(f"pp-train: {error}\n")
+        return REFUSED
+    except torch.OutOfMemoryError as error:
+        sys.stderr.write(f"pp-train: {_out_of_memory(options, error)}\n")
         return REFUSED
     except KeyboardInterrupt:
         sys.stderr.write("pp-train: interrupted; the last checkpoint is kept, the same command goes on from it\n")
@@ -96,26 +117,34 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def train(options: TrainOptions) -> None:
-    """Runs a recipe to its end.
+    """Runs a recipe to its end, alone or as one of torchrun's processes.
 
     Raises:
         DatasetError, CheckpointError, FileNotFoundError, ValueError: what was given does not fit; the message says why.
         FloatingPointError: the loss is not finite; the last checkpoint is kept.
+        SaveError: a checkpoint could not be written; the one before is kept.
     """
+    with joined(options.device) as world:
+        _train(options, world)
+
+
+def _train(options: TrainOptions, world: World) -> None:
     run = _adjusted(recipe(options.recipe), options)
     if (options.out / "pounce").exists():
         raise CheckpointError(f"{options.out} holds a finished run; use another --out")
     data = TrainingSet(options.data, tasks=options.tasks)
     model, bundle = build(run, data, options)
-    trainer = Trainer(model, Batches(data, run, model, bundle, options.device), run.train, data_hash=data.hash)
+    shard(model, world)
+    batches = Batches(data, run, model, bundle, world)
+    trainer = Trainer(model, batches, run.train, data_hash=data.hash, world=world)
     checkpoint = options.out / "checkpoint"
     options.out.mkdir(parents=True, exist_ok=True)
     trainer.resume(checkpoint)
-    log_path = options.out / "log.jsonl"
-    _cut_log(log_path, trainer.step)
     with (
-        log_path.open("a") as log,
-        tqdm(total=run.num_steps, initial=trainer.step, unit="step", disable=not options.progress) as bar,
+        _log(options.out / "log.jsonl", trainer.step, world) as log,
+        tqdm(
+            total=run.num_steps, initial=trainer.step, unit="step", disable=not (options.progress and world.is_first)
+        ) as bar,
     ):
         for report in trainer.run(run.num_steps):
             log.write(json.dumps(asdict(report)) + "\n")
@@ -126,7 +155,13 @@ def train(options: TrainOptions) -> None:
                 trainer.save(checkpoint)
     trainer.save(checkpoint)
     trainer.take_average()
-    export(model, bundle, options.out)
+    if world.size == 1:
+        export(model, bundle, options.out)
+        return
+    whole = build(run, data, replace(options, device="cpu")) if world.is_first else None
+    gather(model, None if whole is None else whole[0])
+    if whole is not None:
+        export(*whole, options.out)
 
 
 def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointModel, PounceBundle]:
@@ -168,19 +203,37 @@ def export(model: JointModel, bundle: PounceBundle, out: Path) -> None:
 
 
 def _adjusted(run: Recipe, options: TrainOptions) -> Recipe:
+    """The recipe with what the command line says instead."""
     seed = run.train.seed if options.seed is None else options.seed
-    return replace(run, num_steps=options.steps or run.num_steps, train=replace(run.train, seed=seed))
+    return replace(
+        run,
+        num_steps=options.steps or run.num_steps,
+        batch_episodes=options.batch_episodes or run.batch_episodes,
+        example=replace(run.example, max_invocations=options.max_invocations or run.example.max_invocations),
+        train=replace(run.train, seed=seed),
+    )
 
 
-def _cut_log(path: Path, step: int) -> None:
-    """Drops the lines of steps that a resumed run will do again."""
-    if path.exists():
-        lines = path.read_text().splitlines(keepends=True)
-        path.write_text("".join(lines[:step]))
+@contextmanager
+def _log(path: Path, step: int, world: World) -> Iterator[TextIO]:
+    """The first process's log without the lines of steps that a resumed run will do again; the others' goes nowhere."""
+    if world.is_first and path.exists():
+        path.write_text("".join(path.read_text().splitlines(keepends=True)[:step]))
+    with (path if world.is_first else Path(os.devnull)).open("a") as log:
+        yield log
 
 
 def _postfix(report: StepReport) -> str:
     return f"loss {report.total:.3f} flow {report.flow_matching:.3f} text {report.grounding:.3f}"
+
+
+def _out_of_memory(options: TrainOptions, error: BaseException) -> str:
+    run = _adjusted(recipe(options.recipe), options)
+    return (
+        f"out of memory at {run.batch_episodes} episodes a step, {run.example.max_invocations} invocations each "
+        f"({error}). Lower --max-invocations first, then --batch-episodes; --dtype bfloat16 halves PONDER; or start "
+        "more processes with torchrun. The last checkpoint is kept: the same command with the lower number goes on."
+    )
 
 
 if __name__ == "__main__":

@@ -11,23 +11,33 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors import SafetensorError
 from torch import Tensor
 
+from ponderpounce.models.pounce_family import sample_times
 from ponderpounce.training.joint import Draws, JointModel, PonderBatch, PounceBatch
 from ponderpounce.training.optim import OptimConfig, Optimiser
+from ponderpounce.training.parallel import World, local
+from ponderpounce.training.shards import RowReader, write_rows
 
 Batches = Callable[[int], tuple[PonderBatch, PounceBatch]]
-"""The batch of a step; a pure function of its number."""
+"""This process's share of the batch of a step (``World.share``); a pure function of the step's number."""
 
-_WEIGHTS, _OPTIMISER, _FACTS = "weights.safetensors", "optimiser.safetensors", "facts.json"
+_WEIGHTS, _OPTIMISER, _FACTS = "weights", "optimiser", "facts.json"
+_DRAW_STREAM = 11  # of a step's random numbers: noise, flow times, cognition dropout
 
 
 class CheckpointError(ValueError):
     """A checkpoint cannot be continued from."""
+
+
+class SaveError(RuntimeError):
+    """A checkpoint could not be written; the one before is whole."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,15 +64,24 @@ class TrainConfig:
 
 
 class Trainer:
-    """Updates a joint model, one batch at a time."""
+    """Updates a joint model, one batch at a time; alone, or as one of several processes with a share of each batch."""
 
-    def __init__(self, model: JointModel, batches: Batches, config: TrainConfig, *, data_hash: str = "") -> None:
-        """``data_hash`` names the data: a checkpoint made with other data is refused."""
+    def __init__(
+        self,
+        model: JointModel,
+        batches: Batches,
+        config: TrainConfig,
+        *,
+        data_hash: str = "",
+        world: World | None = None,
+    ) -> None:
+        """``data_hash`` names the data: a checkpoint made with other data is refused. ``model`` is sharded already."""
         self.model = model
         self.config = config
         self.step = 0
         self._batches = batches
         self._data_hash = data_hash
+        self._world = world or World()
         self._optimiser = Optimiser(model, config.optim)
 
     def run(self, until: int) -> Iterator[StepReport]:
@@ -75,61 +94,93 @@ class Trainer:
             yield self._update()
 
     def _update(self) -> StepReport:
+        world, model = self._world, self.model
         episodes, invocations = self._batches(self.step)
-        device = invocations.actions_INA.device
-        generator = torch.Generator(device).manual_seed(_step_seed(self.config.seed, self.step))
-        loss = self.model(episodes, invocations, Draws.draw(invocations.actions_INA, self.config.dropout, generator))
-        if not torch.isfinite(loss.total):
+        loss = model(episodes, invocations, self._draws(len(episodes.rows), invocations))
+        # Both parts are means over the whole batch: a process's own weigh as much as it has of what they count.
+        count = len(invocations.actions_INA)
+        num_invocations, num_supervised, num_null = (
+            int(number) for number in world.sums([count, loss.num_supervised, loss.num_null])
+        )
+        matching = loss.flow_matching * (count / num_invocations)
+        grounding = loss.grounding * (loss.num_supervised / max(1, num_supervised))
+        part = model.weigh(matching, grounding)
+        total, flow_matching, text = world.sums([part.detach(), matching.detach(), grounding.detach()])
+        if not np.isfinite(total):
             raise FloatingPointError(
-                f"step {self.step}: the loss is {loss.total.item()} (flow matching {loss.flow_matching.item()}, "
-                f"grounding {loss.grounding.item()}). Look at that batch's data, or lower learning_rate."
+                f"step {self.step}: the loss is {total} (flow matching {flow_matching}, grounding {text}). Look at "
+                "that batch's data, or lower learning_rate; the last checkpoint is untouched."
             )
-        loss.total.backward()
+        (part * world.size).backward()  # FSDP2 divides by the number of processes
         norm = self._optimiser.update(self.step)
         report = StepReport(
             step=self.step,
-            total=loss.total.item(),
-            flow_matching=loss.flow_matching.item(),
-            grounding=loss.grounding.item(),
+            total=total,
+            flow_matching=flow_matching,
+            grounding=text,
             gradient_norm=norm,
-            num_supervised=loss.num_supervised,
-            num_null=loss.num_null,
+            num_supervised=num_supervised,
+            num_null=num_null,
         )
         self.step += 1
         return report
+
+    def _draws(self, num_episodes: int, invocations: PounceBatch) -> Draws:
+        """The chance of this step, episode by episode: the same for an episode whichever process has it."""
+        generators = []
+        for index in range(num_episodes):
+            place = self._world.rank + index * self._world.size
+            sequence = np.random.SeedSequence([self.config.seed, _DRAW_STREAM, self.step, place])
+            generators.append(torch.Generator().manual_seed(int(sequence.generate_state(1, np.uint64)[0] >> 1)))
+        return Draws.draw(invocations, partial(sample_times, self.model.pounce), self.config.dropout, generators)
 
     def take_average(self) -> None:
         """Puts the averaged weights in place of the last ones, at the end of a run; nothing where none are kept."""
         self._optimiser.take_average()
 
     def save(self, folder: Path) -> None:
-        """Writes a checkpoint; a kill at any instant leaves the old one or the new one, whole."""
-        fresh = folder.with_name(folder.name + ".tmp")
-        shutil.rmtree(fresh, ignore_errors=True)
-        fresh.mkdir(parents=True)
-        save_file(_weights(self.model), fresh / _WEIGHTS)
-        save_file({k: v.contiguous() for k, v in self._optimiser.tensors().items()}, fresh / _OPTIMISER)
-        facts = {"step": self.step, "config": asdict(self.config), "data_hash": self._data_hash}
-        (fresh / _FACTS).write_text(json.dumps(facts, indent=1) + "\n")
-        for path in fresh.iterdir():
-            _sync(path)
-        old = folder.with_name(folder.name + ".old")
-        if folder.exists():
-            shutil.rmtree(old, ignore_errors=True)
-            folder.rename(old)
-        fresh.rename(folder)
-        _sync(folder.parent)
-        shutil.rmtree(old, ignore_errors=True)
+        """Writes a checkpoint; a kill at any instant leaves the old one or the new one, whole.
+
+        Every process writes its own rows (``shards``), so all of them must see ``folder``.
+
+        Raises:
+            SaveError: a process could not write (a full disk); the old checkpoint is kept, the new one's rest removed.
+        """
+        fresh, old = (folder.with_name(folder.name + suffix) for suffix in (".tmp", ".old"))
+        world = self._world
+        if world.is_first:
+            shutil.rmtree(fresh, ignore_errors=True)
+            fresh.mkdir(parents=True)
+        world.wait()
+        failure: Exception | None = None
+        try:
+            write_rows(_weights(self.model), fresh, _WEIGHTS, world)
+            write_rows(self._optimiser.tensors(), fresh, _OPTIMISER, world)
+            if world.is_first:
+                facts = {"step": self.step, "config": asdict(self.config), "data_hash": self._data_hash}
+                (fresh / _FACTS).write_text(json.dumps(facts, indent=1) + "\n")
+                _sync(fresh / _FACTS)
+        except (OSError, SafetensorError) as error:
+            failure = error
+        (num_failed,) = world.sums([failure is not None])
+        if world.is_first and num_failed:
+            shutil.rmtree(fresh, ignore_errors=True)
+        if num_failed:
+            raise SaveError(_why_not_saved(folder, self.step, failure)) from failure
+        if world.is_first:
+            _replace(folder, fresh, old)
+        world.wait()
 
     def resume(self, folder: Path) -> bool:
-        """Continues from a checkpoint; False if there is none yet.
+        """Continues from a checkpoint, whatever number of processes wrote it; False if there is none yet.
 
         Raises:
             CheckpointError: it was made with another configuration, other data, or another model.
         """
         old = folder.with_name(folder.name + ".old")
-        if not folder.exists() and old.exists():  # killed between the two renames
+        if self._world.is_first and not folder.exists() and old.exists():  # killed between the two renames
             old.rename(folder)
+        self._world.wait()
         if not folder.exists():
             return False
         facts = json.loads((folder / _FACTS).read_text())
@@ -139,14 +190,17 @@ class Trainer:
                     f"{folder}: made with {name} {facts[name]}, this run has {now}. Use another folder, or the same "
                     "data and recipe."
                 )
-        weights = load_file(folder / _WEIGHTS)
         mine = _weights(self.model)
-        if set(weights) != set(mine):
-            raise CheckpointError(f"{folder}: of another model; differs in {sorted(set(weights) ^ set(mine))[:5]}")
-        with torch.no_grad():
+        with RowReader(folder, _WEIGHTS, self._world) as stored, torch.no_grad():
+            shapes = {name: stored.shape(name) for name in stored.names()}
+            wanted = {name: tuple(tensor.shape) for name, tensor in mine.items()}
+            if shapes != wanted:
+                differs = sorted(name for name, _ in shapes.items() ^ wanted.items())
+                raise CheckpointError(f"{folder}: of another model; differs in {differs[:5]}")
             for name, tensor in mine.items():
-                tensor.copy_(weights[name])
-        self._optimiser.load(load_file(folder / _OPTIMISER))
+                local(tensor).copy_(stored.read(name, tensor))
+        with RowReader(folder, _OPTIMISER, self._world) as stored:
+            self._optimiser.load(stored)
         self.step = facts["step"]
         return True
 
@@ -156,8 +210,21 @@ def _weights(model: JointModel) -> dict[str, Tensor]:
     return {name: parameter.detach() for name, parameter in model.named_parameters()}
 
 
-def _step_seed(seed: int, step: int) -> int:
-    return (seed * 1_000_003 + step) % 2**63
+def _replace(folder: Path, fresh: Path, old: Path) -> None:
+    if folder.exists():
+        shutil.rmtree(old, ignore_errors=True)
+        folder.rename(old)
+    fresh.rename(folder)
+    _sync(folder.parent)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _why_not_saved(folder: Path, step: int, failure: Exception | None) -> str:
+    free_gb = shutil.disk_usage(folder.parent).free / 1e9
+    return (
+        f"step {step}: {folder} could not be written ({failure or 'another process says why'}); "
+        f"{free_gb:.1f} GB are free there. The one before is kept: make room, and the same command goes on from it."
+    )
 
 
 def _sync(path: Path) -> None:

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from ponderpounce.models import flow
 from ponderpounce.models.context import Row, Transition
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
@@ -56,7 +57,8 @@ def invocations(pounce: Pounce, *references: tuple[int, int]) -> PounceBatch:
 
 
 def draws_of(batch: PounceBatch, *, dropout: float = 0.0, seed: int = 3) -> Draws:
-    return Draws.draw(batch.actions_INA, dropout, torch.Generator().manual_seed(seed))
+    generators = [torch.Generator().manual_seed(seed + episode) for episode in range(int(batch.episode_I.max()) + 1)]
+    return Draws.draw(batch, flow.sample_times, dropout, generators)
 
 
 def gradients(loss: Tensor, model: JointModel) -> dict[str, Tensor]:
@@ -171,3 +173,12 @@ def test_an_episode_without_a_query_is_refused(model: JointModel) -> None:
     batch = invocations(model.pounce, (0, 0))
     with pytest.raises(ValueError, match="without a query"):
         model(episodes(model.ponder, 0, 1), batch, draws_of(batch))
+
+
+def test_what_is_drawn_for_an_episode_depends_on_no_other(model: JointModel) -> None:
+    both, alone = invocations(model.pounce, (1, 0), (0, 0), (1, 1)), invocations(model.pounce, (0, 0), (0, 1))
+    generators = [torch.Generator().manual_seed(seed) for seed in (4, 5)]
+    drawn = Draws.draw(both, flow.sample_times, 0.5, generators)
+    again = Draws.draw(alone, flow.sample_times, 0.5, [torch.Generator().manual_seed(5)])
+    for name in ("noise_INA", "time_I", "is_dropped_I"):
+        assert torch.equal(getattr(drawn, name)[[0, 2]], getattr(again, name))

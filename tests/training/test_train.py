@@ -16,6 +16,7 @@ from ponderpounce.models.ponder_checkpoint import load_ponder
 from ponderpounce.models.pounce_checkpoint import load_bundle
 from ponderpounce.training import recipes, train
 from ponderpounce.training.data import TrainingSet
+from ponderpounce.training.parallel import World
 from ponderpounce.training.train import TrainOptions
 
 PX = 64
@@ -167,8 +168,22 @@ def test_a_finished_run_is_not_overwritten(folder: Path, tmp_path: Path) -> None
 def test_a_step_draws_the_same_batch_whenever_it_is_asked(folder: Path, tmp_path: Path) -> None:
     run, data = recipes.recipe("tiny"), TrainingSet(folder)
     model, bundle = train.build(run, data, options(folder, tmp_path))
-    batches = train.Batches(data, run, model, bundle, "cpu")
+    batches = train.Batches(data, run, model, bundle, World())
     first, again = batches(5), batches(5)
     assert [r.ids for r in first[0].rows] == [r.ids for r in again[0].rows]
     assert torch.equal(first[1].actions_INA, again[1].actions_INA)
     assert not torch.equal(first[1].actions_INA, batches(6)[1].actions_INA)
+
+
+def test_out_of_memory_says_what_to_lower(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(self: train.Trainer) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory.")
+
+    monkeypatch.setattr(train.Trainer, "_update", full)
+    arguments = ["--recipe", "tiny", "--data", str(folder), "--out", str(tmp_path / "out"), "--batch-episodes", "1"]
+    assert train.main(arguments) == 2
+    said = capsys.readouterr().err
+    assert "out of memory at 1 episodes a step, 2 invocations each" in said
+    assert "--max-invocations" in said

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -15,9 +16,11 @@ from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
 from ponderpounce.models.pounce_configs import tiny_cpu as tiny_pounce
 from ponderpounce.models.pounce_init import random_pounce
+from ponderpounce.training import trainer
 from ponderpounce.training.joint import JointModel, PonderBatch, PounceBatch
 from ponderpounce.training.optim import OptimConfig, Optimiser, learning_rate
-from ponderpounce.training.trainer import CheckpointError, TrainConfig, Trainer
+from ponderpounce.training.shards import write_rows
+from ponderpounce.training.trainer import CheckpointError, SaveError, TrainConfig, Trainer
 
 CONFIG = replace(tiny_ponder(), image_px=(32, 32), num_layers=4)
 TRAIN = TrainConfig(seed=1, dropout=0.3, optim=OptimConfig(learning_rate=1e-3, warmup_steps=3, ema_decay=0.9))
@@ -91,7 +94,7 @@ def test_a_kill_while_saving_loses_nothing(tmp_path: Path, killed: str) -> None:
     trainer.save(tmp_path / "checkpoint")
     if killed == "while writing":
         (tmp_path / "checkpoint.tmp").mkdir()
-        (tmp_path / "checkpoint.tmp" / "weights.safetensors").write_bytes(b"half")
+        (tmp_path / "checkpoint.tmp" / "weights-00000-of-00001.safetensors").write_bytes(b"half")
     else:
         (tmp_path / "checkpoint").rename(tmp_path / "checkpoint.old")
     again = Trainer(joint(), batch, TRAIN)
@@ -143,3 +146,24 @@ def test_frozen_parameters_stay() -> None:
 def test_nothing_to_train_is_said() -> None:
     with pytest.raises(ValueError, match="every parameter is frozen"):
         Optimiser(joint().requires_grad_(False), OptimConfig())
+
+
+def test_a_disk_that_is_full_keeps_the_checkpoint_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    step = Trainer(joint(), batch, TRAIN)
+    list(step.run(1))
+    step.save(tmp_path / "checkpoint")
+    list(step.run(2))
+    written = iter([None])
+
+    def full_at_the_second_file(*arguments: object) -> None:
+        if next(written, "full") == "full":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write_rows(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(trainer, "write_rows", full_at_the_second_file)
+    with pytest.raises(SaveError, match=r"step 2: .*No space left on device.*GB are free there.*make room"):
+        step.save(tmp_path / "checkpoint")
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint"]
+    again = Trainer(joint(), batch, TRAIN)
+    assert again.resume(tmp_path / "checkpoint")
+    assert again.step == 1

@@ -1,0 +1,131 @@
+"""Several processes, one run: torchrun's environment, FSDP2 over both systems, and sums over all processes.
+
+A process is given its share of a batch's episodes. FSDP2 averages gradients over processes, so each scales its part of
+the loss such that the average is the gradient of the whole batch (``trainer``). Parameters keep their names; a process
+holds its rows of each.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+from torch.distributed.device_mesh import init_device_mesh
+from torch.distributed.fsdp import fully_shard
+from torch.distributed.tensor import DTensor
+
+from ponderpounce.models.units import units_of
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class World:
+    """Which of a run's processes this is; the default is a run of one."""
+
+    rank: int = 0
+    size: int = 1
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.rank < self.size:
+            raise ValueError(f"rank must be 0..{self.size - 1}, came {self.rank}")
+
+    @property
+    def is_first(self) -> bool:
+        """Of the process that writes what is written once."""
+        return self.rank == 0
+
+    def share(self, count: int) -> range:
+        """This process's part of ``count`` episodes: every ``size``-th.
+
+        Raises:
+            ValueError: there are fewer than processes; an idle one would leave the others waiting.
+        """
+        if count < self.size:
+            raise ValueError(
+                f"a batch of {count} episodes for {self.size} processes; start at most {count}, or raise batch_episodes"
+            )
+        return range(self.rank, count, self.size)
+
+    def sums(self, numbers: Sequence[float | Tensor]) -> list[float]:
+        """Each number summed over all processes, in float64. All must call it."""
+        total = torch.tensor([float(number) for number in numbers], dtype=torch.float64, device=self.device)
+        if self.size > 1:
+            dist.all_reduce(total)
+        return [float(number) for number in total.tolist()]
+
+    def wait(self) -> None:
+        """Until every process is here."""
+        self.sums([0.0])
+
+
+@contextmanager
+def joined(device: str) -> Iterator[World]:
+    """Joins the processes that torchrun started; alone without torchrun. On CUDA each takes the GPU of its local rank.
+
+    Raises:
+        ValueError: torchrun started more processes on this host than it has GPUs.
+    """
+    size = int(os.environ.get("WORLD_SIZE", "1"))
+    if size == 1:
+        yield World(device=device)
+        return
+    if device == "cuda":
+        local_rank, num_gpus = int(os.environ["LOCAL_RANK"]), torch.cuda.device_count()
+        if local_rank >= num_gpus:
+            raise ValueError(f"process {local_rank} of this host has no GPU: there are {num_gpus}; --nproc-per-node")
+        torch.cuda.set_device(local_rank)
+    dist.init_process_group("nccl" if device == "cuda" else "gloo")
+    try:
+        yield World(rank=dist.get_rank(), size=size, device=device)
+    finally:
+        dist.destroy_process_group()
+
+
+def shard(model: nn.Module, world: World) -> None:
+    """Leaves each process its rows of every parameter; nothing where there is one process.
+
+    Units are gathered when they run and let go after; the rest stays gathered from the start of a step to its end.
+
+    The processes must have built the same weights.
+
+    Raises:
+        ValueError: trained parameters have several dtypes, which FSDP2 cannot reduce together.
+    """
+    if world.size == 1:
+        return
+    dtypes = {str(parameter.dtype) for parameter in model.parameters() if parameter.requires_grad}
+    if len(dtypes) > 1:
+        raise ValueError(f"several processes train in one dtype, the model has {sorted(dtypes)}; use --dtype float32")
+    mesh = init_device_mesh(world.device, (world.size,))
+    for unit in units_of(model):
+        fully_shard(unit, mesh=mesh)
+    fully_shard(model, mesh=mesh)
+
+
+def local(tensor: Tensor) -> Tensor:
+    """This process's rows of a parameter or of what belongs to it, sharing memory; the tensor itself if it is whole."""
+    return tensor.to_local() if isinstance(tensor, DTensor) else tensor
+
+
+def whole(tensor: Tensor) -> Tensor:
+    """All rows. All processes must call it."""
+    return tensor.full_tensor() if isinstance(tensor, DTensor) else tensor
+
+
+@torch.no_grad()
+def gather(model: nn.Module, into: nn.Module | None) -> None:
+    """Copies the whole weights into a model of the same kind, one parameter at a time. All processes must call it.
+
+    Args:
+        into: on any device; None on processes that want none.
+    """
+    targets = None if into is None else dict(into.named_parameters())
+    for name, parameter in model.named_parameters():
+        value = whole(parameter)
+        if targets is not None:
+            targets[name].copy_(value)

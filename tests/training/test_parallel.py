@@ -1,0 +1,163 @@
+"""Two processes with half a batch each do what one does with the whole."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from ponderpounce.models.context import Transition
+from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
+from ponderpounce.models.pounce import freeze
+from ponderpounce.models.pounce_configs import tiny_cpu as tiny_pounce
+from ponderpounce.models.pounce_init import random_pounce
+from ponderpounce.training.joint import NO_QUERY, JointModel, PonderBatch, PounceBatch
+from ponderpounce.training.optim import OptimConfig
+from ponderpounce.training.parallel import World, gather, joined, shard
+from ponderpounce.training.trainer import TrainConfig, Trainer
+
+CONFIG = replace(tiny_ponder(), image_px=(32, 32), num_layers=4)
+TRAIN = TrainConfig(seed=1, dropout=0.3, optim=OptimConfig(learning_rate=1e-3, warmup_steps=3, ema_decay=0.9))
+STEPS = 3
+PATIENCE_S = 120
+
+
+def joint() -> JointModel:
+    pounce = random_pounce(tiny_pounce(num_carriers=1, cognition_size=CONFIG.hidden_size, horizon=4), seed=2)
+    freeze(pounce, "vision")
+    return JointModel(Ponder.random(CONFIG, seed=1), pounce)
+
+
+def batch_of(model: JointModel, places: range, step: int) -> tuple[PonderBatch, PounceBatch]:
+    """Three unequal episodes: one query or two, texts of another length, one to three invocations."""
+    form, config = model.ponder.format, model.pounce.config
+    rows, frames, invocations = [], [], []
+    for index, place in enumerate(places):
+        said = Transition(subgoal=form.vocabulary.encode("pick the cube" + " now" * (5 * place)))
+        rows.append(form.row([*form.opening("press"), *form.query(1, said), *form.query(1) * (place % 2)]))
+        generator = torch.Generator().manual_seed(100 * step + place)
+        shape = (rows[-1].num_images, 32, 32, 3)
+        frames.append(torch.randint(0, 256, shape, generator=generator, dtype=torch.uint8))
+        invocations += [(index, query, 100 * step + 10 * place + query) for query in (NO_QUERY, 0, 0)[: place + 1]]
+    inputs = [config.example_inputs(1, seed=seed) for _, _, seed in invocations]
+    return PonderBatch(rows=tuple(rows), frames=tuple(frames)), PounceBatch(
+        inputs=replace(
+            inputs[0],
+            **{
+                name: torch.cat([getattr(each, name) for each in inputs])
+                for name in ("images", "has_view", "token_ids", "is_token", "age_ns")
+            },
+            cognition=None,
+        ),
+        actions_INA=torch.cat([config.example_actions(1, seed=seed) for _, _, seed in invocations]),
+        episode_I=torch.tensor([episode for episode, _, _ in invocations]),
+        query_I=torch.tensor([query for _, query, _ in invocations]),
+    )
+
+
+def trainer_of(world: World) -> Trainer:
+    model = joint()
+    shard(model, world)
+    return Trainer(model, lambda step: batch_of(model, world.share(3), step), TRAIN, world=world)
+
+
+def weights_of(trainer: Trainer) -> dict[str, Tensor]:
+    whole = joint()
+    gather(trainer.model, whole)
+    return {name: parameter.detach().clone() for name, parameter in whole.named_parameters()}
+
+
+def run_as_one_of_several(folder: Path) -> None:
+    """What each process of torchrun does."""
+    with joined("cpu") as world:
+        trainer = trainer_of(world)
+        reports = [asdict(report) for report in trainer.run(STEPS)]
+        trainer.save(folder / "two")
+        last = weights_of(trainer)
+        trainer.take_average()
+        average = weights_of(trainer)
+        resumed = trainer_of(world)
+        resumed.resume(folder / "one")
+        reports += [asdict(report) for report in resumed.run(STEPS + 1)]
+        if world.is_first:
+            torch.save({"last": last, "average": average}, folder / "weights.pt")
+            (folder / "reports.json").write_text(json.dumps(reports))
+
+
+@pytest.fixture(scope="module")
+def one(tmp_path_factory: pytest.TempPathFactory) -> tuple[Trainer, list[dict[str, float]], Path]:
+    """One process, and a checkpoint after its three steps."""
+    folder = tmp_path_factory.mktemp("parallel")
+    trainer = trainer_of(World())
+    reports = [asdict(report) for report in trainer.run(STEPS)]
+    trainer.save(folder / "one")
+    return trainer, reports, folder
+
+
+@pytest.mark.e2e
+@pytest.mark.slow
+def test_two_processes_are_one(one: tuple[Trainer, list[dict[str, float]], Path]) -> None:
+    trainer, reports, folder = one
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", __file__]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [*command, str(folder)], env=environment, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    theirs = json.loads((folder / "reports.json").read_text())
+    weights = torch.load(folder / "weights.pt", weights_only=True)
+
+    assert len(theirs) == STEPS + 1
+    for mine, other in zip(reports, theirs[:STEPS], strict=True):
+        assert other == pytest.approx(mine, abs=1e-5, rel=1e-5)
+    last = weights_of(trainer)
+    for name, tensor in last.items():
+        torch.testing.assert_close(weights["last"][name], tensor, atol=1e-5, rtol=0, msg=lambda m, n=name: f"{n}: {m}")
+
+    # A checkpoint of two is read by one, bit for bit, and one of one by two: the next step is the same.
+    again = trainer_of(World())
+    assert again.resume(folder / "two")
+    assert again.step == STEPS
+    for name, tensor in weights_of(again).items():
+        assert torch.equal(weights["last"][name], tensor), name
+    again.take_average()
+    for name, tensor in weights_of(again).items():
+        assert torch.equal(weights["average"][name], tensor), name
+    (fourth,) = [asdict(report) for report in trainer.run(STEPS + 1)]
+    assert theirs[STEPS] == pytest.approx(fourth, abs=1e-5, rel=1e-5)
+
+
+def test_shares_are_the_batch() -> None:
+    shares = [list(World(rank=rank, size=3).share(8)) for rank in range(3)]
+    assert sorted(place for share in shares for place in share) == list(range(8))
+
+
+def test_more_processes_than_episodes_are_refused() -> None:
+    with pytest.raises(ValueError, match="a batch of 2 episodes for 3 processes; start at most 2"):
+        World(rank=2, size=3).share(2)
+
+
+def test_alone_nothing_is_sharded() -> None:
+    model = joint()
+    before = [type(module) for module in model.modules()]
+    shard(model, World())
+    assert [type(module) for module in model.modules()] == before
+
+
+def test_weights_of_several_dtypes_are_refused() -> None:
+    model = joint()
+    model.ponder.to(torch.bfloat16)
+    with pytest.raises(ValueError, match="--dtype float32"):
+        shard(model, World(rank=0, size=2))
+
+
+if __name__ == "__main__":
+    run_as_one_of_several(Path(sys.argv[1]))
