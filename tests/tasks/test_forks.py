@@ -144,11 +144,12 @@ def test_after_either_video_the_robot_finds_the_same_world(environment: Environm
     """From the first observation on it is the same to the bit, and each branch's script succeeds in it."""
     env = environment(name)
     env.reset(VIDEO_SEEDS[name])
-    scripted = env.physics.data.mocap_pos.copy()
+    scripted_m = env.physics.data.mocap_pos.copy()
     fork = env.fork()
     assert fork.own.now.physics.integration.tobytes() == fork.twin.now.physics.integration.tobytes()
     env.reset(0, fork.twin.now.difficulty, layout=fork.twin.now.layout)
-    np.testing.assert_allclose(on_the_table(env.physics.data.mocap_pos), on_the_table(scripted), atol=1e-6)
+    gaps_m = np.linalg.norm(on_the_table(scripted_m)[:, None] - on_the_table(env.physics.data.mocap_pos), axis=-1)
+    assert max(gaps_m.min(axis=0).max(), gaps_m.min(axis=1).max()) < 1e-5  # whichever of several dots lies where
     for branch in (fork.own, fork.twin):
         env.restore(branch.now)
         last = play(env, env.oracle())
@@ -156,9 +157,8 @@ def test_after_either_video_the_robot_finds_the_same_world(environment: Environm
 
 
 def on_the_table(positions_m: np.ndarray) -> np.ndarray:
-    """What is not parked, in an order that does not ask which of several dots lies where."""
-    near = positions_m[np.abs(positions_m[:, 0]) < 1].round(6)
-    return near[np.lexsort(near.T)]
+    """The places of what is not parked."""
+    return positions_m[np.abs(positions_m[:, 0]) < 1]
 
 
 def test_a_video_that_leaves_things_elsewhere_has_no_twin(
