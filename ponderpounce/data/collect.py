@@ -20,11 +20,12 @@ from typing import Annotated, Any, Literal
 import tyro
 from tqdm import tqdm
 
-from ponderpounce.data.episode import unpack
+from ponderpounce.data.episode import Package, unpack
 from ponderpounce.data.errors import DatasetError
-from ponderpounce.data.jobs import TRAIN_SEED, Job, Look, jobs_of
+from ponderpounce.data.jobs import Job, Look, jobs_of
 from ponderpounce.data.lerobot_v3 import INFO_PATH, DatasetWriter
 from ponderpounce.data.rollout import UNSOLVED, work_out
+from ponderpounce.data.seeds import TRAIN_SEED
 from ponderpounce.data.store import Store
 from ponderpounce.data.workers import LocalWorkers, RayWorkers, Workers
 from ponderpounce.tasks.task import TaskError, make_task, task_names
@@ -133,7 +134,9 @@ def print_line(text: str) -> None:
     sys.stdout.write(text + "\n")
 
 
-def collect(options: CollectOptions, workers: Workers, say: Callable[[str], None] = lambda text: None) -> Report:
+def collect(
+    options: CollectOptions, workers: Workers[Job, Package], say: Callable[[str], None] = lambda text: None
+) -> Report:
     """Collects what is missing and joins everything into the dataset.
 
     Raises:
@@ -276,7 +279,7 @@ def _join(out: Path, store: Store, jobs: Sequence[Job], wanted: dict[str, Any]) 
     return Report(num_episodes=len(jobs) - len(unsolved), num_rejected=num_rejected, unsolved=tuple(unsolved))
 
 
-def _workers(options: CollectOptions) -> Workers:
+def _workers(options: CollectOptions) -> Workers[Job, Package]:
     if options.ray is not None:
         return RayWorkers(options.ray, work_out)
     return LocalWorkers(options.workers, work_out)

@@ -14,11 +14,10 @@ import numpy as np
 
 import ponderpounce.tasks.headless  # noqa: F401 - before mujoco is imported
 from ponderpounce.data.episode import Recovery
+from ponderpounce.data.seeds import TRAIN_SEED
 from ponderpounce.data.video import FPS
 from ponderpounce.tasks.oracle import FailedGrasp
 
-TRAIN_SEED = 2_000_000
-"""Training seeds begin here; those below are for evaluation."""
 ATTEMPTS = 100
 DIFFICULTY_CYCLE = ("easy", "easy", "medium", "hard")
 _RECOVERY_CYCLE: tuple[Recovery, ...] = ("z",) * 3 + ("xy",) * 3 + ("none",) * 94

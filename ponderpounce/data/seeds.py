@@ -1,0 +1,6 @@
+"""Which scenes are for training and which for evaluation."""
+
+from __future__ import annotations
+
+TRAIN_SEED = 2_000_000
+"""Training seeds begin here; those below are for evaluation."""
