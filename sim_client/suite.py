@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
 import platform
 import secrets
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from clock.report import statistics, stream_sha256
 from clock.service import ClockService
@@ -25,6 +27,7 @@ from protocol.topics import CLOSE, OPEN, alive_key
 from protocol.version import version
 from sim_client.config import SimOptions
 from sim_client.episode import Outcome, RobotSide, play_oracle
+from sim_client.ledger import write_json
 from sim_client.recorder import Recorder
 from sim_client.robot import demonstration, simulated_robot
 
@@ -55,6 +58,7 @@ class Suite:
         self._check_servers = check_servers
         self._recorder = Recorder(link, options.pixels)
         self._session = f"{options.task}-{secrets.token_hex(4)}"
+        self._num_played = 0
         link.bus.declare_alive(alive_key(link.robot, link.proc))
 
     def run(self, on_tick: OnTick = lambda episode, tick: None) -> dict[str, Any]:
@@ -62,35 +66,54 @@ class Suite:
         out = self._options.out
         out.mkdir(parents=True, exist_ok=True)
         results: dict[str, Any] = {
-            "config": _as_json(dataclasses.asdict(self._options)),
+            "config": as_json(dataclasses.asdict(self._options)),
             "versions": versions(),
             "episodes": [],
         }
         has_eyes = self._options.policy == "servers" or self._options.record  # the oracle alone needs none
         with make_environment(self._options.task, max_steps=self._options.max_steps, render=has_eyes) as environment:
             for index in range(self._options.episodes):
-                results["episodes"].append(self._episode(environment, index, on_tick))
-                _write(out / "results.json", results)
+                episode = self.play(
+                    environment, self._options.task, self._options.seed + index, on_tick=partial(on_tick, index)
+                )
+                results["episodes"].append(episode)
+                write_json(out / "results.json", results)
         return results
 
-    def _episode(self, environment: Environment, index: int, on_tick: OnTick) -> dict[str, Any]:
-        seed = self._options.seed + index
+    def play(
+        self,
+        environment: Environment,
+        task: str,
+        seed: int,
+        *,
+        run: int = 0,
+        on_tick: Callable[[int], None] = lambda tick: None,
+    ) -> dict[str, Any]:
+        """Runs one episode; returns its entry in ``results.json``.
+
+        Args:
+            environment: of ``task``.
+            seed: of the scene.
+            run: which time this scene is played; the flow noise, and delays that are drawn, differ from run to run.
+            on_tick: called with the number of ticks played.
+        """
         first = environment.reset(seed, self._options.difficulty)
-        self._link.enter_episode(self._session, f"{self._options.task}-{seed}-{secrets.token_hex(3)}", index + 1)
+        self._num_played += 1
+        self._link.enter_episode(self._session, f"{task}-{seed}-{secrets.token_hex(3)}", self._num_played)
         demo = self._demonstration(environment)
-        info = replace(self._info(environment, first, seed), has_demo=bool(demo))
+        info = replace(self._info(environment, first, task, seed, run), has_demo=bool(demo))
         path = self._log_path(info) if self._options.record else None
         side = RobotSide(
             self._link, environment, self._recorder, self._let_others, round(self._options.patience_s * 1e9)
         )
-        warnings: tuple[str, ...] = ()
+        opened = m.OpenReply()
         self._recorder.begin(info, path)
         if info.policy == "oracle":
-            outcome, _ = play_oracle(info, side, first, lambda tick: on_tick(index, tick))
+            outcome, _ = play_oracle(info, side, first, on_tick)
         else:
             try:
-                warnings = self._open(m.OpenRequest(info=info, demo=demo))
-                outcome = side.run(info, first, lambda tick: on_tick(index, tick))
+                opened = self._open(m.OpenRequest(info=info, demo=demo))
+                outcome = side.run(info, first, on_tick)
             except TransportError as error:
                 outcome = Outcome(status=m.TaskStatus.ABORTED, reason=str(error), num_ticks=0)
         self._await_last_ticks(outcome)
@@ -100,6 +123,7 @@ class Suite:
         return {
             "task": info.task,
             "seed": seed,
+            "run": run,
             "difficulty": info.difficulty,
             "success": result.is_success,
             "status": result.status.name,
@@ -107,19 +131,20 @@ class Suite:
             "steps": result.num_ticks,
             "stream_sha256": result.stream_sha256,
             "mcap": str(path.relative_to(self._options.out)) if path else None,
-            "warnings": [*warnings, *missing],
+            "models": {contract.proc: _model(contract) for contract in opened.contracts},
+            "warnings": [*opened.warnings, *missing],
             "schedule": result.statistics,
         }
 
-    def _info(self, environment: Environment, first: Snapshot, seed: int) -> m.EpisodeInfo:
+    def _info(self, environment: Environment, first: Snapshot, task: str, seed: int, run: int) -> m.EpisodeInfo:
         return m.EpisodeInfo(
             header=self._link.header("info", 0),
-            task=self._options.task,
+            task=task,
             suite="RoboMME",
             seed=seed,
             difficulty=environment.difficulty,
             instruction=environment.instruction,
-            schedule=self._options.schedule(seed),
+            schedule=self._options.schedule(run_seed(seed, run)),
             robot=simulated_robot(environment.physics.robot, first.state),
             t0_unix_ns=time.time_ns(),
             versions=versions(),
@@ -131,7 +156,7 @@ class Suite:
             return ()
         return demonstration(environment, images.wire_codec(self._link.bus.is_local))
 
-    def _open(self, request: m.OpenRequest) -> tuple[str, ...]:
+    def _open(self, request: m.OpenRequest) -> m.OpenReply:
         """Asks the clock service until its servers are ready.
 
         Raises:
@@ -144,7 +169,7 @@ class Suite:
             except CallFailed as error:
                 reply = m.OpenReply(error=str(error), try_again=True)
             if not reply.error:
-                return reply.warnings
+                return reply
             dead = self._check_servers()
             if dead or not reply.try_again or time.monotonic() > deadline_s:
                 raise TransportError(dead or reply.error)
@@ -209,16 +234,24 @@ def versions() -> dict[str, str]:
     return found
 
 
-def _as_json(value: Any) -> Any:
+def run_seed(seed: int, run: int) -> int:
+    """The schedule's seed, and so the flow noise's: that of the scene in run 0, and another in every other run."""
+    return seed if run == 0 else int(np.random.SeedSequence([seed, run]).generate_state(1, np.uint64)[0] >> 1)
+
+
+def as_json(value: Any) -> Any:
+    """Options as they stand in ``results.json``."""
     if isinstance(value, dict):
-        return {key: _as_json(item) for key, item in value.items()}
+        return {key: as_json(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_as_json(item) for item in value]
+        return [as_json(item) for item in value]
     return str(value) if isinstance(value, Path) else value
 
 
-def _write(path: Path, results: dict[str, Any]) -> None:
-    """Atomically: a reader never sees half a file."""
-    partial = path.with_suffix(".json.partial")
-    partial.write_text(json.dumps(results, indent=1) + "\n")
-    partial.replace(path)
+def _model(contract: m.Contract) -> dict[str, Any]:
+    """What is worth knowing afterwards about who answered."""
+    return {
+        "model_hash": contract.model_hash,
+        "num_carriers": contract.num_carriers,
+        "is_untrained": contract.is_fake,
+    }

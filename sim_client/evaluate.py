@@ -1,0 +1,313 @@
+"""``pp-eval``: the paper's evaluation (B.1) of one condition: every task, the same scenes in several runs.
+
+An evaluation is a set of episodes that know nothing of each other. Each is played in lockstep by a worker that has
+loaded its servers once, and written down as soon as it ends (`Ledger`), so a killed evaluation is gone on with by the
+same command: nothing is played twice, nothing is lost, and ``results.json`` says what it would have said.
+"""
+
+from __future__ import annotations
+
+import atexit
+import dataclasses
+import os
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from tqdm import tqdm
+
+import ponderpounce.tasks.headless  # noqa: F401 - before anything that imports mujoco
+
+# isort: split
+
+from ponderpounce.data.errors import DatasetError
+from ponderpounce.data.seeds import TRAIN_SEED
+from ponderpounce.data.workers import LocalWorkers, RayWorkers, Workers
+from ponderpounce.tasks.environment import Environment, make_environment
+from ponderpounce.tasks.task import TaskError, make_task, task_names
+from protocol.bus import Bus
+from protocol.errors import TransportError
+from protocol.link import Link
+from protocol.process import set_up_logging
+from sim_client.config import SimOptions
+from sim_client.donor import DonorError, DonorPonder, donors_in
+from sim_client.launch import Daemons
+from sim_client.ledger import Ledger, LedgerError, write_json
+from sim_client.station import Party, open_station
+from sim_client.suite import Suite, as_json, versions
+
+DONE, REFUSED, INTERRUPTED = 0, 2, 130
+Line = dict[str, Any]  # one episode's entry in results.json
+
+_HOW_MANY = ("tasks", "episodes", "runs")  # a folder may be given more of them later
+_HOW = ("out", "patience_s", "progress")  # and these change no result
+
+
+class EvaluationError(Exception):
+    """An evaluation that cannot be made: the message says what was expected, what came, and the way out."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvalOptions:
+    """Evaluates a pair of checkpoints as the paper does. The same command again goes on with a killed evaluation."""
+
+    out: Path
+    """Folder of one condition: results.json, and with --record one MCAP per episode."""
+    tasks: tuple[str, ...] = ("all",)
+    """sim-client --list-tasks shows them."""
+    episodes: int = 50
+    """Scenes per task (paper: 50)."""
+    runs: int = 3
+    """How often every scene is played, each time with other flow noise (paper: 3)."""
+    seed: int = 0
+    """Of the first scene; all lie below 2,000,000, where the training seeds begin."""
+    difficulty: Literal["easy", "medium", "hard"] | None = None
+    """None: by seed, as the benchmark does."""
+    policy: Literal["servers", "oracle"] = "servers"
+    """oracle: the tasks' own scripts, to test the machine."""
+    ponder_checkpoint: Path | None = None
+    """Weights of PONDER; none are random."""
+    pounce_checkpoint: Path | None = None
+    max_steps: int = 1300
+    """Per episode (paper: 1300)."""
+
+    cognition: Literal["real", "null", "other-episode"] = "real"
+    """null: POUNCE gets the learned null cognition. other-episode: what PONDER said in another episode of the task."""
+    donors: Path | None = None
+    """With --cognition other-episode: the --out of a recorded evaluation with real cognition, of the same scenes."""
+    deliver: Literal["every", "held-transition"] = "every"
+    """held-transition: the first cognition, then those at predicted transitions (paper, 5.2)."""
+    reported_age_ms: int = 0
+    """With held-transition: the age POUNCE is told; 0 is the true one. The paper froze it at 300."""
+    query_period_ms: int = 1000
+    """Between PONDER's looks (paper: 1 Hz)."""
+    delay_ms: int = 300
+    """Of PONDER (paper: fixed 300 ms)."""
+
+    servers: Literal["in-process", "local"] = "in-process"
+    """Each worker's own: in its thread, or two processes that it starts."""
+    workers: int = 1
+    """Processes of this computer; each loads the checkpoints."""
+    ray: str | None = None
+    """Work on a Ray cluster instead: its address, `auto`, or `local`. Logs then need an --out that its nodes share."""
+    gpus_per_worker: float = 0.0
+    """With --ray: what a worker asks for, 0.5 for two on each GPU."""
+    record: bool = False
+    """Write one MCAP per episode, some 10 MB a minute."""
+    patience_s: float = 600.0
+    """How long to wait for servers to be ready, or for any answer."""
+    progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
+    """Show a progress bar."""
+
+    def __post_init__(self) -> None:
+        if min(self.episodes, self.runs, self.workers) < 1 or self.seed < 0:
+            raise EvaluationError("--episodes, --runs and --workers must be at least 1, and --seed at least 0")
+        if self.seed + self.episodes > TRAIN_SEED:
+            raise EvaluationError(
+                f"--seed {self.seed} with {self.episodes} episodes reaches into the training seeds, which begin at "
+                f"{TRAIN_SEED}; evaluate on seeds below"
+            )
+        if self.reported_age_ms and self.deliver != "held-transition":
+            raise EvaluationError("--reported-age-ms is for --deliver held-transition; otherwise ages are true")
+        if self.cognition == "null" and self.deliver != "every":
+            raise EvaluationError("--cognition null delivers nothing, so nothing is held; leave --deliver out")
+        if (self.cognition == "other-episode") != (self.donors is not None):
+            raise EvaluationError("--cognition other-episode and --donors go together: record the real one first")
+        if self.cognition == "other-episode" and (self.servers, self.policy) != ("in-process", "servers"):
+            raise EvaluationError("--cognition other-episode replays PONDER in the worker: use --servers in-process")
+
+    def task_names(self) -> tuple[str, ...]:
+        """The tasks in alphabetical order, each once. Raises TaskError for an unknown one."""
+        if "all" in self.tasks:
+            return task_names()
+        for name in self.tasks:
+            make_task(name)
+        return tuple(sorted(set(self.tasks)))
+
+    def jobs(self) -> list[Job]:
+        """Every episode, task by task: a worker keeps its scene, and finished tasks are whole.
+
+        Raises:
+            TaskError: an unknown task.
+            DonorError: an episode has no donor.
+        """
+        keys = [
+            (task, run, seed)
+            for task in self.task_names()
+            for run in range(self.runs)
+            for seed in range(self.seed, self.seed + self.episodes)
+        ]
+        donors = {} if self.donors is None else donors_in(self.donors, keys)
+        return [
+            Job(options=self, task=task, run=run, seed=seed, donor=donors.get((task, run, seed)))
+            for task, run, seed in keys
+        ]
+
+    def sim(self) -> SimOptions:
+        """The episodes' options: what `sim-client` would be told."""
+        return SimOptions(
+            task="evaluation",
+            episodes=self.episodes,
+            seed=self.seed,
+            difficulty=self.difficulty,
+            policy=self.policy,
+            out=self.out,
+            local=self.servers == "local",
+            in_process=self.servers == "in-process",
+            ponder_checkpoint=self.ponder_checkpoint,
+            pounce_checkpoint=self.pounce_checkpoint,
+            patience_s=self.patience_s,
+            query_period_ms=self.query_period_ms,
+            delay_ms=self.delay_ms,
+            deliver="null" if self.cognition == "null" else self.deliver,
+            held_age_ms=self.reported_age_ms,
+            max_steps=self.max_steps,
+            record=self.record,
+            progress=False,
+        )
+
+    def config(self) -> dict[str, Any]:
+        """As in ``results.json``: sim-client's options, and those that make an evaluation of them."""
+        config: dict[str, Any] = as_json(dataclasses.asdict(self.sim()))
+        del config["task"], config["list_tasks"]
+        own = {"tasks": self.task_names(), "runs": self.runs, "cognition": self.cognition, "donors": self.donors}
+        return config | {name: as_json(value) for name, value in own.items()}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Job:
+    """One episode to play."""
+
+    options: EvalOptions
+    task: str
+    run: int
+    seed: int
+    donor: Path | None = None
+
+    @property
+    def key(self) -> str:
+        return f"{self.task}/{self.run}/{self.seed}"
+
+
+def main(argv: list[str] | None = None) -> int:
+    set_up_logging("WARNING")
+    try:
+        options = tyro.cli(EvalOptions, args=argv, prog="pp-eval", description=EvalOptions.__doc__)
+        episodes = evaluate(options, _workers(options))["episodes"]
+    except (EvaluationError, LedgerError, DonorError, DatasetError, TaskError, TransportError) as error:
+        sys.stderr.write(f"pp-eval: {error}\n")
+        return REFUSED
+    except KeyboardInterrupt:
+        sys.stderr.write("pp-eval: interrupted; finished episodes are kept, the same command goes on\n")
+        return INTERRUPTED
+    for task in sorted({episode["task"] for episode in episodes}):
+        successes = [episode["success"] for episode in episodes if episode["task"] == task]
+        sys.stdout.write(f"{task}: {sum(successes)} of {len(successes)}\n")
+    sys.stdout.write(f"{options.out / 'results.json'}; tables: pp-tables {options.out} --out {options.out}\n")
+    return DONE
+
+
+def evaluate(options: EvalOptions, workers: Workers[Job, Line]) -> dict[str, Any]:
+    """Plays what is missing; returns what ``results.json`` then says of everything in the folder.
+
+    Raises:
+        EvaluationError: an episode could not be begun; those that were finished are kept, and so they are below.
+        LedgerError: the folder holds another condition, or another process works in it.
+        DatasetError: workers keep dying, or there is no Ray.
+        TaskError, DonorError, TransportError: as their names say, before or at the first episode.
+    """
+    jobs = options.jobs()
+    common = {name: value for name, value in options.config().items() if name not in (*_HOW_MANY, *_HOW)}
+    with Ledger(options.out, common | {"versions": versions()}) as ledger:
+        missing = [job for job in jobs if job.key not in ledger.lines]
+        bar = tqdm(total=len(jobs), initial=len(jobs) - len(missing), unit="episode", disable=not options.progress)
+        try:
+            for job, line in workers.run(missing):
+                ledger.commit(job.key, line)
+                bar.update()
+        finally:
+            bar.close()
+            results = {
+                "config": options.config(),
+                "versions": versions(),
+                "episodes": _in_order(ledger.lines.values()),
+            }
+            write_json(options.out / "results.json", results)
+    return results
+
+
+def _in_order(lines: Iterable[Line]) -> list[Line]:
+    return sorted(lines, key=lambda line: (line["task"], line["run"], line["seed"]))
+
+
+def play(job: Job) -> Line:
+    """Plays one episode, in whichever process this is.
+
+    Raises:
+        EvaluationError: it was not begun: servers that do not fit, refuse or died. That says nothing of a policy, and
+            the same command tries again. Whatever ends an episode later is its result.
+    """
+    return _station(job.options).play(job)
+
+
+@cache
+def _station(options: EvalOptions) -> EvaluationStation:
+    """This process's own, with its servers loaded; it lasts as long as the process."""
+    station = EvaluationStation(options)
+    atexit.register(station.close)  # before GL is gone
+    return station
+
+
+class EvaluationStation:
+    """One worker's servers, and the scene of the task it is at."""
+
+    def __init__(self, options: EvalOptions) -> None:
+        sim = options.sim()
+        self._options = options
+        self._donor: DonorPonder | None = None
+        self._daemons = Daemons(options.out / "servers" / str(os.getpid()))
+        replaced = self._build_donor if options.cognition == "other-episode" else None
+        self._station = open_station(sim, self._daemons, replaced)
+        self._suite = Suite(sim, self._station.link, self._station.clock, self._daemons.dead)
+        self._task = ""
+        self._environment: Environment | None = None
+
+    def play(self, job: Job) -> Line:
+        """As the function of this name."""
+        if self._donor is not None and job.donor is not None:
+            self._donor.load(job.donor)
+        line = self._suite.play(self._scene(job.task), job.task, job.seed, run=job.run)
+        if self._options.policy == "servers" and line["status"] == "ABORTED" and line["steps"] == 0:
+            raise EvaluationError(f"{job.key} was not begun: {line['reason']}")
+        if job.donor is not None:
+            line["donor"] = job.donor.name
+        return line
+
+    def close(self) -> None:
+        if self._environment is not None:
+            self._environment.close()
+        self._station.bus.close()
+        self._daemons.__exit__(None, None, None)
+
+    def _scene(self, task: str) -> Environment:
+        if self._environment is None or task != self._task:
+            if self._environment is not None:
+                self._environment.close()
+            has_eyes = self._options.policy == "servers" or self._options.record  # the oracle alone needs none
+            self._environment = make_environment(task, max_steps=self._options.max_steps, render=has_eyes)
+            self._task = task
+        return self._environment
+
+    def _build_donor(self, bus: Bus, robot: str, checkpoint: Path | None) -> Party:
+        self._donor = DonorPonder(Link(bus, robot=robot, proc="ponder"))
+        return self._donor.step
+
+
+def _workers(options: EvalOptions) -> Workers[Job, Line]:
+    if options.ray is not None:
+        return RayWorkers(options.ray, play, num_gpus=options.gpus_per_worker)
+    return LocalWorkers(options.workers, play)

@@ -1,0 +1,84 @@
+"""Everything that an episode needs around it, once: bus, servers, clock service, the robot's end."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from clock.service import ClockService, ServiceConfig
+from protocol.bus import Bus, LocalBus
+from protocol.errors import TransportError
+from protocol.link import Link
+from protocol.options import LinkOptions
+from protocol.zenoh_bus import open_bus
+from sim_client.config import SimOptions
+from sim_client.launch import Daemons, start_local
+
+Party = Callable[[], bool]
+Build = Callable[[Bus, str, Path | None], Party]
+"""Makes a warm server on a bus, for a robot and from a checkpoint; returns its step function."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Station:
+    """Where episodes are played, any number one after the other. Whoever opened it closes the bus."""
+
+    bus: Bus
+    link: Link
+    clock: ClockService | None
+
+
+def open_station(options: SimOptions, daemons: Daemons, ponder: Build | None = None) -> Station:
+    """Starts what the options ask for.
+
+    Args:
+        daemons: what is started as processes is theirs to stop.
+        ponder: in process, a server in place of ``ponder-serve``'s.
+
+    Raises:
+        TransportError: a bus that cannot be opened, or options that contradict each other.
+    """
+    bus, add_party = _bus(options, daemons, ponder)
+    try:
+        clock = None
+        if not options.runs_clock_daemon and options.policy == "servers":
+            config = ServiceConfig(allow_starved=options.allow_starved, watches=not options.in_process)
+            clock = ClockService(Link(bus, robot=options.link.robot, proc="clock"), config)
+            add_party(clock.step)
+        return Station(bus=bus, link=Link(bus, robot=options.link.robot, proc="sim"), clock=clock)
+    except BaseException:
+        bus.close()
+        raise
+
+
+def _bus(options: SimOptions, daemons: Daemons, ponder: Build | None) -> tuple[Bus, Callable[[Party], None]]:
+    """The bus, and how to add one more party to it if all share this thread."""
+    link = options.link
+    if options.policy == "oracle":
+        return LocalBus(), lambda step: None
+    if options.in_process:
+        if options.mode != "lockstep":
+            raise TransportError("--in-process shares one thread: use --mode lockstep, or --local")
+        bus = LocalBus()
+        bus.add_party((ponder or _builder("ponder_server.party"))(bus, link.robot, options.ponder_checkpoint))
+        bus.add_party(_builder("pounce_server.party")(bus, link.robot, options.pounce_checkpoint))
+        return bus, bus.add_party
+    if options.local:
+        endpoints = start_local(
+            daemons,
+            robot=link.robot,
+            with_clock=options.runs_clock_daemon,
+            ponder=["--checkpoint", str(options.ponder_checkpoint)] if options.ponder_checkpoint else [],
+            pounce=["--checkpoint", str(options.pounce_checkpoint)] if options.pounce_checkpoint else [],
+            allow_starved=options.allow_starved,
+        )
+        link = LinkOptions(robot=link.robot, connect=endpoints)
+    return open_bus(link), lambda step: None
+
+
+def _builder(module: str) -> Build:
+    """By name: this package never imports torch, so a robot's computer can do without it."""
+    build: Build = importlib.import_module(module).build
+    return build

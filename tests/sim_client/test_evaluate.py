@@ -1,0 +1,199 @@
+"""An evaluation that was killed anywhere and gone on with is the one that was not; and oracle episodes of two tasks."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ponderpounce.analysis import tables
+from ponderpounce.analysis.results import read_results
+from ponderpounce.data.seeds import TRAIN_SEED
+from protocol import messages as m
+from sim_client import evaluate as module
+from sim_client.evaluate import EvalOptions, EvaluationError, EvaluationStation, Job, Line, evaluate, play
+from sim_client.ledger import LedgerError
+from sim_client.suite import run_seed
+
+TASKS, EPISODES, RUNS = ("PickXtimes", "StopCube"), 2, 2
+NUM_JOBS = len(TASKS) * EPISODES * RUNS
+
+
+class Killed(BaseException):
+    """The process is gone."""
+
+
+class InOrder:
+    """Plays jobs in an order of its own, and is killed when it has done so many."""
+
+    def __init__(self, play: Callable[[Job], Line], order: Sequence[int] = (), dies_after: int | None = None) -> None:
+        self.done: list[str] = []
+        self._play, self._order, self._dies_after = play, order, dies_after
+
+    def run(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, Line]]:
+        for index in [i for i in self._order if i < len(jobs)] or range(len(jobs)):
+            if len(self.done) == self._dies_after:
+                raise Killed
+            self.done.append(jobs[index].key)
+            yield jobs[index], self._play(jobs[index])
+
+
+def pretended(job: Job) -> Line:
+    """An episode that nobody played."""
+    return {
+        "task": job.task,
+        "seed": job.seed,
+        "run": job.run,
+        "difficulty": "easy",
+        "success": bool((job.seed + job.run) % 2),
+        "mcap": None,
+    }
+
+
+def options(out: Path, **changes: Any) -> EvalOptions:
+    values: dict[str, Any] = {
+        "out": out, "tasks": TASKS, "episodes": EPISODES, "runs": RUNS, "policy": "oracle", "progress": False,
+    }  # fmt: skip
+    return EvalOptions(**values | changes)
+
+
+@given(
+    kills=st.lists(st.integers(0, NUM_JOBS - 1), max_size=3),
+    order=st.permutations(range(NUM_JOBS)),
+    torn=st.integers(0, 200),
+)
+@settings(max_examples=25)
+def test_killed_and_gone_on_with_is_as_if_nothing_had_been(
+    tmp_path_factory: pytest.TempPathFactory, kills: list[int], order: list[int], torn: int
+) -> None:
+    out, whole = tmp_path_factory.mktemp("killed"), tmp_path_factory.mktemp("whole")
+    done: list[str] = []
+    for dies_after in kills:
+        workers = InOrder(pretended, order, dies_after)
+        with contextlib.suppress(Killed):
+            evaluate(options(out), workers)
+        done += workers.done
+    ledger = out / "episodes.jsonl"
+    before = len(done)
+    if ledger.exists():  # and the last kill tore the line that was being written
+        kept = ledger.read_bytes()[: -torn or None]
+        before = kept.count(b"\n")
+        ledger.write_bytes(kept)
+    last = InOrder(pretended)
+    found = evaluate(options(out), last)
+    expected = evaluate(options(whole), InOrder(pretended))
+    assert found["episodes"] == expected["episodes"]
+    assert len(found["episodes"]) == NUM_JOBS
+    assert len(last.done) == NUM_JOBS - before
+    assert json.loads((out / "results.json").read_text())["episodes"] == expected["episodes"]
+
+
+def test_more_episodes_are_added_to_a_finished_folder(tmp_path: Path) -> None:
+    evaluate(options(tmp_path), InOrder(pretended))
+    more = InOrder(pretended)
+    found = evaluate(options(tmp_path, episodes=EPISODES + 1), more)
+    assert more.done == ["PickXtimes/0/2", "PickXtimes/1/2", "StopCube/0/2", "StopCube/1/2"]
+    assert len(found["episodes"]) == NUM_JOBS + 4
+
+
+def test_one_folder_holds_one_condition(tmp_path: Path) -> None:
+    evaluate(options(tmp_path), InOrder(pretended))
+    with pytest.raises(LedgerError, match="delay_ms = 300, and this is 1000"):
+        evaluate(options(tmp_path, delay_ms=1000), InOrder(pretended))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"seed": TRAIN_SEED - 1}, "training seeds"),
+        ({"seed": TRAIN_SEED + 5}, "training seeds"),
+        ({"episodes": 0}, "at least 1"),
+        ({"reported_age_ms": 300}, "held-transition"),
+        ({"cognition": "null", "deliver": "held-transition"}, "nothing is held"),
+        ({"cognition": "other-episode"}, "--donors"),
+        ({"donors": Path("x")}, "--donors"),
+        ({"cognition": "other-episode", "donors": Path("x"), "servers": "local"}, "in-process"),
+    ],
+)
+def test_options_that_contradict_each_other_are_refused(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(EvaluationError, match=words):
+        options(tmp_path, **changes)
+
+
+def test_the_last_evaluation_seed_is_below_the_training_seeds(tmp_path: Path) -> None:
+    assert options(tmp_path, seed=TRAIN_SEED - EPISODES).jobs()[-1].seed == TRAIN_SEED - 1
+
+
+def test_the_defaults_are_the_paper_s_protocol(tmp_path: Path) -> None:
+    paper = EvalOptions(out=tmp_path)
+    schedule = paper.sim().schedule(seed=0)
+    assert (paper.episodes, paper.runs, schedule.max_ticks, schedule.mode) == (50, 3, 1300, m.Mode.LOCKSTEP)
+    assert (schedule.query_period_ns, schedule.invoke_period_ticks) == (10**9, 20)
+    assert (schedule.query_delay.kind, schedule.query_delay.mean_ns) == (m.DelayKind.FIXED, 300_000_000)
+    assert len(paper.jobs()) == 16 * 50 * 3
+
+
+@pytest.mark.parametrize(
+    ("changes", "kind", "age_ns"),
+    [
+        ({}, m.DeliveryKind.EVERY, 0),
+        ({"cognition": "null"}, m.DeliveryKind.NULL, 0),
+        ({"deliver": "held-transition"}, m.DeliveryKind.HELD_TRANSITION, 0),
+        ({"deliver": "held-transition", "reported_age_ms": 300}, m.DeliveryKind.HELD_TRANSITION, 300_000_000),
+    ],
+)
+def test_interventions_are_deliveries(tmp_path: Path, changes: Any, kind: m.DeliveryKind, age_ns: int) -> None:
+    delivery = options(tmp_path, **changes).sim().schedule(seed=0).delivery
+    assert (delivery.kind, delivery.reported_age_ns) == (kind, age_ns)
+
+
+@given(st.integers(0, TRAIN_SEED), st.integers(1, 5))
+def test_runs_of_a_scene_have_other_noise(seed: int, run: int) -> None:
+    assert run_seed(seed, 0) == seed
+    assert len({run_seed(seed, each) for each in range(run + 1)}) == run + 1
+    assert 0 <= run_seed(seed, run) < 2**63
+
+
+def test_what_was_not_begun_is_no_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two servers that do not fit say nothing of a policy: nothing is written down, and the reason is told."""
+
+    def refuses(job: Job) -> Line:
+        raise EvaluationError(f"{job.key} was not begun: carriers K")
+
+    monkeypatch.setattr(module, "LocalWorkers", lambda num_workers, play: InOrder(refuses))
+    arguments = ["--out", str(tmp_path), "--tasks", "StopCube", "--episodes", "1", "--policy", "oracle"]
+    assert module.main([*arguments, "--no-progress"]) == module.REFUSED
+    assert json.loads((tmp_path / "results.json").read_text())["episodes"] == []
+
+
+@pytest.mark.sim
+def test_oracle_episodes_of_two_tasks_end_to_end(tmp_path: Path) -> None:
+    """Played in this thread, as a worker would, and made into tables."""
+    chosen = options(tmp_path, runs=1, max_steps=30)
+    with contextlib.closing(EvaluationStation(chosen)) as station:
+        found = evaluate(chosen, InOrder(station.play))
+        again = station.play(chosen.jobs()[0])
+    assert [(e["task"], e["seed"], e["run"]) for e in found["episodes"]] == [
+        (task, seed, 0) for task in TASKS for seed in range(EPISODES)
+    ]
+    assert {(e["status"], e["steps"]) for e in found["episodes"]} == {("TIMEOUT", 30)}
+    assert again == found["episodes"][0]
+    assert read_results(tmp_path).tasks == TASKS
+    assert tables.main([str(tmp_path), "--out", str(tmp_path)]) == 0
+    assert "0.00 [0.0, 65.8]" in (tmp_path / "tables.md").read_text()
+
+
+@pytest.mark.sim
+@pytest.mark.e2e
+def test_a_worker_s_process_plays_what_this_one_does(tmp_path: Path) -> None:
+    arguments = ["--tasks", "StopCube", "--episodes", "1", "--runs", "1", "--policy", "oracle", "--max-steps", "20"]
+    assert module.main([*arguments, "--out", str(tmp_path / "a"), "--no-progress"]) == module.DONE
+    (line,) = json.loads((tmp_path / "a" / "results.json").read_text())["episodes"]
+    (job,) = options(tmp_path / "b", tasks=("StopCube",), episodes=1, runs=1, max_steps=20).jobs()
+    assert play(job) == line
