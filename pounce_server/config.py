@@ -31,3 +31,5 @@ class PounceOptions:
     """H of the random weights; must be PONDER's. Default: the tiny PONDER's."""
     device: str = "cpu"
     dtype: Literal["float32", "bfloat16"] = "float32"
+    continuity: Literal["none", "rtc"] = "none"
+    """rtc: pi0.5 continues the rows that are being played (real-time chunking), for a backward pass per flow step."""

@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 
 DTypeName: TypeAlias = Literal["float32", "bfloat16"]
 
+Continuity: TypeAlias = Literal["none", "rtc"]
+"""Whether a chunk continues the rows that are being played: not, or by real-time chunking (`rtc`)."""
+
 Progress: TypeAlias = Callable[[], None]
 """Called between flow steps, so that a heartbeat comes from the loop that works and not from a timer."""
 
@@ -60,6 +63,12 @@ class Request:
     """Age of the cognition's source observation; 0 with null."""
     seed: int
     """Of the starting noise, at least 0: same seed and inputs, same rows, bit for bit on one machine."""
+    previous_rows: NDArray[np.float32] | None = None
+    """(n, action_dim) float32 in robot units: what is left of the chunk being played; None if there is none."""
+    previous_row0: int = 0
+    """The row of the new chunk that belongs to the tick of the first previous one."""
+    committed_rows: int = 0
+    """How many of the previous rows will be played whatever the new chunk says."""
 
 
 def no_progress() -> None:
@@ -104,6 +113,20 @@ def check_request(request: Request, spec: EngineSpec) -> None:
         raise ValueError(f"this engine takes no cognition (K = 0), came {request.cognition.shape}")
     else:
         _check_floats("cognition", request.cognition, (spec.num_carriers, spec.cognition_size))
+    _check_previous(request, spec)
+
+
+def _check_previous(request: Request, spec: EngineSpec) -> None:
+    num_previous = 0
+    if request.previous_rows is not None:
+        num_previous = len(request.previous_rows)
+        _check_floats("previous_rows", request.previous_rows, (num_previous, spec.action_dim))
+    if request.previous_row0 < 0:
+        raise ValueError(f"previous_row0 must not be negative, came {request.previous_row0}: rows of the future")
+    if not 0 <= request.committed_rows <= num_previous:
+        raise ValueError(
+            f"committed_rows: expected 0..{num_previous}, as there are rows, came {request.committed_rows}"
+        )
 
 
 def _check_floats(name: str, values: NDArray[np.float32], shape: tuple[int, ...]) -> None:
@@ -126,4 +149,6 @@ def example_request(spec: EngineSpec, *, frame_px: int = 256, seed: int = 0) -> 
         cognition=cognition if spec.num_carriers else None,
         age_ns=300_000_000 if spec.num_carriers else 0,
         seed=seed,
+        previous_rows=np.zeros((spec.horizon // 2, spec.action_dim), dtype=np.float32),
+        committed_rows=min(1, spec.horizon // 2),
     )

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ponderpounce.models import flow, rtc
 from ponderpounce.models.flow import EulerStep
 from ponderpounce.models.groot_prompt import EagleTokenizer
 from ponderpounce.models.pounce import Pounce, PounceInputs
@@ -20,6 +21,7 @@ from ponderpounce.models.pounce_groot import GrootInputs, GrootPounce
 from ponderpounce.models.prompt import Tokenizer
 from pounce_server.batching import joined_groot, joined_pi05, of_equal_length
 from pounce_server.contract import (
+    Continuity,
     DTypeName,
     EngineSpec,
     PounceEngine,
@@ -30,7 +32,7 @@ from pounce_server.contract import (
     no_progress,
 )
 from pounce_server.precision import cast_for_serving
-from pounce_server.reading import groot_inputs, pi05_inputs
+from pounce_server.reading import groot_inputs, guide, pi05_inputs
 
 __all__ = ["EagerEngine", "EngineSpec", "PounceEngine", "Request"]
 
@@ -42,9 +44,20 @@ WARM_UP_MEASURED = 20
 
 
 class EagerEngine:
-    """Eager PyTorch, for one thread at a time. Takes over the bundle's model: casts and moves it in place."""
+    """Eager PyTorch, for one thread at a time. Takes over the bundle's model: casts, moves and freezes it in place.
 
-    def __init__(self, bundle: PounceBundle, *, device: str = "cpu", dtype: DTypeName = "float32") -> None:
+    Raises:
+        ValueError: ``continuity`` is "rtc" and the model is not pi0.5.
+    """
+
+    def __init__(
+        self,
+        bundle: PounceBundle,
+        *,
+        device: str = "cpu",
+        dtype: DTypeName = "float32",
+        continuity: Continuity = "none",
+    ) -> None:
         config = bundle.model.config
         self._statistics = bundle.statistics
         self._padded_action_dim = config.padded_action_dim
@@ -63,8 +76,8 @@ class EagerEngine:
             has_fresh_prefix=bundle.has_fresh_prefix,
             dtype=dtype,
         )
-        model = cast_for_serving(bundle.model, dtype).to(self._device).eval()
-        self._sample = _sampler(model, bundle, self._device)
+        model = cast_for_serving(bundle.model, dtype).to(self._device).eval().requires_grad_(False)
+        self._sample = _sampler(model, bundle, self._device, continuity)
 
     @torch.inference_mode()
     def invoke(self, request: Request, progress: Progress = no_progress) -> NDArray[np.float32]:
@@ -127,12 +140,20 @@ class EagerEngine:
 
 
 @torch.inference_mode()
-def _sampler(model: AnyPounce, bundle: PounceBundle, device: torch.device) -> Sampler:
+def _sampler(model: AnyPounce, bundle: PounceBundle, device: torch.device, continuity: Continuity) -> Sampler:
     """Tabulates what depends on the flow step only, and returns the rest."""
     statistics, tokenizer = bundle.statistics, bundle.tokenizer
     if isinstance(model, Pounce):
         assert isinstance(tokenizer, Tokenizer), "the bundle checks this"
+        if continuity == "rtc":
+            return _rtc_sampler(
+                model,
+                lambda request: pi05_inputs(request, model.config, tokenizer, statistics, device),
+                lambda requests: guide(requests, model.config, statistics, device),
+            )
         return _pi05_sampler(model, lambda request: pi05_inputs(request, model.config, tokenizer, statistics, device))
+    if continuity == "rtc":
+        raise ValueError("continuity 'rtc' is pi0.5's only; leave --continuity out for GR00T")
     assert isinstance(tokenizer, EagleTokenizer), "the bundle checks this"
     return _groot_sampler(model, lambda request: groot_inputs(request, model.config, tokenizer, statistics, device))
 
@@ -143,6 +164,30 @@ def _pi05_sampler(pi05: Pounce, read: Callable[[Request], PounceInputs]) -> Samp
     def sample(requests: Sequence[Request], noise_BNA: Tensor) -> Iterator[tuple[list[int], EulerStep]]:
         everyone = list(range(len(requests)))
         for step in pi05.sample(joined_pi05([read(request) for request in requests]), noise_BNA, table):
+            yield everyone, step
+
+    return sample
+
+
+@torch.inference_mode(False)  # what is differentiated through must not be an inference tensor
+def _rtc_sampler(
+    pounce: Pounce,
+    read: Callable[[Request], PounceInputs],
+    guide_of: Callable[[Sequence[Request]], rtc.Guide | None],
+) -> Sampler:
+    table = pounce.step_table()
+
+    @torch.inference_mode(False)
+    def sample(requests: Sequence[Request], noise_BNA: Tensor) -> Iterator[tuple[list[int], EulerStep]]:
+        everyone = list(range(len(requests)))
+        cache = pounce.prefill(joined_pi05([read(request) for request in requests]))
+
+        def velocity_at(index: int, x_BNA: Tensor) -> Tensor:
+            return pounce.pi05.velocity(x_BNA, table.styles[index], cache)
+
+        pull = guide_of(requests)
+        flowing = velocity_at if pull is None else rtc.guided(velocity_at, pull, table.num_steps)
+        for step in flow.euler(flowing, noise_BNA.clone(), table.num_steps):
             yield everyone, step
 
     return sample

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from clock.playback import tick_at
 from clock.rendezvous import Rendezvous
 from pounce_server.contract import EngineSpec, Request
 from protocol import images
@@ -76,6 +77,12 @@ class PounceNode:
         is_null = invocation.ref_query is None or self._spec.num_carriers == 0
         if not is_null and invocation.cognition.shape != expected:
             raise MalformedMessage("Invocation", "cognition", f"{expected}", f"{invocation.cognition.shape}")
+        previous_rows = invocation.previous_rows
+        if previous_rows.size % self._spec.action_dim:
+            expected_size = f"rows of {self._spec.action_dim}"
+            raise MalformedMessage("Invocation", "previous_rows", expected_size, f"{previous_rows.size} numbers")
+        # The rows left are those from the invocation's tick on, the new chunk's those from its observation's.
+        late_ticks = tick_at(observation.source_ns, invocation.now_ns, self._info.schedule.control_hz)
         request = Request(
             instruction=self._info.instruction,
             frames=tuple(images.unpack(image) for image in observation.images),
@@ -83,6 +90,9 @@ class PounceNode:
             cognition=None if is_null else invocation.cognition,
             age_ns=0 if is_null else invocation.age_ns,
             seed=invocation.seed,
+            previous_rows=previous_rows.reshape(-1, self._spec.action_dim) if previous_rows.size else None,
+            previous_row0=max(0, late_ticks),
+            committed_rows=invocation.committed_rows,
         )
         return Work(invocation=invocation, request=request)
 

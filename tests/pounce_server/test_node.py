@@ -173,6 +173,27 @@ def test_a_chunk_says_who_made_it(chunk: m.ActionChunk) -> None:
     assert (chunk.model_hash, chunk.is_fake, chunk.infer_ns) == ("abc", False, 8)
 
 
+@pytest.mark.parametrize(("late_ns", "row0"), [(-1, 0), (0, 0), (49 * MS, 0), (50 * MS, 1), (120 * MS, 2)])
+def test_previous_rows_belong_to_ticks_from_the_invocations_on(
+    new_node: Callable[..., PounceNode], late_ns: int, row0: int
+) -> None:
+    node = new_node()
+    node.on_observation(look(3, source_ns=150 * MS))
+    node.on_invocation(ask(6, 3, now_ns=150 * MS + late_ns))
+    work = node.next_work()
+    assert work is not None
+    assert (work.request.previous_row0, work.request.committed_rows) == (row0, 2)
+    np.testing.assert_array_equal(work.request.previous_rows, np.ones((2, 3), np.float32))
+
+
+def test_previous_rows_of_another_robot_are_refused(new_node: Callable[..., PounceNode]) -> None:
+    node = new_node()
+    node.on_observation(look(3))
+    node.on_invocation(ask(6, 3, previous_rows=np.ones(7, np.float32)))
+    with pytest.raises(MalformedMessage, match="previous_rows: expected rows of 3"):
+        node.next_work()
+
+
 @pytest.mark.parametrize("untrained", [{"is_random": True}, {"has_fresh_prefix": True}])
 def test_a_chunk_of_an_untrained_model_says_so(new_node: Callable[..., PounceNode], untrained: dict[str, bool]) -> None:
     node = new_node(**untrained)
