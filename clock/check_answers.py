@@ -21,6 +21,7 @@ from protocol.mcap_log import EpisodeRecord
 from protocol.messages import (
     EPISODE_CLOCK,
     ActionChunk,
+    ActionSpace,
     Cognition,
     Floats,
     Invocation,
@@ -62,13 +63,14 @@ def answers_of(record: EpisodeRecord) -> Answers:
     """The answers as the clock service takes them: the first to what was asked; doubles and strangers do not count."""
     asked_ns = {q.query: q.source_ns for q in record.queries}
     invoked_ns = {i.invocation: i.now_ns for i in record.invocations}
-    shape = (record.info.schedule.horizon, record.info.robot.action_dim)
+    form = (record.info.schedule.horizon, record.info.robot.action_dim, ActionSpace.JOINT_TARGET)
     answers = Answers()
     for cognition in record.cognitions:
         if asked_ns.get(cognition.query) == cognition.source_ns:
             answers.cognitions.setdefault(cognition.query, cognition)
     for chunk in record.chunks:
-        if invoked_ns.get(chunk.invocation) == chunk.source_ns and (chunk.horizon, chunk.action_dim) == shape:
+        came = (chunk.horizon, chunk.action_dim, chunk.action_space)
+        if invoked_ns.get(chunk.invocation) == chunk.source_ns and came == form:
             answers.chunks.setdefault(chunk.invocation, chunk)
     for stamp in record.stamps:
         if stamp.kind == StampKind.CHUNK:

@@ -26,6 +26,7 @@ from clock.timebase import NS_PER_S
 from protocol.messages import (
     Action,
     ActionChunk,
+    ActionSpace,
     Cognition,
     EpisodeInfo,
     Event,
@@ -134,8 +135,10 @@ class Conductor:
         return _take(self._queries, cognition.query, cognition, cognition.infer_ns, now_ns, self._is_lockstep)
 
     def on_chunk(self, chunk: ActionChunk, now_ns: int) -> bool:
-        """Takes POUNCE's answer; False if nobody asked for it, or its shape or terms are not those asked for."""
+        """Takes POUNCE's answer; False if nobody asked for it, or its shape, space or terms are not those asked for."""
         if (chunk.horizon, chunk.action_dim) != (self.info.schedule.horizon, self.info.robot.action_dim):
+            return False
+        if chunk.action_space != ActionSpace.JOINT_TARGET:
             return False
         terms = (chunk.t_row0, chunk.ref_query, chunk.age_ns)
         if not any(a.index == chunk.invocation and a.terms == terms for a in self._invocations):

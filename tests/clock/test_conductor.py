@@ -493,8 +493,9 @@ def desk(live_info: m.EpisodeInfo) -> Desk:
         {"source_ns": 299 * MS},
         {"horizon": 10, "rows": np.zeros(10 * DIM, np.float32)},
         {"action_dim": 2, "rows": np.zeros(20 * 2, np.float32)},
+        {"action_space": m.ActionSpace.EE_POSE},
     ],
-    ids=["index", "source", "horizon", "action_dim"],
+    ids=["index", "source", "horizon", "action_dim", "action_space"],
 )
 def test_a_chunk_nobody_asked_for_is_not_taken(desk: Desk, changes: dict[str, Any]) -> None:
     assert not desk.conductor.on_chunk(act(desk.invocation, **changes), 320 * MS)
