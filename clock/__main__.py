@@ -11,7 +11,7 @@ from clock.config import ClockOptions
 from clock.service import ClockService
 from protocol.errors import TransportError
 from protocol.link import Link
-from protocol.process import IDLE_WAIT_NS, StopFlag, set_up_logging
+from protocol.process import IDLE_WAIT_NS, StopFlag, freeze_heap, set_up_logging
 from protocol.zenoh_bus import open_bus
 
 log = logging.getLogger("clock-serve")
@@ -28,6 +28,7 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     service = ClockService(Link(bus, robot=options.link.robot, proc="clock"), options.service())
     log.info("ready robot=%s listen=%s", options.link.robot, ",".join(options.link.listen))
+    freeze_heap()
     try:
         while not should_stop():
             if not service.step():

