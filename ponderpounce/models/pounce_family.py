@@ -7,8 +7,8 @@ import torch
 from safetensors import SafetensorError, safe_open
 
 from ponderpounce.models import flow, groot_flow, groot_weights, pi05_weights
-from ponderpounce.models.pounce import Pounce, PounceConfig
-from ponderpounce.models.pounce_groot import GrootPounce, GrootPounceConfig
+from ponderpounce.models.pounce import Pounce, PounceConfig, PounceInputs
+from ponderpounce.models.pounce_groot import GrootInputs, GrootPounce, GrootPounceConfig
 from ponderpounce.models.pounce_init import random_groot_pounce, random_pounce
 from ponderpounce.models.public_layout import WeightsError, weights_files
 
@@ -32,6 +32,21 @@ def blank_model(config: AnyPounceConfig) -> AnyPounce:
 
 def random_model(config: AnyPounceConfig, seed: int) -> AnyPounce:
     return random_pounce(config, seed) if isinstance(config, PounceConfig) else random_groot_pounce(config, seed)
+
+
+def action_loss(
+    model: AnyPounce,
+    inputs: PounceInputs | GrootInputs,
+    actions_BNA: torch.Tensor,
+    noise_BNA: torch.Tensor,
+    time_B: torch.Tensor,
+) -> torch.Tensor:
+    """Returns the scalar L_fm over the robot's action dims. Raises TypeError for the other family's inputs."""
+    if isinstance(model, Pounce) and isinstance(inputs, PounceInputs):
+        return model.loss(inputs, actions_BNA, noise_BNA, time_B)
+    if isinstance(model, GrootPounce) and isinstance(inputs, GrootInputs):
+        return model.loss(inputs, actions_BNA, noise_BNA, time_B)
+    raise TypeError(f"{type(model).__name__} does not read {type(inputs).__name__}")
 
 
 def sample_times(model: AnyPounce, count: int, generator: torch.Generator) -> torch.Tensor:

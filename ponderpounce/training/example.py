@@ -1,7 +1,7 @@
 """One recorded episode under one drawn schedule: PONDER's row, and what each POUNCE invocation saw and should do.
 
-Serving builds the same row segment by segment (``context``), reads the same pixels and prompts (``images``, ``prompt``)
-and refers by the same rule (``clock.reference``); tests hold them equal.
+Serving builds the same row segment by segment (``context``) and refers by the same rule (``clock.reference``); tests
+hold them equal.
 """
 
 from __future__ import annotations
@@ -15,14 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from clock.sampling import Clocks, SampledInvocation, SampledSchedule, sample_schedule
-from ponderpounce.models import prompt
 from ponderpounce.models.context import ContextFormat, Row, Transition
-from ponderpounce.models.images import camera_batch
-from ponderpounce.models.normalisation import RobotStatistics
 from ponderpounce.models.ponder_coordinates import normalised_text
-from ponderpounce.models.pounce import PounceConfig, PounceInputs
-from ponderpounce.models.prompt import Tokenizer
-from ponderpounce.training.joint import NO_QUERY, PonderBatch, PounceBatch
 
 Frame = NDArray[np.uint8]  # (height, width, 3) RGB
 
@@ -128,41 +122,3 @@ def target_rows(episode: TrainingEpisode, tick: int, horizon: int) -> NDArray[np
     """Commands (horizon, 8) from ``tick`` on; after the end the last one stays in force, as on the robot."""
     ticks = np.minimum(tick + np.arange(horizon), episode.num_ticks - 1)
     return episode.action_T8[ticks]
-
-
-def collate(
-    examples: Sequence[Example], config: PounceConfig, tokenizer: Tokenizer, statistics: RobotStatistics
-) -> tuple[PonderBatch, PounceBatch]:
-    """Examples as the joint model takes them; prompts are padded on the right and masked.
-
-    Raises:
-        ValueError: a prompt is longer than ``max_prompt_tokens``.
-    """
-    moments = [(index, example, asked) for index, example in enumerate(examples) for asked in example.invocations]
-    pictures, prompts, actions = [], [], []
-    for _, example, asked in moments:
-        episode, state = example.episode, example.episode.state_T8[asked.tick]
-        pictures.append(camera_batch(episode.frames[asked.tick], config.image_px))
-        text = prompt.prompt_text(episode.instruction, statistics.state.normalise(state))
-        prompts.append(tokenizer.encode(text))
-        actions.append(statistics.normalise_targets(target_rows(episode, asked.tick, config.horizon), state))
-    longest = max(len(ids) for ids in prompts)
-    if longest > config.max_prompt_tokens:
-        raise ValueError(f"a prompt has {longest} tokens, expected at most {config.max_prompt_tokens}")
-    actions_INA = torch.zeros(len(moments), config.horizon, config.padded_action_dim)
-    actions_INA[..., : config.robot_action_dim] = torch.from_numpy(np.stack(actions))
-    references = [asked.reference for _, _, asked in moments]
-    inputs = PounceInputs(
-        images=torch.cat([images for images, _ in pictures]),
-        has_view=torch.cat([has_view for _, has_view in pictures]),
-        token_ids=torch.tensor([ids + [0] * (longest - len(ids)) for ids in prompts]),
-        is_token=torch.tensor([[place < len(ids) for place in range(longest)] for ids in prompts]),
-        age_ns=torch.tensor([reference.age_ns for reference in references]),
-    )
-    episodes = PonderBatch(rows=tuple(e.row for e in examples), frames=tuple(e.frames for e in examples))
-    return episodes, PounceBatch(
-        inputs=inputs,
-        actions_INA=actions_INA,
-        episode_I=torch.tensor([index for index, _, _ in moments]),
-        query_I=torch.tensor([NO_QUERY if r.query is None else r.query for r in references]),
-    )

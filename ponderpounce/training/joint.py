@@ -20,7 +20,9 @@ from torch import Tensor, nn
 
 from ponderpounce.models.context import Row
 from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.pounce import Pounce, PounceInputs
+from ponderpounce.models.pounce import PounceInputs
+from ponderpounce.models.pounce_family import AnyPounce, action_loss
+from ponderpounce.models.pounce_groot import GrootInputs
 
 SampleTimes = Callable[[int, torch.Generator], Tensor]
 """Draws so many flow times."""
@@ -49,7 +51,7 @@ class PonderBatch:
 class PounceBatch:
     """I invocations of the same episodes, in any order."""
 
-    inputs: PounceInputs
+    inputs: PounceInputs | GrootInputs
     """Images, prompts and ages; its cognition is filled in by the model."""
     actions_INA: Tensor
     """Normalised targets, zero beyond the robot's dims."""
@@ -64,7 +66,7 @@ class PounceBatch:
             value = getattr(self.inputs, each.name)
             moved[each.name] = None if value is None else value.to(device)
         return PounceBatch(
-            inputs=PounceInputs(**moved),
+            inputs=type(self.inputs)(**moved),
             actions_INA=self.actions_INA.to(device),
             episode_I=self.episode_I.to(device),
             query_I=self.query_I.to(device),
@@ -104,16 +106,20 @@ class JointLoss(NamedTuple):
     total: Tensor
     flow_matching: Tensor
     grounding: Tensor
-    num_supervised: int
-    """Tokens under the LM head's cross-entropy."""
+    said_N: Tensor
+    """int64: at every token under the LM head's cross-entropy, row after row, the likeliest one instead."""
     num_null: int
     """Invocations that saw the null cognition."""
+
+    @property
+    def num_supervised(self) -> int:
+        return len(self.said_N)
 
 
 class JointModel(nn.Module):
     """PONDER and POUNCE as one module, with the weights of the two losses."""
 
-    def __init__(self, ponder: Ponder, pounce: Pounce, *, w1: float = 1.0, w2: float = 0.1) -> None:
+    def __init__(self, ponder: Ponder, pounce: AnyPounce, *, w1: float = 1.0, w2: float = 0.1) -> None:
         """Raises ValueError if POUNCE was built for another cognition than PONDER gives."""
         super().__init__()
         wanted = (pounce.config.cognition.num_carriers, pounce.config.cognition.cognition_size)
@@ -126,17 +132,17 @@ class JointModel(nn.Module):
 
     def forward(self, episodes: PonderBatch, invocations: PounceBatch, draws: Draws) -> JointLoss:
         hidden = encode_rows(self.ponder, episodes)
-        grounding, num_supervised = self._grounding(episodes, hidden)
+        grounding, said_N = self._grounding(episodes, hidden)
         cognition_QKH, first_query = gather_cognition(episodes.rows, hidden)
         is_null_I = (invocations.query_I == NO_QUERY) | draws.is_dropped_I
         index_I = first_query[invocations.episode_I] + invocations.query_I.clamp(min=0)
         inputs = replace(invocations.inputs, cognition=cognition_QKH[index_I], is_null=is_null_I)
-        matching = self.pounce.loss(inputs, invocations.actions_INA, draws.noise_INA, draws.time_I)
+        matching = action_loss(self.pounce, inputs, invocations.actions_INA, draws.noise_INA, draws.time_I)
         return JointLoss(
             total=self.weigh(matching, grounding),
             flow_matching=matching,
             grounding=grounding,
-            num_supervised=num_supervised,
+            said_N=said_N,
             num_null=int(is_null_I.sum()),
         )
 
@@ -144,20 +150,19 @@ class JointModel(nn.Module):
         """L of its two parts."""
         return self.w1 * matching + self.w2 * grounding
 
-    def _grounding(self, episodes: PonderBatch, hidden: Sequence[Tensor]) -> tuple[Tensor, int]:
+    def _grounding(self, episodes: PonderBatch, hidden: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         """Mean cross-entropy over every supervised token of the batch; zero, on the graph, if there is none."""
         if self.w2 == 0:  # no annotations: the LM head is not even run
-            return hidden[0].new_zeros(()), 0
+            return hidden[0].new_zeros(()), torch.zeros(0, dtype=torch.int64)
         read, wanted = [], []
         for row, hidden_TH in zip(episodes.rows, hidden, strict=True):
             index = torch.from_numpy(row.supervised_index).to(hidden_TH.device)
             read.append(hidden_TH[index])
             wanted.append(torch.tensor(row.targets, device=hidden_TH.device)[index + 1])
-        targets = torch.cat(wanted)
+        targets_N = torch.cat(wanted)
         logits_NV = self.ponder.logits(torch.cat(read))
-        if not len(targets):
-            return logits_NV.sum(), 0
-        return F.cross_entropy(logits_NV.float(), targets), len(targets)
+        said_N = logits_NV.detach().argmax(dim=-1)
+        return F.cross_entropy(logits_NV.float(), targets_N) if len(targets_N) else logits_NV.sum(), said_N
 
 
 def encode_rows(ponder: Ponder, episodes: PonderBatch) -> list[Tensor]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 
 from clock import sampling
@@ -85,7 +85,23 @@ def tiny() -> Recipe:
     )
 
 
-RECIPES: dict[str, Callable[[], Recipe]] = {"robomme": robomme, "robocasa_dc": robocasa_dc, "tiny": tiny}
+def tiny_groot() -> Recipe:
+    """``robocasa_dc`` at the size of ``tiny``: GR00T N1.5's parts, actions only, its clocks and its dropout."""
+    return replace(
+        tiny(),
+        name="tiny_groot",
+        pounce=pounce_configs.tiny_groot(cognition_size=ponder_configs.tiny_cpu().hidden_size),
+        example=ExampleConfig(clocks=sampling.ROBOCASA_DC, max_invocations=8, is_grounded=False),
+        w2=0.0,
+    )
+
+
+RECIPES: dict[str, Callable[[], Recipe]] = {
+    "robomme": robomme,
+    "robocasa_dc": robocasa_dc,
+    "tiny": tiny,
+    "tiny_groot": tiny_groot,
+}
 
 
 def recipe(name: str) -> Recipe:

@@ -26,11 +26,11 @@ from tqdm import tqdm
 from ponderpounce.data.errors import DatasetError
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import load_ponder, save_ponder
-from ponderpounce.models.pounce import Pounce, freeze
+from ponderpounce.models.pounce import freeze
 from ponderpounce.models.pounce_checkpoint import PounceBundle, load_bundle, random_bundle, save_bundle
-from ponderpounce.models.prompt import Tokenizer
+from ponderpounce.training.collate import collate
 from ponderpounce.training.data import TrainingSet
-from ponderpounce.training.example import collate, make_example
+from ponderpounce.training.example import make_example
 from ponderpounce.training.joint import JointModel, PonderBatch, PounceBatch
 from ponderpounce.training.parallel import World, gather, joined, shard
 from ponderpounce.training.recipes import Recipe, recipe
@@ -45,7 +45,7 @@ class TrainOptions:
     """Trains PONDER and POUNCE together. The same command again resumes a run that was killed."""
 
     recipe: str
-    """robomme and robocasa_dc are the paper's; tiny runs on one CPU core."""
+    """robomme and robocasa_dc are the paper's; tiny and tiny_groot run on one CPU core."""
     data: Path
     """A folder that pp-collect or pp-export made."""
     out: Path
@@ -80,10 +80,8 @@ class Batches:
 
     def __init__(self, data: TrainingSet, run: Recipe, model: JointModel, bundle: PounceBundle, world: World) -> None:
         """Raises ValueError if the batch has fewer episodes than there are processes."""
-        if not isinstance(bundle.tokenizer, Tokenizer):
-            raise ValueError("training GR00T jointly is not built yet; use a recipe with pi0.5")
         self._data, self._run, self._model = data, run, model
-        self._bundle, self._tokenizer, self._device = bundle, bundle.tokenizer, world.device
+        self._bundle, self._device = bundle, world.device
         self._places = world.share(run.batch_episodes)
 
     def __call__(self, step: int) -> tuple[PonderBatch, PounceBatch]:
@@ -96,7 +94,7 @@ class Batches:
             )
             for place in self._places
         ]
-        episodes, invocations = collate(examples, config, self._tokenizer, self._bundle.statistics)
+        episodes, invocations = collate(examples, config, self._bundle.tokenizer, self._bundle.statistics)
         return episodes.to(self._device), invocations.to(self._device)
 
 
@@ -189,8 +187,8 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
     bundle = random_bundle(run.pounce, seed) if options.pounce is None else load_bundle(options.pounce)
     bundle = replace(bundle, statistics=data.statistics(run.pounce.horizon))
     pounce = bundle.model.to(options.device)
-    if not isinstance(pounce, Pounce):
-        raise ValueError("training GR00T jointly is not built yet; use a recipe with pi0.5")
+    if type(pounce.config) is not type(run.pounce):
+        raise ValueError(f"recipe {run.name} is of another action model than {options.pounce} holds")
     freeze(pounce, run.freeze)
     return JointModel(ponder, pounce, w1=run.w1, w2=run.w2), bundle
 

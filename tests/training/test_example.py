@@ -11,22 +11,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clock.sampling import EVALUATION, ROBOMME, sample_schedule
+from ponderpounce.models.groot_prompt import tiny_eagle_tokenizer_for_random_weights
 from ponderpounce.models.normalisation import ROBOMME as STATISTICS
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
 from ponderpounce.models.pounce_configs import tiny_cpu as tiny_pounce
+from ponderpounce.models.pounce_configs import tiny_groot
+from ponderpounce.models.pounce_groot import GrootInputs
 from ponderpounce.models.prompt import tiny_tokenizer_for_random_weights
+from ponderpounce.training.collate import collate
 from ponderpounce.training.example import (
     ExampleConfig,
     TrainingEpisode,
-    collate,
     episode_row,
     make_example,
     row_frames,
     target_rows,
 )
 from pounce_server.contract import Request
-from pounce_server.reading import pi05_inputs
+from pounce_server.reading import groot_inputs, pi05_inputs
 
 PONDER = Ponder.random(replace(tiny_ponder(), image_px=(64, 64), num_layers=4), seed=1)
 FORM = PONDER.format
@@ -81,6 +84,38 @@ def test_an_invocation_is_read_as_pounce_serve_reads_it(num_ticks: int, seed: in
         assert batch.inputs.is_token[place].sum() == num_tokens
         assert batch.inputs.age_ns[place] == served.age_ns[0]
         assert batch.query_I[place] == asked.reference.query
+
+
+def test_groot_reads_an_invocation_as_pounce_serve_does() -> None:
+    recorded, longer = (
+        episode(50, seed=3),
+        replace(episode(50, seed=4), instruction="press the button, then pick it up"),
+    )
+    config, tokenizer = tiny_groot(horizon=6), tiny_eagle_tokenizer_for_random_weights()
+    form = ExampleConfig(clocks=ROBOMME, max_invocations=3)
+    examples = [make_example(each, FORM, form, np.random.default_rng(1)) for each in (recorded, longer)]
+    _, batch = collate(examples, config, tokenizer, STATISTICS)
+    moments = [(example.episode, asked) for example in examples for asked in example.invocations]
+    for place, (seen, asked) in enumerate(moments):
+        request = Request(
+            frames=seen.frames[asked.tick],
+            proprio=seen.state_T8[asked.tick],
+            instruction=seen.instruction,
+            cognition=np.zeros((1, 64), np.float32),
+            age_ns=asked.reference.age_ns,
+            seed=0,
+        )
+        served = groot_inputs(request, config, tokenizer, STATISTICS, torch.device("cpu"))
+        num_tokens = served.token_ids.shape[1]
+        assert isinstance(batch.inputs, GrootInputs)
+        for name in ("images", "state", "embodiment", "age_ns"):
+            assert torch.equal(getattr(batch.inputs, name)[place], getattr(served, name)[0]), name
+        assert torch.equal(batch.inputs.token_ids[place, -num_tokens:], served.token_ids[0])
+        assert (
+            batch.inputs.is_token[place].tolist()
+            == [False] * (batch.inputs.token_ids.shape[1] - num_tokens) + [True] * num_tokens
+        )
+    assert not batch.inputs.is_token.all()  # the shorter instruction is padded
 
 
 def test_targets_turn_back_into_the_commands() -> None:

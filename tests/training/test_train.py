@@ -62,6 +62,9 @@ def small_recipe(monkeypatch: pytest.MonkeyPatch) -> None:
     ponder = replace(run.ponder, image_px=(PX, PX), num_layers=4)
     small = replace(run, ponder=ponder, example=replace(run.example, max_invocations=2), batch_episodes=2)
     monkeypatch.setitem(recipes.RECIPES, "tiny", lambda: small)
+    other = recipes.tiny_groot()
+    groot = replace(other, ponder=ponder, example=replace(other.example, max_invocations=2))
+    monkeypatch.setitem(recipes.RECIPES, "tiny_groot", lambda: groot)
 
 
 def options(folder: Path, out: Path, **changes: object) -> TrainOptions:
@@ -98,8 +101,9 @@ def test_statistics_put_what_happened_into_the_networks_range(folder: Path) -> N
     assert np.mean(np.abs(states) <= 1.0) == pytest.approx(0.98, abs=0.02)
 
 
-def test_a_run_leaves_folders_that_the_servers_load(folder: Path, tmp_path: Path) -> None:
-    train.train(options(folder, tmp_path / "run"))
+@pytest.mark.parametrize("name", ["tiny", "tiny_groot"])
+def test_a_run_leaves_folders_that_the_servers_load(folder: Path, tmp_path: Path, name: str) -> None:
+    train.train(options(folder, tmp_path / "run", recipe=name))
     steps = [json.loads(line)["step"] for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
     assert steps == [0, 1]
     assert not load_ponder(tmp_path / "run" / "ponder").is_random
