@@ -257,9 +257,7 @@ def play(job: Job) -> Line:
 @cache
 def _station(options: EvalOptions) -> EvaluationStation:
     """This process's own, with its servers loaded; it lasts as long as the process."""
-    station = EvaluationStation(options)
-    atexit.register(station.close)  # before GL is gone
-    return station
+    return EvaluationStation(options)
 
 
 class EvaluationStation:
@@ -288,6 +286,8 @@ class EvaluationStation:
         return line
 
     def close(self) -> None:
+        """Done by itself when the process ends."""
+        atexit.unregister(self.close)
         if self._environment is not None:
             self._environment.close()
         self._station.bus.close()
@@ -300,6 +300,10 @@ class EvaluationStation:
             has_eyes = self._options.policy == "servers" or self._options.record  # the oracle alone needs none
             self._environment = make_environment(task, max_steps=self._options.max_steps, render=has_eyes)
             self._task = task
+            atexit.unregister(self.close)
+            atexit.register(
+                self.close
+            )  # only now: the latest goes first, and GL, just loaded, must not be gone by then
         return self._environment
 
     def _build_donor(self, bus: Bus, robot: str, checkpoint: Path | None) -> Party:

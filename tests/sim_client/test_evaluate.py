@@ -16,6 +16,7 @@ from ponderpounce.analysis import tables
 from ponderpounce.analysis.results import read_results
 from ponderpounce.data.seeds import TRAIN_SEED
 from protocol import messages as m
+from protocol.mcap_log import read_log
 from sim_client import evaluate as module
 from sim_client.evaluate import EvalOptions, EvaluationError, EvaluationStation, Job, Line, evaluate, play
 from sim_client.ledger import LedgerError
@@ -187,6 +188,27 @@ def test_oracle_episodes_of_two_tasks_end_to_end(tmp_path: Path) -> None:
     assert read_results(tmp_path).tasks == TASKS
     assert tables.main([str(tmp_path), "--out", str(tmp_path)]) == 0
     assert "0.00 [0.0, 65.8]" in (tmp_path / "tables.md").read_text()
+
+
+@pytest.mark.sim
+def test_another_episode_s_cognition_reaches_the_servers(tmp_path: Path) -> None:
+    """Two recorded episodes of the tiny models; then the first again, with what PONDER said in the second."""
+    shared: dict[str, Any] = {"tasks": ("StopCube",), "runs": 1, "policy": "servers", "difficulty": "easy"}
+    shared |= {"max_steps": 25, "record": True}
+    real = options(tmp_path / "real", **shared)
+    with contextlib.closing(EvaluationStation(real)) as station:
+        own, donor = evaluate(real, InOrder(station.play))["episodes"]
+    other = options(tmp_path / "other", cognition="other-episode", donors=tmp_path / "real", **shared)
+    with contextlib.closing(EvaluationStation(other)) as station:
+        given = station.play(other.jobs()[0])
+    assert given["donor"] == Path(donor["mcap"]).name
+    assert given["stream_sha256"] != own["stream_sha256"]
+    vectors = [
+        [cognition.vector.tolist() for cognition in read_log(folder / line["mcap"]).cognitions]
+        for folder, line in ((tmp_path / "real", donor), (tmp_path / "other", given))
+    ]
+    assert vectors[0] == vectors[1]
+    assert own["models"]["ponder"]["is_untrained"]
 
 
 @pytest.mark.sim
