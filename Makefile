@@ -24,6 +24,8 @@ $(READY): requirements.txt pyproject.toml
 	$(BIN)/pip install --quiet "$(TORCH)"           # first and alone: a range elsewhere would fetch gigabytes of CUDA
 	$(BIN)/pip install --quiet -r requirements.txt
 	$(BIN)/pip install --quiet --no-deps robosuite==1.5.2 openpi-client==0.1.2  # their own pins contradict numpy 2
+	# A CUDA build of torch brings its own Triton, and elsewhere than on Linux there is none.
+	$(BIN)/python -c 'import triton' 2>/dev/null || test "$$(uname)" != Linux || $(BIN)/pip install --quiet triton==3.6.0
 	$(BIN)/pip install --quiet --no-deps --no-build-isolation --editable .
 	touch $@
 

@@ -36,7 +36,9 @@ def build_engine(options: PounceOptions) -> PounceEngine:
         hidden_size = options.hidden_size or tiny_ponder().hidden_size
         tiny = tiny_groot if options.family == "groot" else tiny_cpu
         bundle = random_bundle(tiny(num_carriers=options.num_carriers, cognition_size=hidden_size), options.seed)
-    return EagerEngine(bundle, device=options.device, dtype=options.dtype, continuity=options.continuity)
+    return EagerEngine(
+        bundle, device=options.device, dtype=options.dtype, continuity=options.continuity, path=options.path
+    )
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -30,6 +30,8 @@ class PounceOptions:
     hidden_size: int | None = None
     """H of the random weights; must be PONDER's. Default: the tiny PONDER's."""
     device: str = "cpu"
+    path: Literal["eager", "fused"] = "eager"
+    """fused: Triton kernels, static buffers and CUDA graphs for pi0.5; needs a GPU and Triton."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     continuity: Literal["none", "rtc"] = "none"
     """rtc: pi0.5 continues the rows that are being played (real-time chunking), for a backward pass per flow step."""

@@ -4,7 +4,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 import torch
@@ -31,6 +31,7 @@ from pounce_server.contract import (
     example_request,
     no_progress,
 )
+from pounce_server.fused import fused_for
 from pounce_server.precision import cast_for_serving
 from pounce_server.reading import groot_inputs, guide, pi05_inputs
 
@@ -39,15 +40,18 @@ __all__ = ["EagerEngine", "EngineSpec", "PounceEngine", "Request"]
 Sampler: TypeAlias = Callable[[Sequence[Request], Tensor], Iterator[tuple[list[int], EulerStep]]]
 """Reads requests and yields flow steps from given noise, (B, N, A), each with the indices of the requests it moves."""
 
+PathName: TypeAlias = Literal["eager", "fused"]
+
 WARM_UP_UNMEASURED = 3
 WARM_UP_MEASURED = 20
 
 
 class EagerEngine:
-    """Eager PyTorch, for one thread at a time. Takes over the bundle's model: casts, moves and freezes it in place.
+    """PyTorch for one thread at a time, eager or fused. Takes over the bundle's model: casts, moves and freezes it.
 
     Raises:
-        ValueError: ``continuity`` is "rtc" and the model is not pi0.5.
+        ValueError: ``continuity`` is "rtc" and the model is not pi0.5; or ``path`` is "fused", and the model is not
+            pi0.5, the chunks are to be continued, or Triton has nothing to run on.
     """
 
     def __init__(
@@ -57,6 +61,7 @@ class EagerEngine:
         device: str = "cpu",
         dtype: DTypeName = "float32",
         continuity: Continuity = "none",
+        path: PathName = "eager",
     ) -> None:
         config = bundle.model.config
         self._statistics = bundle.statistics
@@ -77,7 +82,10 @@ class EagerEngine:
             dtype=dtype,
         )
         model = cast_for_serving(bundle.model, dtype).to(self._device).eval().requires_grad_(False)
-        self._sample = _sampler(model, bundle, self._device, continuity)
+        if path == "fused":
+            self._sample = _fused_sampler(model, bundle, self._device, continuity)
+        else:
+            self._sample = _sampler(model, bundle, self._device, continuity)
 
     @torch.inference_mode()
     def invoke(self, request: Request, progress: Progress = no_progress) -> NDArray[np.float32]:
@@ -201,5 +209,20 @@ def _groot_sampler(groot: GrootPounce, read: Callable[[Request], GrootInputs]) -
         for alike in of_equal_length(inputs):
             for step in groot.sample(joined_groot([inputs[index] for index in alike]), noise_BNA[alike], table):
                 yield alike, step
+
+    return sample
+
+
+def _fused_sampler(model: AnyPounce, bundle: PounceBundle, device: torch.device, continuity: Continuity) -> Sampler:
+    if not isinstance(model, Pounce) or continuity != "none":
+        raise ValueError("the fused path is for pi0.5 without --continuity; leave --path fused out")
+    pi05, statistics, tokenizer = model, bundle.statistics, bundle.tokenizer
+    assert isinstance(tokenizer, Tokenizer), "the bundle checks this"
+    fused, text = fused_for(pi05, device), tokenizer
+
+    def sample(requests: Sequence[Request], noise_BNA: Tensor) -> Iterator[tuple[list[int], EulerStep]]:
+        inputs = [pi05_inputs(request, pi05.config, text, statistics, device) for request in requests]
+        for step in fused.sample(joined_pi05(inputs), noise_BNA):
+            yield list(range(len(requests))), step
 
     return sample

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from ponderpounce.models import flow
 from ponderpounce.models.interface import CognitionConfig, CognitionPrefix
-from ponderpounce.models.pi05 import Pi05, Pi05Config, PrefixCache, StepTable
+from ponderpounce.models.pi05 import Pi05, Pi05Config, Prefix, PrefixCache, StepTable
 
 Freeze = Literal["none", "vision", "vlm"]
 
@@ -131,12 +131,12 @@ class Pounce(nn.Module):
     def backbone(self) -> Backbone:
         return Backbone(vision=(self.pi05.vision, self.pi05.projector), language=self.pi05.language)
 
-    def prefill(self, inputs: PounceInputs) -> PrefixCache:
-        """Embeds [P][images][text] and runs it through the language layers once."""
+    def embed_prefix(self, inputs: PounceInputs) -> Prefix:
+        """Embeds [P][images][text]."""
         cognition_BPW = None
         if self.cognition_prefix is not None:
             cognition_BPW = self.cognition_prefix(inputs.cognition, inputs.age_ns, inputs.is_null)
-        prefix = self.pi05.embed_prefix(
+        return self.pi05.embed_prefix(
             inputs.images,
             inputs.has_view,
             inputs.token_ids,
@@ -144,7 +144,10 @@ class Pounce(nn.Module):
             cognition_BPW=cognition_BPW,
             is_isolated=self.config.cognition.attention == "isolated",
         )
-        return self.pi05.prefill(prefix)
+
+    def prefill(self, inputs: PounceInputs) -> PrefixCache:
+        """Embeds [P][images][text] and runs it through the language layers once."""
+        return self.pi05.prefill(self.embed_prefix(inputs))
 
     def loss(
         self,

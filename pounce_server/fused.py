@@ -1,0 +1,151 @@
+"""POUNCE's fast path for pi0.5: packed weights, static buffers, fused operations, and a graph per shape of the prefix.
+
+The prefix is padded to a bucket of 16 tokens; padding is unseen and takes no position, so it changes no number beyond
+rounding. A bucket's work is captured once: the prefill, and each flow step with its own styles, so that a heartbeat
+can be given between steps.
+"""
+
+# B batch, T prefix tokens with padding, N horizon, A padded action dim, E expert width, S = T + N slots
+
+from collections.abc import Iterator
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ponderpounce.models.flow import EulerStep
+from ponderpounce.models.gemma import RmsNorm
+from ponderpounce.models.pi05 import Pi05, Prefix
+from ponderpounce.models.pounce import Pounce, PounceInputs
+from pounce_server.fused_stream import KERNELS, FusedStream, Norm, Operations, Run
+from pounce_server.graphs import Capture, Work, cuda_graph, directly
+from pounce_server.kernels.launch import missing_for
+from pounce_server.kernels.rms_norm import Style
+
+BUCKET_TOKENS = 16
+
+
+class FusedPounce:
+    """A pi0.5 POUNCE that samples as `Pounce.sample` does, within rounding. Takes the model over: repacks its weights.
+
+    Not for two threads: all samples of a bucket share its buffers.
+    """
+
+    @torch.no_grad()
+    def __init__(self, model: Pounce, operations: Operations = KERNELS, capture: Capture = directly) -> None:
+        pi05 = model.pi05
+        self._model = model
+        self._capture = capture
+        self._buckets: dict[tuple[int, int], Bucket] = {}
+        self._network = FusedNetwork(pi05, operations, model.config.num_steps)
+
+    def sample(self, inputs: PounceInputs, noise_BNA: Tensor) -> Iterator[EulerStep]:
+        """Yields the sampler's steps. Their tensors are the bucket's own: copy what must outlive the next step."""
+        prefix = _padded(self._model.embed_prefix(inputs))
+        key = (prefix.is_real.shape[0], prefix.is_real.shape[1])
+        if key not in self._buckets:  # captured before it is loaded: capturing runs the work on whatever lies there
+            self._buckets[key] = Bucket(self._network, prefix, self._capture)
+        bucket = self._buckets[key]
+        bucket.load(prefix, noise_BNA)
+        bucket.prefill()
+        for index, step in enumerate(bucket.steps):
+            step()
+            yield EulerStep(index, bucket.velocity.view_as(noise_BNA), bucket.actions.view_as(noise_BNA))
+
+
+def fused_for(model: Pounce, device: torch.device) -> FusedPounce:
+    """The fast path on ``device``: graphs on a GPU, plain calls in Triton's interpreter.
+
+    Raises:
+        ValueError: Triton, or a device that it can run on, is missing; the message says what to do.
+    """
+    if missing := missing_for(device):
+        raise ValueError(f"--path fused cannot run here. {missing}; or --path eager")
+    return FusedPounce(model, KERNELS, cuda_graph if device.type == "cuda" else directly)
+
+
+def _padded(prefix: Prefix) -> Prefix:
+    count = -prefix.is_real.shape[1] % BUCKET_TOKENS
+    return Prefix(
+        embeds=F.pad(prefix.embeds, (0, 0, 0, count)),
+        is_real=F.pad(prefix.is_real, (0, count)),
+        num_cognition=prefix.num_cognition,
+        is_isolated=prefix.is_isolated,
+    )
+
+
+class FusedNetwork:
+    """What does not depend on a request: both streams' packed weights, the tabulated norms, the projections."""
+
+    def __init__(self, pi05: Pi05, operations: Operations, num_steps: int) -> None:
+        self.config = pi05.config
+        self.operations = operations
+        self.num_steps = num_steps
+        self.language = FusedStream(pi05.language.layers, operations)
+        self.expert = FusedStream(pi05.expert.layers, operations)
+        self.prefix_norms = [
+            _plain(norm)
+            for layer in pi05.language.layers
+            for norm in (layer.input_layernorm, layer.post_attention_layernorm)
+        ]
+        self.step_norms = [_styled(styles_M3BTE[:, :, 0, 0]) for styles_M3BTE in pi05.step_table(num_steps).styles]
+        self.action_in = pi05.action_in_proj
+        self.action_out = pi05.action_out_proj
+
+
+def _plain(norm: RmsNorm) -> Norm:
+    return Norm(Style(1.0 + norm.weight.data.float()))
+
+
+def _styled(styles_M3E: Tensor) -> list[Norm]:
+    return [Norm(Style(scale, shift), gate) for scale, shift, gate in styles_M3E]
+
+
+class Bucket:
+    """Static buffers for prefixes of one shape, and the captured work over them."""
+
+    def __init__(self, network: FusedNetwork, prefix: Prefix, capture: Capture) -> None:
+        config, horizon = network.config, network.config.horizon
+        batch_size, num_prefix = prefix.is_real.shape
+        embeds = prefix.embeds
+        self._network = network
+        self._prefix_runs = []
+        first = 0
+        for stream in prefix.streams():
+            seen = slice(first, first + stream.is_real.shape[1])
+            self._prefix_runs.append(Run(config.language, batch_size, stream.is_real.shape[1], seen, embeds))
+            first = seen.stop
+        self._action_run = Run(config.expert, batch_size, horizon, slice(0, num_prefix + horizon), embeds)
+        cache_shape = (batch_size, config.expert.num_kv_heads, num_prefix + horizon, config.expert.head_dim)
+        self._cache = [
+            (embeds.new_zeros(cache_shape), embeds.new_zeros(cache_shape)) for _ in range(config.expert.depth)
+        ]
+        self.actions = torch.zeros(batch_size * horizon, config.action_dim, device=embeds.device)
+        self.velocity = torch.zeros_like(self.actions)
+        self.prefill: Work = capture(self._prefill)
+        self.steps: list[Work] = [capture(self._step(norms)) for norms in network.step_norms]
+
+    def load(self, prefix: Prefix, noise_BNA: Tensor) -> None:
+        for stream, run in zip(prefix.streams(), self._prefix_runs, strict=True):
+            run.x.copy_(stream.embeds.flatten(0, 1))
+            run.place(stream.positions(), stream.is_real)
+        next_position_B = prefix.is_real.sum(dim=1) - prefix.num_cognition
+        offsets_N = torch.arange(noise_BNA.shape[1], device=noise_BNA.device)
+        is_action_BN = prefix.is_real.new_ones(noise_BNA.shape[:2])
+        self._action_run.place(next_position_B[:, None] + offsets_N, torch.cat([prefix.is_real, is_action_BN], dim=1))
+        self.actions.copy_(noise_BNA.flatten(0, 1))
+
+    def _prefill(self) -> None:
+        for run in self._prefix_runs:
+            self._network.language(run, self._network.prefix_norms, self._cache)
+
+    def _step(self, norms: list[Norm]) -> Work:
+        network, run = self._network, self._action_run
+
+        def step() -> None:
+            run.x.copy_(network.action_in(self.actions))
+            network.expert(run, norms, self._cache)
+            torch.mm(run.normed.float(), network.action_out.weight.T, out=self.velocity)
+            network.operations.euler(self.actions, self.velocity, network.action_out.bias, network.num_steps)
+
+        return step

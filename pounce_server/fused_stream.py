@@ -1,0 +1,132 @@
+"""A stream of pi0.5, prefix or actions, over packed weights and static buffers.
+
+Per layer: four GEMMs (q|k|v and gate|up are one each), one attention, and four fused operations between them.
+"""
+
+# B batch, T tokens of the run, R = B * T rows, S slots of the cache, W width, M MLP width
+# h/g query/key heads, D head dim
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from ponderpounce.models.gemma import ExpertLayer, GemmaConfig, GemmaLayer, Rotation, attend
+from pounce_server.kernels.euler import euler_eager, euler_fused
+from pounce_server.kernels.geglu import geglu_eager, geglu_fused
+from pounce_server.kernels.rms_norm import Residual, Style, norm_eager, norm_fused
+from pounce_server.kernels.rope import Slots, rope_eager, rope_fused
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Operations:
+    """One implementation of everything between two GEMMs."""
+
+    norm: Callable[[Tensor, Tensor, Style, Residual | None], None]
+    rope: Callable[[Tensor, Rotation, Tensor, Slots], None]
+    geglu: Callable[[Tensor, Tensor], None]
+    euler: Callable[[Tensor, Tensor, Tensor, int], None]
+
+
+TWINS = Operations(norm=norm_eager, rope=rope_eager, geglu=geglu_eager, euler=euler_eager)
+KERNELS = Operations(norm=norm_fused, rope=rope_fused, geglu=geglu_fused, euler=euler_fused)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Norm:
+    """One norm of a stream: its style, and the gate of the residual that follows it."""
+
+    style: Style
+    gate: Tensor | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PackedLayer:
+    """One layer's matrices, (out, in) as PyTorch keeps them."""
+
+    qkv: Tensor
+    attention_out: Tensor
+    gate_up: Tensor
+    down: Tensor
+
+    @classmethod
+    def of(cls, layer: GemmaLayer | ExpertLayer) -> "PackedLayer":
+        """Packs ``layer``, whose own parameters become views: no weight is held twice."""
+        attention, mlp = layer.self_attn, layer.mlp
+        return cls(
+            qkv=_joined(attention.q_proj, attention.k_proj, attention.v_proj),
+            attention_out=attention.o_proj.weight.data,
+            gate_up=_joined(mlp.gate_proj, mlp.up_proj),
+            down=mlp.down_proj.weight.data,
+        )
+
+
+def _joined(*projections: nn.Linear) -> Tensor:
+    joined = torch.cat([projection.weight.data for projection in projections])
+    parts = joined.split([projection.out_features for projection in projections])
+    for projection, part in zip(projections, parts, strict=True):
+        projection.weight.data = part
+    return joined
+
+
+class Run:
+    """Static buffers of T tokens that go through a stream together, and what they see.
+
+    Whoever runs the stream fills ``x``, ``rotation`` and ``visible`` first.
+    """
+
+    def __init__(self, config: GemmaConfig, batch_size: int, num_tokens: int, seen: slice, like: Tensor) -> None:
+        """``seen`` are the slots that these tokens look at, themselves the last; ``like`` gives type and device."""
+        num_rows, device = batch_size * num_tokens, like.device
+        head_dim, num_heads, num_kv_heads = config.head_dim, config.num_heads, config.num_kv_heads
+        self.seen = seen
+        self.first = seen.stop - num_tokens
+        self.x = like.new_zeros(num_rows, config.width)
+        self.normed = torch.empty_like(self.x)
+        self.branch = torch.empty_like(self.x)
+        self.qkv = like.new_empty(num_rows, (num_heads + 2 * num_kv_heads) * head_dim)
+        self.queries = like.new_empty(batch_size, num_heads, num_tokens, head_dim)
+        self.gate_up = like.new_empty(num_rows, 2 * config.mlp_width)
+        self.activated = like.new_empty(num_rows, config.mlp_width)
+        pairs = torch.zeros(batch_size, 1, num_tokens, head_dim // 2, device=device)
+        self.rotation = Rotation(pairs, pairs.clone())
+        self.visible = torch.ones(batch_size, 1, 1, seen.stop - seen.start, dtype=torch.bool, device=device)
+
+    def place(self, positions_BT: Tensor, visible_BS: Tensor) -> None:
+        """Loads where the tokens stand and which of the slots that they look at are real."""
+        rotation = Rotation.at(positions_BT, 2 * self.rotation.cos.shape[-1])
+        self.rotation.cos.copy_(rotation.cos)
+        self.rotation.sin.copy_(rotation.sin)
+        self.visible.copy_(visible_BS[:, None, None, :])
+
+
+class FusedStream:
+    """The layers of one stream, packed."""
+
+    def __init__(self, layers: Iterable[GemmaLayer | ExpertLayer], operations: Operations) -> None:
+        self._layers = [PackedLayer.of(layer) for layer in layers]
+        self._do = operations
+
+    def __call__(self, run: Run, norms: Sequence[Norm], cache: Sequence[tuple[Tensor, Tensor]]) -> None:
+        """Runs ``run.x`` through the layers; keys and values go into ``cache``, the last norm into ``run.normed``.
+
+        ``norms`` are two a layer and, for a stream whose output is read, the last. Without it the last layer ends
+        after its keys and values: its output would feed nothing.
+        """
+        residual: Residual | None = None
+        for index, (layer, (keys, values)) in enumerate(zip(self._layers, cache, strict=True)):
+            before_attention, before_mlp = norms[2 * index : 2 * index + 2]
+            self._do.norm(run.x, run.normed, before_attention.style, residual)
+            torch.mm(run.normed, layer.qkv.T, out=run.qkv)
+            self._do.rope(run.qkv, run.rotation, run.queries, Slots(keys, values, run.first))
+            if index == len(self._layers) - 1 and len(norms) == 2 * len(self._layers):
+                return
+            mixed = attend(run.queries, keys[:, :, run.seen], values[:, :, run.seen], run.visible)
+            torch.mm(mixed.flatten(0, 1), layer.attention_out.T, out=run.branch)
+            self._do.norm(run.x, run.normed, before_mlp.style, Residual(run.branch, before_attention.gate))
+            torch.mm(run.normed, layer.gate_up.T, out=run.gate_up)
+            self._do.geglu(run.gate_up, run.activated)
+            torch.mm(run.activated, layer.down.T, out=run.branch)
+            residual = Residual(run.branch, before_mlp.gate)
+        self._do.norm(run.x, run.normed, norms[-1].style, residual)

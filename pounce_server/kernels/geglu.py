@@ -1,0 +1,54 @@
+"""The gate of Gemma's MLP, gelu_tanh(gate) * up, over the one GEMM that makes both."""
+
+# R rows, M MLP width; 2M columns are [gate | up]
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from pounce_server.kernels.launch import Tolerance, block_size, check_tensor, kernel, tl
+
+TOLERANCE = {
+    torch.float32: Tolerance(rtol=1e-5, atol=1e-6),
+    # Twin: gelu and the product are rounded; kernel: the product only.
+    torch.bfloat16: Tolerance(rtol=2**-6, atol=2**-9),
+}
+MAX_BLOCK = 1024
+
+
+def geglu_eager(gate_up_R2M: Tensor, out_RM: Tensor) -> None:
+    """Writes gelu_tanh(gate) * up to ``out_RM``: the models' arithmetic."""
+    gate_RM, up_RM = gate_up_R2M.chunk(2, dim=-1)
+    torch.mul(F.gelu(gate_RM, approximate="tanh"), up_RM, out=out_RM)
+
+
+def geglu_fused(gate_up_R2M: Tensor, out_RM: Tensor) -> None:
+    """`geglu_eager` in one launch, in float32 between load and store.
+
+    Raises:
+        ValueError: a tensor is not of the shape, type or layout that the other asks for.
+    """
+    num_rows, width = out_RM.shape
+    check_tensor("out", out_RM, (num_rows, width), out_RM.dtype)
+    check_tensor("gate_up", gate_up_R2M, (num_rows, 2 * width), out_RM.dtype)
+    block = min(block_size(width), MAX_BLOCK)
+    _geglu[(num_rows, -(-width // block))](gate_up_R2M, out_RM, WIDTH=width, BLOCK=block)
+
+
+@kernel
+def _geglu(gate_up_ptr: tl.tensor, out_ptr: tl.tensor, WIDTH: tl.constexpr, BLOCK: tl.constexpr) -> None:
+    row = tl.program_id(0).to(tl.int64)
+    column = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
+    is_inside = column < WIDTH
+    gate_at = gate_up_ptr + row * 2 * WIDTH + column
+    gate = tl.load(gate_at, mask=is_inside, other=0.0).to(tl.float32)
+    up = tl.load(gate_at + WIDTH, mask=is_inside, other=0.0).to(tl.float32)
+    # (1 + tanh(u)) / 2 is the sigmoid of 2u; from exp(-|2u|), which cannot overflow.
+    twice_u = 1.5957691216057308 * (gate + 0.044715 * gate * gate * gate)  # 2 * sqrt(2 / pi)
+    decay = tl.exp(-tl.abs(twice_u))
+    half_one_plus_tanh = tl.where(twice_u >= 0, 1.0, decay) / (1.0 + decay)
+    tl.store(
+        out_ptr + row * WIDTH + column, (gate * half_one_plus_tanh * up).to(out_ptr.dtype.element_ty), mask=is_inside
+    )

@@ -1,0 +1,117 @@
+"""Gemma's RMSNorm, plain or styled by time (adaRMS), together with the gated residual that precedes it.
+
+Between two GEMMs of a pi0.5 stream stands x <- x + gate * branch, then norm(x): as eager operations six passes over
+memory, here one.
+"""
+
+# R rows (batch times tokens), E width
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ponderpounce.models.gemma import RMS_NORM_EPS
+from pounce_server.kernels.launch import Tolerance, block_size, check_tensor, kernel, tl
+
+TOLERANCE = {
+    torch.float32: Tolerance(rtol=1e-5, atol=1e-6),
+    # Twin: gate, product and sum are rounded one by one; kernel: the sum only. Each rounding is half of 2**-7.
+    torch.bfloat16: Tolerance(rtol=2**-7, atol=2**-6),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Style:
+    """What a norm multiplies by and adds, (E,) float32 each; without ``shift`` it is the plain one."""
+
+    scale: Tensor
+    """1 + w of a plain norm, 1 + scale of a styled one."""
+    shift: Tensor | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Residual:
+    """What is added to the stream before the norm."""
+
+    branch: Tensor
+    """(R, E), as the stream"""
+    gate: Tensor | None = None
+    """(E,) float32; None adds the branch as it is."""
+
+
+def norm_eager(x_RE: Tensor, out_RE: Tensor, style: Style, residual: Residual | None = None) -> None:
+    """Adds ``residual`` to ``x_RE`` in place and writes the norm of the sum to ``out_RE``: the models' arithmetic."""
+    if residual is not None:
+        gated_RE = residual.branch if residual.gate is None else residual.gate.to(x_RE.dtype) * residual.branch
+        x_RE += gated_RE
+    normed_RE = torch.nn.functional.rms_norm(x_RE.float(), x_RE.shape[-1:], None, RMS_NORM_EPS) * style.scale
+    out_RE.copy_(normed_RE if style.shift is None else normed_RE + style.shift)
+
+
+def norm_fused(x_RE: Tensor, out_RE: Tensor, style: Style, residual: Residual | None = None) -> None:
+    """`norm_eager` in one launch, a program a row. Sums in float32, and norms the sum as it is stored.
+
+    Raises:
+        ValueError: a tensor is not of the shape, type or layout that the others ask for.
+    """
+    num_rows, width = x_RE.shape
+    check_tensor("x", x_RE, (num_rows, width), x_RE.dtype)
+    check_tensor("out", out_RE, (num_rows, width), x_RE.dtype)
+    check_tensor("scale", style.scale, (width,), torch.float32)
+    if style.shift is not None:
+        check_tensor("shift", style.shift, (width,), torch.float32)
+    if residual is not None:
+        check_tensor("branch", residual.branch, (num_rows, width), x_RE.dtype)
+        if residual.gate is not None:
+            check_tensor("gate", residual.gate, (width,), torch.float32)
+    has_gate = residual is not None and residual.gate is not None
+    _norm[(num_rows,)](
+        x_RE,
+        x_RE if residual is None else residual.branch,
+        residual.gate if residual is not None and has_gate else style.scale,
+        style.scale,
+        style.scale if style.shift is None else style.shift,
+        out_RE,
+        WIDTH=width,
+        BLOCK=block_size(width),
+        EPS=RMS_NORM_EPS,
+        HAS_BRANCH=residual is not None,
+        HAS_GATE=has_gate,
+        HAS_SHIFT=style.shift is not None,
+    )
+
+
+@kernel
+def _norm(
+    x_ptr: tl.tensor,
+    branch_ptr: tl.tensor,
+    gate_ptr: tl.tensor,
+    scale_ptr: tl.tensor,
+    shift_ptr: tl.tensor,
+    out_ptr: tl.tensor,
+    WIDTH: tl.constexpr,
+    BLOCK: tl.constexpr,
+    EPS: tl.constexpr,
+    HAS_BRANCH: tl.constexpr,
+    HAS_GATE: tl.constexpr,
+    HAS_SHIFT: tl.constexpr,
+) -> None:
+    column = tl.arange(0, BLOCK)
+    is_inside = column < WIDTH
+    at = tl.program_id(0).to(tl.int64) * WIDTH + column
+    x = tl.load(x_ptr + at, mask=is_inside, other=0.0).to(tl.float32)
+    if HAS_BRANCH:
+        branch = tl.load(branch_ptr + at, mask=is_inside, other=0.0).to(tl.float32)
+        if HAS_GATE:
+            branch = branch * tl.load(gate_ptr + column, mask=is_inside, other=0.0)
+        stored = (x + branch).to(x_ptr.dtype.element_ty)
+        tl.store(x_ptr + at, stored, mask=is_inside)
+        x = stored.to(tl.float32)
+    y = x * tl.rsqrt(tl.sum(x * x, axis=0) / WIDTH + EPS)
+    y = y * tl.load(scale_ptr + column, mask=is_inside, other=0.0)
+    if HAS_SHIFT:
+        y = y + tl.load(shift_ptr + column, mask=is_inside, other=0.0)
+    tl.store(out_ptr + at, y.to(out_ptr.dtype.element_ty), mask=is_inside)

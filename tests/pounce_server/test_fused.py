@@ -1,0 +1,241 @@
+"""The fast path acts as the eager one does: twins and kernels, prefixes whole, isolated, padded, partly missing."""
+
+import copy
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from ponderpounce.models.gemma import GemmaConfig
+from ponderpounce.models.pounce import Pounce, PounceConfig, PounceInputs
+from ponderpounce.models.pounce_checkpoint import random_bundle
+from ponderpounce.models.pounce_configs import tiny_cpu, tiny_groot
+from ponderpounce.models.siglip import VisionConfig
+from pounce_server.contract import DTypeName, example_request
+from pounce_server.engine import EagerEngine
+from pounce_server.fused import BUCKET_TOKENS, FusedPounce, fused_for
+from pounce_server.fused_stream import KERNELS, TWINS, Operations
+from pounce_server.graphs import Capture, Work, directly
+from pounce_server.kernels.launch import missing_for
+from pounce_server.precision import cast_for_serving
+
+MAE = {"float32": 1e-5, "bfloat16": 4e-3}
+"""Stated tolerance: mean absolute error of the normalised actions after the last step."""
+LACK = missing_for(torch.device("cpu"))
+
+
+def model_of(config: PounceConfig, dtype: DTypeName = "float32", seed: int = 0) -> Pounce:
+    model = random_bundle(config, seed).model
+    assert isinstance(model, Pounce)
+    return cast_for_serving(model, dtype).eval()  # type: ignore[return-value]
+
+
+def ragged(config: PounceConfig, seed: int = 0) -> PounceInputs:
+    """Two samples: one without its second camera, one with a shorter prompt and null cognition."""
+    inputs = config.example_inputs(2, num_tokens=13, seed=seed)
+    inputs.has_view[0, 1] = False
+    inputs.is_token[1, 9:] = False
+    return replace(inputs, is_null=None if inputs.cognition is None else torch.tensor([False, True]))
+
+
+def noise_for(config: PounceConfig, batch_size: int = 2, seed: int = 0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(batch_size, config.horizon, config.padded_action_dim, generator=generator)
+
+
+@torch.inference_mode()
+def eager_actions(model: Pounce, inputs: PounceInputs, noise: Tensor) -> Tensor:
+    *_, last = model.sample(inputs, noise, model.step_table())
+    return last.actions
+
+
+@torch.inference_mode()
+def fused_actions(fused: FusedPounce, inputs: PounceInputs, noise: Tensor) -> Tensor:
+    *_, last = fused.sample(inputs, noise)
+    return last.actions.clone()
+
+
+def mean_error(actual: Tensor, expected: Tensor) -> float:
+    return (actual - expected).abs().mean().item()
+
+
+CONFIGS: dict[str, Callable[[], PounceConfig]] = {
+    "prefix": lambda: tiny_cpu(num_carriers=2),
+    "no prefix": lambda: tiny_cpu(num_carriers=0),
+    "isolated": lambda: replace(
+        tiny_cpu(num_carriers=2), cognition=replace(tiny_cpu(num_carriers=2).cognition, attention="isolated")
+    ),
+}
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+@pytest.mark.parametrize("config", [make() for make in CONFIGS.values()], ids=CONFIGS.keys())
+def test_fused_actions_are_the_eager_ones(config: PounceConfig, dtype: DTypeName, seed: int) -> None:
+    model = model_of(config, dtype, seed)
+    inputs, noise = ragged(config, seed), noise_for(config, seed=seed)
+    expected = eager_actions(model, inputs, noise)
+    assert mean_error(fused_actions(FusedPounce(model, TWINS), inputs, noise), expected) <= MAE[dtype]
+
+
+def small(num_kv_heads: int) -> PounceConfig:
+    """Few programs: the interpreter takes a millisecond or two for each. Grouped keys, which the public sizes lack."""
+    heads = {"depth": 2, "num_heads": 4, "num_kv_heads": num_kv_heads, "head_dim": 6}
+    base = tiny_cpu(num_carriers=1, horizon=5)
+    pi05 = replace(
+        base.pi05,
+        vision=VisionConfig(width=12, depth=1, num_heads=3, mlp_width=12, patch_px=112),
+        language=GemmaConfig(width=20, mlp_width=28, **heads),
+        expert=GemmaConfig(width=12, mlp_width=20, **heads),
+        action_dim=9,
+    )
+    return replace(base, pi05=pi05, num_steps=2)
+
+
+@pytest.mark.skipif(bool(LACK), reason=LACK)
+@pytest.mark.usefixtures("rounding_interpreter")
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+@pytest.mark.parametrize("num_kv_heads", [1, 2])
+def test_kernels_in_the_interpreter_act_as_the_eager_model(num_kv_heads: int, dtype: DTypeName) -> None:
+    config = small(num_kv_heads)
+    model = model_of(config, dtype)
+    inputs, noise = ragged(config), noise_for(config)
+    expected = eager_actions(model, inputs, noise)
+    assert mean_error(fused_actions(FusedPounce(model, KERNELS), inputs, noise), expected) <= MAE[dtype]
+
+
+def test_every_step_is_the_eager_step() -> None:
+    config = tiny_cpu(num_carriers=1)
+    model = model_of(config)
+    inputs, noise = ragged(config), noise_for(config)
+    fused = FusedPounce(copy.deepcopy(model), TWINS)
+    with torch.inference_mode():
+        for expected, step in zip(
+            model.sample(inputs, noise, model.step_table()), fused.sample(inputs, noise), strict=True
+        ):
+            assert step.index == expected.index
+            torch.testing.assert_close(step.actions, expected.actions, rtol=0, atol=1e-5)
+            torch.testing.assert_close(step.velocity, expected.velocity, rtol=0, atol=1e-5)
+
+
+def test_packing_holds_no_weight_twice_and_changes_none() -> None:
+    model = model_of(tiny_cpu())
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    FusedPounce(model, TWINS)
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+    attention = model.pi05.expert.layers[0].self_attn
+    storages = {p.weight.data.untyped_storage().data_ptr() for p in (attention.q_proj, attention.k_proj)}
+    assert len(storages) == 1
+
+
+# -- buckets and graphs, without a GPU
+
+
+class Recorder:
+    """Runs work before the recording as a graph does, and lists what is captured (c) and replayed (r)."""
+
+    def __init__(self) -> None:
+        self.events = ""
+
+    def __call__(self, work: Work) -> Work:
+        self.events += "c"
+        work()
+        work()
+
+        def replay() -> None:
+            self.events += "r"
+            work()
+
+        return replay
+
+
+@pytest.fixture
+def config() -> PounceConfig:
+    return tiny_cpu(num_carriers=1)
+
+
+def with_tokens(config: PounceConfig, num_tokens: int) -> PounceInputs:
+    return config.example_inputs(1, num_tokens=num_tokens, seed=num_tokens)
+
+
+def test_what_is_captured_once_is_replayed_over_new_inputs(config: PounceConfig) -> None:
+    model = model_of(config)
+    noise = noise_for(config, 1)
+    num_free = -(2 * 64 + 2) % BUCKET_TOKENS  # two views, the age and one carrier stand before the text
+    requests = [with_tokens(config, count) for count in (num_free, 1, num_free)]
+    expected = [eager_actions(model, inputs, noise) for inputs in requests]
+    recorder = Recorder()
+    fused = FusedPounce(model, TWINS, recorder)
+    for inputs, actions in zip(requests, expected, strict=True):
+        assert mean_error(fused_actions(fused, inputs, noise), actions) <= MAE["float32"]
+    assert recorder.events == "c" * 11 + "r" * 33, "prefill and ten steps, captured once for three prompts"
+
+
+def test_another_shape_of_prefix_is_another_bucket_and_both_stay(config: PounceConfig) -> None:
+    model = model_of(config)
+    noise = noise_for(config, 1)
+    requests = [with_tokens(config, count) for count in (4, 4 + BUCKET_TOKENS, 4)]
+    expected = [eager_actions(model, inputs, noise) for inputs in requests]
+    recorder = Recorder()
+    fused = FusedPounce(model, TWINS, recorder)
+    for inputs, actions in zip(requests, expected, strict=True):
+        assert mean_error(fused_actions(fused, inputs, noise), actions) <= MAE["float32"]
+    assert recorder.events == ("c" * 11 + "r" * 11) * 2 + "r" * 11
+
+
+@pytest.mark.parametrize("capture", [directly, Recorder()], ids=["directly", "captured"])
+def test_a_sample_leaves_nothing_behind(config: PounceConfig, capture: Capture) -> None:
+    fused = FusedPounce(model_of(config), TWINS, capture)
+    inputs, noise = with_tokens(config, 7), noise_for(config, 1)
+    first = fused_actions(fused, inputs, noise)
+    fused_actions(fused, with_tokens(config, 9), noise_for(config, 1, seed=1))
+    assert torch.equal(fused_actions(fused, inputs, noise), first)
+
+
+def test_operations_are_the_ones_given(config: PounceConfig) -> None:
+    def broken(x: Tensor, velocity: Tensor, bias: Tensor, num_steps: int) -> None:
+        x.fill_(7.0)
+
+    operations: Operations = replace(TWINS, euler=broken)
+    actions = fused_actions(FusedPounce(model_of(config), operations), with_tokens(config, 3), noise_for(config, 1))
+    assert (actions == 7.0).all()
+
+
+def test_without_triton_the_fused_path_says_what_to_install(
+    config: PounceConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pounce_server.kernels.launch.triton", None)
+    with pytest.raises(ValueError, match=r"--path fused cannot run here. Triton is not installed: pip install"):
+        fused_for(model_of(config), torch.device("cuda"))
+
+
+# -- as an engine
+
+
+@pytest.mark.skipif(bool(LACK), reason=LACK)
+@pytest.mark.usefixtures("rounding_interpreter")
+def test_a_fused_engine_gives_the_eager_engine_s_rows() -> None:
+    eager, fused = (
+        EagerEngine(random_bundle(small(1), 0), path=path)
+        for path in ("eager", "fused")  # type: ignore[arg-type]
+    )
+    request = example_request(eager.spec)
+    assert fused.spec == eager.spec
+    np.testing.assert_allclose(fused.invoke(request), eager.invoke(request), rtol=0, atol=1e-5)
+
+
+def test_what_the_fused_path_cannot_do_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"for pi0.5 without --continuity; leave --path fused out"):
+        EagerEngine(random_bundle(tiny_groot(), 0), path="fused")
+    with pytest.raises(ValueError, match=r"for pi0.5 without --continuity; leave --path fused out"):
+        EagerEngine(random_bundle(tiny_cpu(), 0), path="fused", continuity="rtc")
+
+
+def test_a_cpu_that_may_not_interpret_is_told_where_kernels_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("triton")
+    monkeypatch.setenv("TRITON_INTERPRET", "0")
+    with pytest.raises(ValueError, match=r"compiles for a GPU, came device cpu: --device cuda .*; or --path eager"):
+        EagerEngine(random_bundle(tiny_cpu(), 0), path="fused")

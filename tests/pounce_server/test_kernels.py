@@ -1,0 +1,212 @@
+"""Every fused operation agrees with its eager twin, on any shape, and touches nothing but its outputs."""
+
+import subprocess
+import sys
+from dataclasses import dataclass, field
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from ponderpounce.models.gemma import AdaRmsNorm, GeGlu, GemmaConfig, RmsNorm, Rotation
+from pounce_server.kernels import euler, geglu, rms_norm, rope
+from pounce_server.kernels.launch import Tolerance, block_size, missing_for
+
+LACK = missing_for(torch.device("cpu"))
+interpreted = pytest.mark.skipif(bool(LACK), reason=LACK)
+pytestmark = pytest.mark.usefixtures("rounding_interpreter")
+few = settings(max_examples=12)
+dtypes = st.sampled_from([torch.float32, torch.bfloat16])
+counts = st.integers(1, 5)
+widths = st.integers(1, 41)
+seeds = st.integers(0, 2**32 - 1)
+GUARD = 67
+"""NaNs on either side of a tensor; odd, so that nothing is aligned by luck."""
+
+
+@dataclass
+class Arena:
+    """Tensors that lie between NaNs: what is read from outside spoils the result, what is written there shows."""
+
+    seed: int
+    dtype: torch.dtype
+    storages: list[Tensor] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.generator = torch.Generator().manual_seed(self.seed)
+
+    def poisoned(self, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
+        count = torch.Size(shape).numel()
+        self.storages.append(torch.full((count + 2 * GUARD,), torch.nan, dtype=dtype or self.dtype))
+        return self.storages[-1][GUARD:-GUARD].view(shape)
+
+    def drawn(self, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
+        return self.poisoned(*shape, dtype=dtype).copy_(torch.randn(shape, generator=self.generator))
+
+    def check_guards(self) -> None:
+        for storage in self.storages:
+            assert storage[:GUARD].isnan().all()
+            assert storage[-GUARD:].isnan().all()
+
+
+def check(actual: Tensor, expected: Tensor, tolerances: dict[torch.dtype, Tolerance]) -> None:
+    tolerance = tolerances[expected.dtype]
+    torch.testing.assert_close(actual, expected, rtol=tolerance.rtol, atol=tolerance.atol)
+
+
+@interpreted
+@few
+@given(counts, widths, dtypes, st.sampled_from(["no", "plain", "gated"]), st.booleans(), seeds)
+def test_norm(rows: int, width: int, dtype: torch.dtype, residual: str, has_shift: bool, seed: int) -> None:
+    arena = Arena(seed, dtype)
+    x, out = arena.drawn(rows, width), arena.poisoned(rows, width)
+    scale, shift, gate = (arena.drawn(width, dtype=torch.float32) for _ in range(3))
+    style = rms_norm.Style(scale, shift if has_shift else None)
+    branch = rms_norm.Residual(arena.drawn(rows, width), gate if residual == "gated" else None)
+    expected_x, expected_out = x.clone(), torch.empty_like(x)
+    rms_norm.norm_eager(expected_x, expected_out, style, None if residual == "no" else branch)
+    rms_norm.norm_fused(x, out, style, None if residual == "no" else branch)
+    check(x, expected_x, rms_norm.TOLERANCE)
+    # The norm magnifies what is rounded in a sum near zero, so it is compared over the very sum.
+    rms_norm.norm_eager(x.clone(), expected_out, style)
+    check(out, expected_out, rms_norm.TOLERANCE)
+    arena.check_guards()
+
+
+@interpreted
+@few
+@given(counts, widths, dtypes, st.floats(0.1, 60.0), seeds)
+def test_geglu(rows: int, width: int, dtype: torch.dtype, spread: float, seed: int) -> None:
+    arena = Arena(seed, dtype)
+    gate_up, out = arena.drawn(rows, 2 * width), arena.poisoned(rows, width)
+    gate_up[:, :width] *= spread
+    expected = torch.empty_like(out)
+    geglu.geglu_eager(gate_up, expected)
+    geglu.geglu_fused(gate_up, out)
+    check(out, expected, geglu.TOLERANCE)
+    arena.check_guards()
+
+
+@interpreted
+def test_geglu_splits_wide_rows_between_programs() -> None:
+    arena = Arena(0, torch.float32)
+    width = 2 * geglu.MAX_BLOCK + 3
+    gate_up, out, expected = arena.drawn(2, 2 * width), arena.poisoned(2, width), torch.empty(2, width)
+    geglu.geglu_eager(gate_up, expected)
+    geglu.geglu_fused(gate_up, out)
+    check(out, expected, geglu.TOLERANCE)
+    arena.check_guards()
+
+
+@interpreted
+@few
+@given(st.integers(1, 2), counts, st.integers(1, 3), st.integers(1, 3), st.integers(1, 9), dtypes, seeds)
+def test_rope(batch: int, tokens: int, share: int, kv_heads: int, pairs: int, dtype: torch.dtype, seed: int) -> None:
+    arena = Arena(seed, dtype)
+    heads, first, slots = share * kv_heads, seed % 4, tokens + 4
+    qkv = arena.drawn(batch * tokens, (heads + 2 * kv_heads) * 2 * pairs)
+    positions = torch.randint(-9, 900, (batch, tokens), generator=arena.generator)
+    rotation = Rotation.at(positions, 2 * pairs)
+    results = []
+    for run in (rope.rope_eager, rope.rope_fused):
+        queries = arena.poisoned(batch, heads, tokens, 2 * pairs)
+        keys, values = (arena.poisoned(batch, kv_heads, slots, 2 * pairs) for _ in range(2))
+        run(qkv, rotation, queries, rope.Slots(keys, values, first))
+        for buffer in (keys, values):
+            assert buffer[:, :, :first].isnan().all()
+            assert buffer[:, :, first + tokens :].isnan().all()
+        here = slice(first, first + tokens)
+        results.append((queries, keys[:, :, here], values[:, :, here]))
+    for expected, actual in zip(*results, strict=True):
+        check(actual, expected, rope.TOLERANCE)
+    arena.check_guards()
+
+
+@interpreted
+@few
+@given(counts, widths, st.integers(1, 16), seeds)
+def test_euler(rows: int, width: int, num_steps: int, seed: int) -> None:
+    arena = Arena(seed, torch.float32)
+    x, velocity, bias = arena.drawn(rows, width), arena.drawn(rows, width), arena.drawn(width)
+    expected_x, expected_velocity = x.clone(), velocity.clone()
+    euler.euler_eager(expected_x, expected_velocity, bias, num_steps)
+    euler.euler_fused(x, velocity, bias, num_steps)
+    check(x, expected_x, euler.TOLERANCE)
+    check(velocity, expected_velocity, euler.TOLERANCE)
+    arena.check_guards()
+
+
+# -- the twins are what the models do, bit for bit
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@torch.no_grad()
+def test_twin_of_the_norm_is_the_model_s(dtype: torch.dtype) -> None:
+    arena = Arena(1, dtype)
+    x, branch, out = arena.drawn(4, 24), arena.drawn(4, 24), arena.poisoned(4, 24)
+    plain = RmsNorm(24)
+    plain.weight.copy_(torch.randn(24, generator=arena.generator))
+    rms_norm.norm_eager(x, out, rms_norm.Style(1.0 + plain.weight))
+    torch.testing.assert_close(out, plain(x), rtol=1e-6, atol=1e-6)
+
+    styled = AdaRmsNorm(24)
+    style_3B1E = styled.style(torch.randn(1, 24, generator=arena.generator))
+    scale, shift, gate = style_3B1E[:, 0, 0]
+    expected_x = x + gate.to(dtype) * branch
+    expected, _ = styled(expected_x, style_3B1E[:, 0])
+    rms_norm.norm_eager(x, out, rms_norm.Style(scale, shift), rms_norm.Residual(branch, gate))
+    assert torch.equal(x, expected_x)
+    torch.testing.assert_close(out, expected, rtol=1e-6, atol=1e-6)
+
+
+@torch.no_grad()
+def test_twin_of_the_gate_is_the_model_s() -> None:
+    mlp = GeGlu(GemmaConfig(width=6, depth=1, mlp_width=10))
+    x, out = torch.randn(3, 6, generator=torch.Generator().manual_seed(0)), torch.empty(3, 10)
+    geglu.geglu_eager(torch.cat([mlp.gate_proj(x), mlp.up_proj(x)], dim=-1), out)
+    assert torch.equal(mlp.down_proj(out), mlp(x))
+
+
+# -- what does not fit is refused before a pointer is followed
+
+
+@interpreted
+@pytest.mark.parametrize(
+    ("out", "message"),
+    [
+        (torch.empty(3, 4), r"out: expected \(2, 4\) torch.float32 contiguous, came \(3, 4\)"),
+        (torch.empty(2, 4, dtype=torch.bfloat16), "came .* torch.bfloat16"),
+        (torch.empty(4, 2).T, r"came \(2, 4\) torch.float32 strides \(1, 2\)"),
+    ],
+)
+def test_a_misfit_is_refused(out: Tensor, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        rms_norm.norm_fused(torch.zeros(2, 4), out, rms_norm.Style(torch.ones(4)))
+
+
+@interpreted
+def test_tokens_that_overrun_the_slots_are_refused() -> None:
+    keys = torch.zeros(1, 1, 4, 2)
+    rotation = Rotation.at(torch.arange(3)[None], 2)
+    with pytest.raises(ValueError, match="3 tokens from slot 2 on do not fit into 4 slots"):
+        rope.rope_fused(torch.zeros(3, 6), rotation, torch.zeros(1, 1, 3, 2), rope.Slots(keys, keys.clone(), 2))
+
+
+@given(st.integers(1, 10_000))
+def test_block_size_is_the_next_power_of_two(count: int) -> None:
+    block = block_size(count)
+    assert block & (block - 1) == 0
+    assert block // 2 < count <= block
+
+
+def test_twins_need_no_triton() -> None:
+    script = (
+        "import sys, torch; sys.modules['triton'] = None\n"
+        "from pounce_server.kernels import euler, geglu, launch, rms_norm, rope\n"
+        "geglu.geglu_eager(torch.ones(2, 4), torch.empty(2, 2))\n"
+        "print(launch.missing_for(torch.device('cuda')))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout.strip() == "Triton is not installed: pip install 'ponderpounce[kernels]'"
