@@ -1,22 +1,22 @@
 """``pp-train``: trains both systems together on a collected dataset, and leaves folders that the servers load.
 
     OUT/checkpoint/     where a killed run goes on: weights, optimiser, step
-    OUT/log.jsonl       one line per step
+    OUT/log.jsonl       one line per step; OUT/run.png draws it at the end
+    OUT/samples.jsonl   what PONDER says at intervals, beside what it should
     OUT/ponder, pounce  at the end: what ponder-serve and pounce-serve take as --checkpoint
 
-The same command again resumes.
+The same command again resumes. On several GPUs or hosts:
+
+    torchrun --nproc-per-node=8 -m ponderpounce.training.train --device cuda ...
 """
 
 from __future__ import annotations
 
-import json
-import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal, TextIO
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -33,8 +33,10 @@ from ponderpounce.training.data import TrainingSet
 from ponderpounce.training.example import make_example
 from ponderpounce.training.joint import JointModel, PonderBatch, PounceBatch
 from ponderpounce.training.parallel import World, gather, joined, shard
+from ponderpounce.training.plot import plot_log
 from ponderpounce.training.recipes import Recipe, recipe
 from ponderpounce.training.trainer import CheckpointError, SaveError, StepReport, Trainer
+from ponderpounce.training.watch import LOG_FILE, Watch
 
 DONE, REFUSED, INTERRUPTED = 0, 2, 130
 _EPISODE_STREAM = 7  # of a step's random numbers: which episodes, which schedules
@@ -66,6 +68,10 @@ class TrainOptions:
     """Instead of the recipe's: POUNCE's invocations an episode."""
     save_every: int = 100
     """Steps between checkpoints."""
+    sample_every: int = 20
+    """Steps between samples of what PONDER says (OUT/samples.jsonl)."""
+    tensorboard: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Also write OUT/tensorboard: losses, pictures and samples."""
     device: Literal["cpu", "cuda"] = "cpu"
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Of PONDER's weights and of what POUNCE's stream runs in, when they are loaded."""
@@ -102,7 +108,7 @@ def main(argv: list[str] | None = None) -> int:
     options = tyro.cli(TrainOptions, args=argv, prog="pp-train", description=TrainOptions.__doc__)
     try:
         train(options)
-    except (DatasetError, CheckpointError, SaveError, FileNotFoundError, ValueError, FloatingPointError) as error:
+    except (DatasetError, CheckpointError, SaveError, OSError, ValueError, FloatingPointError) as error:
         sys.stderr.write(f"pp-train: {error}\n")
         return REFUSED
     except torch.OutOfMemoryError as error:
@@ -138,20 +144,22 @@ def _train(options: TrainOptions, world: World) -> None:
     checkpoint = options.out / "checkpoint"
     options.out.mkdir(parents=True, exist_ok=True)
     trainer.resume(checkpoint)
-    with (
-        _log(options.out / "log.jsonl", trainer.step, world) as log,
-        tqdm(
-            total=run.num_steps, initial=trainer.step, unit="step", disable=not (options.progress and world.is_first)
-        ) as bar,
-    ):
+    progress = options.progress and world.is_first
+    with ExitStack() as stack:
+        bar = stack.enter_context(tqdm(total=run.num_steps, initial=trainer.step, unit="step", disable=not progress))
+        watch = stack.enter_context(_watch(options, trainer.step)) if world.is_first else None
         for report in trainer.run(run.num_steps):
-            log.write(json.dumps(asdict(report)) + "\n")
+            if watch is not None:
+                watch.step(report, trainer)
             bar.set_postfix_str(_postfix(report), refresh=False)
             bar.update()
             if trainer.step % options.save_every == 0:
-                log.flush()
+                if watch is not None:
+                    watch.flush()
                 trainer.save(checkpoint)
     trainer.save(checkpoint)
+    if world.is_first:
+        plot_log(options.out / LOG_FILE, options.out / "run.png")
     trainer.take_average()
     if world.size == 1:
         export(model, bundle, options.out)
@@ -212,13 +220,8 @@ def _adjusted(run: Recipe, options: TrainOptions) -> Recipe:
     )
 
 
-@contextmanager
-def _log(path: Path, step: int, world: World) -> Iterator[TextIO]:
-    """The first process's log without the lines of steps that a resumed run will do again; the others' goes nowhere."""
-    if world.is_first and path.exists():
-        path.write_text("".join(path.read_text().splitlines(keepends=True)[:step]))
-    with (path if world.is_first else Path(os.devnull)).open("a") as log:
-        yield log
+def _watch(options: TrainOptions, step: int) -> Watch:
+    return Watch(options.out, first_step=step, sample_every=options.sample_every, tensorboard=options.tensorboard)
 
 
 def _postfix(report: StepReport) -> str:

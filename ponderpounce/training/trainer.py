@@ -83,6 +83,7 @@ class Trainer:
         self._data_hash = data_hash
         self._world = world or World()
         self._optimiser = Optimiser(model, config.optim)
+        self._latest: tuple[PonderBatch, Tensor] | None = None
 
     def run(self, until: int) -> Iterator[StepReport]:
         """Updates until ``step`` is ``until``; yields after each.
@@ -123,7 +124,19 @@ class Trainer:
             num_null=num_null,
         )
         self.step += 1
+        self._latest = episodes, loss.said_N
         return report
+
+    @property
+    def latest(self) -> tuple[PonderBatch, Tensor]:
+        """This process's episodes of the last update, and what PONDER would have said in them (``JointLoss.said_N``).
+
+        Raises:
+            RuntimeError: there was no update yet.
+        """
+        if self._latest is None:
+            raise RuntimeError("no step was done yet; latest is of the last one")
+        return self._latest
 
     def _draws(self, num_episodes: int, invocations: PounceBatch) -> Draws:
         """The chance of this step, episode by episode: the same for an episode whichever process has it."""

@@ -106,6 +106,9 @@ def test_a_run_leaves_folders_that_the_servers_load(folder: Path, tmp_path: Path
     train.train(options(folder, tmp_path / "run", recipe=name))
     steps = [json.loads(line)["step"] for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
     assert steps == [0, 1]
+    assert (tmp_path / "run" / "run.png").exists()
+    samples = [json.loads(line) for line in (tmp_path / "run" / "samples.jsonl").read_text().splitlines()]
+    assert {sample["step"] for sample in samples} == ({0} if name == "tiny" else set())  # actions only: no words
     assert not load_ponder(tmp_path / "run" / "ponder").is_random
     bundle = load_bundle(tmp_path / "run" / "pounce")
     assert not bundle.is_random
