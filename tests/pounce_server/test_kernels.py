@@ -23,32 +23,41 @@ counts = st.integers(1, 5)
 widths = st.integers(1, 41)
 seeds = st.integers(0, 2**32 - 1)
 GUARD = 67
-"""NaNs on either side of a tensor; odd, so that nothing is aligned by luck."""
+"""Numbers on either side of a tensor; odd, so that nothing is aligned by luck."""
+SENTINEL = 77.0
 
 
 @dataclass
 class Arena:
-    """Tensors that lie between NaNs: what is read from outside spoils the result, what is written there shows."""
+    """Inputs lie between NaNs: what is read from outside spoils the result. Outputs are NaN, and lie between numbers:
+    what is not written shows, and what is written outside, were it NaN.
+    """
 
     seed: int
     dtype: torch.dtype
     storages: list[Tensor] = field(default_factory=list)
+    guards: list[Tensor] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.generator = torch.Generator().manual_seed(self.seed)
 
     def poisoned(self, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
-        count = torch.Size(shape).numel()
-        self.storages.append(torch.full((count + 2 * GUARD,), torch.nan, dtype=dtype or self.dtype))
-        return self.storages[-1][GUARD:-GUARD].view(shape)
+        tensor = self._between(SENTINEL, shape, dtype)
+        return tensor.fill_(torch.nan)
 
     def drawn(self, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
-        return self.poisoned(*shape, dtype=dtype).copy_(torch.randn(shape, generator=self.generator))
+        return self._between(torch.nan, shape, dtype).copy_(torch.randn(shape, generator=self.generator))
+
+    def _between(self, guard: float, shape: tuple[int, ...], dtype: torch.dtype | None) -> Tensor:
+        count = torch.Size(shape).numel()
+        self.storages.append(torch.full((count + 2 * GUARD,), guard, dtype=dtype or self.dtype))
+        self.guards.append(self.storages[-1][:GUARD].clone())
+        return self.storages[-1][GUARD:-GUARD].view(shape)
 
     def check_guards(self) -> None:
-        for storage in self.storages:
-            assert storage[:GUARD].isnan().all()
-            assert storage[-GUARD:].isnan().all()
+        for storage, guard in zip(self.storages, self.guards, strict=True):
+            for side in (storage[:GUARD], storage[-GUARD:]):
+                torch.testing.assert_close(side, guard, rtol=0, atol=0, equal_nan=True)
 
 
 def check(actual: Tensor, expected: Tensor, tolerances: dict[torch.dtype, Tolerance]) -> None:
