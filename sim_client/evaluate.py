@@ -7,13 +7,14 @@ same command: nothing is played twice, nothing is lost, and ``results.json`` say
 
 from __future__ import annotations
 
-import atexit
+import contextlib
 import dataclasses
 import os
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
+from multiprocessing.util import Finalize
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -257,7 +258,9 @@ def play(job: Job) -> Line:
 @cache
 def _station(options: EvalOptions) -> EvaluationStation:
     """This process's own, with its servers loaded; it lasts as long as the process."""
-    return EvaluationStation(options)
+    station = EvaluationStation(options)
+    Finalize(None, station.close, exitpriority=0)  # a worker's end, while GL and other threads are still there
+    return station
 
 
 class EvaluationStation:
@@ -267,10 +270,12 @@ class EvaluationStation:
         sim = options.sim()
         self._options = options
         self._donor: DonorPonder | None = None
-        self._daemons = Daemons(options.out / "servers" / str(os.getpid()))
+        self._open = contextlib.ExitStack()
+        daemons = self._open.enter_context(Daemons(options.out / "servers" / str(os.getpid())))
         replaced = self._build_donor if options.cognition == "other-episode" else None
-        self._station = open_station(sim, self._daemons, replaced)
-        self._suite = Suite(sim, self._station.link, self._station.clock, self._daemons.dead)
+        station = open_station(sim, daemons, replaced)
+        self._open.callback(station.bus.close)
+        self._suite = Suite(sim, station.link, station.clock, daemons.dead)
         self._task = ""
         self._environment: Environment | None = None
 
@@ -286,12 +291,11 @@ class EvaluationStation:
         return line
 
     def close(self) -> None:
-        """Done by itself when the process ends."""
-        atexit.unregister(self.close)
-        if self._environment is not None:
-            self._environment.close()
-        self._station.bus.close()
-        self._daemons.__exit__(None, None, None)
+        """Stops and frees everything; once more does nothing."""
+        with self._open:
+            if self._environment is not None:
+                self._environment.close()
+                self._environment = None
 
     def _scene(self, task: str) -> Environment:
         if self._environment is None or task != self._task:
@@ -300,10 +304,6 @@ class EvaluationStation:
             has_eyes = self._options.policy == "servers" or self._options.record  # the oracle alone needs none
             self._environment = make_environment(task, max_steps=self._options.max_steps, render=has_eyes)
             self._task = task
-            atexit.unregister(self.close)
-            atexit.register(
-                self.close
-            )  # only now: the latest goes first, and GL, just loaded, must not be gone by then
         return self._environment
 
     def _build_donor(self, bus: Bus, robot: str, checkpoint: Path | None) -> Party:

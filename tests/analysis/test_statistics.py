@@ -136,6 +136,11 @@ def test_what_are_no_outcomes_is_refused(tasks: Any) -> None:
         bootstrap(tasks)
 
 
+def test_a_scene_is_better_by_its_mean_however_many_runs_there_were() -> None:
+    found = paired([[[1, 1, 0], [0, 0, 0]]], [[[1, 1, 0], [0, 1, 0], [1, 1, 0], [0, 1, 1]]], num_resamples=FEW)
+    assert (found.num_better, found.num_worse) == (2, 0)
+
+
 def test_other_scenes_are_not_paired() -> None:
     with pytest.raises(ValueError, match="same scenes"):
         paired([[[0, 1]]], [[[0, 1, 1]]])
