@@ -1,0 +1,189 @@
+"""How fast does training go, where does a step spend its time, and how far is that from what the machine can multiply?
+
+One step is the trainer's own: forward, backward, clipping, AdamW, average. Timed apart, forward and backward: PONDER's
+rows (pictures and text of whole episodes, with the LM head on supervised tokens) and POUNCE's invocations with their
+cognition given. Episodes are noise, as long as ``--ticks`` says, under the recipe's own schedules; decoding and reading
+of a dataset are not in the numbers.
+
+Operations are those that torch counts in matrix products and attention (``FlopCounterMode``), forward and backward; the
+peak is a square product of the same dtype, measured here. A network of a few dozen channels spends its time elsewhere.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+import tyro
+from torch.utils.flop_counter import FlopCounterMode
+
+from benchmarks.report import Report, Row, show, spread
+from ponderpounce.models import ponder_configs
+from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.pounce import freeze
+from ponderpounce.models.pounce_checkpoint import PounceBundle, random_bundle
+from ponderpounce.models.pounce_family import action_loss, sample_times
+from ponderpounce.training.collate import collate
+from ponderpounce.training.example import TrainingEpisode, make_example
+from ponderpounce.training.joint import Draws, JointModel, PonderBatch, PounceBatch, encode_rows
+from ponderpounce.training.recipes import Recipe, recipe
+from ponderpounce.training.trainer import Trainer
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ThroughputOptions:
+    """Steps of one recipe with random weights; `tiny_cpu` sizes are the recipe's own."""
+
+    recipe: str = "tiny"
+    ponder: Literal["recipe", "tiny_cpu", "qwen35_0p8b", "qwen35_2b", "qwen35_4b", "qwen35_9b"] = "recipe"
+    """PONDER of this size instead; POUNCE reads its cognition."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """Of PONDER's weights and of the product that the peak is measured with."""
+    threads: int = 1
+    batch_episodes: int = 2
+    ticks: int = 100
+    """20 Hz steps of an episode."""
+    demo: int = 5
+    """Seconds of demonstration, a picture of each camera for each."""
+    steps: int = 5
+    """After one that is not counted."""
+    peak_size: int = 1024
+    """Side of the square product; 8192 says more of a GPU."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    options = tyro.cli(ThroughputOptions, args=argv, prog="training-throughput")
+    torch.set_num_threads(options.threads)
+    report = Report(
+        name=f"training_throughput_{options.device}",
+        question="How fast does training go, and where does a step spend its time?",
+        config=options,
+        warm_up="one step, one pass of each part, one product.",
+    )
+    model, bundle, run = _build(options)
+    episodes, invocations = _batch(model, bundle, run, options)
+    peak = _peak_flops(options)
+    trainer = Trainer(model, lambda step: (episodes, invocations), run.train)
+    num_tokens = sum(len(row.ids) for row in episodes.rows)
+    count = len(invocations.actions_INA)
+    parts: list[tuple[str, Callable[[], object]]] = [
+        ("a whole step", lambda: list(trainer.run(trainer.step + 1))),
+        ("PONDER's rows", lambda: _ponder(model, episodes)),
+        ("POUNCE's invocations", lambda: _pounce(model, invocations)),
+    ]
+    rows: list[Row] = []
+    for name, once in parts:
+        flops = _flops(once)
+        took_ms = [_timed_ms(once, options.device) for _ in range(options.steps)]
+        p50_s = float(np.median(took_ms)) / 1e3
+        rows.append(
+            {"part": name}
+            | spread(took_ms, "ms")
+            | {
+                "episodes_per_s": round(len(episodes.rows) / p50_s, 2),
+                "row_tokens_per_s": None if name.startswith("POUNCE") else round(num_tokens / p50_s),
+                "invocations_per_s": None if name.startswith("PONDER") else round(count / p50_s, 1),
+                "gflop": round(flops / 1e9, 2),
+                "share_of_peak_%": round(100 * flops / p50_s / peak, 1),
+            }
+        )
+    report.add_table("Forward and backward; the whole step with its update", rows)
+    report.notes += [
+        f"{len(episodes.rows)} episodes of {options.ticks} ticks: rows of {num_tokens} tokens in all with "
+        f"{sum(row.num_images for row in episodes.rows)} pictures, {count} invocations.",
+        f"Measured peak: {peak / 1e9:.1f} GFLOP/s, a product of {options.peak_size} x {options.peak_size} in "
+        f"{options.dtype} on {options.device}, {options.threads} thread(s).",
+        f"PONDER {_millions(model.ponder)} M parameters, POUNCE {_millions(model.pounce)} M, random weights.",
+    ]
+    show(report)
+    print(f"\nwritten: {report.write().name}")
+    return 0
+
+
+def _build(options: ThroughputOptions) -> tuple[JointModel, PounceBundle, Recipe]:
+    run = recipe(options.recipe)
+    if options.ponder != "recipe":
+        ponder_config = getattr(ponder_configs, options.ponder)()
+        cognition = replace(run.pounce.cognition, cognition_size=ponder_config.hidden_size)
+        run = replace(run, ponder=ponder_config, pounce=replace(run.pounce, cognition=cognition))
+    ponder = Ponder.random(run.ponder, seed=0, device=options.device, dtype=getattr(torch, options.dtype))
+    bundle = random_bundle(run.pounce, seed=0)
+    bundle.model.to(options.device)
+    freeze(bundle.model, run.freeze)
+    return JointModel(ponder, bundle.model, w1=run.w1, w2=run.w2), bundle, run
+
+
+def _batch(
+    model: JointModel, bundle: PounceBundle, run: Recipe, options: ThroughputOptions
+) -> tuple[PonderBatch, PounceBatch]:
+    rng = np.random.default_rng(0)
+    height, width = model.ponder.image_px
+    views = tuple(rng.integers(0, 256, (height, width, 3), np.uint8) for _ in range(2))
+    episode = TrainingEpisode(
+        instruction="watch the video, then do the same",
+        demo=(views,) * options.demo,
+        frames=[views] * options.ticks,
+        state_T8=rng.uniform(-0.2, 0.2, (options.ticks, 8)).astype(np.float32),
+        action_T8=rng.uniform(-0.2, 0.2, (options.ticks, 8)).astype(np.float32),
+        subgoals=[f"pick cube {1 + tick // 50} at <{50 + tick // 50}, 120>" for tick in range(options.ticks)],
+    )
+    form = model.ponder.format
+    examples = [make_example(episode, form, run.example, rng) for _ in range(options.batch_episodes)]
+    episodes, invocations = collate(examples, bundle.model.config, bundle.tokenizer, bundle.statistics)
+    return episodes.to(options.device), invocations.to(options.device)
+
+
+def _ponder(model: JointModel, episodes: PonderBatch) -> None:
+    hidden = encode_rows(model.ponder, episodes)
+    read = [hidden_TH[row.supervised_index] for row, hidden_TH in zip(episodes.rows, hidden, strict=True)]
+    model.ponder.logits(torch.cat(read)).float().logsumexp(dim=-1).mean().backward()
+    model.zero_grad(set_to_none=True)
+
+
+def _pounce(model: JointModel, invocations: PounceBatch) -> None:
+    pounce, count = model.pounce, len(invocations.actions_INA)
+    config = pounce.config.cognition
+    device = invocations.actions_INA.device
+    cognition_IKH = torch.zeros(count, config.num_carriers, config.cognition_size, device=device, requires_grad=True)
+    generators = [torch.Generator().manual_seed(index) for index in range(int(invocations.episode_I.max()) + 1)]
+    draws = Draws.draw(invocations, lambda n, generator: sample_times(pounce, n, generator), 0.0, generators)
+    inputs = replace(invocations.inputs, cognition=cognition_IKH)
+    action_loss(pounce, inputs, invocations.actions_INA, draws.noise_INA, draws.time_I).backward()
+    model.zero_grad(set_to_none=True)
+
+
+def _flops(once: Callable[[], object]) -> int:
+    """Also the warm-up."""
+    with FlopCounterMode(display=False) as counter:
+        once()
+    return int(counter.get_total_flops())
+
+
+def _peak_flops(options: ThroughputOptions) -> float:
+    """Of a square product, the best of ten."""
+    side = options.peak_size
+    left = torch.randn(side, side, device=options.device, dtype=getattr(torch, options.dtype))
+    took_ms = [_timed_ms(lambda: left @ left, options.device) for _ in range(11)][1:]
+    return 2 * side**3 / (min(took_ms) / 1e3)
+
+
+def _timed_ms(once: Callable[[], object], device: str) -> float:
+    start_ns = time.perf_counter_ns()
+    once()
+    if device == "cuda":
+        torch.cuda.synchronize()
+    return (time.perf_counter_ns() - start_ns) / 1e6
+
+
+def _millions(model: torch.nn.Module) -> float:
+    return round(sum(parameter.numel() for parameter in model.parameters()) / 1e6, 2)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
