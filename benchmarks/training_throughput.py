@@ -132,6 +132,7 @@ def _batch(
         state_T8=rng.uniform(-0.2, 0.2, (options.ticks, 8)).astype(np.float32),
         action_T8=rng.uniform(-0.2, 0.2, (options.ticks, 8)).astype(np.float32),
         subgoals=[f"pick cube {1 + tick // 50} at <{50 + tick // 50}, 120>" for tick in range(options.ticks)],
+        is_transition_T=np.arange(options.ticks) % 50 == 0,
     )
     form = model.ponder.format
     examples = [make_example(episode, form, run.example, rng) for _ in range(options.batch_episodes)]

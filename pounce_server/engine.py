@@ -15,16 +15,16 @@ from ponderpounce.models import flow, rtc
 from ponderpounce.models.flow import EulerStep
 from ponderpounce.models.groot_prompt import EagleTokenizer
 from ponderpounce.models.pounce import Pounce, PounceInputs
+from ponderpounce.models.pounce_batching import joined_groot, joined_pi05, of_equal_length
 from ponderpounce.models.pounce_checkpoint import PounceBundle
 from ponderpounce.models.pounce_family import AnyPounce
 from ponderpounce.models.pounce_groot import GrootInputs, GrootPounce
+from ponderpounce.models.pounce_reading import groot_inputs, pi05_inputs
 from ponderpounce.models.prompt import Tokenizer
-from pounce_server.batching import joined_groot, joined_pi05, of_equal_length
 from pounce_server.contract import (
     Continuity,
     DTypeName,
     EngineSpec,
-    PounceEngine,
     Progress,
     Request,
     check_request,
@@ -32,10 +32,8 @@ from pounce_server.contract import (
     no_progress,
 )
 from pounce_server.fused import fused_for
+from pounce_server.guidance import guide
 from pounce_server.precision import cast_for_serving
-from pounce_server.reading import groot_inputs, guide, pi05_inputs
-
-__all__ = ["EagerEngine", "EngineSpec", "PounceEngine", "Request"]
 
 Sampler: TypeAlias = Callable[[Sequence[Request], Tensor], Iterator[tuple[list[int], EulerStep]]]
 """Reads requests and yields flow steps from given noise, (B, N, A), each with the indices of the requests it moves."""

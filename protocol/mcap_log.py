@@ -36,7 +36,7 @@ from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
-from protocol import codec, images, topics
+from protocol import codec, disk, images, topics
 from protocol import messages as m
 from protocol.checks import check
 from protocol.errors import ProtocolError
@@ -188,7 +188,7 @@ class EpisodeLog:
             self._writer.finish(entry.result, self._overflowed + self._refused, self._error)
             if not self._error:
                 self.partial.rename(self.path)
-                _fsync_folder(self.path.parent)
+                disk.sync(self.path.parent)
         except Exception as error:
             self._fail(error)
 
@@ -555,12 +555,3 @@ def _described(file: Any) -> FileDescriptorSet:
 
     add(file)
     return described
-
-
-def _fsync_folder(folder: Path) -> None:
-    """A rename survives a power cut only when its folder is on disk too."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

@@ -29,7 +29,7 @@ from ponderpounce.data.errors import DatasetError
 from ponderpounce.data.seeds import TRAIN_SEED
 from ponderpounce.data.workers import LocalWorkers, RayWorkers, Workers
 from ponderpounce.tasks.environment import Environment, make_environment
-from ponderpounce.tasks.task import TaskError, make_task, task_names
+from ponderpounce.tasks.task import TaskError, chosen_tasks
 from protocol.bus import Bus
 from protocol.errors import TransportError
 from protocol.link import Link
@@ -123,11 +123,7 @@ class EvalOptions:
 
     def task_names(self) -> tuple[str, ...]:
         """The tasks in alphabetical order, each once. Raises TaskError for an unknown one."""
-        if "all" in self.tasks:
-            return task_names()
-        for name in self.tasks:
-            make_task(name)
-        return tuple(sorted(set(self.tasks)))
+        return chosen_tasks(self.tasks)
 
     def jobs(self) -> list[Job]:
         """Every episode, task by task: a worker keeps its scene, and finished tasks are whole.

@@ -12,8 +12,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import IO
+from typing import IO, Protocol
 
+from protocol.options import LinkOptions
 from protocol.process import PARENT_VARIABLE
 
 _GRACE_S = 5.0
@@ -105,3 +106,35 @@ def start_local(
     arguments = [*common, "--link.listen", at_clock, "--link.connect", at_ponder, at_pounce]
     daemons.start("clock", "clock", [*arguments, *(["--allow-starved"] if allow_starved else [])])
     return at_clock, at_ponder, at_pounce
+
+
+class LocalOptions(Protocol):
+    """What a program's options say of the servers that it starts."""
+
+    @property
+    def link(self) -> LinkOptions: ...
+    @property
+    def runs_clock_daemon(self) -> bool: ...
+    @property
+    def allow_starved(self) -> bool: ...
+    @property
+    def ponder_checkpoint(self) -> Path | None: ...
+    @property
+    def pounce_checkpoint(self) -> Path | None: ...
+
+
+def local_link(options: LocalOptions, daemons: Daemons) -> LinkOptions:
+    """Starts the servers of ``--local``; returns how to reach them."""
+    endpoints = start_local(
+        daemons,
+        robot=options.link.robot,
+        with_clock=options.runs_clock_daemon,
+        allow_starved=options.allow_starved,
+        ponder=_checkpoint(options.ponder_checkpoint),
+        pounce=_checkpoint(options.pounce_checkpoint),
+    )
+    return LinkOptions(robot=options.link.robot, connect=endpoints)
+
+
+def _checkpoint(folder: Path | None) -> list[str]:
+    return [] if folder is None else ["--checkpoint", str(folder)]

@@ -11,10 +11,9 @@ from clock.service import ClockService, ServiceConfig
 from protocol.bus import Bus, LocalBus
 from protocol.errors import TransportError
 from protocol.link import Link
-from protocol.options import LinkOptions
 from protocol.zenoh_bus import open_bus
 from sim_client.config import SimOptions
-from sim_client.launch import Daemons, start_local
+from sim_client.launch import Daemons, local_link
 
 Party = Callable[[], bool]
 Build = Callable[[Bus, str, Path | None], Party]
@@ -66,15 +65,7 @@ def _bus(options: SimOptions, daemons: Daemons, ponder: Build | None) -> tuple[B
         bus.add_party(_builder("pounce_server.party")(bus, link.robot, options.pounce_checkpoint))
         return bus, bus.add_party
     if options.local:
-        endpoints = start_local(
-            daemons,
-            robot=link.robot,
-            with_clock=options.runs_clock_daemon,
-            ponder=["--checkpoint", str(options.ponder_checkpoint)] if options.ponder_checkpoint else [],
-            pounce=["--checkpoint", str(options.pounce_checkpoint)] if options.pounce_checkpoint else [],
-            allow_starved=options.allow_starved,
-        )
-        link = LinkOptions(robot=link.robot, connect=endpoints)
+        link = local_link(options, daemons)
     return open_bus(link), lambda step: None
 
 

@@ -28,7 +28,7 @@ from ponderpounce.data.rollout import UNSOLVED, work_out
 from ponderpounce.data.seeds import TRAIN_SEED
 from ponderpounce.data.store import Store
 from ponderpounce.data.workers import LocalWorkers, RayWorkers, Workers
-from ponderpounce.tasks.task import TaskError, make_task, task_names
+from ponderpounce.tasks.task import TaskError, chosen_tasks
 
 SCALES = {"1x": 1, "9x": 9}
 COLLECTING, JOINED, COLLECTION_PATH = ".collecting", "joined", "meta/collection.json"
@@ -80,11 +80,7 @@ class CollectOptions:
 
     def task_names(self) -> tuple[str, ...]:
         """The tasks in alphabetical order, each once. Raises TaskError for an unknown one."""
-        if "all" in self.tasks:
-            return task_names()
-        for name in self.tasks:
-            make_task(name)
-        return tuple(sorted(set(self.tasks)))
+        return chosen_tasks(self.tasks)
 
     def jobs(self) -> list[Job]:
         """Everything that is to be collected, in the dataset's order."""

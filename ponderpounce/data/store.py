@@ -7,7 +7,6 @@ the next. A lock keeps two collectors from one folder.
 from __future__ import annotations
 
 import fcntl
-import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,6 +14,7 @@ from types import TracebackType
 
 from ponderpounce.data.episode import Package
 from ponderpounce.data.errors import DatasetError
+from protocol import disk
 
 
 class Store:
@@ -45,17 +45,11 @@ class Store:
         aside = self._aside / key
         aside.mkdir(parents=True)
         for name, content in package.items():
-            with (aside / name).open("wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
+            (aside / name).write_bytes(content)
+            disk.sync(aside / name)
         place.parent.mkdir(exist_ok=True)
         aside.rename(place)
-        handle = os.open(place.parent, os.O_RDONLY)  # a rename survives a power cut when its folder is on disk too
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
+        disk.sync(place.parent)
 
     def read(self, key: str) -> Package:
         """Returns a package that is there."""

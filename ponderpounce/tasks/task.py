@@ -13,7 +13,7 @@ import importlib
 import importlib.util
 import pkgutil
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -174,6 +174,15 @@ def task_names() -> tuple[str, ...]:
     """Returns the names of all tasks that can be made, sorted."""
     _import_all_tasks()
     return tuple(sorted(_REGISTRY))
+
+
+def chosen_tasks(names: Sequence[str]) -> tuple[str, ...]:
+    """Returns the tasks of a program's ``--tasks``, sorted, each once; "all" stands for all. Raises TaskError."""
+    if "all" in names:
+        return task_names()
+    for name in names:
+        make_task(name)
+    return tuple(sorted(set(names)))
 
 
 def make_task(name: str) -> Task[Any, Any]:

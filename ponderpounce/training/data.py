@@ -85,6 +85,7 @@ class TrainingSet:
             state_T8=rows.state[start:],
             action_T8=rows.action[start:],
             subgoals=rows.grounded_subgoal[start:],
+            is_transition_T=rows.is_transition[start:],
             reasoning=rows.demonstration_reasoning[start],
         )
 

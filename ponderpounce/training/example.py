@@ -35,15 +35,19 @@ class TrainingEpisode:
     """Absolute joint targets and the gripper's command."""
     subgoals: Sequence[str]
     """T grounded texts; empty texts for data without annotations."""
+    is_transition_T: NDArray[np.bool_]
+    """Where another subgoal begins. Texts do not tell: two in a row may be the same, and one changes when its object
+    comes into sight."""
     reasoning: str = ""
     """What PONDER writes at the first transition after a demonstration; empty without one."""
 
     def __post_init__(self) -> None:
-        sizes = {len(self.frames), len(self.state_T8), len(self.action_T8), len(self.subgoals)}
+        rows = (self.frames, self.state_T8, self.action_T8, self.subgoals, self.is_transition_T)
+        sizes = {len(column) for column in rows}
         if len(sizes) != 1 or 0 in sizes:
             raise ValueError(
-                f"an episode needs one frame, state, action and text per tick; it has {len(self.frames)}, "
-                f"{len(self.state_T8)}, {len(self.action_T8)}, {len(self.subgoals)}"
+                "an episode needs one frame, state, action, text and transition flag per tick; it has "
+                f"{', '.join(str(len(column)) for column in rows)}"
             )
 
     @property
@@ -52,9 +56,8 @@ class TrainingEpisode:
 
     @property
     def transition_ticks(self) -> frozenset[int]:
-        """Ticks at which another subgoal begins, the first among them; none without annotations."""
-        texts = self.subgoals
-        return frozenset(t for t in range(len(texts)) if texts[t] and (t == 0 or texts[t] != texts[t - 1]))
+        """Ticks at which another subgoal begins."""
+        return frozenset(np.flatnonzero(self.is_transition_T).tolist())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,7 +6,6 @@ read from no disk; and gathering everything on one process would need room for t
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -19,14 +18,14 @@ from torch import Tensor
 from torch.distributed.tensor import DTensor
 
 from ponderpounce.training.parallel import World, local
+from protocol import disk
 
 
 def write_rows(tensors: Mapping[str, Tensor], folder: Path, stem: str, world: World) -> None:
     """Writes this process's rows to ``folder/stem-RANK-of-SIZE.safetensors``, down to the disk."""
     path = folder / f"{stem}-{world.rank:05d}-of-{world.size:05d}.safetensors"
     save_file({name: local(tensor.detach()).contiguous() for name, tensor in tensors.items()}, path)
-    with path.open("rb") as file:
-        os.fsync(file.fileno())
+    disk.sync(path)
 
 
 class RowReader:

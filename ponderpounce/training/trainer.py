@@ -7,7 +7,6 @@ on the weights, the optimiser and its number alone.
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
@@ -24,6 +23,7 @@ from ponderpounce.training.joint import Draws, JointModel, PonderBatch, PounceBa
 from ponderpounce.training.optim import OptimConfig, Optimiser
 from ponderpounce.training.parallel import World, local
 from ponderpounce.training.shards import RowReader, write_rows
+from protocol import disk
 
 Batches = Callable[[int], tuple[PonderBatch, PounceBatch]]
 """This process's share of the batch of a step (``World.share``); a pure function of the step's number."""
@@ -172,7 +172,7 @@ class Trainer:
             if world.is_first:
                 facts = {"step": self.step, "config": asdict(self.config), "data_hash": self._data_hash}
                 (fresh / _FACTS).write_text(json.dumps(facts, indent=1) + "\n")
-                _sync(fresh / _FACTS)
+                disk.sync(fresh / _FACTS)
         except (OSError, SafetensorError) as error:
             failure = error
         (num_failed,) = world.sums([failure is not None])
@@ -228,7 +228,7 @@ def _replace(folder: Path, fresh: Path, old: Path) -> None:
         shutil.rmtree(old, ignore_errors=True)
         folder.rename(old)
     fresh.rename(folder)
-    _sync(folder.parent)
+    disk.sync(folder.parent)
     shutil.rmtree(old, ignore_errors=True)
 
 
@@ -238,11 +238,3 @@ def _why_not_saved(folder: Path, step: int, failure: Exception | None) -> str:
         f"step {step}: {folder} could not be written ({failure or 'another process says why'}); "
         f"{free_gb:.1f} GB are free there. The one before is kept: make room, and the same command goes on from it."
     )
-
-
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

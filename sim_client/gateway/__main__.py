@@ -18,14 +18,13 @@ import ponderpounce.tasks.headless  # noqa: F401 - before anything that imports 
 from clock.service import ClockService, ServiceConfig
 from protocol.errors import TransportError
 from protocol.link import Link
-from protocol.options import LinkOptions
 from protocol.process import StopFlag, set_up_logging
 from protocol.zenoh_bus import open_bus
 from sim_client.gateway.http_form import HttpSide
 from sim_client.gateway.machine import Machine
 from sim_client.gateway.options import GatewayOptions
 from sim_client.gateway.websocket import WebsocketSide
-from sim_client.launch import Daemons, start_local
+from sim_client.launch import Daemons, local_link
 
 log = logging.getLogger("pp-gateway")
 
@@ -49,15 +48,7 @@ def main(argv: list[str] | None = None) -> int:
 def _machine(options: GatewayOptions, daemons: Daemons) -> Iterator[Machine]:
     plan, link = options.plan(), options.link
     if options.local:
-        endpoints = start_local(
-            daemons,
-            robot=link.robot,
-            with_clock=options.runs_clock_daemon,
-            ponder=["--checkpoint", str(options.ponder_checkpoint)] if options.ponder_checkpoint else [],
-            pounce=["--checkpoint", str(options.pounce_checkpoint)] if options.pounce_checkpoint else [],
-            allow_starved=options.allow_starved,
-        )
-        link = LinkOptions(robot=link.robot, connect=endpoints)
+        link = local_link(options, daemons)
     bus = open_bus(link)
     try:
         clock = None

@@ -18,6 +18,7 @@ from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
 from ponderpounce.models.pounce_configs import tiny_cpu as tiny_pounce
 from ponderpounce.models.pounce_configs import tiny_groot
 from ponderpounce.models.pounce_groot import GrootInputs
+from ponderpounce.models.pounce_reading import groot_inputs, pi05_inputs
 from ponderpounce.models.prompt import tiny_tokenizer_for_random_weights
 from ponderpounce.training.collate import collate
 from ponderpounce.training.example import (
@@ -29,7 +30,6 @@ from ponderpounce.training.example import (
     target_rows,
 )
 from pounce_server.contract import Request
-from pounce_server.reading import groot_inputs, pi05_inputs
 
 PONDER = Ponder.random(replace(tiny_ponder(), image_px=(64, 64), num_layers=4), seed=1)
 FORM = PONDER.format
@@ -56,6 +56,7 @@ def episode(num_ticks: int, *, num_demo: int = 0, seed: int = 0, changes: tuple[
         state_T8=rng.uniform(-0.2, 0.2, (num_ticks, 8)).astype(np.float32),
         action_T8=rng.uniform(-0.2, 0.2, (num_ticks, 8)).astype(np.float32),
         subgoals=texts,
+        is_transition_T=np.isin(np.arange(num_ticks), changes),
         reasoning="Demo selected <77, 103>." if num_demo else "",
     )
 
@@ -145,6 +146,17 @@ def test_the_row_says_what_the_annotations_say() -> None:
     assert texts == "Demo selected [402, 301].pick cube 1 at [78, 4]pick cube 2 at [78, 8]"
 
 
+def test_transitions_are_the_datas_and_not_the_texts() -> None:
+    recorded = replace(episode(70), subgoals=["circle the post"] * 40 + ["go on"] * 15 + ["go on at <9, 9>"] * 15)
+    marked = replace(recorded, is_transition_T=np.isin(np.arange(70), (0, 20, 40)))  # the second has the first's words
+    schedule = sample_schedule(np.random.default_rng(0), EVALUATION, 70, transition_ticks=marked.transition_ticks)
+    row = episode_row(marked, FORM, schedule)
+    v = FORM.vocabulary
+    assert v.decode([t for t in row.targets if t >= 0 and t not in (v.t_yes, v.t_no)]) == (
+        "circle the postcircle the postgo on"
+    )
+
+
 def test_pictures_stand_in_the_order_of_the_row() -> None:
     recorded = episode(45, num_demo=2)
     schedule = sample_schedule(np.random.default_rng(0), EVALUATION, 45)
@@ -179,7 +191,7 @@ def test_examples_of_a_batch_keep_apart() -> None:
 
 def test_an_episode_with_missing_rows_is_refused() -> None:
     whole = episode(5)
-    with pytest.raises(ValueError, match="one frame, state, action and text per tick; it has 5, 4, 5, 5"):
+    with pytest.raises(ValueError, match="per tick; it has 5, 4, 5, 5, 5"):
         replace(whole, state_T8=whole.state_T8[:4])
 
 

@@ -45,6 +45,7 @@ def _episode(seed: int, num_demo: int) -> dict[str, bytes]:
             subgoal="pick it",
             grounded_subgoal=f"pick it at <{1 + index // 60}, 7>",
             is_demonstration=index < num_demo,
+            is_transition=index in (num_demo, 60),
             demonstration_reasoning="Demo selected <3, 4>." if num_demo and index == num_demo else "",
         )
         picture = np.full((PX, PX, 3), 20 + index, np.uint8)

@@ -1,6 +1,6 @@
-"""Several requests as one batch: what may be padded is, what may not is kept apart."""
+"""Several moments as one batch: what may be padded is, what may not is kept apart."""
 
-# B requests, T text tokens
+# B moments, T text tokens
 
 from collections.abc import Sequence
 
@@ -30,7 +30,7 @@ def joined_pi05(inputs: Sequence[PounceInputs]) -> PounceInputs:
 
 
 def joined_groot(inputs: Sequence[GrootInputs]) -> GrootInputs:
-    """One batch of `of_equal_length` requests."""
+    """One batch of `of_equal_length` moments."""
     cognition, is_null = _joined_cognition([one.cognition for one in inputs])
     return GrootInputs(
         images=torch.cat([one.images for one in inputs]),
@@ -45,7 +45,7 @@ def joined_groot(inputs: Sequence[GrootInputs]) -> GrootInputs:
 
 
 def of_equal_length(inputs: Sequence[GrootInputs]) -> list[list[int]]:
-    """Indices of the requests that may share a batch: GR00T attends to padding, so there must be none."""
+    """Indices of the moments that may share a batch: GR00T attends to padding, so there must be none."""
     groups: dict[int, list[int]] = {}
     for index, one in enumerate(inputs):
         groups.setdefault(one.token_ids.shape[1], []).append(index)
