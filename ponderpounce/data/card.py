@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
@@ -133,7 +134,21 @@ def _origin(dataset: Dataset) -> list[str]:
             + ", ".join(f"{name} {version}" for name, version in settings["versions"].items())
             + "."
         )
+        if (noise := settings.get("noise")) is not None:
+            lines.append(_noise(noise, dataset.episodes))
     return lines
+
+
+def _noise(settings: dict[str, Any], entries: Sequence[Entry]) -> str:
+    """What was done to the actions."""
+    num_clean = sum(each.noise_rad == 0.0 for each in entries)
+    low, high = (settings["std_rad"] * settings[name] for name in ("least_factor", "most_factor"))
+    return (
+        f"DART noise: `action` is what the oracle planned, `executed_action` what was carried out. Joint targets were "
+        f"moved by an Ornstein-Uhlenbeck process of {low:.4f} to {high:.4f} rad ({settings['correlation_s']} s), less "
+        f"within {settings['free_m']} m of anything to touch; `noise_rad` says how much in each episode, and "
+        f"{num_clean} of {len(entries)} have none."
+    )
 
 
 def _by_task(entries: Sequence[Entry]) -> dict[str, list[Entry]]:

@@ -20,7 +20,8 @@ from typing import Annotated, Any, Literal
 import tyro
 from tqdm import tqdm
 
-from ponderpounce.data.episode import Package, unpack
+from ponderpounce.data.dart import DART, NoiseKind
+from ponderpounce.data.episode import Package, Rejection, unpack
 from ponderpounce.data.errors import DatasetError
 from ponderpounce.data.jobs import Job, Look, jobs_of
 from ponderpounce.data.lerobot_v3 import INFO_PATH, DatasetWriter
@@ -55,6 +56,8 @@ class CollectOptions:
     """With --frames training: how often POUNCE looks (paper: every 100 ms in training)."""
     image_px: int = 256
     """Even; the paper's and the benchmark's is 256."""
+    noise: NoiseKind = "none"
+    """dart: nudge the executed joint targets off the oracle's way; `action` stays the way, the label."""
     max_steps: int = 1300
     """An episode that takes longer is not kept."""
     workers: int = os.cpu_count() or 1
@@ -85,20 +88,20 @@ class CollectOptions:
     def jobs(self) -> list[Job]:
         """Everything that is to be collected, in the dataset's order."""
         num_episodes = self.episodes * SCALES[self.scale]
-        return list(
-            jobs_of(self.task_names(), num_episodes, image_px=self.image_px, max_steps=self.max_steps, look=self.look)
-        )
+        common = {"image_px": self.image_px, "max_steps": self.max_steps}
+        return list(jobs_of(self.task_names(), num_episodes, look=self.look, noise=self.noise, **common))
 
     def settings(self) -> dict[str, Any]:
         """What all episodes of one dataset have in common; how many there are and who made them is not part of it."""
         versions = {name: metadata.version(name) for name in ("ponderpounce", "mujoco", "numpy", "av", "pyarrow")}
-        return {
+        settings = {
             "first_seed": TRAIN_SEED,
             "image_px": self.image_px,
             "max_steps": self.max_steps,
             "look": asdict(self.look),
             "versions": versions,
         }
+        return settings if self.noise == "none" else {**settings, "noise": DART.settings()}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,6 +111,7 @@ class Report:
     num_episodes: int
     num_rejected: int
     unsolved: tuple[str, ...]  # keys of jobs without an episode
+    num_rejected_noisy: int = 0  # of those rejected, how many failed under noise
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -120,7 +124,9 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         sys.stderr.write("pp-collect: interrupted; finished episodes are kept, the same command goes on\n")
         return INTERRUPTED
-    print_line(f"{report.num_episodes} episodes in {options.out} ({report.num_rejected} seeds were tried in vain)")
+    noisy = "" if options.noise == "none" else f", {report.num_rejected_noisy} of them under noise"
+    vain = f"{report.num_rejected} seeds were tried in vain{noisy}"
+    print_line(f"{report.num_episodes} episodes in {options.out} ({vain})")
     for key in report.unsolved:
         sys.stderr.write(f"pp-collect: no episode for {key}: the oracle solved none of its seeds\n")
     return INCOMPLETE if report.unsolved else DONE
@@ -217,9 +223,9 @@ def _claim(path: Path, settings: dict[str, Any]) -> None:
 
 
 def _require_equal(there: dict[str, Any], wanted: dict[str, Any], out: Path) -> None:
-    differing = [name for name in wanted if there.get(name) != wanted[name]]
+    differing = [name for name in {**wanted, **there} if there.get(name) != wanted.get(name)]
     if differing:
-        said = "; ".join(f"{name} was {there.get(name)} and is {wanted[name]}" for name in differing)
+        said = "; ".join(f"{name} was {there.get(name)} and is {wanted.get(name)}" for name in differing)
         raise DatasetError(f"{out} was begun otherwise: {said}. Use the same, or another --out")
 
 
@@ -239,6 +245,7 @@ def _finished(out: Path, wanted: dict[str, Any]) -> Report | None:
             num_episodes=there["episodes"] - len(there["unsolved"]),
             num_rejected=there["num_rejected"],
             unsolved=tuple(there["unsolved"]),
+            num_rejected_noisy=there.get("num_rejected_noisy", 0),
         )
     if not (out / COLLECTING).exists():
         raise DatasetError(
@@ -253,26 +260,35 @@ def _join(out: Path, store: Store, jobs: Sequence[Job], wanted: dict[str, Any]) 
     aside = out / COLLECTING / JOINED
     shutil.rmtree(aside, ignore_errors=True)
     writer = DatasetWriter(aside)
-    unsolved, num_rejected = [], 0
+    unsolved: list[str] = []
+    rejected: list[Rejection] = []
     for job in jobs:
         package = store.read(job.key)
         if UNSOLVED in package:
             unsolved.append(job.key)
-            num_rejected += len(json.loads(package[UNSOLVED]))
+            rejected += [Rejection(**each) for each in json.loads(package[UNSOLVED])]
             continue
         episode = unpack(package)
-        num_rejected += len(episode.about.rejected)
+        rejected += episode.about.rejected
         writer.add(episode)
     if len(unsolved) == len(jobs):
         raise DatasetError(f"the oracle solved no episode at all of {', '.join(wanted['tasks'])}")
     writer.finish()
-    summary = {**wanted, "num_rejected": num_rejected, "unsolved": unsolved}
+    report = Report(
+        num_episodes=len(jobs) - len(unsolved),
+        num_rejected=len(rejected),
+        unsolved=tuple(unsolved),
+        num_rejected_noisy=sum(each.noise_rad > 0 for each in rejected),
+    )
+    summary = {**wanted, "num_rejected": report.num_rejected, "unsolved": unsolved}
+    if "noise" in wanted["settings"]:
+        summary["num_rejected_noisy"] = report.num_rejected_noisy
     (aside / COLLECTION_PATH).write_text(json.dumps(summary, indent=1) + "\n")
     for name in ("meta", "data", "videos"):  # without meta it is no dataset: a kill from here on ends in joining again
         shutil.rmtree(out / name, ignore_errors=True)
     for name in ("data", "videos", "meta"):
         (aside / name).rename(out / name)
-    return Report(num_episodes=len(jobs) - len(unsolved), num_rejected=num_rejected, unsolved=tuple(unsolved))
+    return report
 
 
 def _workers(options: CollectOptions) -> Workers[Job, Package]:

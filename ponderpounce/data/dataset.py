@@ -32,6 +32,7 @@ class Entry:
     is_success: bool
     recovery: str
     num_rejected: int
+    noise_rad: float  # 0 where nobody added noise
     num_rows: int
     num_demonstration_rows: int
     first_row: int  # its number among all rows of the dataset
@@ -91,6 +92,7 @@ def _entry(listed: dict[str, Any]) -> Entry:
         instruction=listed["tasks"][0],
         num_rows=listed["length"],
         first_row=listed["dataset_from_index"],
+        noise_rad=listed.get("noise_rad", 0.0),
         **{name: listed[name] for name in same},
     )
 

@@ -24,6 +24,7 @@ from ponderpounce.data.video import FPS, Frame, VideoWriter
 
 CAMERAS = ("front", "wrist")
 ROWS, ABOUT = "rows.parquet", "episode.json"
+EXECUTED = "executed_action"  # the one column that only some datasets have
 
 Package = dict[str, bytes]  # file name -> content
 Recovery = Literal["none", "z", "xy"]
@@ -41,6 +42,7 @@ class Row:
     is_demonstration: bool = False
     is_transition: bool = False  # the first row of a new subgoal that the robot itself is to reach
     demonstration_reasoning: str = ""  # only in the first row after a demonstration
+    executed_action: NDArray[np.float32] | None = None  # (8,): what was carried out in place of `action`, under noise
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,6 +51,7 @@ class Rejection:
 
     seed: int
     reason: str
+    noise_rad: float = 0.0  # as in `About`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,6 +67,7 @@ class About:
     image_px: int
     recovery: Recovery = "none"  # where a grasp was made to fail before the right one
     rejected: tuple[Rejection, ...] = ()
+    noise_rad: float = 0.0  # standard deviation of the joint targets' noise, far from everything; see `dart`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -79,6 +83,7 @@ class Rows:
     subgoal: tuple[str, ...]
     grounded_subgoal: tuple[str, ...]
     demonstration_reasoning: tuple[str, ...]
+    executed_action: NDArray[np.float32] | None = None  # (N, 8); None: every action was carried out as it is
 
     def __len__(self) -> int:
         return len(self.state)
@@ -116,6 +121,7 @@ class EpisodeWriter:
             subgoal=tuple(row.subgoal for row in rows),
             grounded_subgoal=tuple(row.grounded_subgoal for row in rows),
             demonstration_reasoning=tuple(row.demonstration_reasoning for row in rows),
+            executed_action=_executed(rows),
         )
         pixels = {camera: [each.num_frames, each.counts.tolist()] for camera, each in self._pixels.items()}
         sink = io.BytesIO()
@@ -155,12 +161,21 @@ def unpack(package: Package) -> Episode:
 
 def to_table(rows: Rows) -> pa.Table:
     """The columns as an Arrow table."""
-    return pa.table({each.name: _to_arrow(getattr(rows, each.name)) for each in fields(Rows)})
+    columns = {each.name: getattr(rows, each.name) for each in fields(Rows)}
+    return pa.table({name: _to_arrow(column) for name, column in columns.items() if column is not None})
 
 
 def from_table(table: pa.Table) -> Rows:
-    """The columns of an Arrow table; those it has besides are left aside."""
-    return Rows(**{each.name: _from_arrow(table.column(each.name).combine_chunks()) for each in fields(Rows)})
+    """The columns of an Arrow table; those it has besides are left aside. Without noise it has no executed actions."""
+    names = [each.name for each in fields(Rows) if each.name != EXECUTED or EXECUTED in table.column_names]
+    return Rows(**{name: _from_arrow(table.column(name).combine_chunks()) for name in names})
+
+
+def _executed(rows: list[Row]) -> NDArray[np.float32] | None:
+    """What was carried out in each row (N, 8); None if that is not said of any."""
+    if all(row.executed_action is None for row in rows):
+        return None
+    return np.stack([row.action if row.executed_action is None else row.executed_action for row in rows])
 
 
 def _to_arrow(column: Any) -> Any:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import ponderpounce.tasks.headless  # noqa: F401 - before mujoco is imported
+from ponderpounce.data.dart import NoiseKind
 from ponderpounce.data.episode import Recovery
 from ponderpounce.data.seeds import TRAIN_SEED
 from ponderpounce.data.video import FPS
@@ -42,6 +43,7 @@ class Job:
     image_px: int
     max_steps: int
     look: Look
+    noise: NoiseKind = "none"
 
     @property
     def key(self) -> str:
@@ -61,11 +63,13 @@ class Job:
         return TRAIN_SEED + ATTEMPTS * self.slot + attempt
 
 
-def jobs_of(tasks: Sequence[str], num_episodes: int, *, image_px: int, max_steps: int, look: Look) -> Iterator[Job]:
+def jobs_of(
+    tasks: Sequence[str], num_episodes: int, *, image_px: int, max_steps: int, look: Look, noise: NoiseKind = "none"
+) -> Iterator[Job]:
     """Yields the jobs task by task, in the order their episodes have in the dataset."""
     for task in tasks:
         for slot in range(num_episodes):
-            yield Job(task=task, slot=slot, image_px=image_px, max_steps=max_steps, look=look)
+            yield Job(task=task, slot=slot, image_px=image_px, max_steps=max_steps, look=look, noise=noise)
 
 
 def failed_grasp(recovery: Recovery, seed: int, num_grasps: int) -> FailedGrasp | None:

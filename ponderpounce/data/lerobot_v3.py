@@ -7,7 +7,7 @@ each lies. Nothing here depends on when or where it is written: equal episodes i
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ponderpounce.data.episode import CAMERAS, Episode, to_table
+from ponderpounce.data.episode import CAMERAS, EXECUTED, Episode, to_table
 from ponderpounce.data.statistics import PixelHistogram, Statistics, of_vectors
 from ponderpounce.data.video import CODEC, FPS, PIXEL_FORMAT, VideoJoiner
 
@@ -46,8 +46,9 @@ _COLUMNS: dict[str, dict[str, Any]] = {
     "index": {"dtype": "int64", "shape": [1], "names": None},
     "task_index": {"dtype": "int64", "shape": [1], "names": None},
 }
-_NUMBERS = [name for name, feature in _COLUMNS.items() if feature["dtype"] != "string"]
-_POLICY = ("observation.state", "action", "tcp_pose")
+_EXECUTED_COLUMN = {EXECUTED: _COLUMNS["action"]}
+"""Only in datasets that were collected under noise."""
+_POLICY = ("observation.state", "action", "tcp_pose", EXECUTED)
 """Statistics of these are over the robot's own rows: they normalise a policy, and nobody acts in a demonstration."""
 
 
@@ -69,6 +70,7 @@ class DatasetWriter:
         self._episodes: list[dict[str, Any]] = []
         self._image_px = 0
         self._num_rows = 0
+        self._has_executed: bool | None = None
 
     def add(self, episode: Episode) -> None:
         """Appends an episode."""
@@ -78,6 +80,12 @@ class DatasetWriter:
             raise ValueError(
                 f"episode of {about.image_px} px after ones of {self._image_px} px; a dataset has one size"
             )
+        has_executed = episode.rows.executed_action is not None
+        if self._has_executed not in (None, has_executed):
+            raise ValueError(
+                f"a dataset's episodes all have {EXECUTED}, or none has; {about.task} {about.seed} differs"
+            )
+        self._has_executed = has_executed
         table = self._numbered(episode)
         placed: dict[str, Any] = {
             "episode_index": len(self._episodes),
@@ -94,11 +102,13 @@ class DatasetWriter:
             "num_rejected": len(about.rejected),
             "num_demonstration_rows": int(episode.rows.is_demonstration.sum()),
         }
+        if has_executed:
+            placed["noise_rad"] = about.noise_rad
         placed |= self._data.append(table)
         for camera, videos in self._videos.items():
             placed |= videos.append(episode.videos[camera], num_rows)
             self._pixels[camera] = self._pixels[camera] + episode.pixels[camera]
-        statistics = _of_columns(table)
+        statistics = _of_columns(table, _numbers(table.schema))
         statistics |= {video_key(camera): pixels.statistics() for camera, pixels in episode.pixels.items()}
         placed |= {f"stats/{name}/{key}": value for name, of in statistics.items() for key, value in of.items()}
         placed |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
@@ -123,13 +133,17 @@ class DatasetWriter:
         """The rows under LeRobot's names, with the numbers it counts by."""
         rows, num_rows = to_table(episode.rows), len(episode.rows)
         task_index = self._instructions.setdefault(episode.about.instruction, len(self._instructions))
-        columns = {name: rows[OUR_NAMES.get(name, name)] for name in list(_COLUMNS)[: rows.num_columns]}
+        named = {name: OUR_NAMES.get(name, name) for name in self._columns()}
+        columns = {name: rows[ours] for name, ours in named.items() if ours in rows.column_names}
         columns["timestamp"] = pa.array((np.arange(num_rows) / FPS).astype(np.float32))
         columns["frame_index"] = pa.array(np.arange(num_rows))
         columns["episode_index"] = pa.array(np.full(num_rows, len(self._episodes)))
         columns["index"] = pa.array(np.arange(num_rows) + self._num_rows)
         columns["task_index"] = pa.array(np.full(num_rows, task_index))
         return pa.table(columns)
+
+    def _columns(self) -> dict[str, dict[str, Any]]:
+        return {**_COLUMNS, **_EXECUTED_COLUMN} if self._has_executed else _COLUMNS
 
     def _described(self) -> dict[str, Any]:
         video = {
@@ -160,7 +174,7 @@ class DatasetWriter:
             "splits": {"train": f"0:{len(self._episodes)}"},
             "data_path": DATA_PATH,
             "video_path": VIDEO_PATH,
-            "features": {**_COLUMNS, **{video_key(camera): video for camera in CAMERAS}},
+            "features": {**self._columns(), **{video_key(camera): video for camera in CAMERAS}},
         }
 
 
@@ -192,7 +206,7 @@ class _Rows:
     def statistics(self) -> dict[str, Statistics]:
         """Of all rows, exactly; one column in memory at a time."""
         found = {}
-        for name in _NUMBERS:
+        for name in _numbers(pq.read_schema(self._paths[0])):
             parts = [pq.read_table(path, columns=[*{name, "is_demonstration"}]) for path in self._paths]
             found[name] = _of_columns(pa.concat_tables(parts), names=(name,))[name]
         return found
@@ -233,7 +247,12 @@ def _place(number: int) -> dict[str, int]:
     return {"chunk_index": number // FILES_PER_CHUNK, "file_index": number % FILES_PER_CHUNK}
 
 
-def _of_columns(table: pa.Table, names: tuple[str, ...] = tuple(_NUMBERS)) -> dict[str, Statistics]:
+def _numbers(schema: pa.Schema) -> list[str]:
+    """The columns that statistics are made of."""
+    return [column.name for column in schema if not pa.types.is_string(column.type)]
+
+
+def _of_columns(table: pa.Table, names: Sequence[str]) -> dict[str, Statistics]:
     is_own = ~table["is_demonstration"].to_numpy()
     found = {}
     for name in names:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ponderpounce.tasks.headless  # noqa: F401 - before mujoco is imported
+from ponderpounce.data.dart import Dart, episode_std_rad
 from ponderpounce.data.episode import About, EpisodeWriter, Package, Rejection, Row
 from ponderpounce.data.jobs import ATTEMPTS, Job, failed_grasp
 from ponderpounce.data.video import FPS, Frame
@@ -73,7 +74,8 @@ def work_out(job: Job) -> Package:
         try:
             return _solve(environment, job, seed, tuple(rejected))
         except (UnsolvedError, UnreachableError, SceneFullError) as error:
-            rejected.append(Rejection(seed=seed, reason=str(error)))
+            noise_rad = episode_std_rad(job.noise, job.task, seed)
+            rejected.append(Rejection(seed=seed, reason=str(error), noise_rad=noise_rad))
     return {UNSOLVED: (json.dumps([asdict(each) for each in rejected]) + "\n").encode()}
 
 
@@ -95,6 +97,7 @@ def _solve(environment: Environment, job: Job, seed: int, rejected: tuple[Reject
             image_px=job.image_px,
             recovery=job.recovery if fails else "none",
             rejected=rejected,
+            noise_rad=episode_std_rad(job.noise, job.task, seed),
         )
     )
 
@@ -102,7 +105,7 @@ def _solve(environment: Environment, job: Job, seed: int, rejected: tuple[Reject
 def play(
     environment: Environment, job: Job, seed: int, fails: FailedGrasp | None = None, take: Take | None = None
 ) -> Motions:
-    """Plays an episode with the oracle and hands its rows to ``take``; without one, nobody looks.
+    """Plays an episode with the oracle, under the job's noise, and hands its rows to ``take``; without, nobody looks.
 
     Returns what the arm did. Raises UnsolvedError unless it ends with success.
     """
@@ -116,20 +119,25 @@ def play(
         reasoning = narrator.reasoning()
     motions = Motions(environment.physics, fails)
     script = environment.oracle(motions)
+    dart = Dart(environment.physics, job.task, seed) if job.noise == "dart" else None
     subgoal_index = -1
     while snapshot.status is Status.ONGOING:
         action = next(script, None)
         if action is None:
             raise UnsolvedError(f"the script ended after {snapshot.step} steps and the episode did not")
+        executed = action if dart is None else dart.executed(action)
         if take is not None:
             is_transition = snapshot.subgoal_index != subgoal_index
             row = replace(
-                narrator.row(snapshot, action), is_transition=is_transition, demonstration_reasoning=reasoning
+                narrator.row(snapshot, action),
+                is_transition=is_transition,
+                demonstration_reasoning=reasoning,
+                executed_action=None if dart is None else executed,
             )
             take(row, dict(snapshot.frames))
             subgoal_index, reasoning = snapshot.subgoal_index, ""
         looks = take is not None and (snapshot.step + 1) % look_every == 0
-        snapshot = environment.step(action, look=looks)
+        snapshot = environment.step(executed, look=looks)
     if snapshot.status is not Status.SUCCESS:
         raise UnsolvedError(f"{snapshot.status.value} after {snapshot.step} steps: {snapshot.reason}")
     return motions

@@ -43,20 +43,21 @@ class VideoWriter:
         self._stream.pix_fmt = PIXEL_FORMAT
         self._stream.codec_context.thread_count = 1
         self._num_frames = 0
-        self._last: Frame | None = None
+        self._last: Any = None
 
     def add(self, frame: Frame | None) -> None:
         """Appends a picture; None repeats the last one, which costs some tens of bytes.
 
         Raises ValueError if there is no picture to repeat.
         """
-        self._last = self._last if frame is None else np.ascontiguousarray(frame)
+        if frame is not None:
+            picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
+            self._last = picture.reformat(format=PIXEL_FORMAT)  # once, however often it is repeated
         if self._last is None:
             raise ValueError("the first frame of a video must be a picture; look at the first row of an episode")
-        picture = av.VideoFrame.from_ndarray(self._last, format="rgb24")
-        picture.pts, picture.time_base = self._num_frames, _TIME_BASE
+        self._last.pts, self._last.time_base = self._num_frames, _TIME_BASE
         self._num_frames += 1
-        for packet in self._stream.encode(picture):
+        for packet in self._stream.encode(self._last):
             self._container.mux(packet)
 
     def finish(self) -> bytes:

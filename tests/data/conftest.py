@@ -26,8 +26,13 @@ def make_row(rng: np.random.Generator, **changes: Any) -> Row:
     return dataclasses.replace(row, **changes)
 
 
-def make_package(seed: int, *, num_rows: int = 5, num_demonstration_rows: int = 2, **about: Any) -> Package:
-    """An episode that begins with a demonstration; every second row is rendered."""
+def make_package(
+    seed: int, *, num_rows: int = 5, num_demonstration_rows: int = 2, nudge_rad: float | None = None, **about: Any
+) -> Package:
+    """An episode that begins with a demonstration; every second row is rendered.
+
+    With a nudge, what was executed is said, and is so far from the label.
+    """
     rng = np.random.default_rng(seed)
     writer = EpisodeWriter(PX)
     for index in range(num_rows):
@@ -40,6 +45,8 @@ def make_package(seed: int, *, num_rows: int = 5, num_demonstration_rows: int = 
             is_transition=index == num_demonstration_rows,
             demonstration_reasoning=reasoning,
         )
+        if nudge_rad is not None and not is_demonstration:
+            row = dataclasses.replace(row, executed_action=row.action + np.float32(nudge_rad))
         writer.add(row, pictures if index % 2 == 0 else {})
     values: dict[str, Any] = {
         "task": "Numbers",
@@ -55,7 +62,8 @@ def make_package(seed: int, *, num_rows: int = 5, num_demonstration_rows: int = 
 
 def work_out(job: Job) -> Package:
     """What the oracle would have made of a job."""
-    return make_package(job.seed(0), num_rows=3 + job.slot % 3, task=job.task, difficulty=job.difficulty)
+    noise = {} if job.noise == "none" else {"nudge_rad": 0.5, "noise_rad": 0.01 * (job.slot % 2)}
+    return make_package(job.seed(0), num_rows=3 + job.slot % 3, task=job.task, difficulty=job.difficulty, **noise)
 
 
 @pytest.fixture(scope="session")

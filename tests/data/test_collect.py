@@ -15,7 +15,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ponderpounce.data import collect as module
-from ponderpounce.data.collect import COLLECTING, CollectOptions, collect, disk_needed
+from ponderpounce.data.card import card
+from ponderpounce.data.collect import COLLECTING, COLLECTION_PATH, CollectOptions, collect, disk_needed
+from ponderpounce.data.dart import DART
 from ponderpounce.data.dataset import Dataset
 from ponderpounce.data.episode import Package
 from ponderpounce.data.errors import DatasetError
@@ -110,6 +112,29 @@ def _dying(rename: Callable[..., Path], steps: int) -> Callable[..., Path]:
         return rename(self, target)
 
     return dying
+
+
+def test_noise_is_told_and_counted_and_never_mixed_with_none(tmp_path: Path, pretend: WorkOut) -> None:
+    def mostly(job: Job) -> Package:
+        if job.slot:
+            return pretend(job)
+        tried = [{"seed": 1, "reason": "fail", "noise_rad": 0.02}, {"seed": 2, "reason": "fail", "noise_rad": 0.0}]
+        return {UNSOLVED: json.dumps(tried).encode()}
+
+    noisy = options(tmp_path, noise="dart")
+    report = collect(noisy, InOrder(mostly))
+    assert (report.num_rejected, report.num_rejected_noisy) == (4, 2)
+    assert collect(noisy, InOrder(mostly)) == report  # read from the folder
+    told = json.loads((tmp_path / COLLECTION_PATH).read_text())
+    assert told["settings"]["noise"] == DART.settings()
+    assert [each.noise_rad for each in Dataset(tmp_path).episodes] == [0.01, 0.0] * 2
+    assert "2 of 4 have none" in card(Dataset(tmp_path))
+    with pytest.raises(DatasetError, match="another --out"):
+        collect(options(tmp_path, noise="none"), InOrder(pretend))
+
+
+def test_without_noise_nothing_is_said_of_it(whole: dict[str, bytes]) -> None:
+    assert "noise" not in whole[COLLECTION_PATH].decode()
 
 
 def test_a_finished_collection_is_left_alone(tmp_path: Path, pretend: WorkOut) -> None:

@@ -30,5 +30,5 @@ def test_equal_episodes_are_equal_bytes(package: Callable[..., Package]) -> None
 
 
 def test_every_column_has_a_value_for_every_row(package: Callable[..., Package]) -> None:
-    rows = unpack(package(4, num_rows=6)).rows
+    rows = unpack(package(4, num_rows=6, nudge_rad=0.1)).rows
     assert {len(getattr(rows, each.name)) for each in fields(Rows)} == {6}

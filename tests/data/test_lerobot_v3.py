@@ -12,7 +12,7 @@ import pytest
 
 from ponderpounce.data import lerobot_v3 as v3
 from ponderpounce.data.dataset import Dataset
-from ponderpounce.data.episode import CAMERAS, Episode, Package, unpack
+from ponderpounce.data.episode import CAMERAS, EXECUTED, Episode, Package, unpack
 from ponderpounce.data.errors import DatasetError
 from ponderpounce.data.video import read_frames
 
@@ -101,6 +101,44 @@ def test_statistics_of_actions_leave_demonstrations_out(dataset: Dataset, episod
     assert found["frame_index"]["count"] == [18]
     every = [value for of in found.values() for values in of.values() for value in np.ravel(values)]
     assert np.isfinite(every).all()
+
+
+def test_what_was_executed_under_noise_is_a_column_of_its_own(package: Callable[..., Package], tmp_path: Path) -> None:
+    writer = v3.DatasetWriter(tmp_path)
+    for seed, nudge_rad in ((1, 0.0), (2, 0.25)):
+        writer.add(unpack(package(seed, nudge_rad=nudge_rad, noise_rad=nudge_rad)))
+    writer.finish()
+    dataset = Dataset(tmp_path)
+    assert [each.noise_rad for each in dataset.episodes] == [0.0, 0.25]
+    clean, noisy = dataset.rows(0), dataset.rows(1)
+    assert clean.executed_action is not None
+    assert noisy.executed_action is not None
+    np.testing.assert_array_equal(clean.executed_action, clean.action)
+    own = ~noisy.is_demonstration
+    np.testing.assert_array_equal(noisy.executed_action[own], noisy.action[own] + np.float32(0.25))
+    np.testing.assert_array_equal(noisy.executed_action[~own], noisy.action[~own])
+    features = dataset.described["features"]
+    assert features[EXECUTED] == features["action"]
+    assert set(pq.read_table(tmp_path / "data").column_names) == {
+        name for name, feature in features.items() if feature["dtype"] != "video"
+    }
+    found = json.loads((tmp_path / v3.STATS_PATH).read_text())
+    assert found[EXECUTED]["count"] == found["action"]["count"] == [6]
+    assert found[EXECUTED]["mean"] != found["action"]["mean"]
+
+
+def test_a_dataset_without_noise_has_no_such_column(dataset: Dataset) -> None:
+    assert EXECUTED not in dataset.described["features"]
+    assert "noise_rad" not in pq.read_table(dataset.root / v3.EPISODES_PATH).column_names
+    assert dataset.rows(0).executed_action is None
+    assert {each.noise_rad for each in dataset.episodes} == {0.0}
+
+
+def test_all_episodes_say_what_was_executed_or_none_does(package: Callable[..., Package], tmp_path: Path) -> None:
+    writer = v3.DatasetWriter(tmp_path)
+    writer.add(unpack(package(1)))
+    with pytest.raises(ValueError, match="all have executed_action, or none has"):
+        writer.add(unpack(package(2, nudge_rad=0.25)))
 
 
 def test_one_dataset_has_one_picture_size(package: Callable[..., Package], tmp_path: Path) -> None:
