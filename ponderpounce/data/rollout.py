@@ -74,7 +74,7 @@ def work_out(job: Job) -> Package:
         try:
             return _solve(environment, job, seed, tuple(rejected))
         except (UnsolvedError, UnreachableError, SceneFullError) as error:
-            noise_rad = episode_std_rad(job.noise, job.task, seed)
+            noise_rad = episode_std_rad(job.noise, seed)
             rejected.append(Rejection(seed=seed, reason=str(error), noise_rad=noise_rad))
     return {UNSOLVED: (json.dumps([asdict(each) for each in rejected]) + "\n").encode()}
 
@@ -97,7 +97,7 @@ def _solve(environment: Environment, job: Job, seed: int, rejected: tuple[Reject
             image_px=job.image_px,
             recovery=job.recovery if fails else "none",
             rejected=rejected,
-            noise_rad=episode_std_rad(job.noise, job.task, seed),
+            noise_rad=episode_std_rad(job.noise, seed),
         )
     )
 
@@ -119,7 +119,7 @@ def play(
         reasoning = narrator.reasoning()
     motions = Motions(environment.physics, fails)
     script = environment.oracle(motions)
-    dart = Dart(environment.physics, job.task, seed) if job.noise == "dart" else None
+    dart = Dart(environment.physics, seed) if job.noise == "dart" else None
     subgoal_index = -1
     while snapshot.status is Status.ONGOING:
         action = next(script, None)
