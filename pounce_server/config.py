@@ -33,5 +33,6 @@ class PounceOptions:
     path: Literal["eager", "fused"] = "eager"
     """fused: Triton kernels, static buffers and CUDA graphs for pi0.5; needs a GPU and Triton."""
     dtype: Literal["float32", "bfloat16"] = "float32"
-    continuity: Literal["none", "rtc"] = "none"
-    """rtc: pi0.5 continues the rows that are being played (real-time chunking), for a backward pass per flow step."""
+    continuity: Literal["none", "rtc", "trained"] = "none"
+    """Whether pi0.5 continues the rows that are being played. rtc: real-time chunking, for a backward pass per flow
+    step; trained: at no cost, by a checkpoint that learned to (`pp-train --max-committed-rows`)."""

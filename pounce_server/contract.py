@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 DTypeName: TypeAlias = Literal["float32", "bfloat16"]
 
-Continuity: TypeAlias = Literal["none", "rtc"]
-"""Whether a chunk continues the rows that are being played: not, or by real-time chunking (`rtc`)."""
+Continuity: TypeAlias = Literal["none", "rtc", "trained"]
+"""Whether a chunk continues the rows being played: not, pulled to them (`rtc`), or given them (`committed`)."""
 
 Progress: TypeAlias = Callable[[], None]
 """Called between flow steps, so that a heartbeat comes from the loop that works and not from a timer."""
@@ -46,6 +46,9 @@ class EngineSpec:
     has_fresh_prefix: bool
     """The cognition prefix is drawn, not trained: cognition moves the actions, but not with sense."""
     dtype: DTypeName
+    continuity: Continuity = "none"
+    max_committed_rows: int = 0
+    """The most committed rows that the network was trained to be given; matters to continuity "trained" only."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

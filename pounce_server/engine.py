@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ponderpounce.models import flow, rtc
+from ponderpounce.models.committed import Committed
 from ponderpounce.models.flow import EulerStep
 from ponderpounce.models.groot_prompt import EagleTokenizer
 from ponderpounce.models.pounce import Pounce, PounceInputs
 from ponderpounce.models.pounce_batching import joined_groot, joined_pi05, of_equal_length
 from ponderpounce.models.pounce_checkpoint import PounceBundle
-from ponderpounce.models.pounce_family import AnyPounce
+from ponderpounce.models.pounce_family import AnyPounce, max_committed_rows
 from ponderpounce.models.pounce_groot import GrootInputs, GrootPounce
 from ponderpounce.models.pounce_reading import groot_inputs, pi05_inputs
 from ponderpounce.models.prompt import Tokenizer
@@ -32,7 +33,7 @@ from pounce_server.contract import (
     no_progress,
 )
 from pounce_server.fused import fused_for
-from pounce_server.guidance import guide
+from pounce_server.guidance import given, guide, with_committed
 from pounce_server.precision import cast_for_serving
 
 Sampler: TypeAlias = Callable[[Sequence[Request], Tensor], Iterator[tuple[list[int], EulerStep]]]
@@ -48,8 +49,9 @@ class EagerEngine:
     """PyTorch for one thread at a time, eager or fused. Takes over the bundle's model: casts, moves and freezes it.
 
     Raises:
-        ValueError: ``continuity`` is "rtc" and the model is not pi0.5; or ``path`` is "fused", and the model is not
-            pi0.5, the chunks are to be continued, or Triton has nothing to run on.
+        ValueError: ``continuity`` is not "none" and the model is not pi0.5, or it is "trained" and the model was never
+            trained so; or ``path`` is "fused", and the model is not pi0.5, the chunks are to be continued, or Triton
+            has nothing to run on.
     """
 
     def __init__(
@@ -78,6 +80,8 @@ class EagerEngine:
             is_random=bundle.is_random,
             has_fresh_prefix=bundle.has_fresh_prefix,
             dtype=dtype,
+            continuity=continuity,
+            max_committed_rows=max_committed_rows(config),
         )
         model = cast_for_serving(bundle.model, dtype).to(self._device).eval().requires_grad_(False)
         if path == "fused":
@@ -123,10 +127,14 @@ class EagerEngine:
             actions_BNA[moved] = step.actions
             progress()
         robot_actions_BN8 = actions_BNA[..., : self.spec.action_dim].cpu().numpy()
-        return [
+        rows_BN8 = [
             self._statistics.absolute_targets(actions_N8, request.proprio)
             for actions_N8, request in zip(robot_actions_BN8, requests, strict=True)
         ]
+        if self.spec.continuity != "trained":
+            return rows_BN8
+        most = self.spec.max_committed_rows
+        return [with_committed(rows_N8, request, most) for rows_N8, request in zip(rows_BN8, requests, strict=True)]
 
     def warm_up(self) -> list[int]:
         """See `PounceEngine.warm_up`. The rows end on the CPU, so a duration includes the device's work."""
@@ -157,19 +165,33 @@ def _sampler(model: AnyPounce, bundle: PounceBundle, device: torch.device, conti
                 lambda request: pi05_inputs(request, model.config, tokenizer, statistics, device),
                 lambda requests: guide(requests, model.config, statistics, device),
             )
-        return _pi05_sampler(model, lambda request: pi05_inputs(request, model.config, tokenizer, statistics, device))
-    if continuity == "rtc":
-        raise ValueError("continuity 'rtc' is pi0.5's only; leave --continuity out for GR00T")
+        if continuity == "trained" and not model.config.max_committed_rows:
+            raise ValueError(
+                "this checkpoint was never trained to continue rows (its max_committed_rows is 0): train it with "
+                "pp-train --max-committed-rows, or serve it with --continuity rtc"
+            )
+        return _pi05_sampler(
+            model,
+            lambda request: pi05_inputs(request, model.config, tokenizer, statistics, device),
+            lambda requests: given(requests, model.config, statistics, device) if continuity == "trained" else None,
+        )
+    if continuity != "none":
+        raise ValueError(f"continuity {continuity!r} is pi0.5's only; leave --continuity out for GR00T")
     assert isinstance(tokenizer, EagleTokenizer), "the bundle checks this"
     return _groot_sampler(model, lambda request: groot_inputs(request, model.config, tokenizer, statistics, device))
 
 
-def _pi05_sampler(pi05: Pounce, read: Callable[[Request], PounceInputs]) -> Sampler:
+def _pi05_sampler(
+    pi05: Pounce,
+    read: Callable[[Request], PounceInputs],
+    given_of: Callable[[Sequence[Request]], Committed | None],
+) -> Sampler:
     table = pi05.step_table()
 
     def sample(requests: Sequence[Request], noise_BNA: Tensor) -> Iterator[tuple[list[int], EulerStep]]:
         everyone = list(range(len(requests)))
-        for step in pi05.sample(joined_pi05([read(request) for request in requests]), noise_BNA, table):
+        inputs = joined_pi05([read(request) for request in requests])
+        for step in pi05.sample(inputs, noise_BNA, table, given=given_of(requests)):
             yield everyone, step
 
     return sample

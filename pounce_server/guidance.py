@@ -1,11 +1,13 @@
-"""The rows that are being played, as a pull on the chunk that follows them (`rtc`)."""
+"""The rows being played, as the network takes them: a pull on the next chunk (`rtc`), or given (`committed`)."""
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 
 from ponderpounce.models import rtc
-from ponderpounce.models.normalisation import RobotStatistics
+from ponderpounce.models.committed import Committed, first_rows
+from ponderpounce.models.normalisation import Floats, RobotStatistics
 from ponderpounce.models.pounce import PounceConfig
 from pounce_server.contract import Request
 
@@ -28,3 +30,42 @@ def guide(
     if not weight_BNA.any():
         return None
     return rtc.Guide(target=target_BNA.to(device), weight=weight_BNA.to(device))
+
+
+def given(
+    requests: Sequence[Request], config: PounceConfig, statistics: RobotStatistics, device: torch.device
+) -> Committed | None:
+    """Returns the rows that each request's chunk begins with; None if nobody has any.
+
+    Of more committed rows than training gave, the first so many are given. A late observation's chunk begins at ticks
+    that are past: nobody says what was commanded there, so the first row left stands in.
+    """
+    shape = (len(requests), config.horizon, config.padded_action_dim)
+    rows_BNA, count_B = torch.zeros(shape), torch.zeros(len(requests), dtype=torch.int64)
+    for index, request in enumerate(requests):
+        count = num_given(request, config.max_committed_rows)
+        if count == 0 or request.previous_rows is None:
+            continue
+        rows_n8 = statistics.normalise_targets(request.previous_rows, request.proprio)
+        places = np.maximum(np.arange(count) - request.previous_row0, 0)
+        rows_BNA[index, :count, : config.robot_action_dim] = torch.from_numpy(rows_n8[places])
+        count_B[index] = count
+    if not count_B.any():
+        return None
+    return Committed(rows=rows_BNA.to(device), is_given=first_rows(count_B, config.horizon).to(device))
+
+
+def num_given(request: Request, max_rows: int) -> int:
+    """How many rows of the chunk are fixed before it is made: those of past ticks and the committed ones."""
+    if request.previous_rows is None or request.committed_rows == 0:
+        return 0
+    return min(request.previous_row0 + request.committed_rows, max_rows)
+
+
+def with_committed(rows_N8: Floats, request: Request, max_rows: int) -> Floats:
+    """``rows_N8`` with the given rows as they came: normalising and back rounds."""
+    count = num_given(request, max_rows) - request.previous_row0
+    if request.previous_rows is None or count <= 0:
+        return rows_N8
+    first = request.previous_row0
+    return np.concatenate([rows_N8[:first], request.previous_rows[:count], rows_N8[first + count :]])

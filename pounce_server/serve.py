@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 
+from clock.feasibility import delay_ticks
 from clock.membership import Membership, percentile_ns
 from pounce_server.contract import PounceEngine
 from pounce_server.node import PounceNode, Work
@@ -115,6 +116,7 @@ class PounceServer:
             raise ValueError(
                 f"POUNCE reads {spec.proprio_dim} joint values, the robot has {request.info.robot.num_proprio}"
             )
+        self._check_committed(request.info.schedule)
         self._node.open(request.info)
         return m.Contract(
             proc="pounce",
@@ -129,6 +131,18 @@ class PounceServer:
             is_fake=spec.is_random or spec.has_fresh_prefix,
             version=self._version,
         )
+
+    def _check_committed(self, schedule: m.Schedule) -> None:
+        """Raises ValueError if more ticks pass during an invocation than the network learned to be given rows for."""
+        spec = self._engine.spec
+        if spec.continuity != "trained":
+            return
+        ticks = delay_ticks(schedule, self._heartbeat.health.infer_p99_ns)
+        if ticks > spec.max_committed_rows:
+            raise ValueError(
+                f"an invocation takes {ticks} ticks here, and this checkpoint learned to continue at most "
+                f"{spec.max_committed_rows} rows; use --continuity rtc, or train with --max-committed-rows {ticks}"
+            )
 
     def _close(self) -> None:
         self._node.open(None)

@@ -16,7 +16,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ponderpounce.models import flow
+from ponderpounce.models import committed, flow
+from ponderpounce.models.committed import Committed, pinned, row_styles
 from ponderpounce.models.gemma import ActionExpert, GemmaConfig, LanguageModel, Rotation, attend
 from ponderpounce.models.siglip import VisionConfig, VisionTower
 from ponderpounce.models.sinusoid import sinusoid
@@ -86,6 +87,17 @@ class PrefixCache:
     next_position: Tensor
     """(B,) int64: of the first action token."""
 
+    def repeated(self, times: int) -> "PrefixCache":
+        """The batch ``times`` over: several action streams against one prefix."""
+        if times == 1:
+            return self
+        return PrefixCache(
+            keys=tuple(key.repeat(times, 1, 1, 1) for key in self.keys),
+            values=tuple(value.repeat(times, 1, 1, 1) for value in self.values),
+            visible=self.visible.repeat(times, 1),
+            next_position=self.next_position.repeat(times),
+        )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StepTable:
@@ -97,6 +109,8 @@ class StepTable:
     num_steps: int
     styles: tuple[Tensor, ...]
     """One (M, 3, 1, 1, E) per step; broadcasts over the batch."""
+    done: Tensor
+    """(M, 3, 1, 1, E): of rows that are data already (`committed`)."""
 
 
 class Pi05(nn.Module):
@@ -204,10 +218,14 @@ class Pi05(nn.Module):
         device = self.time_mlp_in.weight.device
         times = torch.tensor(flow.euler_times(num_steps), dtype=torch.float32, device=device)
         styles_M3S1E = self.expert.styles(self.time_condition(times))
-        return StepTable(num_steps=num_steps, styles=torch.split(styles_M3S1E, 1, dim=2))
+        return StepTable(num_steps=num_steps, styles=torch.split(styles_M3S1E, 1, dim=2), done=self._done_styles())
+
+    def _done_styles(self) -> Tensor:
+        device = self.time_mlp_in.weight.device
+        return self.expert.styles(self.time_condition(torch.full((1,), committed.DONE, device=device)))
 
     def velocity(self, x_BNA: Tensor, styles_M3B1E: Tensor, cache: PrefixCache) -> Tensor:
-        """Returns v(x_t, t | prefix), (B, N, A) float32; ``styles_M3B1E`` carries t.
+        """Returns v(x_t, t | prefix), (B, N, A) float32; ``styles_M3B1E`` carries t, or (M, 3, B, N, E) one per row.
 
         Action tokens see every visible prefix token and each other. pi0.5 has no state token.
         """
@@ -230,12 +248,26 @@ class Pi05(nn.Module):
         velocity_BNA: Tensor = self.action_out_proj(final_BNE.float())
         return velocity_BNA
 
-    def velocity_at(self, x_BNA: Tensor, time_B: Tensor, cache: PrefixCache) -> Tensor:
-        """`velocity` with one flow time per sample: training's form."""
-        return self.velocity(x_BNA, self.expert.styles(self.time_condition(time_B)), cache)
+    def velocity_at(
+        self, x_BNA: Tensor, time_B: Tensor, cache: PrefixCache, *, is_given_BN: Tensor | None = None
+    ) -> Tensor:
+        """`velocity` with one flow time per sample: training's form. ``is_given_BN``: rows that are data already."""
+        styles = self.expert.styles(self.time_condition(time_B))
+        if is_given_BN is not None:
+            styles = row_styles(styles, self._done_styles(), is_given_BN)
+        return self.velocity(x_BNA, styles, cache)
 
-    def sample(self, noise_BNA: Tensor, cache: PrefixCache, table: StepTable) -> Iterator[flow.EulerStep]:
-        """Integrates from noise to actions against one prefilled prefix; yields after every step."""
-        return flow.euler(
-            lambda index, x_BNA: self.velocity(x_BNA, table.styles[index], cache), noise_BNA, table.num_steps
-        )
+    def sample(
+        self, noise_BNA: Tensor, cache: PrefixCache, table: StepTable, *, given: Committed | None = None
+    ) -> Iterator[flow.EulerStep]:
+        """Integrates from noise to actions against one prefilled prefix; yields after every step.
+
+        Rows that are ``given`` stand in the actions of every step, bit for bit.
+        """
+        if given is None:
+            return flow.euler(
+                lambda index, x_BNA: self.velocity(x_BNA, table.styles[index], cache), noise_BNA, table.num_steps
+            )
+        styles = [row_styles(styles, table.done, given.is_given) for styles in table.styles]
+        flowing = pinned(lambda index, x_BNA: self.velocity(x_BNA, styles[index], cache), given)
+        return flow.euler(flowing, given.over(noise_BNA), table.num_steps)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ponderpounce.models import flow
+from ponderpounce.models.committed import Committed, first_rows
 from ponderpounce.models.interface import CognitionConfig, CognitionPrefix
 from ponderpounce.models.pi05 import Pi05, Pi05Config, Prefix, PrefixCache, StepTable
 
@@ -49,8 +50,12 @@ class PounceConfig:
     num_steps: int = 10
     """Euler steps per chunk."""
     max_prompt_tokens: int = 200
+    max_committed_rows: int = 0
+    """The most rows that training gives a chunk to continue (`committed`); 0: it was never trained to."""
 
     def __post_init__(self) -> None:
+        if not 0 <= self.max_committed_rows < self.pi05.horizon:
+            raise ValueError(f"max_committed_rows must be 0..{self.pi05.horizon - 1}, came {self.max_committed_rows}")
         if not 0 < self.robot_action_dim <= self.pi05.action_dim:
             raise ValueError(f"robot_action_dim must be 1..{self.pi05.action_dim}, came {self.robot_action_dim}")
         for name in ("num_cameras", "num_steps", "max_prompt_tokens"):
@@ -157,26 +162,51 @@ class Pounce(nn.Module):
         time_B: Tensor,
         *,
         over: flow.LossDims = "real",
+        num_committed_B: Tensor | None = None,
     ) -> Tensor:
         """Returns the scalar L_fm, by default over the robot's action dims only (`flow.mean_loss`).
 
-        ``actions_BNA`` are normalised and zero beyond the robot's dims; noise fills all of A, as in sampling.
+        ``actions_BNA`` are normalised and zero beyond the robot's dims; noise fills all of A, as in sampling. The
+        first ``num_committed_B`` rows of each sample are given and do not count (`committed`).
         """
-        unreduced_BNA = self.unreduced_loss(inputs, actions_BNA, noise_BNA, time_B)
+        unreduced_BNA = self.unreduced_loss(inputs, actions_BNA, noise_BNA, time_B, num_committed_B=num_committed_B)
+        if num_committed_B is not None:
+            unreduced_BNA = unreduced_BNA[~first_rows(num_committed_B, self.config.horizon)]
         return flow.mean_loss(unreduced_BNA, self.config.robot_action_dim, over)
 
-    def unreduced_loss(self, inputs: PounceInputs, actions_BNA: Tensor, noise_BNA: Tensor, time_B: Tensor) -> Tensor:
-        """Returns the squared error of the velocity, (B, N, A)."""
+    def unreduced_loss(
+        self,
+        inputs: PounceInputs,
+        actions_BNA: Tensor,
+        noise_BNA: Tensor,
+        time_B: Tensor,
+        *,
+        num_committed_B: Tensor | None = None,
+    ) -> Tensor:
+        """Returns the squared error of the velocity, (S, N, A); of a row that is given it says nothing.
+
+        Noise, times and counts may be several for each sample, the whole batch over and over (S = D * B): what is
+        read is then computed once, for D flow samples.
+        """
+        num_draws = len(noise_BNA) // len(actions_BNA)
+        actions_BNA = actions_BNA.repeat(num_draws, 1, 1)
         x_BNA = flow.noised(actions_BNA, noise_BNA, time_B)
-        velocity_BNA = self.pi05.velocity_at(x_BNA, time_B, self.prefill(inputs))
+        is_given_BN = None
+        if num_committed_B is not None:
+            is_given_BN = first_rows(num_committed_B, self.config.horizon)
+            x_BNA = Committed(rows=actions_BNA, is_given=is_given_BN).over(x_BNA)
+        cache = self.prefill(inputs).repeated(num_draws)
+        velocity_BNA = self.pi05.velocity_at(x_BNA, time_B, cache, is_given_BN=is_given_BN)
         return (flow.target_velocity(actions_BNA, noise_BNA) - velocity_BNA).square()
 
     def step_table(self) -> StepTable:
         return self.pi05.step_table(self.config.num_steps)
 
-    def sample(self, inputs: PounceInputs, noise_BNA: Tensor, table: StepTable) -> Iterator[flow.EulerStep]:
+    def sample(
+        self, inputs: PounceInputs, noise_BNA: Tensor, table: StepTable, *, given: Committed | None = None
+    ) -> Iterator[flow.EulerStep]:
         """Yields the sampler's steps; the actions of the last are the normalised chunk."""
-        return self.pi05.sample(noise_BNA, self.prefill(inputs), table)
+        return self.pi05.sample(noise_BNA, self.prefill(inputs), table, given=given)
 
 
 def freeze(model: Freezable, what: Freeze = "vlm") -> None:

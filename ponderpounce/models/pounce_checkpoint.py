@@ -40,6 +40,8 @@ GROOT_FORMAT: Final = "ponderpounce.pounce-groot/1"
 CONFIG_FILE = "config.json"
 JAX_FOLDER = "params"
 WEIGHTS_FILE = "model.safetensors"
+_LATER_FIELDS = {"max_committed_rows": 0}
+"""Of pi0.5's config: what it meant where a folder was written before there was such a field."""
 TOKENIZER_FILE = "tokenizer.model"
 EAGLE_TOKENIZER_FILE = "tokenizer.json"
 
@@ -223,5 +225,7 @@ def _read_config(path: Path) -> AnyStoredConfig | None:
     if values is None or values.get("format") not in (FORMAT, GROOT_FORMAT):
         return None
     if values["format"] == FORMAT:
+        if isinstance(values.get("config"), dict):
+            values["config"] = _LATER_FIELDS | values["config"]
         return from_json(StoredConfig, values, path.name)
     return from_json(StoredGrootConfig, values, path.name)

@@ -40,11 +40,15 @@ def action_loss(
     actions_BNA: torch.Tensor,
     noise_BNA: torch.Tensor,
     time_B: torch.Tensor,
+    num_committed_B: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Returns the scalar L_fm over the robot's action dims. Raises TypeError for the other family's inputs."""
+    """Returns the scalar L_fm over the robot's action dims. Raises TypeError for the other family's inputs.
+
+    ``num_committed_B``: how many of the first rows are given (`committed`); pi0.5 only.
+    """
     if isinstance(model, Pounce) and isinstance(inputs, PounceInputs):
-        return model.loss(inputs, actions_BNA, noise_BNA, time_B)
-    if isinstance(model, GrootPounce) and isinstance(inputs, GrootInputs):
+        return model.loss(inputs, actions_BNA, noise_BNA, time_B, num_committed_B=num_committed_B)
+    if isinstance(model, GrootPounce) and isinstance(inputs, GrootInputs) and num_committed_B is None:
         return model.loss(inputs, actions_BNA, noise_BNA, time_B)
     raise TypeError(f"{type(model).__name__} does not read {type(inputs).__name__}")
 
@@ -53,6 +57,11 @@ def sample_times(model: AnyPounce, count: int, generator: torch.Generator) -> to
     """Draws training times, (count,) float32, as the family was pretrained with; their directions are opposite."""
     draw = flow.sample_times if isinstance(model, Pounce) else groot_flow.sample_times
     return draw(count, generator)
+
+
+def max_committed_rows(config: AnyPounceConfig) -> int:
+    """The most rows that a chunk is given to continue, in training and by ``--continuity trained``; 0 for GR00T."""
+    return config.max_committed_rows if isinstance(config, PounceConfig) else 0
 
 
 def load_weights(model: AnyPounce, path: Path) -> bool:

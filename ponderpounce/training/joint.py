@@ -18,6 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from ponderpounce.models.committed import draw_counts
 from ponderpounce.models.context import Row
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.pounce import PounceInputs
@@ -81,22 +82,42 @@ class Draws:
     time_I: Tensor
     is_dropped_I: Tensor
     """bool: cognition dropout."""
+    num_committed_I: Tensor | None = None
+    """int64: how many rows each chunk is given to continue; None: POUNCE does not learn to."""
+
+    @property
+    def num_counted_rows(self) -> int:
+        """Rows under the action loss."""
+        num_committed = 0 if self.num_committed_I is None else int(self.num_committed_I.sum())
+        return self.noise_INA.shape[0] * self.noise_INA.shape[1] - num_committed
 
     @classmethod
     def draw(
-        cls, batch: PounceBatch, times: SampleTimes, dropout: float, generators: Sequence[torch.Generator]
+        cls,
+        batch: PounceBatch,
+        times: SampleTimes,
+        dropout: float,
+        generators: Sequence[torch.Generator],
+        *,
+        max_committed_rows: int = 0,
     ) -> Draws:
         """One CPU generator for each episode: what is drawn for it depends on no other, nor on the device."""
         count, episode_I = len(batch.actions_INA), batch.episode_I.cpu()
         noise_INA, time_I, chance_I = torch.empty(batch.actions_INA.shape), torch.empty(count), torch.empty(count)
+        committed_I = torch.zeros(count, dtype=torch.int64)
         for episode, generator in enumerate(generators):
             (mine,) = torch.where(episode_I == episode)
             noise_INA[mine] = torch.randn(len(mine), *noise_INA.shape[1:], generator=generator)
             time_I[mine] = times(len(mine), generator)
             chance_I[mine] = torch.rand(len(mine), generator=generator)
+            if max_committed_rows:
+                committed_I[mine] = draw_counts(len(mine), max_committed_rows, generator)
         device = batch.actions_INA.device
         return cls(
-            noise_INA=noise_INA.to(device), time_I=time_I.to(device), is_dropped_I=(chance_I < dropout).to(device)
+            noise_INA=noise_INA.to(device),
+            time_I=time_I.to(device),
+            is_dropped_I=(chance_I < dropout).to(device),
+            num_committed_I=committed_I.to(device) if max_committed_rows else None,
         )
 
 
@@ -110,6 +131,8 @@ class JointLoss(NamedTuple):
     """int64: at every token under the LM head's cross-entropy, row after row, the likeliest one instead."""
     num_null: int
     """Invocations that saw the null cognition."""
+    num_rows: int
+    """Rows of chunks that flow matching is the mean over: those that were not given."""
 
     @property
     def num_supervised(self) -> int:
@@ -137,13 +160,16 @@ class JointModel(nn.Module):
         is_null_I = (invocations.query_I == NO_QUERY) | draws.is_dropped_I
         index_I = first_query[invocations.episode_I] + invocations.query_I.clamp(min=0)
         inputs = replace(invocations.inputs, cognition=cognition_QKH[index_I], is_null=is_null_I)
-        matching = action_loss(self.pounce, inputs, invocations.actions_INA, draws.noise_INA, draws.time_I)
+        matching = action_loss(
+            self.pounce, inputs, invocations.actions_INA, draws.noise_INA, draws.time_I, draws.num_committed_I
+        )
         return JointLoss(
             total=self.weigh(matching, grounding),
             flow_matching=matching,
             grounding=grounding,
             said_N=said_N,
             num_null=int(is_null_I.sum()),
+            num_rows=draws.num_counted_rows,
         )
 
     def weigh(self, matching: Tensor, grounding: Tensor) -> Tensor:

@@ -26,7 +26,7 @@ from tqdm import tqdm
 from ponderpounce.data.errors import DatasetError
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import load_ponder, save_ponder
-from ponderpounce.models.pounce import freeze
+from ponderpounce.models.pounce import PounceConfig, freeze
 from ponderpounce.models.pounce_checkpoint import PounceBundle, load_bundle, random_bundle, save_bundle
 from ponderpounce.training.collate import collate
 from ponderpounce.training.data import TrainingSet
@@ -66,6 +66,8 @@ class TrainOptions:
     """Instead of the recipe's: episodes a step, of all processes together."""
     max_invocations: int | None = None
     """Instead of the recipe's: POUNCE's invocations an episode."""
+    max_committed_rows: int | None = None
+    """Instead of the recipe's: pi0.5 learns to continue up to so many rows, for `pounce-serve --continuity trained`."""
     save_every: int = 100
     """Steps between checkpoints."""
     sample_every: int = 20
@@ -197,6 +199,8 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
     pounce = bundle.model.to(options.device)
     if type(pounce.config) is not type(run.pounce):
         raise ValueError(f"recipe {run.name} is of another action model than {options.pounce} holds")
+    if isinstance(pounce.config, PounceConfig) and isinstance(run.pounce, PounceConfig):
+        pounce.config = replace(pounce.config, max_committed_rows=run.pounce.max_committed_rows)
     freeze(pounce, run.freeze)
     return JointModel(ponder, pounce, w1=run.w1, w2=run.w2), bundle
 
@@ -211,8 +215,14 @@ def export(model: JointModel, bundle: PounceBundle, out: Path) -> None:
 def _adjusted(run: Recipe, options: TrainOptions) -> Recipe:
     """The recipe with what the command line says instead."""
     seed = run.train.seed if options.seed is None else options.seed
+    pounce = run.pounce
+    if options.max_committed_rows is not None:
+        if not isinstance(pounce, PounceConfig):
+            raise ValueError(f"--max-committed-rows is pi0.5's, recipe {run.name} trains GR00T")
+        pounce = replace(pounce, max_committed_rows=options.max_committed_rows)
     return replace(
         run,
+        pounce=pounce,
         num_steps=options.steps or run.num_steps,
         batch_episodes=options.batch_episodes or run.batch_episodes,
         example=replace(run.example, max_invocations=options.max_invocations or run.example.max_invocations),

@@ -18,7 +18,7 @@ import torch
 from safetensors import SafetensorError
 from torch import Tensor
 
-from ponderpounce.models.pounce_family import sample_times
+from ponderpounce.models.pounce_family import max_committed_rows, sample_times
 from ponderpounce.training.joint import Draws, JointModel, PonderBatch, PounceBatch
 from ponderpounce.training.optim import OptimConfig, Optimiser
 from ponderpounce.training.parallel import World, local
@@ -99,11 +99,10 @@ class Trainer:
         episodes, invocations = self._batches(self.step)
         loss = model(episodes, invocations, self._draws(len(episodes.rows), invocations))
         # Both parts are means over the whole batch: a process's own weigh as much as it has of what they count.
-        count = len(invocations.actions_INA)
-        num_invocations, num_supervised, num_null = (
-            int(number) for number in world.sums([count, loss.num_supervised, loss.num_null])
+        num_rows, num_supervised, num_null = (
+            int(number) for number in world.sums([loss.num_rows, loss.num_supervised, loss.num_null])
         )
-        matching = loss.flow_matching * (count / num_invocations)
+        matching = loss.flow_matching * (loss.num_rows / num_rows)
         grounding = loss.grounding * (loss.num_supervised / max(1, num_supervised))
         part = model.weigh(matching, grounding)
         total, flow_matching, text = world.sums([part.detach(), matching.detach(), grounding.detach()])
@@ -145,7 +144,13 @@ class Trainer:
             place = self._world.rank + index * self._world.size
             sequence = np.random.SeedSequence([self.config.seed, _DRAW_STREAM, self.step, place])
             generators.append(torch.Generator().manual_seed(int(sequence.generate_state(1, np.uint64)[0] >> 1)))
-        return Draws.draw(invocations, partial(sample_times, self.model.pounce), self.config.dropout, generators)
+        return Draws.draw(
+            invocations,
+            partial(sample_times, self.model.pounce),
+            self.config.dropout,
+            generators,
+            max_committed_rows=max_committed_rows(self.model.pounce.config),
+        )
 
     def take_average(self) -> None:
         """Puts the averaged weights in place of the last ones, at the end of a run; nothing where none are kept."""

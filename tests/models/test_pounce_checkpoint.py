@@ -42,6 +42,13 @@ def test_a_bundle_survives_its_folder(bundle: PounceBundle, folder: Path) -> Non
     assert loaded.digest() == bundle.digest()
 
 
+def test_a_folder_from_before_a_field_means_what_it_meant(bundle: PounceBundle, folder: Path) -> None:
+    stored = json.loads((folder / "config.json").read_text())
+    del stored["config"]["max_committed_rows"]
+    (folder / "config.json").write_text(json.dumps(stored))
+    assert load_bundle(folder).digest() == bundle.digest()
+
+
 def test_flags_of_trained_weights_survive(bundle: PounceBundle, tmp_path: Path) -> None:
     save_bundle(replace(bundle, is_random=False, has_fresh_prefix=False), tmp_path)
     loaded = load_bundle(tmp_path)

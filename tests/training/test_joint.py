@@ -75,6 +75,27 @@ def test_rows_of_a_batch_are_read_as_if_alone(model: JointModel) -> None:
         torch.testing.assert_close(hidden, alone, atol=2e-5, rtol=1e-4)
 
 
+def test_learning_to_continue_rows_leaves_the_other_draws_and_its_loss_counts_the_rest(model: JointModel) -> None:
+    batch = invocations(model.pounce, (0, 0), (0, 0), (0, 0), (0, 0))
+    plain, drawn = (
+        Draws.draw(batch, flow.sample_times, 0.0, [torch.Generator().manual_seed(3)], max_committed_rows=most)
+        for most in (0, 3)
+    )
+    assert plain.num_committed_I is None
+    assert drawn.num_committed_I is not None
+    assert torch.equal(drawn.noise_INA, plain.noise_INA)
+    assert torch.equal(drawn.time_I, plain.time_I)
+    both = episodes(model.ponder, 1)
+    losses = [model(both, batch, draws) for draws in (plain, drawn)]
+    assert [loss.num_rows for loss in losses] == [16, 16 - int(drawn.num_committed_I.sum())]
+    assert losses[0].num_rows != losses[1].num_rows
+    noise = drawn.noise_INA.clone()
+    for place, count in enumerate(drawn.num_committed_I.tolist()):
+        noise[place, :count] = 9.0
+    again = model(both, batch, replace(drawn, noise_INA=noise))
+    assert torch.equal(again.flow_matching, losses[1].flow_matching)
+
+
 def test_an_invocation_sees_the_cognition_it_was_referred_to(model: JointModel) -> None:
     both = episodes(model.ponder, 2, 3)
     batch = invocations(model.pounce, (1, 2), (0, 1), (1, 0), (0, NO_QUERY))

@@ -31,7 +31,8 @@ PATIENCE_S = 120
 
 
 def joint() -> JointModel:
-    pounce = random_pounce(tiny_pounce(num_carriers=1, cognition_size=CONFIG.hidden_size, horizon=4), seed=2)
+    config = tiny_pounce(num_carriers=1, cognition_size=CONFIG.hidden_size, horizon=4)
+    pounce = random_pounce(replace(config, max_committed_rows=2), seed=2)
     freeze(pounce, "vision")
     return JointModel(Ponder.random(CONFIG, seed=1), pounce)
 
