@@ -146,8 +146,8 @@ def _noise(settings: dict[str, Any], entries: Sequence[Entry]) -> str:
     return (
         f"DART noise: `action` is what the oracle planned, `executed_action` what was carried out. Joint targets were "
         f"moved by an Ornstein-Uhlenbeck process of {low:.4f} to {high:.4f} rad ({settings['correlation_s']} s), less "
-        f"within {settings['free_m']} m of anything to touch; `noise_rad` says how much in each episode, and "
-        f"{num_clean} of {len(entries)} have none."
+        f"within {settings['free_m']} m of anything to touch and none where the oracle stands still; `noise_rad` says "
+        f"how much in each episode, and {num_clean} of {len(entries)} have none."
     )
 
 

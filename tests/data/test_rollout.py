@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 from collections.abc import Iterator
 
 import numpy as np
@@ -147,3 +148,13 @@ def test_pictures_belong_to_their_rows_and_only_those_wanted_are_rendered(
                 error = np.abs(frame.astype(float) - seen[camera]).mean()
                 assert error < 12  # what the codec takes from 32 px of colour; another moment's picture differs more
             snapshot = env.step(episode.rows.action[row])
+
+
+@pytest.mark.sim
+def test_texts_count_in_256_px_whatever_is_rendered(rows: list[Row]) -> None:
+    with make_environment("VideoUnmask", image_px=32) as env:
+        seen = env.reset(3, job("VideoUnmask").difficulty)
+        said = [row.grounded_subgoal for row in rows if not row.is_demonstration]
+        assert seen.frames["front"].shape == (32, 32, 3)
+        assert seen.grounded_subgoal == said[0]
+        assert any(int(number) >= 32 for number in re.findall(r"\d+", said[0]))
