@@ -9,6 +9,7 @@ the same modules over a few tokens at a time; how is the daemon's business (``po
 """
 
 from collections.abc import Sequence
+from importlib.util import find_spec
 from typing import Any, Self
 
 import torch
@@ -20,6 +21,7 @@ from transformers.models.qwen3_5.modeling_qwen3_5 import (
 )
 
 from ponderpounce.models.context import ContextFormat, Row
+from ponderpounce.models.gated_delta import GatedDelta
 from ponderpounce.models.ponder_configs import PonderConfig
 from ponderpounce.models.ponder_images import patchify
 from ponderpounce.models.vocabulary import Vocabulary
@@ -189,7 +191,12 @@ def skeleton(qwen_config: Qwen3_5Config) -> nn.Module:
     """The network on the meta device: names, shapes and parameter counts, no memory."""
     build: Any = Qwen3_5ForConditionalGeneration._from_config
     with torch.device("meta"):
-        model: nn.Module = build(qwen_config, attn_implementation="sdpa")
+        model: Any = build(qwen_config, attn_implementation="sdpa")
+        if find_spec("fla") is None:  # whose kernels transformers' own layer calls
+            text: Any = qwen_config.text_config
+            for index, layer in enumerate(model.model.language_model.layers):
+                if text.layer_types[index] == "linear_attention":
+                    layer.linear_attn = GatedDelta(text, index)
     return model
 
 

@@ -1,0 +1,100 @@
+"""Gated DeltaNet for training: transformers' own results, states and gradients, whatever the shape."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+from transformers.models.qwen3_5.modeling_qwen3_5 import (
+    torch_chunk_gated_delta_rule,
+    torch_recurrent_gated_delta_rule,
+)
+
+from ponderpounce.models.gated_delta import gated_delta_rule
+
+
+def inputs(seed: int, length: int, heads: tuple[int, int], dims: tuple[int, int]) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    key_heads, value_heads = heads
+
+    def noise(*shape: int) -> Tensor:
+        return torch.randn(2, *shape, generator=generator)
+
+    return {
+        "query": noise(length, key_heads, dims[0]),
+        "key": noise(length, key_heads, dims[0]),
+        "value": noise(length, value_heads, dims[1]),
+        "g": -0.3 * noise(length, value_heads).abs(),
+        "beta": noise(length, value_heads).sigmoid(),
+        "initial_state": noise(value_heads, *dims),
+    }
+
+
+def error(ours: Tensor, twin: Tensor) -> float:
+    """Largest deviation over the largest value."""
+    return float((ours.double() - twin.double()).abs().max() / twin.abs().max().clamp(min=1e-3))
+
+
+def run(rule, x: dict[str, Tensor]) -> tuple[Tensor, Tensor]:  # type: ignore[no-untyped-def]
+    return rule(**x, output_final_state=True, use_qk_l2norm_in_kernel=True)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 999),
+    length=st.integers(1, 300),
+    heads=st.sampled_from([(1, 1), (1, 3), (2, 2), (2, 4)]),
+    dims=st.sampled_from([(8, 8), (16, 32), (32, 16)]),
+    chunk=st.sampled_from([16, 32, 64]),
+    has_state=st.booleans(),
+)
+def test_results_and_gradients_are_the_twins(
+    seed: int, length: int, heads: tuple[int, int], dims: tuple[int, int], chunk: int, has_state: bool
+) -> None:
+    x = {name: value.requires_grad_() for name, value in inputs(seed, length, heads, dims).items()}
+    if not has_state:
+        del x["initial_state"]
+    leaves = list(x.values())
+    twin = run(torch_chunk_gated_delta_rule, x)
+    ours = run(lambda **kwargs: gated_delta_rule(**kwargs, chunk_size=chunk), x)
+    for our, their in zip(ours, twin, strict=True):
+        assert error(our.detach(), their.detach()) < 1e-5
+    pull = [torch.randn(part.shape, generator=torch.Generator().manual_seed(seed)) for part in twin]
+    wanted = torch.autograd.grad(twin, leaves, pull)
+    for our, their in zip(torch.autograd.grad(ours, leaves, pull), wanted, strict=True):
+        assert error(our, their) < 1e-4
+
+
+@given(length=st.integers(1, 100), pads=st.integers(1, 70))
+@settings(max_examples=20, deadline=None)
+def test_padding_without_beta_and_decay_is_inert(length: int, pads: int) -> None:
+    x = inputs(length, length + pads, (2, 4), (16, 16))
+    x["beta"][:, length:], x["g"][:, length:] = 0, 0
+    alone = {name: value if name == "initial_state" else value[:, :length] for name, value in x.items()}
+    read, state = run(gated_delta_rule, alone)
+    padded, padded_state = run(gated_delta_rule, x)
+    torch.testing.assert_close(padded[:, :length], read, rtol=0, atol=1e-5)
+    torch.testing.assert_close(padded_state, state, rtol=0, atol=1e-5)
+
+
+def test_repeated_keys_that_never_fade_stay_exact() -> None:
+    x = inputs(0, 200, (1, 1), (16, 16))
+    x["key"][:], x["beta"][:], x["g"][:] = x["key"][:, :1].clone(), 1, 0
+    for our, their in zip(run(gated_delta_rule, x), run(torch_recurrent_gated_delta_rule, x), strict=True):
+        assert error(our, their) < 1e-5
+
+
+def test_bfloat16_comes_back_as_it_went_in() -> None:
+    x = {name: value.bfloat16() for name, value in inputs(0, 70, (2, 4), (16, 16)).items()}
+    ours, twin = run(gated_delta_rule, x), run(torch_chunk_gated_delta_rule, x)
+    assert (ours[0].dtype, ours[1].dtype) == (torch.bfloat16, torch.float32)
+    assert error(ours[0], twin[0]) < 1e-2
+    assert error(ours[1], twin[1]) < 1e-5
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+def test_autocast_changes_nothing_inside(wanted: bool) -> None:
+    x = inputs(0, 70, (2, 4), (16, 16))
+    plain = run(gated_delta_rule, x)
+    with torch.autocast("cpu", torch.bfloat16, enabled=wanted):
+        assert all(torch.equal(our, their) for our, their in zip(run(gated_delta_rule, x), plain, strict=True))
