@@ -26,6 +26,10 @@ from ponderpounce.models.ponder_configs import PonderConfig
 from ponderpounce.models.ponder_images import patchify
 from ponderpounce.models.vocabulary import Vocabulary
 
+FLOAT32_PARAMETERS = ("linear_attn.A_log", "linear_attn.norm.weight")
+"""Ends of the names of what stays float32 in every dtype, as in public Qwen3.5 checkpoints: A_log is the decay, which
+accumulates over thousands of tokens."""
+
 
 class Ponder(nn.Module):
     """System 2. Build it with :meth:`random`, or with ``ponder_checkpoint.load_ponder``."""
@@ -63,7 +67,13 @@ class Ponder(nn.Module):
         self.image_px = image_px
         self.is_random = True
         """The carriers were never trained: cognition is noise. A trainer sets it False, checkpoints keep it."""
-        qwen: Any = skeleton(qwen_config).to(dtype=dtype).to_empty(device=device)
+        self.mtp: dict[str, Tensor] = {}
+        """The checkpoint's multi-token prediction block, by name. It is not run, and written back as it came."""
+        qwen: Any = skeleton(qwen_config).to(dtype=dtype)
+        for name, parameter in qwen.named_parameters():
+            if name.endswith(FLOAT32_PARAMETERS):
+                parameter.data = parameter.data.float()
+        qwen.to_empty(device=device)
         qwen.tie_weights()  # to_empty makes a separate tensor of every name
         # Frequencies are buffers that no checkpoint holds; to_empty left them undefined.
         qwen.model.language_model.rotary_emb = Qwen3_5TextRotaryEmbedding(text).to(device)

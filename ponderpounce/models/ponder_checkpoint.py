@@ -5,11 +5,13 @@
     model.safetensors    the weights, or model.safetensors.index.json and its shards
     ponder.json          what PONDER adds: carriers and image size
 
-A public Qwen3.5 checkpoint has no ponder.json and loads as it is; its carriers are untrained padding rows.
+A public Qwen3.5 checkpoint has no ponder.json and loads as it is; its carriers are untrained padding rows. Loaded in
+the dtype it was written in, it is written back bit for bit, multi-token prediction included.
 """
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -29,7 +31,7 @@ CONFIG_NAME = "config.json"
 INDEX_NAME = "model.safetensors.index.json"
 SINGLE_NAME = "model.safetensors"
 OWN_NAME = "ponder.json"
-IGNORED_PREFIX = "mtp."  # multi-token prediction: in public checkpoints, not in transformers' Qwen3.5
+MTP_PREFIX = "mtp."  # multi-token prediction: in public checkpoints, not in transformers' Qwen3.5
 MAX_SHARD_BYTES = 5_000_000_000
 MAX_NAMES_SHOWN = 5
 
@@ -79,10 +81,13 @@ def load_ponder(directory: Path, *, device: torch.device | str = "cpu", dtype: t
             f"<|image_pad|> is {vocabulary.image_pad}; the two files are from different checkpoints."
         )
     files = _files_by_tensor(directory)
-    _check_tensors(directory, files, skeleton(qwen_config), tied=qwen_config.tie_word_embeddings)
+    shapes = {name: tuple(tensor.shape) for name, tensor in _own_tensors(skeleton(qwen_config)).items()}
+    if any(name.startswith(MTP_PREFIX) for name in files):
+        shapes |= mtp_shapes(qwen_config.text_config, shapes)
+    _check_tensors(directory, files, shapes, tied=qwen_config.tie_word_embeddings)
     ponder = Ponder(qwen_config, context_format, image_px=stored.image_px, device=device, dtype=dtype)
     ponder.is_random = stored.is_random
-    _read_tensors(files, ponder.qwen)
+    _read_tensors(files, ponder)
     return ponder
 
 
@@ -105,7 +110,7 @@ def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_S
     (directory / OWN_NAME).write_text(json.dumps(asdict(stored), indent=2) + "\n")
     shards: list[dict[str, Tensor]] = [{}]
     shard_bytes = 0
-    for name, tensor in _own_tensors(ponder.qwen).items():
+    for name, tensor in (_own_tensors(ponder.qwen) | ponder.mtp).items():
         if shards[-1] and shard_bytes + tensor.nbytes > max_shard_bytes:
             shards.append({})
             shard_bytes = 0
@@ -125,7 +130,7 @@ def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_S
 
 
 def weights_hash(ponder: Ponder) -> str:
-    """12 hex digits of sha256 over every tensor's name, dtype, shape and bytes: provenance.
+    """12 hex digits of sha256 over the name, dtype, shape and bytes of every tensor that is run: provenance.
 
     Reads every weight once, which takes seconds per ten gigabytes: compute it when a network is loaded.
     """
@@ -135,6 +140,23 @@ def weights_hash(ponder: Ponder) -> str:
         flat = tensor.detach().contiguous().reshape(-1).view(torch.uint8)
         digest.update(flat.cpu().numpy().data)
     return digest.hexdigest()[:12]
+
+
+def mtp_shapes(text_config: Any, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
+    """The multi-token prediction block that belongs to a network with tensors of these ``shapes``.
+
+    Attention layers like the network's own, behind a projection of [embedding; hidden] and before a norm. Source:
+    tensor names of public Qwen3.5 checkpoints; the sum is their published number of parameters.
+    """
+    hidden = text_config.hidden_size
+    like = f"model.language_model.layers.{text_config.layer_types.index('full_attention')}."
+    layer = {name.removeprefix(like): shape for name, shape in shapes.items() if name.startswith(like)}
+    norms = ("norm", "pre_fc_norm_embedding", "pre_fc_norm_hidden")
+    block: dict[str, tuple[int, ...]] = {"fc.weight": (hidden, 2 * hidden)}
+    block |= {f"{norm}.weight": (hidden,) for norm in norms}
+    for index in range(getattr(text_config, "mtp_num_hidden_layers", 1)):
+        block |= {f"layers.{index}.{name}": shape for name, shape in layer.items()}
+    return {MTP_PREFIX + name: shape for name, shape in block.items()}
 
 
 def _own_tensors(module: nn.Module) -> dict[str, Tensor]:
@@ -185,9 +207,10 @@ def _files_by_tensor(directory: Path) -> dict[str, Path]:
         return dict.fromkeys(file.keys(), single)
 
 
-def _check_tensors(directory: Path, files: dict[str, Path], expected: nn.Module, *, tied: bool) -> None:
-    expected_shapes = {name: tuple(tensor.shape) for name, tensor in _own_tensors(expected).items()}
-    found = {name for name in files if not name.startswith(IGNORED_PREFIX)}
+def _check_tensors(
+    directory: Path, files: dict[str, Path], expected_shapes: dict[str, tuple[int, ...]], *, tied: bool
+) -> None:
+    found = set(files)
     if tied:
         found.discard("lm_head.weight")  # some exporters write the tied tensor twice
     faults = [f"missing {name} {expected_shapes[name]}" for name in sorted(set(expected_shapes) - found)]
@@ -207,10 +230,12 @@ def _check_tensors(directory: Path, files: dict[str, Path], expected: nn.Module,
 
 
 @torch.no_grad()
-def _read_tensors(files: dict[str, Path], module: nn.Module) -> None:
-    own = _own_tensors(module)
+def _read_tensors(files: dict[str, Path], ponder: Ponder) -> None:
+    own = _own_tensors(ponder.qwen)
     for path in sorted(set(files.values())):
         with _open(path) as file:
             for name in file.keys():  # noqa: SIM118 - safe_open is not a mapping
                 if name in own and files.get(name) == path:
                     own[name].copy_(file.get_tensor(name))
+                elif name.startswith(MTP_PREFIX) and files.get(name) == path:
+                    ponder.mtp[name] = file.get_tensor(name)  # mapped, not read: until it is saved it costs no memory

@@ -1,6 +1,7 @@
 """Checkpoints: what is written is what is read, by transformers too; every fault names its tensor."""
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,16 +11,17 @@ import torch
 from safetensors.torch import load_file, save_file
 from transformers.models.qwen3_5 import Qwen3_5ForConditionalGeneration
 
-from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.ponder import FLOAT32_PARAMETERS, Ponder, skeleton
 from ponderpounce.models.ponder_checkpoint import (
     INDEX_NAME,
     SINGLE_NAME,
     CheckpointError,
     load_ponder,
+    mtp_shapes,
     save_ponder,
     weights_hash,
 )
-from ponderpounce.models.ponder_configs import tiny_cpu
+from ponderpounce.models.ponder_configs import PonderConfig, qwen35_0p8b, qwen35_2b, qwen35_4b, qwen35_9b, tiny_cpu
 from ponderpounce.models.vocabulary import Vocabulary
 
 VOCABULARY = Vocabulary.tiny()
@@ -114,9 +116,73 @@ def test_many_faults_are_counted_not_listed(folder: Path) -> None:
         load_ponder(folder)
 
 
-def test_multi_token_prediction_weights_are_left_alone(ponder: Ponder, folder: Path) -> None:
-    edit_tensors(folder, lambda tensors: tensors.update({"mtp.fc.weight": torch.zeros(2, 2)}))
-    assert weights_hash(load_ponder(folder)) == weights_hash(ponder)
+@pytest.mark.parametrize(
+    ("config", "num_parameters"),
+    [(qwen35_0p8b, 20_452_864), (qwen35_2b, 60_828_160), (qwen35_4b, 120_599_552), (qwen35_9b, 243_290_624)],
+)
+def test_the_multi_token_prediction_block_has_its_published_size(
+    config: Callable[[], PonderConfig], num_parameters: int
+) -> None:
+    qwen = config().qwen()
+    shapes = {name: tuple(tensor.shape) for name, tensor in skeleton(qwen).state_dict().items()}
+    assert sum(math.prod(shape) for shape in mtp_shapes(qwen.text_config, shapes).values()) == num_parameters
+
+
+@pytest.fixture
+def public(tmp_path: Path) -> Path:
+    """A folder as public Qwen3.5 checkpoints are: bfloat16, some float32, multi-token prediction, no ponder.json."""
+    ponder = Ponder.random(CONFIG, VOCABULARY, seed=1, dtype=torch.bfloat16)
+    text_config = ponder.qwen.config.text_config
+    text_config.mtp_num_hidden_layers = 1
+    shapes = {name: tuple(tensor.shape) for name, tensor in ponder.qwen.state_dict().items()}
+    ponder.mtp = {
+        name: torch.full(shape, number / 7, dtype=torch.bfloat16)
+        for number, (name, shape) in enumerate(mtp_shapes(text_config, shapes).items())
+    }
+    assert len(ponder.mtp) == 15
+    save_ponder(ponder, tmp_path / "public")
+    (tmp_path / "public" / "ponder.json").unlink()
+    return tmp_path / "public"
+
+
+@pytest.mark.parametrize("max_shard_bytes", [10**9, 200_000])
+def test_a_public_checkpoint_is_written_back_bit_for_bit(public: Path, tmp_path: Path, max_shard_bytes: int) -> None:
+    save_ponder(load_ponder(public, dtype=torch.bfloat16), tmp_path / "again", max_shard_bytes=max_shard_bytes)
+    before = load_file(public / SINGLE_NAME)
+    after = {name: t for file in (tmp_path / "again").glob("*.safetensors") for name, t in load_file(file).items()}
+    assert {t.dtype for name, t in before.items() if name.endswith(FLOAT32_PARAMETERS)} == {torch.float32}
+    assert before.keys() == after.keys()
+    assert {name: t.dtype for name, t in before.items()} == {name: t.dtype for name, t in after.items()}
+    assert all(torch.equal(before[name], after[name]) for name in before)
+    read = json.loads((tmp_path / "again" / "config.json").read_text())
+    assert read["text_config"]["mtp_num_hidden_layers"] == 1
+    Qwen3_5ForConditionalGeneration.from_pretrained(tmp_path / "again", dtype=torch.float32)
+
+
+def test_multi_token_prediction_changes_nothing_that_is_served(public: Path) -> None:
+    with_block = load_ponder(public, dtype=torch.bfloat16)
+    edit_tensors(public, lambda tensors: [tensors.pop(name) for name in with_block.mtp])
+    without = load_ponder(public, dtype=torch.bfloat16)
+    assert not without.mtp
+    assert weights_hash(without) == weights_hash(with_block)
+    assert with_block.state_dict().keys() == without.state_dict().keys()
+
+
+@pytest.mark.parametrize(
+    ("edit", "fault"),
+    [
+        (lambda tensors: tensors.pop("mtp.norm.weight"), r"missing mtp\.norm\.weight \(96,\)"),
+        (lambda tensors: tensors.update({"mtp.layers.1.norm": torch.zeros(1)}), r"extra mtp\.layers\.1\.norm"),
+        (
+            lambda tensors: tensors.update({"mtp.fc.weight": torch.zeros(2, 2)}),
+            r"misshapen mtp\.fc\.weight: \(2, 2\), .* \(96, 192\)",
+        ),
+    ],
+)
+def test_a_fault_in_multi_token_prediction_is_named(public: Path, edit: Callable[[Tensors], None], fault: str) -> None:
+    edit_tensors(public, edit)
+    with pytest.raises(CheckpointError, match=fault):
+        load_ponder(public)
 
 
 def test_a_shard_that_is_not_there_is_named(ponder: Ponder, tmp_path: Path) -> None:
