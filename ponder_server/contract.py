@@ -12,6 +12,8 @@ from typing import Generic, Literal, Protocol, TypeAlias, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from ponderpounce.models.eyes import Eyes
+
 Frame: TypeAlias = npt.NDArray[np.uint8]
 """One camera image, (h, w, 3) uint8 RGB."""
 
@@ -50,9 +52,9 @@ class EngineSpec:
     hidden_size: int
     """H"""
     image_px: tuple[int, int]
-    """(h, w) of every frame."""
+    """(h, w) of every picture that the network reads; of every frame, if there are no ``eyes``."""
     num_cameras: int
-    """Frames per fire, always the same cameras in the same order."""
+    """Frames per fire, always the same cameras in the same order, whatever is seen of them."""
     max_context_tokens: int
     model_hash: str
     """12 hex digits over the weights."""
@@ -60,6 +62,8 @@ class EngineSpec:
     """The carriers were never trained: every cognition is noise, and reports must say so."""
     dtype: str
     """Of weights and activations, e.g. "float32"; cognition is float32 always."""
+    eyes: Eyes = None
+    """What is seen of the frames."""
     session_bytes: int = 0
     """Memory of one session at its longest; that of all of them is allocated at start."""
 

@@ -40,6 +40,7 @@ from ponder_server.runner import BUCKETS, NUM_SAVED_STATES, Append, Runner, Sess
 from ponder_server.slots import slot_size
 from ponder_server.writer import Steps, TransitionWriter
 from ponderpounce.models.context import Segment, SegmentKind
+from ponderpounce.models.eyes import Pictures, check_cameras, readable_sizes, see
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import weights_hash
 
@@ -97,7 +98,8 @@ class _Query:
     """A query that was begun."""
 
     episode: _Episode
-    frames: tuple[Frame, ...]
+    pictures: Pictures
+    """(images, h, w, 3): what is seen of its frames."""
     force_text_tokens: int | None
 
 
@@ -109,6 +111,8 @@ class QwenEngine:
         self._config = config
         self._format = ponder.format
         self._episodes: dict[str, _Episode] = {}
+        self._frame_px = readable_sizes(self._format.eyes, ponder.image_px)[0]
+        check_cameras([self._frame_px] * config.num_cameras, self._format.eyes, ponder.image_px)
         size = slot_size(ponder.qwen.config.text_config, ponder.dtype)
         session_bytes = size.slot_bytes(config.max_context_tokens) + NUM_SAVED_STATES * size.state_bytes
         try:
@@ -129,6 +133,7 @@ class QwenEngine:
             hidden_size=ponder.hidden_size,
             image_px=ponder.image_px,
             num_cameras=config.num_cameras,
+            eyes=self._format.eyes,
             max_context_tokens=config.max_context_tokens,
             model_hash=weights_hash(ponder),
             is_random=ponder.is_random,
@@ -160,14 +165,14 @@ class QwenEngine:
         for instant, views in enumerate(opening.demo_frames):
             if not views:
                 raise ValueError(f"demo instant {instant} has no view")
-            self._check_frames(views, f"demo instant {instant}")
+        demo = [self._see(views, f"demo instant {n}") for n, views in enumerate(opening.demo_frames)]
         segments = self._format.opening(opening.instruction, [len(views) for views in opening.demo_frames])
         wanted = sum(len(segment) for segment in segments)
         if wanted > self._config.max_context_tokens:
             raise ContextFull(session=session, used=0, wanted=wanted, limit=self._config.max_context_tokens)
         context = self._runner.open(session)
         try:
-            self._encode(context, opening, segments, progress)
+            self._encode(context, opening, segments, demo, progress)
         except BaseException as error:
             self._runner.close(context)
             if isinstance(error, torch.OutOfMemoryError):
@@ -180,19 +185,26 @@ class QwenEngine:
         )
         return context.num_tokens
 
-    def _encode(self, context: Session, opening: Opening, segments: tuple[Segment, ...], progress: Progress) -> None:
+    def _encode(
+        self,
+        context: Session,
+        opening: Opening,
+        segments: tuple[Segment, ...],
+        demo: list[Pictures],
+        progress: Progress,
+    ) -> None:
         """Fills an empty context: from an equal opening of before, or in a few large forwards."""
         prefix = self._prefixes.find(opening) if opening.has_demo else None
         if prefix is not None:
             context.start_from(prefix)
             progress()
             return
-        frames = [frame for views in opening.demo_frames for frame in views]
+        pictures = [picture for instant in demo for picture in instant]
         for chunk in _chunks(segments, self._config.prefill_chunk_tokens):
             ids = [token for segment in chunk for token in segment.ids]
             num_images = sum(segment.num_images for segment in chunk)
-            context.append(ids, self._embed(ids, frames[:num_images]), num_wanted=0)
-            del frames[:num_images]
+            context.append(ids, self._embed(ids, pictures[:num_images]), num_wanted=0)
+            del pictures[:num_images]
             progress()
         if opening.has_demo:
             self._prefixes.keep(opening, context)
@@ -227,20 +239,20 @@ class QwenEngine:
             raise SessionError(f"session {session!r} is thinking about a query already; one at a time.")
         if len(frames) != self._config.num_cameras:
             raise ValueError(f"fire got {len(frames)} frames, this engine has num_cameras {self._config.num_cameras}")
-        self._check_frames(frames, "observation")
+        pictures = self._see(frames, "observation")
         if force_text_tokens is not None and force_text_tokens < 1:
             raise ValueError(f"force_text_tokens is {force_text_tokens}; at least 1, or None")
         self._make_room(episode)
         context.check_room(len(self._query_ids))
-        self._begun[session] = _Query(episode=episode, frames=frames, force_text_tokens=force_text_tokens)
+        self._begun[session] = _Query(episode=episode, pictures=pictures, force_text_tokens=force_text_tokens)
 
     @torch.inference_mode()
     def step(self, progress: Progress = no_progress) -> list[Outcome[Fire]]:
         """One forward for the queries that were begun; those answered by it. See ``BatchingEngine.step``."""
         begun, self._begun = self._begun, {}
         if begun:
-            frames = [frame for query in begun.values() for frame in query.frames]
-            embeds_TH = self._embed(self._query_ids * len(begun), frames)
+            pictures = [picture for query in begun.values() for picture in query.pictures]
+            embeds_TH = self._embed(self._query_ids * len(begun), pictures)
             pieces = embeds_TH.split(len(self._query_ids))
             for (session, query), query_TH in zip(begun.items(), pieces, strict=True):
                 self._batch.add(session, self._think(query, query_TH))
@@ -299,7 +311,7 @@ class QwenEngine:
     @torch.inference_mode()
     def warm_up(self) -> list[int]:
         """Durations in ns of cognition-only fires at one and the same short context, results on the host."""
-        height, width = self._spec.image_px
+        height, width = self._frame_px
         noise = np.random.default_rng(0)
         frames = tuple(
             noise.integers(0, 256, (height, width, 3), dtype=np.uint8) for _ in range(self._config.num_cameras)
@@ -325,18 +337,16 @@ class QwenEngine:
             raise SessionError(f"session {session!r} is not open; open are {sorted(self._episodes)}.")
         return episode
 
-    def _check_frames(self, frames: tuple[Frame, ...], where: str) -> None:
-        expected = (*self._spec.image_px, 3)
-        for index, frame in enumerate(frames):
-            if frame.shape != expected or frame.dtype != np.uint8:
-                raise ValueError(
-                    f"{where}, frame {index}: {frame.dtype} of shape {frame.shape}; expected uint8 {expected}"
-                )
+    def _see(self, frames: tuple[Frame, ...], where: str) -> Pictures:
+        try:
+            return see(frames, self._format.eyes, self._format.image_px)
+        except ValueError as error:
+            raise ValueError(f"{where}, {error}") from None
 
-    def _embed(self, ids: Sequence[int], frames: Sequence[Frame]) -> Tensor:
-        if not frames:
+    def _embed(self, ids: Sequence[int], pictures: Sequence[Pictures]) -> Tensor:
+        if not pictures:
             return self._ponder.embed(ids)
-        return self._ponder.embed(ids, torch.from_numpy(np.stack(frames)).to(self._ponder.device))
+        return self._ponder.embed(ids, torch.from_numpy(np.stack(pictures)).to(self._ponder.device))
 
     @torch.inference_mode()
     def _make_room(self, episode: _Episode) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 
 from clock.rendezvous import Rendezvous
 from ponder_server.contract import EngineSpec, Fire, Frame
+from ponderpounce.models.eyes import unreadable
 from protocol import images
 from protocol import messages as m
 from protocol.errors import MalformedMessage
@@ -45,7 +46,7 @@ class PonderNode:
         Raises:
             MalformedMessage: not the cameras that the engine was built for; nothing good is displaced by it.
         """
-        check_cameras(observation, self._spec)
+        check_pictures(observation, self._spec)
         self._rendezvous.on_observation(observation)
 
     def on_query(self, query: m.Query) -> None:
@@ -100,11 +101,28 @@ class PonderNode:
         return cognition, texts
 
 
-def check_cameras(observation: m.Observation, spec: EngineSpec) -> None:
-    """Raises MalformedMessage unless the images have the number and the size that the engine was built for."""
+def check_robot(robot: m.Robot, spec: EngineSpec) -> None:
+    """Raises ValueError unless the engine can read what this robot's cameras will give: no robot moves unseen."""
+    if len(robot.cameras) != spec.num_cameras:
+        raise ValueError(
+            f"robot {robot.name!r} has {len(robot.cameras)} cameras {list(robot.cameras)}; PONDER expects "
+            f"{spec.num_cameras}"
+        )
+    size = (robot.image_height, robot.image_width)
+    found = unreadable([size] * len(robot.cameras), spec.eyes, spec.image_px)
+    if found is not None:
+        camera, wanted = found
+        raise ValueError(
+            f"robot {robot.name!r}: camera {robot.cameras[camera]!r} gives {size[0]} x {size[1]} px; "
+            f"PONDER reads {wanted}"
+        )
+
+
+def check_pictures(observation: m.Observation, spec: EngineSpec) -> None:
+    """Raises MalformedMessage unless the images have the number and sizes that the engine can read."""
     if len(observation.images) != spec.num_cameras:
         raise MalformedMessage("Observation", "images", f"{spec.num_cameras} cameras", f"{len(observation.images)}")
-    for image in observation.images:
-        if (image.height, image.width) != spec.image_px:
-            expected = f"{spec.image_px[0]} x {spec.image_px[1]} px"
-            raise MalformedMessage("Image", image.camera, expected, f"{image.height} x {image.width} px")
+    found = unreadable([(image.height, image.width) for image in observation.images], spec.eyes, spec.image_px)
+    if found is not None:
+        image = observation.images[found[0]]
+        raise MalformedMessage("Image", image.camera, found[1], f"{image.height} x {image.width} px")

@@ -8,7 +8,7 @@ import time
 
 from clock.membership import Membership, percentile_ns
 from ponder_server.contract import ContextFull, Fire, Opening, PonderEngine, SessionError
-from ponder_server.node import PonderNode, Work
+from ponder_server.node import PonderNode, Work, check_robot
 from protocol import codec, images, topics
 from protocol import messages as m
 from protocol.errors import CallFailed, MalformedMessage, ProtocolError
@@ -148,6 +148,7 @@ class PonderServer:
         self._heartbeat.set(next_index=self._node.next_query, num_answered=self._heartbeat.health.num_answered + 1)
 
     def _open(self, request: m.OpenRequest) -> m.Contract:
+        check_robot(request.info.robot, self._engine.spec)
         demo = tuple(tuple(images.unpack(image) for image in frame.images) for frame in request.demo)
         opening = Opening(instruction=request.info.instruction, demo_frames=demo)
         self._context_tokens = self._engine.open(self._link.episode, opening, self._heartbeat.beat)

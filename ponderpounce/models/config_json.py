@@ -15,7 +15,7 @@ def from_json(kind: type[Record], values: Any, where: str) -> Record:
     """Builds ``kind`` from parsed JSON; ``where`` names the place in errors.
 
     Every field must be there: a file must not change its meaning when a default does. Fields may be numbers,
-    strings, booleans, Literals, unions, homogeneous tuples, and records of these.
+    strings, booleans, Literals, unions, homogeneous tuples, records of these, and tuples of such records.
 
     Raises:
         ValueError: a field is missing, unknown or of another type, or the record's own checks refuse it.
@@ -35,9 +35,15 @@ def from_json(kind: type[Record], values: Any, where: str) -> Record:
 def _value(hint: Any, value: Any, where: str) -> Any:
     if dataclasses.is_dataclass(hint):
         return from_json(typing.cast(type[Any], hint), value, where)
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType) and value is not None and len(set(args) - {types.NoneType}) == 1:
+        return _value(next(arg for arg in args if arg is not types.NoneType), value, where)
+    if origin is tuple and dataclasses.is_dataclass(args[0]) and isinstance(value, list):
+        return tuple(_value(args[0], item, f"{where}[{index}]") for index, item in enumerate(value))
     if not _fits(hint, value):
-        raise ValueError(f"{where}: expected {getattr(hint, '__name__', hint)}, came {value!r}")
-    return tuple(value) if typing.get_origin(hint) is tuple else value
+        expected = " or ".join(map(repr, args)) if origin is typing.Literal else getattr(hint, "__name__", hint)
+        raise ValueError(f"{where}: expected {expected}, came {value!r}")
+    return tuple(value) if origin is tuple else value
 
 
 def _fits(hint: Any, value: Any) -> bool:

@@ -7,7 +7,8 @@ One episode is
     <|im_start|>user\\n Ins [demo frames, 1 Hz] <|im_end|>\\n<|im_start|>assistant\\n     once, at opening
     O_t  [ T_yes S_t | T_yes DR T_yes S_t ]  K carriers                               per query t
 
-where a frame is ``<|vision_start|> <|image_pad|> * n <|vision_end|>`` (n = 64 at 256 px). **T_no is never in
+where a frame is ``<|vision_start|> <|image_pad|> * n <|vision_end|>`` (n = 64 at 256 px), one per view or, where a
+PONDER has ``eyes``, one per eye. **T_no is never in
 the row.** It is only the LM *target* at the first carrier position (paper, appendix A.2), so T_t is always
 decided by the logits of the token before: the last one of O_t, or the last one of the text. Carriers are rows
 of the embedding table that no real token uses; their ids are ordinary ids.
@@ -25,6 +26,7 @@ from enum import StrEnum
 import numpy as np
 import numpy.typing as npt
 
+from ponderpounce.models.eyes import Eyes, num_seen
 from ponderpounce.models.vocabulary import Vocabulary
 
 IGNORE = -100
@@ -79,13 +81,17 @@ class Row:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ContextFormat:
-    """Builds segments for one vocabulary, one image size and K carriers."""
+    """Builds segments for one vocabulary, one way of seeing and K carriers."""
 
     vocabulary: Vocabulary
     num_carriers: int
     first_carrier_id: int
     image_grid: tuple[int, int]
     """Tokens of one image as (rows, columns): (8, 8) for 256 px, patch 16, merge 2."""
+    token_px: int = 32
+    """Side in pixels of what one image token covers: patch times merge."""
+    eyes: Eyes = None
+    """What is seen of an instant's views: how many images it gives, and with ``image_px`` which pixels."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.num_carriers <= 16:
@@ -105,6 +111,12 @@ class ContextFormat:
         rows, columns = self.image_grid
         return rows * columns
 
+    @property
+    def image_px(self) -> tuple[int, int]:
+        """Height and width of every image in the row."""
+        rows, columns = self.image_grid
+        return rows * self.token_px, columns * self.token_px
+
     def instruction(self, text: str) -> Segment:
         """``<|im_start|>user\\n`` and the instruction, verbatim. ValueError if it spells a control token."""
         v = self.vocabulary
@@ -112,8 +124,8 @@ class ContextFormat:
         return _unsupervised(SegmentKind.INSTRUCTION, ids)
 
     def demo(self, num_views: int) -> Segment:
-        """All views of one demonstration instant."""
-        return _unsupervised(SegmentKind.DEMO, self._frames(num_views), num_images=num_views)
+        """What is seen of all views of one demonstration instant."""
+        return self._seen(SegmentKind.DEMO, num_views)
 
     def execution(self) -> Segment:
         """Ends the user's turn and opens the assistant's: from here on the episode runs."""
@@ -122,8 +134,8 @@ class ContextFormat:
         return _unsupervised(SegmentKind.EXECUTION, ids)
 
     def observation(self, num_cameras: int) -> Segment:
-        """O_t: one frame per camera."""
-        return _unsupervised(SegmentKind.OBSERVATION, self._frames(num_cameras), num_images=num_cameras)
+        """O_t: what is seen of one frame per camera."""
+        return self._seen(SegmentKind.OBSERVATION, num_cameras)
 
     def text(self, transition: Transition) -> Segment:
         """``[T_yes, S]`` or ``[T_yes, DR, T_yes, S]``; every token of it is a target."""
@@ -201,9 +213,11 @@ class ContextFormat:
             index, position = end, position + max(rows, columns)
         return positions_4T, position
 
-    def _frames(self, num_views: int) -> tuple[int, ...]:
+    def _seen(self, kind: SegmentKind, num_views: int) -> Segment:
         v = self.vocabulary
-        return (v.vision_start, *(v.image_pad,) * self.num_image_tokens, v.vision_end) * num_views
+        num_images = num_seen(num_views, self.eyes)
+        ids = (v.vision_start, *(v.image_pad,) * self.num_image_tokens, v.vision_end) * num_images
+        return _unsupervised(kind, ids, num_images=num_images)
 
 
 def _unsupervised(kind: SegmentKind, ids: tuple[int, ...], num_images: int = 0) -> Segment:

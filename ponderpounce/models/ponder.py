@@ -46,7 +46,7 @@ class Ponder(nn.Module):
         """Allocates the network and leaves its weights undefined, for :meth:`random` or a checkpoint to fill.
 
         Raises ValueError if the carriers do not fit into the embedding table, or if ``image_px`` is not what
-        ``context_format.image_grid`` says.
+        ``context_format`` says.
         """
         super().__init__()
         text: Any = qwen_config.text_config
@@ -57,11 +57,11 @@ class Ponder(nn.Module):
                 f"carrier id {last_carrier_id} is outside the embedding table of {text.vocab_size} rows; "
                 "lower first_carrier_id or num_carriers."
             )
-        token_px = vision.patch_size * vision.spatial_merge_size
-        if image_px != tuple(token_px * n for n in context_format.image_grid):
+        needed_px = token_px(qwen_config)
+        if image_px != context_format.image_px or needed_px != context_format.token_px:
             raise ValueError(
                 f"image_px {image_px} does not give an image grid of {context_format.image_grid} tokens of "
-                f"{token_px} px; height and width must be multiples of {token_px}."
+                f"{needed_px} px; height and width must be multiples of {needed_px}."
             )
         self.format = context_format
         self.image_px = image_px
@@ -102,6 +102,8 @@ class Ponder(nn.Module):
             num_carriers=config.num_carriers,
             first_carrier_id=config.first_carrier_id,
             image_grid=image_grid(qwen_config, config.image_px),
+            token_px=token_px(qwen_config),
+            eyes=config.eyes,
         )
         ponder = cls(qwen_config, context_format, image_px=config.image_px, device=device, dtype=dtype)
         fill_randomly(ponder.qwen, seed=seed)
@@ -187,14 +189,19 @@ class Ponder(nn.Module):
         return hidden_BTH[0]
 
 
+def token_px(qwen_config: Qwen3_5Config) -> int:
+    """Side in pixels of what one image token covers."""
+    vision: Any = qwen_config.vision_config
+    return int(vision.patch_size * vision.spatial_merge_size)
+
+
 def image_grid(qwen_config: Qwen3_5Config, image_px: tuple[int, int]) -> tuple[int, int]:
     """Tokens of one frame as (rows, columns). ValueError if they do not come out even."""
-    vision: Any = qwen_config.vision_config
-    token_px = vision.patch_size * vision.spatial_merge_size
+    side_px = token_px(qwen_config)
     height, width = image_px
-    if height < token_px or width < token_px or height % token_px or width % token_px:
-        raise ValueError(f"image_px {image_px}: height and width must be multiples of {token_px} px")
-    return height // token_px, width // token_px
+    if height < side_px or width < side_px or height % side_px or width % side_px:
+        raise ValueError(f"image_px {image_px}: height and width must be multiples of {side_px} px")
+    return height // side_px, width // side_px
 
 
 def skeleton(qwen_config: Qwen3_5Config) -> nn.Module:

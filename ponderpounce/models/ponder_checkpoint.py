@@ -3,7 +3,7 @@
     config.json          transformers' Qwen3.5 configuration
     tokenizer.json       the tokenizer
     model.safetensors    the weights, or model.safetensors.index.json and its shards
-    ponder.json          what PONDER adds: carriers and image size
+    ponder.json          what PONDER adds: carriers, image size, eyes
 
 A public Qwen3.5 checkpoint has no ponder.json and loads as it is; its carriers are untrained padding rows. Loaded in
 the dtype it was written in, it is written back bit for bit, multi-token prediction included.
@@ -24,7 +24,8 @@ from transformers.models.qwen3_5 import Qwen3_5Config
 
 from ponderpounce.models.config_json import from_json
 from ponderpounce.models.context import ContextFormat
-from ponderpounce.models.ponder import Ponder, image_grid, skeleton
+from ponderpounce.models.eyes import Eyes, check_eyes
+from ponderpounce.models.ponder import Ponder, image_grid, skeleton, token_px
 from ponderpounce.models.vocabulary import Vocabulary
 
 CONFIG_NAME = "config.json"
@@ -44,13 +45,18 @@ class CheckpointError(ValueError):
 class StoredPonder:
     """Contents of ponder.json. The defaults are for a public Qwen3.5, which has none; a file has every field."""
 
-    format: Literal["ponderpounce.ponder/1"] = "ponderpounce.ponder/1"
+    format: Literal["ponderpounce.ponder/2"] = "ponderpounce.ponder/2"
+    """/1 is the same without ``eyes``, and is read as having none."""
     num_carriers: int = 1
     first_carrier_id: int | None = None
     """None: the first row after the tokenizer's last id."""
     image_px: tuple[int, int] = (256, 256)
+    eyes: Eyes = None
     is_random: bool = True
     """The carriers were never trained."""
+
+    def __post_init__(self) -> None:
+        check_eyes(self.eyes, self.image_px)
 
 
 def load_ponder(directory: Path, *, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Ponder:
@@ -74,6 +80,8 @@ def load_ponder(directory: Path, *, device: torch.device | str = "cpu", dtype: t
         num_carriers=stored.num_carriers,
         first_carrier_id=vocabulary.num_tokens if first_carrier_id is None else first_carrier_id,
         image_grid=image_grid(qwen_config, stored.image_px),
+        token_px=token_px(qwen_config),
+        eyes=stored.eyes,
     )
     if qwen_config.image_token_id != vocabulary.image_pad:
         raise CheckpointError(
@@ -105,6 +113,7 @@ def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_S
         num_carriers=ponder.format.num_carriers,
         first_carrier_id=ponder.format.first_carrier_id,
         image_px=ponder.image_px,
+        eyes=ponder.format.eyes,
         is_random=ponder.is_random,
     )
     (directory / OWN_NAME).write_text(json.dumps(asdict(stored), indent=2) + "\n")
@@ -188,7 +197,10 @@ def _read_stored(directory: Path) -> StoredPonder:
     path = directory / OWN_NAME
     if not path.is_file():
         return StoredPonder()
-    return from_json(StoredPonder, _read_json(path), str(path))
+    values = _read_json(path)
+    if isinstance(values, dict) and values.get("format") == "ponderpounce.ponder/1":
+        values |= {"format": "ponderpounce.ponder/2", "eyes": None}
+    return from_json(StoredPonder, values, str(path))
 
 
 def _files_by_tensor(directory: Path) -> dict[str, Path]:

@@ -10,6 +10,7 @@ from typing import Any
 
 from transformers.models.qwen3_5 import Qwen3_5Config
 
+from ponderpounce.models.eyes import Eye, Eyes, check_eyes
 from ponderpounce.models.vocabulary import Vocabulary
 
 
@@ -35,6 +36,9 @@ class PonderConfig:
     vision_ffn_size: int
     vision_num_heads: int
     vision_num_positions: int = 2304
+    """A square number: the learned positions' grid, interpolated to the picture's."""
+    vision_patch_px: int = 16
+    """Side of a patch; 2 x 2 of them become one token."""
 
     mrope_section: tuple[int, int, int] = (11, 11, 10)
     """Rotary frequencies for t, h, w; they sum to an eighth of ``head_dim``."""
@@ -45,7 +49,9 @@ class PonderConfig:
     first_carrier_id: int = 248_077
     """First unused row of the embedding table; the K carriers live there."""
     image_px: tuple[int, int] = (256, 256)
-    """Height and width of every frame, in pixels."""
+    """Height and width of every picture that the network reads, in pixels."""
+    eyes: Eyes = None
+    """What it looks at; None: every camera's whole picture, which must then be of ``image_px``."""
 
     def __post_init__(self) -> None:
         if self.first_carrier_id + self.num_carriers > self.vocab_size:
@@ -55,6 +61,7 @@ class PonderConfig:
             )
         if 8 * sum(self.mrope_section) != self.head_dim:
             raise ValueError(f"mrope_section {self.mrope_section} must sum to head_dim / 8 = {self.head_dim / 8}")
+        check_eyes(self.eyes, self.image_px)
 
     def qwen(self, vocabulary: Vocabulary | None = None) -> Qwen3_5Config:
         """The transformers configuration; token ids come from ``vocabulary`` when there is one."""
@@ -97,6 +104,7 @@ class PonderConfig:
                 "num_heads": self.vision_num_heads,
                 "out_hidden_size": self.hidden_size,
                 "num_position_embeddings": self.vision_num_positions,
+                "patch_size": self.vision_patch_px,
             },
             **token_ids,
         )
@@ -123,6 +131,33 @@ def tiny_cpu() -> PonderConfig:
         vision_num_positions=256,
         mrope_section=(2, 1, 1),
         first_carrier_id=448,
+    )
+
+
+def small() -> PonderConfig:
+    """1.9 M weights, to be trained from scratch on CPU cores: one eye on the workspace in the front camera."""
+    return PonderConfig(
+        hidden_size=128,
+        ffn_size=256,
+        num_layers=8,
+        num_query_heads=4,
+        num_kv_heads=2,
+        head_dim=32,
+        num_gdn_key_heads=4,
+        num_gdn_value_heads=4,
+        gdn_head_dim=32,
+        tied_embeddings=False,
+        vocab_size=512,
+        vision_depth=3,
+        vision_hidden_size=96,
+        vision_ffn_size=192,
+        vision_num_heads=3,
+        vision_num_positions=64,
+        vision_patch_px=8,
+        mrope_section=(2, 1, 1),
+        first_carrier_id=448,
+        image_px=(64, 64),
+        eyes=(Eye(camera=0, box=(8 / 256, 64 / 256, 136 / 256, 192 / 256)),),
     )
 
 

@@ -1,8 +1,7 @@
 """Camera frames to Qwen3.5's patches, in torch, so that it runs where the model runs.
 
 Equal to the public image processor (transformers' ``Qwen2VLImageProcessorPil`` with mean = std = 0.5) to the
-last bit for frames it does not resize. We never resize: PONDER sees the pixels the camera gave, or the frame
-is refused.
+last bit for frames it does not resize. Nothing is resized here: pictures come as ``eyes.see`` gives them.
 """
 
 import torch

@@ -7,7 +7,7 @@ written down anywhere: T_yes is 248060 in one tokenizer and 400 in the other.
 Source: Qwen3.5's public tokenizer files; T_yes and T_no: paper, appendix A.2.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -90,7 +90,22 @@ class Vocabulary:
 
     @classmethod
     def tiny(cls) -> Self:
-        """A byte-level BPE of about 400 tokens trained on a few subgoal texts: any UTF-8 text round-trips."""
+        """About 400 tokens, trained on a few subgoal texts."""
+        return cls.trained_on(_TINY_CORPUS, num_tokens=_TINY_NUM_BPE_TOKENS + len(CONTROL_TOKENS))
+
+    @classmethod
+    def trained_on(cls, texts: Iterable[str], num_tokens: int) -> Self:
+        """A byte-level BPE of at most ``num_tokens``, control tokens included: any UTF-8 text round-trips.
+
+        A small PONDER says the subgoals of its tasks in fewer tokens if these are the texts. Texts that hold few
+        different pairs give fewer tokens than asked for. Equal texts give the same tokenizer.
+
+        Raises ValueError if ``num_tokens`` has no room for the 256 bytes and the control tokens.
+        """
+        alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
+        least = len(alphabet) + len(CONTROL_TOKENS)
+        if num_tokens < least:
+            raise ValueError(f"num_tokens is {num_tokens}; bytes and control tokens alone are {least}.")
         tokenizer = Tokenizer(models.BPE())
         tokenizer.normalizer = normalizers.NFC()
         tokenizer.pre_tokenizer = pre_tokenizers.Sequence(
@@ -101,11 +116,11 @@ class Vocabulary:
         )
         tokenizer.decoder = decoders.ByteLevel()
         trainer = trainers.BpeTrainer(
-            vocab_size=_TINY_NUM_BPE_TOKENS,
-            initial_alphabet=sorted(pre_tokenizers.ByteLevel.alphabet()),
+            vocab_size=num_tokens - len(CONTROL_TOKENS),
+            initial_alphabet=alphabet,
             show_progress=False,
         )
-        tokenizer.train_from_iterator(_TINY_CORPUS, trainer)
+        tokenizer.train_from_iterator(texts, trainer)
         tokenizer.add_special_tokens(list(CONTROL_TOKENS))
         return cls(tokenizer)
 

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from clock.sampling import Clocks, SampledInvocation, SampledSchedule, sample_schedule
 from ponderpounce.models.context import ContextFormat, Row, Transition
+from ponderpounce.models.eyes import see
 from ponderpounce.models.ponder_coordinates import normalised_text
 
 Frame = NDArray[np.uint8]  # (height, width, 3) RGB
@@ -91,7 +92,7 @@ def make_example(
     chosen = np.sort(rng.choice(len(schedule.invocations), size=count, replace=False))
     return Example(
         row=episode_row(episode, form, schedule, is_grounded=config.is_grounded),
-        frames=row_frames(episode, schedule),
+        frames=row_frames(episode, form, schedule),
         invocations=tuple(schedule.invocations[index] for index in chosen),
         episode=episode,
     )
@@ -114,11 +115,13 @@ def episode_row(
     return form.row(segments)
 
 
-def row_frames(episode: TrainingEpisode, schedule: SampledSchedule) -> Tensor:
-    """All pictures of the row in order: the demonstration's, then every query's; (N, height, width, 3) uint8."""
-    views = [view for instant in episode.demo for view in instant]
-    views += [view for query in schedule.queries for view in episode.frames[query.tick]]
-    return torch.from_numpy(np.stack(views))
+def row_frames(episode: TrainingEpisode, form: ContextFormat, schedule: SampledSchedule) -> Tensor:
+    """All pictures of the row in order: the demonstration's, then every query's; (N, height, width, 3) uint8.
+
+    Raises ValueError if the episode's pictures have a size that ``form`` cannot see.
+    """
+    instants = [*episode.demo, *(episode.frames[query.tick] for query in schedule.queries)]
+    return torch.from_numpy(np.concatenate([see(views, form.eyes, form.image_px) for views in instants]))
 
 
 def target_rows(episode: TrainingEpisode, tick: int, horizon: int) -> NDArray[np.float32]:

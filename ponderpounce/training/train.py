@@ -23,7 +23,9 @@ import torch
 import tyro
 from tqdm import tqdm
 
+from ponderpounce.data.episode import CAMERAS
 from ponderpounce.data.errors import DatasetError
+from ponderpounce.models.eyes import check_cameras, readable_sizes
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import load_ponder, save_ponder
 from ponderpounce.models.pounce import PounceConfig, freeze
@@ -189,11 +191,11 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
         ponder = load_ponder(options.ponder, device=options.device, dtype=dtype)
     else:
         ponder = Ponder.random(run.ponder, seed=seed, device=options.device, dtype=dtype)
-    if ponder.image_px != (data.image_px, data.image_px):
-        raise ValueError(
-            f"PONDER reads pictures of {ponder.image_px} px and {options.data} has {data.image_px} px; "
-            f"collect with --image-px {ponder.image_px[0]}"
-        )
+    try:
+        check_cameras([(data.image_px, data.image_px)] * len(CAMERAS), ponder.format.eyes, ponder.image_px)
+    except ValueError as error:
+        wanted_px = readable_sizes(ponder.format.eyes, ponder.image_px)[0][0]
+        raise ValueError(f"{options.data}: {error}; collect with --image-px {wanted_px}") from None
     bundle = random_bundle(run.pounce, seed) if options.pounce is None else load_bundle(options.pounce)
     bundle = replace(bundle, statistics=data.statistics(run.pounce.horizon))
     pounce = bundle.model.to(options.device)

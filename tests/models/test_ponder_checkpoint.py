@@ -11,6 +11,7 @@ import torch
 from safetensors.torch import load_file, save_file
 from transformers.models.qwen3_5 import Qwen3_5ForConditionalGeneration
 
+from ponderpounce.models.eyes import Eye
 from ponderpounce.models.ponder import FLOAT32_PARAMETERS, Ponder, skeleton
 from ponderpounce.models.ponder_checkpoint import (
     INDEX_NAME,
@@ -215,6 +216,33 @@ def test_a_tokenizer_of_another_checkpoint_is_noticed(folder: Path) -> None:
 def test_another_architecture_is_refused(folder: Path) -> None:
     (folder / "config.json").write_text(json.dumps({"model_type": "llama"}))
     with pytest.raises(CheckpointError, match="'llama'"):
+        load_ponder(folder)
+
+
+def test_a_checkpoint_remembers_its_eyes(tmp_path: Path) -> None:
+    eyes = (Eye(camera=1), Eye(camera=0, box=(0.25, 0, 0.75, 0.5)))
+    saved = Ponder.random(replace(CONFIG, vision_patch_px=8, eyes=eyes), VOCABULARY, seed=1)
+    save_ponder(saved, tmp_path)
+    loaded = load_ponder(tmp_path)
+    assert loaded.format.eyes == eyes
+    assert (loaded.format.image_grid, loaded.format.token_px, loaded.image_px) == ((4, 4), 16, (64, 64))
+
+
+def test_a_folder_from_before_there_were_eyes_has_none(ponder: Ponder, folder: Path) -> None:
+    stored = json.loads((folder / "ponder.json").read_text())
+    del stored["eyes"]
+    (folder / "ponder.json").write_text(json.dumps({**stored, "format": "ponderpounce.ponder/1"}))
+    loaded = load_ponder(folder)
+    assert loaded.format.eyes is None
+    assert loaded.image_px == (64, 64)
+    assert weights_hash(loaded) == weights_hash(ponder)
+
+
+@pytest.mark.parametrize("eyes", [[], [{"camera": 0}], [{"camera": 0, "box": [0, 0, 2, 1]}], 7])
+def test_eyes_that_are_none_are_refused(folder: Path, eyes: object) -> None:
+    stored = json.loads((folder / "ponder.json").read_text())
+    (folder / "ponder.json").write_text(json.dumps({**stored, "eyes": eyes}))
+    with pytest.raises(ValueError, match="eye"):
         load_ponder(folder)
 
 

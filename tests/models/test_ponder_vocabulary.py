@@ -1,5 +1,7 @@
 """The tokenizer: any text survives, control tokens keep their names, none can be smuggled in."""
 
+import hashlib
+import json
 from pathlib import Path
 
 import pytest
@@ -26,6 +28,28 @@ def test_control_tokens_keep_qwens_order_behind_the_text_tokens() -> None:
     assert ids == list(range(ids[0], ids[0] + len(CONTROL_TOKENS)))
     assert TINY.num_tokens == ids[-1] + 1
     assert TINY.control_ids == set(ids)
+
+
+def test_the_tiny_tokenizer_is_the_one_that_checkpoints_were_trained_with() -> None:
+    spelled = json.dumps(sorted(TINY.names().items())).encode()
+    assert (TINY.num_tokens, TINY.t_yes) == (417, 400)
+    assert hashlib.sha256(spelled).hexdigest()[:16] == "058ded6ad758d45c"
+
+
+def test_a_tokenizer_trained_on_texts_says_them_in_fewer_tokens() -> None:
+    texts = ["sweep the crumbs towards the dustpan at <72, 104>", "sweep the crumbs towards the bin"]
+    own = Vocabulary.trained_on(texts, num_tokens=350)
+    assert own.num_tokens <= 350
+    assert own.names() == Vocabulary.trained_on(iter(texts), num_tokens=350).names()
+    for text in texts:
+        assert own.decode(own.encode(text)) == text
+        assert len(own.encode(text)) < len(TINY.encode(text))
+    assert own.decode(own.encode("größer → 2")) == "größer → 2"
+
+
+def test_a_tokenizer_without_room_for_bytes_and_control_tokens_is_refused() -> None:
+    with pytest.raises(ValueError, match="num_tokens is 288; bytes and control tokens alone are 289"):
+        Vocabulary.trained_on(["pick"], num_tokens=288)
 
 
 def test_digits_are_single_tokens() -> None:

@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ponder_server.contract import EngineSpec, Fire, Text
-from ponder_server.node import KEEP_QUERIES, PonderNode
+from ponder_server.node import KEEP_QUERIES, PonderNode, check_robot
+from ponderpounce.models.eyes import Eye
 from protocol import images
 from protocol import messages as m
 from protocol.errors import MalformedMessage
@@ -122,6 +123,33 @@ def test_frames_of_another_engine_are_refused_and_displace_nothing(
         node.on_observation(observation)
     node.on_query(ask(0, 0))
     assert worked(node) == [0]
+
+
+def robot(px: tuple[int, int], cameras: tuple[str, ...] = ("front", "wrist")) -> m.Robot:
+    none = np.zeros(1, np.float32)
+    return m.Robot(
+        name="arm", command_low=none, command_high=none, max_step=none, initial_command=none, cameras=cameras,
+        image_height=px[0], image_width=px[1], num_proprio=1, is_simulated=True,
+    )  # fmt: skip
+
+
+WITH_EYES = dataclasses.replace(SPEC, eyes=(Eye(camera=1, box=(0.5, 0.0, 1.0, 0.5)),))
+
+
+@pytest.mark.parametrize("px", [(8, 12), (16, 24)])
+def test_eyes_read_cameras_of_several_sizes(px: tuple[int, int]) -> None:
+    check_robot(robot(px), WITH_EYES)
+    node = PonderNode(WITH_EYES)
+    node.on_observation(look(0, px=px))
+    node.on_query(ask(0, 0))
+    assert worked(node) == [0]
+
+
+def test_eyes_refuse_what_they_cannot_read_at_open_and_later() -> None:
+    with pytest.raises(ValueError, match="camera 'wrist' gives 10 x 12 px; PONDER reads 8 x 12 or 16 x 24"):
+        check_robot(robot((10, 12)), WITH_EYES)
+    with pytest.raises(MalformedMessage, match=r"Image\.camera1: expected 8 x 12 or 16 x 24 .* came 10 x 12 px"):
+        PonderNode(WITH_EYES).on_observation(look(0, px=(10, 12)))
 
 
 def test_bytes_that_are_no_picture_cost_their_query_only(node: PonderNode) -> None:

@@ -113,6 +113,26 @@ def test_a_refused_fire_leaves_ponder_idle(ward: Ward) -> None:
     assert not ward.health.is_inferring
 
 
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"cameras": ("front",)}, "robot 'arm' has 1 cameras ['front']; PONDER expects 2"),
+        ({"image_height": 8}, "robot 'arm': camera 'front' gives 8 x 4 px; PONDER reads 4 x 4 px"),
+    ],
+)
+def test_a_robot_whose_pictures_cannot_be_read_is_refused_before_it_moves(
+    rig: Any,
+    episode_info: Info,
+    paper: m.Schedule,
+    robot_with: Callable[..., m.Robot],
+    changes: dict[str, Any],
+    said: str,
+) -> None:
+    reply = rig.open(episode_info(paper, robot=robot_with(**changes)))
+    assert reply.error == f"ponder refuses the episode: {said}"
+    assert rig.ponder_engine.contexts == {}
+
+
 def test_a_demonstration_too_long_refuses_the_episode(
     rig: Any, episode_info: Info, paper: m.Schedule, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -194,7 +214,11 @@ def test_a_broken_journal_leaves_ponder_outside_the_episode(ward: Ward, fake_pon
 
 @pytest.mark.slow
 def test_a_real_engine_restarts_as_if_it_had_never_died(
-    new_rig: Callable[..., Any], fake_pounce: Any, episode_info: Info, paper: m.Schedule
+    new_rig: Callable[..., Any],
+    fake_pounce: Any,
+    episode_info: Info,
+    paper: m.Schedule,
+    robot_with: Callable[..., m.Robot],
 ) -> None:
     """The tiny network on the CPU: a rebuilt context gives the same hidden states, bit for bit."""
     from ponder_server.__main__ import build_engine
@@ -218,7 +242,8 @@ def test_a_real_engine_restarts_as_if_it_had_never_died(
                 rig.ponder = rig.start_ponder(Link(rig.bus, robot="r0", proc="ponder"), engine)
 
         rig.meanwhile = restart
-        rig.run(episode_info(paper), 90)
+        height, width = spec.image_px
+        rig.run(episode_info(paper, robot=robot_with(image_height=height, image_width=width)), 90)
         take()
         vectors.append({c.query: c.vector.tobytes() for c in rig.said[m.Cognition]})
     assert vectors[0].keys() == set(range(5))

@@ -141,7 +141,7 @@ def test_the_row_says_what_the_annotations_say() -> None:
     v = FORM.vocabulary
     said = [i for i in row.ids if i == v.t_yes]
     assert len(said) == 3  # reasoning and first subgoal, second subgoal
-    assert row.num_images == 2 * (3 + len(schedule.queries)) == len(row_frames(recorded, schedule))
+    assert row.num_images == 2 * (3 + len(schedule.queries)) == len(row_frames(recorded, FORM, schedule))
     texts = v.decode([t for t in row.targets if t >= 0 and t not in (v.t_yes, v.t_no)])
     assert texts == "Demo selected [402, 301].pick cube 1 at [78, 4]pick cube 2 at [78, 8]"
 
@@ -160,7 +160,7 @@ def test_transitions_are_the_datas_and_not_the_texts() -> None:
 def test_pictures_stand_in_the_order_of_the_row() -> None:
     recorded = episode(45, num_demo=2)
     schedule = sample_schedule(np.random.default_rng(0), EVALUATION, 45)
-    frames = row_frames(recorded, schedule)
+    frames = row_frames(recorded, FORM, schedule)
     assert np.array_equal(frames[1], recorded.demo[0][1])
     assert np.array_equal(frames[4 + 2], recorded.frames[schedule.queries[1].tick][0])
 
