@@ -49,6 +49,8 @@ class EngineSpec:
     continuity: Continuity = "none"
     max_committed_rows: int = 0
     """The most committed rows that the network was trained to be given; matters to continuity "trained" only."""
+    reads_subgoal: bool = False
+    """The engine reads PONDER's newest subgoal in place of cognition (then K = 0)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -72,6 +74,8 @@ class Request:
     """The row of the new chunk that belongs to the tick of the first previous one."""
     committed_rows: int = 0
     """How many of the previous rows will be played whatever the new chunk says."""
+    subgoal: str = ""
+    """PONDER's newest subgoal, for engines that read it; empty before there is one."""
 
 
 def no_progress() -> None:
@@ -104,6 +108,8 @@ def check_request(request: Request, spec: EngineSpec) -> None:
     for index, frame in enumerate(request.frames):
         if frame is not None and (frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3 or not frame.size):
             raise ValueError(f"frame {index}: expected (h, w, 3) uint8, came {frame.shape} {frame.dtype}")
+    if request.subgoal and not spec.reads_subgoal:
+        raise ValueError(f"this engine reads no subgoals, came {request.subgoal[:60]!r}")
     _check_floats("proprio", request.proprio, (spec.proprio_dim,))
     if not 0 <= request.seed < 2**63:
         raise ValueError(f"seed: expected 0 <= seed < 2**63, came {request.seed}")

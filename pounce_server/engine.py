@@ -82,6 +82,7 @@ class EagerEngine:
             dtype=dtype,
             continuity=continuity,
             max_committed_rows=max_committed_rows(config),
+            reads_subgoal=config.reads_subgoal,
         )
         model = cast_for_serving(bundle.model, dtype).to(self._device).eval().requires_grad_(False)
         if path == "fused":

@@ -116,6 +116,11 @@ class PounceServer:
             raise ValueError(
                 f"POUNCE reads {spec.proprio_dim} joint values, the robot has {request.info.robot.num_proprio}"
             )
+        if spec.reads_subgoal:
+            raise ValueError(
+                "this checkpoint reads PONDER's subgoals in place of cognition, and no message of the protocol brings "
+                "them to POUNCE; serve one that reads cognition"
+            )
         self._check_committed(request.info.schedule)
         self._node.open(request.info)
         return m.Contract(

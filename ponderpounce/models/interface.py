@@ -75,6 +75,14 @@ def scale_gradient(x: Tensor, scale: float) -> Tensor:
     return cast(Tensor, _ScaleGradient.apply(x, scale))  # type: ignore[no-untyped-call]
 
 
+def check_channel(cognition: CognitionConfig, reads_subgoal: bool) -> None:
+    """Raises ValueError if POUNCE were told both ways: text stands in place of cognition, not beside it."""
+    if reads_subgoal and cognition.num_carriers:
+        raise ValueError(
+            f"reads_subgoal puts text in place of cognition: expected num_carriers 0, came {cognition.num_carriers}"
+        )
+
+
 class CognitionPrefix(nn.Module):
     """Projects cognition and age into the language stream. Needs K >= 1."""
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from ponderpounce.models import flow
 from ponderpounce.models.committed import Committed, first_rows
-from ponderpounce.models.interface import CognitionConfig, CognitionPrefix
+from ponderpounce.models.interface import CognitionConfig, CognitionPrefix, check_channel
 from ponderpounce.models.pi05 import Pi05, Pi05Config, Prefix, PrefixCache, StepTable
 
 Freeze = Literal["none", "vision", "vlm"]
@@ -52,8 +52,11 @@ class PounceConfig:
     max_prompt_tokens: int = 200
     max_committed_rows: int = 0
     """The most rows that training gives a chunk to continue (`committed`); 0: it was never trained to."""
+    reads_subgoal: bool = False
+    """The newest subgoal's text stands in the prompt instead of cognition: the paper's subgoal-text reference (3.1)."""
 
     def __post_init__(self) -> None:
+        check_channel(self.cognition, self.reads_subgoal)
         if not 0 <= self.max_committed_rows < self.pi05.horizon:
             raise ValueError(f"max_committed_rows must be 0..{self.pi05.horizon - 1}, came {self.max_committed_rows}")
         if not 0 < self.robot_action_dim <= self.pi05.action_dim:

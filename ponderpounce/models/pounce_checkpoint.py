@@ -40,8 +40,9 @@ GROOT_FORMAT: Final = "ponderpounce.pounce-groot/1"
 CONFIG_FILE = "config.json"
 JAX_FOLDER = "params"
 WEIGHTS_FILE = "model.safetensors"
-_LATER_FIELDS = {"max_committed_rows": 0}
+_LATER_FIELDS = {"max_committed_rows": 0, "reads_subgoal": False}
 """Of pi0.5's config: what it meant where a folder was written before there was such a field."""
+_LATER_GROOT_FIELDS = {"reads_subgoal": False}
 TOKENIZER_FILE = "tokenizer.model"
 EAGLE_TOKENIZER_FILE = "tokenizer.json"
 
@@ -228,4 +229,6 @@ def _read_config(path: Path) -> AnyStoredConfig | None:
         if isinstance(values.get("config"), dict):
             values["config"] = _LATER_FIELDS | values["config"]
         return from_json(StoredConfig, values, path.name)
+    if isinstance(values.get("config"), dict):
+        values["config"] = _LATER_GROOT_FIELDS | values["config"]
     return from_json(StoredGrootConfig, values, path.name)

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from ponderpounce.models import groot_flow
 from ponderpounce.models.flow import EulerStep
 from ponderpounce.models.groot import Groot, GrootCache, GrootConfig, GrootStepTable
-from ponderpounce.models.interface import CognitionConfig, CognitionPrefix
+from ponderpounce.models.interface import CognitionConfig, CognitionPrefix, check_channel
 from ponderpounce.models.pounce import Backbone
 
 PrefixSlot = Literal["features", "embeddings"]
@@ -65,8 +65,11 @@ class GrootPounceConfig:
     """Euler steps per chunk."""
     max_prompt_tokens: int = 200
     """Of the text, without the image tokens."""
+    reads_subgoal: bool = False
+    """The newest subgoal's text stands in the prompt instead of cognition: the paper's subgoal-text reference (3.1)."""
 
     def __post_init__(self) -> None:
+        check_channel(self.cognition, self.reads_subgoal)
         groot = self.groot
         for name, limit in (("robot_action_dim", groot.action_dim), ("robot_state_dim", groot.state_dim)):
             if not 0 < getattr(self, name) <= limit:

@@ -41,6 +41,10 @@ class Moment(Protocol):
 
     @property
     def age_ns(self) -> int: ...
+    @property
+    def subgoal(self) -> str:
+        """What PONDER last told itself to do; empty before it did. Models with ``reads_subgoal`` read it."""
+        ...
 
 
 def pi05_inputs(
@@ -53,7 +57,7 @@ def pi05_inputs(
     """
     images, has_view = camera_batch(moment.frames, config.image_px)
     state = statistics.state.normalise(moment.proprio)
-    token_ids = tokenizer.encode(prompt.prompt_text(moment.instruction, state))
+    token_ids = tokenizer.encode(prompt.prompt_text(_told(moment, config.reads_subgoal), state))
     _check_length(len(token_ids), config.max_prompt_tokens, moment.instruction)
     return PounceInputs(
         images=images.to(device),
@@ -79,7 +83,8 @@ def groot_inputs(
     """
     images, _ = camera_batch(moment.frames, config.image_px)
     num_patches = config.groot.eagle.vision.num_patches
-    token_ids = tokenizer.encode(groot_prompt.prompt_text(moment.instruction, config.num_cameras, num_patches))
+    told = _told(moment, config.reads_subgoal)
+    token_ids = tokenizer.encode(groot_prompt.prompt_text(told, config.num_cameras, num_patches))
     num_text = len(token_ids) - config.num_cameras * num_patches
     _check_length(num_text, config.max_prompt_tokens, moment.instruction)
     state = torch.zeros(1, config.groot.state_dim)
@@ -93,6 +98,10 @@ def groot_inputs(
         age_ns=torch.tensor([moment.age_ns], device=device),
         cognition=_cognition(moment, device),
     )
+
+
+def _told(moment: Moment, reads_subgoal: bool) -> str:
+    return prompt.with_subgoal(moment.instruction, moment.subgoal) if reads_subgoal else moment.instruction
 
 
 def _cognition(moment: Moment, device: torch.device) -> Tensor | None:

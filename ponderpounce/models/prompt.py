@@ -44,6 +44,14 @@ def prompt_text(instruction: str, state: ArrayLike) -> str:
     return f"Task: {text}, State: {' '.join(map(str, state_bins(state)))};\nAction: "
 
 
+def with_subgoal(instruction: str, subgoal: str) -> str:
+    """Returns what a POUNCE that reads text is told: the instruction and the newest subgoal, or the instruction alone.
+
+    The wording is ours; RoboMME's own subgoal baselines write "Current Subgoal" and leave the state out.
+    """
+    return f"{instruction.strip()}, Subgoal: {subgoal.strip()}" if subgoal.strip() else instruction
+
+
 class Tokenizer:
     """A SentencePiece model, PaliGemma's or any other; prompts begin with its BOS.
 

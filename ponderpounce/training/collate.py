@@ -56,6 +56,11 @@ class _Asked:
     def age_ns(self) -> int:
         return self.invocation.reference.age_ns
 
+    @property
+    def subgoal(self) -> str:
+        query = self.invocation.reference.query
+        return "" if query is None else self.example.said[query]
+
 
 def collate(
     examples: Sequence[Example], config: AnyPounceConfig, tokenizer: AnyTokenizer, statistics: RobotStatistics

@@ -81,6 +81,8 @@ class Example:
     """(num_images, height, width, 3) uint8"""
     invocations: tuple[SampledInvocation, ...]
     episode: TrainingEpisode
+    said: tuple[str, ...]
+    """Per query, the subgoal that PONDER had last written by then; empty texts without grounding."""
 
 
 def make_example(
@@ -95,6 +97,7 @@ def make_example(
         frames=row_frames(episode, form, schedule),
         invocations=tuple(schedule.invocations[index] for index in chosen),
         episode=episode,
+        said=said_by_query(episode, schedule) if config.is_grounded else ("",) * len(schedule.queries),
     )
 
 
@@ -113,6 +116,17 @@ def episode_row(
             reasoning = None
         segments += form.query(len(episode.frames[query.tick]), transition)
     return form.row(segments)
+
+
+def said_by_query(episode: TrainingEpisode, schedule: SampledSchedule) -> tuple[str, ...]:
+    """The newest subgoal at every query, as PONDER writes it: new ones come at predicted transitions only."""
+    texts: list[str] = []
+    newest = ""
+    for query in schedule.queries:
+        if query.stamp.is_transition and episode.subgoals[query.tick]:
+            newest = normalised_text(episode.subgoals[query.tick])
+        texts.append(newest)
+    return tuple(texts)
 
 
 def row_frames(episode: TrainingEpisode, form: ContextFormat, schedule: SampledSchedule) -> Tensor:

@@ -147,7 +147,7 @@ class JointModel(nn.Module):
         super().__init__()
         wanted = (pounce.config.cognition.num_carriers, pounce.config.cognition.cognition_size)
         given = (ponder.format.num_carriers, ponder.hidden_size)
-        if wanted != given:
+        if wanted != given and not pounce.config.reads_subgoal:
             raise ValueError(f"POUNCE reads (K, H) = {wanted}, PONDER gives {given}; build them for each other")
         self.ponder = ponder
         self.pounce = pounce

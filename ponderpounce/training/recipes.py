@@ -96,11 +96,21 @@ def tiny_groot() -> Recipe:
     )
 
 
+def tiny_subgoal_text() -> Recipe:
+    """``tiny`` with the paper's reference in place of the interface: POUNCE reads PONDER's newest subgoal.
+
+    Actions then teach PONDER nothing; it learns from its texts.
+    """
+    silent = pounce_configs.tiny_cpu(num_carriers=0, cognition_size=ponder_configs.tiny_cpu().hidden_size)
+    return replace(tiny(), name="tiny_subgoal_text", pounce=replace(silent, reads_subgoal=True))
+
+
 RECIPES: dict[str, Callable[[], Recipe]] = {
     "robomme": robomme,
     "robocasa_dc": robocasa_dc,
     "tiny": tiny,
     "tiny_groot": tiny_groot,
+    "tiny_subgoal_text": tiny_subgoal_text,
 }
 
 

@@ -49,7 +49,7 @@ class TrainOptions:
     """Trains PONDER and POUNCE together. The same command again resumes a run that was killed."""
 
     recipe: str
-    """robomme and robocasa_dc are the paper's; tiny and tiny_groot run on one CPU core."""
+    """robomme and robocasa_dc are the paper's; tiny, tiny_groot and tiny_subgoal_text run on one CPU core."""
     data: Path
     """A folder that pp-collect or pp-export made."""
     out: Path

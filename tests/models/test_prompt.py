@@ -13,6 +13,7 @@ from ponderpounce.models.prompt import (
     prompt_text,
     state_bins,
     tiny_tokenizer_for_random_weights,
+    with_subgoal,
 )
 
 
@@ -45,6 +46,14 @@ def test_bins_at_the_ends_and_beyond() -> None:
 def test_prompt_is_the_public_template_with_one_number_per_robot_dim() -> None:
     text = prompt_text("  put_the red\ncube down ", np.array([-1.0, 0.0, 1.0]))
     assert text == "Task: put the red cube down, State: 0 128 255;\nAction: "
+
+
+def test_a_subgoal_follows_the_instruction_and_none_leaves_it_alone() -> None:
+    told = with_subgoal("press the button ", " pick the cube at [78, 4]")
+    assert prompt_text(told, np.array([0.0])) == (
+        "Task: press the button, Subgoal: pick the cube at [78, 4], State: 128;\nAction: "
+    )
+    assert with_subgoal("press the button ", " ") == "press the button "
 
 
 @settings(deadline=None)

@@ -32,7 +32,7 @@ def test_both_systems_of_a_recipe_fit(name: str) -> None:
     run = recipe(name)
     assert run.name == name
     assert run.pounce.cognition.cognition_size == run.ponder.hidden_size
-    assert run.pounce.cognition.num_carriers == run.ponder.num_carriers
+    assert run.pounce.cognition.num_carriers == (0 if run.pounce.reads_subgoal else run.ponder.num_carriers)
 
 
 def test_a_mistyped_name_is_answered_with_the_nearest() -> None:

@@ -1,0 +1,144 @@
+"""The reference channel: POUNCE is told PONDER's newest subgoal in words, and nothing else of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from clock.sampling import EVALUATION, sample_schedule
+from ponderpounce.models import prompt
+from ponderpounce.models.groot_prompt import tiny_eagle_tokenizer_for_random_weights
+from ponderpounce.models.normalisation import ROBOMME as STATISTICS
+from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
+from ponderpounce.models.pounce_checkpoint import random_bundle
+from ponderpounce.models.pounce_configs import tiny_cpu, tiny_groot
+from ponderpounce.models.pounce_init import random_pounce
+from ponderpounce.models.pounce_reading import groot_inputs, pi05_inputs
+from ponderpounce.training.collate import collate
+from ponderpounce.training.example import Example, ExampleConfig, TrainingEpisode, make_example, said_by_query
+from ponderpounce.training.joint import Draws, JointModel
+from pounce_server.contract import Request, example_request
+from pounce_server.engine import EagerEngine
+from protocol import messages as m
+
+PONDER = Ponder.random(replace(tiny_ponder(), image_px=(64, 64), num_layers=4), seed=1)
+POUNCE = replace(tiny_cpu(num_carriers=0, horizon=6), reads_subgoal=True)
+TOKENIZER = prompt.tiny_tokenizer_for_random_weights()
+NUM_TICKS, CHANGES = 90, (0, 30)
+CPU = torch.device("cpu")
+
+
+def episode() -> TrainingEpisode:
+    rng = np.random.default_rng(0)
+    views = [tuple(rng.integers(0, 256, (64, 64, 3), np.uint8) for _ in range(2)) for _ in range(NUM_TICKS)]
+    return TrainingEpisode(
+        instruction="press the button, then pick",
+        demo=(),
+        frames=views,
+        state_T8=rng.uniform(-0.2, 0.2, (NUM_TICKS, 8)).astype(np.float32),
+        action_T8=rng.uniform(-0.2, 0.2, (NUM_TICKS, 8)).astype(np.float32),
+        subgoals=["press at <5, 5>"] * 30 + ["pick at <10, 20>"] * 30 + ["pick at <30, 40>"] * 30,
+        is_transition_T=np.isin(np.arange(NUM_TICKS), CHANGES),
+    )
+
+
+def example(*, is_grounded: bool = True) -> Example:
+    config = ExampleConfig(clocks=EVALUATION, is_grounded=is_grounded)
+    return make_example(episode(), PONDER.format, config, np.random.default_rng(0))
+
+
+def test_it_is_what_ponder_wrote_at_the_last_transition() -> None:
+    """At one query a second: the text of tick 60 is new words for the old subgoal, which nobody writes."""
+    schedule = sample_schedule(np.random.default_rng(0), EVALUATION, NUM_TICKS, transition_ticks=frozenset(CHANGES))
+    said = said_by_query(episode(), schedule)
+    written = {query.tick: text for query, text in zip(schedule.queries, said, strict=True)}
+    first, second = "press at [20, 20]", "pick at [78, 39]"
+    assert [text for _, text in sorted(written.items())] == [first, first, second, second, second]
+
+
+def test_training_reads_the_subgoal_of_the_query_it_refers_to() -> None:
+    seen = example()
+    _, batch = collate([seen], POUNCE, TOKENIZER, STATISTICS)
+    for place, asked in enumerate(seen.invocations):
+        assert asked.reference.query is not None
+        request = Request(
+            frames=seen.episode.frames[asked.tick],
+            proprio=seen.episode.state_T8[asked.tick],
+            instruction=seen.episode.instruction,
+            cognition=None,
+            age_ns=0,
+            seed=0,
+            subgoal=seen.said[asked.reference.query],
+        )
+        served = pi05_inputs(request, POUNCE, TOKENIZER, STATISTICS, CPU)
+        told = served.token_ids.shape[1]
+        assert torch.equal(batch.inputs.token_ids[place, :told], served.token_ids[0])
+        assert "Subgoal: p" in TOKENIZER._pieces.decode(served.token_ids[0].tolist())
+    assert len({tuple(ids.tolist()) for ids in batch.inputs.token_ids}) > 1
+
+
+@pytest.mark.parametrize("family", ["pi05", "groot"])
+def test_without_a_subgoal_the_prompt_is_the_ordinary_one(family: str) -> None:
+    request = replace(example_request(EagerEngine(random_bundle(POUNCE, seed=0)).spec), subgoal="pick")
+    tokens: dict[tuple[bool, bool], Any] = {}
+    for reads in (True, False):
+        for is_told in (True, False):
+            asked = request if is_told else replace(request, subgoal="")
+            if family == "pi05":
+                config = replace(POUNCE, reads_subgoal=reads)
+                tokens[reads, is_told] = pi05_inputs(asked, config, TOKENIZER, STATISTICS, CPU).token_ids
+            else:
+                groot = replace(tiny_groot(num_carriers=0), reads_subgoal=reads)
+                eagle = tiny_eagle_tokenizer_for_random_weights()
+                tokens[reads, is_told] = groot_inputs(asked, groot, eagle, STATISTICS, CPU).token_ids
+    assert torch.equal(tokens[True, False], tokens[False, False])
+    assert torch.equal(tokens[False, True], tokens[False, False])
+    assert tokens[True, True].shape[1] > tokens[True, False].shape[1]
+
+
+def test_without_grounding_there_is_nothing_to_read() -> None:
+    assert set(example(is_grounded=False).said) == {""}
+
+
+def test_actions_teach_ponder_nothing_through_text_and_words_do() -> None:
+    model = JointModel(PONDER, random_pounce(POUNCE, 0))
+    episodes, batch = collate([example()], POUNCE, TOKENIZER, STATISTICS)
+    draws = Draws.draw(batch, lambda n, g: torch.rand(n, generator=g), 0.0, [torch.Generator().manual_seed(0)])
+    loss = model(episodes, batch, draws)
+    weights = [parameter for parameter in model.ponder.parameters() if parameter.requires_grad]
+    by_actions = torch.autograd.grad(loss.flow_matching, weights, allow_unused=True, retain_graph=True)
+    by_words = torch.autograd.grad(loss.grounding, weights, allow_unused=True)
+    assert all(gradient is None or not gradient.any() for gradient in by_actions)
+    assert any(gradient is not None and gradient.any() for gradient in by_words)
+
+
+@pytest.mark.parametrize("config", [tiny_cpu(num_carriers=1), tiny_groot(num_carriers=1)])
+def test_text_beside_cognition_is_refused(config: Any) -> None:
+    with pytest.raises(ValueError, match="in place of cognition: expected num_carriers 0, came 1"):
+        replace(config, reads_subgoal=True)
+
+
+def test_an_engine_acts_on_the_text_and_another_refuses_it() -> None:
+    reader = EagerEngine(random_bundle(POUNCE, seed=0))
+    request = example_request(reader.spec)
+    rows = [reader.invoke(replace(request, subgoal=text)) for text in ("", "pick at [78, 39]", "press at [20, 20]")]
+    assert np.abs(rows[0] - rows[1]).max() > 1e-4
+    assert np.abs(rows[1] - rows[2]).max() > 1e-4
+    plain = EagerEngine(random_bundle(replace(POUNCE, reads_subgoal=False), seed=0))
+    with pytest.raises(ValueError, match="reads no subgoals, came 'pick'"):
+        plain.invoke(replace(request, subgoal="pick"))
+
+
+def test_the_servers_protocol_brings_no_text_and_says_so_before_motion(
+    new_rig: Any, episode_info: Any, robot_with: Any, paper: m.Schedule
+) -> None:
+    rig = new_rig(pounce_engine=EagerEngine(random_bundle(replace(POUNCE, pi05=tiny_cpu().pi05), seed=0)))
+    low, high, step = (np.full(8, value, np.float32) for value in (-3, 3, 0.2))
+    robot = robot_with(command_low=low, command_high=high, max_step=step, initial_command=0 * low, num_proprio=8)
+    reply = rig.open(episode_info(paper, robot=robot))
+    assert "reads PONDER's subgoals in place of cognition" in reply.error
