@@ -12,10 +12,16 @@ from typing import Literal, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from ponderpounce.models.action_space import ActionSpace
+from ponderpounce.models.arm import JOINT_HIGH_RAD, JOINT_LOW_RAD, NUM_ARM_JOINTS
+from protocol.messages import Robot
+
 DTypeName: TypeAlias = Literal["float32", "bfloat16"]
 
 Continuity: TypeAlias = Literal["none", "rtc", "trained"]
 """Whether a chunk continues the rows being played: not, pulled to them (`rtc`), or given them (`committed`)."""
+
+_LIMIT_SLACK_RAD = 1e-3  # limits travel as float32
 
 Progress: TypeAlias = Callable[[], None]
 """Called between flow steps, so that a heartbeat comes from the loop that works and not from a timer."""
@@ -46,6 +52,8 @@ class EngineSpec:
     has_fresh_prefix: bool
     """The cognition prefix is drawn, not trained: cognition moves the actions, but not with sense."""
     dtype: DTypeName
+    space: ActionSpace = "joint_delta"
+    """What the network answers in. Rows are absolute joint targets all the same; see `check_robot`."""
     continuity: Continuity = "none"
     max_committed_rows: int = 0
     """The most committed rows that the network was trained to be given; matters to continuity "trained" only."""
@@ -95,6 +103,28 @@ class PounceEngine(Protocol):
     def warm_up(self) -> list[int]:
         """Runs until times are steady, then returns the durations of at least 20 invocations, in ns."""
         ...
+
+
+def check_robot(robot: Robot, spec: EngineSpec) -> None:
+    """Raises ValueError, with the reason, if the engine cannot read this robot or its chunks are none for it.
+
+    Horizon and row size are the clock's to compare: it knows the schedule.
+    """
+    if robot.num_proprio != spec.proprio_dim:
+        raise ValueError(f"POUNCE reads {spec.proprio_dim} joint values, the robot has {robot.num_proprio}")
+    if len(robot.cameras) != spec.num_cameras:
+        names = ", ".join(robot.cameras) or "none"
+        raise ValueError(f"POUNCE sees through {spec.num_cameras} cameras, the robot has {len(robot.cameras)}: {names}")
+    if spec.space == "joint_delta":
+        return
+    low, high = robot.command_low[:NUM_ARM_JOINTS], robot.command_high[:NUM_ARM_JOINTS]
+    is_panda = len(low) == NUM_ARM_JOINTS and (low >= JOINT_LOW_RAD - _LIMIT_SLACK_RAD).all()
+    if not (is_panda and (high <= JOINT_HIGH_RAD + _LIMIT_SLACK_RAD).all()):
+        raise ValueError(
+            f"this checkpoint moves the tool ({spec.space}) and knows the Panda's arm only; {robot.name} has joint "
+            f"limits {np.round(low, 2).tolist()} to {np.round(high, 2).tolist()} rad beyond it. Load a joint_delta "
+            "checkpoint."
+        )
 
 
 def check_request(request: Request, spec: EngineSpec) -> None:

@@ -1,6 +1,6 @@
 """A POUNCE of either family as an action engine: requests in, a chunk of absolute joint targets out for each."""
 
-# B requests, N horizon, A padded action dim
+# B requests, N horizon, A padded action dim, D numbers of the action space
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ponderpounce.models import flow, rtc
+from ponderpounce.models.action_space import ROBOT_DIM
 from ponderpounce.models.committed import Committed
 from ponderpounce.models.flow import EulerStep
 from ponderpounce.models.groot_prompt import EagleTokenizer
@@ -65,12 +66,13 @@ class EagerEngine:
     ) -> None:
         config = bundle.model.config
         self._statistics = bundle.statistics
-        self._padded_action_dim = config.padded_action_dim
+        self._network_action_dim, self._padded_action_dim = config.robot_action_dim, config.padded_action_dim
         self._device = torch.device(device)
         self.spec = EngineSpec(
             horizon=config.horizon,
-            action_dim=config.robot_action_dim,
-            proprio_dim=bundle.statistics.state.num_dims,
+            action_dim=ROBOT_DIM,
+            proprio_dim=ROBOT_DIM,
+            space=bundle.statistics.space,
             num_carriers=config.cognition.num_carriers,
             cognition_size=config.cognition.cognition_size,
             image_px=config.image_px,
@@ -127,10 +129,10 @@ class EagerEngine:
         for moved, step in self._sample(requests, noise_BNA):
             actions_BNA[moved] = step.actions
             progress()
-        robot_actions_BN8 = actions_BNA[..., : self.spec.action_dim].cpu().numpy()
+        robot_actions_BND = actions_BNA[..., : self._network_action_dim].cpu().numpy()
         rows_BN8 = [
-            self._statistics.absolute_targets(actions_N8, request.proprio)
-            for actions_N8, request in zip(robot_actions_BN8, requests, strict=True)
+            self._statistics.absolute_targets(actions_ND, request.proprio)
+            for actions_ND, request in zip(robot_actions_BND, requests, strict=True)
         ]
         if self.spec.continuity != "trained":
             return rows_BN8

@@ -7,7 +7,7 @@ import time
 
 from clock.feasibility import delay_ticks
 from clock.membership import Membership, percentile_ns
-from pounce_server.contract import PounceEngine
+from pounce_server.contract import PounceEngine, check_robot
 from pounce_server.node import PounceNode, Work
 from protocol import images, topics
 from protocol import messages as m
@@ -112,10 +112,7 @@ class PounceServer:
 
     def _open(self, request: m.OpenRequest) -> m.Contract:
         spec = self._engine.spec
-        if request.info.robot.num_proprio != spec.proprio_dim:
-            raise ValueError(
-                f"POUNCE reads {spec.proprio_dim} joint values, the robot has {request.info.robot.num_proprio}"
-            )
+        check_robot(request.info.robot, spec)
         if spec.reads_subgoal:
             raise ValueError(
                 "this checkpoint reads PONDER's subgoals in place of cognition, and no message of the protocol brings "

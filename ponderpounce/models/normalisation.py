@@ -1,17 +1,17 @@
-"""Robot units to the network's [-1, 1] and back: quantiles, and arm actions as deltas from the current state."""
+"""Robot units to the network's [-1, 1] and back: an `action_space` and the quantiles of its numbers."""
 
-# N horizon, 8 = 7 arm joints (rad) + gripper
+# N horizon, 8 = 7 arm joints (rad) + gripper, D numbers of the space
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ponderpounce.models.action_space import ActionSpace, actions_in, num_dims, states_in, targets_from
+
 Floats = NDArray[np.float32]
 
 QUANTILE_EPS = 1e-6
-NUM_ARM_JOINTS = 7
-GRIPPER_MIN, GRIPPER_MAX = -1.0, 1.0  # closed, open
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,23 +50,41 @@ class Quantiles:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobotStatistics:
-    """Quantiles of the state, and of the action as the network learns it: arm deltas, absolute gripper."""
+    """What the network's numbers mean: in which space it reads states and answers, and the quantiles there.
+
+    Raises:
+        ValueError: no such space, or quantiles of another number of dims.
+    """
 
     state: Quantiles
     action: Quantiles
+    space: ActionSpace = "joint_delta"
+
+    def __post_init__(self) -> None:
+        expected = num_dims(self.space)
+        for name, table in (("state", self.state), ("action", self.action)):
+            if table.num_dims != expected:
+                raise ValueError(
+                    f"statistics in space {self.space!r} need {expected} {name} dims, came {table.num_dims}; "
+                    "collect them in that space (TrainingSet.statistics)"
+                )
+
+    def normalise_states(self, states_8: ArrayLike) -> Floats:
+        """The robot's states (..., 8) -> (..., D) as the network reads them."""
+        return self.state.normalise(states_in(self.space, states_8))
 
     def normalise_targets(self, targets_N8: ArrayLike, state_8: ArrayLike) -> Floats:
-        """Absolute joint targets -> the network's actions; all rows are relative to the one current state."""
-        actions_N8 = np.array(targets_N8, dtype=np.float64)
-        actions_N8[..., :NUM_ARM_JOINTS] -= np.asarray(state_8, dtype=np.float64)[:NUM_ARM_JOINTS]
-        return self.action.normalise(actions_N8)
+        """Absolute joint targets -> the network's actions (N, D); all rows are relative to the one current state."""
+        rows_1N = np.arange(len(np.asarray(targets_N8)))[None]
+        return self.normalise_chunks(targets_N8, np.asarray(state_8)[None], rows_1N)[0]
 
-    def absolute_targets(self, actions_N8: ArrayLike, state_8: ArrayLike) -> Floats:
-        """The network's actions -> absolute joint targets (rad) and gripper, clipped to [-1, 1]."""
-        rows_N8 = self.action.denormalise(actions_N8)
-        rows_N8[..., :NUM_ARM_JOINTS] += np.asarray(state_8, dtype=np.float32)[:NUM_ARM_JOINTS]
-        rows_N8[..., NUM_ARM_JOINTS] = rows_N8[..., NUM_ARM_JOINTS].clip(GRIPPER_MIN, GRIPPER_MAX)
-        return rows_N8
+    def normalise_chunks(self, targets_T8: ArrayLike, states_M8: ArrayLike, rows_MN: NDArray[np.integer]) -> Floats:
+        """`normalise_targets` of many chunks (M, N, D): chunk m starts at state m and commands ``targets[rows[m]]``."""
+        return self.action.normalise(actions_in(self.space, targets_T8, states_M8, rows_MN))
+
+    def absolute_targets(self, actions_ND: ArrayLike, state_8: ArrayLike) -> Floats:
+        """The network's actions (N, D) -> absolute joint targets (rad) and gripper, clipped to [-1, 1]: (N, 8)."""
+        return targets_from(self.space, self.action.denormalise(actions_ND), state_8).astype(np.float32)
 
 
 ROBOMME = RobotStatistics(

@@ -14,7 +14,7 @@ import torch
 from ponderpounce.models.config_json import from_json
 from ponderpounce.models.groot_folder import groot_config_of
 from ponderpounce.models.groot_prompt import EagleTokenizer, tiny_eagle_tokenizer_for_random_weights
-from ponderpounce.models.normalisation import ROBOMME, RobotStatistics
+from ponderpounce.models.normalisation import ROBOMME, Quantiles, RobotStatistics
 from ponderpounce.models.openpi_jax import METADATA_FILE, load_jax_weights
 from ponderpounce.models.pounce import Pounce, PounceConfig
 from ponderpounce.models.pounce_configs import groot_n1_5, pi05_base
@@ -97,15 +97,14 @@ class PounceBundle:
                 raise ValueError(
                     f"the tokenizer's image token is {self.tokenizer.image_token_id}, the model's {image_token_id}"
                 )
-            if self.statistics.state.num_dims != config.robot_state_dim:
-                raise ValueError(
-                    f"statistics describe {self.statistics.state.num_dims} state dims, "
-                    f"the config {config.robot_state_dim}"
-                )
-        if self.statistics.action.num_dims != config.robot_action_dim:
+            self._check_dims("state", self.statistics.state, config.robot_state_dim)
+        self._check_dims("action", self.statistics.action, config.robot_action_dim)
+
+    def _check_dims(self, what: str, table: Quantiles, expected: int) -> None:
+        if table.num_dims != expected:
             raise ValueError(
-                f"statistics describe {self.statistics.action.num_dims} action dims, "
-                f"the config {config.robot_action_dim}"
+                f"statistics describe {table.num_dims} {what} dims, the config {expected}; with their action space "
+                f"{self.statistics.space!r} its robot_{what}_dim must be {table.num_dims} (pounce_configs.in_space)"
             )
 
     def stored_config(self) -> AnyStoredConfig:
@@ -130,12 +129,13 @@ class PounceBundle:
         return digest.hexdigest()
 
 
-def random_bundle(config: AnyPounceConfig, seed: int) -> PounceBundle:
+def random_bundle(config: AnyPounceConfig, seed: int, *, statistics: RobotStatistics = ROBOMME) -> PounceBundle:
     """A bundle that needs no file: seeded random weights and a tiny tokenizer."""
     is_pi05 = isinstance(config, PounceConfig)
     return PounceBundle(
         model=random_model(config, seed),
         tokenizer=tiny_tokenizer_for_random_weights() if is_pi05 else tiny_eagle_tokenizer_for_random_weights(),
+        statistics=statistics,
         is_random=True,
         has_fresh_prefix=config.cognition.num_carriers > 0,
     )
@@ -150,31 +150,39 @@ def save_bundle(bundle: PounceBundle, folder: Path) -> None:
 
 
 def load_bundle(
-    folder: Path, *, config: AnyPounceConfig | None = None, tokenizer: Path | None = None, prefix_seed: int = 0
+    folder: Path,
+    *,
+    config: AnyPounceConfig | None = None,
+    statistics: RobotStatistics | None = None,
+    tokenizer: Path | None = None,
+    prefix_seed: int = 0,
 ) -> PounceBundle:
-    """Reads our own folder, or a public one, which acts with RoboMME's statistics.
+    """Reads our own folder, or a public one, which acts with RoboMME's statistics unless others are given.
 
     Public folders: openpi's pi0.5 (PyTorch, or JAX in ``params/``) and lerobot's; NVIDIA's GR00T N1.5, in shards or
     not, and lerobot's ``groot``.
 
     Args:
         config: for a public folder; default `pi05_base()`, or for GR00T what the folder itself says.
+        statistics: for a public folder; ``config`` must be in their action space.
         tokenizer: its file; default the folder's tokenizer.model (pi0.5) or tokenizer.json (GR00T).
         prefix_seed: draws the cognition prefix where the folder has none.
 
     Raises:
         FileNotFoundError: no weights, or no tokenizer anywhere.
         WeightsError: the tensors do not fit the configuration.
-        ValueError: our config.json does not parse, or ``config`` is given although the folder has its own.
+        ValueError: our config.json does not parse, or ``config`` or ``statistics`` is given although the folder has
+            its own.
     """
     is_jax = (folder / JAX_FOLDER / METADATA_FILE).is_file()
     if not is_jax:
         weights_files(folder / WEIGHTS_FILE)  # a folder without any is told so before anything else of it is judged
     stored = _read_config(folder / CONFIG_FILE)
     if stored is not None:
-        if config is not None:
-            raise ValueError(f"checkpoint {folder} has its own {CONFIG_FILE}; leave the config argument out")
-        config = stored.config
+        for name, given in (("config", config), ("statistics", statistics)):
+            if given is not None:
+                raise ValueError(f"checkpoint {folder} has its own {CONFIG_FILE}; leave the {name} argument out")
+        config, statistics = stored.config, stored.statistics
     model = blank_model(config or (pi05_base() if is_jax else _public_config(folder)))
     has_prefix = _load_jax(model, folder) if is_jax else load_weights(model, folder / WEIGHTS_FILE)
     if not has_prefix:
@@ -183,7 +191,7 @@ def load_bundle(
     return PounceBundle(
         model=model,
         tokenizer=_read_tokenizer(model.config, tokenizer or folder / _tokenizer_file(model.config)),
-        statistics=ROBOMME if stored is None else stored.statistics,
+        statistics=statistics or ROBOMME,
         is_random=stored is not None and stored.is_random,
         has_fresh_prefix=model.cognition_prefix is not None and not is_prefix_trained,
     )
@@ -225,6 +233,8 @@ def _read_config(path: Path) -> AnyStoredConfig | None:
     values = _json_of(path)
     if values is None or values.get("format") not in (FORMAT, GROOT_FORMAT):
         return None
+    if isinstance(values.get("statistics"), dict):
+        values["statistics"] = {"space": "joint_delta"} | values["statistics"]  # of a folder from before there were two
     if values["format"] == FORMAT:
         if isinstance(values.get("config"), dict):
             values["config"] = _LATER_FIELDS | values["config"]

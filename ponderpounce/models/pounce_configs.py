@@ -1,5 +1,9 @@
 """Named complete POUNCE configurations."""
 
+from dataclasses import replace
+from typing import TypeVar
+
+from ponderpounce.models.action_space import ActionSpace, num_dims
 from ponderpounce.models.eagle import EagleConfig
 from ponderpounce.models.gemma import GemmaConfig
 from ponderpounce.models.groot import GrootConfig
@@ -10,6 +14,8 @@ from ponderpounce.models.pounce import PounceConfig
 from ponderpounce.models.pounce_groot import GrootPounceConfig
 from ponderpounce.models.qwen3 import Qwen3Config
 from ponderpounce.models.siglip import VisionConfig
+
+Config = TypeVar("Config", bound=PounceConfig | GrootPounceConfig)
 
 ROBOMME_HORIZON = 20
 """One second of 20 Hz playback (paper B.1)."""
@@ -93,3 +99,10 @@ def tiny_groot(*, num_carriers: int = 1, cognition_size: int = 64, horizon: int 
         ),
         embodiment=1,
     )
+
+
+def in_space(config: Config, space: ActionSpace) -> Config:
+    """Returns the configuration for a network that answers in an action space; no weight has another shape."""
+    if isinstance(config, GrootPounceConfig):
+        return replace(config, robot_action_dim=num_dims(space), robot_state_dim=num_dims(space))
+    return replace(config, robot_action_dim=num_dims(space))

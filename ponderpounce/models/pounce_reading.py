@@ -56,7 +56,7 @@ def pi05_inputs(
         ValueError: the prompt is too long.
     """
     images, has_view = camera_batch(moment.frames, config.image_px)
-    state = statistics.state.normalise(moment.proprio)
+    state = statistics.normalise_states(moment.proprio)
     token_ids = tokenizer.encode(prompt.prompt_text(_told(moment, config.reads_subgoal), state))
     _check_length(len(token_ids), config.max_prompt_tokens, moment.instruction)
     return PounceInputs(
@@ -88,7 +88,7 @@ def groot_inputs(
     num_text = len(token_ids) - config.num_cameras * num_patches
     _check_length(num_text, config.max_prompt_tokens, moment.instruction)
     state = torch.zeros(1, config.groot.state_dim)
-    state[0, : config.robot_state_dim] = torch.from_numpy(statistics.state.normalise(moment.proprio))
+    state[0, : config.robot_state_dim] = torch.from_numpy(statistics.normalise_states(moment.proprio))
     return GrootInputs(
         images=images.to(device),
         token_ids=torch.tensor([token_ids], device=device),

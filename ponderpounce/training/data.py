@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from ponderpounce.data.dataset import Dataset
 from ponderpounce.data.episode import CAMERAS, Rows
 from ponderpounce.data.video import FPS
-from ponderpounce.models.normalisation import NUM_ARM_JOINTS, Quantiles, RobotStatistics
-from ponderpounce.training.example import Frame, TrainingEpisode
+from ponderpounce.models.action_space import ActionSpace, actions_in, num_dims, states_in
+from ponderpounce.models.normalisation import Quantiles, RobotStatistics
+from ponderpounce.training.example import Frame, TrainingEpisode, chunk_ticks
 
 _QUANTILES = (0.01, 0.99)
 _MIN_SPAN = 1e-3
@@ -89,8 +90,8 @@ class TrainingSet:
             reasoning=rows.demonstration_reasoning[start],
         )
 
-    def statistics(self, horizon: int) -> RobotStatistics:
-        """Quantiles of the states, and of the actions as the network learns them: relative to the chunk's first state.
+    def statistics(self, horizon: int, space: ActionSpace = "joint_delta") -> RobotStatistics:
+        """Quantiles of the states as the network reads them, and of the actions as it learns them in an `action_space`.
 
         Pooled over all rows of a chunk, as the released RoboMME statistics are.
         """
@@ -98,12 +99,12 @@ class TrainingSet:
         for entry in self._entries:
             rows = self._dataset.rows(entry.index)
             state, action = _own(rows, rows.state), _own(rows, rows.action)
-            states.append(state)
-            for offset in range(horizon):
-                relative = action[np.minimum(np.arange(len(action)) + offset, len(action) - 1)].copy()
-                relative[:, :NUM_ARM_JOINTS] -= state[:, :NUM_ARM_JOINTS]
-                actions.append(relative)
-        return RobotStatistics(state=_quantiles(np.concatenate(states)), action=_quantiles(np.concatenate(actions)))
+            chunks_TND = actions_in(space, action, state, chunk_ticks(np.arange(len(action)), horizon, len(action)))
+            states.append(states_in(space, state).astype(np.float32))
+            actions.append(chunks_TND.astype(np.float32).reshape(-1, num_dims(space)))
+        return RobotStatistics(
+            state=_quantiles(np.concatenate(states)), action=_quantiles(np.concatenate(actions)), space=space
+        )
 
 
 def _own(rows: Rows, column: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -13,7 +13,8 @@ from ponderpounce.models.interface import CognitionConfig
 from ponderpounce.models.normalisation import ROBOMME, Quantiles, RobotStatistics
 from ponderpounce.models.pi05_weights import WeightsError
 from ponderpounce.models.pounce_checkpoint import PounceBundle, load_bundle, random_bundle, save_bundle
-from ponderpounce.models.pounce_configs import tiny_cpu
+from ponderpounce.models.pounce_configs import in_space, tiny_cpu, tiny_groot
+from ponderpounce.models.pounce_family import AnyPounceConfig
 
 
 @pytest.fixture(scope="module")
@@ -167,3 +168,39 @@ def test_parts_that_do_not_fit_each_other_are_refused(bundle: PounceBundle) -> N
         random_bundle(replace(small.model.config, pi05=vocabulary), seed=0)
     with pytest.raises(ValueError, match="statistics describe 8 action dims, the config 7"):
         random_bundle(replace(small.model.config, robot_action_dim=7), seed=0)
+
+
+EE = RobotStatistics(
+    state=Quantiles(q01=(-1.0,) * 7, q99=(1.0,) * 7),
+    action=Quantiles(q01=(-0.1,) * 7, q99=(0.1,) * 7),
+    space="ee_delta",
+)
+
+
+@pytest.mark.parametrize("config", [tiny_cpu(), tiny_groot()], ids=["pi05", "groot"])
+def test_the_action_space_survives_its_folder(config: AnyPounceConfig, tmp_path: Path) -> None:
+    save_bundle(random_bundle(in_space(config, "ee_delta"), 0, statistics=EE), tmp_path)
+    assert load_bundle(tmp_path).statistics == EE
+
+
+def test_a_folder_from_before_there_were_spaces_moves_joints(bundle: PounceBundle, folder: Path) -> None:
+    stored = json.loads((folder / "config.json").read_text())
+    assert stored["statistics"].pop("space") == "joint_delta"
+    (folder / "config.json").write_text(json.dumps(stored))
+    assert load_bundle(folder).digest() == bundle.digest()
+
+
+def test_an_unknown_action_space_is_refused_by_name(folder: Path) -> None:
+    stored = json.loads((folder / "config.json").read_text())
+    stored["statistics"]["space"] = "ee_pose"
+    (folder / "config.json").write_text(json.dumps(stored))
+    with pytest.raises(ValueError, match=r"statistics\.space: expected 'joint_delta' or 'ee_delta', came 'ee_pose'"):
+        load_bundle(folder)
+
+
+@pytest.mark.parametrize("config", [tiny_cpu(), tiny_groot()], ids=["pi05", "groot"])
+def test_a_config_in_another_space_than_the_statistics_is_refused(config: AnyPounceConfig) -> None:
+    with pytest.raises(ValueError, match=r"statistics describe 7 \w+ dims, the config 8; with their action space 'ee_"):
+        random_bundle(config, 0, statistics=EE)
+    with pytest.raises(ValueError, match=r"statistics describe 8 \w+ dims, the config 7; with .*'joint_delta'"):
+        random_bundle(in_space(config, "ee_delta"), 0)

@@ -3,24 +3,37 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
-from typing import Any
+from dataclasses import replace
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 
 from clock.check import disagreements
+from ponderpounce.models.action_space import ActionSpace
+from ponderpounce.models.normalisation import Quantiles, RobotStatistics
 from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
 from ponderpounce.models.pounce_checkpoint import random_bundle, save_bundle
-from ponderpounce.models.pounce_configs import tiny_cpu, tiny_groot
+from ponderpounce.models.pounce_configs import in_space, tiny_cpu, tiny_groot
+from ponderpounce.tasks import panda
+from pounce_server.contract import EngineSpec, check_robot
 from pounce_server.engine import EagerEngine
 from protocol import messages as m
 from protocol.mcap_log import EpisodeRecord, read_log
 from sim_client.__main__ import main as sim_client
+from sim_client.robot import simulated_robot
 
 NUM_TICKS = 22  # two invocations of the paper's schedule
 FAMILIES = {"pi05": tiny_cpu, "groot": tiny_groot}
 K, H = 2, 8  # of the fake PONDER
+
+PANDA = simulated_robot(panda.PANDA_WRISTCAM, np.append(panda.HOME_QPOS, 0.04))
+SPEC = EngineSpec(
+    horizon=20, action_dim=8, proprio_dim=8, num_carriers=K, cognition_size=H, image_px=224, num_steps=10,
+    num_cameras=2, model_hash="", is_random=True, has_fresh_prefix=True, dtype="float32",
+)  # fmt: skip
 
 Info = Callable[..., m.EpisodeInfo]
 
@@ -92,3 +105,42 @@ def test_a_model_of_another_robot_or_schedule_is_refused_before_motion(
 def test_a_model_of_this_robot_and_schedule_is_not(opened: Callable[..., Any], paper: m.Schedule, family: str) -> None:
     _, reply = opened(family, paper, robot_dim=8)
     assert reply.error == ""
+
+
+MISFITS: dict[str, tuple[ActionSpace, dict[str, Any], str]] = {
+    "an arm of other limits": (
+        "ee_delta",
+        {"command_high": np.full(8, 3, np.float32)},
+        "this checkpoint moves the tool (ee_delta) and knows the Panda's arm only; panda_wristcam has joint limits",
+    ),
+    "an arm of fewer joints": ("ee_delta", {"command_low": np.full(4, -1, np.float32)}, "knows the Panda's arm only"),
+    "one camera": ("joint_delta", {"cameras": ("front",)}, "sees through 2 cameras, the robot has 1: front"),
+    "two fingers": ("ee_delta", {"num_proprio": 9}, "POUNCE reads 8 joint values, the robot has 9"),
+}
+
+
+@pytest.mark.parametrize(("space", "changes", "sentence"), MISFITS.values(), ids=MISFITS.keys())
+def test_a_robot_that_the_checkpoint_cannot_move_is_refused_with_the_reason(
+    space: ActionSpace, changes: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        check_robot(replace(PANDA, **changes), replace(SPEC, space=space))
+
+
+@pytest.mark.parametrize("space", get_args(ActionSpace))
+def test_the_panda_is_not(space: ActionSpace) -> None:
+    check_robot(PANDA, replace(SPEC, space=space))
+
+
+def test_an_arm_that_tool_deltas_do_not_fit_is_refused_at_the_door(
+    new_rig: Callable[..., Any], episode_info: Info, paper: m.Schedule
+) -> None:
+    table = Quantiles(q01=(-0.1,) * 7, q99=(0.1,) * 7)
+    statistics = RobotStatistics(state=table, action=table, space="ee_delta")
+    bundle = random_bundle(in_space(tiny_cpu(num_carriers=K, cognition_size=H), "ee_delta"), 0, statistics=statistics)
+    rig = new_rig(pounce_engine=EagerEngine(bundle))
+    small = replace(PANDA, image_height=4, image_width=4)  # what the rig's PONDER sees
+    other = replace(small, command_low=np.full(8, -4, np.float32))
+    assert "knows the Panda's arm only" in rig.open(episode_info(paper, robot=other)).error
+    assert rig.clock._episode is None
+    assert rig.open(episode_info(paper, robot=small)).error == ""
