@@ -27,11 +27,12 @@ from ponderpounce.models import ponder_configs
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.pounce import freeze
 from ponderpounce.models.pounce_checkpoint import PounceBundle, random_bundle
+from ponderpounce.models.pounce_configs import in_space
 from ponderpounce.models.pounce_family import action_loss, sample_times
-from ponderpounce.training.collate import collate
+from ponderpounce.training.collate import collate_ponder, collate_pounce
 from ponderpounce.training.example import TrainingEpisode, make_example
 from ponderpounce.training.joint import Draws, JointModel, PonderBatch, PounceBatch, encode_rows
-from ponderpounce.training.recipes import Recipe, recipe
+from ponderpounce.training.recipes import Recipe, recipe, stages_of
 from ponderpounce.training.trainer import Trainer
 
 
@@ -107,7 +108,8 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _build(options: ThroughputOptions) -> tuple[JointModel, PounceBundle, Recipe]:
-    run = recipe(options.recipe)
+    *_, run = stages_of(recipe(options.recipe))
+    run = replace(run, pounce=in_space(run.pounce, "joint_delta"))  # statistics of no data are RoboMME's
     if options.ponder != "recipe":
         ponder_config = getattr(ponder_configs, options.ponder)()
         cognition = replace(run.pounce.cognition, cognition_size=ponder_config.hidden_size)
@@ -136,7 +138,8 @@ def _batch(
     )
     form = model.ponder.format
     examples = [make_example(episode, form, run.example, rng) for _ in range(options.batch_episodes)]
-    episodes, invocations = collate(examples, bundle.model.config, bundle.tokenizer, bundle.statistics)
+    episodes = collate_ponder(examples)
+    invocations = collate_pounce(examples, bundle.model.config, bundle.tokenizer, bundle.statistics)
     return episodes.to(options.device), invocations.to(options.device)
 
 
@@ -155,7 +158,7 @@ def _pounce(model: JointModel, invocations: PounceBatch) -> None:
     generators = [torch.Generator().manual_seed(index) for index in range(int(invocations.episode_I.max()) + 1)]
     draws = Draws.draw(invocations, lambda n, generator: sample_times(pounce, n, generator), 0.0, generators)
     inputs = replace(invocations.inputs, cognition=cognition_IKH)
-    action_loss(pounce, inputs, invocations.actions_INA, draws.noise_INA, draws.time_I).backward()
+    action_loss(pounce, inputs, invocations.actions_INA, draws.noise_SNA, draws.time_S).backward()
     model.zero_grad(set_to_none=True)
 
 

@@ -23,7 +23,8 @@ def guide(
         first = request.previous_row0
         if request.previous_rows is None or first >= config.horizon:
             continue
-        rows_n8 = statistics.normalise_targets(request.previous_rows, request.proprio)[: config.horizon - first]
+        reached = request.previous_rows[: config.horizon - first]
+        rows_n8 = statistics.normalise_targets(reached, request.proprio, first_row=first)
         mask = rtc.soft_mask(config.horizon - first, len(rows_n8), min(request.committed_rows, len(rows_n8)))
         target_BNA[index, first : first + len(rows_n8), :dims] = torch.from_numpy(rows_n8)
         weight_BNA[index, first:, :dims] = mask[:, None]
@@ -46,9 +47,9 @@ def given(
         count = num_given(request, config.max_committed_rows)
         if count == 0 or request.previous_rows is None:
             continue
-        rows_n8 = statistics.normalise_targets(request.previous_rows, request.proprio)
         places = np.maximum(np.arange(count) - request.previous_row0, 0)
-        rows_BNA[index, :count, : config.robot_action_dim] = torch.from_numpy(rows_n8[places])
+        rows_n8 = statistics.normalise_targets(request.previous_rows[places], request.proprio)
+        rows_BNA[index, :count, : config.robot_action_dim] = torch.from_numpy(rows_n8)
         count_B[index] = count
     if not count_B.any():
         return None

@@ -36,6 +36,8 @@ def resize_with_pad(frame: NDArray[np.uint8], size_px: int) -> Tensor:
 
 def camera_batch(frames: Sequence[NDArray[np.uint8] | None], size_px: int) -> tuple[Tensor, Tensor]:
     """Returns one moment's views, (1, V, 3, px, px), and which cameras were not None, (1, V) bool."""
+    if not frames:
+        return torch.empty(1, 0, 3, size_px, size_px), torch.empty(1, 0, dtype=torch.bool)
     missing = torch.full((3, size_px, size_px), PADDING)
     views = [missing if frame is None else resize_with_pad(frame, size_px) for frame in frames]
     has_view = [frame is not None for frame in frames]

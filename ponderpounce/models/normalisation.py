@@ -59,6 +59,10 @@ class RobotStatistics:
     state: Quantiles
     action: Quantiles
     space: ActionSpace = "joint_delta"
+    reach: tuple[float, ...] = ()
+    """Of each row of a chunk, how far it moves compared with all of them; () takes all rows as one, as the released
+    RoboMME statistics do. The first rows move little: measured by the whole chunk's spread, what decides over a grasp
+    is lost in a flow's last bit of noise."""
 
     def __post_init__(self) -> None:
         expected = num_dims(self.space)
@@ -68,23 +72,42 @@ class RobotStatistics:
                     f"statistics in space {self.space!r} need {expected} {name} dims, came {table.num_dims}; "
                     "collect them in that space (TrainingSet.statistics)"
                 )
+        if any(each <= 0 for each in self.reach):
+            raise ValueError(f"a row's reach must be above 0, came {self.reach}")
 
     def normalise_states(self, states_8: ArrayLike) -> Floats:
         """The robot's states (..., 8) -> (..., D) as the network reads them."""
         return self.state.normalise(states_in(self.space, states_8))
 
-    def normalise_targets(self, targets_N8: ArrayLike, state_8: ArrayLike) -> Floats:
-        """Absolute joint targets -> the network's actions (N, D); all rows are relative to the one current state."""
-        rows_1N = np.arange(len(np.asarray(targets_N8)))[None]
-        return self.normalise_chunks(targets_N8, np.asarray(state_8)[None], rows_1N)[0]
+    def normalise_targets(self, targets_N8: ArrayLike, state_8: ArrayLike, *, first_row: int = 0) -> Floats:
+        """Absolute joint targets -> the network's actions (N, D); all rows are relative to the one current state.
 
-    def normalise_chunks(self, targets_T8: ArrayLike, states_M8: ArrayLike, rows_MN: NDArray[np.integer]) -> Floats:
+        ``first_row``: which row of its chunk the first target is.
+        """
+        rows_1N = np.arange(len(np.asarray(targets_N8)))[None]
+        return self.normalise_chunks(targets_N8, np.asarray(state_8)[None], rows_1N, first_row=first_row)[0]
+
+    def normalise_chunks(
+        self, targets_T8: ArrayLike, states_M8: ArrayLike, rows_MN: NDArray[np.integer], *, first_row: int = 0
+    ) -> Floats:
         """`normalise_targets` of many chunks (M, N, D): chunk m starts at state m and commands ``targets[rows[m]]``."""
-        return self.action.normalise(actions_in(self.space, targets_T8, states_M8, rows_MN))
+        actions_MND = actions_in(self.space, targets_T8, states_M8, rows_MN)
+        actions_MND[..., :-1] /= self._reach(actions_MND.shape[1], first_row)
+        return self.action.normalise(actions_MND)
 
     def absolute_targets(self, actions_ND: ArrayLike, state_8: ArrayLike) -> Floats:
         """The network's actions (N, D) -> absolute joint targets (rad) and gripper, clipped to [-1, 1]: (N, 8)."""
-        return targets_from(self.space, self.action.denormalise(actions_ND), state_8).astype(np.float32)
+        actions = self.action.denormalise(actions_ND)
+        actions[:, :-1] *= self._reach(len(actions), 0)
+        return targets_from(self.space, actions, state_8).astype(np.float32)
+
+    def _reach(self, num_rows: int, first_row: int) -> NDArray[np.float64]:
+        """(N, 1). Raises ValueError for a longer chunk than the statistics are of."""
+        if not self.reach:
+            return np.ones((num_rows, 1))
+        if first_row + num_rows > len(self.reach):
+            raise ValueError(f"statistics are of chunks of {len(self.reach)} rows, came {first_row + num_rows}")
+        return np.array(self.reach)[first_row : first_row + num_rows, None]
 
 
 ROBOMME = RobotStatistics(

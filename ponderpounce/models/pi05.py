@@ -136,6 +136,8 @@ class Pi05(nn.Module):
     def embed_images(self, images_BV3PP: Tensor) -> Tensor:
         """(B, V, 3, px, px) -> (B, V * patches, W). Not divided by sqrt(W), unlike stock PaliGemma."""
         batch_size, num_views = images_BV3PP.shape[:2]
+        if num_views == 0:
+            return images_BV3PP.new_zeros(batch_size, 0, self.config.language.width)
         features: Tensor = self.projector(self.vision(images_BV3PP.flatten(0, 1), self.stream_dtype))
         return features.reshape(batch_size, num_views * features.shape[1], -1)
 
@@ -147,17 +149,22 @@ class Pi05(nn.Module):
         is_token_BT: Tensor,
         *,
         cognition_BPW: Tensor | None = None,
+        state_B1W: Tensor | None = None,
         is_isolated: bool = False,
     ) -> Prefix:
-        """Assembles [P][views][text]. A missing camera keeps its slots but is neither seen nor counted.
+        """Assembles [P][views][text][state]. A missing camera keeps its slots but is neither seen nor counted.
 
-        ``cognition_BPW`` enters as it is: like image tokens and unlike text it is not multiplied by sqrt(W).
+        ``cognition_BPW`` and ``state_B1W`` enter as they are: like image tokens and unlike text they are not
+        multiplied by sqrt(W).
         """
-        image_embeds = self.embed_images(images_BV3PP)
+        image_embeds = self.embed_images(images_BV3PP)  # without any view, no tokens
         is_image = has_view_BV.repeat_interleave(self.config.vision.num_patches, dim=1)
         parts = [image_embeds, self.language.embed(token_ids_BT)]
         is_real = [is_image, is_token_BT]
         num_cognition = 0
+        if state_B1W is not None:
+            parts.append(state_B1W)
+            is_real.append(is_token_BT.new_ones(state_B1W.shape[:2]))
         if cognition_BPW is not None:
             num_cognition = cognition_BPW.shape[1]
             parts.insert(0, cognition_BPW)

@@ -39,6 +39,7 @@ _PREFIXES = (
     ("pi05.expert.", _EXPERT),
     ("pi05.", ""),  # action_in_proj, action_out_proj, time_mlp_in, time_mlp_out
     ("cognition_prefix.", COGNITION),
+    ("state_projector.", "state_proj."),  # pi0's name for it
 )
 
 

@@ -24,6 +24,7 @@ from ponderpounce.models.context import ContextFormat, Row
 from ponderpounce.models.gated_delta import GatedDelta
 from ponderpounce.models.ponder_configs import PonderConfig
 from ponderpounce.models.ponder_images import patchify
+from ponderpounce.models.ponder_vision import image_tokens
 from ponderpounce.models.vocabulary import Vocabulary
 
 FLOAT32_PARAMETERS = ("linear_attn.A_log", "linear_attn.norm.weight")
@@ -131,18 +132,15 @@ class Ponder(nn.Module):
     def image_features(self, frames_NHW3: Tensor) -> Tensor:
         """Vision tokens (N * tokens per image, H) of N frames (N, height, width, 3) uint8."""
         vision = self.qwen.config.vision_config
-        num_frames, height, width, _ = frames_NHW3.shape
+        _, height, width, _ = frames_NHW3.shape
         patches = patchify(
             frames_NHW3,
             patch_px=vision.patch_size,
             merge=vision.spatial_merge_size,
             temporal=vision.temporal_patch_size,
         )
-        grid_thw = [1, height // vision.patch_size, width // vision.patch_size]
-        features: Tensor = self.qwen.model.visual(
-            patches.to(self.dtype), grid_thw=torch.tensor([grid_thw] * num_frames, device=patches.device)
-        ).pooler_output
-        return features
+        grid = (height // vision.patch_size, width // vision.patch_size)
+        return image_tokens(self.qwen.model.visual, patches.to(self.dtype), grid)
 
     def embed(self, ids_T: Sequence[int], frames_NHW3: Tensor | None = None) -> Tensor:
         """Input embeddings (T, H): rows of the table, with the frames' vision tokens at the image positions.

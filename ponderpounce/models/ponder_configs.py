@@ -27,6 +27,8 @@ class PonderConfig:
     num_gdn_key_heads: int = 16
     num_gdn_value_heads: int
     gdn_head_dim: int = 128
+    full_attention_every: int = 4
+    """The last of so many layers attends, the others are GDN."""
     tied_embeddings: bool
     vocab_size: int = 248_320
     """Rows of the embedding table; a multiple of 128 beyond the tokenizer's last id."""
@@ -83,6 +85,7 @@ class PonderConfig:
                 "num_attention_heads": self.num_query_heads,
                 "num_key_value_heads": self.num_kv_heads,
                 "head_dim": self.head_dim,
+                "full_attention_interval": self.full_attention_every,
                 "linear_num_key_heads": self.num_gdn_key_heads,
                 "linear_num_value_heads": self.num_gdn_value_heads,
                 "linear_key_head_dim": self.gdn_head_dim,
@@ -135,11 +138,12 @@ def tiny_cpu() -> PonderConfig:
 
 
 def small() -> PonderConfig:
-    """1.9 M weights, to be trained from scratch on CPU cores: one eye on the workspace in the front camera."""
+    """1.2 M weights, to be trained from scratch on CPU cores: one eye on the workspace in the front camera."""
     return PonderConfig(
         hidden_size=128,
         ffn_size=256,
-        num_layers=8,
+        num_layers=4,
+        full_attention_every=2,
         num_query_heads=4,
         num_kv_heads=2,
         head_dim=32,

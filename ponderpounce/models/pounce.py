@@ -15,6 +15,7 @@ from ponderpounce.models.interface import CognitionConfig, CognitionPrefix, chec
 from ponderpounce.models.pi05 import Pi05, Pi05Config, Prefix, PrefixCache, StepTable
 
 Freeze = Literal["none", "vision", "vlm"]
+StateInput = Literal["prompt", "token"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -35,6 +36,8 @@ class PounceInputs:
     """(B, K, H) float32; None means null cognition everywhere, or K = 0"""
     is_null: Tensor | None = None
     """(B,) bool; samples of ``cognition`` to replace by the learned null"""
+    state: Tensor | None = None
+    """(B, S) float32, normalised; where the config's ``state_input`` is "token"."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,6 +53,12 @@ class PounceConfig:
     num_steps: int = 10
     """Euler steps per chunk."""
     max_prompt_tokens: int = 200
+    state_input: StateInput = "prompt"
+    """prompt: 256 bins written as digits, as pi0.5 does. token: one linear token of the numbers, as pi0 has in its
+    action stream; here it ends the prefix, so that its keys are computed once. A network that starts from nothing
+    would first have to learn to read digits."""
+    robot_state_dim: int = 8
+    """S, with ``state_input`` "token"; a prompt takes any."""
     max_committed_rows: int = 0
     """The most rows that training gives a chunk to continue (`committed`); 0: it was never trained to."""
     reads_subgoal: bool = False
@@ -85,7 +94,7 @@ class PounceConfig:
         """Fabricates a valid batch for tests and benchmarks: all views present, cognition 300 ms old."""
         generator = torch.Generator().manual_seed(seed)
         px = self.pi05.vision.image_px
-        cognition = self.cognition
+        cognition, has_token = self.cognition, self.state_input == "token"
         image_shape = (batch_size, self.num_cameras, 3, px, px)
         token_shape = (batch_size, num_tokens)
         cognition_BKH = torch.randn((batch_size, cognition.num_carriers, cognition.cognition_size), generator=generator)
@@ -96,6 +105,7 @@ class PounceConfig:
             is_token=torch.ones(token_shape, dtype=torch.bool),
             age_ns=torch.full((batch_size,), 300_000_000),
             cognition=cognition_BKH if cognition.num_carriers else None,
+            state=torch.rand(batch_size, self.robot_state_dim, generator=generator) * 2 - 1 if has_token else None,
         )
 
     def example_actions(self, batch_size: int, *, seed: int = 0) -> Tensor:
@@ -134,27 +144,39 @@ class Pounce(nn.Module):
         has_prefix = config.cognition.num_carriers > 0
         width = config.pi05.language.width
         self.cognition_prefix = CognitionPrefix(config.cognition, width) if has_prefix else None
+        has_token = config.state_input == "token"
+        self.state_projector = nn.Linear(config.robot_state_dim, width) if has_token else None
 
     @property
     def backbone(self) -> Backbone:
         return Backbone(vision=(self.pi05.vision, self.pi05.projector), language=self.pi05.language)
 
     def embed_prefix(self, inputs: PounceInputs) -> Prefix:
-        """Embeds [P][images][text]."""
+        """Embeds [P][images][text][state].
+
+        Raises:
+            ValueError: the state is missing where it is a token.
+        """
         cognition_BPW = None
         if self.cognition_prefix is not None:
             cognition_BPW = self.cognition_prefix(inputs.cognition, inputs.age_ns, inputs.is_null)
+        state_B1W = None
+        if self.state_projector is not None:
+            if inputs.state is None:
+                raise ValueError("state_input is 'token' and the inputs hold no state")
+            state_B1W = self.state_projector(inputs.state)[:, None]
         return self.pi05.embed_prefix(
             inputs.images,
             inputs.has_view,
             inputs.token_ids,
             inputs.is_token,
             cognition_BPW=cognition_BPW,
+            state_B1W=state_B1W,
             is_isolated=self.config.cognition.attention == "isolated",
         )
 
     def prefill(self, inputs: PounceInputs) -> PrefixCache:
-        """Embeds [P][images][text] and runs it through the language layers once."""
+        """Embeds [P][images][text][state] and runs it through the language layers once."""
         return self.pi05.prefill(self.embed_prefix(inputs))
 
     def loss(

@@ -18,6 +18,7 @@ def joined_pi05(inputs: Sequence[PounceInputs]) -> PounceInputs:
     """One batch of all. Shorter prompts are padded on the right: pi0.5 neither sees nor counts padding."""
     num_tokens = max(one.token_ids.shape[1] for one in inputs)
     cognition, is_null = _joined_cognition([one.cognition for one in inputs])
+    states = [one.state for one in inputs]
     return PounceInputs(
         images=torch.cat([one.images for one in inputs]),
         has_view=torch.cat([one.has_view for one in inputs]),
@@ -26,6 +27,7 @@ def joined_pi05(inputs: Sequence[PounceInputs]) -> PounceInputs:
         age_ns=torch.cat([one.age_ns for one in inputs]),
         cognition=cognition,
         is_null=is_null,
+        state=None if None in states else torch.cat([state for state in states if state is not None]),
     )
 
 

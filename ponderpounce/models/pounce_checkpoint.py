@@ -40,7 +40,7 @@ GROOT_FORMAT: Final = "ponderpounce.pounce-groot/1"
 CONFIG_FILE = "config.json"
 JAX_FOLDER = "params"
 WEIGHTS_FILE = "model.safetensors"
-_LATER_FIELDS = {"max_committed_rows": 0, "reads_subgoal": False}
+_LATER_FIELDS = {"max_committed_rows": 0, "reads_subgoal": False, "state_input": "prompt", "robot_state_dim": 8}
 """Of pi0.5's config: what it meant where a folder was written before there was such a field."""
 _LATER_GROOT_FIELDS = {"reads_subgoal": False}
 TOKENIZER_FILE = "tokenizer.model"
@@ -97,6 +97,7 @@ class PounceBundle:
                 raise ValueError(
                     f"the tokenizer's image token is {self.tokenizer.image_token_id}, the model's {image_token_id}"
                 )
+        if not isinstance(config, PounceConfig) or config.state_input == "token":
             self._check_dims("state", self.statistics.state, config.robot_state_dim)
         self._check_dims("action", self.statistics.action, config.robot_action_dim)
 
@@ -234,7 +235,7 @@ def _read_config(path: Path) -> AnyStoredConfig | None:
     if values is None or values.get("format") not in (FORMAT, GROOT_FORMAT):
         return None
     if isinstance(values.get("statistics"), dict):
-        values["statistics"] = {"space": "joint_delta"} | values["statistics"]  # of a folder from before there were two
+        values["statistics"] = {"space": "joint_delta", "reach": ()} | values["statistics"]  # of a folder from before there were two
     if values["format"] == FORMAT:
         if isinstance(values.get("config"), dict):
             values["config"] = _LATER_FIELDS | values["config"]

@@ -57,6 +57,24 @@ def tiny_cpu(*, num_carriers: int = 1, cognition_size: int = 64, horizon: int = 
     )
 
 
+def small(*, num_carriers: int = 1, cognition_size: int = 128, horizon: int = ROBOMME_HORIZON) -> PounceConfig:
+    """1.3 M weights, to be trained from scratch on CPU cores: end-effector deltas, small pictures, state as a token."""
+    config = PounceConfig(
+        pi05=Pi05Config(
+            vision=VisionConfig(width=96, depth=2, num_heads=3, mlp_width=192, patch_px=16, image_px=64),
+            language=GemmaConfig(width=128, depth=3, mlp_width=256, num_heads=4, head_dim=32),
+            expert=GemmaConfig(width=96, depth=3, mlp_width=256, num_heads=4, head_dim=32),
+            vocab_size=512,
+            action_dim=8,
+            horizon=horizon,
+        ),
+        cognition=CognitionConfig(num_carriers=num_carriers, cognition_size=cognition_size),
+        state_input="token",
+        num_steps=4,
+    )
+    return in_space(config, "ee_delta")
+
+
 def groot_n1_5(*, num_carriers: int = 1, cognition_size: int = 4096, horizon: int = GROOT_HORIZON) -> GrootPounceConfig:
     """The public GR00T N1.5 (2.72 B with its unused LM head) with a prefix from a 9B PONDER."""
     return GrootPounceConfig(
@@ -103,6 +121,4 @@ def tiny_groot(*, num_carriers: int = 1, cognition_size: int = 64, horizon: int 
 
 def in_space(config: Config, space: ActionSpace) -> Config:
     """Returns the configuration for a network that answers in an action space; no weight has another shape."""
-    if isinstance(config, GrootPounceConfig):
-        return replace(config, robot_action_dim=num_dims(space), robot_state_dim=num_dims(space))
-    return replace(config, robot_action_dim=num_dims(space))
+    return replace(config, robot_action_dim=num_dims(space), robot_state_dim=num_dims(space))

@@ -3,6 +3,7 @@
 # P image side in px
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -57,7 +58,9 @@ def pi05_inputs(
     """
     images, has_view = camera_batch(moment.frames, config.image_px)
     state = statistics.normalise_states(moment.proprio)
-    token_ids = tokenizer.encode(prompt.prompt_text(_told(moment, config.reads_subgoal), state))
+    has_token = config.state_input == "token"
+    text = prompt.stateless_prompt_text if has_token else partial(prompt.prompt_text, state=state)
+    token_ids = tokenizer.encode(text(_told(moment, config.reads_subgoal)))
     _check_length(len(token_ids), config.max_prompt_tokens, moment.instruction)
     return PounceInputs(
         images=images.to(device),
@@ -66,6 +69,7 @@ def pi05_inputs(
         is_token=torch.ones(1, len(token_ids), dtype=torch.bool, device=device),
         age_ns=torch.tensor([moment.age_ns], device=device),
         cognition=_cognition(moment, device),
+        state=torch.from_numpy(state)[None].to(device) if has_token else None,
     )
 
 

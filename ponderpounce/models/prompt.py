@@ -40,8 +40,17 @@ def state_bins(state: ArrayLike) -> list[int]:
 
 def prompt_text(instruction: str, state: ArrayLike) -> str:
     """Returns pi0.5's prompt for an instruction and a normalised, unpadded state."""
-    text = instruction.strip().replace("_", " ").replace("\n", " ")
+    text = _cleaned(instruction)
     return f"Task: {text}, State: {' '.join(map(str, state_bins(state)))};\nAction: "
+
+
+def stateless_prompt_text(instruction: str) -> str:
+    """Returns the prompt of a network that is given its state as numbers: pi0's, the instruction and a line's end."""
+    return _cleaned(instruction) + "\n"
+
+
+def _cleaned(instruction: str) -> str:
+    return instruction.strip().replace("_", " ").replace("\n", " ")
 
 
 def with_subgoal(instruction: str, subgoal: str) -> str:

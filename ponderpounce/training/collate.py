@@ -35,6 +35,7 @@ class _Asked:
     """Of its example in the batch."""
     example: Example
     invocation: SampledInvocation
+    is_blind: bool
 
     @property
     def instruction(self) -> str:
@@ -42,7 +43,7 @@ class _Asked:
 
     @property
     def frames(self) -> tuple[Frame, ...]:
-        return self.example.episode.frames[self.invocation.tick]
+        return () if self.is_blind else self.example.episode.frames[self.invocation.tick]
 
     @property
     def proprio(self) -> Floats:
@@ -62,10 +63,24 @@ class _Asked:
         return "" if query is None else self.example.said[query]
 
 
-def collate(
-    examples: Sequence[Example], config: AnyPounceConfig, tokenizer: AnyTokenizer, statistics: RobotStatistics
-) -> tuple[PonderBatch, PounceBatch]:
-    """Examples as the joint model takes them.
+def collate_ponder(examples: Sequence[Example], *, with_rows: bool = True, stand_in_size: int = 0) -> PonderBatch:
+    """PONDER's side: rows and pictures, stand-ins of ``stand_in_size`` numbers; what is not asked is not made."""
+    return PonderBatch(
+        rows=tuple(each.row() for each in examples) if with_rows else (),
+        frames=tuple(each.frames() for each in examples) if with_rows else (),
+        stand_ins=tuple(each.stand_ins(stand_in_size) for each in examples) if stand_in_size else (),
+    )
+
+
+def collate_pounce(
+    examples: Sequence[Example],
+    config: AnyPounceConfig,
+    tokenizer: AnyTokenizer,
+    statistics: RobotStatistics,
+    *,
+    is_blind: bool = False,
+) -> PounceBatch:
+    """POUNCE's side. ``is_blind`` leaves the pictures out, as if no camera had delivered; pi0.5 only.
 
     Prompts of unequal length are padded: on the right and masked for pi0.5. GR00T is padded on the left, as in its
     public data path; its mixer attends to the pads, which serving, one moment at a time, never has.
@@ -73,7 +88,11 @@ def collate(
     Raises:
         ValueError: a prompt is longer than ``max_prompt_tokens``, or the tokenizer is another family's.
     """
-    moments = [_Asked(index=n, example=e, invocation=i) for n, e in enumerate(examples) for i in e.invocations]
+    moments = [
+        _Asked(index=n, example=e, invocation=i, is_blind=is_blind)
+        for n, e in enumerate(examples)
+        for i in e.invocations
+    ]
     inputs: PounceInputs | GrootInputs
     if isinstance(config, PounceConfig) and isinstance(tokenizer, Tokenizer):
         inputs = joined_pi05([pi05_inputs(moment, config, tokenizer, statistics, _CPU) for moment in moments])
@@ -88,7 +107,7 @@ def collate(
         wanted = torch.from_numpy(statistics.normalise_targets(rows, moment.proprio))
         actions_INA[place, :, : config.robot_action_dim] = wanted
     queries = [moment.invocation.reference.query for moment in moments]
-    return PonderBatch(rows=tuple(e.row for e in examples), frames=tuple(e.frames for e in examples)), PounceBatch(
+    return PounceBatch(
         inputs=inputs,
         actions_INA=actions_INA,
         episode_I=torch.tensor([moment.index for moment in moments]),

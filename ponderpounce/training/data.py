@@ -15,9 +15,11 @@ from ponderpounce.data.episode import CAMERAS, Rows
 from ponderpounce.data.video import FPS
 from ponderpounce.models.action_space import ActionSpace, actions_in, num_dims, states_in
 from ponderpounce.models.normalisation import Quantiles, RobotStatistics
+from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.training.example import Frame, TrainingEpisode, chunk_ticks
 
 _QUANTILES = (0.01, 0.99)
+_MIN_REACH = 1e-3
 _MIN_SPAN = 1e-3
 """A dimension that hardly moves is not blown up to fill [-1, 1]."""
 
@@ -59,6 +61,15 @@ class TrainingSet:
             digest.update(self._dataset.rows(entry.index).action.tobytes())
         return digest.hexdigest()
 
+    def texts(self) -> list[str]:
+        """All that PONDER reads or says in these episodes, each text once, in order."""
+        found = set()
+        for entry in self._entries:
+            rows = self._dataset.rows(entry.index)
+            said = {*rows.grounded_subgoal, *rows.demonstration_reasoning} - {""}
+            found |= {entry.instruction, *(normalised_text(text) for text in said)}
+        return sorted(found)
+
     def __getitem__(self, number: int) -> TrainingEpisode:
         if number in self._cache:
             self._cache.move_to_end(number)
@@ -90,10 +101,11 @@ class TrainingSet:
             reasoning=rows.demonstration_reasoning[start],
         )
 
-    def statistics(self, horizon: int, space: ActionSpace = "joint_delta") -> RobotStatistics:
+    def statistics(self, horizon: int, space: ActionSpace = "joint_delta", *, by_row: bool = False) -> RobotStatistics:
         """Quantiles of the states as the network reads them, and of the actions as it learns them in an `action_space`.
 
-        Pooled over all rows of a chunk, as the released RoboMME statistics are.
+        All rows of a chunk are pooled, as the released RoboMME statistics are; ``by_row`` first brings every row to
+        the same spread (`RobotStatistics.reach`).
         """
         states, actions = [], []
         for entry in self._entries:
@@ -101,10 +113,23 @@ class TrainingSet:
             state, action = _own(rows, rows.state), _own(rows, rows.action)
             chunks_TND = actions_in(space, action, state, chunk_ticks(np.arange(len(action)), horizon, len(action)))
             states.append(states_in(space, state).astype(np.float32))
-            actions.append(chunks_TND.astype(np.float32).reshape(-1, num_dims(space)))
+            actions.append(chunks_TND.astype(np.float32))
+        actions_MND = np.concatenate(actions)
+        reach_N = _reach(actions_MND[..., :-1]) if by_row else np.ones(horizon)
+        actions_MND[..., :-1] /= reach_N[:, None]
         return RobotStatistics(
-            state=_quantiles(np.concatenate(states)), action=_quantiles(np.concatenate(actions)), space=space
+            state=_quantiles(np.concatenate(states)),
+            action=_quantiles(actions_MND.reshape(-1, num_dims(space))),
+            space=space,
+            reach=tuple(reach_N.tolist()) if by_row else (),
         )
+
+
+def _reach(moves_MND: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Each row's rms move over that of all rows, dims weighed alike; never 0."""
+    squares_ND = np.square(moves_MND, dtype=np.float64).mean(axis=0)
+    share_N: NDArray[np.float64] = np.sqrt((squares_ND / squares_ND.mean(axis=0).clip(_MIN_SPAN**2)).mean(axis=1))
+    return share_N.clip(_MIN_REACH)
 
 
 def _own(rows: Rows, column: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -18,6 +18,7 @@ from clock.sampling import Clocks, SampledInvocation, SampledSchedule, sample_sc
 from ponderpounce.models.context import ContextFormat, Row, Transition
 from ponderpounce.models.eyes import see
 from ponderpounce.models.ponder_coordinates import normalised_text
+from ponderpounce.training.stand_in import stand_in
 
 Frame = NDArray[np.uint8]  # (height, width, 3) RGB
 
@@ -70,19 +71,49 @@ class ExampleConfig:
     """Of those that the schedule has, so many are drawn: they cost most."""
     is_grounded: bool = True
     """False: texts are left out of the row, as in RoboCasa-DC."""
+    text_dropout: float = 0.0
+    """Share of rows without their texts although they have some: cognition must then come from what was seen."""
+
+    max_queries: int | None = None
+    """The row ends after so many queries, and with it the invocations; None: with the episode. Most of what is to be
+    seen is seen early."""
+
+    def __post_init__(self) -> None:
+        if self.max_queries is not None and self.max_queries < 1:
+            raise ValueError(f"max_queries must be at least 1, came {self.max_queries}")
+        if not 0 <= self.text_dropout <= 1:
+            raise ValueError(f"text_dropout must be in [0, 1], came {self.text_dropout}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Example:
-    """An episode under a schedule."""
+    """An episode under a schedule. What a stage does not read is not made."""
 
-    row: Row
-    frames: Tensor
-    """(num_images, height, width, 3) uint8"""
-    invocations: tuple[SampledInvocation, ...]
     episode: TrainingEpisode
-    said: tuple[str, ...]
-    """Per query, the subgoal that PONDER had last written by then; empty texts without grounding."""
+    form: ContextFormat
+    schedule: SampledSchedule
+    invocations: tuple[SampledInvocation, ...]
+    """Those of the schedule that were drawn."""
+    is_grounded: bool
+
+    def row(self) -> Row:
+        """PONDER's tokens."""
+        return episode_row(self.episode, self.form, self.schedule, is_grounded=self.is_grounded)
+
+    def frames(self) -> Tensor:
+        """PONDER's pictures, (num_images, height, width, 3) uint8."""
+        return row_frames(self.episode, self.form, self.schedule)
+
+    @property
+    def said(self) -> tuple[str, ...]:
+        """Per query, the subgoal that PONDER had last written by then; empty texts without grounding."""
+        queries = self.schedule.queries
+        return said_by_query(self.episode, self.schedule) if self.is_grounded else ("",) * len(queries)
+
+    def stand_ins(self, size: int) -> Tensor:
+        """`stand_in` of the subgoal in force at every query, (Q, size)."""
+        texts = [self.episode.subgoals[query.tick] for query in self.schedule.queries]
+        return torch.from_numpy(np.stack([stand_in(text, size) for text in texts]))
 
 
 def make_example(
@@ -90,14 +121,26 @@ def make_example(
 ) -> Example:
     """Draws a schedule and lays the episode out under it."""
     schedule = sample_schedule(rng, config.clocks, episode.num_ticks, transition_ticks=episode.transition_ticks)
+    schedule = _shortened(schedule, config.max_queries)
     count = min(config.max_invocations, len(schedule.invocations))
     chosen = np.sort(rng.choice(len(schedule.invocations), size=count, replace=False))
     return Example(
-        row=episode_row(episode, form, schedule, is_grounded=config.is_grounded),
-        frames=row_frames(episode, form, schedule),
-        invocations=tuple(schedule.invocations[index] for index in chosen),
         episode=episode,
-        said=said_by_query(episode, schedule) if config.is_grounded else ("",) * len(schedule.queries),
+        form=form,
+        schedule=schedule,
+        invocations=tuple(schedule.invocations[index] for index in chosen),
+        is_grounded=config.is_grounded and rng.random() >= config.text_dropout,
+    )
+
+
+def _shortened(schedule: SampledSchedule, max_queries: int | None) -> SampledSchedule:
+    """Only the first queries, and the invocations before the next one."""
+    if max_queries is None or max_queries >= len(schedule.queries):
+        return schedule
+    end = schedule.queries[max_queries].tick
+    return SampledSchedule(
+        queries=schedule.queries[:max_queries],
+        invocations=tuple(each for each in schedule.invocations if each.tick < end),
     )
 
 
@@ -144,5 +187,5 @@ def target_rows(episode: TrainingEpisode, tick: int, horizon: int) -> NDArray[np
 
 
 def chunk_ticks(first_M: NDArray[np.integer], horizon: int, num_ticks: int) -> NDArray[np.intp]:
-    """Whose commands the rows of chunks play, (M, horizon), for `RobotStatistics.normalise_chunks`: see `target_rows`."""
+    """Whose commands the rows of chunks play, (M, horizon), for `normalise_chunks`: see `target_rows`."""
     return np.minimum(first_M[:, None] + np.arange(horizon), num_ticks - 1)

@@ -3,16 +3,21 @@
 PONDER reads every episode as one causal row, all queries in one pass. Every POUNCE invocation takes the cognition that
 the schedule referred it to, so many invocations share one; their action loss reaches PONDER only through it, scaled
 (A.3). The LM head runs only where a token is supervised.
+
+What stands in for pretraining, where networks start from nothing, runs through the same graph with one system left out:
+POUNCE alone acts from the stand-in cognition (``stand_in``), PONDER alone learns its words and, by an auxiliary loss
+w3 L_align that is off otherwise, to carry the stand-in.
 """
 
 # B episodes, T tokens, H hidden, Q queries, I invocations of all episodes, K carriers, N horizon, A padded action dim
+# S flow samples: every invocation once, or the whole list of them several times over
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import pairwise
-from typing import Any, NamedTuple
+from itertools import accumulate
+from typing import Any, Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -25,6 +30,9 @@ from ponderpounce.models.pounce import PounceInputs
 from ponderpounce.models.pounce_family import AnyPounce, action_loss
 from ponderpounce.models.pounce_groot import GrootInputs
 
+Trains = Literal["both", "ponder", "pounce"]
+"""Which systems a stage trains. The other one is not even run."""
+
 SampleTimes = Callable[[int, torch.Generator], Tensor]
 """Draws so many flow times."""
 
@@ -34,18 +42,31 @@ NO_QUERY = -1
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PonderBatch:
-    """What PONDER reads of B episodes."""
+    """What PONDER reads of B episodes, or what stands in for it."""
 
-    rows: tuple[Row, ...]
-    frames: tuple[Tensor | None, ...]
+    rows: tuple[Row, ...] = ()
+    """() in a stage without PONDER."""
+    frames: tuple[Tensor | None, ...] = ()
     """Per row, (num_images, height, width, 3) uint8 in the order of its image positions; None without images."""
+    stand_ins: tuple[Tensor, ...] = ()
+    """Per row, (its queries, H): `stand_in` of the subgoal in force; () where no stage asks for them."""
 
     def __post_init__(self) -> None:
         if len(self.rows) != len(self.frames):
             raise ValueError(f"{len(self.rows)} rows, frames for {len(self.frames)}")
+        if self.stand_ins and self.rows and len(self.stand_ins) != len(self.rows):
+            raise ValueError(f"{len(self.rows)} rows, stand-ins for {len(self.stand_ins)}")
+
+    @property
+    def num_episodes(self) -> int:
+        return len(self.rows or self.stand_ins)
 
     def to(self, device: torch.device | str) -> PonderBatch:
-        return replace(self, frames=tuple(None if f is None else f.to(device) for f in self.frames))
+        return replace(
+            self,
+            frames=tuple(None if f is None else f.to(device) for f in self.frames),
+            stand_ins=tuple(each.to(device) for each in self.stand_ins),
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -78,18 +99,18 @@ class PounceBatch:
 class Draws:
     """The chance in one step, drawn by one generator: a step repeats exactly, whatever ran before it."""
 
-    noise_INA: Tensor
-    time_I: Tensor
+    noise_SNA: Tensor
+    time_S: Tensor
     is_dropped_I: Tensor
     """bool: cognition dropout."""
-    num_committed_I: Tensor | None = None
+    num_committed_S: Tensor | None = None
     """int64: how many rows each chunk is given to continue; None: POUNCE does not learn to."""
 
     @property
     def num_counted_rows(self) -> int:
         """Rows under the action loss."""
-        num_committed = 0 if self.num_committed_I is None else int(self.num_committed_I.sum())
-        return self.noise_INA.shape[0] * self.noise_INA.shape[1] - num_committed
+        num_committed = 0 if self.num_committed_S is None else int(self.num_committed_S.sum())
+        return self.noise_SNA.shape[0] * self.noise_SNA.shape[1] - num_committed
 
     @classmethod
     def draw(
@@ -99,25 +120,32 @@ class Draws:
         dropout: float,
         generators: Sequence[torch.Generator],
         *,
+        num_samples: int = 1,
         max_committed_rows: int = 0,
     ) -> Draws:
-        """One CPU generator for each episode: what is drawn for it depends on no other, nor on the device."""
+        """One CPU generator for each episode: what is drawn for it depends on no other, nor on the device.
+
+        ``num_samples`` flow samples of each invocation share what POUNCE reads, which is then computed once.
+        """
         count, episode_I = len(batch.actions_INA), batch.episode_I.cpu()
-        noise_INA, time_I, chance_I = torch.empty(batch.actions_INA.shape), torch.empty(count), torch.empty(count)
-        committed_I = torch.zeros(count, dtype=torch.int64)
+        noise_DINA = torch.empty(num_samples, *batch.actions_INA.shape)
+        time_DI, chance_I = torch.empty(num_samples, count), torch.empty(count)
+        committed_DI = torch.zeros(num_samples, count, dtype=torch.int64)
         for episode, generator in enumerate(generators):
             (mine,) = torch.where(episode_I == episode)
-            noise_INA[mine] = torch.randn(len(mine), *noise_INA.shape[1:], generator=generator)
-            time_I[mine] = times(len(mine), generator)
+            for sample in range(num_samples):
+                noise_DINA[sample, mine] = torch.randn(len(mine), *noise_DINA.shape[2:], generator=generator)
+                time_DI[sample, mine] = times(len(mine), generator)
             chance_I[mine] = torch.rand(len(mine), generator=generator)
             if max_committed_rows:
-                committed_I[mine] = draw_counts(len(mine), max_committed_rows, generator)
+                for sample in range(num_samples):
+                    committed_DI[sample, mine] = draw_counts(len(mine), max_committed_rows, generator)
         device = batch.actions_INA.device
         return cls(
-            noise_INA=noise_INA.to(device),
-            time_I=time_I.to(device),
+            noise_SNA=noise_DINA.flatten(0, 1).to(device),
+            time_S=time_DI.flatten().to(device),
             is_dropped_I=(chance_I < dropout).to(device),
-            num_committed_I=committed_I.to(device) if max_committed_rows else None,
+            num_committed_S=committed_DI.flatten().to(device) if max_committed_rows else None,
         )
 
 
@@ -127,12 +155,16 @@ class JointLoss(NamedTuple):
     total: Tensor
     flow_matching: Tensor
     grounding: Tensor
+    alignment: Tensor
+    """Mean squared distance of C from the stand-ins; 0 unless w3 is set."""
     said_N: Tensor
     """int64: at every token under the LM head's cross-entropy, row after row, the likeliest one instead."""
     num_null: int
     """Invocations that saw the null cognition."""
     num_rows: int
     """Rows of chunks that flow matching is the mean over: those that were not given."""
+    num_queries: int
+    """What alignment is the mean over."""
 
     @property
     def num_supervised(self) -> int:
@@ -140,9 +172,18 @@ class JointLoss(NamedTuple):
 
 
 class JointModel(nn.Module):
-    """PONDER and POUNCE as one module, with the weights of the two losses."""
+    """PONDER and POUNCE as one module, with the weights of the losses."""
 
-    def __init__(self, ponder: Ponder, pounce: AnyPounce, *, w1: float = 1.0, w2: float = 0.1) -> None:
+    def __init__(
+        self,
+        ponder: Ponder,
+        pounce: AnyPounce,
+        *,
+        w1: float = 1.0,
+        w2: float = 0.1,
+        w3: float = 0.0,
+        trains: Trains = "both",
+    ) -> None:
         """Raises ValueError if POUNCE was built for another cognition than PONDER gives."""
         super().__init__()
         wanted = (pounce.config.cognition.num_carriers, pounce.config.cognition.cognition_size)
@@ -151,30 +192,56 @@ class JointModel(nn.Module):
             raise ValueError(f"POUNCE reads (K, H) = {wanted}, PONDER gives {given}; build them for each other")
         self.ponder = ponder
         self.pounce = pounce
-        self.w1, self.w2 = w1, w2
+        self.w1, self.w2, self.w3 = w1, w2, w3
+        self.trains = trains
+        for name, system in (("ponder", ponder), ("pounce", pounce)):
+            if trains not in ("both", name):
+                system.requires_grad_(False)
+
+    @property
+    def needs_stand_ins(self) -> bool:
+        return self.w3 > 0 or self.trains == "pounce"
 
     def forward(self, episodes: PonderBatch, invocations: PounceBatch, draws: Draws) -> JointLoss:
-        hidden = encode_rows(self.ponder, episodes)
-        grounding, said_N = self._grounding(episodes, hidden)
-        cognition_QKH, first_query = gather_cognition(episodes.rows, hidden)
-        is_null_I = (invocations.query_I == NO_QUERY) | draws.is_dropped_I
-        index_I = first_query[invocations.episode_I] + invocations.query_I.clamp(min=0)
-        inputs = replace(invocations.inputs, cognition=cognition_QKH[index_I], is_null=is_null_I)
-        matching = action_loss(
-            self.pounce, inputs, invocations.actions_INA, draws.noise_INA, draws.time_I, draws.num_committed_I
-        )
+        if self.needs_stand_ins and not episodes.stand_ins:
+            raise ValueError("this stage needs the stand-ins of every row; the batch has none")
+        device = invocations.actions_INA.device
+        zero = torch.zeros((), device=device)
+        matching, grounding, alignment = zero, zero, zero
+        said_N = torch.zeros(0, dtype=torch.int64)
+        num_null = 0
+        if self.trains == "pounce":
+            cognition_QKH = torch.cat(episodes.stand_ins)[:, None].expand(-1, self.ponder.format.num_carriers, -1)
+            first_query = _starts([len(each) for each in episodes.stand_ins], device)
+        else:
+            hidden = encode_rows(self.ponder, episodes)
+            grounding, said_N = self._grounding(episodes, hidden)
+            cognition_QKH, first_query = gather_cognition(episodes.rows, hidden)
+            if self.w3 > 0:
+                wanted_QKH = torch.cat(episodes.stand_ins)[:, None].expand_as(cognition_QKH)
+                alignment = F.mse_loss(cognition_QKH.float(), wanted_QKH)
+        if self.trains != "ponder":
+            is_null_I = (invocations.query_I == NO_QUERY) | draws.is_dropped_I
+            num_null = int(is_null_I.sum())
+            index_I = first_query[invocations.episode_I] + invocations.query_I.clamp(min=0)
+            inputs = replace(invocations.inputs, cognition=cognition_QKH[index_I], is_null=is_null_I)
+            matching = action_loss(
+                self.pounce, inputs, invocations.actions_INA, draws.noise_SNA, draws.time_S, draws.num_committed_S
+            )
         return JointLoss(
-            total=self.weigh(matching, grounding),
+            total=self.weigh(matching, grounding, alignment),
             flow_matching=matching,
             grounding=grounding,
+            alignment=alignment,
             said_N=said_N,
-            num_null=int(is_null_I.sum()),
-            num_rows=draws.num_counted_rows,
+            num_rows=draws.num_counted_rows if self.trains != "ponder" else 0,
+            num_queries=len(cognition_QKH),
+            num_null=num_null,
         )
 
-    def weigh(self, matching: Tensor, grounding: Tensor) -> Tensor:
-        """L of its two parts."""
-        return self.w1 * matching + self.w2 * grounding
+    def weigh(self, matching: Tensor, grounding: Tensor, alignment: Tensor) -> Tensor:
+        """L of its parts."""
+        return self.w1 * matching + self.w2 * grounding + self.w3 * alignment
 
     def _grounding(self, episodes: PonderBatch, hidden: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         """Mean cross-entropy over every supervised token of the batch; zero, on the graph, if there is none."""
@@ -212,9 +279,11 @@ def gather_cognition(rows: Sequence[Row], hidden: Sequence[Tensor]) -> tuple[Ten
     """Cognition of all queries of all rows, (Q, K, H), and the index of each row's first, (B,) int64."""
     device = hidden[0].device
     parts = [h[torch.from_numpy(row.carrier_index).to(device)] for row, h in zip(rows, hidden, strict=True)]
-    starts = [0]
-    for part in parts:
-        starts.append(starts[-1] + len(part))
-    if any(start == end for start, end in pairwise(starts)):
+    return torch.cat(parts), _starts([len(part) for part in parts], device)
+
+
+def _starts(counts: Sequence[int], device: torch.device) -> Tensor:
+    """Where each row's queries begin among those of all rows, (B,) int64."""
+    if 0 in counts:
         raise ValueError("a row without a query gives no cognition; leave such an episode out")
-    return torch.cat(parts), torch.tensor(starts[:-1], device=device)
+    return torch.tensor([0, *accumulate(counts)][:-1], device=device)

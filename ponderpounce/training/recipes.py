@@ -8,12 +8,16 @@ from difflib import get_close_matches
 
 from clock import sampling
 from ponderpounce.models import ponder_configs, pounce_configs
+from ponderpounce.models.action_space import ActionSpace
 from ponderpounce.models.ponder_configs import PonderConfig
 from ponderpounce.models.pounce import Freeze
 from ponderpounce.models.pounce_family import AnyPounceConfig
 from ponderpounce.training.example import ExampleConfig
+from ponderpounce.training.joint import Trains
 from ponderpounce.training.optim import OptimConfig
 from ponderpounce.training.trainer import TrainConfig
+
+_FROM_SCRATCH = OptimConfig(learning_rate=1e-3, warmup_steps=200, betas=(0.9, 0.95), weight_decay=1e-4, ema_decay=0.998)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,12 +35,39 @@ class Recipe:
     batch_episodes: int
     w1: float = 1.0
     w2: float = 0.1
+    w3: float = 0.0
+    """Of the auxiliary alignment with the stand-ins (`stand_in`); the paper has no such loss."""
+    trains: Trains = "both"
+    """Which systems; the other is not run."""
+    is_blind: bool = False
+    """POUNCE learns without pictures, on state and cognition alone: several times as many samples a minute."""
+    space: ActionSpace = "joint_delta"
+    """What POUNCE's actions are."""
+    statistics_by_row: bool = False
+    """Every row of a chunk in its own measure (`RobotStatistics.reach`)."""
+    vocabulary_size: int = 0
+    """Pieces of PONDER's own vocabulary, trained on the data's texts; 0: `Vocabulary.tiny`. From scratch only."""
     from_scratch: bool = False
     """True: weights are drawn. False: both systems start from pretrained checkpoints, given to the program."""
 
     def __post_init__(self) -> None:
-        if self.example.is_grounded != (self.w2 > 0):
+        if self.trains != "pounce" and self.example.is_grounded != (self.w2 > 0):
             raise ValueError(f"recipe {self.name}: is_grounded is {self.example.is_grounded}, but w2 is {self.w2}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Curriculum:
+    """Stages, each a run of its own; a later one starts from what earlier ones have left of either system."""
+
+    name: str
+    stages: tuple[Recipe, ...]
+    """Named ``curriculum/stage``."""
+
+    def __post_init__(self) -> None:
+        first, *others = self.stages
+        for other in others:
+            if (other.ponder, other.pounce, other.space) != (first.ponder, first.pounce, first.space):
+                raise ValueError(f"{other.name} trains other networks than {first.name}; stages share them")
 
 
 def robomme() -> Recipe:
@@ -105,16 +136,74 @@ def tiny_subgoal_text() -> Recipe:
     return replace(tiny(), name="tiny_subgoal_text", pounce=replace(silent, reads_subgoal=True))
 
 
-RECIPES: dict[str, Callable[[], Recipe]] = {
+def small() -> Curriculum:
+    """Both architectures at about a million weights each, from scratch on CPU cores: see docs/training.md.
+
+    Where the paper starts from pretrained weights, three stages stand in for them. `motor` needs none of the others.
+    """
+    looking = Recipe(
+        name="small/looking",
+        ponder=ponder_configs.small(),
+        pounce=pounce_configs.small(),
+        freeze="none",
+        example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=1, text_dropout=0.4, max_queries=8),
+        train=TrainConfig(seed=0, optim=_FROM_SCRATCH),
+        num_steps=4000,
+        batch_episodes=16,
+        w2=1.0,
+        w3=1.0,
+        trains="ponder",
+        space="ee_delta",
+        statistics_by_row=True,
+        vocabulary_size=400,
+        from_scratch=True,
+    )
+    grounding = replace(
+        looking,
+        name="small/grounding",
+        example=replace(looking.example, text_dropout=0.2, max_queries=None),
+        num_steps=2000,
+        batch_episodes=8,
+    )
+    motor = replace(
+        looking,
+        name="small/motor",
+        example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=16),
+        train=TrainConfig(seed=0, dropout=0.1, flow_samples=2, optim=replace(_FROM_SCRATCH, learning_rate=2e-3)),
+        num_steps=6000,
+        batch_episodes=8,
+        w3=0.0,
+        trains="pounce",
+        is_blind=True,
+    )
+    joint = replace(
+        grounding,
+        name="small/joint",
+        example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=8),
+        train=TrainConfig(seed=0, dropout=0.1, flow_samples=2, optim=replace(_FROM_SCRATCH, learning_rate=5e-4)),
+        num_steps=1000,
+        w3=0.0,
+        trains="both",
+    )
+    return Curriculum(name="small", stages=(looking, grounding, motor, joint))
+
+
+RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
     "robomme": robomme,
     "robocasa_dc": robocasa_dc,
     "tiny": tiny,
     "tiny_groot": tiny_groot,
     "tiny_subgoal_text": tiny_subgoal_text,
+    "small": small,
 }
 
 
-def recipe(name: str) -> Recipe:
+def stages_of(chosen: Recipe | Curriculum) -> tuple[Recipe, ...]:
+    """The runs that it takes."""
+    return (chosen,) if isinstance(chosen, Recipe) else chosen.stages
+
+
+def recipe(name: str) -> Recipe | Curriculum:
     """Returns a named recipe. Raises ValueError with the nearest name if there is none."""
     if name not in RECIPES:
         close = get_close_matches(name, RECIPES, n=1)

@@ -5,6 +5,8 @@
     OUT/samples.jsonl   what PONDER says at intervals, beside what it should
     OUT/ponder, pounce  at the end: what ponder-serve and pounce-serve take as --checkpoint
 
+A recipe of several stages leaves all of that in a folder for each, and the last stage's models in OUT as well.
+
 The same command again resumes. On several GPUs or hosts:
 
     torchrun --nproc-per-node=8 -m ponderpounce.training.train --device cuda ...
@@ -12,6 +14,7 @@ The same command again resumes. On several GPUs or hosts:
 
 from __future__ import annotations
 
+import shutil
 import sys
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -30,17 +33,19 @@ from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import load_ponder, save_ponder
 from ponderpounce.models.pounce import PounceConfig, freeze
 from ponderpounce.models.pounce_checkpoint import PounceBundle, load_bundle, random_bundle, save_bundle
-from ponderpounce.training.collate import collate
+from ponderpounce.models.vocabulary import Vocabulary
+from ponderpounce.training.collate import collate_ponder, collate_pounce
 from ponderpounce.training.data import TrainingSet
 from ponderpounce.training.example import make_example
-from ponderpounce.training.joint import JointModel, PonderBatch, PounceBatch
+from ponderpounce.training.joint import JointModel, PonderBatch, PounceBatch, Trains
 from ponderpounce.training.parallel import World, gather, joined, shard
 from ponderpounce.training.plot import plot_log
-from ponderpounce.training.recipes import Recipe, recipe
+from ponderpounce.training.recipes import Curriculum, Recipe, recipe, stages_of
 from ponderpounce.training.trainer import CheckpointError, SaveError, StepReport, Trainer
 from ponderpounce.training.watch import LOG_FILE, Watch
 
 DONE, REFUSED, INTERRUPTED = 0, 2, 130
+_SYSTEMS = ("ponder", "pounce")
 _EPISODE_STREAM = 7  # of a step's random numbers: which episodes, which schedules
 
 
@@ -49,11 +54,14 @@ class TrainOptions:
     """Trains PONDER and POUNCE together. The same command again resumes a run that was killed."""
 
     recipe: str
-    """robomme and robocasa_dc are the paper's; tiny, tiny_groot and tiny_subgoal_text run on one CPU core."""
+    """robomme and robocasa_dc are the paper's; small learns from scratch on CPU cores; tiny and tiny_groot are for a
+    try."""
     data: Path
     """A folder that pp-collect or pp-export made."""
     out: Path
     """Folder for checkpoints, log and the trained models."""
+    stage: str | None = None
+    """Of a recipe with stages, only this one: stages that do not need each other can run side by side."""
     tasks: tuple[str, ...] = ()
     """Train on these tasks of the data; () for all."""
     ponder: Path | None = None
@@ -95,16 +103,26 @@ class Batches:
         self._places = world.share(run.batch_episodes)
 
     def __call__(self, step: int) -> tuple[PonderBatch, PounceBatch]:
-        chance = (self._run.train.seed, _EPISODE_STREAM, step)
-        form, config = self._model.ponder.format, self._model.pounce.config
-        numbers = np.random.default_rng(chance).integers(len(self._data), size=self._run.batch_episodes)
+        run, model, bundle = self._run, self._model, self._bundle
+        chance = (run.train.seed, _EPISODE_STREAM, step)
+        numbers = np.random.default_rng(chance).integers(len(self._data), size=run.batch_episodes)
         examples = [
             make_example(
-                self._data[int(numbers[place])], form, self._run.example, np.random.default_rng([*chance, place])
+                self._data[int(numbers[place])],
+                model.ponder.format,
+                run.example,
+                np.random.default_rng([*chance, place]),
             )
             for place in self._places
         ]
-        episodes, invocations = collate(examples, config, self._bundle.tokenizer, self._bundle.statistics)
+        episodes = collate_ponder(
+            examples,
+            with_rows=run.trains != "pounce",
+            stand_in_size=model.ponder.hidden_size if model.needs_stand_ins else 0,
+        )
+        invocations = collate_pounce(
+            examples, model.pounce.config, bundle.tokenizer, bundle.statistics, is_blind=run.is_blind
+        )
         return episodes.to(self._device), invocations.to(self._device)
 
 
@@ -132,15 +150,46 @@ def train(options: TrainOptions) -> None:
         FloatingPointError: the loss is not finite; the last checkpoint is kept.
         SaveError: a checkpoint could not be written; the one before is kept.
     """
-    with joined(options.device) as world:
-        _train(options, world)
-
-
-def _train(options: TrainOptions, world: World) -> None:
-    run = _adjusted(recipe(options.recipe), options)
-    if (options.out / "pounce").exists():
+    chosen = recipe(options.recipe)
+    if _is_finished(options.out):
         raise CheckpointError(f"{options.out} holds a finished run; use another --out")
     data = TrainingSet(options.data, tasks=options.tasks)
+    with joined(options.device) as world:
+        if isinstance(chosen, Recipe):
+            if options.stage is not None:
+                raise ValueError(f"recipe {chosen.name} has no stages; leave --stage out")
+            _train(_adjusted(chosen, options), data, options, world)
+        else:
+            _train_stages(chosen, data, options, world)
+
+
+def _train_stages(curriculum: Curriculum, data: TrainingSet, options: TrainOptions, world: World) -> None:
+    names = [stage.name.rpartition("/")[2] for stage in curriculum.stages]
+    if options.stage is not None and options.stage not in names:
+        raise ValueError(f"recipe {curriculum.name} has the stages {', '.join(names)}; there is no {options.stage!r}")
+    latest = options
+    for name, stage in zip(names, curriculum.stages, strict=True):
+        out = options.out / name
+        is_wanted = options.stage in (None, name)
+        if is_wanted and not _is_finished(out):
+            if world.is_first:
+                tqdm.write(f"stage {name}", file=sys.stderr)
+            _train(_adjusted(stage, options), data, replace(latest, out=out), world)
+        latest = replace(
+            latest,
+            ponder=out / "ponder" if (out / "ponder").exists() else latest.ponder,
+            pounce=out / "pounce" if (out / "pounce").exists() else latest.pounce,
+        )
+    if world.is_first and _is_finished(options.out / names[-1]):
+        for system in _SYSTEMS:
+            shutil.copytree(options.out / names[-1] / system, options.out / system)
+
+
+def _is_finished(out: Path) -> bool:
+    return any((out / system).exists() for system in _SYSTEMS)
+
+
+def _train(run: Recipe, data: TrainingSet, options: TrainOptions, world: World) -> None:
     model, bundle = build(run, data, options)
     shard(model, world)
     batches = Batches(data, run, model, bundle, world)
@@ -166,12 +215,12 @@ def _train(options: TrainOptions, world: World) -> None:
         plot_log(options.out / LOG_FILE, options.out / "run.png")
     trainer.take_average()
     if world.size == 1:
-        export(model, bundle, options.out)
+        export(model, bundle, options.out, trained=run.trains)
         return
     whole = build(run, data, replace(options, device="cpu")) if world.is_first else None
     gather(model, None if whole is None else whole[0])
     if whole is not None:
-        export(*whole, options.out)
+        export(*whole, options.out, trained=run.trains)
 
 
 def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointModel, PounceBundle]:
@@ -190,28 +239,34 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
     if options.ponder is not None:
         ponder = load_ponder(options.ponder, device=options.device, dtype=dtype)
     else:
-        ponder = Ponder.random(run.ponder, seed=seed, device=options.device, dtype=dtype)
+        vocabulary = Vocabulary.trained_on(data.texts(), run.vocabulary_size) if run.vocabulary_size else None
+        ponder = Ponder.random(run.ponder, vocabulary, seed=seed, device=options.device, dtype=dtype)
     try:
         check_cameras([(data.image_px, data.image_px)] * len(CAMERAS), ponder.format.eyes, ponder.image_px)
     except ValueError as error:
         wanted_px = readable_sizes(ponder.format.eyes, ponder.image_px)[0][0]
         raise ValueError(f"{options.data}: {error}; collect with --image-px {wanted_px}") from None
-    bundle = random_bundle(run.pounce, seed) if options.pounce is None else load_bundle(options.pounce)
-    bundle = replace(bundle, statistics=data.statistics(run.pounce.horizon))
+    statistics = data.statistics(run.pounce.horizon, run.space, by_row=run.statistics_by_row)
+    if options.pounce is None:
+        bundle = random_bundle(run.pounce, seed, statistics=statistics)
+    else:
+        bundle = replace(load_bundle(options.pounce), statistics=statistics)
     pounce = bundle.model.to(options.device)
     if type(pounce.config) is not type(run.pounce):
         raise ValueError(f"recipe {run.name} is of another action model than {options.pounce} holds")
     if isinstance(pounce.config, PounceConfig) and isinstance(run.pounce, PounceConfig):
         pounce.config = replace(pounce.config, max_committed_rows=run.pounce.max_committed_rows)
     freeze(pounce, run.freeze)
-    return JointModel(ponder, pounce, w1=run.w1, w2=run.w2), bundle
+    return JointModel(ponder, pounce, w1=run.w1, w2=run.w2, w3=run.w3, trains=run.trains), bundle
 
 
-def export(model: JointModel, bundle: PounceBundle, out: Path) -> None:
-    """Writes both folders as the servers read them."""
-    model.ponder.is_random = False
-    save_ponder(model.ponder, out / "ponder")
-    save_bundle(replace(bundle, is_random=False, has_fresh_prefix=False), out / "pounce")
+def export(model: JointModel, bundle: PounceBundle, out: Path, *, trained: Trains = "both") -> None:
+    """Writes the folders of what was trained, as the servers read them."""
+    if trained != "pounce":
+        model.ponder.is_random = False
+        save_ponder(model.ponder, out / "ponder")
+    if trained != "ponder":
+        save_bundle(replace(bundle, is_random=False, has_fresh_prefix=False), out / "pounce")
 
 
 def _adjusted(run: Recipe, options: TrainOptions) -> Recipe:
@@ -237,15 +292,17 @@ def _watch(options: TrainOptions, step: int) -> Watch:
 
 
 def _postfix(report: StepReport) -> str:
-    return f"loss {report.total:.3f} flow {report.flow_matching:.3f} text {report.grounding:.3f}"
+    parts = {"flow": report.flow_matching, "text": report.grounding, "align": report.alignment}
+    return " ".join(f"{name} {value:.3f}" for name, value in parts.items() if value)
 
 
 def _out_of_memory(options: TrainOptions, error: BaseException) -> str:
-    run = _adjusted(recipe(options.recipe), options)
+    sizes = [_adjusted(stage, options) for stage in stages_of(recipe(options.recipe))]
+    tried = " or ".join(f"{size.batch_episodes} x {size.example.max_invocations}" for size in sizes)
     return (
-        f"out of memory at {run.batch_episodes} episodes a step, {run.example.max_invocations} invocations each "
-        f"({error}). Lower --max-invocations first, then --batch-episodes; --dtype bfloat16 halves PONDER; or start "
-        "more processes with torchrun. The last checkpoint is kept: the same command with the lower number goes on."
+        f"out of memory at {tried} (episodes a step x invocations each; {error}). Lower --max-invocations first, then "
+        "--batch-episodes; --dtype bfloat16 halves PONDER; or start more processes with torchrun. The last checkpoint "
+        "is kept: the same command with the lower number goes on."
     )
 
 

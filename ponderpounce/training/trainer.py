@@ -48,6 +48,7 @@ class StepReport:
     total: float
     flow_matching: float
     grounding: float
+    alignment: float
     gradient_norm: float
     num_supervised: int
     num_null: int
@@ -60,6 +61,8 @@ class TrainConfig:
     seed: int = 42
     dropout: float = 0.0
     """Share of invocations that see the null cognition instead (paper: 0 for RoboMME, 0.15 for RoboCasa-DC)."""
+    flow_samples: int = 1
+    """Noise and flow time drawn so often for each invocation, over one reading of it. pi0.5 only if above 1."""
     optim: OptimConfig = field(default_factory=OptimConfig)
 
 
@@ -97,15 +100,18 @@ class Trainer:
     def _update(self) -> StepReport:
         world, model = self._world, self.model
         episodes, invocations = self._batches(self.step)
-        loss = model(episodes, invocations, self._draws(len(episodes.rows), invocations))
-        # Both parts are means over the whole batch: a process's own weigh as much as it has of what they count.
-        num_rows, num_supervised, num_null = (
-            int(number) for number in world.sums([loss.num_rows, loss.num_supervised, loss.num_null])
+        loss = model(episodes, invocations, self._draws(episodes.num_episodes, invocations))
+        # The parts are means over the whole batch: a process's own weigh as much as it has of what they count.
+        num_rows, num_supervised, num_queries, num_null = (
+            int(number) for number in world.sums([loss.num_rows, loss.num_supervised, loss.num_queries, loss.num_null])
         )
-        matching = loss.flow_matching * (loss.num_rows / num_rows)
+        matching = loss.flow_matching * (loss.num_rows / max(1, num_rows))
         grounding = loss.grounding * (loss.num_supervised / max(1, num_supervised))
-        part = model.weigh(matching, grounding)
-        total, flow_matching, text = world.sums([part.detach(), matching.detach(), grounding.detach()])
+        alignment = loss.alignment * (loss.num_queries / max(1, num_queries))
+        part = model.weigh(matching, grounding, alignment)
+        total, flow_matching, text, aligned = world.sums(
+            [part.detach(), matching.detach(), grounding.detach(), alignment.detach()]
+        )
         if not np.isfinite(total):
             raise FloatingPointError(
                 f"step {self.step}: the loss is {total} (flow matching {flow_matching}, grounding {text}). Look at "
@@ -118,6 +124,7 @@ class Trainer:
             total=total,
             flow_matching=flow_matching,
             grounding=text,
+            alignment=aligned,
             gradient_norm=norm,
             num_supervised=num_supervised,
             num_null=num_null,
@@ -149,6 +156,7 @@ class Trainer:
             partial(sample_times, self.model.pounce),
             self.config.dropout,
             generators,
+            num_samples=self.config.flow_samples,
             max_committed_rows=max_committed_rows(self.model.pounce.config),
         )
 

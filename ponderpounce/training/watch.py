@@ -22,6 +22,7 @@ _TAGS = {
     "loss/total": "total",
     "loss/flow_matching": "flow_matching",
     "loss/grounding": "grounding",
+    "loss/alignment": "alignment",
     "gradient/norm": "gradient_norm",
     "batch/supervised_tokens": "num_supervised",
     "batch/null_invocations": "num_null",
@@ -74,6 +75,8 @@ class Watch:
 
     def _show(self, step: int, trainer: Trainer) -> None:
         episodes, said_N = trainer.latest
+        if not episodes.rows:  # a stage without PONDER
+            return
         row, frames = episodes.rows[0], episodes.frames[0]
         samples = samples_of(row, said_N, trainer.model.ponder.format.vocabulary)
         for sample in samples:

@@ -77,7 +77,7 @@ def test_the_library_called_its_own_way_gives_the_same_hidden_states(ponder: Pon
             use_cache=False,
         ).last_hidden_state[0]
     ponder.qwen.model.rope_deltas = None  # the library's call leaves it on the module
-    torch.testing.assert_close(ours, public, rtol=0, atol=1e-5)
+    torch.testing.assert_close(ours, public, rtol=0, atol=5e-5)  # the vision tower sums in another order
 
 
 def test_one_seed_gives_one_network_and_touches_no_global_state() -> None:

@@ -228,7 +228,8 @@ def test_full_size_runs_on_the_meta_device() -> None:
     """Shapes fit at full size, and no tensor is created on another device than the inputs'."""
     config = pi05_base(num_carriers=8)
     inputs = config.example_inputs(1)
-    on_meta = {field.name: getattr(inputs, field.name) for field in fields(inputs) if field.name != "is_null"}
+    given = {field.name: getattr(inputs, field.name) for field in fields(inputs)}
+    on_meta = {name: tensor for name, tensor in given.items() if tensor is not None}
     with torch.device("meta"):
         model = Pounce(config)
     noise = torch.empty(1, 20, 32, device="meta")

@@ -20,7 +20,7 @@ from ponderpounce.models.pounce_configs import tiny_groot
 from ponderpounce.models.pounce_groot import GrootInputs
 from ponderpounce.models.pounce_reading import groot_inputs, pi05_inputs
 from ponderpounce.models.prompt import tiny_tokenizer_for_random_weights
-from ponderpounce.training.collate import collate
+from ponderpounce.training.collate import collate_ponder, collate_pounce
 from ponderpounce.training.example import (
     ExampleConfig,
     TrainingEpisode,
@@ -67,7 +67,7 @@ def test_an_invocation_is_read_as_pounce_serve_reads_it(num_ticks: int, seed: in
     recorded = episode(num_ticks, seed=3)
     config = ExampleConfig(clocks=ROBOMME, max_invocations=4)
     example = make_example(recorded, FORM, config, np.random.default_rng(seed))
-    _, batch = collate([example], POUNCE, TOKENIZER, STATISTICS)
+    batch = collate_pounce([example], POUNCE, TOKENIZER, STATISTICS)
     for place, asked in enumerate(example.invocations):
         request = Request(
             frames=recorded.frames[asked.tick],
@@ -95,7 +95,7 @@ def test_groot_reads_an_invocation_as_pounce_serve_does() -> None:
     config, tokenizer = tiny_groot(horizon=6), tiny_eagle_tokenizer_for_random_weights()
     form = ExampleConfig(clocks=ROBOMME, max_invocations=3)
     examples = [make_example(each, FORM, form, np.random.default_rng(1)) for each in (recorded, longer)]
-    _, batch = collate(examples, config, tokenizer, STATISTICS)
+    batch = collate_pounce(examples, config, tokenizer, STATISTICS)
     moments = [(example.episode, asked) for example in examples for asked in example.invocations]
     for place, (seen, asked) in enumerate(moments):
         request = Request(
@@ -122,7 +122,7 @@ def test_groot_reads_an_invocation_as_pounce_serve_does() -> None:
 def test_targets_turn_back_into_the_commands() -> None:
     recorded = episode(30)
     example = make_example(recorded, FORM, ExampleConfig(clocks=EVALUATION), np.random.default_rng(0))
-    _, batch = collate([example], POUNCE, TOKENIZER, STATISTICS)
+    batch = collate_pounce([example], POUNCE, TOKENIZER, STATISTICS)
     for place, asked in enumerate(example.invocations):
         rows = STATISTICS.absolute_targets(batch.actions_INA[place, :, :8].numpy(), recorded.state_T8[asked.tick])
         np.testing.assert_allclose(rows, target_rows(recorded, asked.tick, 6), atol=1e-5)
@@ -169,7 +169,7 @@ def test_without_grounding_the_row_has_no_text() -> None:
     recorded = episode(45, num_demo=2)
     config = ExampleConfig(clocks=EVALUATION, is_grounded=False)
     example = make_example(recorded, FORM, config, np.random.default_rng(0))
-    assert FORM.vocabulary.t_yes not in example.row.ids
+    assert FORM.vocabulary.t_yes not in example.row().ids
 
 
 def test_no_more_invocations_than_asked_for_and_in_order() -> None:
@@ -183,10 +183,11 @@ def test_examples_of_a_batch_keep_apart() -> None:
     config = ExampleConfig(clocks=ROBOMME, max_invocations=2)
     rng = np.random.default_rng(0)
     examples = [make_example(episode(n, seed=n), FORM, config, rng) for n in (25, 50)]
-    episodes, batch = collate(examples, POUNCE, TOKENIZER, STATISTICS)
+    episodes, batch = collate_ponder(examples), collate_pounce(examples, POUNCE, TOKENIZER, STATISTICS)
     assert batch.episode_I.tolist() == [0, 0, 1, 1]
     assert [len(row.carrier_index) for row in episodes.rows] == [2, 3]
-    assert torch.equal(batch.inputs.images[2:], collate(examples[1:], POUNCE, TOKENIZER, STATISTICS)[1].inputs.images)
+    alone = collate_pounce(examples[1:], POUNCE, TOKENIZER, STATISTICS)
+    assert torch.equal(batch.inputs.images[2:], alone.inputs.images)
 
 
 def test_an_episode_with_missing_rows_is_refused() -> None:
@@ -198,4 +199,4 @@ def test_an_episode_with_missing_rows_is_refused() -> None:
 def test_a_prompt_that_is_too_long_is_refused() -> None:
     example = make_example(episode(5), FORM, ExampleConfig(clocks=EVALUATION), np.random.default_rng(0))
     with pytest.raises(ValueError, match="expected at most 3"):
-        collate([example], replace(POUNCE, max_prompt_tokens=3), TOKENIZER, STATISTICS)
+        collate_pounce([example], replace(POUNCE, max_prompt_tokens=3), TOKENIZER, STATISTICS)

@@ -81,18 +81,18 @@ def test_learning_to_continue_rows_leaves_the_other_draws_and_its_loss_counts_th
         Draws.draw(batch, flow.sample_times, 0.0, [torch.Generator().manual_seed(3)], max_committed_rows=most)
         for most in (0, 3)
     )
-    assert plain.num_committed_I is None
-    assert drawn.num_committed_I is not None
-    assert torch.equal(drawn.noise_INA, plain.noise_INA)
-    assert torch.equal(drawn.time_I, plain.time_I)
+    assert plain.num_committed_S is None
+    assert drawn.num_committed_S is not None
+    assert torch.equal(drawn.noise_SNA, plain.noise_SNA)
+    assert torch.equal(drawn.time_S, plain.time_S)
     both = episodes(model.ponder, 1)
     losses = [model(both, batch, draws) for draws in (plain, drawn)]
-    assert [loss.num_rows for loss in losses] == [16, 16 - int(drawn.num_committed_I.sum())]
+    assert [loss.num_rows for loss in losses] == [16, 16 - int(drawn.num_committed_S.sum())]
     assert losses[0].num_rows != losses[1].num_rows
-    noise = drawn.noise_INA.clone()
-    for place, count in enumerate(drawn.num_committed_I.tolist()):
+    noise = drawn.noise_SNA.clone()
+    for place, count in enumerate(drawn.num_committed_S.tolist()):
         noise[place, :count] = 9.0
-    again = model(both, batch, replace(drawn, noise_INA=noise))
+    again = model(both, batch, replace(drawn, noise_SNA=noise))
     assert torch.equal(again.flow_matching, losses[1].flow_matching)
 
 
@@ -106,7 +106,7 @@ def test_an_invocation_sees_the_cognition_it_was_referred_to(model: JointModel) 
         hidden[e][torch.from_numpy(both.rows[e].carrier_index[q])] for e, q in ((1, 2), (0, 1), (1, 0), (0, 0))
     ]
     inputs = replace(batch.inputs, cognition=torch.stack(cognition), is_null=torch.tensor([False, False, False, True]))
-    expected = model.pounce.loss(inputs, batch.actions_INA, draws.noise_INA, draws.time_I)
+    expected = model.pounce.loss(inputs, batch.actions_INA, draws.noise_SNA, draws.time_S)
     torch.testing.assert_close(loss, expected)
 
 
@@ -201,5 +201,5 @@ def test_what_is_drawn_for_an_episode_depends_on_no_other(model: JointModel) -> 
     generators = [torch.Generator().manual_seed(seed) for seed in (4, 5)]
     drawn = Draws.draw(both, flow.sample_times, 0.5, generators)
     again = Draws.draw(alone, flow.sample_times, 0.5, [torch.Generator().manual_seed(5)])
-    for name in ("noise_INA", "time_I", "is_dropped_I"):
+    for name in ("noise_SNA", "time_S", "is_dropped_I"):
         assert torch.equal(getattr(drawn, name)[[0, 2]], getattr(again, name))

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pytest
 
-from ponderpounce.training.recipes import RECIPES, recipe
+from ponderpounce.training.recipes import RECIPES, recipe, stages_of
 
 
 def test_robomme_is_the_papers() -> None:
-    run = recipe("robomme")
+    (run,) = stages_of(recipe("robomme"))
     optim = run.train.optim
     assert (run.num_steps, run.batch_episodes, run.train.seed, run.w1, run.w2) == (4320, 32, 42, 1.0, 0.1)
     assert (optim.learning_rate, optim.warmup_steps, optim.betas) == (2e-5, 100, (0.9, 0.95))
@@ -20,7 +20,7 @@ def test_robomme_is_the_papers() -> None:
 
 
 def test_robocasa_dc_is_the_papers() -> None:
-    run = recipe("robocasa_dc")
+    (run,) = stages_of(recipe("robocasa_dc"))
     assert (run.num_steps, run.batch_episodes, run.train.dropout, run.w2) == (4000, 32, 0.15, 0.0)
     assert (run.train.optim.learning_rate, run.pounce.horizon) == (1e-5, 16)
     assert run.pounce.cognition.projector_std == 1e-3
@@ -29,10 +29,10 @@ def test_robocasa_dc_is_the_papers() -> None:
 
 @pytest.mark.parametrize("name", RECIPES)
 def test_both_systems_of_a_recipe_fit(name: str) -> None:
-    run = recipe(name)
-    assert run.name == name
-    assert run.pounce.cognition.cognition_size == run.ponder.hidden_size
-    assert run.pounce.cognition.num_carriers == (0 if run.pounce.reads_subgoal else run.ponder.num_carriers)
+    for run in stages_of(recipe(name)):
+        assert run.name.partition("/")[0] == name
+        assert run.pounce.cognition.cognition_size == run.ponder.hidden_size
+        assert run.pounce.cognition.num_carriers == (0 if run.pounce.reads_subgoal else run.ponder.num_carriers)
 
 
 def test_a_mistyped_name_is_answered_with_the_nearest() -> None:
@@ -42,4 +42,4 @@ def test_a_mistyped_name_is_answered_with_the_nearest() -> None:
 
 def test_text_without_a_loss_or_a_loss_without_text_is_refused() -> None:
     with pytest.raises(ValueError, match="is_grounded is True, but w2 is 0"):
-        replace(recipe("robomme"), w2=0.0)
+        replace(*stages_of(recipe("robomme")), w2=0.0)

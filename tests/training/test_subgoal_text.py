@@ -19,7 +19,7 @@ from ponderpounce.models.pounce_checkpoint import random_bundle
 from ponderpounce.models.pounce_configs import tiny_cpu, tiny_groot
 from ponderpounce.models.pounce_init import random_pounce
 from ponderpounce.models.pounce_reading import groot_inputs, pi05_inputs
-from ponderpounce.training.collate import collate
+from ponderpounce.training.collate import collate_ponder, collate_pounce
 from ponderpounce.training.example import Example, ExampleConfig, TrainingEpisode, make_example, said_by_query
 from ponderpounce.training.joint import Draws, JointModel
 from pounce_server.contract import Request, example_request
@@ -63,7 +63,7 @@ def test_it_is_what_ponder_wrote_at_the_last_transition() -> None:
 
 def test_training_reads_the_subgoal_of_the_query_it_refers_to() -> None:
     seen = example()
-    _, batch = collate([seen], POUNCE, TOKENIZER, STATISTICS)
+    batch = collate_pounce([seen], POUNCE, TOKENIZER, STATISTICS)
     for place, asked in enumerate(seen.invocations):
         assert asked.reference.query is not None
         request = Request(
@@ -107,7 +107,8 @@ def test_without_grounding_there_is_nothing_to_read() -> None:
 
 def test_actions_teach_ponder_nothing_through_text_and_words_do() -> None:
     model = JointModel(PONDER, random_pounce(POUNCE, 0))
-    episodes, batch = collate([example()], POUNCE, TOKENIZER, STATISTICS)
+    seen = [example()]
+    episodes, batch = collate_ponder(seen), collate_pounce(seen, POUNCE, TOKENIZER, STATISTICS)
     draws = Draws.draw(batch, lambda n, g: torch.rand(n, generator=g), 0.0, [torch.Generator().manual_seed(0)])
     loss = model(episodes, batch, draws)
     weights = [parameter for parameter in model.ponder.parameters() if parameter.requires_grad]

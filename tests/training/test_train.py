@@ -12,10 +12,12 @@ import torch
 
 from ponderpounce.data.episode import About, EpisodeWriter, Row, unpack
 from ponderpounce.data.lerobot_v3 import DatasetWriter
+from ponderpounce.models.action_space import ActionSpace, num_dims
 from ponderpounce.models.ponder_checkpoint import load_ponder
 from ponderpounce.models.pounce_checkpoint import load_bundle
 from ponderpounce.training import recipes, train
 from ponderpounce.training.data import TrainingSet
+from ponderpounce.training.example import chunk_ticks
 from ponderpounce.training.parallel import World
 from ponderpounce.training.train import TrainOptions
 
@@ -97,11 +99,23 @@ def test_a_small_cache_reads_the_same(folder: Path) -> None:
     assert len(small._cache) == 1
 
 
-def test_statistics_put_what_happened_into_the_networks_range(folder: Path) -> None:
+@pytest.mark.parametrize("space", ["joint_delta", "ee_delta"])
+def test_statistics_put_what_happened_into_the_networks_range(folder: Path, space: ActionSpace) -> None:
     data = TrainingSet(folder)
-    statistics = data.statistics(horizon=4)
-    states = np.concatenate([statistics.state.normalise(data[number].state_T8) for number in range(len(data))])
-    assert np.mean(np.abs(states) <= 1.0) == pytest.approx(0.98, abs=0.02)
+    statistics = data.statistics(horizon=4, space=space)
+    episodes = [data[number] for number in range(len(data))]
+    states = np.concatenate([statistics.normalise_states(episode.state_T8) for episode in episodes])
+    chunks = np.concatenate(
+        [
+            statistics.normalise_chunks(
+                episode.action_T8, episode.state_T8, chunk_ticks(np.arange(episode.num_ticks), 4, episode.num_ticks)
+            )
+            for episode in episodes
+        ]
+    )
+    assert chunks.shape == (len(states), 4, num_dims(space))
+    for numbers in (states, chunks):
+        assert np.mean(np.abs(numbers) <= 1.0) == pytest.approx(0.98, abs=0.02)
 
 
 @pytest.mark.parametrize("name", ["tiny", "tiny_groot", "tiny_subgoal_text"])
@@ -156,7 +170,7 @@ def test_what_does_not_fit_is_said_in_one_sentence(
 
 
 def test_pictures_of_another_size_are_refused(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    small = recipes.recipe("tiny")
+    (small,) = recipes.stages_of(recipes.recipe("tiny"))
     larger = replace(small, ponder=replace(small.ponder, image_px=(96, 96)))
     monkeypatch.setitem(recipes.RECIPES, "tiny", lambda: larger)
     with pytest.raises(ValueError, match="collect with --image-px 96"):
@@ -176,7 +190,8 @@ def test_a_finished_run_is_not_overwritten(folder: Path, tmp_path: Path) -> None
 
 
 def test_a_step_draws_the_same_batch_whenever_it_is_asked(folder: Path, tmp_path: Path) -> None:
-    run, data = recipes.recipe("tiny"), TrainingSet(folder)
+    (run,) = recipes.stages_of(recipes.recipe("tiny"))
+    data = TrainingSet(folder)
     model, bundle = train.build(run, data, options(folder, tmp_path))
     batches = train.Batches(data, run, model, bundle, World())
     first, again = batches(5), batches(5)
@@ -195,5 +210,5 @@ def test_out_of_memory_says_what_to_lower(
     arguments = ["--recipe", "tiny", "--data", str(folder), "--out", str(tmp_path / "out"), "--batch-episodes", "1"]
     assert train.main(arguments) == 2
     said = capsys.readouterr().err
-    assert "out of memory at 1 episodes a step, 2 invocations each" in said
+    assert "out of memory at 1 x 2 (episodes a step x invocations each; CUDA" in said
     assert "--max-invocations" in said

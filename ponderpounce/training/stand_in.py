@@ -1,0 +1,62 @@
+"""A stand-in for cognition: the oracle's subgoal as numbers, for networks that have no pretrained weights.
+
+A pretrained PONDER and a pretrained POUNCE already share what words and places mean. From scratch they do not, and
+each is the other's only teacher. The stand-in cuts that knot: POUNCE first learns to act from it, PONDER first learns
+to say the subgoal and to carry it in this form, and then both are trained together, end to end, without it. Nothing
+here is learned, so the two first stages need not wait for each other. Serving never sees it.
+
+Layout of one carrier's H numbers, rms 1: sines, cosines and the value itself of both coordinates, the rest a fixed
+random code of the text without its coordinates and its colour.
+"""
+
+# H hidden size, K carriers
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import re
+
+import numpy as np
+from numpy.typing import NDArray
+
+_PLACE = re.compile(r"<\s*(\d+)\s*,\s*(\d+)\s*>")
+_COLOUR = re.compile(r", which is \w+")
+_IMAGE_PX = 256
+_PERIODS = 2.0 ** np.arange(1, -5, -1)  # of the picture's side: two pictures down to 16 px
+NUM_PLACE_FEATURES = 2 * (2 * len(_PERIODS) + 1)
+_VALUE_SCALE = 2 * 3**0.5  # a coordinate is uniform in [-1/2, 1/2] at most: rms 1
+_NOWHERE = (_IMAGE_PX // 2, _IMAGE_PX // 2)
+
+
+@functools.lru_cache(maxsize=1 << 16)
+def stand_in(subgoal: str, size: int) -> NDArray[np.float32]:
+    """Returns the stand-in (size,) for a grounded subgoal, ``<y, x>`` in pixels of a 256 px picture.
+
+    Of several coordinates the first counts; a subgoal without any points at the middle.
+
+    Raises:
+        ValueError: ``size`` leaves no room for the text's code.
+    """
+    num_code = size - NUM_PLACE_FEATURES
+    if num_code < NUM_PLACE_FEATURES:
+        raise ValueError(f"a stand-in of {size} numbers is too small; expected at least {2 * NUM_PLACE_FEATURES}")
+    place = _PLACE.search(subgoal)
+    yx_px = (int(place[1]), int(place[2])) if place else _NOWHERE
+    values = np.concatenate([_place_features(yx_px), _code(_COLOUR.sub("", _PLACE.sub("<>", subgoal)), num_code)])
+    values.flags.writeable = False
+    return values
+
+
+def _place_features(yx_px: tuple[int, int]) -> NDArray[np.float32]:
+    yx = np.array(yx_px, np.float64) / _IMAGE_PX
+    angles = 2 * np.pi * np.outer(1 / _PERIODS, yx).ravel()
+    waves = 2**0.5 * np.concatenate([np.sin(angles), np.cos(angles)])
+    return np.concatenate([waves, (yx - 0.5) * _VALUE_SCALE]).astype(np.float32)
+
+
+@functools.lru_cache(maxsize=1 << 10)
+def _code(text: str, size: int) -> NDArray[np.float32]:
+    """Drawn from the text alone: nearly orthogonal to every other text's."""
+    seed = int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "big")
+    return np.random.default_rng(seed).normal(size=size).astype(np.float32)
