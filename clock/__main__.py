@@ -22,11 +22,12 @@ def main(argv: list[str] | None = None) -> int:
     set_up_logging()
     should_stop = StopFlag()
     try:
+        config = options.service()
         bus = open_bus(options.link)
-    except TransportError as error:
+    except (TransportError, ValueError, OSError) as error:
         print(f"clock-serve: {error}", file=sys.stderr)
         return 2
-    service = ClockService(Link(bus, robot=options.link.robot, proc="clock"), options.service())
+    service = ClockService(Link(bus, robot=options.link.robot, proc="clock"), config)
     log.info("ready robot=%s listen=%s", options.link.robot, ",".join(options.link.listen))
     freeze_heap()
     try:

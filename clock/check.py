@@ -18,6 +18,7 @@ from clock.check_answers import answers_of, check_invocations, check_queries, ch
 from clock.check_findings import Disagreement, compare
 from clock.check_ticks import check_deadlines, check_rows
 from clock.report import statistics, stream_sha256
+from clock.residual import DEFAULT_LOADER, RESIDUAL_EVENT, ResidualHead, load_head
 from protocol.errors import ProtocolError
 from protocol.mcap_log import EpisodeRecord, read_log, recover
 from protocol.messages import Mode
@@ -35,20 +36,35 @@ class CheckConfig:
     """Write what is readable of the one FILE into this finished log, and check that."""
     json: bool = False
     """One JSON object per file instead of a sentence."""
+    residual_head: Path | None = None
+    """The head that corrected the rows, if one did."""
+    residual_loader: str = DEFAULT_LOADER
+    """Who reads it: package.module:callable."""
 
 
-def disagreements(record: EpisodeRecord) -> Iterator[Disagreement]:
-    """All of them, causes before consequences; only the first is sure to be a cause. Lazy: take one with ``next``."""
+def disagreements(record: EpisodeRecord, residual: ResidualHead | None = None) -> Iterator[Disagreement]:
+    """All of them, causes before consequences; only the first is sure to be a cause. Lazy: take one with ``next``.
+
+    ``residual``: the head that corrected the rows, if one did.
+    """
     if record.info.policy != "oracle":
         answers = answers_of(record)
         yield from check_queries(record)
         yield from check_stamps(record, answers)
         yield from check_invocations(record, answers)
         yield from check_deadlines(record)
-        yield from check_rows(record, answers)
+        yield from check_residual(record, residual)
+        yield from check_rows(record, answers, residual)
     else:
         yield from check_deadlines(record)
     yield from check_result(record)
+
+
+def check_residual(record: EpisodeRecord, residual: ResidualHead | None) -> Iterator[Disagreement]:
+    """Whether the head given is the one that played; without it no row can be derived."""
+    logged = [event.attributes["digest"] for event in record.events if event.name == RESIDUAL_EVENT]
+    given = "none (--residual-head)" if residual is None else residual.digest
+    yield from compare("Event", 0, residual_head=(given, logged[0] if logged else "none (--residual-head)"))
 
 
 def check_result(record: EpisodeRecord) -> Iterator[Disagreement]:
@@ -80,10 +96,11 @@ def _check(path: Path, config: CheckConfig) -> int:
             recover(path, config.recover)
             path = config.recover
         record = read_log(path)
-    except (OSError, ProtocolError) as error:
+        head = None if config.residual_head is None else load_head(config.residual_head, config.residual_loader)
+    except (OSError, ValueError, ProtocolError) as error:
         _tell(config, {"file": str(path), "error": str(error)}, f"{path}: unreadable: {error}")
         return UNREADABLE
-    found = next(disagreements(record), None)
+    found = next(disagreements(record, head), None)
     dropped = int(record.metadata.get("ponderpounce.result", {}).get("dropped_messages", "0"))
     fields: dict[str, object] = {
         "file": str(path),

@@ -18,6 +18,7 @@ from clock.ladder import Ladder
 from clock.limits import Hit, within_limits
 from clock.playback import Chunk, covering, deadline_ns, row_of, seam_policy, tick_at
 from clock.report import PLAYED
+from clock.residual import Due, ResidualHead, corrected
 from clock.timebase import NS_PER_MS
 from protocol.mcap_log import EpisodeRecord
 from protocol.messages import EpisodeInfo, Floats, Level, Mode, Tick
@@ -44,12 +45,12 @@ def check_deadlines(record: EpisodeRecord) -> Iterator[Disagreement]:
             yield from compare("Tick", index, late_ns=(0, tick.late_ns))
 
 
-def check_rows(record: EpisodeRecord, answers: Answers) -> Iterator[Disagreement]:
+def check_rows(record: EpisodeRecord, answers: Answers, residual: ResidualHead | None = None) -> Iterator[Disagreement]:
     """What each tick commanded, and that the Action sent is the same. Assumes that the deadlines agree."""
     states = _logged_states(record)
     actions = {action.tick: action for action in record.actions}
     engaged = sorted(event.tick for event in record.events if event.name == "engaged")
-    playing = _Playing(record.info)
+    playing = _Playing(record.info, residual)
     for index, tick in enumerate(record.ticks):
         newest = tick_at(record.ticks[0].deadline_ns, tick.decided_ns, record.info.schedule.control_hz)
         is_skipped = newest > index
@@ -84,6 +85,7 @@ class _Playing:
     """The rules, one tick after the other."""
 
     info: EpisodeInfo
+    residual: ResidualHead | None
     ladder: Ladder = field(init=False)
     last_command: Floats = field(init=False)
     played_invocation: int | None = None
@@ -100,7 +102,9 @@ class _Playing:
         """(expected, found) of every field of ``tick``; ``usable``: chunks with a row for it, oldest first."""
         raw, row, hit = _NO_FLOATS, None, Hit.NONE
         if usable:
-            raw = seam_policy(self.info.schedule.seam)(usable, tick.tick)
+            joined, newest = seam_policy(self.info.schedule.seam)(usable, tick.tick), usable[-1]
+            due = Due(row_A=joined, state=tick.state, row=tick.tick - newest.t_row0, age_ns=newest.age_ns)
+            raw = corrected(self.residual, due)
             row, hit = within_limits(raw, self.last_command, self.info.robot)
         is_stale = bool(usable) and usable[-1].age_ns > self.info.schedule.max_age_ns
         command = self.ladder.step(row, is_stale, self.last_command, tick.state)

@@ -22,6 +22,7 @@ from clock.ladder import Ladder
 from clock.limits import Hit, within_limits
 from clock.playback import Chunk, Join, covering, deadline_ns, row_of, seam_policy, tick_at
 from clock.reference import Ready, Reference, latest_ready, refer
+from clock.residual import Due, ResidualHead, corrected
 from clock.timebase import NS_PER_S
 from protocol.messages import (
     Action,
@@ -83,11 +84,13 @@ class Conductor:
     Attributes:
         info: what was agreed when the episode was opened.
         committed_ticks: ticks that will be played whatever a new chunk says (told to POUNCE).
+        residual: corrects every row with the newest joints; None: nobody does.
         start_ns: deadline of tick 0, once known.
     """
 
     info: EpisodeInfo
     committed_ticks: int = 0
+    residual: ResidualHead | None = None
     stage: Stage = Stage.WAIT_OBSERVATION
     start_ns: int = 0
     tick: int = 0
@@ -395,8 +398,11 @@ class Conductor:
         self._chunks = [c if c.first_tick is not None else replace(c, first_tick=self.tick) for c in self._chunks]
         usable = [c for c in covering(self._chunks, self.tick) if c.age_ns <= schedule.stale_limit_ns]
         raw, row, hit = _NO_FLOATS, None, Hit.NONE
+        proprio = self._newest.proprio if self._newest is not None else self.last_command
         if usable:
-            raw = self._join(usable, self.tick)
+            chunk, raw = usable[-1], self._join(usable, self.tick)
+            due = Due(row_A=raw, state=proprio, row=self.tick - chunk.t_row0, age_ns=chunk.age_ns)
+            raw = corrected(self.residual, due)
             row, hit = within_limits(raw, self.last_command, robot)
         if Hit.NON_FINITE in hit:
             self._tell(
@@ -410,18 +416,17 @@ class Conductor:
         before = self.ladder.level
         was_playing = self.ladder.has_played
         is_stale = bool(usable) and usable[-1].age_ns > schedule.max_age_ns
-        proprio = self._newest.proprio if self._newest is not None else self.last_command
         command = self.ladder.step(row, is_stale, self.last_command, proprio)
         level = self.ladder.level
         if level in (Level.DECELERATE, Level.STOPPED):  # the straight line obeys the limits too
             command = _limited(command, self.last_command, self.info)
-        chunk = usable[-1] if level in (Level.PLAY, Level.STALE) else None
-        jump = self._seam_jump(chunk, raw)
+        played = usable[-1] if level in (Level.PLAY, Level.STALE) else None
+        jump = self._seam_jump(played, raw)
         self.last_command = command
         if level != before and (was_playing or level != Level.PLAY):
             self._tell_level(effects, before, level)
         effects.append(Action(tick=self.tick, deadline_ns=self.deadline_ns(self.tick), level=level, values=command))
-        effects.append(self._account(self.tick, now_ns, level, chunk, command, raw, hit, jump))
+        effects.append(self._account(self.tick, now_ns, level, played, command, raw, hit, jump))
 
     def _seam_jump(self, chunk: Chunk | None, raw: Floats) -> float:
         """How far the first row of a new chunk lies from the last command; 0 between switches."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
+from clock.residual import DEFAULT_LOADER, load_head
 from clock.service import ServiceConfig
 from protocol.options import LinkOptions
 
@@ -21,8 +23,16 @@ class ClockOptions:
     """Start although the schedule leaves ticks without a row (see docs/clock.md)."""
     max_clock_bound_ms: float = 5.0
     """Refuse to start when another host's clock is known less exactly than this."""
+    residual_head: Path | None = None
+    """Correct every row at 20 Hz with this head, a file of its loader's (see docs/clock.md)."""
+    residual_loader: str = DEFAULT_LOADER
+    """Who reads it: package.module:callable."""
 
     def service(self) -> ServiceConfig:
+        """Raises ValueError or OSError if the residual head cannot be had."""
+        head = None if self.residual_head is None else load_head(self.residual_head, self.residual_loader)
         return ServiceConfig(
-            allow_starved=self.allow_starved, max_clock_bound_ns=round(self.max_clock_bound_ms * 1_000_000)
+            allow_starved=self.allow_starved,
+            max_clock_bound_ns=round(self.max_clock_bound_ms * 1_000_000),
+            residual=head,
         )

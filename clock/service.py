@@ -15,6 +15,7 @@ from typing import Any
 from clock.conductor import Conductor, Stage
 from clock.feasibility import check_feasible
 from clock.offset import Offset, from_exchange, narrowest
+from clock.residual import RESIDUAL_EVENT, ResidualHead, check_head
 from clock.timebase import MonotonicClock, VirtualClock
 from clock.watch import HEARTBEAT_TIMEOUT_NS, Watch
 from protocol import messages as m
@@ -66,6 +67,8 @@ class ServiceConfig:
     max_clock_bound_ns: int = 5_000_000
     """An episode does not start when a clock on another host is known less exactly than this."""
     heartbeat_timeout_ns: int = HEARTBEAT_TIMEOUT_NS
+    residual: ResidualHead | None = None
+    """Corrects every row at 20 Hz."""
     journal_limit_bytes: int = 2 << 30
     """Observations kept for a PONDER that restarts; beyond it, a restarted PONDER is refused and the ladder acts."""
     watches: bool = True
@@ -286,10 +289,14 @@ class ClockService:
         header = request.info.header
         self._link.enter_episode(header.session, header.episode, header.epoch)
         self._last_epoch[header.session] = header.epoch
-        self._episode = _Episode(request, Conductor(request.info, committed_ticks=committed_ticks))
+        head = self._config.residual if request.info.policy == "servers" else None
+        self._episode = _Episode(request, Conductor(request.info, committed_ticks=committed_ticks, residual=head))
         self._watch.forget_losses()
         self._robot_heard_ns = self._host.now_ns()
         self._link.publish(INFO, request.info, at_ns=0)
+        if head is not None:
+            text = f"every row is corrected by {head.digest}"
+            self._event(m.Severity.INFO, RESIDUAL_EVENT, text, digest=head.digest)
         for warning in warnings:
             self._event(m.Severity.WARNING, "warning", warning)
         for proc, offset in self._offsets.items():
@@ -358,6 +365,11 @@ class ClockService:
                 f"POUNCE gives chunks of ({pounce.horizon}, {pounce.action_dim}), the episode was opened for "
                 f"({info.schedule.horizon}, {info.robot.action_dim}). Set --horizon, or load another checkpoint."
             )
+        if self._config.residual is not None:
+            try:
+                check_head(self._config.residual, info.robot)
+            except ValueError as error:
+                raise ProtocolError(str(error)) from error
         fake = [c.proc for c in contracts if c.is_fake]
         if fake and not info.robot.is_simulated:
             raise ProtocolError(f"{' and '.join(fake)} run untrained weights; a real robot is not theirs to move.")

@@ -37,7 +37,12 @@ def build_engine(options: PounceOptions) -> PounceEngine:
         tiny = tiny_groot if options.family == "groot" else tiny_cpu
         bundle = random_bundle(tiny(num_carriers=options.num_carriers, cognition_size=hidden_size), options.seed)
     return EagerEngine(
-        bundle, device=options.device, dtype=options.dtype, continuity=options.continuity, path=options.path
+        bundle,
+        device=options.device,
+        dtype=options.dtype,
+        continuity=options.continuity,
+        path=options.path,
+        rolls_forward=options.roll_forward,
     )
 
 

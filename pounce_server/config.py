@@ -36,3 +36,5 @@ class PounceOptions:
     continuity: Literal["none", "rtc", "trained"] = "none"
     """Whether pi0.5 continues the rows that are being played. rtc: real-time chunking, for a backward pass per flow
     step; trained: at no cost, by a checkpoint that learned to (`pp-train --max-committed-rows`)."""
+    roll_forward: bool = False
+    """Plan from the state that the committed rows lead to instead of the measured one."""

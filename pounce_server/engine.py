@@ -36,6 +36,7 @@ from pounce_server.contract import (
 from pounce_server.fused import fused_for
 from pounce_server.guidance import given, guide, with_committed
 from pounce_server.precision import cast_for_serving
+from pounce_server.roll_forward import placed, rolled
 
 Sampler: TypeAlias = Callable[[Sequence[Request], Tensor], Iterator[tuple[list[int], EulerStep]]]
 """Reads requests and yields flow steps from given noise, (B, N, A), each with the indices of the requests it moves."""
@@ -52,7 +53,7 @@ class EagerEngine:
     Raises:
         ValueError: ``continuity`` is not "none" and the model is not pi0.5, or it is "trained" and the model was never
             trained so; or ``path`` is "fused", and the model is not pi0.5, the chunks are to be continued, or Triton
-            has nothing to run on.
+            has nothing to run on; or the state is rolled forward past the rows that the chunk is to be given.
     """
 
     def __init__(
@@ -63,7 +64,11 @@ class EagerEngine:
         dtype: DTypeName = "float32",
         continuity: Continuity = "none",
         path: PathName = "eager",
+        rolls_forward: bool = False,
     ) -> None:
+        if rolls_forward and continuity == "trained":
+            raise ValueError("--roll-forward plans after the committed rows, --continuity trained with them: take one")
+        self._rolls_forward = rolls_forward
         config = bundle.model.config
         self._statistics = bundle.statistics
         self._network_action_dim, self._padded_action_dim = config.robot_action_dim, config.padded_action_dim
@@ -124,6 +129,15 @@ class EagerEngine:
         return self._invoke(requests, progress)
 
     def _invoke(self, requests: Sequence[Request], progress: Progress) -> list[NDArray[np.float32]]:
+        if not self._rolls_forward:
+            return self._planned(requests, progress)
+        rolled_requests = [rolled(request, self.spec.horizon) for request in requests]
+        return [
+            placed(rows, request)
+            for rows, request in zip(self._planned(rolled_requests, progress), requests, strict=True)
+        ]
+
+    def _planned(self, requests: Sequence[Request], progress: Progress) -> list[NDArray[np.float32]]:
         noise_BNA = torch.cat([self._noise(request.seed) for request in requests])
         actions_BNA = noise_BNA.clone()
         for moved, step in self._sample(requests, noise_BNA):

@@ -15,6 +15,7 @@ import pytest
 from clock.conductor import Conductor, Stage
 from clock.playback import deadline_ns
 from clock.report import stream_sha256
+from clock.residual import RESIDUAL_EVENT, ResidualHead
 from protocol import codec, images, topics
 from protocol import messages as m
 from protocol.mcap_log import EpisodeLog
@@ -180,11 +181,20 @@ def look(tick: int, source_ns: int, num_ticks: int, *, has_images: bool) -> m.Ob
     )
 
 
-def run_lockstep(timing: m.Schedule, num_ticks: int, seed: int, *, has_images: bool = False) -> Episode:
+def _conductor(episode: Episode, residual: ResidualHead | None) -> Conductor:
+    if residual is not None:
+        digest = {"digest": residual.digest}
+        episode.say(m.Event(severity=m.Severity.INFO, name=RESIDUAL_EVENT, text="", attributes=digest), 0)
+    return Conductor(episode.info, residual=residual)
+
+
+def run_lockstep(
+    timing: m.Schedule, num_ticks: int, seed: int, *, has_images: bool = False, residual: ResidualHead | None = None
+) -> Episode:
     """Virtual time; answers are handed over in any order and as late as ``is_waiting`` allows."""
     rng = np.random.default_rng(seed)
     episode = Episode(episode_info(timing))
-    conductor = Conductor(episode.info)
+    conductor = _conductor(episode, residual)
     inbox: list[Any] = [look(0, 0, num_ticks, has_images=has_images)]
     now_ns = 0
     while conductor.stage != Stage.ENDED:
@@ -210,17 +220,24 @@ def run_lockstep(timing: m.Schedule, num_ticks: int, seed: int, *, has_images: b
 
 
 def run_realtime(
-    timing: m.Schedule, num_ticks: int, seed: int, *, stalls: float = 0.02, silence: range = range(0)
+    timing: m.Schedule,
+    num_ticks: int,
+    seed: int,
+    *,
+    stalls: float = 0.02,
+    silence: range = range(0),
+    residual: ResidualHead | None = None,
 ) -> Episode:
     """Real time, simulated: everything takes as long as it takes, and the clock service itself is late or stalls.
 
     Args:
         stalls: chance, per wake-up, that the clock service stands still for 20 to 300 ms.
         silence: invocations that POUNCE never answers; then it is declared lost, and back.
+        residual: corrects every row.
     """
     rng = np.random.default_rng(seed)
     episode = Episode(episode_info(dataclasses.replace(timing, mode=m.Mode.REALTIME)))
-    conductor = Conductor(episode.info)
+    conductor = _conductor(episode, residual)
     coming: list[tuple[int, int, Any]] = []
 
     def post(at_ns: int, what: Any) -> None:
