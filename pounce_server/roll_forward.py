@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ponderpounce.models.normalisation import NUM_ARM_JOINTS
+from ponderpounce.models.arm import NUM_ARM_JOINTS
 from pounce_server.contract import Request
 
 
