@@ -1,40 +1,49 @@
 """How old is a cognition when several robots think with one PONDER, and what does a greedy robot cost the others?
 
-Robots ask once a period, all at the same instant, of one engine in one process: the worst case, which admission counts
-with. Age is from the instant a query was due to its cognition on the host. "In common forwards" is how ponder-serve
-runs; "one by one" allows a forward one row. The last rows have one robot that asks again the moment it is answered, and
-one that writes a long text every time.
+Robots ask once a period of one engine in one process: all at the same instant, the worst case, which admission counts
+with; or evenly spread. Age is from the instant a query was due to its cognition on the host. "In common forwards" is
+how ponder-serve runs; "one by one" allows a forward one row. Then as many robots as one core should carry, for longer,
+with the worst of them by name; whom admission would refuse, and with which words; and what three robots notice of a
+fourth that asks again the moment it is answered, or writes a long text every time.
 """
 
 from __future__ import annotations
 
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 import tyro
 
 from benchmarks.report import Report, Row, show, spread
-from ponder_server.contract import Frame, Opening
+from clock.membership import percentile_ns
+from ponder_server.admission import Admission
+from ponder_server.contract import Frame, Opening, SessionError
 from ponder_server.engine import EngineConfig, QwenEngine
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
 
 MAX_CONTEXT_TOKENS = 16_384
+MAX_ROWS = 8
+"""Of a forward, as ponder-serve has it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConcurrencyOptions:
     """Many robots on one engine."""
 
-    robots: tuple[int, ...] = (1, 2, 4, 8)
+    robots: tuple[int, ...] = (1, 4, 8, 16)
     period_ms: int = 1000
     seconds: float = 6.0
     """Per row, after one second that is not counted."""
+    many: int = 32
+    many_seconds: float = 60.0
+    """Per row of so many robots."""
     text_tokens: int = 45
     """Of the robot that writes all the time."""
+    threads: int = 1
 
 
 @dataclass(slots=True, kw_only=True)
@@ -46,14 +55,13 @@ class Robot:
     period_ns: int
     text_tokens: int | None = None
     is_thinking: bool = False
-
-    def asks(self, now_ns: int) -> bool:
-        return not self.is_thinking and now_ns >= self.due_ns
+    num_due: int = 0
+    ages_ms: list[float] = field(default_factory=list)
 
 
 def main(argv: list[str] | None = None) -> int:
     options = tyro.cli(ConcurrencyOptions, args=argv, prog="ponder-concurrency")
-    torch.set_num_threads(1)
+    torch.set_num_threads(options.threads)
     report = Report(
         name="ponder_concurrency",
         question="How old is a cognition when several robots think with one PONDER?",
@@ -61,70 +69,126 @@ def main(argv: list[str] | None = None) -> int:
         warm_up="the engine's own, and the first second of each row.",
     )
     ponder = Ponder.random(tiny_cpu(), seed=0)
-    rows = []
-    for count in options.robots:
-        for name, max_rows in (("in common forwards", 8), ("one by one", 1)):
-            ages_ms = _run(ponder, options, count, max_rows)
-            rows.append(
-                {"robots": count, "forwards": name} | spread([age for ages in ages_ms.values() for age in ages], "ms")
-            )
-    report.add_table(f"Age of a cognition, all robots asking at one instant, every {options.period_ms} ms", rows)
-    others: list[Row] = []
-    for name, change in (
-        ("asks as all do", {}),
-        ("asks again at once", {"period_ns": 0}),
-        (f"writes {options.text_tokens} tokens each time", {"text_tokens": options.text_tokens}),
-    ):
-        ages_ms = _run(ponder, options, 4, 8, change)
-        patient = [age_ms for robot, ages in ages_ms.items() if robot != "r0" for age_ms in ages]
-        others.append({"the fourth robot": name, "its answers": len(ages_ms["r0"])} | spread(patient, "ms"))
-    report.add_table("Age of a cognition of three robots, by what a fourth one does", others)
+    title = f"Age of a cognition, every robot asking once in {options.period_ms} ms"
+    report.add_table(title + ", all at one instant", _few(ponder, options))
+    report.add_table(f"{title}: {options.many} robots for {options.many_seconds:.0f} s", _many(ponder, options))
+    report.add_table("Admission, counting with the fires of this machine's warm-up", _admission(ponder, options))
+    report.add_table("Age of a cognition of three robots, by what a fourth one does", _beside_a_fourth(ponder, options))
     report.notes += [
-        "tiny_cpu with random weights, one thread; contexts grow by 133 tokens a query.",
+        f"tiny_cpu with random weights, {options.threads} thread(s); contexts grow by 133 tokens a query.",
         "A robot that is still thinking asks late, and the age of that answer includes the wait.",
+        "The worst robot is the one with the largest p95.",
     ]
     show(report)
     print(f"\nwritten: {report.write().name}")
     return 0
 
 
+def _few(ponder: Ponder, options: ConcurrencyOptions) -> list[Row]:
+    rows: list[Row] = []
+    for count in options.robots:
+        for name, max_rows in (("in common forwards", MAX_ROWS), ("one by one", 1)):
+            robots = _run(ponder, options, count, options.seconds, max_rows=max_rows)
+            rows.append({"robots": count, "forwards": name} | spread(_ages(robots), "ms"))
+    return rows
+
+
+def _many(ponder: Ponder, options: ConcurrencyOptions) -> list[Row]:
+    rows: list[Row] = []
+    for name, is_spread in (("at one instant", False), ("evenly spread", True)):
+        robots = _run(ponder, options, options.many, options.many_seconds, is_spread=is_spread)
+        worst = max(robots, key=lambda robot: float(np.percentile(robot.ages_ms, 95, method="inverted_cdf")))
+        answers = {"answered": len(_ages(robots)), "due": sum(robot.num_due for robot in robots)}
+        fewest = {"fewest of one robot": min(len(robot.ages_ms) for robot in robots)}
+        for whose, ages_ms in (("all", _ages(robots)), (f"the worst, {worst.name}", worst.ages_ms)):
+            rows.append({"they ask": name, "whose": whose} | answers | fewest | spread(ages_ms, "ms"))
+    return rows
+
+
+def _admission(ponder: Ponder, options: ConcurrencyOptions) -> list[Row]:
+    durations_ns = QwenEngine(ponder, EngineConfig(max_sessions=1)).warm_up()
+    p50_ns, p99_ns = (percentile_ns(durations_ns, percent) for percent in (50, 99))
+    tight_ms = -(-((options.many - 1) * p50_ns + p99_ns) // 1_000_000)
+    rows: list[Row] = []
+    for budget_ms in (tight_ms, 1000):
+        admission = Admission(fire_p50_ns=p50_ns, fire_p99_ns=p99_ns, latency_budget_ns=budget_ms * 1_000_000)
+        refusal = ""
+        while not refusal:
+            try:
+                admission.admit(f"r{len(admission.periods_ns)}", options.period_ms * 1_000_000)
+            except SessionError as error:
+                refusal = str(error)
+        rows.append(
+            {"latency_budget_ms": budget_ms, "admitted": len(admission.periods_ns), "the next one is told": refusal}
+        )
+    return rows
+
+
+def _beside_a_fourth(ponder: Ponder, options: ConcurrencyOptions) -> list[Row]:
+    rows: list[Row] = []
+    for name, change in (
+        ("asks as all do", {}),
+        ("asks again at once", {"period_ns": 0}),
+        (f"writes {options.text_tokens} tokens each time", {"text_tokens": options.text_tokens}),
+    ):
+        fourth, *patient = _run(ponder, options, 4, options.seconds, change=change)
+        rows.append({"the fourth robot": name, "its answers": len(fourth.ages_ms)} | spread(_ages(patient), "ms"))
+    return rows
+
+
+def _ages(robots: list[Robot]) -> list[float]:
+    return [age_ms for robot in robots for age_ms in robot.ages_ms]
+
+
 def _run(
     ponder: Ponder,
     options: ConcurrencyOptions,
     count: int,
-    max_rows: int,
+    seconds: float,
+    *,
+    max_rows: int = MAX_ROWS,
+    is_spread: bool = False,
     change: dict[str, int] | None = None,
-) -> dict[str, list[float]]:
-    """Ages in ms by robot; ``change`` is what makes the first robot another."""
+) -> list[Robot]:
+    """So many robots with their ages; ``change`` is what makes the first one another."""
     config = EngineConfig(
         max_context_tokens=MAX_CONTEXT_TOKENS, max_sessions=count, max_batch_rows=max_rows, when_full="pin-and-slide"
     )
     engine = QwenEngine(ponder, config)
     engine.warm_up()
-    period_ns = options.period_ms * 1_000_000
-    start_ns = time.perf_counter_ns()
-    robots = {f"r{index}": Robot(name=f"r{index}", due_ns=start_ns, period_ns=period_ns) for index in range(count)}
-    robots["r0"] = replace(robots["r0"], **(change or {}))
     frames = _frames(ponder)
-    for name in robots:
-        engine.open(name, Opening(instruction="pick up the red cube"))
-    ages_ms: dict[str, list[float]] = {name: [] for name in robots}
-    counted_from_ns, end_ns = start_ns + 1_000_000_000, start_ns + round((1 + options.seconds) * 1e9)
-    while (now_ns := time.perf_counter_ns()) < end_ns:
+    period_ns = options.period_ms * 1_000_000
+    for index in range(count):
+        engine.open(f"r{index}", Opening(instruction="pick up the red cube"))
+    start_ns = time.perf_counter_ns()
+    robots = {}
+    for index in range(count):
+        due_ns = start_ns + is_spread * index * period_ns // count
+        robots[f"r{index}"] = Robot(name=f"r{index}", due_ns=due_ns, period_ns=period_ns)
+    robots["r0"] = replace(robots["r0"], **(change or {}))
+    counted_from_ns, end_ns = start_ns + 1_000_000_000, start_ns + round((1 + seconds) * 1e9)
+    while True:
+        now_ns = time.perf_counter_ns()
         for robot in robots.values():
-            if robot.asks(now_ns):
+            if not robot.is_thinking and robot.due_ns <= min(now_ns, end_ns - 1):
                 engine.begin(robot.name, frames, force_text_tokens=robot.text_tokens)
                 robot.is_thinking = True
+        if not any(robot.is_thinking for robot in robots.values()):
+            if now_ns >= end_ns:
+                break
+            time.sleep(1e-3)
         outcomes = engine.step()
         now_ns = time.perf_counter_ns()
         for outcome in outcomes:
             outcome.unwrap()
             robot = robots[outcome.session]
             if robot.due_ns >= counted_from_ns:
-                ages_ms[robot.name].append((now_ns - robot.due_ns) / 1e6)
+                robot.ages_ms.append((now_ns - robot.due_ns) / 1e6)
             robot.is_thinking = False
             robot.due_ns = robot.due_ns + robot.period_ns if robot.period_ns else now_ns
-    return ages_ms
+    for robot in robots.values():
+        robot.num_due = round(seconds * 1e9 / robot.period_ns) if robot.period_ns else len(robot.ages_ms)
+    return list(robots.values())
 
 
 def _frames(ponder: Ponder) -> tuple[Frame, Frame]:

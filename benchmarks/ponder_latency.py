@@ -2,6 +2,9 @@
 
 One fire: two 256 px frames on the host become a cognition on the host; vision tower, append, T gate and copies are all
 inside. The same query is asked at every context length, after which the context goes back, so lengths do not drift.
+What the longest context adds is set against what its attention's products must take at the speed that this machine
+multiplies large matrices with, in the same run: no code that computes them can add less.
+
 Beside it what a server without an append-only context pays, the whole context encoded again in one forward, and a
 transition with a text of 45 tokens (the paper's), decoded one by one and with a draft that knows it.
 
@@ -39,7 +42,8 @@ class LatencyOptions:
     size: Literal["tiny_cpu", "qwen35_0p8b", "qwen35_2b", "qwen35_4b", "qwen35_9b"] = "tiny_cpu"
     device: str = "cpu"
     dtype: Literal["float32", "bfloat16"] = "float32"
-    threads: int = 1
+    threads: tuple[int, ...] = (1, 2)
+    """Of torch; all but the fires is measured with the first."""
     contexts: tuple[int, ...] = (800, 4_000, 14_000)
     """Tokens in the context before the fire, about."""
     fires: int = 60
@@ -51,7 +55,7 @@ class LatencyOptions:
 
 def main(argv: list[str] | None = None) -> int:
     options = tyro.cli(LatencyOptions, args=argv, prog="ponder-latency")
-    torch.set_num_threads(options.threads)
+    torch.set_num_threads(options.threads[0])
     report = Report(
         name="ponder_latency",
         question="How long does PONDER think about one query, and how does that grow with its context?",
@@ -65,8 +69,16 @@ def main(argv: list[str] | None = None) -> int:
         for name, draft in (("one by one", NoDraft()), ("with a draft", TrieDraft([_own_text(ponder)])))
     }
     with torch.inference_mode():
-        rows, fire_p50_ms = _fires(engines["one by one"], options)
+        rows, floors = [], []
+        for threads in options.threads:
+            torch.set_num_threads(threads)
+            of_contexts = _fires(engines["one by one"], options)
+            rows += [{"threads": threads} | row for row in of_contexts]
+            floors.append({"threads": threads} | _floor(engines["one by one"], options, of_contexts))
+        torch.set_num_threads(options.threads[0])
         report.add_table("A cognition fire: two frames in, C_t out", rows)
+        report.add_table("What the longest context adds, and what its attention's products alone must take", floors)
+        fire_p50_ms = float(rows[len(options.contexts) - 1]["p50_ms"] or 0)
         encode_ms = _encodes(ponder, options)
         report.add_table(
             f"The longest context encoded again, every token of it ({max(options.contexts)} tokens)",
@@ -78,8 +90,8 @@ def main(argv: list[str] | None = None) -> int:
         )
     size = engines["one by one"].spec.session_bytes
     report.notes += [
-        f"{options.size} with random weights, {options.dtype} on {options.device}, {options.threads} thread(s); a "
-        f"session of {max(options.contexts) + 600} tokens takes {size / 2**20:.1f} MiB.",
+        f"{options.size} with random weights, {options.dtype} on {options.device}, {options.threads[0]} thread(s) if "
+        f"nothing else is said; a session of {max(options.contexts) + 600} tokens takes {size / 2**20:.1f} MiB.",
         "The draft knows the text beforehand, which is the best a draft can do.",
     ]
     show(report)
@@ -87,8 +99,8 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def _fires(engine: QwenEngine, options: LatencyOptions) -> tuple[list[Row], float]:
-    """A row per context length, and the p50 of the longest."""
+def _fires(engine: QwenEngine, options: LatencyOptions) -> list[Row]:
+    """A row per context length."""
     frames = _frames(engine, 2, seed=0)
     rows: list[Row] = []
     p50_ms: list[float] = []
@@ -102,7 +114,43 @@ def _fires(engine: QwenEngine, options: LatencyOptions) -> tuple[list[Row], floa
             | spread(took_ms, "ms")
             | {"p50_against_first": round(p50_ms[-1] / p50_ms[0], 2)}
         )
-    return rows, p50_ms[-1]
+    return rows
+
+
+def _floor(engine: QwenEngine, options: LatencyOptions, fires: list[Row]) -> Row:
+    """The longest context beside the first one."""
+    text = engine._ponder.qwen.config.text_config
+    last = text.num_hidden_layers - 1
+    num_read = 1 + engine.spec.num_carriers  # the last layer answers for these alone
+    num_queries = [
+        num_read if index == last else len(engine._query_ids)
+        for index, kind in enumerate(text.layer_types)
+        if kind == "full_attention"
+    ]
+    num_keys = options.contexts[-1] - options.contexts[0]
+    # two products, of queries and keys and of shares and values; a multiplication and an addition each
+    flop = 4 * sum(num_queries) * num_keys * text.num_attention_heads * text.head_dim
+    flop_per_ms = _product_flop_per_ms(engine)
+    first_ms, longest_ms = (float(fires[at]["p50_ms"] or 0) for at in (0, -1))
+    return {
+        "more keys": num_keys,
+        "adds_ms": round(longest_ms - first_ms, 2),
+        "products_gflop": round(flop / 1e9, 2),
+        "machine_gflop_per_s": round(flop_per_ms / 1e6),
+        "products_ms": round(flop / flop_per_ms, 2),
+        "least_p50_against_first": round(1 + flop / flop_per_ms / first_ms, 2),
+    }
+
+
+def _product_flop_per_ms(engine: QwenEngine, size: int = 1024) -> float:
+    """Of the fastest of twenty products of square matrices in the network's own precision."""
+    left, right = torch.randn(2, size, size, device=engine._ponder.device, dtype=engine._ponder.dtype)
+    took_ms = []
+    for _ in range(20):
+        start_ns = time.perf_counter_ns()
+        (left @ right)[0, 0].item()
+        took_ms.append((time.perf_counter_ns() - start_ns) / 1e6)
+    return 2 * size**3 / min(took_ms)
 
 
 def _texts(engine: QwenEngine, options: LatencyOptions) -> Row:

@@ -82,7 +82,8 @@ class Membership:
         """
         first = 0
         while first < num_queries:
-            request = m.JournalRequest(first_query=first, max_queries=JOURNAL_PAGE)
+            # not beyond what was asked for: the journal grows, and what is new comes as a query of its own
+            request = m.JournalRequest(first_query=first, max_queries=min(JOURNAL_PAGE, num_queries - first))
             reply = self._link.call(JOURNAL, "clock", request, timeout_ns=_CALL_NS)
             if reply.error or not reply.entries:
                 raise ProtocolError(reply.error or f"the journal ends at query {first} of {num_queries}")

@@ -25,6 +25,8 @@ class _Thought(Generic[Result]):
     session: str
     steps: Steps[Result]
     request: Append
+    turn: int
+    """Whoever has the smallest waits longest."""
 
 
 class Batch(Generic[Result]):
@@ -35,6 +37,7 @@ class Batch(Generic[Result]):
         self._max_rows = max_rows
         self._waiting: list[_Thought[Result]] = []
         self._ended: list[Outcome[Result]] = []
+        self._next_turn = 0
 
     @property
     def sessions(self) -> tuple[str, ...]:
@@ -44,7 +47,12 @@ class Batch(Generic[Result]):
     def __bool__(self) -> bool:
         return bool(self._waiting or self._ended)
 
-    def add(self, session: str, steps: Steps[Result]) -> None:
+    def turn(self) -> int:
+        """A place at the end of the queue, for a thought that is added later."""
+        self._next_turn += 1
+        return self._next_turn
+
+    def add(self, session: str, steps: Steps[Result], turn: int) -> None:
         """Starts a thought; what it raises before its first append is its outcome."""
         assert session not in self.sessions, f"{session!r} is thinking already"
         try:
@@ -52,7 +60,8 @@ class Batch(Generic[Result]):
         except Exception as error:
             self._ended.append(Outcome(session, None, error))
         else:
-            self._waiting.append(_Thought(session, steps, request))
+            self._waiting.append(_Thought(session, steps, request, turn))
+            self._waiting.sort(key=lambda thought: thought.turn)
 
     def step(self, progress: Progress) -> list[Outcome[Result]]:
         """One forward; the thoughts that ended with it. What interrupts it is told to every thought in it."""
@@ -94,6 +103,7 @@ class Batch(Generic[Result]):
         except Exception as error:
             self._ended.append(Outcome(thought.session, None, error))
         else:
+            thought.turn = self.turn()
             self._waiting.append(thought)
 
     def _abandon(self, group: Sequence[_Thought[Result]], error: BaseException) -> None:

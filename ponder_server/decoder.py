@@ -2,15 +2,14 @@
 
 transformers' decoder has one length for all rows, moves the recurrent state by padding and attends to whatever a cache
 returns. Here every row is a slot with a length of its own, padding on the right is inert, and attention reads valid
-positions only. The modules and the delta-rule functions are transformers' (which take fla's kernels where those are
-installed); the tests hold this file to transformers' own forward.
+positions only. The modules are transformers'; the tests hold this file to its own forward.
 
 # B rows, T tokens of a row with its padding, H hidden, D head dimension, C conv channels, W conv width
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -18,7 +17,12 @@ from torch.nn import functional as F
 
 from ponder_server.attention import attend
 from ponder_server.slots import AttentionMemory, RecurrentMemory, SlotMemory
-from ponderpounce.models.ponder_kernels import delta_rule_of_many, delta_rule_of_one, rotate
+from ponderpounce.models.gated_delta import gated_delta_rule
+from ponderpounce.models.ponder_kernels import DeltaRule, delta_rule_of_many, delta_rule_of_one, rotate
+
+LEAST_TOKENS = 4
+"""Rows times tokens of a forward, at least. A CPU multiplies one to three rows of a matrix by other kernels than more,
+which round differently; from four on, no token's bits depend on how many others share its forward."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,7 +42,7 @@ def decode(
 ) -> list[Tensor]:
     """Appends each row to its slot; final hidden states (num_wanted, H) of each.
 
-    Rows must be of different slots, and padding must be finite.
+    Rows must be of different slots, and padding must be finite. Rows beyond the places are nobody's: see LEAST_TOKENS.
     """
     assert len({place.slot for place in places}) == len(places), "two rows of one slot"
     num_new_B = torch.tensor([place.num_new for place in places], device=embeds_BTH.device)
@@ -57,9 +61,11 @@ def decode(
         hidden = hidden + mixed_BTH
         if index == last:
             wanted = [slice(place.num_new - place.num_wanted, place.num_new) for place in places]
-            hidden = torch.cat([row_TH[part] for row_TH, part in zip(hidden, wanted, strict=True)])
+            hidden = torch.cat([row_TH[part] for row_TH, part in zip(hidden, wanted, strict=False)])
+            hidden = F.pad(hidden, (0, 0, 0, max(0, LEAST_TOKENS - len(hidden))))
         hidden = hidden + layer.mlp(layer.post_attention_layernorm(hidden))
-    return list(text_model.norm(hidden).split([place.num_wanted for place in places]))
+    num_wanted = [place.num_wanted for place in places]
+    return list(text_model.norm(hidden)[: sum(num_wanted)].split(num_wanted))
 
 
 def _attention(
@@ -92,11 +98,18 @@ def _attention(
     return mixed_BTH
 
 
+def _rule(length: int, device: torch.device) -> DeltaRule:
+    """transformers' functions, which are fla's kernels where that is installed; on a CPU our own is the faster one."""
+    if length == 1:
+        return delta_rule_of_one
+    return cast(DeltaRule, gated_delta_rule) if device.type == "cpu" else delta_rule_of_many
+
+
 def _gated_delta(delta: Any, memory: RecurrentMemory, slot_B: Tensor, num_new_B: Tensor, hidden_BTH: Tensor) -> Tensor:
-    """Advances every row's states by its valid tokens; (B, T, H)."""
-    batch, length, _ = hidden_BTH.shape
+    """Advances every row's states by its valid tokens; (B, T, H), of which rows beyond the slots mean nothing."""
+    batch, length = len(slot_B), hidden_BTH.shape[1]
     width = delta.conv_kernel_size
-    inputs_BCT = torch.cat([memory.conv[slot_B], delta.in_proj_qkv(hidden_BTH).transpose(1, 2)], dim=-1)
+    inputs_BCT = torch.cat([memory.conv[slot_B], delta.in_proj_qkv(hidden_BTH)[:batch].transpose(1, 2)], dim=-1)
     # The last W inputs of each row end at its last valid token, not at its padding.
     kept_BW = num_new_B[:, None] + torch.arange(width, device=hidden_BTH.device)
     memory.conv[slot_B] = inputs_BCT.gather(2, kept_BW[:, None].expand(-1, inputs_BCT.shape[1], -1))
@@ -106,10 +119,9 @@ def _gated_delta(delta: Any, memory: RecurrentMemory, slot_B: Tensor, num_new_B:
 
     # Beta 0 writes nothing, decay exp(0) forgets nothing: a pad leaves the state as it is, to the last bit.
     is_valid_BT1 = (torch.arange(length, device=hidden_BTH.device) < num_new_B[:, None])[..., None]
-    beta = delta.in_proj_b(hidden_BTH).sigmoid() * is_valid_BT1
-    decay = -delta.A_log.float().exp() * F.softplus(delta.in_proj_a(hidden_BTH).float() + delta.dt_bias)
-    rule = delta_rule_of_one if length == 1 else delta_rule_of_many
-    read, state = rule(
+    beta = delta.in_proj_b(hidden_BTH)[:batch].sigmoid() * is_valid_BT1
+    decay = -delta.A_log.float().exp() * F.softplus(delta.in_proj_a(hidden_BTH)[:batch].float() + delta.dt_bias)
+    read, state = _rule(length, hidden_BTH.device)(
         queries.reshape(batch, length, -1, delta.head_k_dim),
         keys.reshape(batch, length, -1, delta.head_k_dim),
         values.reshape(batch, length, -1, delta.head_v_dim),
@@ -120,7 +132,7 @@ def _gated_delta(delta: Any, memory: RecurrentMemory, slot_B: Tensor, num_new_B:
         use_qk_l2norm_in_kernel=True,
     )
     memory.state[slot_B] = state
-    gate = delta.in_proj_z(hidden_BTH).reshape(-1, delta.head_v_dim)
-    normed = delta.norm(read.reshape(-1, delta.head_v_dim), gate)
-    mixed_BTH: Tensor = delta.out_proj(normed.reshape(batch, length, -1))
+    gate = delta.in_proj_z(hidden_BTH)[:batch].reshape(-1, delta.head_v_dim)
+    normed_BTD = delta.norm(read.reshape(-1, delta.head_v_dim), gate).reshape(batch, length, -1)
+    mixed_BTH: Tensor = delta.out_proj(F.pad(normed_BTD, (0, 0, 0, 0, 0, len(hidden_BTH) - batch)))
     return mixed_BTH

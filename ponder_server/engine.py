@@ -101,6 +101,7 @@ class _Query:
     pictures: Pictures
     """(images, h, w, 3): what is seen of its frames."""
     force_text_tokens: int | None
+    turn: int
 
 
 class QwenEngine:
@@ -244,18 +245,21 @@ class QwenEngine:
             raise ValueError(f"force_text_tokens is {force_text_tokens}; at least 1, or None")
         self._make_room(episode)
         context.check_room(len(self._query_ids))
-        self._begun[session] = _Query(episode=episode, pictures=pictures, force_text_tokens=force_text_tokens)
+        self._begun[session] = _Query(
+            episode=episode, pictures=pictures, force_text_tokens=force_text_tokens, turn=self._batch.turn()
+        )
 
     @torch.inference_mode()
     def step(self, progress: Progress = no_progress) -> list[Outcome[Fire]]:
         """One forward for the queries that were begun; those answered by it. See ``BatchingEngine.step``."""
-        begun, self._begun = self._begun, {}
+        # no more at a time than share a forward: the rest would wait behind their vision tower, and outgrow the caches
+        begun = {session: self._begun.pop(session) for session in [*self._begun][: self._config.max_batch_rows]}
         if begun:
             pictures = [picture for query in begun.values() for picture in query.pictures]
             embeds_TH = self._embed(self._query_ids * len(begun), pictures)
             pieces = embeds_TH.split(len(self._query_ids))
             for (session, query), query_TH in zip(begun.items(), pieces, strict=True):
-                self._batch.add(session, self._think(query, query_TH))
+                self._batch.add(session, self._think(query, query_TH), query.turn)
         return self._batch.step(progress)
 
     def _think(self, query: _Query, embeds_TH: Tensor) -> Steps[Fire]:

@@ -6,7 +6,9 @@ weights and the turns. A robot is admitted to an episode if everybody's latency 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 from clock.membership import percentile_ns
 from ponder_server.admission import Admission
@@ -21,9 +23,10 @@ from ponder_server.contract import (
     SessionError,
     no_progress,
 )
-from ponder_server.node import Work
+from ponder_server.node import KEEP_QUERIES, Work
 from ponder_server.serve import PonderServer
 from protocol import messages as m
+from protocol.errors import CallFailed, ProtocolError
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
 from protocol.process import host_clock_id
@@ -83,7 +86,11 @@ class RobotEngine:
 
 
 class RobotServer(PonderServer):
-    """PONDER for one of several robots: a query is begun in one step and answered in a later one."""
+    """PONDER for one of several robots: a query is begun in one step and answered in a later one.
+
+    A lost context is rebuilt in the same way, a query at a time, so that the other robots' queries take turns with it;
+    what its own robot asks meanwhile waits for the end of it.
+    """
 
     def __init__(
         self, link: Link, engine: RobotEngine, heartbeat: Heartbeat, version: str, admission: Admission
@@ -91,52 +98,104 @@ class RobotServer(PonderServer):
         super().__init__(link, engine, heartbeat, version)
         self._robot_engine = engine
         self._admission = admission
+        self._waiting: deque[Work] = deque()
         self._thinking: tuple[Work, int] | None = None
+        self._rebuild: _Rebuild | None = None
 
     @property
-    def is_thinking(self) -> bool:
-        return self._thinking is not None
+    def is_busy(self) -> bool:
+        return self._thinking is not None or self._rebuild is not None
 
     def step(self) -> bool:
         """Takes in what came and hands over what was answered; the fleet does the thinking in between."""
         worked = self._listen()
+        while len(self._waiting) < KEEP_QUERIES and (work := self._next_work()) is not None:
+            self._waiting.append(work)  # out of the node: observations are kept for ticks there, not for seconds
         return self._finish() or self._begin() or worked
 
+    def rejoin(self) -> bool:
+        """Asks which episode runs, and begins to rebuild its context."""
+        rejoined = self._membership.rejoin()
+        if rejoined is None:
+            return False
+        self._node.open(next_query=rejoined.num_queries)
+        self._rebuild = _Rebuild(self._missed_work(rejoined.num_queries), rejoined.num_queries, rejoined.owed_query)
+        return True
+
     def _begin(self) -> bool:
-        if self._thinking is not None or (work := self._next_work()) is None:
+        if self._thinking is not None or (work := self._next_rebuilt() or self._next_asked()) is None:
             return False
         try:
             self._robot_engine.begin(self._link.episode, work.frames)
         except (SessionError, ValueError) as error:
-            self._refuse(work, error)
+            self._fail(work, error)
         else:
             self._thinking = work, self._start()
         return True
+
+    def _next_asked(self) -> Work | None:
+        return self._waiting.popleft() if self._waiting else None
+
+    def _next_rebuilt(self) -> Work | None:
+        """The next query to be thought over; without one the rebuilding is over."""
+        if self._rebuild is None:
+            return None
+        try:
+            work = next(self._rebuild.missed, None)
+        except (CallFailed, ProtocolError) as error:
+            self._give_up(error)
+            return None
+        if work is None:
+            num_queries, self._rebuild = self._rebuild.num_queries, None
+            self._rebuilt(num_queries)
+        return work
 
     def _finish(self) -> bool:
         if self._thinking is None or (outcome := self._robot_engine.fetch(self._link.episode)) is None:
             return False
         work, start_ns = self._thinking
         self._thinking = None
-        if outcome.result is not None:
-            self._answer(work, outcome.result, start_ns)
-        elif isinstance(outcome.error, ValueError):
-            self._refuse(work, outcome.error)
-        else:
-            outcome.unwrap()
         self._stop()
+        if isinstance(outcome.error, ValueError):
+            self._fail(work, outcome.error)
+        else:
+            fire = outcome.unwrap()
+            if self._is_owed(work):
+                self._answer(work, fire, start_ns)
         return True
+
+    def _fail(self, work: Work, error: Exception) -> None:
+        if self._is_owed(work):
+            self._refuse(work, error)
+        else:
+            self._give_up(error)
+
+    def _is_owed(self, work: Work) -> bool:
+        """Whether somebody waits for the answer, or the context alone needs it."""
+        return self._rebuild is None or work.query.query == self._rebuild.owed_query
 
     def _open(self, request: m.OpenRequest) -> m.Contract:
         self._admission.admit(self._link.robot, request.info.schedule.query_period_ns)
         return super()._open(request)
 
     def _close(self) -> None:
+        self._rebuild = None
+        self._waiting.clear()
         if self._thinking is not None:
             self._thinking = None
             self._stop()
         self._admission.release(self._link.robot)
         super()._close()
+
+
+@dataclass(frozen=True, slots=True)
+class _Rebuild:
+    """A lost context on its way back."""
+
+    missed: Iterator[Work]
+    num_queries: int
+    owed_query: int | None
+    """The clock still waits for this one's answer (lockstep)."""
 
 
 class PonderFleet:
@@ -166,7 +225,11 @@ class PonderFleet:
         for _, heartbeat in self._ends:
             heartbeat.set(state=m.ServingState.WARMING)
         durations_ns = self._shared.engine.warm_up()
-        admission = Admission(fire_ns=percentile_ns(durations_ns, 99), latency_budget_ns=self._latency_budget_ns)
+        admission = Admission(
+            fire_p50_ns=percentile_ns(durations_ns, 50),
+            fire_p99_ns=percentile_ns(durations_ns, 99),
+            latency_budget_ns=self._latency_budget_ns,
+        )
         for link, heartbeat in self._ends:
             engine = RobotEngine(self._shared, link.robot, durations_ns)
             self._servers.append(RobotServer(link, engine, heartbeat, self._version, admission))
@@ -181,7 +244,7 @@ class PonderFleet:
         """Every robot is heard, then one forward for all of those that asked."""
         worked = [server.step() for server in self._servers]
         self._shared.step(self._beat)
-        return any(worked) or any(server.is_thinking for server in self._servers)
+        return any(worked) or any(server.is_busy for server in self._servers)
 
     def _beat(self) -> None:
         for _, heartbeat in self._ends:

@@ -62,8 +62,16 @@ class PonderNode:
         pair = self._rendezvous.next_pair()
         if pair is None:
             return None
-        query, observation = pair
-        return Work(query=query, frames=tuple(images.unpack(image) for image in observation.images))
+        return _work(*pair)
+
+    def replay(self, query: m.Query, observation: m.Observation) -> Work:
+        """A query of the past and the observation that it was about, from the journal.
+
+        Raises:
+            MalformedMessage: not what the engine can read.
+        """
+        check_pictures(observation, self._spec)
+        return _work(query, observation)
 
     def missed(self) -> list[m.Query]:
         """Queries whose observation was lost on the way."""
@@ -99,6 +107,10 @@ class PonderNode:
             for text in fire.texts
         ]
         return cognition, texts
+
+
+def _work(query: m.Query, observation: m.Observation) -> Work:
+    return Work(query=query, frames=tuple(images.unpack(image) for image in observation.images))
 
 
 def check_robot(robot: m.Robot, spec: EngineSpec) -> None:

@@ -5,7 +5,8 @@ recurrent layers forget what they were: their state is copied out and back, whil
 length are simply no longer looked at.
 
 Rows are padded on the right to one of a few *buckets*, so that a forward has one of a few shapes; what is longer than
-the largest bucket goes in several forwards. All memory is allocated at construction, and everything writes in place.
+the largest bucket goes in several forwards. A row's buckets do not depend on who shares its forwards. All memory is
+allocated at construction, and everything writes in place.
 
 # T new tokens, H hidden
 """
@@ -19,7 +20,7 @@ import torch
 from torch import Tensor
 
 from ponder_server.contract import ContextFull, SessionError
-from ponder_server.decoder import Place, decode
+from ponder_server.decoder import LEAST_TOKENS, Place, decode
 from ponder_server.slots import SlotMemory
 from ponderpounce.models.ponder import Ponder
 
@@ -103,7 +104,8 @@ class Runner:
             one.session.check_room(len(one.ids))
         rows = [_Row(one, self._ponder) for one in appends]
         while active := [row for row in rows if row.num_left]:
-            self._forward(active)
+            length = max(self.bucket(row.num_left) for row in active)
+            self._forward([row for row in active if self.bucket(row.num_left) == length], length)
         for one, row in zip(appends, rows, strict=True):
             one.session.ids.extend(one.ids)
             one.session.next_position = row.next_position
@@ -112,10 +114,10 @@ class Runner:
     def _blank_state(self, slot: int) -> SavedState:
         return SavedState(num_ids=0, next_position=0, tensors=[torch.empty_like(t) for t in self.memory.states(slot)])
 
-    def _forward(self, rows: "Sequence[_Row]") -> None:
-        length = self.bucket(max(row.num_left for row in rows))
-        embeds_BTH = rows[0].embeds_TH.new_zeros(len(rows), length, rows[0].embeds_TH.shape[1])
-        positions_3BT = np.zeros((3, len(rows), length), dtype=np.int64)
+    def _forward(self, rows: "Sequence[_Row]", length: int) -> None:
+        num_rows = max(len(rows), -(-LEAST_TOKENS // length))
+        embeds_BTH = rows[0].embeds_TH.new_zeros(num_rows, length, rows[0].embeds_TH.shape[1])
+        positions_3BT = np.zeros((3, num_rows, length), dtype=np.int64)
         places = []
         for index, row in enumerate(rows):
             first, end = row.num_done, min(row.num_done + length, row.num_tokens)

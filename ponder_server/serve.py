@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import time
+from collections.abc import Iterator
 
 from clock.membership import Membership, percentile_ns
 from ponder_server.contract import ContextFull, Fire, Opening, PonderEngine, SessionError
@@ -92,27 +93,39 @@ class PonderServer:
         rejoined = self._membership.rejoin()
         if rejoined is None:
             return False
-        num_queries = rejoined.num_queries
+        self._node.open(next_query=rejoined.num_queries)
         try:
-            for entry in self._membership.journal(num_queries):
-                observation = codec.decode(m.Observation, entry.observation)
-                self._node.on_observation(observation)
-                self._node.on_query(m.Query(query=entry.query, tick=entry.tick, source_ns=entry.source_ns))
-                work = self._node.next_work()
-                if work is not None and entry.query == rejoined.owed_query:
+            for work in self._missed_work(rejoined.num_queries):
+                if work.query.query == rejoined.owed_query:
                     self._fire(work)  # the clock still waits for this one (lockstep)
-                elif work is not None:
+                else:
                     self._engine.fire(self._link.episode, work.frames, self._heartbeat.beat)
         except (CallFailed, ProtocolError, ContextFull) as error:
-            log.error("rebuild failed episode=%s %s", self._link.episode, error)
-            self._close()
-            self._link.leave_episode()
+            self._give_up(error)
             return False
-        self._node.open(next_query=num_queries)
+        self._rebuilt(rejoined.num_queries)
+        return True
+
+    def _missed_work(self, num_queries: int) -> Iterator[Work]:
+        """The first queries of the running episode, from the clock service's journal.
+
+        Raises:
+            CallFailed, ProtocolError: it does not answer, or not with what was asked.
+        """
+        for entry in self._membership.journal(num_queries):
+            query = m.Query(query=entry.query, tick=entry.tick, source_ns=entry.source_ns)
+            yield self._node.replay(query, codec.decode(m.Observation, entry.observation))
+
+    def _rebuilt(self, num_queries: int) -> None:
         self._heartbeat.set(next_index=num_queries)
         self._membership.announce()
         self._tell(m.Severity.INFO, "context_rebuilt", f"PONDER rebuilt its context from {num_queries} observations")
-        return True
+
+    def _give_up(self, error: Exception) -> None:
+        """Leaves an episode whose context cannot be rebuilt."""
+        log.error("rebuild failed episode=%s %s", self._link.episode, error)
+        self._close()
+        self._link.leave_episode()
 
     def _fire(self, work: Work) -> None:
         start_ns = self._start()

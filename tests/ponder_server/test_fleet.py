@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 
 from ponder_server import contract
+from ponder_server.engine import EngineConfig, QwenEngine
 from ponder_server.fleet import PonderFleet
-from protocol import images, topics
+from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.ponder_configs import tiny_cpu
+from protocol import codec, images, topics
 from protocol import messages as m
 from protocol.bus import LocalBus
 from protocol.heartbeat import Heartbeat
@@ -50,7 +54,8 @@ class InTurns:
 class Hall:
     """Robots, their clocks, and the one PONDER that serves them."""
 
-    engine: InTurns
+    engine: Any
+    px: int = 4
     bus: LocalBus = dataclasses.field(default_factory=LocalBus)
     latency_budget_ms: int = 1000
 
@@ -64,7 +69,7 @@ class Hall:
         link = Link(self.bus, robot=ROBOTS[0], proc="ponder")
         self.fleet = PonderFleet(
             link,
-            self.engine,  # type: ignore[arg-type]
+            self.engine,
             Heartbeat(link, "test", "host/monotonic"),
             "test",
             other_robots=ROBOTS[1:],
@@ -73,21 +78,47 @@ class Hall:
         self.fleet.warm_up()
         self.fleet.ready()
         self.bus.add_party(self.fleet.step)
+        self.requests: dict[str, m.OpenRequest] = {}
+        self.journals: dict[str, list[m.JournalEntry]] = {robot: [] for robot in ROBOTS}
+        self.calls = [
+            (robot, clock.serve(topics.ACTIVE), clock.serve(topics.JOURNAL)) for robot, clock in self.clocks.items()
+        ]
+        self.bus.add_party(self.answer)
+
+    def answer(self) -> bool:
+        """What the clock services answer to a PONDER that knows nothing."""
+        num_answered = 0
+        for robot, active, journal in self.calls:
+            entries = tuple(self.journals[robot])
+            num_answered += active.answer(partial(running, self.requests.get(robot), len(entries)))
+            num_answered += journal.answer(partial(page, entries))
+        return num_answered > 0
 
     def open(self, robot: str, info: m.EpisodeInfo) -> m.OpenReply:
         clock = self.clocks[robot]
         header = dataclasses.replace(info.header, robot=robot)
         clock.enter_episode(header.session, header.episode, header.epoch)
-        request = m.OpenRequest(info=dataclasses.replace(info, header=header))
+        cameras = dataclasses.replace(info.robot, image_height=self.px, image_width=self.px)
+        request = m.OpenRequest(info=dataclasses.replace(info, header=header, robot=cameras))
+        self.requests[robot] = request
         return clock.call(topics.OPEN, "ponder", request, timeout_ns=1)  # type: ignore[no-any-return]
 
     def ask(self, robot: str, query: int) -> None:
         clock = self.clocks[robot]
-        frame = np.full((4, 4, 3), 10 * query + ROBOTS.index(robot), np.uint8)
+        frame = np.full((self.px, self.px, 3), 10 * query + ROBOTS.index(robot), np.uint8)
+        frame[: query + 1, ::2] += 40
         pictures = images.pack({"front": frame, "wrist": frame}, m.ImageCodec.RAW)
         seen = m.Observation(tick=query, source_ns=query, proprio=np.zeros(3, np.float32), images=pictures)
+        entry = m.JournalEntry(query=query, tick=query, source_ns=query, observation=codec.encode(seen))
+        self.journals[robot].append(entry)
         clock.publish(topics.OBSERVATION, seen, at_ns=query)
         clock.publish(topics.QUERY, m.Query(query=query, tick=query, source_ns=query), at_ns=query)
+
+    def forget(self, robot: str) -> None:
+        """PONDER loses this robot's episode, and may ask for it at once."""
+        self.clocks[robot].call(topics.CLOSE, "ponder", m.CloseRequest(), timeout_ns=1)
+        (server,) = [server for server in self.fleet._servers if server._link.robot == robot]
+        server._membership._ask_again_ns = 0
 
     def settle(self) -> None:
         while self.bus.run_parties():
@@ -95,6 +126,14 @@ class Hall:
 
     def said(self, robot: str, cls: type) -> list[Any]:
         return self.streams[robot, cls].drain()  # type: ignore[no-any-return]
+
+
+def running(request: m.OpenRequest | None, num_queries: int, _: m.ActiveRequest) -> m.ActiveReply:
+    return m.ActiveReply(open=request, num_queries=num_queries)
+
+
+def page(entries: tuple[m.JournalEntry, ...], asked: m.JournalRequest) -> m.JournalReply:
+    return m.JournalReply(entries=entries[asked.first_query : asked.first_query + asked.max_queries])
 
 
 @pytest.fixture
@@ -157,3 +196,89 @@ def test_closing_one_robots_episode_leaves_the_others(hall: Hall, episode_info: 
     hall.ask("r0", 0)
     hall.settle()
     assert len(hall.said("r0", m.Cognition)) == 1
+
+
+def test_while_one_context_is_rebuilt_the_others_take_turns_with_it(
+    hall: Hall, episode_info: Info, paper: m.Schedule
+) -> None:
+    for robot in ROBOTS:
+        hall.open(robot, episode_info(paper))
+    for query in range(9):
+        hall.ask("r1", query)
+        hall.settle()
+    hall.forget("r1")
+    hall.ask("r1", 9)
+    for query in range(3):  # a rebuilding of ten queries, and three of each of the others beside it
+        for robot in ("r0", "r2"):
+            hall.ask(robot, query)
+        for _ in range(5):
+            hall.bus.run_parties()
+        assert [len(hall.said(robot, m.Cognition)) for robot in ("r0", "r2")] == [1, 1]
+        assert hall.said("r1", m.Event) == []
+    hall.settle()
+    assert [event.name for event in hall.said("r1", m.Event)] == ["context_rebuilt"]
+
+
+def test_a_rebuilt_context_is_the_lost_one_and_what_was_asked_meanwhile_is_answered(
+    fake_ponder: Any, episode_info: Info, paper: m.Schedule
+) -> None:
+    vectors = []
+    for is_lost in (False, True):
+        hall = Hall(InTurns(dataclasses.replace(fake_ponder, contexts={}, num_tokens={})))
+        hall.open("r1", episode_info(paper))
+        for query in range(8):
+            hall.ask("r1", query)
+            if query in (3, 7):
+                hall.settle()
+            if query == 3 and is_lost:
+                hall.forget("r1")
+            hall.bus.run_parties()
+        events = [event.name for event in hall.said("r1", m.Event)]
+        assert events == ["context_rebuilt"] * is_lost
+        vectors.append({c.query: c.vector.tobytes() for c in hall.said("r1", m.Cognition)})
+    unasked = set(range(8)) - vectors[1].keys()
+    assert unasked <= {4}, "the query that woke it is in the journal, so nobody waits for its answer"
+    assert all(vectors[0][query] == vector for query, vector in vectors[1].items())
+
+
+def test_a_journal_that_does_not_answer_ends_that_robots_episode_only(
+    hall: Hall, episode_info: Info, paper: m.Schedule
+) -> None:
+    for robot in ROBOTS:
+        hall.open(robot, episode_info(paper))
+    hall.ask("r1", 0)
+    hall.settle()
+    hall.forget("r1")
+    hall.journals["r1"][0] = dataclasses.replace(hall.journals["r1"][0], observation=b"\xff")
+    for robot in ROBOTS:
+        hall.ask(robot, 1)
+    hall.settle()
+    assert [len(hall.said(robot, m.Cognition)) for robot in ROBOTS] == [1, 1, 1]
+    assert set(hall.engine.contexts) == {"r0/ep-1", "r2/ep-1"}
+
+
+def test_the_loss_of_one_context_changes_no_bit_of_the_others(episode_info: Info, paper: m.Schedule) -> None:
+    """The tiny network: one robot's context is lost and thought over again, in common forwards with the others."""
+    ponder = Ponder.random(dataclasses.replace(tiny_cpu(), image_px=(64, 64)), seed=1)
+    vectors: list[dict[tuple[str, int], bytes]] = []
+    for lost_before in (None, 3):
+        engine = QwenEngine(ponder, EngineConfig(max_context_tokens=400, max_sessions=4, max_text_tokens=8))
+        engine.warm_up = lambda: [MS]  # type: ignore[method-assign]
+        hall = Hall(engine, px=64)
+        for robot in ROBOTS:
+            assert hall.open(robot, episode_info(paper)).error == ""
+        said = []
+        for query in range(6):
+            if query == lost_before:
+                hall.forget("r1")
+            for robot in ROBOTS:
+                hall.ask(robot, query)
+            hall.bus.run_parties()  # a loss is still being made good when the others ask again
+        hall.settle()
+        for robot in ROBOTS:
+            said += [(robot, c.query, c.vector.tobytes()) for c in hall.said(robot, m.Cognition)]
+        vectors.append({(robot, query): vector for robot, query, vector in said})
+    whole, lossy = vectors
+    assert {key for key in whole if key[0] != "r1"} <= lossy.keys()
+    assert ("r1", 5) in lossy
+    assert [key for key, vector in lossy.items() if vector != whole[key]] == []
