@@ -42,7 +42,7 @@ class LatencyOptions:
     size: Literal["tiny_cpu", "qwen35_0p8b", "qwen35_2b", "qwen35_4b", "qwen35_9b"] = "tiny_cpu"
     device: str = "cpu"
     dtype: Literal["float32", "bfloat16"] = "float32"
-    threads: tuple[int, ...] = (1, 2)
+    threads: tuple[int, ...] = (1,)
     """Of torch; all but the fires is measured with the first."""
     contexts: tuple[int, ...] = (800, 4_000, 14_000)
     """Tokens in the context before the fire, about."""

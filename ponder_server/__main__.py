@@ -44,6 +44,7 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
         when_full=options.when_full,
         max_sessions=options.max_sessions,
         max_text_tokens=options.max_text_tokens,
+        max_batch_rows=options.max_batch_rows,
     )
     draft: NoDraft | TrieDraft = NoDraft()
     if options.draft_texts is not None:

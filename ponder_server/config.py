@@ -31,6 +31,8 @@ class PonderOptions:
     max_text_tokens: int = 256
     other_robots: tuple[str, ...] = ()
     """Robots to serve beside --link.robot, with the same weights and in common forwards."""
+    max_batch_rows: int = 8
+    """Robots that share a forward at most. With 1, no device's answers depend on other robots in their last bits."""
     latency_budget_ms: int = 1000
     """With other robots: from a query to its cognition when all ask at once; an episode that breaks it is refused."""
     draft_texts: Path | None = None
