@@ -22,6 +22,7 @@ import tyro
 from torch import Tensor
 
 from benchmarks.report import Report, Row, show, spread
+from benchmarks.roofline import Ceilings, measure_ceilings, piece_of
 from ponderpounce.models import flow, groot_flow
 from ponderpounce.models.pounce import Pounce
 from ponderpounce.models.pounce_checkpoint import random_bundle
@@ -29,12 +30,14 @@ from ponderpounce.models.pounce_configs import groot_n1_5, pi05_base, tiny_cpu, 
 from ponderpounce.models.pounce_family import AnyPounce, AnyPounceConfig, Family, random_model
 from pounce_server.contract import DTypeName, example_request
 from pounce_server.engine import EagerEngine
+from pounce_server.fused import FusedPounce, fused_for
+from pounce_server.int8 import quantise
 from pounce_server.precision import cast_for_serving
 
 CompileMode = Literal["default", "reduce-overhead", "max-autotune"]
 Call = Callable[[], Tensor | None]
 
-EAGER, NAIVE = "eager", "prefix again at every step"
+EAGER, NAIVE, BARE, FUSED = "eager", "prefix again at every step", "eager, no cognition (K = 0)", "fused"
 PROMPT_TOKENS = 60
 HORIZON = 20
 _CONFIGS: dict[tuple[Family, str], Callable[..., AnyPounceConfig]] = {
@@ -110,6 +113,21 @@ class Ways:
 
         return chunk
 
+    def fused(self, model: Pounce, device: torch.device) -> Call:
+        """Packs the model's own weights anew: the eager ways go on over views of them."""
+        fused: FusedPounce = fused_for(model, device)
+
+        def chunk() -> Tensor:
+            *_, last = fused.sample(self._inputs, self._noise)
+            return last.actions.cpu()
+
+        return chunk
+
+    def least_ms(self, ceilings: Ceilings) -> float:
+        """The roofline of a whole invocation: the prefix once, and every step."""
+        prefix, step = piece_of(self.prefix), piece_of(self.one_step)
+        return prefix.least_ms(ceilings) + self._table.num_steps * step.least_ms(ceilings)
+
     def eager(self) -> Tensor:
         cache = self._prefill(self._inputs)
         return self._integrated(lambda index, x: self._velocity(x, self._table.styles[index], cache))
@@ -148,27 +166,36 @@ def main(argv: list[str] | None = None) -> int:
     )
     invocations: list[Row] = []
     parts: list[Row] = []
+    ratios: list[Row] = []
     modes = _compile_modes(options, report.notes)
     with torch.inference_mode():
+        dtype = {"float32": torch.float32, "bfloat16": torch.bfloat16}[options.dtype]
+        ceilings = measure_ceilings(torch.device(options.device), dtype)
         for family in options.families:
             for shape in SHAPES:
-                found = _measure(family, shape, options, modes if shape.is_compiled else (), report.notes)
-                invocations += found[0]
-                parts += found[1]
+                found = _measure(family, shape, options, modes if shape.is_compiled else (), report.notes, ceilings)
+                for rows, new in zip((invocations, parts, ratios), found, strict=True):
+                    rows += new
     report.add_table(
         "One invocation, noise to actions; the error is against eager float32, normalised actions", invocations
     )
     report.add_table("What an eager invocation consists of", parts)
-    report.notes += _notes(options)
+    report.add_table("Ratios and differences of this run's p50", ratios)
+    report.notes += _notes(options, ceilings)
     show(report)
     print(f"\nwritten: {report.write().name}")
     return 0
 
 
 def _measure(
-    family: Family, shape: Shape, options: LatencyOptions, modes: tuple[CompileMode, ...], notes: list[str]
-) -> tuple[list[Row], list[Row]]:
-    """The rows of both tables."""
+    family: Family,
+    shape: Shape,
+    options: LatencyOptions,
+    modes: tuple[CompileMode, ...],
+    notes: list[str],
+    ceilings: Ceilings,
+) -> tuple[list[Row], list[Row], list[Row]]:
+    """The rows of the three tables."""
     device = torch.device(options.device)
     bundle = random_bundle(shape.config(family, options.size), 0)
     model = bundle.model.to(device).eval()
@@ -177,25 +204,36 @@ def _measure(
     without = random_model(shape.config(family, options.size, has_cognition=False), 0).to(device).eval()
     cast_for_serving(without, options.dtype)
     engine = EagerEngine(bundle, device=options.device, dtype=options.dtype)
+    narrow = random_model(shape.config(family, options.size), 0).to(device).eval() if device.type == "cpu" else None
+    if narrow is not None:
+        quantise(narrow)
+        cast_for_serving(narrow, options.dtype)
     invocations: list[Row] = []
     parts: list[Row] = []
+    ratios: list[Row] = []
     for batch in options.batches:
         ways = Ways(model, batch, device)
-        calls: dict[str, Call] = {EAGER: ways.eager, "eager, no cognition (K = 0)": Ways(without, batch, device).eager}
+        calls: dict[str, Call] = {EAGER: ways.eager, BARE: Ways(without, batch, device).eager, NAIVE: ways.naive}
+        if narrow is not None:
+            calls["eager, int8 weights"] = Ways(narrow, batch, device).eager
         if batch == 1:
-            calls |= {NAIVE: ways.naive}
             calls |= _compiled(ways, modes, f"{family}, {shape.name}", notes)
+        if device.type == "cuda" and isinstance(model, Pounce):  # Triton's interpreter is not worth timing
+            calls[FUSED] = ways.fused(model, device)
         calls |= _engine_call(engine, batch)
         steps = f"{model.config.num_steps} steps"
         pieces: dict[str, Call] = {"prefix": ways.prefix, "1 step": ways.one_step, steps: ways.all_steps}
+        least_ms = ways.least_ms(ceilings)
         took_ms = _in_turns(calls | pieces, options, device)
         eager_p50_ms = _p50(took_ms[EAGER])
         of: Row = {"model": family, "shape": shape.name, "batch": batch}
         for name, call in calls.items():
             ratio = round(_p50(took_ms[name]) / eager_p50_ms, 2)
-            is_same_network = not name.startswith(("engine", "eager, no"))
+            is_same_network = not name.startswith("engine") and name != BARE
             error = _mae(call(), exact[batch]) if is_same_network else None
-            invocations.append(of | {"way": name} | spread(took_ms[name], "ms") | {"of_eager": ratio, "mae": error})
+            share = round(least_ms / _p50(took_ms[name]), 3) if is_same_network else None
+            judged: Row = {"of_eager": ratio, "of_roofline": share, "mae": error}
+            invocations.append(of | {"way": name} | spread(took_ms[name], "ms") | judged)
         parts += [
             of
             | {"part": name}
@@ -203,7 +241,20 @@ def _measure(
             | {"of_eager": round(_p50(took_ms[name]) / eager_p50_ms, 2)}
             for name in pieces
         ]
-    return invocations, parts
+        ratios.append(of | _ratios({name: _p50(values) for name, values in took_ms.items()}, steps))
+    return invocations, parts, ratios
+
+
+def _ratios(p50_ms: dict[str, float], steps: str) -> Row:
+    """What the flow steps, the cache, the cognition and the kernels make of an invocation."""
+    compiled = [value for name, value in p50_ms.items() if name.startswith("torch.compile")]
+    fused = p50_ms.get(FUSED)
+    return {
+        "all_steps_of_1_step": round(p50_ms[steps] / p50_ms["1 step"], 2),
+        "prefix_again_of_once": round(p50_ms[NAIVE] / p50_ms[EAGER], 2),
+        "cognition_ms": round(p50_ms[EAGER] - p50_ms[BARE], 3),
+        "best_compile_of_fused": round(min(compiled) / fused, 2) if fused and compiled else None,
+    }
 
 
 def _engine_call(engine: EagerEngine, batch: int) -> dict[str, Call]:
@@ -270,12 +321,16 @@ def _moved(inputs: Any, device: torch.device) -> Any:
     return replace(inputs, **{name: value.to(device) for name, value in tensors.items() if value is not None})
 
 
-def _notes(options: LatencyOptions) -> list[str]:
+def _notes(options: LatencyOptions, ceilings: Ceilings) -> list[str]:
     where = options.device if options.device == "cpu" else torch.cuda.get_device_name(options.device)
     return [
         f"Both families at {options.size} size with random weights, {options.dtype} on {where}, {options.threads} "
         "thread(s).",
         f'"{NAIVE}" is the same sampler without its cache; of_eager is a ratio of two p50 of this run.',
+        "of_roofline: least time over p50, with this device's best in this run: "
+        f"{ceilings.flops_per_s / 1e9:.0f} GFLOP/s in one large product, {ceilings.bytes_per_s / 1e9:.1f} GB/s in one "
+        "large copy.",
+        f'"{FUSED}" is measured on a GPU only; on a CPU its kernels run in Triton\'s interpreter, which tests do.',
         "pi0.5 takes 10 steps in either shape, GR00T 10 in the paper's and its own 4 in RoboMME's.",
         "The engine's rows have a longer prompt than 60 tokens, and count the resizing of their pictures.",
     ]

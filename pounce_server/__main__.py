@@ -43,6 +43,7 @@ def build_engine(options: PounceOptions) -> PounceEngine:
         continuity=options.continuity,
         path=options.path,
         rolls_forward=options.roll_forward,
+        weights=options.weights,
     )
 
 

@@ -33,6 +33,8 @@ class PounceOptions:
     path: Literal["eager", "fused"] = "eager"
     """fused: Triton kernels, static buffers and CUDA graphs for pi0.5; needs a GPU and Triton."""
     dtype: Literal["float32", "bfloat16"] = "float32"
+    weights: Literal["float", "int8"] = "float"
+    """int8: a quarter of the memory on a CPU; the error of the actions is measured at start and told."""
     continuity: Literal["none", "rtc", "trained"] = "none"
     """Whether pi0.5 continues the rows that are being played. rtc: real-time chunking, for a backward pass per flow
     step; trained: at no cost, by a checkpoint that learned to (`pp-train --max-committed-rows`)."""

@@ -17,6 +17,7 @@ from ponderpounce.models.arm import JOINT_HIGH_RAD, JOINT_LOW_RAD, NUM_ARM_JOINT
 from protocol.messages import Robot
 
 DTypeName: TypeAlias = Literal["float32", "bfloat16"]
+WeightsName: TypeAlias = Literal["float", "int8"]
 
 Continuity: TypeAlias = Literal["none", "rtc", "trained"]
 """Whether a chunk continues the rows being played: not, pulled to them (`rtc`), or given them (`committed`)."""
@@ -57,6 +58,9 @@ class EngineSpec:
     continuity: Continuity = "none"
     max_committed_rows: int = 0
     """The most committed rows that the network was trained to be given; matters to continuity "trained" only."""
+    weights: WeightsName = "float"
+    action_error: float = 0.0
+    """Mean absolute error of the network's normalised actions that ``weights`` cost, on made-up requests."""
     reads_subgoal: bool = False
     """The engine reads PONDER's newest subgoal in place of cognition (then K = 0)."""
 

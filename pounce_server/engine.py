@@ -4,6 +4,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -29,12 +30,14 @@ from pounce_server.contract import (
     EngineSpec,
     Progress,
     Request,
+    WeightsName,
     check_request,
     example_request,
     no_progress,
 )
 from pounce_server.fused import fused_for
 from pounce_server.guidance import given, guide, with_committed
+from pounce_server.int8 import quantise
 from pounce_server.precision import cast_for_serving
 from pounce_server.roll_forward import placed, rolled
 
@@ -43,6 +46,8 @@ Sampler: TypeAlias = Callable[[Sequence[Request], Tensor], Iterator[tuple[list[i
 
 PathName: TypeAlias = Literal["eager", "fused"]
 
+NUM_COMPARED = 4
+"""Made-up requests on which the error of int8 weights is taken."""
 WARM_UP_UNMEASURED = 3
 WARM_UP_MEASURED = 20
 
@@ -65,7 +70,12 @@ class EagerEngine:
         continuity: Continuity = "none",
         path: PathName = "eager",
         rolls_forward: bool = False,
+        weights: WeightsName = "float",
     ) -> None:
+        if weights == "int8" and (path == "fused" or torch.device(device).type != "cpu"):
+            raise ValueError(
+                "int8 weights are for the eager path on a CPU; leave --weights out, and take --dtype bfloat16"
+            )
         if rolls_forward and continuity == "trained":
             raise ValueError("--roll-forward plans after the committed rows, --continuity trained with them: take one")
         self._rolls_forward = rolls_forward
@@ -92,10 +102,16 @@ class EagerEngine:
             reads_subgoal=config.reads_subgoal,
         )
         model = cast_for_serving(bundle.model, dtype).to(self._device).eval().requires_grad_(False)
-        if path == "fused":
-            self._sample = _fused_sampler(model, bundle, self._device, continuity)
-        else:
-            self._sample = _sampler(model, bundle, self._device, continuity)
+        make_sampler = _fused_sampler if path == "fused" else _sampler
+        self._sample = make_sampler(model, bundle, self._device, continuity)
+        if weights == "int8":
+            examples = [example_request(self.spec, seed=seed) for seed in range(NUM_COMPARED)]
+            exact = self._network_actions(examples, no_progress)
+            quantise(model)
+            self._sample = make_sampler(model, bundle, self._device, continuity)
+            error = float((self._network_actions(examples, no_progress) - exact).abs().mean())
+            hash_ = f"{self.spec.model_hash}-int8"
+            self.spec = replace(self.spec, weights=weights, model_hash=hash_, action_error=error)
 
     @torch.inference_mode()
     def invoke(self, request: Request, progress: Progress = no_progress) -> NDArray[np.float32]:
@@ -137,13 +153,18 @@ class EagerEngine:
             for rows, request in zip(self._planned(rolled_requests, progress), requests, strict=True)
         ]
 
-    def _planned(self, requests: Sequence[Request], progress: Progress) -> list[NDArray[np.float32]]:
+    @torch.inference_mode()
+    def _network_actions(self, requests: Sequence[Request], progress: Progress) -> Tensor:
+        """(B, N, D), normalised."""
         noise_BNA = torch.cat([self._noise(request.seed) for request in requests])
         actions_BNA = noise_BNA.clone()
         for moved, step in self._sample(requests, noise_BNA):
             actions_BNA[moved] = step.actions
             progress()
-        robot_actions_BND = actions_BNA[..., : self._network_action_dim].cpu().numpy()
+        return actions_BNA[..., : self._network_action_dim].cpu()
+
+    def _planned(self, requests: Sequence[Request], progress: Progress) -> list[NDArray[np.float32]]:
+        robot_actions_BND = self._network_actions(requests, progress).numpy()
         rows_BN8 = [
             self._statistics.absolute_targets(actions_ND, request.proprio)
             for actions_ND, request in zip(robot_actions_BND, requests, strict=True)

@@ -12,6 +12,11 @@ _STREAMS = (
 _FLOAT32_PARTS = ("norm", "patch_embedding", "position_embedding")
 
 
+def is_of_a_stream(name: str) -> bool:
+    """Whether a parameter is one of the streams' matrices, which may be narrow."""
+    return name.startswith(_STREAMS) and not any(part in name for part in _FLOAT32_PARTS)
+
+
 def cast_for_serving(model: AnyPounce, dtype: DTypeName) -> AnyPounce:
     """Casts ``model`` in place and returns it.
 
@@ -23,6 +28,6 @@ def cast_for_serving(model: AnyPounce, dtype: DTypeName) -> AnyPounce:
         raise ValueError(f"dtype must be 'float32' or 'bfloat16', came {dtype!r}")
     if dtype == "bfloat16":
         for name, parameter in model.named_parameters():
-            if name.startswith(_STREAMS) and not any(part in name for part in _FLOAT32_PARTS):
+            if is_of_a_stream(name):
                 parameter.data = parameter.data.to(torch.bfloat16)
     return model

@@ -44,6 +44,10 @@ class PounceServer:
             is_fake=spec.is_random or spec.has_fresh_prefix,
             progress=1.0,
         )
+        if spec.weights != "float":
+            told = f"{spec.weights} weights: mean error of the normalised actions {spec.action_error:.1e}"
+            self._heartbeat.set(detail=told)
+            log.info("%s", told)
 
     def ready(self) -> None:
         """Joins a running episode, if there is one, and only then says that it is ready."""

@@ -235,7 +235,9 @@ def _read_config(path: Path) -> AnyStoredConfig | None:
     if values is None or values.get("format") not in (FORMAT, GROOT_FORMAT):
         return None
     if isinstance(values.get("statistics"), dict):
-        values["statistics"] = {"space": "joint_delta", "reach": ()} | values["statistics"]  # of a folder from before there were two
+        values["statistics"] = {"space": "joint_delta", "reach": ()} | values[
+            "statistics"
+        ]  # of a folder from before there were two
     if values["format"] == FORMAT:
         if isinstance(values.get("config"), dict):
             values["config"] = _LATER_FIELDS | values["config"]

@@ -1,0 +1,85 @@
+"""int8 weights: near the exact ones, a quarter of the bytes, and whoever serves them says what they cost."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import nn
+
+from ponderpounce.models.pounce_checkpoint import random_bundle
+from ponderpounce.models.pounce_configs import tiny_cpu, tiny_groot
+from ponderpounce.models.pounce_init import random_pounce
+from pounce_server.contract import DTypeName, example_request
+from pounce_server.engine import EagerEngine
+from pounce_server.int8 import Int8Linear, quantise
+from pounce_server.serve import PounceServer
+from protocol.heartbeat import Heartbeat
+
+
+@given(seed=st.integers(0, 2**31), rows=st.integers(1, 9), columns=st.integers(1, 9), scale=st.floats(1e-6, 1e6))
+@settings(deadline=None)
+def test_no_weight_is_off_by_more_than_half_a_step(seed: int, rows: int, columns: int, scale: float) -> None:
+    linear = nn.Linear(columns, rows)
+    with torch.no_grad():
+        linear.weight.copy_(scale * torch.randn(rows, columns, generator=torch.Generator().manual_seed(seed)))
+    narrow = Int8Linear(linear)
+    error = (narrow.weight_OI.float() * narrow.scale_O[:, None] - linear.weight).abs()
+    assert (error <= narrow.scale_O[:, None] * 0.501).all()
+    x = torch.eye(columns)
+    torch.testing.assert_close(narrow(x), x @ (narrow.weight_OI.float() * narrow.scale_O[:, None]).T + linear.bias)
+
+
+def test_a_row_of_zeros_stays_one() -> None:
+    linear = nn.Linear(3, 2, bias=False)
+    nn.init.zeros_(linear.weight)
+    assert torch.equal(Int8Linear(linear)(torch.ones(1, 3)), torch.zeros(1, 2))
+
+
+def test_the_streams_matrices_take_a_quarter_and_the_rest_is_untouched() -> None:
+    model = random_pounce(tiny_cpu(), 0)
+    before = {name: parameter.clone() for name, parameter in model.named_parameters()}
+    saved = quantise(model)
+    after = dict(model.named_parameters())
+    gone = [name for name in before if name not in after]
+    assert gone
+    assert all(name.endswith(".weight") and "norm" not in name for name in gone)
+    assert saved == 3 * sum(before[name].numel() for name in gone)
+    assert all(torch.equal(after[name], before[name]) for name in after)
+    assert "pi05.action_out_proj.weight" in after
+
+
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+@pytest.mark.parametrize("config", [tiny_cpu(), tiny_groot()], ids=["pi05", "groot"])
+def test_an_engine_acts_nearly_alike_and_tells_how_nearly(config: Any, dtype: DTypeName) -> None:
+    exact, narrow = (
+        EagerEngine(random_bundle(config, seed=0), weights=weights, dtype=dtype) for weights in ("float", "int8")
+    )
+    request = example_request(exact.spec, seed=9)
+    error = np.abs(narrow.invoke(request) - exact.invoke(request)).mean()
+    assert 0 < error < 0.02
+    assert 0 < narrow.spec.action_error < 0.05
+    assert exact.spec.action_error == 0
+    assert narrow.spec.model_hash == f"{exact.spec.model_hash}-int8"
+    np.testing.assert_array_equal(narrow.invoke(request), narrow.invoke(request))
+
+
+def test_the_server_says_it_in_its_health_and_log(new_rig: Any, caplog: pytest.LogCaptureFixture) -> None:
+    engine = EagerEngine(random_bundle(tiny_cpu(), seed=0), weights="int8")
+    link = new_rig().links["pounce"]
+    heartbeat = Heartbeat(link, "test", "host/monotonic")
+    with caplog.at_level(logging.INFO):
+        PounceServer(link, engine, heartbeat, "test").warm_up()
+    told = f"int8 weights: mean error of the normalised actions {engine.spec.action_error:.1e}"
+    assert heartbeat.health.detail == told
+    assert told in caplog.text
+
+
+def test_int8_is_refused_where_it_is_of_no_use() -> None:
+    with pytest.raises(ValueError, match="for the eager path on a CPU"):
+        EagerEngine(random_bundle(tiny_cpu(), seed=0), weights="int8", path="fused")
