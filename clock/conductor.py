@@ -199,6 +199,15 @@ class Conductor:
         modelled = [a.due_ns for a in (*self._queries, *self._invocations) if a.delay_ns is not None]
         return min((due for due in modelled if due > now_ns), default=None)
 
+    def will_look(self, tick: int) -> bool:
+        """Whether a model may be asked about the observation of ``tick``, the next one; False only if surely none is.
+
+        In lockstep the schedule alone decides, so pictures that nobody will ask for need not be made.
+        """
+        if not self._is_lockstep or self.stage != Stage.RUNNING:
+            return True
+        return tick >= self._invoke_due_tick or self.deadline_ns(tick) >= self._query_due_ns
+
     def is_waiting(self, now_ns: int) -> bool:
         """Lockstep: whether time must stand still at ``now_ns`` because an answer or an observation is owed."""
         if self._newest is None:

@@ -389,10 +389,10 @@ class ClockService:
         return m.CloseReply()
 
     def _finish(self, result: m.EpisodeResult | None) -> None:
-        if self._episode is not None and self._episode.request.info.policy == "servers":
+        episode, self._episode = self._episode, None  # first: a server that finds a late query must not rejoin it
+        if episode is not None and episode.request.info.policy == "servers":
             self._close_servers(result)
         self._watch.forget_losses()  # whoever is restarted between episodes comes back to no episode, and is not lost
-        self._episode = None
         self._link.leave_episode()
 
     def _close_servers(self, result: m.EpisodeResult | None) -> None:

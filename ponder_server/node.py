@@ -41,11 +41,13 @@ class PonderNode:
         self.next_query = next_query
 
     def on_observation(self, observation: m.Observation) -> None:
-        """Keeps what a query may name.
+        """Keeps what a query may name; one without any picture none does (`Conductor.will_look`).
 
         Raises:
             MalformedMessage: not the cameras that the engine was built for; nothing good is displaced by it.
         """
+        if not observation.images:
+            return
         check_pictures(observation, self._spec)
         self._rendezvous.on_observation(observation)
 

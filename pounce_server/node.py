@@ -45,11 +45,13 @@ class PounceNode:
         self._info = info
 
     def on_observation(self, observation: m.Observation) -> None:
-        """Keeps what an invocation may name.
+        """Keeps what an invocation may name; one without any picture none does (`Conductor.will_look`).
 
         Raises:
             MalformedMessage: not the joints or cameras that the engine reads; nothing good is displaced by it.
         """
+        if self._spec.num_cameras and not observation.images:
+            return
         for field, expected in (("proprio", self._spec.proprio_dim), ("images", self._spec.num_cameras)):
             came = len(getattr(observation, field))
             if came != expected:

@@ -43,15 +43,21 @@ class Outcome:
     num_ticks: int
 
 
+def always(tick: int) -> bool:
+    """Every tick is looked at."""
+    return True
+
+
 @dataclass(slots=True)
 class RobotSide:
-    """Runs one episode against whoever publishes actions."""
+    """Runs one episode against whoever publishes actions. Where nobody ``looks`` at a tick, it is not rendered."""
 
     link: Link
     environment: Environment
     recorder: Recorder
     let_others: Others
     patience_ns: int
+    looks: Callable[[int], bool] = always
     _tick: int = 0
     _start_ns: int = 0
     _command: m.Floats = field(default_factory=lambda: np.zeros(0, np.float32))
@@ -101,8 +107,8 @@ class RobotSide:
                 break
         self._command = action.values
         self._stopped_ticks = self._stopped_ticks + 1 if action.level == m.Level.STOPPED else 0
-        snapshot = self.environment.step(action.values)
         self._tick = action.tick + 1
+        snapshot = self.environment.step(action.values, look=self.looks(self._tick))
         self._show(snapshot, deadline_ns(self._start_ns, self._tick, info.schedule.control_hz))
         return snapshot
 

@@ -103,9 +103,8 @@ class Suite:
         demo = self._demonstration(environment)
         info = replace(self._info(environment, first, task, seed, run), has_demo=bool(demo))
         path = self._log_path(info) if self._options.record else None
-        side = RobotSide(
-            self._link, environment, self._recorder, self._let_others, round(self._options.patience_s * 1e9)
-        )
+        patience_ns = round(self._options.patience_s * 1e9)
+        side = RobotSide(self._link, environment, self._recorder, self._let_others, patience_ns, self._looks)
         opened = m.OpenReply()
         self._recorder.begin(info, path)
         if info.policy == "oracle":
@@ -198,6 +197,11 @@ class Suite:
                 return
             longest_ns = self._clock.wait_ns(longest_ns)
         self._link.bus.wait(longest_ns)
+
+    def _looks(self, tick: int) -> bool:
+        """Whether the pictures of a tick are wanted: by the log always, by the models when the schedule says so."""
+        conductor = self._clock.conductor if self._clock is not None else None
+        return self._options.record or conductor is None or conductor.will_look(tick)
 
     def _await_last_ticks(self, outcome: Outcome) -> None:
         """Accounts of ticks travel behind their actions; the hash is over all of them."""

@@ -34,7 +34,7 @@ from protocol.bus import LocalBus
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
 from protocol.topics import OBSERVATION
-from sim_client.episode import Outcome, RobotSide
+from sim_client.episode import Outcome, RobotSide, always
 
 hypothesis.settings.register_profile("house", deadline=None)  # a deadline reads the wall clock
 hypothesis.settings.load_profile("house")
@@ -141,6 +141,7 @@ class NumberWorld:
     num_steps: int
     px: int = PX
     commands: list[bytes] = field(default_factory=list)
+    num_looks: int = 0
 
     def look(self) -> Snapshot:
         state = np.frombuffer(self.commands[-1], np.float32) if self.commands else np.zeros(DIM, np.float32)
@@ -160,9 +161,11 @@ class NumberWorld:
             subgoal_index=0,
         )
 
-    def step(self, command: m.Floats) -> Snapshot:
+    def step(self, command: m.Floats, *, look: bool = True) -> Snapshot:
         self.commands.append(command.tobytes())
-        return self.look()
+        self.num_looks += look
+        snapshot = self.look()
+        return snapshot if look else dataclasses.replace(snapshot, frames={})
 
 
 class NoRecorder:
@@ -264,7 +267,9 @@ class Rig:
         self.links["sim"].enter_episode(header.session, header.episode, header.epoch)
         return reply
 
-    def run(self, info: m.EpisodeInfo, num_steps: int) -> tuple[Outcome, NumberWorld]:
+    def run(
+        self, info: m.EpisodeInfo, num_steps: int, looks: Callable[[int], bool] = always
+    ) -> tuple[Outcome, NumberWorld]:
         """One episode; ``meanwhile`` runs before each turn of the servers."""
         self.enter(info)
         world = NumberWorld(num_steps, self.px)
@@ -273,7 +278,7 @@ class Rig:
             self.meanwhile()
             self.bus.run_parties()
 
-        side = RobotSide(self.links["sim"], world, NoRecorder(), let_others, 20_000_000_000)  # type: ignore[arg-type]
+        side = RobotSide(self.links["sim"], world, NoRecorder(), let_others, 20_000_000_000, looks)  # type: ignore[arg-type]
         outcome = side.run(info, world.look(), lambda tick: None)
         self.settle()
         return outcome, world

@@ -445,6 +445,19 @@ def test_closing_an_episode_closes_it_everywhere(rig: Any, episode_info: Info, p
     assert rig.ponder_engine.contexts == {}
 
 
+def test_a_late_query_does_not_bring_a_closed_episode_back(
+    monotonic: Monotonic, new_rig: Callable[..., Any], episode_info: Info, paper: m.Schedule
+) -> None:
+    """The last query may still lie at PONDER's door when the episode is closed: it must not be thought over again."""
+    rig, info = new_rig(), episode_info(paper)
+    rig.run(info, 30)
+    monotonic.now_ns += 2_000 * MS  # a server asks for its episode once a second at most
+    rig.links["clock"].publish(topics.QUERY, m.Query(query=9, tick=29, source_ns=0), at_ns=0)
+    assert rig.clock.close(m.CloseRequest(header=info.header)).error == ""
+    rig.settle()
+    assert rig.ponder_engine.contexts == {}
+
+
 def test_a_demonstration_is_part_of_the_context(
     new_rig: Callable[..., Any], episode_info: Info, paper: m.Schedule, rig: Any
 ) -> None:

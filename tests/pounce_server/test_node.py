@@ -119,7 +119,7 @@ def test_a_cognition_of_another_ponder_is_refused(node: PounceNode, shape: tuple
     ("changes", "sentence"),
     [
         ({"proprio": np.zeros(8, np.float32)}, r"Observation\.proprio: expected 3 of them, came 8"),
-        ({"images": ()}, r"Observation\.images: expected 2 of them, came 0"),
+        ({"images": look(3).images[:1]}, r"Observation\.images: expected 2 of them, came 1"),
     ],
 )
 def test_an_observation_of_another_robot_is_refused_and_displaces_nothing(
@@ -128,6 +128,14 @@ def test_an_observation_of_another_robot_is_refused_and_displaces_nothing(
     node.on_observation(look(3))
     with pytest.raises(MalformedMessage, match=sentence):
         node.on_observation(look(3, **changes))
+    node.on_invocation(ask(0, 3))
+    assert node.next_work() is not None
+
+
+def test_an_observation_without_pictures_is_not_one_to_look_at(node: PounceNode) -> None:
+    node.on_observation(look(3))
+    for tick in range(4, 40):
+        node.on_observation(look(tick, images=()))
     node.on_invocation(ask(0, 3))
     assert node.next_work() is not None
 

@@ -212,6 +212,18 @@ def test_another_episode_s_cognition_reaches_the_servers(tmp_path: Path) -> None
 
 
 @pytest.mark.sim
+def test_an_episode_that_is_not_recorded_is_the_same_with_fewer_pictures(tmp_path: Path) -> None:
+    shared: dict[str, Any] = {"tasks": ("StopCube",), "runs": 1, "policy": "servers", "max_steps": 25}
+    lines = []
+    for name, record in (("seen", True), ("unseen", False)):
+        chosen = options(tmp_path / name, record=record, **shared)
+        with contextlib.closing(EvaluationStation(chosen)) as station:
+            lines.append(station.play(chosen.jobs()[0]) | {"mcap": None})
+    assert lines[0] == lines[1]
+    assert lines[0]["stream_sha256"]
+
+
+@pytest.mark.sim
 @pytest.mark.e2e
 def test_a_worker_s_process_plays_what_this_one_does(tmp_path: Path) -> None:
     arguments = ["--tasks", "StopCube", "--episodes", "1", "--runs", "1", "--policy", "oracle", "--max-steps", "20"]
