@@ -44,6 +44,7 @@ def build_engine(options: PounceOptions) -> PounceEngine:
         path=options.path,
         rolls_forward=options.roll_forward,
         weights=options.weights,
+        autotune=options.autotune,
     )
 
 

@@ -32,6 +32,8 @@ class PounceOptions:
     device: str = "cpu"
     path: Literal["eager", "fused"] = "eager"
     """fused: Triton kernels, static buffers and CUDA graphs for pi0.5; needs a GPU and Triton."""
+    autotune: bool = False
+    """fused: time cuBLAS against cuBLASLt for every product, once for a GPU; kept in the user's cache folder."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     weights: Literal["float", "int8"] = "float"
     """int8: a quarter of the memory on a CPU; the error of the actions is measured at start and told."""

@@ -5,6 +5,7 @@
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -71,7 +72,10 @@ class EagerEngine:
         path: PathName = "eager",
         rolls_forward: bool = False,
         weights: WeightsName = "float",
+        autotune: bool = False,
     ) -> None:
+        if autotune and path != "fused":
+            raise ValueError("--autotune chooses among the fused path's products; add --path fused, or leave it out")
         if weights == "int8" and (path == "fused" or torch.device(device).type != "cpu"):
             raise ValueError(
                 "int8 weights are for the eager path on a CPU; leave --weights out, and take --dtype bfloat16"
@@ -102,7 +106,7 @@ class EagerEngine:
             reads_subgoal=config.reads_subgoal,
         )
         model = cast_for_serving(bundle.model, dtype).to(self._device).eval().requires_grad_(False)
-        make_sampler = _fused_sampler if path == "fused" else _sampler
+        make_sampler = partial(_fused_sampler, autotune=autotune) if path == "fused" else _sampler
         self._sample = make_sampler(model, bundle, self._device, continuity)
         if weights == "int8":
             examples = [example_request(self.spec, seed=seed) for seed in range(NUM_COMPARED)]
@@ -271,12 +275,14 @@ def _groot_sampler(groot: GrootPounce, read: Callable[[Request], GrootInputs]) -
     return sample
 
 
-def _fused_sampler(model: AnyPounce, bundle: PounceBundle, device: torch.device, continuity: Continuity) -> Sampler:
+def _fused_sampler(
+    model: AnyPounce, bundle: PounceBundle, device: torch.device, continuity: Continuity, *, autotune: bool
+) -> Sampler:
     if not isinstance(model, Pounce) or continuity != "none":
         raise ValueError("the fused path is for pi0.5 without --continuity; leave --path fused out")
     pi05, statistics, tokenizer = model, bundle.statistics, bundle.tokenizer
     assert isinstance(tokenizer, Tokenizer), "the bundle checks this"
-    fused, text = fused_for(pi05, device), tokenizer
+    fused, text = fused_for(pi05, device, autotune=autotune), tokenizer
 
     def sample(requests: Sequence[Request], noise_BNA: Tensor) -> Iterator[tuple[list[int], EulerStep]]:
         inputs = [pi05_inputs(request, pi05.config, text, statistics, device) for request in requests]

@@ -8,6 +8,7 @@ can be given between steps.
 # B batch, T prefix tokens with padding, N horizon, A padded action dim, E expert width, S = T + N slots
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
@@ -19,6 +20,7 @@ from ponderpounce.models.pi05 import Pi05, Prefix
 from ponderpounce.models.pounce import Pounce, PounceInputs
 from pounce_server.fused_stream import KERNELS, FusedStream, Norm, Operations, Run
 from pounce_server.graphs import Capture, Work, cuda_graph, directly
+from pounce_server.kernels.choice import Choices, ChosenProduct, cuda_time_ms, default_cache, machine_name, preferring
 from pounce_server.kernels.launch import missing_for
 from pounce_server.kernels.rms_norm import Style
 
@@ -53,15 +55,23 @@ class FusedPounce:
             yield EulerStep(index, bucket.velocity.view_as(noise_BNA), bucket.actions.view_as(noise_BNA))
 
 
-def fused_for(model: Pounce, device: torch.device) -> FusedPounce:
+def fused_for(model: Pounce, device: torch.device, *, autotune: bool = False) -> FusedPounce:
     """The fast path on ``device``: graphs on a GPU, plain calls in Triton's interpreter.
+
+    ``autotune``: the large products go to the library that was fastest on this GPU (`kernels.choice`).
 
     Raises:
         ValueError: Triton, or a device that it can run on, is missing; the message says what to do.
     """
     if missing := missing_for(device):
         raise ValueError(f"--path fused cannot run here. {missing}; or --path eager")
-    return FusedPounce(model, KERNELS, cuda_graph if device.type == "cuda" else directly)
+    if device.type != "cuda":
+        return FusedPounce(model, KERNELS, directly)
+    operations = KERNELS
+    if autotune:
+        chosen = ChosenProduct(Choices(default_cache(), machine_name(device)), cuda_time_ms, preferring)
+        operations = replace(KERNELS, product=chosen)
+    return FusedPounce(model, operations, cuda_graph)
 
 
 def _padded(prefix: Prefix) -> Prefix:

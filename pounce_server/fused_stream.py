@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from ponderpounce.models.gemma import ExpertLayer, GemmaConfig, GemmaLayer, Rotation, attend
+from pounce_server.kernels.choice import product
 from pounce_server.kernels.euler import euler_eager, euler_fused
 from pounce_server.kernels.geglu import geglu_eager, geglu_fused
 from pounce_server.kernels.rms_norm import Residual, Style, norm_eager, norm_fused
@@ -21,12 +22,13 @@ from pounce_server.kernels.rope import Slots, rope_eager, rope_fused
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Operations:
-    """One implementation of everything between two GEMMs."""
+    """One implementation of everything between two GEMMs, and of the GEMMs."""
 
     norm: Callable[[Tensor, Tensor, Style, Residual | None], None]
     rope: Callable[[Tensor, Rotation, Tensor, Slots], None]
     geglu: Callable[[Tensor, Tensor], None]
     euler: Callable[[Tensor, Tensor, Tensor, int], None]
+    product: Callable[[Tensor, Tensor, Tensor], None] = product
 
 
 TWINS = Operations(norm=norm_eager, rope=rope_eager, geglu=geglu_eager, euler=euler_eager)
@@ -118,15 +120,15 @@ class FusedStream:
         for index, (layer, (keys, values)) in enumerate(zip(self._layers, cache, strict=True)):
             before_attention, before_mlp = norms[2 * index : 2 * index + 2]
             self._do.norm(run.x, run.normed, before_attention.style, residual)
-            torch.mm(run.normed, layer.qkv.T, out=run.qkv)
+            self._do.product(run.normed, layer.qkv, run.qkv)
             self._do.rope(run.qkv, run.rotation, run.queries, Slots(keys, values, run.first))
             if index == len(self._layers) - 1 and len(norms) == 2 * len(self._layers):
                 return
             mixed = attend(run.queries, keys[:, :, run.seen], values[:, :, run.seen], run.visible)
-            torch.mm(mixed.flatten(0, 1), layer.attention_out.T, out=run.branch)
+            self._do.product(mixed.flatten(0, 1), layer.attention_out, run.branch)
             self._do.norm(run.x, run.normed, before_mlp.style, Residual(run.branch, before_attention.gate))
-            torch.mm(run.normed, layer.gate_up.T, out=run.gate_up)
+            self._do.product(run.normed, layer.gate_up, run.gate_up)
             self._do.geglu(run.gate_up, run.activated)
-            torch.mm(run.activated, layer.down.T, out=run.branch)
+            self._do.product(run.activated, layer.down, run.branch)
             residual = Residual(run.branch, before_mlp.gate)
         self._do.norm(run.x, run.normed, norms[-1].style, residual)

@@ -1,0 +1,119 @@
+"""Which library multiplies a given shape fastest on this GPU: timed once, kept on disk, never asked again.
+
+cuBLAS and cuBLASLt give the same product by other kernels, and neither wins everywhere. The choice is made the first
+time a shape is met, before a graph is captured (`graphs.cuda_graph` runs work first). Choices of other GPUs and of
+other versions stand beside in the same file, and are left alone.
+"""
+
+# M rows, K inputs, N outputs
+
+import contextlib
+import json
+import os
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import TypeAlias
+
+import torch
+from torch import Tensor
+
+LIBRARIES = ("cublas", "cublaslt")
+REPEATS = 20
+
+Timer: TypeAlias = Callable[[Callable[[], None]], float]
+"""How long work takes, in any unit."""
+Switch: TypeAlias = Callable[[str], AbstractContextManager[None]]
+"""Makes torch multiply by one library within."""
+
+
+def default_cache() -> Path:
+    """Where choices are kept: the user's cache folder."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ponderpounce" / "products.json"
+
+
+def machine_name(device: torch.device) -> str:
+    """What a choice is good for: this GPU, with these versions."""
+    return f"{torch.cuda.get_device_name(device)}, torch {torch.__version__}, CUDA {torch.version.cuda}"
+
+
+class Choices:
+    """The file: machine -> product -> library. A file that does not parse is begun anew; a lost one costs a few ms."""
+
+    def __init__(self, path: Path, machine: str) -> None:
+        self._path, self._machine = path, machine
+        self._mine = {name: value for name, value in self._read().get(machine, {}).items() if value in LIBRARIES}
+
+    def get(self, product: str) -> str | None:
+        return self._mine.get(product)
+
+    def keep(self, product: str, library: str) -> None:
+        """Writes at once: the file is whole at any instant, and keeps what others wrote meanwhile."""
+        self._mine[product] = library
+        everything = self._read()
+        everything[self._machine] = everything.get(self._machine, {}) | self._mine
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        fresh = self._path.with_name(f"{self._path.name}.{os.getpid()}.tmp")
+        fresh.write_text(json.dumps(everything, indent=1, sort_keys=True) + "\n")
+        fresh.replace(self._path)
+
+    def _read(self) -> dict[str, dict[str, str]]:
+        try:
+            values = json.loads(self._path.read_text())
+        except (OSError, ValueError):
+            return {}
+        if not isinstance(values, dict):
+            return {}
+        return {machine: choices for machine, choices in values.items() if isinstance(choices, dict)}
+
+
+class ChosenProduct:
+    """Multiplies like `product`, each shape by the library chosen for it."""
+
+    def __init__(self, choices: Choices, timer: Timer, switch: Switch) -> None:
+        self._choices, self._timer, self._switch = choices, timer, switch
+
+    def __call__(self, x_MK: Tensor, weight_NK: Tensor, out_MN: Tensor) -> None:
+        (rows, inputs), outputs = x_MK.shape, len(weight_NK)
+        name = f"{str(x_MK.dtype).removeprefix('torch.')} {rows}x{inputs}x{outputs}"
+        library = self._choices.get(name)
+        if library is None:
+            library = self._fastest(x_MK, weight_NK, out_MN)
+            self._choices.keep(name, library)
+        with self._switch(library):
+            product(x_MK, weight_NK, out_MN)
+
+    def _fastest(self, x_MK: Tensor, weight_NK: Tensor, out_MN: Tensor) -> str:
+        times = {}
+        for library in LIBRARIES:
+            with self._switch(library):
+                times[library] = self._timer(lambda: product(x_MK, weight_NK, out_MN))
+        return min(LIBRARIES, key=times.__getitem__)
+
+
+def product(x_MK: Tensor, weight_NK: Tensor, out_MN: Tensor) -> None:
+    """x W^T into ``out_MN``, by whatever torch prefers."""
+    torch.mm(x_MK, weight_NK.T, out=out_MN)
+
+
+@contextlib.contextmanager
+def preferring(library: str) -> Iterator[None]:
+    """The `Switch` of a CUDA build: a CPU build knows no such choice."""
+    before = torch.backends.cuda.preferred_blas_library()
+    torch.backends.cuda.preferred_blas_library(library)
+    try:
+        yield
+    finally:
+        torch.backends.cuda.preferred_blas_library(before)
+
+
+def cuda_time_ms(work: Callable[[], None]) -> float:
+    """Mean of `REPEATS` runs in the current stream, after one that does not count."""
+    work()
+    start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+    start.record()
+    for _ in range(REPEATS):
+        work()
+    end.record()
+    end.synchronize()
+    return float(start.elapsed_time(end)) / REPEATS
