@@ -14,9 +14,9 @@ import numpy as np
 import tyro
 from PIL import Image, ImageDraw
 
-from ponderpounce.data.collect import COLLECTION_PATH
 from ponderpounce.data.dataset import Dataset, Entry
 from ponderpounce.data.errors import DatasetError
+from ponderpounce.data.lerobot_v3 import COLLECTION_PATH
 from ponderpounce.data.video import FPS
 
 CARD, SHEET = "README.md", "contact_sheet.jpg"

@@ -24,7 +24,7 @@ from ponderpounce.data.dart import DART, NoiseKind
 from ponderpounce.data.episode import Package, Rejection, unpack
 from ponderpounce.data.errors import DatasetError
 from ponderpounce.data.jobs import Job, Look, jobs_of
-from ponderpounce.data.lerobot_v3 import INFO_PATH, DatasetWriter
+from ponderpounce.data.lerobot_v3 import COLLECTION_PATH, INFO_PATH, DatasetWriter
 from ponderpounce.data.rollout import UNSOLVED, work_out
 from ponderpounce.data.seeds import TRAIN_SEED
 from ponderpounce.data.store import Store
@@ -32,7 +32,7 @@ from ponderpounce.data.workers import LocalWorkers, RayWorkers, Workers
 from ponderpounce.tasks.task import TaskError, chosen_tasks
 
 SCALES = {"1x": 1, "9x": 9}
-COLLECTING, JOINED, COLLECTION_PATH = ".collecting", "joined", "meta/collection.json"
+COLLECTING, JOINED = ".collecting", "joined"
 DONE, INCOMPLETE, REFUSED, INTERRUPTED = 0, 1, 2, 130
 ROWS_PER_EPISODE, BYTES_PER_ROW = 500, 4200  # before anything is measured: both cameras at 256 px and 20 Hz, all tasks
 MEASURED_EPISODES = 5  # from so many on, the estimate is theirs

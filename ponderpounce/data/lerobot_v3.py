@@ -26,6 +26,8 @@ DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 EPISODES_PATH, TASKS_PATH = "meta/episodes/chunk-000/file-000.parquet", "meta/tasks.parquet"
 INFO_PATH, STATS_PATH = "meta/info.json", "meta/stats.json"
+COLLECTION_PATH = "meta/collection.json"
+"""Ours: how `pp-collect` made the folder."""
 
 _JOINTS = [f"joint_{number}" for number in range(1, 8)]
 _POSE = ["x", "y", "z", "qw", "qx", "qy", "qz"]

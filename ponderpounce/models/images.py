@@ -18,20 +18,32 @@ def resize_with_pad(frame: NDArray[np.uint8], size_px: int) -> Tensor:
     Bilinear with antialiasing on uint8, like the PIL resize of openpi's data path and client. lerobot
     interpolates floats without antialiasing, which differs wherever a frame shrinks.
     """
+    pixels = _resized(frame, size_px)
+    height_px, width_px = pixels.shape[1:]
+    image = torch.full((3, size_px, size_px), PADDING)
+    top_px, left_px = (size_px - height_px) // 2, (size_px - width_px) // 2
+    image[:, top_px : top_px + height_px, left_px : left_px + width_px] = pixels.float() / 127.5 - 1.0
+    return image
+
+
+def resized(frame: NDArray[np.uint8], size_px: int) -> NDArray[np.uint8]:
+    """(h, w, 3) uint8, its longer side brought to ``size_px``: to `resize_with_pad` it is the same picture."""
+    return _resized(frame, size_px).permute(1, 2, 0).contiguous().numpy()
+
+
+def _resized(frame: NDArray[np.uint8], size_px: int) -> Tensor:
+    """(3, h, w) uint8"""
     height_px, width_px = frame.shape[:2]
     longest_px = max(height_px, width_px)
     new_height_px = max(1, height_px * size_px // longest_px)
     new_width_px = max(1, width_px * size_px // longest_px)
     # Copied: frames off the wire are read-only views of bytes, which torch warns of, and may have any strides.
     pixels = torch.from_numpy(np.array(frame, order="C")).permute(2, 0, 1)
-    if (new_height_px, new_width_px) != (height_px, width_px):
-        pixels = F.interpolate(
-            pixels[None], (new_height_px, new_width_px), mode="bilinear", antialias=True, align_corners=False
-        )[0]
-    image = torch.full((3, size_px, size_px), PADDING)
-    top_px, left_px = (size_px - new_height_px) // 2, (size_px - new_width_px) // 2
-    image[:, top_px : top_px + new_height_px, left_px : left_px + new_width_px] = pixels.float() / 127.5 - 1.0
-    return image
+    if (new_height_px, new_width_px) == (height_px, width_px):
+        return pixels
+    return F.interpolate(
+        pixels[None], (new_height_px, new_width_px), mode="bilinear", antialias=True, align_corners=False
+    )[0]
 
 
 def camera_batch(frames: Sequence[NDArray[np.uint8] | None], size_px: int) -> tuple[Tensor, Tensor]:

@@ -40,6 +40,7 @@ GROOT_FORMAT: Final = "ponderpounce.pounce-groot/1"
 CONFIG_FILE = "config.json"
 JAX_FOLDER = "params"
 WEIGHTS_FILE = "model.safetensors"
+_LATER_STATISTICS = {"space": "joint_delta", "reach": []}
 _LATER_FIELDS = {"max_committed_rows": 0, "reads_subgoal": False, "state_input": "prompt", "robot_state_dim": 8}
 """Of pi0.5's config: what it meant where a folder was written before there was such a field."""
 _LATER_GROOT_FIELDS = {"reads_subgoal": False}
@@ -130,12 +131,20 @@ class PounceBundle:
         return digest.hexdigest()
 
 
-def random_bundle(config: AnyPounceConfig, seed: int, *, statistics: RobotStatistics = ROBOMME) -> PounceBundle:
-    """A bundle that needs no file: seeded random weights and a tiny tokenizer."""
-    is_pi05 = isinstance(config, PounceConfig)
+def random_bundle(
+    config: AnyPounceConfig,
+    seed: int,
+    *,
+    statistics: RobotStatistics = ROBOMME,
+    tokenizer: AnyTokenizer | None = None,
+) -> PounceBundle:
+    """A bundle that needs no file: seeded random weights and a tiny tokenizer, unless another is given."""
+    if tokenizer is None:
+        is_pi05 = isinstance(config, PounceConfig)
+        tokenizer = tiny_tokenizer_for_random_weights() if is_pi05 else tiny_eagle_tokenizer_for_random_weights()
     return PounceBundle(
         model=random_model(config, seed),
-        tokenizer=tiny_tokenizer_for_random_weights() if is_pi05 else tiny_eagle_tokenizer_for_random_weights(),
+        tokenizer=tokenizer,
         statistics=statistics,
         is_random=True,
         has_fresh_prefix=config.cognition.num_carriers > 0,
@@ -235,9 +244,7 @@ def _read_config(path: Path) -> AnyStoredConfig | None:
     if values is None or values.get("format") not in (FORMAT, GROOT_FORMAT):
         return None
     if isinstance(values.get("statistics"), dict):
-        values["statistics"] = {"space": "joint_delta", "reach": ()} | values[
-            "statistics"
-        ]  # of a folder from before there were two
+        values["statistics"] = _LATER_STATISTICS | values["statistics"]
     if values["format"] == FORMAT:
         if isinstance(values.get("config"), dict):
             values["config"] = _LATER_FIELDS | values["config"]

@@ -3,13 +3,15 @@
 import torch
 from torch import nn
 
-from ponderpounce.models.gemma import RmsNorm
+from ponderpounce.models.gemma import AdaRmsNorm, RmsNorm
 from ponderpounce.models.groot import Groot
 from ponderpounce.models.groot_blocks import EmbodimentLinear
 from ponderpounce.models.pi05 import Pi05
 from ponderpounce.models.pounce import Pounce, PounceConfig
 from ponderpounce.models.pounce_groot import GrootPounce, GrootPounceConfig
 from ponderpounce.models.qwen3 import PlainRmsNorm
+
+_FAINT = 0.1
 
 
 def random_pounce(config: PounceConfig, seed: int) -> Pounce:
@@ -23,7 +25,22 @@ def random_pounce(config: PounceConfig, seed: int) -> Pounce:
     generator = torch.Generator().manual_seed(seed)
     initialise_pi05(model.pi05, generator)
     initialise_prefix(model, generator)
+    if model.state_projector is not None:
+        _draw(model.state_projector, generator)
     return model
+
+
+@torch.no_grad()
+def open_gates(model: Pounce | GrootPounce) -> None:
+    """For training from scratch: every adaRMS norm of pi0.5's expert begins as a plain one with its residual let
+    through, and hardly listens to the time. Drawn like the rest, gates are as often negative as positive."""
+    if not isinstance(model, Pounce):
+        return
+    for module in model.pi05.expert.modules():
+        if isinstance(module, AdaRmsNorm):
+            module.dense.weight.mul_(_FAINT)
+            _scale, _shift, gate = module.dense.bias.chunk(3)
+            gate.fill_(1.0)
 
 
 def random_groot_pounce(config: GrootPounceConfig, seed: int) -> GrootPounce:

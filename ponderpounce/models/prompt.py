@@ -7,6 +7,7 @@ altogether (``discrete_state_input=False``) and so act without proprioception; a
 """
 
 import io
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,8 @@ from numpy.typing import ArrayLike
 
 NUM_BINS = 256
 TINY_VOCAB_SIZE = 512
+_MAX_PIECE = 64  # characters
+_REPEATS = 4  # pairs that occur once are not merged
 
 # Enough of RoboMME's language for the pieces of a tiny tokenizer to be words; bytes cover everything else.
 _TASK_LANGUAGE = (
@@ -99,13 +102,26 @@ def tiny_tokenizer_for_random_weights() -> Tokenizer:
 
     Special ids are PaliGemma's (pad 0, eos 1, bos 2, unk 3) and digits are split, as Gemma's tokenizer does.
     """
-    model = io.BytesIO()
     states = (f"Task: {text}, State: 0 12 37 64 128 193 255 255;\nAction: " for text in _TASK_LANGUAGE)
+    return _trained(states, TINY_VOCAB_SIZE)
+
+
+def tokenizer_of_instructions(instructions: Sequence[str], vocab_size: int = TINY_VOCAB_SIZE) -> Tokenizer:
+    """Trains a tokenizer on the instructions of a dataset, for a network that starts from nothing.
+
+    Its pieces may span words: what is always said alike becomes a few tokens, and every token costs.
+    """
+    prompts = [stateless_prompt_text(instruction) for instruction in instructions]
+    return _trained(prompts * _REPEATS, vocab_size, split_by_whitespace=False, max_sentencepiece_length=_MAX_PIECE)
+
+
+def _trained(sentences: Iterable[str], vocab_size: int, **options: bool | int) -> Tokenizer:
+    model = io.BytesIO()
     sentencepiece.SentencePieceTrainer.train(
-        sentence_iterator=states,
+        sentence_iterator=iter(sentences),
         model_writer=model,
         model_type="bpe",
-        vocab_size=TINY_VOCAB_SIZE,
+        vocab_size=vocab_size,
         hard_vocab_limit=False,
         byte_fallback=True,
         split_digits=True,
@@ -118,5 +134,6 @@ def tiny_tokenizer_for_random_weights() -> Tokenizer:
         add_dummy_prefix=False,
         num_threads=1,
         minloglevel=2,
+        **options,
     )
     return Tokenizer(model.getvalue())

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 
@@ -20,7 +21,7 @@ from ponderpounce.models.pounce_family import AnyPounceConfig
 from ponderpounce.models.pounce_groot import GrootInputs, GrootPounceConfig
 from ponderpounce.models.pounce_reading import groot_inputs, pi05_inputs
 from ponderpounce.models.prompt import Tokenizer
-from ponderpounce.training.example import Example, Frame, target_rows
+from ponderpounce.training.example import Example, Frame, chunk_ticks
 from ponderpounce.training.joint import NO_QUERY, PonderBatch, PounceBatch
 
 _GROOT_PAD = "<|endoftext|>"
@@ -35,7 +36,6 @@ class _Asked:
     """Of its example in the batch."""
     example: Example
     invocation: SampledInvocation
-    is_blind: bool
 
     @property
     def instruction(self) -> str:
@@ -43,7 +43,7 @@ class _Asked:
 
     @property
     def frames(self) -> tuple[Frame, ...]:
-        return () if self.is_blind else self.example.episode.frames[self.invocation.tick]
+        return self.example.episode.frames[self.invocation.tick]
 
     @property
     def proprio(self) -> Floats:
@@ -77,10 +77,8 @@ def collate_pounce(
     config: AnyPounceConfig,
     tokenizer: AnyTokenizer,
     statistics: RobotStatistics,
-    *,
-    is_blind: bool = False,
 ) -> PounceBatch:
-    """POUNCE's side. ``is_blind`` leaves the pictures out, as if no camera had delivered; pi0.5 only.
+    """POUNCE's side. Without pictures (`Sight`) it is as if no camera had delivered; pi0.5 only.
 
     Prompts of unequal length are padded: on the right and masked for pi0.5. GR00T is padded on the left, as in its
     public data path; its mixer attends to the pads, which serving, one moment at a time, never has.
@@ -88,11 +86,7 @@ def collate_pounce(
     Raises:
         ValueError: a prompt is longer than ``max_prompt_tokens``, or the tokenizer is another family's.
     """
-    moments = [
-        _Asked(index=n, example=e, invocation=i, is_blind=is_blind)
-        for n, e in enumerate(examples)
-        for i in e.invocations
-    ]
+    moments = [_Asked(index=n, example=e, invocation=i) for n, e in enumerate(examples) for i in e.invocations]
     inputs: PounceInputs | GrootInputs
     if isinstance(config, PounceConfig) and isinstance(tokenizer, Tokenizer):
         inputs = joined_pi05([pi05_inputs(moment, config, tokenizer, statistics, _CPU) for moment in moments])
@@ -102,10 +96,14 @@ def collate_pounce(
     else:
         raise ValueError(f"a {type(config).__name__} does not read with a {type(tokenizer).__name__}")
     actions_INA = torch.zeros(len(moments), config.horizon, config.padded_action_dim)
-    for place, moment in enumerate(moments):
-        rows = target_rows(moment.example.episode, moment.invocation.tick, config.horizon)
-        wanted = torch.from_numpy(statistics.normalise_targets(rows, moment.proprio))
-        actions_INA[place, :, : config.robot_action_dim] = wanted
+    first = 0
+    for example in examples:
+        ticks = np.array([invocation.tick for invocation in example.invocations], dtype=np.intp)
+        episode = example.episode
+        rows = chunk_ticks(ticks, config.horizon, episode.num_ticks)
+        wanted = statistics.normalise_chunks(episode.action_T8, episode.state_T8[ticks], rows)
+        actions_INA[first : first + len(ticks), :, : config.robot_action_dim] = torch.from_numpy(wanted)
+        first += len(ticks)
     queries = [moment.invocation.reference.query for moment in moments]
     return PounceBatch(
         inputs=inputs,

@@ -5,15 +5,19 @@ from __future__ import annotations
 import hashlib
 from collections import OrderedDict
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ponderpounce.data.dataset import Dataset
+from ponderpounce.data.dataset import Dataset, Entry
 from ponderpounce.data.episode import CAMERAS, Rows
 from ponderpounce.data.video import FPS
 from ponderpounce.models.action_space import ActionSpace, actions_in, num_dims, states_in
+from ponderpounce.models.context import ContextFormat
+from ponderpounce.models.eyes import see
+from ponderpounce.models.images import resized
 from ponderpounce.models.normalisation import Quantiles, RobotStatistics
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.training.example import Frame, TrainingEpisode, chunk_ticks
@@ -24,6 +28,28 @@ _MIN_SPAN = 1e-3
 """A dimension that hardly moves is not blown up to fill [-1, 1]."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sight:
+    """What a stage reads of the pictures. Kept at these sizes, a set of hundreds of episodes stays in memory."""
+
+    form: ContextFormat | None
+    """PONDER's, for its eyes; None: it is not run."""
+    pounce_px: int | None
+    """Side of POUNCE's pictures, to which they are resized as serving does; None: it gets none."""
+
+    def needs(self, camera: int) -> bool:
+        """Whether pictures of the camera of this number are read at all."""
+        if self.pounce_px is not None or self.form is None or self.form.eyes is None:
+            return True
+        return camera <= max(eye.camera for eye in self.form.eyes)  # eyes count from the first camera
+
+    def of_ponder(self, views: tuple[Frame, ...]) -> tuple[Frame, ...]:
+        return () if self.form is None else tuple(see(views, self.form.eyes, self.form.image_px))
+
+    def of_pounce(self, views: tuple[Frame, ...]) -> tuple[Frame, ...]:
+        return () if self.pounce_px is None else tuple(resized(view, self.pounce_px) for view in views)
+
+
 class TrainingSet:
     """Episodes by number. ``pp-collect`` and ``pp-export`` make the folder.
 
@@ -31,20 +57,24 @@ class TrainingSet:
     as in the video.
     """
 
-    def __init__(self, root: Path, *, tasks: Sequence[str] = (), cache_mb: int = 4000) -> None:
-        """Reads the episodes of ``tasks``, or all.
+    def __init__(
+        self, root: Path, *, tasks: Sequence[str] = (), sight: Sight | None = None, cache_mb: int = 4000
+    ) -> None:
+        """Reads the episodes of ``tasks``, or all; their pictures whole, or as ``sight`` says.
 
         Raises:
             DatasetError: the folder holds no dataset of ours.
             ValueError: no episode of these tasks is in it.
         """
         self._dataset = Dataset(root)
+        self._sight = sight
         entries = self._dataset.episodes
         self._entries = [e for e in entries if e.is_success and (not tasks or e.task in tasks)]
         if not self._entries:
             there = ", ".join(sorted({e.task for e in entries}))
             raise ValueError(f"{root} has no successful episode of {', '.join(tasks) or 'any task'}; it has {there}")
         self.image_px = self._dataset.image_px
+        self._look_every = FPS // self._dataset.execution_hz
         self._cache: OrderedDict[int, TrainingEpisode] = OrderedDict()
         self._cache_bytes = cache_mb * 1_000_000
         self._cached_bytes = 0
@@ -60,6 +90,15 @@ class TrainingSet:
             digest.update(f"{entry.task} {entry.seed} {entry.instruction}".encode())
             digest.update(self._dataset.rows(entry.index).action.tobytes())
         return digest.hexdigest()
+
+    @property
+    def names(self) -> list[tuple[str, int]]:
+        """Task and seed of every episode, in order."""
+        return [(entry.task, entry.seed) for entry in self._entries]
+
+    def instructions(self) -> list[str]:
+        """Every instruction once, in order."""
+        return sorted({entry.instruction for entry in self._entries})
 
     def texts(self) -> list[str]:
         """All that PONDER reads or says in these episodes, each text once, in order."""
@@ -87,19 +126,44 @@ class TrainingSet:
         rows = self._dataset.rows(entry.index)
         start = entry.num_demonstration_rows
         shown = [*range(0, start, FPS), *range(start, entry.num_rows)]
-        pictures = [self._dataset.frames(entry.index, camera, shown) for camera in CAMERAS]
-        views: list[tuple[Frame, ...]] = list(zip(*pictures, strict=True))
         num_shown = len(range(0, start, FPS))
+        views, sights = self._pictures(entry, shown)
         return TrainingEpisode(
             instruction=entry.instruction,
-            demo=tuple(views[:num_shown]),
+            demo=tuple((views if sights is None else sights)[:num_shown]),
             frames=views[num_shown:],
+            sights=None if sights is None else sights[num_shown:],
             state_T8=rows.state[start:],
             action_T8=rows.action[start:],
             subgoals=rows.grounded_subgoal[start:],
             is_transition_T=rows.is_transition[start:],
             reasoning=rows.demonstration_reasoning[start],
         )
+
+    def _pictures(
+        self, entry: Entry, shown: Sequence[int]
+    ) -> tuple[list[tuple[Frame, ...]], list[tuple[Frame, ...]] | None]:
+        """POUNCE's views of the rows, and PONDER's where they are other ones."""
+        sight = self._sight
+        if sight is not None and sight.form is None and sight.pounce_px is None:
+            return [()] * len(shown), [()] * len(shown)
+        taken = [row - self._late(row, entry) for row in shown]
+        once = sorted(set(taken))
+        wanted = CAMERAS if sight is None else [c for n, c in enumerate(CAMERAS) if sight.needs(n)]
+        pictures = {
+            camera: dict(zip(once, self._dataset.frames(entry.index, camera, once), strict=True)) for camera in wanted
+        }
+        whole = {row: tuple(pictures[camera][row] for camera in wanted) for row in once}
+        if sight is None:
+            return [whole[row] for row in taken], None
+        views = {row: sight.of_pounce(whole[row]) for row in once}
+        sights = {row: sight.of_ponder(whole[row]) for row in once}
+        return [views[row] for row in taken], [sights[row] for row in taken]
+
+    def _late(self, row: int, entry: Entry) -> int:
+        """How many rows before this one its picture was taken: those between two looks repeat the one before."""
+        step = row - entry.num_demonstration_rows
+        return step % self._look_every if step > 0 else 0
 
     def statistics(self, horizon: int, space: ActionSpace = "joint_delta", *, by_row: bool = False) -> RobotStatistics:
         """Quantiles of the states as the network reads them, and of the actions as it learns them in an `action_space`.
@@ -144,4 +208,6 @@ def _quantiles(values: NDArray[np.float32]) -> Quantiles:
 
 
 def _num_bytes(episode: TrainingEpisode) -> int:
-    return sum(view.nbytes for views in (*episode.demo, *episode.frames) for view in views)
+    """Of its pictures, each counted once however many rows share it."""
+    instants = {id(views): views for views in (*episode.demo, *episode.frames, *(episode.sights or ()))}
+    return sum(view.nbytes for views in instants.values() for view in views)

@@ -7,7 +7,7 @@ hold them equal.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -31,7 +31,7 @@ class TrainingEpisode:
     demo: tuple[tuple[Frame, ...], ...]
     """The demonstration's views at 1 Hz; () without one."""
     frames: Sequence[tuple[Frame, ...]]
-    """T ticks of views, in the order of the robot's cameras."""
+    """T ticks of views, in the order of the robot's cameras; () at ticks where POUNCE has none."""
     state_T8: NDArray[np.float32]
     action_T8: NDArray[np.float32]
     """Absolute joint targets and the gripper's command."""
@@ -42,6 +42,9 @@ class TrainingEpisode:
     comes into sight."""
     reasoning: str = ""
     """What PONDER writes at the first transition after a demonstration; empty without one."""
+    sights: Sequence[tuple[Frame, ...]] | None = None
+    """T ticks of what PONDER's eyes make of the views, where ``frames`` are not the cameras' own; ``demo`` then is what
+    they make of it, too."""
 
     def __post_init__(self) -> None:
         rows = (self.frames, self.state_T8, self.action_T8, self.subgoals, self.is_transition_T)
@@ -148,6 +151,7 @@ def episode_row(
     episode: TrainingEpisode, form: ContextFormat, schedule: SampledSchedule, *, is_grounded: bool = True
 ) -> Row:
     """The tokens of the episode. The first transition of a demonstration episode begins with its reasoning."""
+    views, form = _before_ponder(episode, form)
     segments = list(form.opening(episode.instruction, [len(views) for views in episode.demo]))
     encode = form.vocabulary.encode
     reasoning = encode(normalised_text(episode.reasoning)) if episode.reasoning else None
@@ -157,7 +161,7 @@ def episode_row(
         if is_grounded and query.stamp.is_transition and text:
             transition = Transition(subgoal=encode(normalised_text(text)), reasoning=reasoning)
             reasoning = None
-        segments += form.query(len(episode.frames[query.tick]), transition)
+        segments += form.query(len(views[query.tick]), transition)
     return form.row(segments)
 
 
@@ -177,8 +181,14 @@ def row_frames(episode: TrainingEpisode, form: ContextFormat, schedule: SampledS
 
     Raises ValueError if the episode's pictures have a size that ``form`` cannot see.
     """
-    instants = [*episode.demo, *(episode.frames[query.tick] for query in schedule.queries)]
+    views, form = _before_ponder(episode, form)
+    instants = [*episode.demo, *(views[query.tick] for query in schedule.queries)]
     return torch.from_numpy(np.concatenate([see(views, form.eyes, form.image_px) for views in instants]))
+
+
+def _before_ponder(episode: TrainingEpisode, form: ContextFormat) -> tuple[Sequence[tuple[Frame, ...]], ContextFormat]:
+    """The pictures that PONDER is shown, and its format for them: what was seen once is read as it is."""
+    return (episode.frames, form) if episode.sights is None else (episode.sights, replace(form, eyes=None))
 
 
 def target_rows(episode: TrainingEpisode, tick: int, horizon: int) -> NDArray[np.float32]:

@@ -45,8 +45,8 @@ class Recipe:
     """What POUNCE's actions are."""
     statistics_by_row: bool = False
     """Every row of a chunk in its own measure (`RobotStatistics.reach`)."""
-    vocabulary_size: int = 0
-    """Pieces of PONDER's own vocabulary, trained on the data's texts; 0: `Vocabulary.tiny`. From scratch only."""
+    has_own_tokenizers: bool = False
+    """From scratch: both tokenizers are trained on the data's texts, which then take fewer tokens."""
     from_scratch: bool = False
     """True: weights are drawn. False: both systems start from pretrained checkpoints, given to the program."""
 
@@ -155,7 +155,7 @@ def small() -> Curriculum:
         trains="ponder",
         space="ee_delta",
         statistics_by_row=True,
-        vocabulary_size=400,
+        has_own_tokenizers=True,
         from_scratch=True,
     )
     grounding = replace(
@@ -169,7 +169,7 @@ def small() -> Curriculum:
         looking,
         name="small/motor",
         example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=16),
-        train=TrainConfig(seed=0, dropout=0.1, flow_samples=2, optim=replace(_FROM_SCRATCH, learning_rate=2e-3)),
+        train=TrainConfig(seed=0, dropout=0.1, flow_samples=2, optim=replace(_FROM_SCRATCH, learning_rate=1e-3)),
         num_steps=6000,
         batch_episodes=8,
         w3=0.0,

@@ -29,13 +29,16 @@ from tqdm import tqdm
 from ponderpounce.data.episode import CAMERAS
 from ponderpounce.data.errors import DatasetError
 from ponderpounce.models.eyes import check_cameras, readable_sizes
+from ponderpounce.models.normalisation import ROBOMME
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import load_ponder, save_ponder
 from ponderpounce.models.pounce import PounceConfig, freeze
 from ponderpounce.models.pounce_checkpoint import PounceBundle, load_bundle, random_bundle, save_bundle
+from ponderpounce.models.pounce_init import open_gates
+from ponderpounce.models.prompt import tokenizer_of_instructions
 from ponderpounce.models.vocabulary import Vocabulary
 from ponderpounce.training.collate import collate_ponder, collate_pounce
-from ponderpounce.training.data import TrainingSet
+from ponderpounce.training.data import Sight, TrainingSet
 from ponderpounce.training.example import make_example
 from ponderpounce.training.joint import JointModel, PonderBatch, PounceBatch, Trains
 from ponderpounce.training.parallel import World, gather, joined, shard
@@ -84,6 +87,8 @@ class TrainOptions:
     """Steps between samples of what PONDER says (OUT/samples.jsonl)."""
     tensorboard: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Also write OUT/tensorboard: losses, pictures and samples."""
+    cache_mb: int = 6000
+    """Memory for pictures, at the sizes that the networks read; what does not fit is decoded again."""
     device: Literal["cpu", "cuda"] = "cpu"
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Of PONDER's weights and of what POUNCE's stream runs in, when they are loaded."""
@@ -120,9 +125,7 @@ class Batches:
             with_rows=run.trains != "pounce",
             stand_in_size=model.ponder.hidden_size if model.needs_stand_ins else 0,
         )
-        invocations = collate_pounce(
-            examples, model.pounce.config, bundle.tokenizer, bundle.statistics, is_blind=run.is_blind
-        )
+        invocations = collate_pounce(examples, model.pounce.config, bundle.tokenizer, bundle.statistics)
         return episodes.to(self._device), invocations.to(self._device)
 
 
@@ -192,6 +195,7 @@ def _is_finished(out: Path) -> bool:
 def _train(run: Recipe, data: TrainingSet, options: TrainOptions, world: World) -> None:
     model, bundle = build(run, data, options)
     shard(model, world)
+    data = TrainingSet(options.data, tasks=options.tasks, sight=_sight(run, model), cache_mb=options.cache_mb)
     batches = Batches(data, run, model, bundle, world)
     trainer = Trainer(model, batches, run.train, data_hash=data.hash, world=world)
     checkpoint = options.out / "checkpoint"
@@ -239,7 +243,8 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
     if options.ponder is not None:
         ponder = load_ponder(options.ponder, device=options.device, dtype=dtype)
     else:
-        vocabulary = Vocabulary.trained_on(data.texts(), run.vocabulary_size) if run.vocabulary_size else None
+        is_own = run.has_own_tokenizers
+        vocabulary = Vocabulary.trained_on(data.texts(), run.ponder.first_carrier_id) if is_own else None
         ponder = Ponder.random(run.ponder, vocabulary, seed=seed, device=options.device, dtype=dtype)
     try:
         check_cameras([(data.image_px, data.image_px)] * len(CAMERAS), ponder.format.eyes, ponder.image_px)
@@ -248,9 +253,14 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
         raise ValueError(f"{options.data}: {error}; collect with --image-px {wanted_px}") from None
     statistics = data.statistics(run.pounce.horizon, run.space, by_row=run.statistics_by_row)
     if options.pounce is None:
-        bundle = random_bundle(run.pounce, seed, statistics=statistics)
+        is_own = run.has_own_tokenizers and isinstance(run.pounce, PounceConfig)
+        tokenizer = tokenizer_of_instructions(data.instructions()) if is_own else None
+        bundle = random_bundle(run.pounce, seed, statistics=statistics, tokenizer=tokenizer)
+        open_gates(bundle.model)
     else:
-        bundle = replace(load_bundle(options.pounce), statistics=statistics)
+        bundle = load_bundle(options.pounce)
+        if bundle.statistics == ROBOMME:  # a public folder; our own act in the measure that they were trained in
+            bundle = replace(bundle, statistics=statistics)
     pounce = bundle.model.to(options.device)
     if type(pounce.config) is not type(run.pounce):
         raise ValueError(f"recipe {run.name} is of another action model than {options.pounce} holds")
@@ -284,6 +294,14 @@ def _adjusted(run: Recipe, options: TrainOptions) -> Recipe:
         batch_episodes=options.batch_episodes or run.batch_episodes,
         example=replace(run.example, max_invocations=options.max_invocations or run.example.max_invocations),
         train=replace(run.train, seed=seed),
+    )
+
+
+def _sight(run: Recipe, model: JointModel) -> Sight:
+    """What the run reads of the pictures."""
+    return Sight(
+        form=model.ponder.format if run.trains != "pounce" else None,
+        pounce_px=model.pounce.config.image_px if run.trains != "ponder" and not run.is_blind else None,
     )
 
 
