@@ -9,6 +9,7 @@ altogether (``discrete_state_input=False``) and so act without proprioception; a
 import io
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import sentencepiece
@@ -115,7 +116,7 @@ def tokenizer_of_instructions(instructions: Sequence[str], vocab_size: int = TIN
     return _trained(prompts * _REPEATS, vocab_size, split_by_whitespace=False, max_sentencepiece_length=_MAX_PIECE)
 
 
-def _trained(sentences: Iterable[str], vocab_size: int, **options: bool | int) -> Tokenizer:
+def _trained(sentences: Iterable[str], vocab_size: int, **options: Any) -> Tokenizer:
     model = io.BytesIO()
     sentencepiece.SentencePieceTrainer.train(
         sentence_iterator=iter(sentences),

@@ -1,0 +1,212 @@
+"""Stages: each trains one system or both, from what earlier ones left; what a stage does not need is not made."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ponderpounce.data.episode import About, EpisodeWriter, Row, unpack
+from ponderpounce.data.lerobot_v3 import DatasetWriter
+from ponderpounce.models import flow
+from ponderpounce.models.arm import tool_poses
+from ponderpounce.models.eyes import Eye
+from ponderpounce.models.ponder_checkpoint import load_ponder
+from ponderpounce.models.pounce_checkpoint import load_bundle
+from ponderpounce.training import recipes, train
+from ponderpounce.training.data import Sight, TrainingSet
+from ponderpounce.training.example import ExampleConfig, make_example, row_frames
+from ponderpounce.training.joint import Draws, JointModel
+from ponderpounce.training.parallel import World
+from ponderpounce.training.recipes import Curriculum, Recipe, stages_of
+from ponderpounce.training.train import TrainOptions, build
+from ponderpounce.training.trainer import Trainer
+
+PX, NUM_EPISODES, NUM_ROWS = 64, 2, 50
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("stages") / "set"
+    writer = DatasetWriter(root)
+    for seed in range(NUM_EPISODES):
+        writer.add(unpack(_package(seed)))
+    writer.finish()
+    return root
+
+
+def _package(seed: int) -> dict[str, bytes]:
+    rng = np.random.default_rng(seed)
+    episode = EpisodeWriter(PX)
+    for k in range(NUM_ROWS):
+        joints = np.array([0, 0.2, 0, -2.2, 0, 2.4, 0.8, 0.04], np.float32) + 0.01 * np.float32(k)
+        row = Row(
+            state=joints,
+            action=joints + 0.02,
+            tcp_pose=np.zeros(7, np.float32),
+            subgoal="press",
+            grounded_subgoal=f"press the button at <{60 + seed}, {80 if k < 25 else 90}>",
+            is_transition=k in (0, 25),
+        )
+        episode.add(row, {camera: rng.integers(0, 256, (PX, PX, 3), np.uint8) for camera in ("front", "wrist")})
+    return episode.pack(
+        About(
+            task="PickHighlight", instruction="press it", seed=seed, difficulty="easy", origin="oracle",
+            is_success=True, image_px=PX,
+        )
+    )  # fmt: skip
+
+
+def shrunk(run: Recipe) -> Recipe:
+    ponder = replace(run.ponder, image_px=(16, 16), eyes=(Eye(camera=0, box=(0.0, 0.0, 0.5, 0.5)),), vision_depth=1)
+    example = replace(run.example, max_invocations=2, max_queries=2, text_dropout=0.0)
+    return replace(run, ponder=ponder, example=example, num_steps=2, batch_episodes=2)
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> dict[str, Recipe]:
+    stages = {run.name.rpartition("/")[2]: shrunk(run) for run in stages_of(recipes.recipe("small"))}
+    curriculum = Curriculum(name="small", stages=tuple(stages.values()))
+    monkeypatch.setitem(recipes.RECIPES, "small", lambda: curriculum)
+    return stages
+
+
+def options(folder: Path, out: Path, **changes: object) -> TrainOptions:
+    return replace(
+        TrainOptions(recipe="small", data=folder, out=out, save_every=1, progress=False),
+        **changes,  # type: ignore[arg-type]
+    )
+
+
+def trainer_of(run: Recipe, folder: Path) -> Trainer:
+    data = TrainingSet(folder)
+    model, bundle = build(run, data, options(folder, folder / "unused"))
+    data = TrainingSet(folder, sight=train._sight(run, model))
+    return Trainer(model, train.Batches(data, run, model, bundle, World()), run.train)
+
+
+def snapshot(model: JointModel, system: str) -> dict[str, torch.Tensor]:
+    return {name: p.detach().clone() for name, p in model.named_parameters() if name.startswith(system)}
+
+
+@pytest.mark.parametrize(
+    ("stage", "still", "moves"), [("looking", "pounce.", "ponder."), ("motor", "ponder.", "pounce.")]
+)
+def test_a_stage_moves_its_own_system_alone(
+    folder: Path, small: dict[str, Recipe], stage: str, still: str, moves: str
+) -> None:
+    trainer = trainer_of(small[stage], folder)
+    before, other = snapshot(trainer.model, still), snapshot(trainer.model, moves)
+    reports = list(trainer.run(2))
+    assert all(torch.equal(now, before[name]) for name, now in snapshot(trainer.model, still).items())
+    assert any(not torch.equal(now, other[name]) for name, now in snapshot(trainer.model, moves).items())
+    assert (reports[0].flow_matching == 0.0) == (stage == "looking")
+    assert (reports[0].alignment > 0.0) == (stage == "looking")
+    assert (reports[0].num_supervised > 0) == (stage == "looking")
+
+
+def test_a_stage_makes_only_what_it_reads(folder: Path, small: dict[str, Recipe]) -> None:
+    motor, looking, joint = (trainer_of(small[name], folder)._batches(0) for name in ("motor", "looking", "joint"))
+    assert (motor[0].rows, motor[0].frames, len(motor[0].stand_ins)) == ((), (), 2)
+    assert motor[1].inputs.images.shape[1] == 0  # blind
+    assert len(looking[0].rows) == len(looking[0].stand_ins) == 2
+    assert looking[1].inputs.images.shape[1] == 0
+    assert (len(joint[0].rows), joint[0].stand_ins, joint[1].inputs.images.shape[1]) == (2, (), 2)
+
+
+def test_all_stages_follow_each_other_and_the_last_is_what_is_served(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    train.train(options(folder, out))
+    assert not (out / "motor" / "ponder").exists()
+    assert not (out / "looking" / "pounce").exists()
+    served, last = load_ponder(out / "ponder"), load_ponder(out / "joint" / "ponder")
+    assert not served.is_random
+    for (name, mine), (_, theirs) in zip(served.named_parameters(), last.named_parameters(), strict=True):
+        assert torch.equal(mine, theirs), name
+    bundle = load_bundle(out / "pounce")
+    assert (bundle.statistics.space, len(bundle.statistics.reach)) == ("ee_delta", bundle.model.config.horizon)
+    assert len(bundle.tokenizer.encode("press it\n")) < 8
+    with pytest.raises(ValueError, match="holds a finished run"):
+        train.train(options(folder, out))
+
+
+def test_stages_run_apart_are_the_run_in_one_go(folder: Path, tmp_path: Path) -> None:
+    train.train(options(folder, tmp_path / "together"))
+    for stage in ("motor", "looking", "grounding", "joint"):  # the first two need not wait for each other
+        train.train(options(folder, tmp_path / "apart", stage=stage))
+    for system in ("ponder", "pounce"):
+        one, other = (tmp_path / name / system / "model.safetensors" for name in ("together", "apart"))
+        assert one.read_bytes() == other.read_bytes()
+
+
+def test_a_stage_that_does_not_exist_is_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="has the stages looking, grounding, motor, joint; there is no 'driving'"):
+        train.train(options(folder, tmp_path / "run", stage="driving"))
+    with pytest.raises(ValueError, match="tiny has no stages"):
+        train.train(options(folder, tmp_path / "run", recipe="tiny", stage="joint"))
+
+
+def test_pictures_kept_small_are_what_whole_ones_become(folder: Path, small: dict[str, Recipe]) -> None:
+    run = small["joint"]
+    model, bundle = build(run, TrainingSet(folder), options(folder, folder / "unused"))
+    form, pounce_px = model.ponder.format, run.pounce.image_px
+    whole, kept = TrainingSet(folder), TrainingSet(folder, sight=Sight(form=form, pounce_px=pounce_px))
+    config = ExampleConfig(clocks=run.example.clocks)
+    examples = [make_example(data[1], form, config, np.random.default_rng(3)) for data in (whole, kept)]
+    assert examples[0].row().ids == examples[1].row().ids
+    assert torch.equal(*(row_frames(e.episode, form, e.schedule) for e in examples))
+    batches = [
+        train.collate_pounce([e], model.pounce.config, bundle.tokenizer, bundle.statistics).inputs for e in examples
+    ]
+    assert torch.equal(batches[0].images, batches[1].images)
+
+
+def test_several_flow_samples_are_the_mean_of_single_ones(folder: Path, small: dict[str, Recipe]) -> None:
+    trainer = trainer_of(small["motor"], folder)
+    episodes, batch = trainer._batches(0)
+    both = Draws.draw(batch, flow.sample_times, 0.0, [torch.Generator().manual_seed(s) for s in (1, 2)], num_samples=2)
+    loss = trainer.model(episodes, batch, both).flow_matching
+    count = len(batch.actions_INA)
+    singles = [
+        replace(both, noise_SNA=both.noise_SNA[part], time_S=both.time_S[part])
+        for part in (slice(0, count), slice(count, None))
+    ]
+    apart = torch.stack([trainer.model(episodes, batch, one).flow_matching for one in singles])
+    torch.testing.assert_close(loss, apart.mean())
+    assert trainer.model(episodes, batch, both).num_rows == 2 * count * batch.actions_INA.shape[1]
+
+
+def test_rows_in_their_own_measure_have_one_spread_and_come_back(folder: Path) -> None:
+    data = TrainingSet(folder)
+    statistics = data.statistics(6, "ee_delta", by_row=True)
+    episode = data[0]
+    ticks = np.arange(0, NUM_ROWS - 6)
+    chunks = statistics.normalise_chunks(episode.action_T8, episode.state_T8[ticks], ticks[:, None] + np.arange(6))
+    spread_N = np.abs(chunks[..., :3]).mean(axis=(0, 2))
+    assert spread_N.max() < 1.5 * spread_N.min()
+    back = statistics.absolute_targets(chunks[3], episode.state_T8[3])
+    reached, meant = (tool_poses(rows[:, :7]).position_m for rows in (back, episode.action_T8[3:9]))
+    np.testing.assert_allclose(reached, meant, atol=1e-4)  # the arm has a joint to spare: poses come back, not joints
+    tail = statistics.normalise_targets(episode.action_T8[5:9], episode.state_T8[3], first_row=2)
+    np.testing.assert_allclose(tail, chunks[3, 2:], atol=1e-5)
+    with pytest.raises(ValueError, match="chunks of 6 rows, came 7"):
+        statistics.normalise_targets(episode.action_T8[:7], episode.state_T8[0])
+
+
+def test_a_row_without_its_texts_keeps_its_queries(folder: Path, small: dict[str, Recipe]) -> None:
+    model, _ = build(small["looking"], TrainingSet(folder), options(folder, folder / "unused"))
+    told, untold = (
+        make_example(
+            TrainingSet(folder)[0],
+            model.ponder.format,
+            replace(small["looking"].example, text_dropout=share, max_queries=None),
+            np.random.default_rng(0),
+        )
+        for share in (0.0, 1.0)
+    )
+    assert len(told.row().carrier_index) == len(untold.row().carrier_index)
+    assert len(told.row().supervised_index) > len(untold.row().supervised_index)
+    assert torch.equal(told.stand_ins(128), untold.stand_ins(128))
