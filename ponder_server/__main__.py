@@ -25,10 +25,9 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
 
     from ponder_server.draft import NoDraft, TrieDraft
     from ponder_server.engine import EngineConfig, QwenEngine
+    from ponderpounce.models import ponder_configs
     from ponderpounce.models.ponder import Ponder
     from ponderpounce.models.ponder_checkpoint import load_ponder
-    from ponderpounce.models.ponder_configs import tiny_cpu
-    from ponderpounce.models.vocabulary import Vocabulary
 
     num_robots = 1 + len(options.other_robots)
     if options.max_sessions < num_robots:
@@ -38,7 +37,8 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     if options.checkpoint is not None:
         ponder = load_ponder(options.checkpoint, device=options.device, dtype=dtype)
     else:
-        ponder = Ponder.random(tiny_cpu(), Vocabulary.tiny(), seed=options.seed, device=options.device, dtype=dtype)
+        size = getattr(ponder_configs, options.size)()
+        ponder = Ponder.random(size, seed=options.seed, device=options.device, dtype=dtype)
     config = EngineConfig(
         max_context_tokens=options.max_context_tokens,
         when_full=options.when_full,
@@ -55,7 +55,7 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
 
 def main(argv: list[str] | None = None) -> int:
     options = tyro.cli(PonderOptions, args=argv, prog="ponder-serve", description=PonderOptions.__doc__)
-    weights = str(options.checkpoint or "random weights")
+    weights = str(options.checkpoint or f"random weights ({options.size})")
 
     def make(link: Link, engine: BatchingEngine, heartbeat: Heartbeat, version: str) -> PonderServer | PonderFleet:
         if not options.other_robots:

@@ -9,6 +9,9 @@ from typing import Literal
 from ponder_server.context_policy import PolicyName
 from protocol.options import LinkOptions
 
+SizeName = Literal["tiny_cpu", "qwen35_0p8b", "qwen35_2b", "qwen35_4b", "qwen35_9b"]
+"""Functions of ``ponderpounce.models.ponder_configs``."""
+
 NUM_TORCH_THREADS = 1  # on a CPU one thread per process beats two: a contended second one costs more than it gives
 
 
@@ -18,7 +21,9 @@ class PonderOptions:
 
     link: LinkOptions = field(default_factory=lambda: LinkOptions(listen=("tcp/127.0.0.1:7448",)))
     checkpoint: Path | None = None
-    """Folder in the Hugging Face layout; none: a tiny network with random weights, which is no policy."""
+    """Folder in the Hugging Face layout; none: random weights, which are no policy."""
+    size: SizeName = "tiny_cpu"
+    """Of the random network, if there is no checkpoint. It speaks the tiny vocabulary at every size."""
     seed: int = 0
     """Of the random weights, if there is no checkpoint."""
     device: str = "cpu"

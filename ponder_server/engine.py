@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ponder_server.audible import audible
 from ponder_server.batching import Batch
 from ponder_server.context_policy import POLICIES, PolicyName, Span
 from ponder_server.contract import (
@@ -141,6 +142,8 @@ class QwenEngine:
             dtype=str(ponder.dtype).removeprefix("torch."),
             session_bytes=session_bytes,
         )
+        model = ponder.qwen.model
+        self._parts = [layer.mlp for layer in (*model.visual.blocks, *model.language_model.layers)]
         self._writer = TransitionWriter(ponder, draft or NoDraft(), max_text_tokens=config.max_text_tokens)
         self._query_ids = (*self._format.observation(config.num_cameras).ids, *self._format.carrier_ids)
         self._prefixes = Prefixes(config.max_prefixes)
@@ -173,7 +176,8 @@ class QwenEngine:
             raise ContextFull(session=session, used=0, wanted=wanted, limit=self._config.max_context_tokens)
         context = self._runner.open(session)
         try:
-            self._encode(context, opening, segments, demo, progress)
+            with audible(self._parts, progress):
+                self._encode(context, opening, segments, demo, progress)
         except BaseException as error:
             self._runner.close(context)
             if isinstance(error, torch.OutOfMemoryError):
@@ -252,15 +256,16 @@ class QwenEngine:
     @torch.inference_mode()
     def step(self, progress: Progress = no_progress) -> list[Outcome[Fire]]:
         """One forward for the queries that were begun; those answered by it. See ``BatchingEngine.step``."""
-        # no more at a time than share a forward: the rest would wait behind their vision tower, and outgrow the caches
-        begun = {session: self._begun.pop(session) for session in [*self._begun][: self._config.max_batch_rows]}
-        if begun:
-            pictures = [picture for query in begun.values() for picture in query.pictures]
-            embeds_TH = self._embed(self._query_ids * len(begun), pictures)
-            pieces = embeds_TH.split(len(self._query_ids))
-            for (session, query), query_TH in zip(begun.items(), pieces, strict=True):
-                self._batch.add(session, self._think(query, query_TH), query.turn)
-        return self._batch.step(progress)
+        with audible(self._parts, progress):
+            # no more at a time than share a forward: the rest would wait behind their vision tower, and outgrow the caches
+            begun = {session: self._begun.pop(session) for session in [*self._begun][: self._config.max_batch_rows]}
+            if begun:
+                pictures = [picture for query in begun.values() for picture in query.pictures]
+                embeds_TH = self._embed(self._query_ids * len(begun), pictures)
+                pieces = embeds_TH.split(len(self._query_ids))
+                for (session, query), query_TH in zip(begun.items(), pieces, strict=True):
+                    self._batch.add(session, self._think(query, query_TH), query.turn)
+            return self._batch.step(progress)
 
     def _think(self, query: _Query, embeds_TH: Tensor) -> Steps[Fire]:
         """One query's way through the network; whatever ends it early, the context is as it was."""

@@ -3,16 +3,18 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
 import torch
 
 from ponder_server.__main__ import build_engine
-from ponder_server.config import PonderOptions
+from ponder_server.config import PonderOptions, SizeName
 from ponder_server.contract import ContextFull, Frame, Opening, SessionError
 from ponder_server.engine import EngineConfig, QwenEngine
 from ponder_server.runner import Session
+from ponderpounce.models import ponder_configs
 from ponderpounce.models.context import Row, Transition
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
@@ -22,6 +24,8 @@ TOLERANCE = 1e-4
 VOCABULARY = Vocabulary.tiny()
 MODEL = replace(tiny_cpu(), image_px=(64, 64), num_carriers=2)
 CONFIG = EngineConfig(num_cameras=2, max_context_tokens=400, max_sessions=3)
+HEARD = MODEL.num_layers + 1  # signs of life of a forward: its layers, and its end
+SEEN = MODEL.vision_depth  # and of the vision tower, however many pictures at once
 INSTRUCTION = "press the buttons in order"
 REASONING = VOCABULARY.encode("left, then right, then the left")
 SUBGOAL = VOCABULARY.encode("press the left button")
@@ -236,12 +240,12 @@ def test_progress_is_heard_at_every_chunk_and_every_token(ponder: Ponder) -> Non
     engine = QwenEngine(ponder, replace(CONFIG, prefill_chunk_tokens=1))
     calls: list[int] = []
     engine.open("a", WITH_DEMO, lambda: calls.append(0))
-    assert len(calls) == 1 + len(DEMO) + 1
+    assert len(calls) == (1 + len(DEMO) + 1) * HEARD + len(DEMO) * SEEN
     engine.fire("a", observation(0), lambda: calls.append(1))
-    assert calls.count(1) == 1
+    assert calls.count(1) == HEARD + SEEN
     engine.fire("a", observation(1), lambda: calls.append(2))
     # one-pass try, observation again, each token, T_yes between the texts, carriers
-    assert calls.count(2) == 1 + 1 + len(REASONING) + 1 + len(SUBGOAL) + 1
+    assert calls.count(2) == (1 + 1 + len(REASONING) + 1 + len(SUBGOAL) + 1) * HEARD + SEEN
 
 
 def test_the_chunks_of_the_opening_do_not_matter(ponder: Ponder) -> None:
@@ -282,7 +286,12 @@ def test_a_long_demonstration_takes_a_few_forwards(ponder: Ponder) -> None:
     calls: list[int] = []
     demo = tuple((frame(2 * i), frame(2 * i + 1)) for i in range(48))
     assert engine.open("a", Opening(instruction="x", demo_frames=demo), lambda: calls.append(1)) > 48 * 2 * 6
-    assert len(calls) == 1
+    assert len(calls) == HEARD + SEEN
+
+
+@pytest.mark.parametrize("size", get_args(SizeName))
+def test_every_size_that_can_be_asked_for_exists(size: str) -> None:
+    assert getattr(ponder_configs, size)().vocab_size >= VOCABULARY.num_tokens
 
 
 def test_forced_text_has_exactly_so_many_plain_tokens(engine: QwenEngine) -> None:

@@ -1,0 +1,178 @@
+"""Does PONDER of a real size fit into this machine's memory, and does a session take what it says?
+
+Two measurements. *Sessions*: the engine is built with a few and with more sessions, and every byte it allocated is
+written once, because an operating system gives memory when it is written; the difference, per session, stands beside
+what ``EngineSpec.session_bytes`` computes. *Episode*: ``ponder-serve`` with random weights of that size, a tiny
+``pounce-serve`` and ``sim-client`` play one PickHighlight in lockstep, processes of their own as a user starts them;
+the kernel's own account of ``ponder-serve``'s largest resident memory is read at the end. Linux only (/proc).
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal, TypeVar
+
+import torch
+import tyro
+from torch import Tensor
+
+from benchmarks.report import Report, Row, show, spread
+from ponder_server.config import SizeName
+from ponder_server.engine import EngineConfig, QwenEngine
+from ponderpounce.models import ponder_configs
+from ponderpounce.models.ponder import Ponder
+from protocol.mcap_log import read_log
+from sim_client.launch import Daemons, start_local
+
+MIB = 2**20
+Built = TypeVar("Built")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MemoryOptions:
+    """Sessions of a PONDER with random weights, and an episode with it."""
+
+    size: SizeName = "qwen35_0p8b"
+    dtype: Literal["float32", "bfloat16"] = "bfloat16"
+    max_context_tokens: int = 16_384
+    sessions: tuple[int, int] = (1, 3)
+    """The sessions of the two engines whose memory is compared."""
+    served_sessions: int = 2
+    """--max-sessions of the episode's ponder-serve."""
+    episode: bool = True
+    seed: int = 0
+    """Of the scene, which is an easy one."""
+    max_steps: int = 1300
+    limit_gib: float = 24.0
+    """What ponder-serve may take at most; it is said whether it did."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    options = tyro.cli(MemoryOptions, args=argv, prog="ponder-memory")
+    torch.set_num_threads(1)
+    report = Report(
+        name=f"ponder_memory_{options.size}",
+        question="Does PONDER of this size fit into memory, and does a session take what was computed?",
+        config=options,
+        warm_up="in the episode: ponder-serve's own warm-up, 36 fires.",
+    )
+    report.add_table("A session: computed, and what the engine takes for it", [session_row(options)])
+    if options.episode:
+        with tempfile.TemporaryDirectory() as folder:
+            row, fires_ms = play(options, Path(folder))
+        report.add_table("An episode in lockstep, the paper's schedule", [row])
+        report.add_table("A fire in it, vision tower to cognition", [spread(fires_ms, "ms")])
+        report.notes.append(
+            f"ponder-serve's largest resident memory, weights and all, is {row['peak_gib']} GiB: "
+            f"{'within' if row['is_within_limit'] else 'beyond'} {options.limit_gib:g} GiB."
+        )
+    report.notes += [
+        f"{options.size} with random weights and the tiny vocabulary in the full table; one thread a process.",
+        "allocated: tensors that the engine made, each counted once. resident: growth of the process when they are "
+        "written.",
+    ]
+    show(report)
+    print(f"\nwritten: {report.write().name}")
+    return 0
+
+
+def session_row(options: MemoryOptions) -> Row:
+    """What one more session takes, three ways, in MiB."""
+    ponder = Ponder.random(getattr(ponder_configs, options.size)(), seed=0, dtype=getattr(torch, options.dtype))
+    engines, allocated, resident = [], [], []  # all are kept: what a process frees stays resident for its next use
+    for count in options.sessions:
+        config = EngineConfig(max_sessions=count, max_context_tokens=options.max_context_tokens)
+        before = resident_bytes()
+        engine, own = made_by(partial(QwenEngine, ponder, config))
+        for tensor in own:
+            tensor.fill_(1)
+        resident.append(resident_bytes() - before)
+        allocated.append(sum(tensor.nbytes for tensor in own))
+        engines.append(engine)
+    computed = engines[0].spec.session_bytes
+    fewer, more = options.sessions
+    per_session = [(values[1] - values[0]) / (more - fewer) for values in (allocated, resident)]
+    return {
+        "max_context_tokens": options.max_context_tokens,
+        "computed_mib": round(computed / MIB, 2),
+        "allocated_mib": round(per_session[0] / MIB, 2),
+        "resident_mib": round(per_session[1] / MIB, 2),
+        "allocated_off_%": round(100 * (per_session[0] / computed - 1), 2),
+        "resident_off_%": round(100 * (per_session[1] / computed - 1), 2),
+    }
+
+
+def made_by(build: Callable[[], Built]) -> tuple[Built, list[Tensor]]:
+    """What ``build`` returns, and as bytes the memory of the tensors that are alive since."""
+    before = list(storages())  # held, so that no address is used twice
+    built = build()
+    known = {tensor.data_ptr() for tensor in before}
+    return built, [tensor for tensor in storages() if tensor.data_ptr() not in known]
+
+
+def storages() -> Iterator[Tensor]:
+    """The memory of every tensor that is alive, each once, as bytes."""
+    seen: set[int] = set()
+    for each in gc.get_objects():
+        if not issubclass(type(each), Tensor) or each.is_meta:  # isinstance would wake what warns when looked at
+            continue
+        storage = each.untyped_storage()
+        if storage.data_ptr() not in seen:
+            seen.add(storage.data_ptr())
+            yield torch.empty(0, dtype=torch.uint8, device=each.device).set_(storage)
+
+
+def resident_bytes() -> int:
+    """Of this process, now."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def play(options: MemoryOptions, folder: Path) -> tuple[Row, list[float]]:
+    """One easy episode with real processes; the duration of every fire beside it, in ms."""
+    ponder = ["--size", options.size, "--dtype", options.dtype, "--max-sessions", str(options.served_sessions)]
+    ponder += ["--max-context-tokens", str(options.max_context_tokens)]
+    hidden_size = getattr(ponder_configs, options.size)().hidden_size
+    with Daemons(folder) as daemons:
+        endpoints = start_local(
+            daemons, robot="r0", with_clock=False, ponder=ponder, pounce=["--hidden-size", str(hidden_size)]
+        )
+        command = [sys.executable, "-m", "sim_client", "--mode", "lockstep", "--task", "PickHighlight"]
+        command += ["--difficulty", "easy", "--seed", str(options.seed), "--max-steps", str(options.max_steps)]
+        command += ["--patience-s", "3600", "--no-progress", "--out", str(folder), "--link.connect", *endpoints]
+        environment = os.environ | {"OMP_NUM_THREADS": "1", "MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl")}
+        played = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        if played.returncode != 0 or daemons.dead():
+            raise RuntimeError(f"sim-client left with {played.returncode}: {played.stderr[-2000:]} {daemons.dead()}")
+        peak_bytes = peak_resident_bytes(daemons.processes["ponder"].pid)
+    (episode,) = json.loads((folder / "results.json").read_text())["episodes"]
+    record = read_log(folder / episode["mcap"])
+    row: Row = {
+        "scene": f"PickHighlight easy, seed {options.seed}",
+        "outcome": episode["status"],
+        "steps": episode["steps"],
+        "fires": len(record.cognitions),
+        "context_tokens": record.cognitions[-1].context_tokens,
+        "servers_lost": sum(event.name.endswith("_lost") for event in record.events),
+        "peak_gib": round(peak_bytes / 2**30, 2),
+        "is_within_limit": peak_bytes <= options.limit_gib * 2**30,
+    }
+    return row, [cognition.infer_ns / 1e6 for cognition in record.cognitions]
+
+
+def peak_resident_bytes(pid: int) -> int:
+    """The most that a running process ever had."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) * 1024
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,72 @@
+"""What a session of PONDER takes is what was computed beforehand, and nothing is allocated for it later."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from benchmarks import ponder_memory, report
+from benchmarks.ponder_memory import made_by
+from ponder_server.contract import Opening
+from ponder_server.engine import EngineConfig, QwenEngine
+from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.ponder_configs import tiny_cpu
+
+SMALL = replace(tiny_cpu(), num_layers=4, vision_depth=1, image_px=(64, 64))
+
+
+@settings(max_examples=6, deadline=None)
+@given(
+    shape=st.fixed_dictionaries(
+        {
+            "num_layers": st.sampled_from([4, 8]),
+            "num_kv_heads": st.sampled_from([1, 2, 4]),
+            "num_gdn_key_heads": st.sampled_from([1, 2]),
+            "num_gdn_value_heads": st.sampled_from([2, 4]),
+            "gdn_head_dim": st.sampled_from([16, 32]),
+        }
+    ),
+    dtype=st.sampled_from([torch.float32, torch.bfloat16]),
+    num_sessions=st.integers(1, 4),
+    max_context_tokens=st.integers(1, 700),
+)
+def test_sessions_take_what_was_computed(
+    shape: dict[str, Any], dtype: torch.dtype, num_sessions: int, max_context_tokens: int
+) -> None:
+    ponder = Ponder.random(replace(SMALL, **shape), seed=0, dtype=dtype)
+    config = EngineConfig(max_sessions=num_sessions, max_context_tokens=max_context_tokens)
+    engine, made = made_by(partial(QwenEngine, ponder, config))
+    which_tokens_are_text_bytes = 2 * ponder.vocab_size  # the writer's masks, one of a kind
+    expected_bytes = num_sessions * engine.spec.session_bytes + which_tokens_are_text_bytes
+    assert sum(memory.nbytes for memory in made) == expected_bytes
+
+
+def test_an_episode_keeps_nothing_beside_its_session() -> None:
+    engine = QwenEngine(Ponder.random(SMALL, seed=0), EngineConfig(max_sessions=2, max_context_tokens=400))
+    frames = tuple(np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3), dtype=np.uint8))
+
+    def play() -> None:
+        engine.open("a", Opening(instruction="press"))
+        for exactly in (None, 7, None):
+            engine.fire("a", frames, force_text_tokens=exactly)
+
+    _, made = made_by(play)
+    assert sum(memory.nbytes for memory in made) < 1000  # tables of the vision tower's angles at most
+
+
+def test_the_command_says_both_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(report, "REPORTS", tmp_path)
+    assert ponder_memory.main(["--size", "tiny_cpu", "--no-episode"]) == 0
+    (table,) = json.loads((tmp_path / "ponder_memory_tiny_cpu.json").read_text())["tables"]
+    (row,) = table["rows"]
+    assert row["computed_mib"] == row["allocated_mib"]
+    assert row["resident_mib"] > 0
