@@ -257,7 +257,7 @@ class QwenEngine:
     def step(self, progress: Progress = no_progress) -> list[Outcome[Fire]]:
         """One forward for the queries that were begun; those answered by it. See ``BatchingEngine.step``."""
         with audible(self._parts, progress):
-            # no more at a time than share a forward: the rest would wait behind their vision tower, and outgrow the caches
+            # no more than share a forward: the rest would wait behind their vision tower, and outgrow the caches
             begun = {session: self._begun.pop(session) for session in [*self._begun][: self._config.max_batch_rows]}
             if begun:
                 pictures = [picture for query in begun.values() for picture in query.pictures]
