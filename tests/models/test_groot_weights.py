@@ -10,7 +10,6 @@ from safetensors.torch import load_file, save_file
 
 from ponderpounce.models.groot_prompt import tiny_eagle_tokenizer_for_random_weights
 from ponderpounce.models.groot_weights import load_weights, public_name, save_weights, unused_shapes
-from ponderpounce.models.normalisation import Quantiles
 from ponderpounce.models.pi05_weights import save_weights as save_pi05
 from ponderpounce.models.pounce_checkpoint import load_bundle, random_bundle, save_bundle
 from ponderpounce.models.pounce_configs import groot_n1_5, tiny_cpu, tiny_groot
@@ -335,9 +334,8 @@ def test_parts_that_do_not_fit_each_other_are_refused() -> None:
     bundle = random_bundle(tiny_groot(), seed=0)
     with pytest.raises(ValueError, match="reads with EagleTokenizer, came Tokenizer"):
         replace(bundle, tokenizer=random_bundle(tiny_cpu(), seed=0).tokenizer)
-    narrow = replace(bundle.statistics, state=Quantiles(q01=(0.0,) * 5, q99=(1.0,) * 5))
-    with pytest.raises(ValueError, match="statistics describe 5 state dims, the config 8"):
-        replace(bundle, statistics=narrow)
+    with pytest.raises(ValueError, match="statistics describe 8 state dims, the config 7"):
+        random_bundle(replace(tiny_groot(), robot_state_dim=7), seed=0)
     eagle = replace(tiny_groot().groot.eagle, image_token_id=260)
     with pytest.raises(ValueError, match="the tokenizer's image token is 261, the model's 260"):
         random_bundle(replace(tiny_groot(), groot=replace(tiny_groot().groot, eagle=eagle)), seed=0)

@@ -14,12 +14,15 @@ from ponderpounce.data.episode import About, EpisodeWriter, Row, unpack
 from ponderpounce.data.lerobot_v3 import DatasetWriter
 from ponderpounce.models.action_space import ActionSpace, num_dims
 from ponderpounce.models.ponder_checkpoint import load_ponder
+from ponderpounce.models.pounce import PounceConfig
 from ponderpounce.models.pounce_checkpoint import load_bundle
 from ponderpounce.training import recipes, train
 from ponderpounce.training.data import TrainingSet
 from ponderpounce.training.example import chunk_ticks
 from ponderpounce.training.parallel import World
 from ponderpounce.training.train import TrainOptions
+from pounce_server.contract import example_request
+from pounce_server.engine import EagerEngine
 
 PX = 64
 NUM_DEMO_ROWS = 41
@@ -212,3 +215,19 @@ def test_out_of_memory_says_what_to_lower(
     said = capsys.readouterr().err
     assert "out of memory at 1 x 2 (episodes a step x invocations each; CUDA" in said
     assert "--max-invocations" in said
+
+
+def test_what_was_learned_to_be_given_is_served(folder: Path, tmp_path: Path) -> None:
+    train.train(options(folder, tmp_path / "run", max_committed_rows=3))
+    bundle = load_bundle(tmp_path / "run" / "pounce")
+    assert isinstance(bundle.model.config, PounceConfig)
+    assert bundle.model.config.max_committed_rows == 3
+    engine = EagerEngine(bundle, continuity="trained")
+    rows = np.full((2, 8), 0.1, np.float32)
+    request = replace(example_request(engine.spec), previous_rows=rows, committed_rows=2)
+    np.testing.assert_array_equal(engine.invoke(request)[:2], rows)
+
+
+def test_groot_does_not_learn_to_be_given_rows(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"is pi0\.5's, recipe tiny_groot trains GR00T"):
+        train.train(options(folder, tmp_path / "run", recipe="tiny_groot", max_committed_rows=3))
