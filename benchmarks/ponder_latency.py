@@ -6,7 +6,8 @@ What the longest context adds is set against what its attention's products must 
 multiplies large matrices with, in the same run: no code that computes them can add less.
 
 Beside it what a server without an append-only context pays, the whole context encoded again in one forward, and a
-transition with a text of 45 tokens (the paper's), decoded one by one and with a draft that knows it.
+transition with a text of 45 tokens (the paper's), decoded one by one and with a draft that knows it; and what an
+episode's opening with a long demonstration takes, in a few large forwards and instant by instant.
 
 The networks have random weights: their speed is a trained one's, what they say is not.
 """
@@ -32,7 +33,10 @@ from ponderpounce.models.context import Row as EpisodeRow
 from ponderpounce.models.ponder import Ponder
 
 SESSION = "bench"
+WAYS_TO_ENCODE = {"in forwards of 2048 tokens": 2048, "an instant a forward": 1}
 TEXT_TOKENS = 45
+DEMO_S = 48
+"""Two views at 1 Hz: some 6.4K tokens, with two frames of 256 px an instant."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,7 +64,7 @@ def main(argv: list[str] | None = None) -> int:
         name="ponder_latency",
         question="How long does PONDER think about one query, and how does that grow with its context?",
         config=options,
-        warm_up="ten fires per context length; one encode; one text.",
+        warm_up="ten fires per context length; one encode of each kind; one text.",
     )
     config = getattr(ponder_configs, options.size)()
     ponder = Ponder.random(config, seed=0, device=options.device, dtype=getattr(torch, options.dtype))
@@ -87,6 +91,10 @@ def main(argv: list[str] | None = None) -> int:
         report.add_table(
             f"A transition: the same, and a text of {TEXT_TOKENS} tokens",
             [{"decoded": name} | _texts(engine, options) for name, engine in engines.items()],
+        )
+        report.add_table(
+            f"A demonstration of {DEMO_S} s, two views at 1 Hz, encoded when the episode is opened",
+            [_demonstration(ponder, name, tokens, options) for name, tokens in WAYS_TO_ENCODE.items()],
         )
     size = engines["one by one"].spec.session_bytes
     report.notes += [
@@ -174,6 +182,22 @@ def _encodes(ponder: Ponder, options: LatencyOptions) -> list[float]:
         ponder.encode_row(row, frames)[-1].float().cpu()
         took_ms.append((time.perf_counter_ns() - start_ns) / 1e6)
     return took_ms[1:]
+
+
+def _demonstration(ponder: Ponder, way: str, prefill_chunk_tokens: int, options: LatencyOptions) -> Row:
+    config = EngineConfig(
+        max_context_tokens=8192, max_sessions=1, max_prefixes=0, prefill_chunk_tokens=prefill_chunk_tokens
+    )
+    engine = QwenEngine(ponder, config)
+    frames = _frames(engine, 2 * DEMO_S, seed=2)
+    opening = Opening(instruction="do as shown", demo_frames=tuple(zip(frames[::2], frames[1::2], strict=True)))
+    took_ms, num_tokens = [], 0
+    for _ in range(1 + options.encodes):
+        start_ns = time.perf_counter_ns()
+        num_tokens = engine.open(SESSION, opening)
+        took_ms.append((time.perf_counter_ns() - start_ns) / 1e6)
+        engine.close(SESSION)
+    return {"encoded": way, "tokens": num_tokens} | spread(took_ms[1:], "ms")
 
 
 def _own_text(ponder: Ponder) -> tuple[int, ...]:
