@@ -197,7 +197,8 @@ def _demonstration(ponder: Ponder, way: str, prefill_chunk_tokens: int, options:
         num_tokens = engine.open(SESSION, opening)
         took_ms.append((time.perf_counter_ns() - start_ns) / 1e6)
         engine.close(SESSION)
-    return {"encoded": way, "tokens": num_tokens} | spread(took_ms[1:], "ms")
+    row: Row = {"encoded": way, "tokens": num_tokens}
+    return row | spread(took_ms[1:], "ms")
 
 
 def _own_text(ponder: Ponder) -> tuple[int, ...]:
