@@ -88,8 +88,9 @@ def main(argv: list[str] | None = None) -> int:
 def session_row(options: MemoryOptions) -> Row:
     """What one more session takes, three ways, in MiB."""
     ponder = Ponder.random(getattr(ponder_configs, options.size)(), seed=0, dtype=getattr(torch, options.dtype))
+    fewer, more = options.sessions
     engines, allocated, resident = [], [], []  # all are kept: what a process frees stays resident for its next use
-    for count in options.sessions:
+    for count in (fewer, fewer, more):  # the first one takes what was free before, and is not compared
         config = EngineConfig(max_sessions=count, max_context_tokens=options.max_context_tokens)
         before = resident_bytes()
         engine, own = made_by(partial(QwenEngine, ponder, config))
@@ -99,8 +100,7 @@ def session_row(options: MemoryOptions) -> Row:
         allocated.append(sum(tensor.nbytes for tensor in own))
         engines.append(engine)
     computed = engines[0].spec.session_bytes
-    fewer, more = options.sessions
-    per_session = [(values[1] - values[0]) / (more - fewer) for values in (allocated, resident)]
+    per_session = [(values[2] - values[1]) / (more - fewer) for values in (allocated, resident)]
     return {
         "max_context_tokens": options.max_context_tokens,
         "computed_mib": round(computed / MIB, 2),
@@ -155,13 +155,15 @@ def play(options: MemoryOptions, folder: Path) -> tuple[Row, list[float]]:
         peak_bytes = peak_resident_bytes(daemons.processes["ponder"].pid)
     (episode,) = json.loads((folder / "results.json").read_text())["episodes"]
     record = read_log(folder / episode["mcap"])
+    lost = [event.text for event in record.events if event.name.endswith("_lost")]
     row: Row = {
         "scene": f"PickHighlight easy, seed {options.seed}",
         "outcome": episode["status"],
         "steps": episode["steps"],
         "fires": len(record.cognitions),
         "context_tokens": record.cognitions[-1].context_tokens,
-        "servers_lost": sum(event.name.endswith("_lost") for event in record.events),
+        "servers_lost": len(lost),
+        "first_loss": lost[0] if lost else None,
         "peak_gib": round(peak_bytes / 2**30, 2),
         "is_within_limit": peak_bytes <= options.limit_gib * 2**30,
     }
