@@ -28,6 +28,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from clock.sampling import EVALUATION
+from ponderpounce.analysis.diagnosis import DIAGNOSIS, SCHEMA
 from ponderpounce.data.errors import DatasetError
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import load_ponder, weights_hash
@@ -38,8 +39,6 @@ from ponderpounce.training.data import Sight, TrainingSet
 from ponderpounce.training.example import Example, ExampleConfig, make_example
 from ponderpounce.training.joint import NO_QUERY, PounceBatch, encode_rows, gather_cognition
 
-FILE = "diagnosis.json"
-SCHEMA = "ponderpounce-diagnosis/1"
 STALE_BY = (0, 1, 2, 4)
 """k of C_{t-k}: queries, which at 1 Hz are seconds."""
 EVERY_INVOCATION = ExampleConfig(clocks=EVALUATION, max_invocations=1 << 30)
@@ -86,8 +85,8 @@ def main(argv: list[str] | None = None) -> int:
         sys.stderr.write(f"pp-diagnose: {error}\n")
         return 2
     options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / FILE).write_text(json.dumps(found, indent=1) + "\n")
-    sys.stdout.write(f"{options.out / FILE}; tables: pp-tables {options.out} --out {options.out}\n")
+    (options.out / DIAGNOSIS).write_text(json.dumps(found, indent=1) + "\n")
+    sys.stdout.write(f"{options.out / DIAGNOSIS}; tables: pp-tables {options.out} --out {options.out}\n")
     return 0
 
 
@@ -121,6 +120,7 @@ def diagnose(options: DiagnoseOptions) -> dict[str, Any]:
         episodes.append({"task": task, "seed": seed} | measured)
     return {
         "schema": SCHEMA,
+        "stale_by": STALE_BY,
         "config": {name: _as_json(getattr(options, name)) for name in options.__slots__ if name != "progress"},
         "data_hash": data.hash,
         "models": {

@@ -18,6 +18,7 @@ from clock.sampling import Clocks, SampledInvocation, SampledSchedule, sample_sc
 from ponderpounce.models.context import ContextFormat, Row, Transition
 from ponderpounce.models.eyes import see
 from ponderpounce.models.ponder_coordinates import normalised_text
+from ponderpounce.training.augment import AS_IT_IS, NOT_AUGMENTED, Augmentation, View, draw_view
 from ponderpounce.training.stand_in import stand_in
 
 Frame = NDArray[np.uint8]  # (height, width, 3) RGB
@@ -77,6 +78,8 @@ class ExampleConfig:
     text_dropout: float = 0.0
     """Share of rows without their texts although they have some: cognition must then come from what was seen."""
 
+    augmentation: Augmentation = NOT_AUGMENTED
+    """Other views of the scene, for stages that train PONDER alone."""
     max_queries: int | None = None
     """The row ends after so many queries, and with it the invocations; None: with the episode. Most of what is to be
     seen is seen early."""
@@ -98,14 +101,15 @@ class Example:
     invocations: tuple[SampledInvocation, ...]
     """Those of the schedule that were drawn."""
     is_grounded: bool
+    view: View = AS_IT_IS
 
     def row(self) -> Row:
         """PONDER's tokens."""
-        return episode_row(self.episode, self.form, self.schedule, is_grounded=self.is_grounded)
+        return episode_row(self.episode, self.form, self.schedule, is_grounded=self.is_grounded, view=self.view)
 
     def frames(self) -> Tensor:
         """PONDER's pictures, (num_images, height, width, 3) uint8."""
-        return row_frames(self.episode, self.form, self.schedule)
+        return self.view.pictures(row_frames(self.episode, self.form, self.schedule))
 
     @property
     def said(self) -> tuple[str, ...]:
@@ -115,7 +119,7 @@ class Example:
 
     def stand_ins(self, size: int) -> Tensor:
         """`stand_in` of the subgoal in force at every query, (Q, size)."""
-        texts = [self.episode.subgoals[query.tick] for query in self.schedule.queries]
+        texts = [self.view.text(self.episode.subgoals[query.tick]) for query in self.schedule.queries]
         return torch.from_numpy(np.stack([stand_in(text, size) for text in texts]))
 
 
@@ -133,6 +137,7 @@ def make_example(
         schedule=schedule,
         invocations=tuple(schedule.invocations[index] for index in chosen),
         is_grounded=config.is_grounded and rng.random() >= config.text_dropout,
+        view=draw_view(config.augmentation, form, set(episode.subgoals), rng),
     )
 
 
@@ -148,18 +153,23 @@ def _shortened(schedule: SampledSchedule, max_queries: int | None) -> SampledSch
 
 
 def episode_row(
-    episode: TrainingEpisode, form: ContextFormat, schedule: SampledSchedule, *, is_grounded: bool = True
+    episode: TrainingEpisode,
+    form: ContextFormat,
+    schedule: SampledSchedule,
+    *,
+    is_grounded: bool = True,
+    view: View = AS_IT_IS,
 ) -> Row:
     """The tokens of the episode. The first transition of a demonstration episode begins with its reasoning."""
     views, form = _before_ponder(episode, form)
     segments = list(form.opening(episode.instruction, [len(views) for views in episode.demo]))
     encode = form.vocabulary.encode
-    reasoning = encode(normalised_text(episode.reasoning)) if episode.reasoning else None
+    reasoning = encode(normalised_text(view.text(episode.reasoning))) if episode.reasoning else None
     for query in schedule.queries:
         transition = None
         text = episode.subgoals[query.tick]
         if is_grounded and query.stamp.is_transition and text:
-            transition = Transition(subgoal=encode(normalised_text(text)), reasoning=reasoning)
+            transition = Transition(subgoal=encode(normalised_text(view.text(text))), reasoning=reasoning)
             reasoning = None
         segments += form.query(len(views[query.tick]), transition)
     return form.row(segments)

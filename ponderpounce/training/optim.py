@@ -10,6 +10,8 @@ from torch import Tensor, nn
 from ponderpounce.training.parallel import local, whole
 from ponderpounce.training.shards import RowReader
 
+_EMA_MEMORY = 10  # the average of n steps goes back n / 10 of them at most
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OptimConfig:
@@ -71,8 +73,9 @@ class Optimiser:
         self._adam.step()
         self._adam.zero_grad(set_to_none=True)
         with torch.no_grad():
+            decay = min(self._config.ema_decay, (1 + step) / (_EMA_MEMORY + step))  # early weights are soon forgotten
             for name, average in self.average.items():
-                local(average).lerp_(local(self._named[name]), 1 - self._config.ema_decay)
+                local(average).lerp_(local(self._named[name]), 1 - decay)
         return norm
 
     @torch.no_grad()

@@ -12,6 +12,7 @@ from ponderpounce.models.action_space import ActionSpace
 from ponderpounce.models.ponder_configs import PonderConfig
 from ponderpounce.models.pounce import Freeze
 from ponderpounce.models.pounce_family import AnyPounceConfig
+from ponderpounce.training.augment import Augmentation
 from ponderpounce.training.example import ExampleConfig
 from ponderpounce.training.joint import Trains
 from ponderpounce.training.optim import OptimConfig
@@ -146,7 +147,13 @@ def small() -> Curriculum:
         ponder=ponder_configs.small(),
         pounce=pounce_configs.small(),
         freeze="none",
-        example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=1, text_dropout=0.4, max_queries=8),
+        example=ExampleConfig(
+            clocks=sampling.ROBOMME,
+            max_invocations=1,
+            text_dropout=0.4,
+            max_queries=8,
+            augmentation=Augmentation(max_shift_px=4, mirror=True),
+        ),
         train=TrainConfig(seed=0, optim=_FROM_SCRATCH),
         num_steps=4000,
         batch_episodes=16,

@@ -61,7 +61,7 @@ def _package(seed: int) -> dict[str, bytes]:
 
 
 def shrunk(run: Recipe) -> Recipe:
-    ponder = replace(run.ponder, image_px=(16, 16), eyes=(Eye(camera=0, box=(0.0, 0.0, 0.5, 0.5)),), vision_depth=1)
+    ponder = replace(run.ponder, image_px=(16, 16), eyes=(Eye(camera=0, box=(0.0, 0.25, 0.5, 0.75)),), vision_depth=1)
     example = replace(run.example, max_invocations=2, max_queries=2, text_dropout=0.0)
     return replace(run, ponder=ponder, example=example, num_steps=2, batch_episodes=2)
 

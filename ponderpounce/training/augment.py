@@ -1,0 +1,99 @@
+"""Other views of the same scene for a PONDER that learns to see from few hundred of them: moved, and mirrored.
+
+Pictures and words change together, so nothing that was shown is lost and every text stays true. A patch then sees its
+cubes at every place within itself, which is what a vision tower from scratch otherwise learns only from many scenes.
+POUNCE acts in the real scene: stages that train it do not use this.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ponderpounce.models.context import ContextFormat
+
+_PLACE = re.compile(r"<\s*(\d+)\s*,\s*(\d+)\s*>")
+_SIDED = re.compile(r"left|right|clockwise", re.IGNORECASE)
+_TEXT_PX = 256  # coordinates in texts, whatever the size of a picture
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Augmentation:
+    """How far views may differ."""
+
+    max_shift_px: int = 0
+    """Of PONDER's picture, either way in both directions; edges are repeated."""
+    mirror: bool = False
+    """Half of the episodes are mirrored, unless their texts speak of sides."""
+
+    def __post_init__(self) -> None:
+        if self.max_shift_px < 0:
+            raise ValueError(f"max_shift_px must be at least 0, came {self.max_shift_px}")
+
+
+NOT_AUGMENTED = Augmentation()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class View:
+    """One way to look at a whole episode."""
+
+    down_px: int = 0
+    right_px: int = 0
+    """What is shown moves by so many pixels of PONDER's picture."""
+    is_mirrored: bool = False
+    """First left and right change places, then it moves."""
+    text_px: float = 1.0
+    """Pixels of a text's coordinates to one of PONDER's picture."""
+
+    def pictures(self, frames_NHW3: Tensor) -> Tensor:
+        """(N, height, width, 3) uint8"""
+        if self.is_mirrored:
+            frames_NHW3 = frames_NHW3.flip(2)
+        margin = max(abs(self.down_px), abs(self.right_px))
+        if margin == 0:
+            return frames_NHW3
+        height, width = frames_NHW3.shape[1:3]
+        wide = F.pad(frames_NHW3.permute(0, 3, 1, 2).float(), (margin,) * 4, mode="replicate").to(torch.uint8)
+        top, left = margin - self.down_px, margin - self.right_px
+        return wide[:, :, top : top + height, left : left + width].permute(0, 2, 3, 1)
+
+    def text(self, text: str) -> str:
+        """Its coordinates as they are in this view; at the picture's edge where they would leave it."""
+        if self == View(text_px=self.text_px):
+            return text
+        return _PLACE.sub(self._moved, text)
+
+    def _moved(self, place: re.Match[str]) -> str:
+        y, x = int(place[1]), int(place[2])
+        x = _TEXT_PX - x if self.is_mirrored else x
+        y, x = (round(v + shift * self.text_px) for v, shift in ((y, self.down_px), (x, self.right_px)))
+        return f"<{min(max(y, 0), _TEXT_PX)}, {min(max(x, 0), _TEXT_PX)}>"
+
+
+AS_IT_IS = View()
+
+
+def draw_view(config: Augmentation, form: ContextFormat, texts: set[str], rng: np.random.Generator) -> View:
+    """Draws the view of an episode.
+
+    Raises:
+        ValueError: PONDER has several eyes or none, or one that is not symmetric and is to be mirrored: where its
+            pictures lie in the texts' coordinates is then not told by one number.
+    """
+    if config == NOT_AUGMENTED:
+        return AS_IT_IS
+    if form.eyes is None or len(form.eyes) != 1:
+        raise ValueError("views are drawn for a PONDER with one eye; leave the recipe's augmentation out")
+    top, left, bottom, right = form.eyes[0].box
+    if config.mirror and abs(left + right - 1) > 1e-9:
+        raise ValueError(f"an eye from {left} to {right} is not symmetric about the middle and cannot be mirrored")
+    down_px, right_px = rng.integers(-config.max_shift_px, config.max_shift_px + 1, size=2).tolist()
+    is_mirrored = config.mirror and bool(rng.integers(2)) and not any(_SIDED.search(text) for text in texts)
+    text_px = (bottom - top) * _TEXT_PX / form.image_px[0]
+    return View(down_px=down_px, right_px=right_px, is_mirrored=is_mirrored, text_px=text_px)
