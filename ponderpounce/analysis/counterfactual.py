@@ -7,8 +7,53 @@ does not use the past gives the same answer twice, so it is right once and wrong
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from ponderpounce.analysis.results import ResultsError
+
+COUNTERFACTUAL = "counterfactual.json"
+SCHEMA = "ponderpounce-counterfactual/1"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Counterfactual:
+    """What ``pp-counterfactual`` found for one pair of checkpoints: per task, (P,) mean scores of its pairs."""
+
+    label: str
+    by_task: Mapping[str, NDArray[np.float64]]
+    is_untrained: bool
+
+    @property
+    def scores_P(self) -> NDArray[np.float64]:
+        return np.concatenate(list(self.by_task.values()))
+
+
+def read_counterfactual(path: Path) -> Counterfactual:
+    """Reads a file of ``pp-counterfactual``, or that of a folder. Raises ResultsError if it is none or has no pairs."""
+    file = path / COUNTERFACTUAL if path.is_dir() else path
+    try:
+        found = json.loads(file.read_text())
+        if found["schema"] != SCHEMA or not found["pairs"]:
+            raise ValueError(
+                f"schema {found['schema']!r} with {len(found['pairs'])} pairs, expected some of {SCHEMA!r}"
+            )
+        scores: dict[str, list[float]] = {}
+        for pair in found["pairs"]:
+            scores.setdefault(pair["task"], []).append(float(pair["score"]))
+        is_untrained = any(model["is_untrained"] for model in found["models"].values())
+    except OSError as error:
+        raise ResultsError(f"{file} cannot be read ({error.strerror}); give folders of pp-counterfactual") from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ResultsError(f"{file} is no file of pp-counterfactual: {error!r}") from error
+    label = str(path.parent if path.name == COUNTERFACTUAL else path)
+    by_task = {task: np.array(of_task) for task, of_task in sorted(scores.items())}
+    return Counterfactual(label=label, by_task=by_task, is_untrained=is_untrained)
 
 
 def follows_own_past(predicted: ArrayLike, script: ArrayLike, *, scale: ArrayLike | None = None) -> NDArray[np.float64]:

@@ -78,6 +78,17 @@ def bootstrap(
     return _interval(success_rate(outcomes), means, level)
 
 
+def bootstrap_mean(values: ArrayLike, *, level: float = LEVEL, num_resamples: int = NUM_RESAMPLES) -> Interval:
+    """Returns the mean of independent values (N,) with its percentile interval. Raises ValueError if there are none."""
+    values_N = np.asarray(values, np.float64)
+    if values_N.ndim != 1 or not values_N.size:
+        raise ValueError(f"expected values (N,), at least one; got shape {values_N.shape}")
+    drawn_BN = np.random.default_rng(0).multinomial(
+        values_N.size, np.full(values_N.size, 1 / values_N.size), num_resamples
+    )
+    return _interval(float(values_N.mean()), drawn_BN @ values_N / values_N.size, level)
+
+
 def paired(
     first: Sequence[ArrayLike],
     second: Sequence[ArrayLike],

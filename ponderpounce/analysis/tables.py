@@ -1,4 +1,4 @@
-"""``pp-tables``: results files as tables in the form of the paper's, with intervals, beside the paper's own figures.
+"""``pp-tables``: results files as tables and plots in the form of the paper's, with intervals, beside its own figures.
 
 What is printed follows from the files alone, to the last digit: the bootstrap's seed is fixed.
 """
@@ -14,8 +14,13 @@ from typing import Annotated, Any
 import tyro
 
 from ponderpounce.analysis import paper
+from ponderpounce.analysis.ceiling import ceiling_of
+from ponderpounce.analysis.counterfactual import COUNTERFACTUAL, read_counterfactual
+from ponderpounce.analysis.diagnosis import DIAGNOSIS, read_diagnosis
+from ponderpounce.analysis.diagnosis_tables import counterfactual_table, diagnosis_tables
+from ponderpounce.analysis.markdown import markdown, percent
 from ponderpounce.analysis.results import Results, ResultsError, read_comparable
-from ponderpounce.analysis.statistics import Interval, bootstrap, paired, wilson
+from ponderpounce.analysis.statistics import bootstrap, paired, wilson
 
 TABLES = "tables.md"
 NOTE = f"""\
@@ -26,32 +31,50 @@ tasks: other scenes, other pictures, other physics. They are no baseline of ours
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TablesOptions:
-    """Makes the paper's tables of evaluations: by task, by family, and between conditions."""
+    """Makes the paper's tables and plots of whatever evaluations and diagnoses wrote."""
 
     results: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Folders (or results.json files) of pp-eval or sim-client; conditions are compared with the first."""
+    """Folders of pp-eval, sim-client, pp-diagnose or pp-counterfactual, or their files; conditions of an evaluation are
+    compared with the first."""
     out: Path
-    """Folder for tables.md."""
+    """Folder for tables.md, and of diagnoses staleness.png."""
 
 
 def main(argv: list[str] | None = None) -> int:
     options = tyro.cli(TablesOptions, args=argv, prog="pp-tables", description=TablesOptions.__doc__)
+    of_kind = {name: [p for p in options.results if _holds(p, name)] for name in (DIAGNOSIS, COUNTERFACTUAL)}
+    evaluations = [p for p in options.results if not any(p in paths for paths in of_kind.values())]
+    diagnoses, parts = [], []
     try:
-        text = tables(read_comparable(options.results))
-    except ResultsError as error:
+        if evaluations:
+            parts.append(tables(read_comparable(evaluations)).rstrip("\n"))
+        if of_kind[DIAGNOSIS]:
+            diagnoses = [read_diagnosis(path) for path in of_kind[DIAGNOSIS]]
+            parts.append(diagnosis_tables(diagnoses))
+        if of_kind[COUNTERFACTUAL]:
+            parts.append(counterfactual_table([read_counterfactual(path) for path in of_kind[COUNTERFACTUAL]]))
+    except (ResultsError, ValueError) as error:
         sys.stderr.write(f"pp-tables: {error}\n")
         return 2
     options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / TABLES).write_text(text)
+    if diagnoses:
+        from ponderpounce.analysis.staleness_plot import plot_staleness  # needs Pillow, and tables alone do not
+
+        plot_staleness(diagnoses, options.out / "staleness.png")
+    (options.out / TABLES).write_text("\n\n".join(parts) + "\n")
     sys.stdout.write(f"{options.out / TABLES}\n")
     return 0
+
+
+def _holds(path: Path, name: str) -> bool:
+    return path.name == name or (path / name).is_file()
 
 
 def tables(results: Sequence[Results]) -> str:
     """Returns everything as markdown. Raises ResultsError if two conditions were run on other scenes."""
     parts = ["# Evaluation", NOTE, "\n".join(_about(each) for each in results)]
     parts += ["## By family (form of the paper's Table 1)", by_family(results)]
-    parts += ["## By task (form of the paper's Table 7)", by_task(results)]
+    parts += ["## By task (form of the paper's Table 7)", by_task(results), *_ceilings(results)]
     if len(results) > 1:
         parts += ["## Between conditions (form of the paper's Tables 3 and 4)", between_conditions(results)]
     return "\n\n".join(parts) + "\n"
@@ -63,7 +86,7 @@ def by_family(results: Sequence[Results]) -> str:
     rows = [[_of_family(name, tasks), *_means(results, tasks), *_papers(tasks)] for name, tasks in families.items()]
     every = results[0].tasks
     rows.append([f"**Average** of {_count(len(every), 'task')}", *_means(results, every), *_papers(every)])
-    return _markdown(["family", *_columns(results)], rows)
+    return markdown(["family", *_columns(results)], rows)
 
 
 def by_task(results: Sequence[Results]) -> str:
@@ -71,8 +94,23 @@ def by_task(results: Sequence[Results]) -> str:
     rows = []
     for task in results[0].tasks:
         ours = [wilson(float(each.outcomes[task].mean()), len(each.scenes[task])) for each in results]
-        rows.append([task, *map(_percent, ours), *_papers((task,))])
-    return _markdown(["task", *_columns(results)], rows)
+        rows.append([task, *map(percent, ours), *_papers((task,))])
+    return markdown(["task", *_columns(results)], rows)
+
+
+def _ceilings(results: Sequence[Results]) -> list[str]:
+    """A sentence for each task of which it is known what can be reached without memory, over each one's scenes."""
+    sentences = []
+    for task in results[0].tasks:
+        exact = [ceiling_of(task, (difficulty for _, difficulty in each.scenes[task])) for each in results]
+        shares = [f"{100 * float(share):.2f} over the scenes of `{each.label}`"
+                  for share, each in zip(exact, results, strict=True) if share is not None]  # fmt: skip
+        if shares:
+            sentences.append(
+                f"{task} without memory and with perfect motion, exactly: {', '.join(shares)}. Without cognition no "
+                "more than that is to be expected."
+            )
+    return sentences
 
 
 def between_conditions(results: Sequence[Results]) -> str:
@@ -91,19 +129,19 @@ def between_conditions(results: Sequence[Results]) -> str:
                 "give both evaluations the same --seed, --episodes and --difficulty"
             )
         means = [bootstrap(each.of(tasks)) for tasks in (*families.values(), each.tasks)]
-        row = [each.label, *_condition(each), *map(_percent, means)]
+        row = [each.label, *_condition(each), *map(percent, means)]
         if each is first:
             row += ["", "", ""]
         else:
             gain = paired(first.of(first.tasks), each.of(first.tasks))
-            row += [_percent(gain.difference, "+"), f"{gain.num_better}, {gain.num_worse}", f"{gain.p_value:.2g}"]
+            row += [percent(gain.difference, "+"), f"{gain.num_better}, {gain.num_worse}", f"{gain.p_value:.2g}"]
         rows.append(row)
     if set(first.tasks) == set(paper.TASKS):
         for number, table in ((3, paper.TABLE_3), (4, paper.TABLE_4)):
-            for name, means_percent in table.items():
-                figures = [f"{mean:.2f}" for mean in means_percent]
+            for name, meanspercent in table.items():
+                figures = [f"{mean:.2f}" for mean in meanspercent]
                 rows.append([f"Table {number}: {name} ({paper.MARK})", "", "", "", "", *figures, "", "", ""])
-    return _markdown(head, rows)
+    return markdown(head, rows)
 
 
 def _condition(results: Results) -> tuple[str, str, str, str]:
@@ -143,7 +181,7 @@ def _of_family(name: str, tasks: Sequence[str]) -> str:
 
 
 def _means(results: Sequence[Results], tasks: Sequence[str]) -> list[str]:
-    return [_percent(bootstrap(each.of(tasks))) for each in results]
+    return [percent(bootstrap(each.of(tasks))) for each in results]
 
 
 def _papers(tasks: Sequence[str]) -> list[str]:
@@ -154,19 +192,9 @@ def _columns(results: Sequence[Results]) -> list[str]:
     return [*(each.label for each in results), *(f"{method} ({paper.MARK})" for method in paper.SHOWN)]
 
 
-def _percent(interval: Interval, sign: str = "") -> str:
-    value, low, high = (100 * part + 0.0 for part in (interval.value, interval.low, interval.high))
-    return f"{value:{sign}.2f} [{low:{sign}.1f}, {high:{sign}.1f}]"
-
-
 def _ms(value: int | None) -> str:
     return "" if value is None else f"{value} ms"
 
 
 def _count(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
-
-
-def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [head, ["---", *["--:"] * (len(head) - 1)], *rows]
-    return "\n".join(f"| {' | '.join(cell.replace('|', '/') for cell in line)} |" for line in lines)
