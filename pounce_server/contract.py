@@ -116,7 +116,7 @@ def check_robot(robot: Robot, spec: EngineSpec) -> None:
     """
     if robot.num_proprio != spec.proprio_dim:
         raise ValueError(f"POUNCE reads {spec.proprio_dim} joint values, the robot has {robot.num_proprio}")
-    if len(robot.cameras) != spec.num_cameras:
+    if spec.num_cameras and len(robot.cameras) != spec.num_cameras:
         names = ", ".join(robot.cameras) or "none"
         raise ValueError(f"POUNCE sees through {spec.num_cameras} cameras, the robot has {len(robot.cameras)}: {names}")
     if spec.space == "joint_delta":
@@ -137,7 +137,7 @@ def check_request(request: Request, spec: EngineSpec) -> None:
         raise ValueError("instruction is empty; POUNCE needs the task's text")
     if len(request.frames) != spec.num_cameras:
         raise ValueError(f"expected {spec.num_cameras} frames (front, wrist order), came {len(request.frames)}")
-    if all(frame is None for frame in request.frames):
+    if spec.num_cameras and all(frame is None for frame in request.frames):
         raise ValueError(f"all {spec.num_cameras} cameras are missing; POUNCE does not act blind")
     for index, frame in enumerate(request.frames):
         if frame is not None and (frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3 or not frame.size):

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from pounce_server.__main__ import build_engine
 from pounce_server.config import PounceOptions
+from pounce_server.contract import EngineSpec, Request
 from pounce_server.serve import PounceServer
 from protocol.bus import Bus
 from protocol.heartbeat import Heartbeat
@@ -23,3 +27,34 @@ def build(bus: Bus, robot: str, checkpoint: Path | None) -> Callable[[], bool]:
     server.warm_up()
     server.ready()
     return server.step
+
+
+Floats = NDArray[np.float32]
+Act = Callable[[str, Sequence[NDArray[np.uint8]], Floats, Floats | None, int, int], Floats]
+"""From an instruction, frames, proprioception, cognition (None: null), its age [ns] and a noise seed to a chunk."""
+
+
+def build_actor(checkpoint: Path | None) -> tuple[Act, EngineSpec]:
+    """A POUNCE outside of any episode, for offline measurements: a function, and what the engine is."""
+    engine = build_engine(PounceOptions(checkpoint=checkpoint))
+
+    def act(
+        instruction: str,
+        frames: Sequence[NDArray[np.uint8]],
+        proprio: Floats,
+        cognition: Floats | None,
+        age_ns: int,
+        seed: int,
+    ) -> Floats:
+        return engine.invoke(
+            Request(
+                instruction=instruction,
+                frames=tuple(frames),
+                proprio=proprio,
+                cognition=cognition,
+                age_ns=age_ns,
+                seed=seed,
+            )
+        )
+
+    return act, engine.spec

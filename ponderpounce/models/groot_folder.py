@@ -59,6 +59,32 @@ def groot_config_of(shapes: Shapes, values: dict[str, Any] | None, where: str) -
         raise ValueError(f"{where}: no tensor {error.args[0]}; GR00T N1.5's sizes are read from it") from error
 
 
+def nvidia_config(groot: GrootConfig, num_steps: int) -> dict[str, Any]:
+    """Returns the config.json of a public folder: what `groot_config_of` reads there, and the facts it insists on."""
+    head = "action_head_cfg."
+    told = {
+        **_FACTS,
+        "action_horizon": groot.horizon,
+        "action_dim": groot.action_dim,
+        head + "action_horizon": groot.horizon,
+        head + "action_dim": groot.action_dim,
+        head + "num_inference_timesteps": num_steps,
+        head + "num_timestep_buckets": groot.num_time_buckets,
+        head + "diffusion_model_cfg.num_attention_heads": groot.dit.num_heads,
+        head + "diffusion_model_cfg.attention_head_dim": groot.dit.head_dim,
+        head + "vl_self_attention_cfg.num_attention_heads": groot.mixer.num_heads,
+        head + "vl_self_attention_cfg.attention_head_dim": groot.mixer.head_dim,
+    }
+    values: dict[str, Any] = {}
+    for name, value in told.items():
+        *folders, last = name.split(".")
+        place = values
+        for part in folders:
+            place = place.setdefault(part, {})
+        place[last] = value
+    return values
+
+
 def _read(shapes: Shapes, values: dict[str, Any], published: GrootConfig) -> GrootConfig:
     head = "action_head_cfg."
     patch = shapes[_VISION + "embeddings.patch_embedding.weight"]

@@ -49,7 +49,7 @@ class PounceConfig:
     robot_action_dim: int = 8
     """The first dims of the padded action: 7 arm joints and the gripper."""
     num_cameras: int = 2
-    """front, wrist"""
+    """front, wrist. 0: it acts on state and cognition alone, and takes any robot's cameras."""
     num_steps: int = 10
     """Euler steps per chunk."""
     max_prompt_tokens: int = 200
@@ -70,9 +70,9 @@ class PounceConfig:
             raise ValueError(f"max_committed_rows must be 0..{self.pi05.horizon - 1}, came {self.max_committed_rows}")
         if not 0 < self.robot_action_dim <= self.pi05.action_dim:
             raise ValueError(f"robot_action_dim must be 1..{self.pi05.action_dim}, came {self.robot_action_dim}")
-        for name in ("num_cameras", "num_steps", "max_prompt_tokens"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, came {getattr(self, name)}")
+        for name, least in (("num_cameras", 0), ("num_steps", 1), ("max_prompt_tokens", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}, came {getattr(self, name)}")
 
     @property
     def horizon(self) -> int:

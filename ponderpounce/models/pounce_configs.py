@@ -58,10 +58,14 @@ def tiny_cpu(*, num_carriers: int = 1, cognition_size: int = 64, horizon: int = 
 
 
 def small(*, num_carriers: int = 1, cognition_size: int = 128, horizon: int = ROBOMME_HORIZON) -> PounceConfig:
-    """1.3 M weights, to be trained from scratch on CPU cores: end-effector deltas, small pictures, state as a token."""
+    """0.9 M weights, to be trained from scratch on CPU cores: end-effector deltas, the state as a token, no pictures.
+
+    The action expert's samples are what CPU minutes buy; pictures would cost several times as many, and where the hand
+    should go is what cognition tells.
+    """
     config = PounceConfig(
         pi05=Pi05Config(
-            vision=VisionConfig(width=96, depth=2, num_heads=3, mlp_width=192, patch_px=16, image_px=64),
+            vision=VisionConfig(width=16, depth=1, num_heads=1, mlp_width=16, patch_px=32, image_px=64),
             language=GemmaConfig(width=128, depth=3, mlp_width=256, num_heads=4, head_dim=32),
             expert=GemmaConfig(width=96, depth=3, mlp_width=256, num_heads=4, head_dim=32),
             vocab_size=512,
@@ -70,6 +74,7 @@ def small(*, num_carriers: int = 1, cognition_size: int = 128, horizon: int = RO
         ),
         cognition=CognitionConfig(num_carriers=num_carriers, cognition_size=cognition_size),
         state_input="token",
+        num_cameras=0,
         num_steps=4,
     )
     return in_space(config, "ee_delta")

@@ -2,7 +2,8 @@
 
 Two questions, with the same ticks, targets, pictures and flow draws in every condition:
 
-- *Staleness* (paper, Figure 4): C_t is replaced by C_{t-k}, k = 0, 1, 2, 4 queries at 1 Hz, with its true age, 0.3 + k s.
+- *Staleness* (paper, Figure 4): C_t is replaced by C_{t-k}, k = 0, 1, 2, 4 queries at 1 Hz, told its true age,
+  0.3 + k s.
 - *Cognition*: the real one, the learned null, or that of the next episode of the same task at the same query. Over all
   ticks, and at branch points: the first invocation after each beginning of a subgoal, where the way parts and the
   motion itself does not yet tell it. The mean over all ticks is no guide to success; this is.
@@ -32,6 +33,7 @@ from ponderpounce.analysis.diagnosis import DIAGNOSIS, SCHEMA
 from ponderpounce.data.errors import DatasetError
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import load_ponder, weights_hash
+from ponderpounce.models.pounce import Pounce
 from ponderpounce.models.pounce_checkpoint import PounceBundle, load_bundle
 from ponderpounce.models.pounce_family import AnyPounce, sample_times
 from ponderpounce.training.collate import collate_ponder, collate_pounce
@@ -147,20 +149,18 @@ def measure(
         others_QKH: that of another episode; beyond its end, its last one.
     """
     batch = collate_pounce([example], bundle.model.config, bundle.tokenizer, bundle.statistics).to(own_QKH.device)
-    noise = [torch.randn(batch.actions_INA.shape, generator=generator) for _ in range(num_draws)]
-    times = [sample_times(bundle.model, len(batch.actions_INA), generator) for _ in range(num_draws)]
+    noise_DINA = torch.randn(num_draws, *batch.actions_INA.shape, generator=generator)
+    time_DI = torch.stack([sample_times(bundle.model, len(batch.actions_INA), generator) for _ in range(num_draws)])
 
     def losses(given: Given) -> Tensor:
-        return torch.stack(
-            [_losses(bundle.model, batch, given, *draw) for draw in zip(noise, times, strict=True)]
-        ).mean(0)
+        return _losses(bundle.model, batch, given, noise_DINA, time_DI)
 
     query_I = batch.query_I.cpu()
     is_fed_I = query_I != NO_QUERY
     is_old_I = query_I >= max(STALE_BY)
     conditions = cognition_conditions(batch, own_QKH, others_QKH)
     by_condition = {name: losses(given) for name, given in conditions.items()}
-    by_age = {str(k): losses(stale(example, batch, own_QKH, k)) for k in STALE_BY}
+    by_age = {str(k): losses(stale(example, batch, own_QKH, k)) for k in STALE_BY if k} | {"0": by_condition["real"]}
     return {
         "staleness": _means(by_age, is_old_I),
         "all": _means(by_condition, is_fed_I),
@@ -234,12 +234,18 @@ def _cognition(ponder: Ponder, example: Example) -> Tensor:
     return cognition_QKH.float()
 
 
-def _losses(model: AnyPounce, batch: PounceBatch, given: Given, noise_INA: Tensor, time_I: Tensor) -> Tensor:
-    """(I,): the flow loss of every invocation over the robot's own dims."""
+def _losses(model: AnyPounce, batch: PounceBatch, given: Given, noise_DINA: Tensor, time_DI: Tensor) -> Tensor:
+    """(I,): the flow loss of every invocation over the robot's own dims, a mean over D flow draws."""
     device = given.cognition_IKH.device
+    noise_DINA, time_DI = noise_DINA.to(device), time_DI.to(device)
     inputs: Any = replace(batch.inputs, cognition=given.cognition_IKH, age_ns=given.age_ns_I, is_null=given.is_null_I)
-    squared_INA = model.unreduced_loss(inputs, batch.actions_INA, noise_INA.to(device), time_I.to(device))
-    return squared_INA[..., : model.config.robot_action_dim].mean(dim=(1, 2)).cpu()
+    if isinstance(model, Pounce):  # what is read is computed once for all draws
+        flat = model.unreduced_loss(inputs, batch.actions_INA, noise_DINA.flatten(0, 1), time_DI.flatten())
+        squared_DINA = flat.unflatten(0, time_DI.shape)
+    else:
+        draws = zip(noise_DINA, time_DI, strict=True)
+        squared_DINA = torch.stack([model.unreduced_loss(inputs, batch.actions_INA, *draw) for draw in draws])
+    return squared_DINA[..., : model.config.robot_action_dim].mean(dim=(0, 2, 3)).cpu()
 
 
 def _means(losses: Mapping[str, Tensor], counts_I: Tensor) -> dict[str, Any]:

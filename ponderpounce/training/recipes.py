@@ -40,8 +40,6 @@ class Recipe:
     """Of the auxiliary alignment with the stand-ins (`stand_in`); the paper has no such loss."""
     trains: Trains = "both"
     """Which systems; the other is not run."""
-    is_blind: bool = False
-    """POUNCE learns without pictures, on state and cognition alone: several times as many samples a minute."""
     space: ActionSpace = "joint_delta"
     """What POUNCE's actions are."""
     statistics_by_row: bool = False
@@ -181,7 +179,6 @@ def small() -> Curriculum:
         batch_episodes=8,
         w3=0.0,
         trains="pounce",
-        is_blind=True,
     )
     joint = replace(
         grounding,

@@ -299,9 +299,10 @@ def _adjusted(run: Recipe, options: TrainOptions) -> Recipe:
 
 def _sight(run: Recipe, model: JointModel) -> Sight:
     """What the run reads of the pictures."""
+    pounce = model.pounce.config
+    sees = run.trains != "ponder" and pounce.num_cameras > 0
     return Sight(
-        form=model.ponder.format if run.trains != "pounce" else None,
-        pounce_px=model.pounce.config.image_px if run.trains != "ponder" and not run.is_blind else None,
+        form=model.ponder.format if run.trains != "pounce" else None, pounce_px=pounce.image_px if sees else None
     )
 
 

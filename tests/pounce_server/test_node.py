@@ -210,3 +210,14 @@ def test_a_chunk_of_an_untrained_model_says_so(new_node: Callable[..., PounceNod
     work = node.next_work()
     assert work is not None
     assert node.answer(work, np.zeros((5, 3), np.float32), infer_ns=8).is_fake
+
+
+def test_who_reads_no_pictures_takes_any_observation_and_asks_with_none(new_node: Callable[..., PounceNode]) -> None:
+    node = new_node(num_cameras=0)
+    for tick, changes in ((3, {}), (4, {"images": ()})):
+        node.on_observation(look(tick, **changes))
+        node.on_invocation(ask(tick, tick))
+        work = node.next_work()
+        assert work is not None
+        assert work.request.frames == ()
+        check_request(work.request, dataclasses.replace(SPEC, num_cameras=0))
