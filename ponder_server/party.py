@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ponder_server.__main__ import build_engine
 from ponder_server.config import PonderOptions
+from ponder_server.contract import EngineSpec, Frame, Opening
 from ponder_server.serve import PonderServer
 from protocol.bus import Bus
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
 from protocol.process import host_clock_id
 from protocol.version import version
+
+_OFFLINE = "offline"
 
 
 def build(bus: Bus, robot: str, checkpoint: Path | None) -> Callable[[], bool]:
@@ -23,3 +29,26 @@ def build(bus: Bus, robot: str, checkpoint: Path | None) -> Callable[[], bool]:
     server.warm_up()
     server.ready()
     return server.step
+
+
+Views = Sequence[Frame]
+"""One instant, camera by camera."""
+Read = Callable[[str, Sequence[Views], Sequence[Views]], NDArray[np.float32]]
+
+
+def build_reader(checkpoint: Path | None) -> tuple[Read, EngineSpec]:
+    """A PONDER outside of any episode, for offline measurements.
+
+    Returns a function from an instruction, a demonstration at 1 Hz and the observations since to the cognition (K, H)
+    of the last one, as served: texts are PONDER's own. And what the engine is.
+    """
+    engine = build_engine(PonderOptions(checkpoint=checkpoint))
+
+    def read(instruction: str, demo: Sequence[Views], seen: Sequence[Views]) -> NDArray[np.float32]:
+        engine.open(_OFFLINE, Opening(instruction=instruction, demo_frames=tuple(tuple(views) for views in demo)))
+        try:
+            return [engine.fire(_OFFLINE, tuple(views)) for views in seen][-1].cognition
+        finally:
+            engine.close(_OFFLINE)
+
+    return read, engine.spec

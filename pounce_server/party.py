@@ -49,7 +49,7 @@ def build_actor(checkpoint: Path | None) -> tuple[Act, EngineSpec]:
         return engine.invoke(
             Request(
                 instruction=instruction,
-                frames=tuple(frames),
+                frames=tuple(frames)[: engine.spec.num_cameras],  # some read none
                 proprio=proprio,
                 cognition=cognition,
                 age_ns=age_ns,

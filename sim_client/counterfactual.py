@@ -1,0 +1,123 @@
+"""``pp-counterfactual``: does a trained pair act on its own past? Both models as served, on the pairs of ``pp-pairs``.
+
+Of each pair PONDER reads either past and the common present, and POUNCE acts on what it then thinks: twice on the same
+pictures, joints and noise. `ponderpounce.analysis.counterfactual` compares with what the script does in either branch.
+PONDER writes its own texts on the way, as in an episode.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+import ponderpounce.tasks.headless  # noqa: F401 - before anything that imports mujoco
+
+# isort: split
+
+from clock.timebase import NS_PER_MS
+from ponderpounce.analysis.counterfactual import COUNTERFACTUAL, SCHEMA, follows_own_past
+from ponderpounce.tasks.pair_files import read_pairs
+from ponderpounce.tasks.pairs import Pair, Telling
+from sim_client.ledger import write_json
+from sim_client.robot import CAMERAS
+
+Views = tuple[NDArray[np.uint8], ...]
+Floats = NDArray[np.float32]
+Read = Callable[[str, Sequence[Views], Sequence[Views]], Floats]
+"""`ponder_server.party.build_reader`'s."""
+Act = Callable[[str, Views, Floats, Floats | None, int, int], Floats]
+"""`pounce_server.party.build_actor`'s."""
+_MIN_SCALE = 1e-3  # of a dimension that no script moves
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CounterfactualOptions:
+    """Scores how often a trained pair's action follows its own past, on pairs that look the same now."""
+
+    ponder: Path
+    """PONDER's checkpoint."""
+    pounce: Path
+    """POUNCE's checkpoint, trained with it."""
+    pairs: Path
+    """A folder of pp-pairs, of pictures as large as the cameras that PONDER was trained on."""
+    out: Path
+    """Folder for counterfactual.json."""
+    draws: int = 4
+    """Flow noise; each draw is given to both branches."""
+    age_ms: int = 300
+    """The age that POUNCE is told of what PONDER thinks of the present, which stands still: as when an episode runs."""
+    progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
+
+
+def main(argv: list[str] | None = None) -> int:
+    options = tyro.cli(
+        CounterfactualOptions, args=argv, prog="pp-counterfactual", description=CounterfactualOptions.__doc__
+    )
+    try:
+        pairs = read_pairs(options.pairs)
+        read, ponder = importlib.import_module("ponder_server.party").build_reader(options.ponder)
+        act, pounce = importlib.import_module("pounce_server.party").build_actor(options.pounce)
+        entries = scored(tqdm(pairs, unit="pair", disable=not options.progress), read, act, options)
+    except (OSError, ValueError) as error:
+        sys.stderr.write(f"pp-counterfactual: {error}\n")
+        return 2
+    options.out.mkdir(parents=True, exist_ok=True)
+    models = {
+        name: {"model_hash": spec.model_hash, "is_untrained": spec.is_random}
+        for name, spec in (("ponder", ponder), ("pounce", pounce))
+    }
+    config = {name: json.loads(json.dumps(getattr(options, name), default=str)) for name in options.__slots__}
+    write_json(options.out / COUNTERFACTUAL, {"schema": SCHEMA, "config": config, "models": models, "pairs": entries})
+    sys.stdout.write(f"{options.out / COUNTERFACTUAL}; tables: pp-tables {options.out} --out {options.out}\n")
+    return 0
+
+
+def scored(pairs: Iterable[Pair], read: Read, act: Act, options: CounterfactualOptions) -> list[dict[str, Any]]:
+    """One entry per pair: which, and its mean score over draws and branches, in [0, 1].
+
+    Differences of joints and gripper are weighed by their standard deviation over all pairs' scripts.
+
+    Raises:
+        ValueError: there are no pairs, or the models do not fit them.
+    """
+    found, answers, scripts = [], [], []
+    for index, pair in enumerate(pairs):
+        found.append({"task": pair.task, "seed": pair.seed, "variant": pair.variant, "difficulty": pair.difficulty})
+        branches = [_answers(pair, telling, read, act, options, index) for telling in (pair.own, pair.twin)]
+        answers.append(np.stack(branches, axis=1))
+        scripts.append(np.stack([pair.own.oracle, pair.twin.oracle]))
+    if not found:
+        raise ValueError(f"{options.pairs} holds no pairs")
+    scale = np.maximum(np.concatenate(scripts).reshape(-1, scripts[0].shape[-1]).std(axis=0), _MIN_SCALE)
+    for entry, answers_D2HA, script_2HA in zip(found, answers, scripts, strict=True):
+        script = np.broadcast_to(script_2HA, answers_D2HA.shape)
+        entry["score"] = float(follows_own_past(answers_D2HA, script, scale=scale).mean())
+    return found
+
+
+def _answers(
+    pair: Pair, telling: Telling, read: Read, act: Act, options: CounterfactualOptions, index: int
+) -> NDArray[np.float32]:
+    """What POUNCE does after this past, (draws, H, A)."""
+    past = [tuple(telling.frames[camera][row] for camera in CAMERAS) for row in range(len(telling.steps))]
+    demo = [views for views, is_shown in zip(past, telling.is_demonstration, strict=True) if is_shown]
+    seen = [views for views, is_shown in zip(past, telling.is_demonstration, strict=True) if not is_shown]
+    now = tuple(pair.frames[camera] for camera in CAMERAS)
+    cognition = read(pair.instruction, demo, [*seen, now])
+    age_ns = options.age_ms * NS_PER_MS
+    seeds = range(index * options.draws, (index + 1) * options.draws)
+    return np.stack([act(pair.instruction, now, pair.state, cognition, age_ns, seed) for seed in seeds])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,106 @@
+"""A policy that follows its past scores 1, one that follows the other's 0, one without memory exactly one half."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ponderpounce.analysis import tables
+from ponderpounce.analysis.counterfactual import read_counterfactual
+from ponderpounce.tasks.pair_files import write_index, write_pair
+from ponderpounce.tasks.pairs import Pair, Telling
+from sim_client import counterfactual
+from sim_client.counterfactual import CounterfactualOptions, scored
+
+PX = 256
+OPTIONS = CounterfactualOptions(ponder=Path("p"), pounce=Path("q"), pairs=Path("none"), out=Path("o"), draws=3)
+
+
+def telling(mark: int, num_demo: int = 2, num_seen: int = 2, px: int = 2) -> Telling:
+    """A past that shows one brightness, and a script that goes there."""
+    count = num_demo + num_seen
+    return Telling(
+        frames=dict.fromkeys(("front", "wrist"), np.full((count, px, px, 3), mark, np.uint8)),
+        states=np.zeros((count, 8), np.float32),
+        steps=np.arange(count),
+        is_demonstration=np.arange(count) < num_demo,
+        oracle=np.full((20, 8), mark, np.float32),
+        subgoal="",
+        reasoning="",
+    )
+
+
+def pair(seed: int, own: int = 10, twin: int = 200, px: int = 2) -> Pair:
+    now = dict.fromkeys(("front", "wrist"), np.full((px, px, 3), 99, np.uint8))
+    return Pair(
+        task="VideoRepick", family="reference", seed=seed, difficulty="easy", variant=0, is_cut=False, seam=0.0,
+        instruction="pick it again", frames=now, state=np.zeros(8, np.float32),
+        own=telling(own, px=px), twin=telling(twin, px=px),
+    )  # fmt: skip
+
+
+def remembers(instruction: str, demo: Any, seen: Any) -> np.ndarray:
+    """The first brightness that was shown; the last one is the present."""
+    assert (len(demo), len(seen), int(seen[-1][0].max())) == (2, 3, 99)
+    return np.full((1, 4), demo[0][0].max(), np.float32)
+
+
+def goes_there(instruction: str, now: Any, state: Any, cognition: Any, age_ns: int, seed: int) -> np.ndarray:
+    assert age_ns == 300_000_000
+    return np.full((20, 8), cognition[0, 0] + np.random.default_rng(seed).normal(), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("memory", "score"),
+    [
+        (lambda cognition: cognition, 1.0),
+        (lambda cognition: 210 - cognition, 0.0),
+        (lambda cognition: np.full_like(cognition, 44), 0.5),
+    ],
+)
+def test_the_score_is_how_often_the_own_past_is_followed(memory: Any, score: float) -> None:
+    def read(*asked: Any) -> np.ndarray:
+        return memory(remembers(*asked))
+
+    found = scored([pair(0), pair(1)], read, goes_there, OPTIONS)
+    assert [entry["score"] for entry in found] == [score, score]
+    assert [entry["seed"] for entry in found] == [0, 1]
+
+
+def test_both_branches_get_the_same_noise_and_every_pair_its_own() -> None:
+    seeds: list[int] = []
+
+    def act(instruction: str, now: Any, state: Any, cognition: Any, age_ns: int, seed: int) -> np.ndarray:
+        seeds.append(seed)
+        return np.zeros((20, 8), np.float32)
+
+    scored([pair(0), pair(1)], remembers, act, OPTIONS)
+    assert seeds == [0, 1, 2, 0, 1, 2, 3, 4, 5, 3, 4, 5]
+
+
+def test_without_pairs_there_is_no_score() -> None:
+    with pytest.raises(ValueError, match="holds no pairs"):
+        scored([], remembers, goes_there, OPTIONS)
+
+
+def test_the_served_models_answer_and_the_table_says_that_they_are_untrained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The tiny random pair: from files of pairs to a table."""
+    from ponder_server import party as ponder_party
+    from pounce_server import party as pounce_party
+
+    models = ponder_party.build_reader(None), pounce_party.build_actor(None)
+    monkeypatch.setattr(ponder_party, "build_reader", lambda checkpoint: models[0])
+    monkeypatch.setattr(pounce_party, "build_actor", lambda checkpoint: models[1])
+    write_index([write_pair(pair(0, px=PX), tmp_path)], tmp_path)
+    arguments = ["--ponder", "any", "--pounce", "any", "--pairs", str(tmp_path), "--out", str(tmp_path / "out")]
+    assert counterfactual.main([*arguments, "--draws", "1", "--no-progress"]) == 0
+    found = read_counterfactual(tmp_path / "out")
+    assert found.is_untrained
+    assert found.scores_P.tolist()[0] in (0.0, 0.5, 1.0)
+    assert tables.main([str(tmp_path / "out"), "--out", str(tmp_path)]) == 0
+    assert "| VideoRepick | 1 |" in (tmp_path / "tables.md").read_text()
