@@ -12,6 +12,7 @@ from pounce_server.__main__ import build_engine
 from pounce_server.config import PounceOptions
 from pounce_server.contract import EngineSpec, Request
 from pounce_server.serve import PounceServer
+from pounce_server.told import Source
 from protocol.bus import Bus
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
@@ -19,11 +20,12 @@ from protocol.process import host_clock_id
 from protocol.version import version
 
 
-def build(bus: Bus, robot: str, checkpoint: Path | None) -> Callable[[], bool]:
-    """A warm server's step function."""
+def build(bus: Bus, robot: str, checkpoint: Path | None, subgoals: Source | None = None) -> Callable[[], bool]:
+    """A warm server's step function. ``subgoals``: see `told`."""
     link = Link(bus, robot=robot, proc="pounce")
     heartbeat = Heartbeat(link, version(), host_clock_id())
-    server = PounceServer(link, build_engine(PounceOptions(checkpoint=checkpoint)), heartbeat, version())
+    engine = build_engine(PounceOptions(checkpoint=checkpoint))
+    server = PounceServer(link, engine, heartbeat, version(), subgoals)
     server.warm_up()
     server.ready()
     return server.step

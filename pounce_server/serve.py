@@ -9,6 +9,7 @@ from clock.feasibility import delay_ticks
 from clock.membership import Membership, percentile_ns
 from pounce_server.contract import PounceEngine, check_robot
 from pounce_server.node import PounceNode, Work
+from pounce_server.told import Source, Told
 from protocol import images, topics
 from protocol import messages as m
 from protocol.errors import MalformedMessage
@@ -22,15 +23,20 @@ log = logging.getLogger(__name__)
 class PounceServer:
     """POUNCE on a bus. ``step`` does one piece of work and says whether there was any."""
 
-    def __init__(self, link: Link, engine: PounceEngine, heartbeat: Heartbeat, version: str) -> None:
+    def __init__(
+        self, link: Link, engine: PounceEngine, heartbeat: Heartbeat, version: str, subgoals: Source | None = None
+    ) -> None:
+        """``subgoals``: whose texts an engine that reads them is told; see `told`."""
         self._link = link
         self._engine = engine
         self._heartbeat = heartbeat
         self._version = version
-        self._node = PounceNode(engine.spec)
+        self._is_told = subgoals is not None
+        self._node = PounceNode(engine.spec, None if subgoals is None else Told(subgoals))
         self._membership = Membership(link, heartbeat, self._open, self._close)
         self._observations = link.subscribe(topics.OBSERVATION, keep=8)
         self._invocations = link.subscribe(topics.INVOCATION)
+        self._subgoals = link.subscribe(topics.SUBGOAL) if self._is_told else None
 
     def warm_up(self) -> None:
         """Measures the engine: its p99 decides whether a schedule can be kept."""
@@ -61,6 +67,9 @@ class PounceServer:
         for observation in self._observations.drain():
             if is_of_episode(self._link, observation.header):
                 self._see(observation)
+        for subgoal in self._subgoals.drain() if self._subgoals is not None else ():
+            if is_of_episode(self._link, subgoal.header):
+                self._node.on_subgoal(subgoal)
         for invocation in self._invocations.drain():
             if invocation.header.episode != self._link.episode:
                 worked |= self.rejoin()
@@ -117,10 +126,15 @@ class PounceServer:
     def _open(self, request: m.OpenRequest) -> m.Contract:
         spec = self._engine.spec
         check_robot(request.info.robot, spec)
-        if spec.reads_subgoal:
+        if spec.reads_subgoal and not self._is_told:
             raise ValueError(
                 "this checkpoint reads PONDER's subgoals in place of cognition, and no message of the protocol brings "
-                "them to POUNCE; serve one that reads cognition"
+                "them to POUNCE; serve one that reads cognition, or evaluate with pp-eval --subgoal-text"
+            )
+        if self._is_told and not spec.reads_subgoal:
+            raise ValueError(
+                "this checkpoint reads cognition and no subgoals: it was not trained with reads_subgoal; leave "
+                "--subgoal-text out"
             )
         self._check_committed(request.info.schedule)
         self._node.open(request.info)

@@ -80,6 +80,8 @@ class EvalOptions:
     """null: POUNCE gets the learned null cognition. other-episode: what PONDER said in another episode of the task."""
     donors: Path | None = None
     """With --cognition other-episode: the --out of a recorded evaluation with real cognition, of the same scenes."""
+    subgoal_text: Literal["ponder", "oracle"] | None = None
+    """For a POUNCE that reads subgoals in place of cognition: PONDER's own, or the task's. Refused by any other."""
     deliver: Literal["every", "held-transition"] = "every"
     """held-transition: the first cognition, then those at predicted transitions (paper, 5.2)."""
     reported_age_ms: int = 0
@@ -120,6 +122,11 @@ class EvalOptions:
             raise EvaluationError("--cognition other-episode and --donors go together: record the real one first")
         if self.cognition == "other-episode" and (self.servers, self.policy) != ("in-process", "servers"):
             raise EvaluationError("--cognition other-episode replays PONDER in the worker: use --servers in-process")
+
+        if self.subgoal_text is not None and (self.servers, self.cognition) != ("in-process", "real"):
+            raise EvaluationError(
+                "--subgoal-text is for --servers in-process, and POUNCE then reads no cognition: leave --cognition out"
+            )
 
     def task_names(self) -> tuple[str, ...]:
         """The tasks in alphabetical order, each once. Raises TaskError for an unknown one."""
@@ -172,6 +179,8 @@ class EvalOptions:
         config: dict[str, Any] = as_json(dataclasses.asdict(self.sim()))
         del config["task"], config["list_tasks"]
         own = {"tasks": self.task_names(), "runs": self.runs, "cognition": self.cognition, "donors": self.donors}
+        if self.subgoal_text is not None:
+            own["subgoal_text"] = self.subgoal_text
         return config | {name: as_json(value) for name, value in own.items()}
 
 
@@ -269,7 +278,7 @@ class EvaluationStation:
         self._open = contextlib.ExitStack()
         daemons = self._open.enter_context(Daemons(options.out / "servers" / str(os.getpid())))
         replaced = self._build_donor if options.cognition == "other-episode" else None
-        station = open_station(sim, daemons, replaced)
+        station = open_station(sim, daemons, replaced, options.subgoal_text)
         self._open.callback(station.bus.close)
         self._suite = Suite(sim, station.link, station.clock, daemons.dead)
         self._task = ""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from clock.service import ClockService, ServiceConfig
@@ -29,17 +30,20 @@ class Station:
     clock: ClockService | None
 
 
-def open_station(options: SimOptions, daemons: Daemons, ponder: Build | None = None) -> Station:
+def open_station(
+    options: SimOptions, daemons: Daemons, ponder: Build | None = None, subgoals: str | None = None
+) -> Station:
     """Starts what the options ask for.
 
     Args:
         daemons: what is started as processes is theirs to stop.
         ponder: in process, a server in place of ``ponder-serve``'s.
+        subgoals: in process, whose texts a POUNCE that reads them is told, "ponder" or "oracle".
 
     Raises:
         TransportError: a bus that cannot be opened, or options that contradict each other.
     """
-    bus, add_party = _bus(options, daemons, ponder)
+    bus, add_party = _bus(options, daemons, ponder, subgoals)
     try:
         clock = None
         if not options.runs_clock_daemon and options.policy == "servers":
@@ -52,7 +56,9 @@ def open_station(options: SimOptions, daemons: Daemons, ponder: Build | None = N
         raise
 
 
-def _bus(options: SimOptions, daemons: Daemons, ponder: Build | None) -> tuple[Bus, Callable[[Party], None]]:
+def _bus(
+    options: SimOptions, daemons: Daemons, ponder: Build | None, subgoals: str | None
+) -> tuple[Bus, Callable[[Party], None]]:
     """The bus, and how to add one more party to it if all share this thread."""
     link = options.link
     if options.policy == "oracle":
@@ -62,7 +68,8 @@ def _bus(options: SimOptions, daemons: Daemons, ponder: Build | None) -> tuple[B
             raise TransportError("--in-process shares one thread: use --mode lockstep, or --local")
         bus = LocalBus()
         bus.add_party((ponder or _builder("ponder_server.party"))(bus, link.robot, options.ponder_checkpoint))
-        bus.add_party(_builder("pounce_server.party")(bus, link.robot, options.pounce_checkpoint))
+        pounce = partial(_builder("pounce_server.party"), **({} if subgoals is None else {"subgoals": subgoals}))
+        bus.add_party(pounce(bus, link.robot, options.pounce_checkpoint))
         return bus, bus.add_party
     if options.local:
         link = local_link(options, daemons)

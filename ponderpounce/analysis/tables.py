@@ -150,6 +150,8 @@ def _condition(results: Results) -> tuple[str, str, str, str]:
     if config.get("policy") == "oracle":
         return "nothing: the oracle played", "", "", ""
     gets = {"null": "the null cognition", "other-episode": "another episode's cognition"}.get(_cognition(config), "C_t")
+    if config.get("subgoal_text") is not None:
+        gets = {"ponder": "PONDER's subgoal text", "oracle": "the oracle's subgoal text"}[config["subgoal_text"]]
     if config.get("deliver") == "held-transition":
         told = config.get("held_age_ms", 0)
         gets += f" held at transitions, told {f'{told} ms' if told else 'its true age'}"

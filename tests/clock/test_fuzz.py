@@ -85,7 +85,9 @@ NOT_NUMBERS: dict[Topic[Any], Any] = {
     topics.HEALTH: stream_pb2.Health(state=3, progress=NAN),
 }
 SHAPES: dict[Topic[Any], Any] = {  # well-formed, of this very episode, and of no use here
-    topics.OBSERVATION: dataclasses.replace(GOOD[topics.OBSERVATION], proprio=np.zeros(9, np.float32), images=()),
+    topics.OBSERVATION: dataclasses.replace(
+        GOOD[topics.OBSERVATION], proprio=np.zeros(9, np.float32), images=GOOD[topics.OBSERVATION].images[:1]
+    ),
     topics.COGNITION: GOOD[topics.COGNITION],
     topics.CHUNK: dataclasses.replace(GOOD[topics.CHUNK], horizon=4, rows=np.zeros(4 * DIM, np.float32)),
 }

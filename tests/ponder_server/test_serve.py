@@ -77,7 +77,8 @@ def test_a_missed_observation_is_told(ward: Ward) -> None:
 
 
 def test_frames_of_another_size_are_refused_and_counted(ward: Ward) -> None:
-    ward.rig.show(3, 7, images=())
+    image = m.Image(camera="front", codec=m.ImageCodec.RAW, height=5, width=5, data=bytes(75))
+    ward.rig.show(3, 7, images=(image, image))
     ward.step()
     assert dict(ward.rig.links["ponder"].dropped) == {"wrong_shape": 1}
 

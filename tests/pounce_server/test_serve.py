@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from pounce_server.contract import Request
+from protocol import images, topics
 from protocol import messages as m
-from protocol import topics
 from protocol.link import Link
 
 MS = 1_000_000
+ONE_CAMERA = images.pack({"front": np.zeros((4, 4, 3), np.uint8)}, m.ImageCodec.RAW)
 Info = Callable[..., m.EpisodeInfo]
 
 
@@ -97,7 +98,7 @@ def test_a_cognition_of_another_shape_is_refused_and_counted(ward: Ward) -> None
     assert dict(ward.rig.links["pounce"].dropped) == {"wrong_request": 1}
 
 
-@pytest.mark.parametrize("changes", [{"proprio": np.zeros(8, np.float32)}, {"images": ()}])
+@pytest.mark.parametrize("changes", [{"proprio": np.zeros(8, np.float32)}, {"images": ONE_CAMERA}])
 def test_an_observation_of_another_robot_is_refused_and_counted(ward: Ward, changes: dict[str, Any]) -> None:
     ward.rig.show(3, 7, **changes)
     ward.step()

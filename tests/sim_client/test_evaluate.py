@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -15,6 +16,9 @@ from hypothesis import strategies as st
 from ponderpounce.analysis import tables
 from ponderpounce.analysis.results import read_results
 from ponderpounce.data.seeds import TRAIN_SEED
+from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
+from ponderpounce.models.pounce_checkpoint import random_bundle, save_bundle
+from ponderpounce.models.pounce_configs import tiny_cpu
 from protocol import messages as m
 from protocol.mcap_log import read_log
 from sim_client import evaluate as module
@@ -120,6 +124,8 @@ def test_one_folder_holds_one_condition(tmp_path: Path) -> None:
         ({"cognition": "other-episode"}, "--donors"),
         ({"donors": Path("x")}, "--donors"),
         ({"cognition": "other-episode", "donors": Path("x"), "servers": "local"}, "in-process"),
+        ({"subgoal_text": "oracle", "servers": "local"}, "in-process"),
+        ({"subgoal_text": "oracle", "cognition": "null"}, "reads no cognition"),
     ],
 )
 def test_options_that_contradict_each_other_are_refused(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
@@ -221,6 +227,25 @@ def test_an_episode_that_is_not_recorded_is_the_same_with_fewer_pictures(tmp_pat
             lines.append(station.play(chosen.jobs()[0]) | {"mcap": None})
     assert lines[0] == lines[1]
     assert lines[0]["stream_sha256"]
+
+
+@pytest.mark.sim
+def test_subgoal_text_reaches_a_pounce_that_reads_it_and_is_refused_by_another(tmp_path: Path) -> None:
+    silent = tiny_cpu(num_carriers=0, cognition_size=tiny_ponder().hidden_size)
+    save_bundle(random_bundle(dataclasses.replace(silent, reads_subgoal=True), seed=0), tmp_path / "pounce")
+    shared: dict[str, Any] = {"tasks": ("StopCube",), "runs": 1, "policy": "servers", "max_steps": 10}
+    streams = {}
+    for source in ("ponder", "oracle"):
+        chosen = options(tmp_path / source, subgoal_text=source, pounce_checkpoint=tmp_path / "pounce", **shared)
+        with contextlib.closing(EvaluationStation(chosen)) as station:
+            streams[source] = station.play(chosen.jobs()[0])["stream_sha256"]
+    assert streams["ponder"] != streams["oracle"]
+    other = options(tmp_path / "other", subgoal_text="oracle", **shared)
+    with (
+        contextlib.closing(EvaluationStation(other)) as station,
+        pytest.raises(EvaluationError, match="reads cognition and no subgoals"),
+    ):
+        station.play(other.jobs()[0])
 
 
 @pytest.mark.sim
