@@ -1,20 +1,21 @@
 """The parts of both systems that hold most weights and run through ``forward`` alone.
 
-What gathers weights when a module runs (FSDP2) sees only ``forward``. Of pi0.5's layers and GR00T's blocks it can have
-the MLPs, most of their weights: their attention is called by other methods (`gemma.Attention.qkv`).
+What gathers weights when a module runs (FSDP2) sees only ``forward``. Of pi0.5's layers, GR00T's blocks and PONDER's
+vision blocks it can have the MLPs, most of their weights: their attention is called otherwise (`gemma.Attention.qkv`,
+`ponder_vision`).
 """
 
 from __future__ import annotations
 
 from torch import nn
-from transformers.models.qwen3_5.modeling_qwen3_5 import Qwen3_5DecoderLayer, Qwen3_5VisionBlock
+from transformers.models.qwen3_5.modeling_qwen3_5 import Qwen3_5DecoderLayer, Qwen3_5VisionMLP
 
 from ponderpounce.models.gemma import GeGlu
 from ponderpounce.models.groot_blocks import BlockMlp
 from ponderpounce.models.qwen3 import Qwen3Layer
 from ponderpounce.models.siglip import VisionLayer
 
-_UNITS = (Qwen3_5DecoderLayer, Qwen3_5VisionBlock, VisionLayer, GeGlu, Qwen3Layer, BlockMlp)
+_UNITS = (Qwen3_5DecoderLayer, Qwen3_5VisionMLP, VisionLayer, GeGlu, Qwen3Layer, BlockMlp)
 
 
 def units_of(model: nn.Module) -> list[nn.Module]:

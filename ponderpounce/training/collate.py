@@ -23,6 +23,7 @@ from ponderpounce.models.pounce_reading import groot_inputs, pi05_inputs
 from ponderpounce.models.prompt import Tokenizer
 from ponderpounce.training.example import Example, Frame, chunk_ticks
 from ponderpounce.training.joint import NO_QUERY, PonderBatch, PounceBatch
+from ponderpounce.training.nudge import apply_nudges
 
 _GROOT_PAD = "<|endoftext|>"
 _CPU = torch.device("cpu")
@@ -104,6 +105,13 @@ def collate_pounce(
         wanted = statistics.normalise_chunks(episode.action_T8, episode.state_T8[ticks], rows)
         actions_INA[first : first + len(ticks), :, : config.robot_action_dim] = torch.from_numpy(wanted)
         first += len(ticks)
+    nudges = [example.nudges_I2 for example in examples]
+    if examples and all(each is not None for each in nudges):
+        if not isinstance(inputs, PounceInputs) or inputs.state is None:
+            raise ValueError("starts are nudged for a pi0.5 that reads its state as a token")
+        every_I2 = np.concatenate([each for each in nudges if each is not None])
+        state, actions_INA = apply_nudges(examples[0].nudge, every_I2, inputs.state, actions_INA, statistics)
+        inputs = replace(inputs, state=state)
     queries = [moment.invocation.reference.query for moment in moments]
     return PounceBatch(
         inputs=inputs,

@@ -17,8 +17,10 @@ from torch import Tensor
 from clock.sampling import Clocks, SampledInvocation, SampledSchedule, sample_schedule
 from ponderpounce.models.context import ContextFormat, Row, Transition
 from ponderpounce.models.eyes import see
+from ponderpounce.models.normalisation import Floats
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.training.augment import AS_IT_IS, NOT_AUGMENTED, Augmentation, View, draw_view
+from ponderpounce.training.nudge import NO_NUDGE, Nudge, draw_nudges
 from ponderpounce.training.stand_in import stand_in
 
 Frame = NDArray[np.uint8]  # (height, width, 3) RGB
@@ -80,6 +82,8 @@ class ExampleConfig:
 
     augmentation: Augmentation = NOT_AUGMENTED
     """Other views of the scene, for stages that train PONDER alone."""
+    nudge: Nudge = NO_NUDGE
+    """Displaced starts of POUNCE's invocations."""
     max_queries: int | None = None
     """The row ends after so many queries, and with it the invocations; None: with the episode. Most of what is to be
     seen is seen early."""
@@ -102,6 +106,9 @@ class Example:
     """Those of the schedule that were drawn."""
     is_grounded: bool
     view: View = AS_IT_IS
+    nudge: Nudge = NO_NUDGE
+    nudges_I2: Floats | None = None
+    """Of each invocation's tool [m]; None: starts are as recorded."""
 
     def row(self) -> Row:
         """PONDER's tokens."""
@@ -131,13 +138,21 @@ def make_example(
     schedule = _shortened(schedule, config.max_queries)
     count = min(config.max_invocations, len(schedule.invocations))
     chosen = np.sort(rng.choice(len(schedule.invocations), size=count, replace=False))
+    invocations = tuple(schedule.invocations[index] for index in chosen)
+    is_grounded = config.is_grounded and rng.random() >= config.text_dropout
+    view = draw_view(config.augmentation, form, set(episode.subgoals), rng)
+    nudges_I2 = None
+    if config.nudge != NO_NUDGE:
+        nudges_I2 = draw_nudges(config.nudge, episode.state_T8[[each.tick for each in invocations]], rng)
     return Example(
         episode=episode,
         form=form,
         schedule=schedule,
-        invocations=tuple(schedule.invocations[index] for index in chosen),
-        is_grounded=config.is_grounded and rng.random() >= config.text_dropout,
-        view=draw_view(config.augmentation, form, set(episode.subgoals), rng),
+        invocations=invocations,
+        is_grounded=is_grounded,
+        view=view,
+        nudge=config.nudge,
+        nudges_I2=nudges_I2,
     )
 
 

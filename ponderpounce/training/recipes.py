@@ -15,10 +15,13 @@ from ponderpounce.models.pounce_family import AnyPounceConfig
 from ponderpounce.training.augment import Augmentation
 from ponderpounce.training.example import ExampleConfig
 from ponderpounce.training.joint import Trains
+from ponderpounce.training.nudge import Nudge
 from ponderpounce.training.optim import OptimConfig
 from ponderpounce.training.trainer import TrainConfig
 
 _FROM_SCRATCH = OptimConfig(learning_rate=1e-3, warmup_steps=200, betas=(0.9, 0.95), weight_decay=1e-4, ema_decay=0.998)
+
+_BESIDE_THE_WAY = Nudge(std_m=0.03)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -173,7 +176,7 @@ def small() -> Curriculum:
     motor = replace(
         looking,
         name="small/motor",
-        example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=16),
+        example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=16, nudge=_BESIDE_THE_WAY),
         train=TrainConfig(seed=0, dropout=0.1, flow_samples=2, optim=replace(_FROM_SCRATCH, learning_rate=1e-3)),
         num_steps=6000,
         batch_episodes=8,
@@ -183,7 +186,7 @@ def small() -> Curriculum:
     joint = replace(
         grounding,
         name="small/joint",
-        example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=8),
+        example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=16, nudge=_BESIDE_THE_WAY),
         train=TrainConfig(seed=0, dropout=0.1, flow_samples=2, optim=replace(_FROM_SCRATCH, learning_rate=5e-4)),
         num_steps=1000,
         w3=0.0,
