@@ -45,6 +45,7 @@ _ASK_AGAIN_NS = 200_000_000
 _LAST_TICKS_NS = 1_000_000_000
 _IDLE_NS = 20_000_000
 _LIVE_TURN_NS = 2_000_000  # a request cannot ring the bus's bell
+_UNREADABLE = "PONDER reads"  # of `ponder_server.node.check_robot`
 _MISSHAPEN = "wrong_shape"  # the servers' own word in Health.dropped
 _STOPPED = "the gateway was stopped"
 T = TypeVar("T")
@@ -323,6 +324,8 @@ class Machine:
             self._end(m.TaskStatus.ABORTED, str(error))
             with self._lock:
                 self._seat.leave(client)
+            if _UNREADABLE in str(error):  # the gateway can make them another size
+                raise Refused(f"{error}. See --image-px") from error
             raise
         for stale in (self._actions, self._accounts, self._chunks):
             stale.drain()

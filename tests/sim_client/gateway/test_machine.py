@@ -156,13 +156,15 @@ def test_pictures_that_change_their_size_are_refused_and_the_episode_goes_on(ben
 
 
 @pytest.mark.parametrize("schedule", [schedules.paper(), schedules.realtime()])
-def test_pictures_that_a_server_was_not_built_for_end_the_episode_with_a_hint(
+def test_pictures_that_a_server_cannot_read_are_refused_with_a_hint(
     bench_with: Callable[..., Any], step_of: StepOf, schedule: m.Schedule
 ) -> None:
     bench = bench_with(schedule)
     big = np.zeros((8, 8, 3), np.uint8)
     for _ in range(2):
-        with pytest.raises(Refused, match=r"the episode is over: ponder was built for other pictures.*--image-px"):
+        with pytest.raises(
+            Refused, match=r"ponder refuses .*'front' gives 8 x 8 px; PONDER reads 4 x 4 px.*--image-px"
+        ):
             bench.ask(step_of(begins=True, frames={"front": big, "wrist": big}))
     bench.ask(step_of(begins=True))
 
