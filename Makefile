@@ -30,19 +30,24 @@ $(READY): requirements.txt pyproject.toml
 	touch $@
 
 ## make demo    three processes drive a Panda through PickHighlight; logs, checks and a picture in out/demo
+SHIPPED := --ponder-checkpoint checkpoints/small/ponder --pounce-checkpoint checkpoints/small/pounce
+
 demo: setup
 	$(BIN)/pp-doctor --required-only
 	rm -rf out/demo
-	@echo "--- real time: ponder-serve, pounce-serve and clock-serve over zenoh, tiny random models (motion, not skill)"
-	$(BIN)/sim-client --local --mode realtime --episodes 1 --max-steps 400 --out out/demo/realtime
+	@echo "--- real time: ponder-serve, pounce-serve and clock-serve over zenoh, with the small policy that was trained here"
+	$(BIN)/sim-client --local --mode realtime $(SHIPPED) --difficulty easy --episodes 1 --max-steps 400 --out out/demo/realtime
 	@echo "--- lockstep: the paper's schedule, both models at 1 Hz, 300 ms of delay"
-	$(BIN)/sim-client --local --mode lockstep --episodes 2 --max-steps 200 --out out/demo/lockstep
+	$(BIN)/sim-client --local --mode lockstep $(SHIPPED) --difficulty easy --episodes 2 --max-steps 400 --out out/demo/lockstep
+	@echo "--- does it remember? the same scenes with its cognition, and with the learned null in its place"
+	$(BIN)/pp-eval $(SHIPPED) --tasks PickHighlight --difficulty easy --episodes 6 --runs 1 --max-steps 600 --out out/demo/real
+	$(BIN)/pp-eval $(SHIPPED) --tasks PickHighlight --difficulty easy --episodes 6 --runs 1 --max-steps 600 --cognition null --out out/demo/null
 	@echo "--- the task's own script, to see the task done"
 	$(BIN)/sim-client --policy oracle --episodes 3 --out out/demo/oracle
 	@echo "--- every reference, age, row and deadline again, from the logs alone"
 	$(BIN)/pp-check $$(find out/demo -name '*.mcap')
 	$(BIN)/pp-replay $$(find out/demo/realtime -name '*.mcap') --save out/demo/realtime.rrd
-	@echo "Watch one: $(BIN)/pp-replay $$(find out/demo/oracle -name '*.mcap' | head -1)"
+	@echo "Watch one: $(BIN)/pp-replay $$(find out/demo/lockstep -name '*.mcap' | head -1)"
 
 ## make test    everything that needs no GPU; make unit: without processes and long runs
 test: setup

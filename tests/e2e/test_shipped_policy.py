@@ -1,0 +1,44 @@
+"""The policy in the repository: trained, small enough, and it is its memory that does the task."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from ponderpounce.models.ponder_checkpoint import load_ponder
+from ponderpounce.models.pounce_checkpoint import load_bundle
+from sim_client import evaluate
+
+SHIPPED = Path(__file__).parents[2] / "checkpoints" / "small"
+NUM_SCENES, FIRST_SEED = 6, 100_000
+MOST_BYTES = 20_000_000
+
+
+def test_it_is_trained_and_small() -> None:
+    assert not load_ponder(SHIPPED / "ponder").is_random
+    bundle = load_bundle(SHIPPED / "pounce")
+    assert not bundle.is_random
+    assert not bundle.has_fresh_prefix
+    assert sum(path.stat().st_size for path in SHIPPED.rglob("*") if path.is_file()) < MOST_BYTES
+
+
+@pytest.mark.slow
+@pytest.mark.e2e
+def test_it_picks_what_was_highlighted_and_without_cognition_it_does_not(tmp_path: Path) -> None:
+    """Six easy scenes that nothing was chosen by. Rounding differs between machines, so the bar is low."""
+    solved = {}
+    for cognition in ("real", "null"):
+        out = tmp_path / cognition
+        arguments = (
+            f"--ponder-checkpoint {SHIPPED / 'ponder'} --pounce-checkpoint {SHIPPED / 'pounce'} --tasks PickHighlight "
+            f"--difficulty easy --episodes {NUM_SCENES} --seed {FIRST_SEED} --runs 1 --max-steps 500 "
+            f"--cognition {cognition} --no-progress --out {out}"
+        )
+        assert evaluate.main(arguments.split()) == 0
+        results = json.loads((out / "results.json").read_text())
+        solved[cognition] = sum(episode["success"] for episode in results["episodes"])
+    assert solved["real"] >= 2
+    assert solved["null"] <= 1  # one of three cubes is the right one: a guess that presses and lifts may hit
+    assert solved["null"] < solved["real"]
