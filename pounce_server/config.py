@@ -30,8 +30,9 @@ class PounceOptions:
     hidden_size: int | None = None
     """H of the random weights; must be PONDER's. Default: the tiny PONDER's."""
     device: str = "cpu"
-    path: Literal["eager", "fused"] = "eager"
-    """fused: Triton kernels, static buffers and CUDA graphs for pi0.5; needs a GPU and Triton."""
+    path: Literal["eager", "compile", "max-autotune", "fused"] = "eager"
+    """compile, max-autotune: torch.compile, for either family, a minute at start. fused: Triton kernels, static buffers
+    and CUDA graphs for pi0.5; needs a GPU and Triton."""
     autotune: bool = False
     """fused: time cuBLAS against cuBLASLt for every product, once for a GPU; kept in the user's cache folder."""
     dtype: Literal["float32", "bfloat16"] = "float32"

@@ -25,6 +25,7 @@ from ponderpounce.models.pounce_family import AnyPounce, max_committed_rows
 from ponderpounce.models.pounce_groot import GrootInputs, GrootPounce
 from ponderpounce.models.pounce_reading import groot_inputs, pi05_inputs
 from ponderpounce.models.prompt import Tokenizer
+from pounce_server.compiled import compiled_sampler
 from pounce_server.contract import (
     Continuity,
     DTypeName,
@@ -45,7 +46,7 @@ from pounce_server.roll_forward import placed, rolled
 Sampler: TypeAlias = Callable[[Sequence[Request], Tensor], Iterator[tuple[list[int], EulerStep]]]
 """Reads requests and yields flow steps from given noise, (B, N, A), each with the indices of the requests it moves."""
 
-PathName: TypeAlias = Literal["eager", "fused"]
+PathName: TypeAlias = Literal["eager", "compile", "max-autotune", "fused"]
 
 NUM_COMPARED = 4
 """Made-up requests on which the error of int8 weights is taken."""
@@ -54,12 +55,14 @@ WARM_UP_MEASURED = 20
 
 
 class EagerEngine:
-    """PyTorch for one thread at a time, eager or fused. Takes over the bundle's model: casts, moves and freezes it.
+    """PyTorch for one thread at a time, eager, compiled or fused.
+
+    Takes over the bundle's model: casts, moves and freezes it.
 
     Raises:
         ValueError: ``continuity`` is not "none" and the model is not pi0.5, or it is "trained" and the model was never
-            trained so; or ``path`` is "fused", and the model is not pi0.5, the chunks are to be continued, or Triton
-            has nothing to run on; or the state is rolled forward past the rows that the chunk is to be given.
+            trained so, or ``path`` is not "eager"; or ``path`` is "fused", and the model is not pi0.5 or Triton has
+            nothing to run on; or the state is rolled forward past the rows that the chunk is to be given.
     """
 
     def __init__(
@@ -76,7 +79,7 @@ class EagerEngine:
     ) -> None:
         if autotune and path != "fused":
             raise ValueError("--autotune chooses among the fused path's products; add --path fused, or leave it out")
-        if weights == "int8" and (path == "fused" or torch.device(device).type != "cpu"):
+        if weights == "int8" and (path != "eager" or torch.device(device).type != "cpu"):
             raise ValueError(
                 "int8 weights are for the eager path on a CPU; leave --weights out, and take --dtype bfloat16"
             )
@@ -106,7 +109,11 @@ class EagerEngine:
             reads_subgoal=config.reads_subgoal,
         )
         model = cast_for_serving(bundle.model, dtype).to(self._device).eval().requires_grad_(False)
-        make_sampler = partial(_fused_sampler, autotune=autotune) if path == "fused" else _sampler
+        make_sampler = _sampler
+        if path == "fused":
+            make_sampler = partial(_fused_sampler, autotune=autotune)
+        elif path != "eager":
+            make_sampler = partial(_compiled_sampler, mode=path)
         self._sample = make_sampler(model, bundle, self._device, continuity)
         if weights == "int8":
             examples = [example_request(self.spec, seed=seed) for seed in range(NUM_COMPARED)]
@@ -270,6 +277,31 @@ def _groot_sampler(groot: GrootPounce, read: Callable[[Request], GrootInputs]) -
         inputs = [read(request) for request in requests]
         for alike in of_equal_length(inputs):
             for step in groot.sample(joined_groot([inputs[index] for index in alike]), noise_BNA[alike], table):
+                yield alike, step
+
+    return sample
+
+
+@torch.inference_mode()
+def _compiled_sampler(
+    model: AnyPounce, bundle: PounceBundle, device: torch.device, continuity: Continuity, *, mode: str
+) -> Sampler:
+    if continuity != "none":
+        raise ValueError(f"the path {mode!r} knows no --continuity; leave one of them out")
+    statistics, tokenizer = bundle.statistics, bundle.tokenizer
+    run = compiled_sampler(model, mode)
+
+    def sample(requests: Sequence[Request], noise_BNA: Tensor) -> Iterator[tuple[list[int], EulerStep]]:
+        if isinstance(model, Pounce):
+            assert isinstance(tokenizer, Tokenizer), "the bundle checks this"
+            read = [pi05_inputs(request, model.config, tokenizer, statistics, device) for request in requests]
+            for step in run(joined_pi05(read), noise_BNA):
+                yield list(range(len(requests))), step
+            return
+        assert isinstance(tokenizer, EagleTokenizer), "the bundle checks this"
+        seen = [groot_inputs(request, model.config, tokenizer, statistics, device) for request in requests]
+        for alike in of_equal_length(seen):
+            for step in run(joined_groot([seen[index] for index in alike]), noise_BNA[alike]):
                 yield alike, step
 
     return sample
