@@ -97,7 +97,14 @@ def test_tensorboard_gets_scalars_words_and_pictures(tmp_path: Path, form: Conte
     format_only = SimpleNamespace(ponder=SimpleNamespace(format=form))
     trainer: Any = SimpleNamespace(latest=(episodes, said_N), model=format_only)
     report = StepReport(
-        step=0, total=2.5, flow_matching=1.0, grounding=1.5, gradient_norm=1.0, num_supervised=3, num_null=0
+        step=0,
+        total=2.5,
+        flow_matching=1.0,
+        grounding=1.5,
+        alignment=0.0,
+        gradient_norm=1.0,
+        num_supervised=3,
+        num_null=0,
     )
     with Watch(tmp_path, first_step=0, sample_every=1, tensorboard=True) as watch:
         watch.step(report, trainer)
