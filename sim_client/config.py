@@ -75,6 +75,8 @@ class SimOptions:
 
     record: bool = True
     """Write one MCAP per episode."""
+    record_hz: Literal[1, 2, 4, 5, 10, 20] = 20
+    """In lockstep: how often the log has pictures, beside those that the models look at."""
     pixels: Literal["jpeg", "exact"] = "jpeg"
     """jpeg: raw frames are logged as JPEG; exact: also bit for bit as the models saw them (8 MB/s)."""
     progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True

@@ -8,20 +8,15 @@ schedule, and the age, counted from this episode's query. Beyond the donor's las
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from clock.membership import Membership
 from protocol import messages as m
-from protocol import topics
 from protocol.errors import ProtocolError
-from protocol.heartbeat import Heartbeat
-from protocol.link import Link, is_of_episode
+from protocol.link import Link
 from protocol.mcap_log import EpisodeRecord, read_log
-from protocol.process import host_clock_id
-from protocol.version import version
+from sim_client.puppet import Answer, PuppetPonder
 
 Key = tuple[str, int, int]  # task, run, seed
 
@@ -30,16 +25,12 @@ class DonorError(ValueError):
     """There is no cognition to give: the message says what is missing and the way out."""
 
 
-class DonorPonder:
-    """A PONDER on a bus without a model. ``step`` answers what is asked and says whether anything was."""
+class DonorPonder(PuppetPonder):
+    """Answers with what was recorded."""
 
     def __init__(self, link: Link) -> None:
-        self._link = link
-        self._heartbeat = Heartbeat(link, version(), host_clock_id())
-        self._membership = Membership(link, self._heartbeat, self._open, lambda: None)
-        self._queries = link.subscribe(topics.QUERY)
         self._donor: list[m.Cognition] = []
-        self._heartbeat.set(state=m.ServingState.READY, progress=1.0)
+        super().__init__(link)
 
     def load(self, path: Path) -> None:
         """Takes the donor of the next episode.
@@ -59,49 +50,32 @@ class DonorPonder:
         if not self._donor:
             raise DonorError(f"{name}: no cognition in it; donors are logs of the real PONDER, of pp-eval --record")
 
-    def step(self) -> bool:
-        self._heartbeat.beat()
-        worked = self._membership.step()
-        for query in self._queries.drain():
-            if is_of_episode(self._link, query.header):
-                self._answer(query)
-                worked = True
-        return worked
-
-    def _answer(self, query: m.Query) -> None:
+    def answer(self, query: m.Query) -> Answer:
         has_ended = query.query >= len(self._donor)
         given = self._donor[-1 if has_ended else query.query]
-        now_ns = time.monotonic_ns()
-        cognition = m.Cognition(
-            query=query.query,
-            tick=query.tick,
-            source_ns=query.source_ns,
-            ready_ns=now_ns,
+        return Answer(
             vector=given.vector,
             is_transition=given.is_transition and not has_ended,
             norm=given.norm,
-            model_hash=self._hash,
             is_fake=given.is_fake,
         )
-        self._link.publish(topics.COGNITION, cognition, at_ns=now_ns, clock_id=host_clock_id())
 
-    def _open(self, request: m.OpenRequest) -> m.Contract:
+    def end(self) -> None:
+        """What was taken stays: it may be asked for again."""
+
+    def shape(self) -> tuple[int, int]:
         if not self._donor:
             raise DonorError("no donor was taken for this episode")
         num_carriers, hidden_size = self._donor[0].vector.shape
-        return m.Contract(
-            proc="ponder",
-            num_carriers=num_carriers,
-            hidden_size=hidden_size,
-            model_hash=self._hash,
-            is_fake=self._donor[0].is_fake,
-            version=version(),
-        )
+        return num_carriers, hidden_size
 
     @property
-    def _hash(self) -> str:
-        """Says in every log whose vectors these were."""
+    def model_hash(self) -> str:
         return f"{self._donor[0].model_hash} in {self._donor[0].header.episode}"
+
+    @property
+    def is_fake(self) -> bool:
+        return self._donor[0].is_fake
 
 
 def donors_in(folder: Path, keys: Iterable[Key]) -> dict[Key, Path]:

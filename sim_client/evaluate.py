@@ -40,10 +40,12 @@ from sim_client.launch import Daemons
 from sim_client.ledger import Ledger, LedgerError, write_json
 from sim_client.station import Party, open_station
 from sim_client.suite import Suite, as_json, versions
+from sim_client.told_cognition import ToldPonder, cognition_shape
 
 DONE, REFUSED, INTERRUPTED = 0, 2, 130
 Line = dict[str, Any]  # one episode's entry in results.json
 
+_PUPPETS = ("other-episode", "stand-in")
 _HOW_MANY = ("tasks", "episodes", "runs")  # a folder may be given more of them later
 _HOW = ("out", "patience_s", "progress")  # and these change no result
 
@@ -76,8 +78,9 @@ class EvalOptions:
     max_steps: int = 1300
     """Per episode (paper: 1300)."""
 
-    cognition: Literal["real", "null", "other-episode"] = "real"
-    """null: POUNCE gets the learned null cognition. other-episode: what PONDER said in another episode of the task."""
+    cognition: Literal["real", "null", "other-episode", "stand-in"] = "real"
+    """null: POUNCE gets the learned null cognition. other-episode: what PONDER said in another episode of the task.
+    stand-in: the simulator's own subgoal, in the form that stage `motor` of the recipe `small` teaches."""
     donors: Path | None = None
     """With --cognition other-episode: the --out of a recorded evaluation with real cognition, of the same scenes."""
     subgoal_text: Literal["ponder", "oracle"] | None = None
@@ -101,6 +104,8 @@ class EvalOptions:
     """With --ray: what a worker asks for, 0.5 for two on each GPU."""
     record: bool = False
     """Write one MCAP per episode, some 10 MB a minute."""
+    record_hz: Literal[1, 2, 4, 5, 10, 20] = 20
+    """With --record: how often pictures are taken, beside those that the models look at."""
     patience_s: float = 600.0
     """How long to wait for servers to be ready, or for any answer."""
     progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
@@ -120,9 +125,10 @@ class EvalOptions:
             raise EvaluationError("--cognition null delivers nothing, so nothing is held; leave --deliver out")
         if (self.cognition == "other-episode") != (self.donors is not None):
             raise EvaluationError("--cognition other-episode and --donors go together: record the real one first")
-        if self.cognition == "other-episode" and (self.servers, self.policy) != ("in-process", "servers"):
-            raise EvaluationError("--cognition other-episode replays PONDER in the worker: use --servers in-process")
-
+        if self.cognition in _PUPPETS and (self.servers, self.policy) != ("in-process", "servers"):
+            raise EvaluationError(f"--cognition {self.cognition} replaces PONDER: use --servers in-process")
+        if self.cognition == "stand-in" and self.pounce_checkpoint is None:
+            raise EvaluationError("--cognition stand-in is for a --pounce-checkpoint that has learned from stand-ins")
         if self.subgoal_text is not None and (self.servers, self.cognition) != ("in-process", "real"):
             raise EvaluationError(
                 "--subgoal-text is for --servers in-process, and POUNCE then reads no cognition: leave --cognition out"
@@ -171,6 +177,7 @@ class EvalOptions:
             held_age_ms=self.reported_age_ms,
             max_steps=self.max_steps,
             record=self.record,
+            record_hz=self.record_hz,
             progress=False,
         )
 
@@ -277,7 +284,7 @@ class EvaluationStation:
         self._donor: DonorPonder | None = None
         self._open = contextlib.ExitStack()
         daemons = self._open.enter_context(Daemons(options.out / "servers" / str(os.getpid())))
-        replaced = self._build_donor if options.cognition == "other-episode" else None
+        replaced = {"other-episode": self._build_donor, "stand-in": self._build_told}.get(options.cognition)
         station = open_station(sim, daemons, replaced, options.subgoal_text)
         self._open.callback(station.bus.close)
         self._suite = Suite(sim, station.link, station.clock, daemons.dead)
@@ -314,6 +321,15 @@ class EvaluationStation:
     def _build_donor(self, bus: Bus, robot: str, checkpoint: Path | None) -> Party:
         self._donor = DonorPonder(Link(bus, robot=robot, proc="ponder"))
         return self._donor.step
+
+    def _build_told(self, bus: Bus, robot: str, checkpoint: Path | None) -> Party:
+        pounce = self._options.pounce_checkpoint
+        assert pounce is not None  # the options said so
+        try:
+            shape = cognition_shape(pounce)
+        except ValueError as error:
+            raise EvaluationError(str(error)) from None
+        return ToldPonder(Link(bus, robot=robot, proc="ponder"), *shape).step
 
 
 def _workers(options: EvalOptions) -> Workers[Job, Line]:

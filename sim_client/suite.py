@@ -35,6 +35,7 @@ _OPEN_NS = 130_000_000_000
 _CLOSE_NS = 5_000_000_000
 _ASK_AGAIN_S = 0.2
 _LAST_TICKS_S = 1.0
+_CONTROL_HZ = 20
 
 OnTick = Callable[[int, int], None]
 """Called with (episode index, ticks played) as an episode goes on."""
@@ -199,9 +200,10 @@ class Suite:
         self._link.bus.wait(longest_ns)
 
     def _looks(self, tick: int) -> bool:
-        """Whether the pictures of a tick are wanted: by the log always, by the models when the schedule says so."""
+        """Whether the pictures of a tick are wanted: by the log, or by the models when the schedule says so."""
         conductor = self._clock.conductor if self._clock is not None else None
-        return self._options.record or conductor is None or conductor.will_look(tick)
+        is_logged = self._options.record and tick % (_CONTROL_HZ // self._options.record_hz) == 0
+        return is_logged or conductor is None or conductor.will_look(tick)
 
     def _await_last_ticks(self, outcome: Outcome) -> None:
         """Accounts of ticks travel behind their actions; the hash is over all of them."""

@@ -23,7 +23,7 @@ from tqdm import tqdm
 from ponderpounce.data.dart import DART, NoiseKind
 from ponderpounce.data.episode import Package, Rejection, unpack
 from ponderpounce.data.errors import DatasetError
-from ponderpounce.data.jobs import Job, Look, jobs_of
+from ponderpounce.data.jobs import RECOVERY_SHARE, Job, Look, jobs_of
 from ponderpounce.data.lerobot_v3 import COLLECTION_PATH, INFO_PATH, DatasetWriter
 from ponderpounce.data.rollout import UNSOLVED, work_out
 from ponderpounce.data.seeds import TRAIN_SEED
@@ -58,6 +58,8 @@ class CollectOptions:
     """Even; the paper's and the benchmark's is 256."""
     noise: NoiseKind = "none"
     """dart: nudge the executed joint targets off the oracle's way; `action` stays the way, the label."""
+    recovery_share: float = RECOVERY_SHARE
+    """Of the episodes, those with a grasp that closes too high or aside before it is made right."""
     max_steps: int = 1300
     """An episode that takes longer is not kept."""
     workers: int = os.cpu_count() or 1
@@ -74,6 +76,8 @@ class CollectOptions:
             raise DatasetError("--episodes and --workers must be at least 1")
         if self.image_px < 16 or self.image_px % 2:
             raise DatasetError(f"--image-px {self.image_px}: videos need an even number of at least 16")
+        if not 0 <= self.recovery_share <= 1:
+            raise DatasetError(f"--recovery-share {self.recovery_share} is not a share, in [0, 1]")
 
     @property
     def look(self) -> Look:
@@ -88,8 +92,16 @@ class CollectOptions:
     def jobs(self) -> list[Job]:
         """Everything that is to be collected, in the dataset's order."""
         num_episodes = self.episodes * SCALES[self.scale]
-        common = {"image_px": self.image_px, "max_steps": self.max_steps}
-        return list(jobs_of(self.task_names(), num_episodes, look=self.look, noise=self.noise, **common))
+        jobs = jobs_of(
+            self.task_names(),
+            num_episodes,
+            image_px=self.image_px,
+            max_steps=self.max_steps,
+            look=self.look,
+            noise=self.noise,
+            recovery_share=self.recovery_share,
+        )
+        return list(jobs)
 
     def settings(self) -> dict[str, Any]:
         """What all episodes of one dataset have in common; how many there are and who made them is not part of it."""
@@ -101,6 +113,8 @@ class CollectOptions:
             "look": asdict(self.look),
             "versions": versions,
         }
+        if self.recovery_share != RECOVERY_SHARE:
+            settings["recovery_share"] = self.recovery_share
         return settings if self.noise == "none" else {**settings, "noise": DART.settings()}
 
 

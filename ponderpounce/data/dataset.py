@@ -55,7 +55,6 @@ class Dataset:
         if self.described["codebase_version"] != v3.VERSION or "num_demonstration_rows" not in listed.column_names:
             raise DatasetError(f"{root} is a dataset of {self.described['codebase_version']}, but not one of ours")
         self.image_px: int = self.described["features"][v3.video_key("front")]["shape"][0]
-        self.execution_hz = _execution_hz(root)
         wanted = [name for name in listed.column_names if not name.startswith("stats/")]
         self._listed = listed.select(wanted).to_pylist()
         self.episodes = tuple(map(_entry, self._listed))
@@ -84,12 +83,6 @@ class Dataset:
         )
         begin = round(listed[f"videos/{key}/from_timestamp"] * FPS)
         return np.stack(list(read_frames(self.root / path, [begin + row for row in rows])))
-
-
-def _execution_hz(root: Path) -> int:
-    """How often pictures were taken while the robot acted: rows between repeat the one before."""
-    path = root / v3.COLLECTION_PATH
-    return int(json.loads(path.read_text())["settings"]["look"]["execution_hz"]) if path.exists() else FPS
 
 
 def _entry(listed: dict[str, Any]) -> Entry:

@@ -166,9 +166,15 @@ def _said(subgoals: Sequence[m.Subgoal], num_ticks: int) -> list[tuple[str, str,
 
 
 def _pictures(path: Path, observations: Sequence[m.Observation]) -> Iterator[dict[str, Frame]]:
-    """Each observation's pictures: the exact pixels where the log has them, else what its cameras' channels hold."""
+    """Each observation's pictures: the exact pixels where the log has them, else what its cameras' channels hold.
+
+    None at ticks that nobody looked at (`--record-hz`).
+    """
     logged = read_pictures(path)
     for observation in observations:
+        if not observation.images and observation is not observations[0]:
+            yield {}
+            continue
         exact = {each.camera: images.unpack(each) for each in observation.images if each.codec == m.ImageCodec.RAW}
         if set(exact) == set(CAMERAS):
             yield exact

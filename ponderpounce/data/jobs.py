@@ -1,8 +1,9 @@
 """What is to be collected: one job per kept episode, each with its own row of seeds.
 
 Jobs know nothing of each other, so any number of workers in any order make the same set: a job tries its seeds in turn
-until the oracle solves one. As in RoboMME two of four episodes are easy, one is medium and one hard, and of every
-hundred episodes three begin with a grasp that closes too high and three with one that closes aside.
+until the oracle solves one. As in RoboMME two of four episodes are easy, one is medium and one hard, and unless told
+otherwise three of every hundred have a grasp that closes too high before it is made right, and three one that closes
+aside.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from ponderpounce.tasks.oracle import FailedGrasp
 
 ATTEMPTS = 100
 DIFFICULTY_CYCLE = ("easy", "easy", "medium", "hard")
-_RECOVERY_CYCLE: tuple[Recovery, ...] = ("z",) * 3 + ("xy",) * 3 + ("none",) * 94
+RECOVERY_SHARE = 0.06  # upstream's
+_RECOVERY_CYCLE = 100
 _RECOVERY_STREAM = 1  # of a seed's random numbers; the scene draws from another
 _ASIDE = tuple((x, y, 0) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y)
 
@@ -44,6 +46,7 @@ class Job:
     max_steps: int
     look: Look
     noise: NoiseKind = "none"
+    recovery_share: float = RECOVERY_SHARE
 
     @property
     def key(self) -> str:
@@ -56,7 +59,9 @@ class Job:
 
     @property
     def recovery(self) -> Recovery:
-        return _RECOVERY_CYCLE[self.slot % len(_RECOVERY_CYCLE)]
+        num_each = round(self.recovery_share * _RECOVERY_CYCLE / 2)
+        place = self.slot % _RECOVERY_CYCLE
+        return "z" if place < num_each else "xy" if place < 2 * num_each else "none"
 
     def seed(self, attempt: int) -> int:
         """The scene's seed of an attempt from 0 to 99; no two jobs of a task share one."""
@@ -64,12 +69,27 @@ class Job:
 
 
 def jobs_of(
-    tasks: Sequence[str], num_episodes: int, *, image_px: int, max_steps: int, look: Look, noise: NoiseKind = "none"
+    tasks: Sequence[str],
+    num_episodes: int,
+    *,
+    image_px: int,
+    max_steps: int,
+    look: Look,
+    noise: NoiseKind = "none",
+    recovery_share: float = RECOVERY_SHARE,
 ) -> Iterator[Job]:
     """Yields the jobs task by task, in the order their episodes have in the dataset."""
     for task in tasks:
         for slot in range(num_episodes):
-            yield Job(task=task, slot=slot, image_px=image_px, max_steps=max_steps, look=look, noise=noise)
+            yield Job(
+                task=task,
+                slot=slot,
+                image_px=image_px,
+                max_steps=max_steps,
+                look=look,
+                noise=noise,
+                recovery_share=recovery_share,
+            )
 
 
 def failed_grasp(recovery: Recovery, seed: int, num_grasps: int) -> FailedGrasp | None:

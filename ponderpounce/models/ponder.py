@@ -69,7 +69,7 @@ class Ponder(nn.Module):
         self.is_random = True
         """The carriers were never trained: cognition is noise. A trainer sets it False, checkpoints keep it."""
         self.mtp: dict[str, Tensor] = {}
-        """The checkpoint's multi-token prediction block, by name. It is not run, and written back as it came."""
+        """The checkpoint's multi-token prediction block, by name: a draft for serving, and written back as it came."""
         qwen: Any = skeleton(qwen_config).to(dtype=dtype)
         for name, parameter in qwen.named_parameters():
             if name.endswith(FLOAT32_PARAMETERS):

@@ -139,7 +139,7 @@ def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_S
 
 
 def weights_hash(ponder: Ponder) -> str:
-    """12 hex digits of sha256 over the name, dtype, shape and bytes of every tensor that is run: provenance.
+    """12 hex digits of sha256 over the name, dtype, shape and bytes of every tensor that answers depend on: provenance.
 
     Reads every weight once, which takes seconds per ten gigabytes: compute it when a network is loaded.
     """

@@ -85,9 +85,12 @@ def collate_pounce(
     public data path; its mixer attends to the pads, which serving, one moment at a time, never has.
 
     Raises:
-        ValueError: a prompt is longer than ``max_prompt_tokens``, or the tokenizer is another family's.
+        ValueError: a prompt is longer than ``max_prompt_tokens``, the tokenizer is another family's, or all episodes
+            are watched ones.
     """
     moments = [_Asked(index=n, example=e, invocation=i) for n, e in enumerate(examples) for i in e.invocations]
+    if not moments:
+        raise ValueError("no episode of this share of the batch is to be imitated: lower --watch-share")
     inputs: PounceInputs | GrootInputs
     if isinstance(config, PounceConfig) and isinstance(tokenizer, Tokenizer):
         inputs = joined_pi05([pi05_inputs(moment, config, tokenizer, statistics, _CPU) for moment in moments])

@@ -50,63 +50,90 @@ class Sight:
         return () if self.pounce_px is None else tuple(resized(view, self.pounce_px) for view in views)
 
 
-class TrainingSet:
-    """Episodes by number. ``pp-collect`` and ``pp-export`` make the folder.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Source:
+    """Where an episode lies."""
 
-    Where the dataset holds only some pictures (``--frames training``), a tick without its own has the one before it,
+    dataset: Dataset
+    entry: Entry
+    is_watched: bool
+
+    def rows(self) -> Rows:
+        return self.dataset.rows(self.entry.index)
+
+
+class TrainingSet:
+    """Episodes by number. ``pp-collect`` and ``pp-export`` make the folders.
+
+    Where a dataset holds only some pictures (``--frames training``), a tick without its own has the one before it,
     as in the video.
     """
 
     def __init__(
-        self, root: Path, *, tasks: Sequence[str] = (), sight: Sight | None = None, cache_mb: int = 4000
+        self,
+        root: Path,
+        *,
+        watched: Sequence[Path] = (),
+        tasks: Sequence[str] = (),
+        sight: Sight | None = None,
+        cache_mb: int = 4000,
     ) -> None:
         """Reads the episodes of ``tasks``, or all; their pictures whole, or as ``sight`` says.
 
+        Args:
+            root: episodes to imitate; those that did not succeed are left out.
+            watched: folders of episodes that come after them, to be looked at only (`TrainingEpisode.is_watched`).
+            tasks: those to read; () for all.
+            sight: see its class.
+            cache_mb: of pictures that are kept.
+
         Raises:
-            DatasetError: the folder holds no dataset of ours.
-            ValueError: no episode of these tasks is in it.
+            DatasetError: a folder holds no dataset of ours.
+            ValueError: no episode of these tasks is in a folder, or the folders' pictures differ in size.
         """
-        self._dataset = Dataset(root)
         self._sight = sight
-        entries = self._dataset.episodes
-        self._entries = [e for e in entries if e.is_success and (not tasks or e.task in tasks)]
-        if not self._entries:
-            there = ", ".join(sorted({e.task for e in entries}))
-            raise ValueError(f"{root} has no successful episode of {', '.join(tasks) or 'any task'}; it has {there}")
-        self.image_px = self._dataset.image_px
-        self._look_every = FPS // self._dataset.execution_hz
+        self._sources = _sources(Dataset(root), tasks, is_watched=False)
+        self.num_imitated = len(self._sources)
+        for folder in watched:
+            self._sources += _sources(Dataset(folder), tasks, is_watched=True)
+        sizes = {source.dataset.image_px for source in self._sources}
+        if len(sizes) > 1:
+            folders = ", ".join(map(str, (root, *watched)))
+            raise ValueError(f"pictures of {sorted(sizes)} px in {folders}; collect all at one --image-px")
+        (self.image_px,) = sizes
         self._cache: OrderedDict[int, TrainingEpisode] = OrderedDict()
         self._cache_bytes = cache_mb * 1_000_000
         self._cached_bytes = 0
 
     def __len__(self) -> int:
-        return len(self._entries)
+        return len(self._sources)
 
     @property
     def hash(self) -> str:
         """16 hex digits over which episodes these are and what was done in them."""
         digest = hashlib.blake2b(digest_size=8)
-        for entry in self._entries:
+        for source in self._sources:
+            entry = source.entry
             digest.update(f"{entry.task} {entry.seed} {entry.instruction}".encode())
-            digest.update(self._dataset.rows(entry.index).action.tobytes())
+            digest.update(source.rows().action.tobytes())
         return digest.hexdigest()
 
     @property
     def names(self) -> list[tuple[str, int]]:
         """Task and seed of every episode, in order."""
-        return [(entry.task, entry.seed) for entry in self._entries]
+        return [(source.entry.task, source.entry.seed) for source in self._sources]
 
     def instructions(self) -> list[str]:
         """Every instruction once, in order."""
-        return sorted({entry.instruction for entry in self._entries})
+        return sorted({source.entry.instruction for source in self._sources})
 
     def texts(self) -> list[str]:
         """All that PONDER reads or says in these episodes, each text once, in order."""
         found = set()
-        for entry in self._entries:
-            rows = self._dataset.rows(entry.index)
+        for source in self._sources:
+            rows = source.rows()
             said = {*rows.grounded_subgoal, *rows.demonstration_reasoning} - {""}
-            found |= {entry.instruction, *(normalised_text(text) for text in said)}
+            found |= {source.entry.instruction, *(normalised_text(text) for text in said)}
         return sorted(found)
 
     def __getitem__(self, number: int) -> TrainingEpisode:
@@ -122,12 +149,12 @@ class TrainingSet:
         return episode
 
     def _read(self, number: int) -> TrainingEpisode:
-        entry = self._entries[number]
-        rows = self._dataset.rows(entry.index)
+        source = self._sources[number]
+        entry, rows = source.entry, source.rows()
         start = entry.num_demonstration_rows
         shown = [*range(0, start, FPS), *range(start, entry.num_rows)]
         num_shown = len(range(0, start, FPS))
-        views, sights = self._pictures(entry, shown)
+        views, sights = self._pictures(source, rows.is_rendered, shown)
         return TrainingEpisode(
             instruction=entry.instruction,
             demo=tuple((views if sights is None else sights)[:num_shown]),
@@ -138,20 +165,23 @@ class TrainingSet:
             subgoals=rows.grounded_subgoal[start:],
             is_transition_T=rows.is_transition[start:],
             reasoning=rows.demonstration_reasoning[start],
+            is_watched=source.is_watched,
         )
 
     def _pictures(
-        self, entry: Entry, shown: Sequence[int]
+        self, source: _Source, is_rendered: NDArray[np.bool_], shown: Sequence[int]
     ) -> tuple[list[tuple[Frame, ...]], list[tuple[Frame, ...]] | None]:
         """POUNCE's views of the rows, and PONDER's where they are other ones."""
         sight = self._sight
         if sight is not None and sight.form is None and sight.pounce_px is None:
             return [()] * len(shown), [()] * len(shown)
-        taken = [row - self._late(row, entry) for row in shown]
+        own = np.maximum.accumulate(np.where(is_rendered, np.arange(len(is_rendered)), 0))
+        taken = [int(own[row]) for row in shown]  # rows between two looks repeat the one before
         once = sorted(set(taken))
         wanted = CAMERAS if sight is None else [c for n, c in enumerate(CAMERAS) if sight.needs(n)]
         pictures = {
-            camera: dict(zip(once, self._dataset.frames(entry.index, camera, once), strict=True)) for camera in wanted
+            camera: dict(zip(once, source.dataset.frames(source.entry.index, camera, once), strict=True))
+            for camera in wanted
         }
         whole = {row: tuple(pictures[camera][row] for camera in wanted) for row in once}
         if sight is None:
@@ -160,20 +190,15 @@ class TrainingSet:
         sights = {row: sight.of_ponder(whole[row]) for row in once}
         return [views[row] for row in taken], [sights[row] for row in taken]
 
-    def _late(self, row: int, entry: Entry) -> int:
-        """How many rows before this one its picture was taken: those between two looks repeat the one before."""
-        step = row - entry.num_demonstration_rows
-        return step % self._look_every if step > 0 else 0
-
     def statistics(self, horizon: int, space: ActionSpace = "joint_delta", *, by_row: bool = False) -> RobotStatistics:
         """Quantiles of the states as the network reads them, and of the actions as it learns them in an `action_space`.
 
         All rows of a chunk are pooled, as the released RoboMME statistics are; ``by_row`` first brings every row to
-        the same spread (`RobotStatistics.reach`).
+        the same spread (`RobotStatistics.reach`). Of the episodes to imitate alone.
         """
         states, actions = [], []
-        for entry in self._entries:
-            rows = self._dataset.rows(entry.index)
+        for source in self._sources[: self.num_imitated]:
+            rows = source.rows()
             state, action = _own(rows, rows.state), _own(rows, rows.action)
             chunks_TND = actions_in(space, action, state, chunk_ticks(np.arange(len(action)), horizon, len(action)))
             states.append(states_in(space, state).astype(np.float32))
@@ -187,6 +212,15 @@ class TrainingSet:
             space=space,
             reach=tuple(reach_N.tolist()) if by_row else (),
         )
+
+
+def _sources(dataset: Dataset, tasks: Sequence[str], *, is_watched: bool) -> list[_Source]:
+    entries = [e for e in dataset.episodes if (is_watched or e.is_success) and (not tasks or e.task in tasks)]
+    if not entries:
+        there = ", ".join(sorted({e.task for e in dataset.episodes}))
+        kind = "" if is_watched else "successful "
+        raise ValueError(f"{dataset.root} has no {kind}episode of {', '.join(tasks) or 'any task'}; it has {there}")
+    return [_Source(dataset=dataset, entry=entry, is_watched=is_watched) for entry in entries]
 
 
 def _reach(moves_MND: NDArray[np.float32]) -> NDArray[np.float64]:

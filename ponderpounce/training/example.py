@@ -45,6 +45,8 @@ class TrainingEpisode:
     comes into sight."""
     reasoning: str = ""
     """What PONDER writes at the first transition after a demonstration; empty without one."""
+    is_watched: bool = False
+    """Somebody else's doing, good or bad: PONDER learns to follow it, POUNCE does not imitate it."""
     sights: Sequence[tuple[Frame, ...]] | None = None
     """T ticks of what PONDER's eyes make of the views, where ``frames`` are not the cameras' own; ``demo`` then is what
     they make of it, too."""
@@ -136,7 +138,7 @@ def make_example(
     """Draws a schedule and lays the episode out under it."""
     schedule = sample_schedule(rng, config.clocks, episode.num_ticks, transition_ticks=episode.transition_ticks)
     schedule = _shortened(schedule, config.max_queries)
-    count = min(config.max_invocations, len(schedule.invocations))
+    count = 0 if episode.is_watched else min(config.max_invocations, len(schedule.invocations))
     chosen = np.sort(rng.choice(len(schedule.invocations), size=count, replace=False))
     invocations = tuple(schedule.invocations[index] for index in chosen)
     is_grounded = config.is_grounded and rng.random() >= config.text_dropout

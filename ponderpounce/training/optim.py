@@ -1,4 +1,7 @@
-"""AdamW as the paper runs it: linear warm-up, then constant; joint gradient norm clipped; weights averaged."""
+"""AdamW as the paper runs it: linear warm-up, then constant; joint gradient norm clipped; weights averaged.
+
+Networks that learn from scratch may end with a falling rate, which the paper's do not need.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from torch import Tensor, nn
 from ponderpounce.training.parallel import local, whole
 from ponderpounce.training.shards import RowReader
 
+_LEAST_RATE = 0.02
 _EMA_MEMORY = 10  # the average of n steps goes back n / 10 of them at most
 
 
@@ -19,6 +23,8 @@ class OptimConfig:
 
     learning_rate: float = 2e-5
     warmup_steps: int = 100
+    decay: tuple[int, int] | None = None
+    """Between these two steps the rate falls in proportion, to a fiftieth; None: it stays."""
     betas: tuple[float, float] = (0.9, 0.95)
     eps: float = 1e-8
     weight_decay: float = 1e-10
@@ -31,11 +37,17 @@ class OptimConfig:
             raise ValueError("learning_rate and clip_norm must be above 0, warmup_steps at least 0")
         if not 0 <= self.ema_decay < 1:
             raise ValueError(f"ema_decay must be in [0, 1), came {self.ema_decay}")
+        if self.decay is not None and not 0 <= self.decay[0] < self.decay[1]:
+            raise ValueError(f"decay must be two steps in order, came {self.decay}")
 
 
 def learning_rate(config: OptimConfig, step: int) -> float:
     """Of the ``step``-th update, from 0: the first one already moves."""
-    return config.learning_rate * min(1.0, (step + 1) / max(1, config.warmup_steps))
+    rate = config.learning_rate * min(1.0, (step + 1) / max(1, config.warmup_steps))
+    if config.decay is None:
+        return rate
+    first, last = config.decay
+    return rate * min(1.0, max(_LEAST_RATE, (last - step) / (last - first)))
 
 
 class Optimiser:

@@ -21,7 +21,7 @@ from ponderpounce.training.trainer import TrainConfig
 
 _FROM_SCRATCH = OptimConfig(learning_rate=1e-3, warmup_steps=200, betas=(0.9, 0.95), weight_decay=1e-4, ema_decay=0.998)
 
-_BESIDE_THE_WAY = Nudge(std_m=0.03)
+_BESIDE_THE_WAY = Nudge(std_m=0.04)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -141,7 +141,8 @@ def tiny_subgoal_text() -> Recipe:
 def small() -> Curriculum:
     """Both architectures at about a million weights each, from scratch on CPU cores: see docs/training.md.
 
-    Where the paper starts from pretrained weights, three stages stand in for them. `motor` needs none of the others.
+    Where the paper starts from pretrained weights, four stages stand in for them: two of either system, so that two
+    cores can run them side by side. Episodes that are watched (`pp-train --watch`) are for `grounding` and `joint`.
     """
     looking = Recipe(
         name="small/looking",
@@ -156,7 +157,7 @@ def small() -> Curriculum:
             augmentation=Augmentation(max_shift_px=4, mirror=True),
         ),
         train=TrainConfig(seed=0, optim=_FROM_SCRATCH),
-        num_steps=4000,
+        num_steps=1800,
         batch_episodes=16,
         w2=1.0,
         w3=1.0,
@@ -170,29 +171,36 @@ def small() -> Curriculum:
         looking,
         name="small/grounding",
         example=replace(looking.example, text_dropout=0.2, max_queries=None),
-        num_steps=2000,
+        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, decay=(1100, 1600))),
+        num_steps=1600,
         batch_episodes=8,
     )
-    motor = replace(
+    reaching = replace(
         looking,
-        name="small/motor",
+        name="small/reaching",
         example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=16, nudge=_BESIDE_THE_WAY),
-        train=TrainConfig(seed=0, dropout=0.1, flow_samples=2, optim=replace(_FROM_SCRATCH, learning_rate=1e-3)),
+        train=TrainConfig(seed=0, dropout=0.1, flow_samples=2, optim=_FROM_SCRATCH),
         num_steps=6000,
         batch_episodes=8,
         w3=0.0,
         trains="pounce",
     )
+    motor = replace(
+        reaching,
+        name="small/motor",
+        train=replace(reaching.train, optim=replace(_FROM_SCRATCH, decay=(6000, 11000))),
+        num_steps=11000,
+    )
     joint = replace(
         grounding,
         name="small/joint",
         example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=16, nudge=_BESIDE_THE_WAY),
-        train=TrainConfig(seed=0, dropout=0.1, flow_samples=2, optim=replace(_FROM_SCRATCH, learning_rate=5e-4)),
-        num_steps=1000,
+        train=replace(reaching.train, optim=replace(_FROM_SCRATCH, learning_rate=3e-4, decay=(300, 600))),
+        num_steps=600,
         w3=0.0,
         trains="both",
     )
-    return Curriculum(name="small", stages=(looking, grounding, motor, joint))
+    return Curriculum(name="small", stages=(looking, reaching, motor, grounding, joint))
 
 
 RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {

@@ -18,12 +18,14 @@ import shutil
 import sys
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 import torch
 import tyro
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from ponderpounce.data.episode import CAMERAS
@@ -63,6 +65,10 @@ class TrainOptions:
     """A folder that pp-collect or pp-export made."""
     out: Path
     """Folder for checkpoints, log and the trained models."""
+    watch: tuple[Path, ...] = ()
+    """Further folders, of pp-export: what policies did, with the simulator's words. PONDER alone learns from them."""
+    watch_share: float = 0.5
+    """With --watch: how much of a batch is watched; one episode at least is not."""
     stage: str | None = None
     """Of a recipe with stages, only this one: stages that do not need each other can run side by side."""
     tasks: tuple[str, ...] = ()
@@ -101,16 +107,27 @@ class Batches:
     Each schedule follows from (seed, step, place in the batch), so the shares of N processes are the batch of one.
     """
 
-    def __init__(self, data: TrainingSet, run: Recipe, model: JointModel, bundle: PounceBundle, world: World) -> None:
-        """Raises ValueError if the batch has fewer episodes than there are processes."""
+    def __init__(
+        self,
+        data: TrainingSet,
+        run: Recipe,
+        model: JointModel,
+        bundle: PounceBundle,
+        world: World,
+        watch_share: float = 0.5,
+    ) -> None:
+        """Raises ValueError if the batch has fewer episodes than there are processes, or the share is none."""
+        if not 0 <= watch_share <= 1:
+            raise ValueError(f"--watch-share must be in [0, 1], came {watch_share}")
         self._data, self._run, self._model = data, run, model
+        self._watch_share = watch_share
         self._bundle, self._device = bundle, world.device
         self._places = world.share(run.batch_episodes)
 
     def __call__(self, step: int) -> tuple[PonderBatch, PounceBatch]:
         run, model, bundle = self._run, self._model, self._bundle
         chance = (run.train.seed, _EPISODE_STREAM, step)
-        numbers = np.random.default_rng(chance).integers(len(self._data), size=run.batch_episodes)
+        numbers = self._draw(np.random.default_rng(chance))
         examples = [
             make_example(
                 self._data[int(numbers[place])],
@@ -127,6 +144,15 @@ class Batches:
         )
         invocations = collate_pounce(examples, model.pounce.config, bundle.tokenizer, bundle.statistics)
         return episodes.to(self._device), invocations.to(self._device)
+
+    def _draw(self, rng: np.random.Generator) -> NDArray[np.integer]:
+        """Numbers of the batch's episodes; the last of them are watched ones."""
+        size, first = self._run.batch_episodes, self._data.num_imitated
+        numbers = rng.integers(first, size=size)
+        if first < len(self._data):
+            num_watched = min(round(self._watch_share * size), size - 1)
+            numbers[size - num_watched :] = rng.integers(first, len(self._data), size=num_watched)
+        return numbers
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -195,8 +221,14 @@ def _is_finished(out: Path) -> bool:
 def _train(run: Recipe, data: TrainingSet, options: TrainOptions, world: World) -> None:
     model, bundle = build(run, data, options)
     shard(model, world)
-    data = TrainingSet(options.data, tasks=options.tasks, sight=_sight(run, model), cache_mb=options.cache_mb)
-    batches = Batches(data, run, model, bundle, world)
+    data = TrainingSet(
+        options.data,
+        watched=options.watch if run.trains != "pounce" else (),
+        tasks=options.tasks,
+        sight=_sight(run, model),
+        cache_mb=options.cache_mb,
+    )
+    batches = Batches(data, run, model, bundle, world, options.watch_share)
     trainer = Trainer(model, batches, run.train, data_hash=data.hash, world=world)
     checkpoint = options.out / "checkpoint"
     options.out.mkdir(parents=True, exist_ok=True)
@@ -251,16 +283,16 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
     except ValueError as error:
         wanted_px = readable_sizes(ponder.format.eyes, ponder.image_px)[0][0]
         raise ValueError(f"{options.data}: {error}; collect with --image-px {wanted_px}") from None
-    statistics = data.statistics(run.pounce.horizon, run.space, by_row=run.statistics_by_row)
+    measured = partial(data.statistics, run.pounce.horizon, run.space, by_row=run.statistics_by_row)
     if options.pounce is None:
         is_own = run.has_own_tokenizers and isinstance(run.pounce, PounceConfig)
         tokenizer = tokenizer_of_instructions(data.instructions()) if is_own else None
-        bundle = random_bundle(run.pounce, seed, statistics=statistics, tokenizer=tokenizer)
+        bundle = random_bundle(run.pounce, seed, statistics=measured(), tokenizer=tokenizer)
         open_gates(bundle.model)
     else:
         bundle = load_bundle(options.pounce)
         if bundle.statistics == ROBOMME:  # a public folder; our own act in the measure that they were trained in
-            bundle = replace(bundle, statistics=statistics)
+            bundle = replace(bundle, statistics=measured())
     pounce = bundle.model.to(options.device)
     if type(pounce.config) is not type(run.pounce):
         raise ValueError(f"recipe {run.name} is of another action model than {options.pounce} holds")

@@ -32,6 +32,12 @@ def test_shares_are_the_benchmark_s() -> None:
     assert Counter(job.recovery for job in hundred) == {"none": 94, "z": 3, "xy": 3}
 
 
+def test_a_share_of_failed_grasps_is_split_evenly_and_over_all_difficulties() -> None:
+    jobs = list(jobs_of(("A",), 200, image_px=256, max_steps=1300, look=Look(), recovery_share=0.4))
+    assert Counter(job.recovery for job in jobs) == {"none": 120, "z": 40, "xy": 40}
+    assert Counter(job.difficulty for job in jobs if job.recovery == "z") == {"easy": 20, "medium": 10, "hard": 10}
+
+
 @given(st.sampled_from(["z", "xy"]), st.integers(0, 2**40), st.integers(1, 9))
 def test_one_of_the_grasps_fails_high_or_aside(recovery: str, seed: int, num_grasps: int) -> None:
     fails = failed_grasp(recovery, seed, num_grasps)

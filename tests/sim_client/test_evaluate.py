@@ -9,22 +9,27 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ponderpounce.analysis import tables
 from ponderpounce.analysis.results import read_results
+from ponderpounce.data.dataset import Dataset
+from ponderpounce.data.export import ExportOptions, export
 from ponderpounce.data.seeds import TRAIN_SEED
 from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
 from ponderpounce.models.pounce_checkpoint import random_bundle, save_bundle
 from ponderpounce.models.pounce_configs import tiny_cpu
+from ponderpounce.training.stand_in import stand_in
 from protocol import messages as m
 from protocol.mcap_log import read_log
 from sim_client import evaluate as module
 from sim_client.evaluate import EvalOptions, EvaluationError, EvaluationStation, Job, Line, evaluate, play
 from sim_client.ledger import LedgerError
 from sim_client.suite import run_seed
+from sim_client.told_cognition import cognition_shape
 
 TASKS, EPISODES, RUNS = ("PickXtimes", "StopCube"), 2, 2
 NUM_JOBS = len(TASKS) * EPISODES * RUNS
@@ -256,3 +261,46 @@ def test_a_worker_s_process_plays_what_this_one_does(tmp_path: Path) -> None:
     (line,) = json.loads((tmp_path / "a" / "results.json").read_text())["episodes"]
     (job,) = options(tmp_path / "b", tasks=("StopCube",), episodes=1, runs=1, max_steps=20).jobs()
     assert play(job) == line
+
+
+@pytest.mark.sim
+def test_the_hand_alone_is_told_the_task_s_own_subgoals_and_what_it_did_can_be_watched(tmp_path: Path) -> None:
+    save_bundle(random_bundle(tiny_cpu(num_carriers=2), seed=0), tmp_path / "pounce")
+    chosen = options(
+        tmp_path / "told", tasks=("PickHighlight",), runs=1, policy="servers", max_steps=65, record=True, record_hz=5,
+        cognition="stand-in", pounce_checkpoint=tmp_path / "pounce",
+    )  # fmt: skip
+    with contextlib.closing(EvaluationStation(chosen)) as station:
+        lines = [station.play(job) for job in chosen.jobs()[:2]]
+    paths = tuple(tmp_path / "told" / line["mcap"] for line in lines)
+    for path in paths:
+        record = read_log(path)
+        (text,) = {each.text for each in record.subgoals if each.kind == m.SubgoalKind.TASK_GROUNDED}
+        wanted = np.tile(stand_in(text, 64), (2, 1))
+        assert [cognition.is_transition for cognition in record.cognitions] == [True, False, False, False]
+        assert all(np.array_equal(cognition.vector, wanted) for cognition in record.cognitions)
+        looks = {stamp.tick for stamp in record.cognitions} | set(range(0, 66, 4))
+        assert {each.tick: len(each.images) for each in record.observations} == {k: 2 * (k in looks) for k in range(66)}
+    export(ExportOptions(files=paths, out=tmp_path / "set", progress=False))
+    assert {entry.origin for entry in Dataset(tmp_path / "set").episodes} == {"servers"}
+    rows = Dataset(tmp_path / "set").rows(1)
+    assert set(np.flatnonzero(rows.is_rendered)) == looks - {65}  # what was seen after the last action is left out
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({}, "is for a --pounce-checkpoint"),
+        ({"pounce_checkpoint": Path("nowhere"), "servers": "local"}, "use --servers in-process"),
+    ],
+)
+def test_stand_ins_where_they_mean_nothing_are_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(EvaluationError, match=message):
+        options(tmp_path, policy="servers", cognition="stand-in", **changes)
+
+
+def test_a_folder_that_says_nothing_of_cognition_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text('{"config": 3}')
+    for folder in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(ValueError, match="give a folder of pp-train"):
+            cognition_shape(folder)

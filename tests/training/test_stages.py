@@ -22,7 +22,7 @@ from ponderpounce.training.example import ExampleConfig, make_example, row_frame
 from ponderpounce.training.joint import Draws, JointModel
 from ponderpounce.training.parallel import World
 from ponderpounce.training.recipes import Curriculum, Recipe, stages_of
-from ponderpounce.training.train import TrainOptions, build
+from ponderpounce.training.train import Batches, TrainOptions, build
 from ponderpounce.training.trainer import Trainer
 
 PX, NUM_EPISODES, NUM_ROWS = 64, 2, 50
@@ -30,15 +30,18 @@ PX, NUM_EPISODES, NUM_ROWS = 64, 2, 50
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("stages") / "set"
+    return _dataset(tmp_path_factory.mktemp("stages") / "set", seeds=range(NUM_EPISODES))
+
+
+def _dataset(root: Path, *, seeds: range, is_success: bool = True) -> Path:
     writer = DatasetWriter(root)
-    for seed in range(NUM_EPISODES):
-        writer.add(unpack(_package(seed)))
+    for seed in seeds:
+        writer.add(unpack(_package(seed, is_success=is_success)))
     writer.finish()
     return root
 
 
-def _package(seed: int) -> dict[str, bytes]:
+def _package(seed: int, *, is_success: bool) -> dict[str, bytes]:
     rng = np.random.default_rng(seed)
     episode = EpisodeWriter(PX)
     for k in range(NUM_ROWS):
@@ -55,7 +58,7 @@ def _package(seed: int) -> dict[str, bytes]:
     return episode.pack(
         About(
             task="PickHighlight", instruction="press it", seed=seed, difficulty="easy", origin="oracle",
-            is_success=True, image_px=PX,
+            is_success=is_success, image_px=PX,
         )
     )  # fmt: skip
 
@@ -135,7 +138,7 @@ def test_all_stages_follow_each_other_and_the_last_is_what_is_served(folder: Pat
 
 def test_stages_run_apart_are_the_run_in_one_go(folder: Path, tmp_path: Path) -> None:
     train.train(options(folder, tmp_path / "together"))
-    for stage in ("motor", "looking", "grounding", "joint"):  # the first two need not wait for each other
+    for stage in ("reaching", "motor", "looking", "grounding", "joint"):  # neither system waits for the other
         train.train(options(folder, tmp_path / "apart", stage=stage))
     for system in ("ponder", "pounce"):
         one, other = (tmp_path / name / system / "model.safetensors" for name in ("together", "apart"))
@@ -143,7 +146,9 @@ def test_stages_run_apart_are_the_run_in_one_go(folder: Path, tmp_path: Path) ->
 
 
 def test_a_stage_that_does_not_exist_is_refused(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="has the stages looking, grounding, motor, joint; there is no 'driving'"):
+    with pytest.raises(
+        ValueError, match="has the stages looking, reaching, motor, grounding, joint; there is no 'driving'"
+    ):
         train.train(options(folder, tmp_path / "run", stage="driving"))
     with pytest.raises(ValueError, match="tiny has no stages"):
         train.train(options(folder, tmp_path / "run", recipe="tiny", stage="joint"))
@@ -210,3 +215,33 @@ def test_a_row_without_its_texts_keeps_its_queries(folder: Path, small: dict[str
     assert len(told.row().carrier_index) == len(untold.row().carrier_index)
     assert len(told.row().supervised_index) > len(untold.row().supervised_index)
     assert torch.equal(told.stand_ins(128), untold.stand_ins(128))
+
+
+def test_what_is_watched_teaches_ponder_alone(folder: Path, tmp_path: Path, small: dict[str, Recipe]) -> None:
+    """A failed episode of a policy: in PONDER's rows like any other, in POUNCE's invocations and statistics not."""
+    watched = _dataset(tmp_path / "watched", seeds=range(7, 10), is_success=False)
+    alone, both = TrainingSet(folder), TrainingSet(folder, watched=(watched,))
+    assert (alone.num_imitated, both.num_imitated, len(both)) == (NUM_EPISODES, NUM_EPISODES, NUM_EPISODES + 3)
+    assert [both[n].is_watched for n in range(len(both))] == [False] * NUM_EPISODES + [True] * 3
+    assert both.statistics(4) == alone.statistics(4)
+    assert both.hash != alone.hash
+    run = replace(small["joint"], batch_episodes=4)
+    model, bundle = build(run, both, options(folder, tmp_path))
+    for share, num_watched in ((0.0, 0), (0.5, 2), (1.0, 3)):
+        batches = Batches(both, run, model, bundle, World(), share)
+        for step in range(5):
+            episodes, invocations = batches(step)
+            assert episodes.num_episodes == 4
+            assert set(invocations.episode_I.tolist()) == set(range(4 - num_watched))
+
+
+def test_shares_that_are_none_and_batches_to_look_at_only_are_refused(
+    folder: Path, tmp_path: Path, small: dict[str, Recipe]
+) -> None:
+    both = TrainingSet(folder, watched=(_dataset(tmp_path / "watched", seeds=range(7, 8)),))
+    model, bundle = build(small["joint"], both, options(folder, tmp_path))
+    with pytest.raises(ValueError, match="--watch-share must be in"):
+        Batches(both, small["joint"], model, bundle, World(), 1.5)
+    second_of_two = Batches(both, small["joint"], model, bundle, World(rank=1, size=2), 0.5)
+    with pytest.raises(ValueError, match="lower --watch-share"):
+        second_of_two(0)

@@ -1,0 +1,94 @@
+"""A PONDER on a bus without a model: what a stand-in for it has in common, whatever it answers."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+from clock.membership import Membership
+from protocol import messages as m
+from protocol import topics
+from protocol.heartbeat import Heartbeat
+from protocol.link import Link, is_of_episode
+from protocol.process import host_clock_id
+from protocol.version import version
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answer:
+    """A cognition in the place of PONDER's."""
+
+    vector: m.Floats
+    """(K, H)."""
+    is_transition: bool
+    norm: float
+    is_fake: bool
+
+
+class PuppetPonder(ABC):
+    """``step`` answers what is asked and says whether anything was."""
+
+    def __init__(self, link: Link) -> None:
+        self.link = link
+        self._heartbeat = Heartbeat(link, version(), host_clock_id())
+        self._membership = Membership(link, self._heartbeat, self._open, self.end)
+        self._queries = link.subscribe(topics.QUERY)
+        self._heartbeat.set(state=m.ServingState.READY, progress=1.0)
+
+    @property
+    @abstractmethod
+    def model_hash(self) -> str:
+        """Says in every log whose vectors these were."""
+
+    @abstractmethod
+    def shape(self) -> tuple[int, int]:
+        """Returns (K, H) of the episode that is opened. Raises ValueError if there is nothing to answer with."""
+
+    @abstractmethod
+    def answer(self, query: m.Query) -> Answer:
+        """What PONDER would have to say now."""
+
+    @abstractmethod
+    def end(self) -> None:
+        """An episode is over, or about to begin."""
+
+    def step(self) -> bool:
+        self._heartbeat.beat()
+        worked = self._membership.step()
+        for query in self._queries.drain():
+            if is_of_episode(self.link, query.header):
+                self._publish(query, self.answer(query))
+                worked = True
+        return worked
+
+    def _publish(self, query: m.Query, answer: Answer) -> None:
+        now_ns = time.monotonic_ns()
+        cognition = m.Cognition(
+            query=query.query,
+            tick=query.tick,
+            source_ns=query.source_ns,
+            ready_ns=now_ns,
+            vector=answer.vector,
+            is_transition=answer.is_transition,
+            norm=answer.norm,
+            model_hash=self.model_hash,
+            is_fake=answer.is_fake,
+        )
+        self.link.publish(topics.COGNITION, cognition, at_ns=now_ns, clock_id=host_clock_id())
+
+    def _open(self, request: m.OpenRequest) -> m.Contract:
+        num_carriers, hidden_size = self.shape()
+        return m.Contract(
+            proc="ponder",
+            num_carriers=num_carriers,
+            hidden_size=hidden_size,
+            model_hash=self.model_hash,
+            is_fake=self.is_fake,
+            version=version(),
+        )
+
+    @property
+    def is_fake(self) -> bool:
+        """Whether nothing that was trained gives these vectors."""
+        return False

@@ -1,0 +1,62 @@
+"""PONDER's stand-in that knows the task: what does the hand alone make of perfect cognition?
+
+Every query is answered with the simulator's own subgoal of that instant, as the numbers that a POUNCE trained by itself
+has learned to act from (`ponderpounce.training.stand_in`, stage ``motor`` of the recipe ``small``). To any other POUNCE
+they mean nothing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+
+from ponderpounce.training.stand_in import stand_in
+from protocol import messages as m
+from protocol import topics
+from protocol.link import Link, is_of_episode
+from sim_client.puppet import Answer, PuppetPonder
+
+
+class ToldPonder(PuppetPonder):
+    """Answers with the stand-in of the task's newest grounded subgoal."""
+
+    def __init__(self, link: Link, num_carriers: int, hidden_size: int) -> None:
+        self._shape = num_carriers, hidden_size
+        self._subgoals = link.subscribe(topics.SUBGOAL)
+        self._text, self._answered = "", ""
+        super().__init__(link)
+
+    def answer(self, query: m.Query) -> Answer:
+        for subgoal in self._subgoals.drain():
+            if is_of_episode(self.link, subgoal.header) and subgoal.kind == m.SubgoalKind.TASK_GROUNDED:
+                self._text = subgoal.text
+        is_new, self._answered = self._text != self._answered, self._text
+        vector = np.repeat(stand_in(self._text, self._shape[1])[None], self._shape[0], axis=0)
+        return Answer(vector=vector, is_transition=is_new, norm=float(np.linalg.norm(vector)), is_fake=True)
+
+    def shape(self) -> tuple[int, int]:
+        return self._shape
+
+    def end(self) -> None:
+        self._text, self._answered = "", ""
+
+    @property
+    def model_hash(self) -> str:
+        return f"stand-in {hashlib.blake2b(repr(self._shape).encode(), digest_size=4).hexdigest()}"
+
+    @property
+    def is_fake(self) -> bool:
+        return True
+
+
+def cognition_shape(pounce: Path) -> tuple[int, int]:
+    """Returns (K, H) that a POUNCE folder reads. Raises ValueError if it is none of ours."""
+    path = pounce / "config.json"
+    try:
+        cognition = json.loads(path.read_text())["config"]["cognition"]
+        return int(cognition["num_carriers"]), int(cognition["cognition_size"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} does not say what cognition it reads ({error}); give a folder of pp-train") from None
