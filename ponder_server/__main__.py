@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 
 import tyro
@@ -14,6 +15,8 @@ from ponder_server.serve import PonderServer
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
 
+log = logging.getLogger(__name__)
+
 
 def build_engine(options: PonderOptions) -> BatchingEngine:
     """Loads or draws the model.
@@ -23,8 +26,9 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     """
     import torch  # here, so that --help and a mistyped option answer at once
 
-    from ponder_server.draft import NoDraft, TrieDraft
+    from ponder_server.draft import Draft, FirstOf, TrieDraft
     from ponder_server.engine import EngineConfig, QwenEngine
+    from ponder_server.mtp import MtpDraft
     from ponderpounce.models import ponder_configs
     from ponderpounce.models.ponder import Ponder
     from ponderpounce.models.ponder_checkpoint import load_ponder
@@ -32,6 +36,11 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     num_robots = 1 + len(options.other_robots)
     if options.max_sessions < num_robots:
         raise ValueError(f"{num_robots} robots need as many sessions: --max-sessions is {options.max_sessions}.")
+    if options.weights == "fp8":
+        raise ValueError(
+            "--weights fp8 needs a GPU's fp8 products, and this engine has no such path; take --weights int8 on a CPU, "
+            "--dtype bfloat16 on a GPU."
+        )
     torch.set_num_threads(NUM_TORCH_THREADS)
     dtype = {"float32": torch.float32, "bfloat16": torch.bfloat16}[options.dtype]
     if options.checkpoint is not None:
@@ -45,12 +54,19 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
         max_sessions=options.max_sessions,
         max_text_tokens=options.max_text_tokens,
         max_batch_rows=options.max_batch_rows,
+        weights=options.weights,
     )
-    draft: NoDraft | TrieDraft = NoDraft()
+    drafts: list[Draft] = []
     if options.draft_texts is not None:
         lines = options.draft_texts.read_text(encoding="utf-8").splitlines()
-        draft = TrieDraft(ponder.format.vocabulary.encode(line) for line in lines if line.strip())
-    return QwenEngine(ponder, config, draft)
+        drafts.append(TrieDraft(ponder.format.vocabulary.encode(line) for line in lines if line.strip()))
+    if options.draft_tokens and ponder.mtp:
+        drafts.append(MtpDraft(ponder, num_tokens=options.draft_tokens))
+    elif options.draft_tokens:
+        log.warning(
+            "--draft-tokens: these weights have no multi-token prediction (mtp.*); texts are written without it"
+        )
+    return QwenEngine(ponder, config, FirstOf(drafts))
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -42,3 +42,9 @@ class PonderOptions:
     """With other robots: from a query to its cognition when all ask at once; an episode that breaks it is refused."""
     draft_texts: Path | None = None
     """File of example texts, one a line: texts like them are written several tokens a forward."""
+    draft_tokens: int = 0
+    """Tokens that the checkpoint's multi-token prediction guesses at a time where the examples have no guess, 15 at
+    most. The texts stay the same ones."""
+    weights: Literal["float", "int8", "fp8"] = "float"
+    """int8: a quarter of the layers' memory on a CPU; the change of cognition is measured at start and told. fp8 is
+    refused."""

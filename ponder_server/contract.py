@@ -19,6 +19,8 @@ Frame: TypeAlias = npt.NDArray[np.uint8]
 
 Result = TypeVar("Result")
 
+WeightsName: TypeAlias = Literal["float", "int8"]
+
 Progress: TypeAlias = Callable[[], None]
 """Called between pieces of work, so that a heartbeat comes from the loop that works and not from a timer."""
 
@@ -57,7 +59,7 @@ class EngineSpec:
     """Frames per fire, always the same cameras in the same order, whatever is seen of them."""
     max_context_tokens: int
     model_hash: str
-    """12 hex digits over the weights."""
+    """12 hex digits over the weights, and how they were narrowed."""
     is_random: bool
     """The carriers were never trained: every cognition is noise, and reports must say so."""
     dtype: str
@@ -66,6 +68,9 @@ class EngineSpec:
     """What is seen of the frames."""
     session_bytes: int = 0
     """Memory of one session at its longest; that of all of them is allocated at start."""
+    weights: WeightsName = "float"
+    cognition_error: float = 0.0
+    """Relative L2 change of C that ``weights`` cost, after one and the same short context (the warm-up's)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -8,6 +8,8 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Protocol
 
+from torch import Tensor, nn
+
 MAX_SUFFIX = 8
 """Tokens of the past that a guess looks at."""
 MIN_SUFFIX = 2
@@ -20,15 +22,36 @@ _BEGINNING = -1
 class Draft(Protocol):
     """Must depend on its arguments alone: it decides which tokens share a forward, and with it the last bits."""
 
-    def propose(self, written: Sequence[int], max_tokens: int) -> tuple[int, ...]:
-        """At most ``max_tokens`` tokens that may follow those ``written`` since the text began."""
+    parts: Sequence[nn.Module]
+    """Run one after another for a proposal, so that it can be heard (``audible``)."""
+
+    def propose(self, written: Sequence[int], max_tokens: int, hidden_TH: Tensor | None = None) -> tuple[int, ...]:
+        """At most ``max_tokens`` tokens that may follow those ``written`` since the text began.
+
+        Tokens of text only, none that ends it. ``hidden_TH``: the network's hidden state before each of those written,
+        for a draft that reads it.
+        """
 
 
 class NoDraft:
     """Plain greedy decoding."""
 
-    def propose(self, written: Sequence[int], max_tokens: int) -> tuple[int, ...]:
+    parts: Sequence[nn.Module] = ()
+
+    def propose(self, written: Sequence[int], max_tokens: int, hidden_TH: Tensor | None = None) -> tuple[int, ...]:
         return ()
+
+
+class FirstOf:
+    """Asks one draft after another until one has a guess."""
+
+    def __init__(self, drafts: Sequence[Draft]) -> None:
+        self._drafts = drafts
+        self.parts: Sequence[nn.Module] = [part for draft in drafts for part in draft.parts]
+
+    def propose(self, written: Sequence[int], max_tokens: int, hidden_TH: Tensor | None = None) -> tuple[int, ...]:
+        proposals = (draft.propose(written, max_tokens, hidden_TH) for draft in self._drafts)
+        return next((guesses for guesses in proposals if guesses), ())
 
 
 class TrieDraft:
@@ -37,6 +60,8 @@ class TrieDraft:
     A trie over every run of up to ``MAX_SUFFIX`` tokens in the examples, so that a text that left its template at a
     number or a colour is recognised again two tokens later.
     """
+
+    parts: Sequence[nn.Module] = ()
 
     def __init__(self, examples: Iterable[Sequence[int]]) -> None:
         counts: dict[tuple[int, ...], Counter[int]] = {}
@@ -52,7 +77,7 @@ class TrieDraft:
             if is_ground and count >= MIN_CONFIDENCE * followers.total():
                 self._next[suffix] = token
 
-    def propose(self, written: Sequence[int], max_tokens: int) -> tuple[int, ...]:
+    def propose(self, written: Sequence[int], max_tokens: int, hidden_TH: Tensor | None = None) -> tuple[int, ...]:
         tokens = [_BEGINNING, *written]
         first_guess = len(tokens)
         while len(tokens) < first_guess + max_tokens:

@@ -13,7 +13,7 @@ a session.
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate
 
 import numpy as np
@@ -33,9 +33,11 @@ from ponder_server.contract import (
     Progress,
     SessionError,
     Text,
+    WeightsName,
     no_progress,
 )
 from ponder_server.draft import Draft, NoDraft
+from ponder_server.int8 import quantise
 from ponder_server.prefixes import Prefixes
 from ponder_server.runner import BUCKETS, NUM_SAVED_STATES, Append, Runner, Session
 from ponder_server.slots import slot_size
@@ -46,6 +48,7 @@ from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import weights_hash
 
 WARM_UP_SESSION = "warm-up"
+WARM_UP_OPENING = Opening(instruction="warm up")
 NUM_UNMEASURED_FIRES = 5
 NUM_MEASURED_FIRES = 30
 
@@ -72,6 +75,8 @@ class EngineConfig:
     """Demonstrations kept encoded for further episodes that begin with the same one."""
     buckets: tuple[int, ...] = BUCKETS
     """Lengths that a forward's rows are padded to, growing."""
+    weights: WeightsName = "float"
+    """int8: a quarter of the layers' memory, on a CPU; the change of cognition is measured when the engine is built."""
 
     def __post_init__(self) -> None:
         for name in self.__slots__:
@@ -109,6 +114,13 @@ class QwenEngine:
     """A ``BatchingEngine`` on one device, one call at a time."""
 
     def __init__(self, ponder: Ponder, config: EngineConfig, draft: Draft | None = None) -> None:
+        """Takes over ``ponder``, whose layers are replaced if ``config.weights`` says so.
+
+        Raises ValueError if the sessions do not fit in memory, if the cameras are not those that the network was made
+        for, or for int8 weights elsewhere than on a CPU.
+        """
+        if config.weights == "int8" and ponder.device.type != "cpu":
+            raise ValueError("int8 weights are for a CPU; leave --weights out, and take --dtype bfloat16.")
         self._ponder = ponder
         self._config = config
         self._format = ponder.format
@@ -143,12 +155,19 @@ class QwenEngine:
             session_bytes=session_bytes,
         )
         model = ponder.qwen.model
-        self._parts = [layer.mlp for layer in (*model.visual.blocks, *model.language_model.layers)]
-        self._writer = TransitionWriter(ponder, draft or NoDraft(), max_text_tokens=config.max_text_tokens)
+        draft = draft or NoDraft()
+        self._parts = [*(layer.mlp for layer in (*model.visual.blocks, *model.language_model.layers)), *draft.parts]
+        self._writer = TransitionWriter(ponder, draft, max_text_tokens=config.max_text_tokens)
         self._query_ids = (*self._format.observation(config.num_cameras).ids, *self._format.carrier_ids)
         self._prefixes = Prefixes(config.max_prefixes)
         self._begun: dict[str, _Query] = {}
         self._batch: Batch[Fire] = Batch(self._runner, max_rows=config.max_batch_rows)
+        if config.weights == "int8":
+            exact_KH = self._example_cognition()
+            quantise(ponder)
+            change = float((self._example_cognition() - exact_KH).norm() / exact_KH.norm())
+            hash_ = f"{self._spec.model_hash}-int8"
+            self._spec = replace(self._spec, weights="int8", model_hash=hash_, cognition_error=change)
 
     @property
     def spec(self) -> EngineSpec:
@@ -320,12 +339,8 @@ class QwenEngine:
     @torch.inference_mode()
     def warm_up(self) -> list[int]:
         """Durations in ns of cognition-only fires at one and the same short context, results on the host."""
-        height, width = self._frame_px
-        noise = np.random.default_rng(0)
-        frames = tuple(
-            noise.integers(0, 256, (height, width, 3), dtype=np.uint8) for _ in range(self._config.num_cameras)
-        )
-        self.open(WARM_UP_SESSION, Opening(instruction="warm up"))
+        frames = self._warm_up_frames()
+        self.open(WARM_UP_SESSION, WARM_UP_OPENING)
         try:
             context = self._episode(WARM_UP_SESSION).context
             opened = context.save()
@@ -339,6 +354,23 @@ class QwenEngine:
         finally:
             self.close(WARM_UP_SESSION)
         return durations_ns[NUM_UNMEASURED_FIRES:]
+
+    def _warm_up_frames(self) -> tuple[Frame, ...]:
+        noise = np.random.default_rng(0)
+        shape = (*self._frame_px, 3)
+        return tuple(noise.integers(0, 256, shape, dtype=np.uint8) for _ in range(self._config.num_cameras))
+
+    @torch.inference_mode()
+    def _example_cognition(self) -> Tensor:
+        """C (K, H) after the warm-up's context and one observation, as if T_t were T_no: always the same tokens."""
+        pictures = self._see(self._warm_up_frames(), "warm-up")
+        self.open(WARM_UP_SESSION, WARM_UP_OPENING)
+        try:
+            embeds_TH = self._embed(self._query_ids, [*pictures])
+            context = self._episode(WARM_UP_SESSION).context
+            return context.append(self._query_ids, embeds_TH, num_wanted=self._format.num_carriers).float()
+        finally:
+            self.close(WARM_UP_SESSION)
 
     def _episode(self, session: str) -> _Episode:
         episode = self._episodes.get(session)

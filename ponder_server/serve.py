@@ -38,13 +38,18 @@ class PonderServer:
         """Measures the engine before anybody relies on it; the first fires of a process are no measure."""
         self._heartbeat.set(state=m.ServingState.WARMING)
         durations_ns = self._engine.warm_up()
+        spec = self._engine.spec
         self._heartbeat.set(
             infer_p50_ns=percentile_ns(durations_ns, 50),
             infer_p99_ns=percentile_ns(durations_ns, 99),
-            model_hash=self._engine.spec.model_hash,
-            is_fake=self._engine.spec.is_random,
+            model_hash=spec.model_hash,
+            is_fake=spec.is_random,
             progress=1.0,
         )
+        if spec.weights != "float":
+            told = f"{spec.weights} weights: relative L2 change of cognition {spec.cognition_error:.1e} at start"
+            self._heartbeat.set(detail=told)
+            log.info("%s", told)
 
     def ready(self) -> None:
         """Joins a running episode, if there is one, and only then says that it is ready."""

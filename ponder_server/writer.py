@@ -25,6 +25,15 @@ MAX_CHECKED_TOKENS = 16
 """Tokens of one forward while text is decoded: the bucket beyond a single token."""
 
 
+def sayable(ponder: Ponder) -> Tensor:
+    """Which tokens may be part of a text, (V) bool: no control tokens, carriers or unused rows."""
+    vocabulary = ponder.format.vocabulary
+    is_text_V = torch.zeros(ponder.vocab_size, dtype=torch.bool)
+    is_text_V[: vocabulary.num_tokens] = True
+    is_text_V[list(vocabulary.control_ids)] = False
+    return is_text_V.to(ponder.device)
+
+
 class TransitionWriter:
     """Appends O_t and [T_yes, S], or [T_yes, DR, T_yes, S], and always leaves room for the carriers.
 
@@ -40,12 +49,9 @@ class TransitionWriter:
         v = ponder.format.vocabulary
         self._t_yes = v.t_yes
         self._ends = frozenset({v.t_yes, v.t_no, v.end_of_text, v.im_end})
-        is_text_V = torch.zeros(ponder.vocab_size, dtype=torch.bool)
-        is_text_V[: v.num_tokens] = True
-        is_text_V[list(v.control_ids)] = False
-        may_end_V = is_text_V.clone()
-        may_end_V[list(self._ends)] = True
-        self._is_text_V, self._may_end_V = is_text_V.to(ponder.device), may_end_V.to(ponder.device)
+        self._is_text_V = sayable(ponder)
+        self._may_end_V = self._is_text_V.clone()
+        self._may_end_V[list(self._ends)] = True
 
     def write(
         self,
@@ -106,6 +112,7 @@ class TransitionWriter:
         """
         sayable_V = self._may_end_V if exactly is None else self._is_text_V
         ids: list[int] = []
+        hidden_before = [hidden_NH]  # each token of the text, and the next one
         pending: list[int] = []
         end: int | None = None
         (token,) = self._greedy(hidden_NH, sayable_V)
@@ -118,12 +125,13 @@ class TransitionWriter:
             ids.append(token)
             pending.append(token)
             room = min(limit - len(ids), MAX_CHECKED_TOKENS - len(pending))
-            draft = self._draft.propose(ids, room) if room > 0 else ()
+            draft = self._draft.propose(ids, room, torch.cat(hidden_before)) if room > 0 else ()
             before_draft = context.save(context.before_draft) if draft else None
             hidden_NH = yield self._append(context, [*pending, *draft], num_wanted=1 + len(draft))
             said = self._greedy(hidden_NH, sayable_V)
             num_right = next((i for i, guess in enumerate(draft) if guess != said[i]), len(draft))
             ids += draft[:num_right]
+            hidden_before.append(hidden_NH[: num_right + 1])
             token = said[num_right]
             if before_draft is not None and num_right < len(draft):
                 context.restore(before_draft)

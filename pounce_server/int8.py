@@ -1,48 +1,12 @@
-"""Weight-only int8: a quarter of the memory, for CPUs; the products themselves stay floating.
+"""Which of POUNCE's matrices are int8: the streams'. Embeddings, norms, small projections stay, as in `precision`."""
 
-Each output row has its own scale, its largest weight / 127. Weights are widened as a layer is called, which costs about
-what reading them as floats would. Embeddings, norms and the small projections stay as they are, as in `precision`.
-"""
-
-# O output rows, I input columns
-
-import torch
-import torch.nn.functional as F
-from torch import Tensor, nn
-
+from ponderpounce.models.int8 import quantise_where
 from ponderpounce.models.pounce_family import AnyPounce
 from pounce_server.precision import is_of_a_stream
 
-_MOST = 127
 _KEPT = "groot.dit.proj_out_2.weight"  # tells GR00T's action stream in which type it runs
-
-
-class Int8Linear(nn.Module):
-    """`nn.Linear` over int8 weights."""
-
-    weight_OI: Tensor
-    scale_O: Tensor
-
-    def __init__(self, linear: nn.Linear) -> None:
-        super().__init__()
-        exact_OI = linear.weight.detach().float()
-        scale_O = exact_OI.abs().amax(dim=1).clamp(min=torch.finfo(torch.float32).tiny) / _MOST
-        self.register_buffer("weight_OI", (exact_OI / scale_O[:, None]).round().to(torch.int8))
-        self.register_buffer("scale_O", scale_O)
-        self.bias = linear.bias
-
-    def forward(self, x: Tensor) -> Tensor:
-        out = F.linear(x, self.weight_OI.to(x.dtype)) * self.scale_O.to(x.dtype)
-        return out if self.bias is None else out + self.bias.to(x.dtype)
 
 
 def quantise(model: AnyPounce) -> int:
     """Replaces the streams' matrices in place; returns how many bytes that saved."""
-    saved = 0
-    for name, module in list(model.named_modules()):
-        for child_name, child in list(module.named_children()):
-            path = f"{name}.{child_name}.weight"
-            if type(child) is nn.Linear and is_of_a_stream(path) and path != _KEPT:
-                saved += child.weight.numel() * (child.weight.element_size() - 1)
-                setattr(module, child_name, Int8Linear(child))
-    return saved
+    return quantise_where(model, lambda name: is_of_a_stream(name) and name != _KEPT)
