@@ -10,7 +10,7 @@ export MUJOCO_GL ?= egl
 export OMP_NUM_THREADS ?= 1
 
 # `make help` lists the rest.
-.PHONY: help setup demo test unit accept lint types proto bench clean
+.PHONY: help setup demo policy test unit accept lint types proto bench clean
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
 
@@ -48,6 +48,10 @@ demo: setup
 	$(BIN)/pp-check $$(find out/demo -name '*.mcap')
 	$(BIN)/pp-replay $$(find out/demo/realtime -name '*.mcap') --save out/demo/realtime.rrd
 	@echo "Watch one: $(BIN)/pp-replay $$(find out/demo/lockstep -name '*.mcap' | head -1)"
+
+## make policy  train the demo's policy again from nothing, on two cores, and measure it; goes on after a kill
+policy: setup
+	BIN=$(BIN) checkpoints/small/train.sh out/small
 
 ## make test    everything that needs no GPU; make unit: without processes and long runs
 test: setup
