@@ -368,7 +368,8 @@ class QwenEngine:
         try:
             embeds_TH = self._embed(self._query_ids, [*pictures])
             context = self._episode(WARM_UP_SESSION).context
-            return context.append(self._query_ids, embeds_TH, num_wanted=self._format.num_carriers).float()
+            hidden_NH = context.append(self._query_ids, embeds_TH, num_wanted=1 + self._format.num_carriers)
+            return hidden_NH[1:].float()
         finally:
             self.close(WARM_UP_SESSION)
 

@@ -16,6 +16,7 @@ from ponder_server.contract import ContextFull, Text
 from ponder_server.draft import Draft
 from ponder_server.runner import Append, SavedState, Session
 from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.vocabulary import Vocabulary
 
 Result = TypeVar("Result")
 Steps: TypeAlias = Generator[Append, Tensor, Result]
@@ -25,12 +26,18 @@ MAX_CHECKED_TOKENS = 16
 """Tokens of one forward while text is decoded: the bucket beyond a single token."""
 
 
-def sayable(ponder: Ponder) -> Tensor:
-    """Which tokens may be part of a text, (V) bool: no control tokens, carriers or unused rows."""
+def ends_of_text(vocabulary: Vocabulary) -> frozenset[int]:
+    """Tokens that end a text; none of them is part of it."""
+    return frozenset({vocabulary.t_yes, vocabulary.t_no, vocabulary.end_of_text, vocabulary.im_end})
+
+
+def sayable(ponder: Ponder, *, ends: bool) -> Tensor:
+    """Which tokens may follow in a text, (V) bool: no control tokens, carriers or unused rows, ``ends`` or not."""
     vocabulary = ponder.format.vocabulary
     is_text_V = torch.zeros(ponder.vocab_size, dtype=torch.bool)
     is_text_V[: vocabulary.num_tokens] = True
     is_text_V[list(vocabulary.control_ids)] = False
+    is_text_V[list(ends_of_text(vocabulary))] = ends
     return is_text_V.to(ponder.device)
 
 
@@ -46,12 +53,9 @@ class TransitionWriter:
         self._ponder = ponder
         self._draft = draft
         self._max_text_tokens = max_text_tokens
-        v = ponder.format.vocabulary
-        self._t_yes = v.t_yes
-        self._ends = frozenset({v.t_yes, v.t_no, v.end_of_text, v.im_end})
-        self._is_text_V = sayable(ponder)
-        self._may_end_V = self._is_text_V.clone()
-        self._may_end_V[list(self._ends)] = True
+        self._t_yes = ponder.format.vocabulary.t_yes
+        self._ends = ends_of_text(ponder.format.vocabulary)
+        self._is_text_V, self._may_end_V = sayable(ponder, ends=False), sayable(ponder, ends=True)
 
     def write(
         self,

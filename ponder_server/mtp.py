@@ -1,0 +1,71 @@
+"""Guesses of a checkpoint's own multi-token prediction.
+
+The head looks back over the text that is being written and no further: its past is a function of what the writer hands
+over, so there is no second cache that restoring, forking and forgetting would have to follow. What came before the text
+reaches it through the network's hidden states. It was trained to look at the whole context as well, which could only
+make its guesses better, never other texts.
+
+# T tokens of the text, H hidden, V vocabulary
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from ponder_server.decoder import Place, decode
+from ponder_server.slots import SlotMemory
+from ponder_server.writer import MAX_CHECKED_TOKENS, ends_of_text, sayable
+from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.ponder_mtp import MtpHead
+
+WINDOW = 64
+"""Tokens of the text that the head looks back over: they are read again for every proposal."""
+MAX_DRAFT_TOKENS = MAX_CHECKED_TOKENS - 1
+
+
+class MtpDraft:
+    """Proposes ``num_tokens`` at a time, fewer where the head sees the text end."""
+
+    def __init__(self, ponder: Ponder, *, num_tokens: int) -> None:
+        """Raises ValueError for a number of tokens that cannot be checked in one forward, and as :class:`MtpHead`."""
+        if not 1 <= num_tokens <= MAX_DRAFT_TOKENS:
+            raise ValueError(f"{num_tokens} tokens at a time were asked for; 1 to {MAX_DRAFT_TOKENS} can be checked.")
+        self._ponder = ponder
+        self._num_tokens = num_tokens
+        self._head = MtpHead(ponder)
+        self._memory = SlotMemory(
+            self._head.text_config,
+            num_slots=1,
+            max_tokens=WINDOW + num_tokens,
+            device=ponder.device,
+            dtype=ponder.dtype,
+        )
+        self._may_end_V = sayable(ponder, ends=True)
+        self._ends = ends_of_text(ponder.format.vocabulary)
+        self.parts: Sequence[nn.Module] = [layer.mlp for layer in self._head.layers]  # type: ignore[misc]
+
+    def propose(self, written: Sequence[int], max_tokens: int, hidden_TH: Tensor | None = None) -> tuple[int, ...]:
+        assert hidden_TH is not None, "this draft reads hidden states"
+        assert len(hidden_TH) == len(written) > 0, "a hidden state before every token"
+        ids, hidden = list(written[-WINDOW:]), hidden_TH[-WINDOW:]
+        guesses: list[int] = []
+        num_past = 0
+        while len(guesses) < min(max_tokens, self._num_tokens):
+            hidden = self._last_hidden(ids, hidden, num_past)
+            logits_V = self._ponder.logits(hidden)[0].masked_fill(~self._may_end_V, float("-inf"))
+            token = int(logits_V.argmax())
+            if token in self._ends:
+                break
+            num_past += len(ids)
+            guesses.append(token)
+            ids = [token]
+        return tuple(guesses)
+
+    def _last_hidden(self, ids: Sequence[int], hidden_TH: Tensor, num_past: int) -> Tensor:
+        """Appends tokens to the head's own past; its output (1, H) behind the last of them."""
+        place = Place(slot=0, num_past=num_past, num_new=len(ids), num_wanted=1)
+        positions_T = torch.arange(num_past, num_past + len(ids), device=hidden_TH.device)
+        merged_TH = self._head.merge(self._ponder.embed(ids), hidden_TH)
+        (last_1H,) = decode(self._head, self._memory, [place], merged_TH[None], positions_T.expand(3, 1, -1))
+        return last_1H

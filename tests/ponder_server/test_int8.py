@@ -1,0 +1,93 @@
+"""PONDER in int8: near its exact self, and who serves it says how near."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from ponder_server.__main__ import build_engine
+from ponder_server.config import PonderOptions
+from ponder_server.contract import Opening, WeightsName
+from ponder_server.engine import EngineConfig, QwenEngine
+from ponder_server.int8 import quantise
+from ponder_server.serve import PonderServer
+from ponderpounce.models.int8 import Int8Linear
+from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.ponder_configs import tiny_cpu
+from protocol.heartbeat import Heartbeat
+
+MODEL = replace(tiny_cpu(), num_layers=4, hidden_size=48, ffn_size=96, image_px=(32, 32), num_carriers=2)
+CONFIG = EngineConfig(num_cameras=1, max_context_tokens=200, max_sessions=2)
+
+
+def engine_of(weights: WeightsName, dtype: torch.dtype = torch.float32) -> QwenEngine:
+    return QwenEngine(Ponder.random(MODEL, seed=1, dtype=dtype), replace(CONFIG, weights=weights))
+
+
+def test_the_layers_take_a_quarter_and_the_rest_is_untouched() -> None:
+    ponder = Ponder.random(MODEL, seed=0)
+    before = {name: parameter.clone() for name, parameter in ponder.qwen.named_parameters()}
+    saved = quantise(ponder)
+    after = dict(ponder.qwen.named_parameters())
+    gone = {name for name in before if name not in after}
+    assert saved == 3 * sum(before[name].numel() for name in gone)
+    assert all(torch.equal(after[name], before[name]) for name in after)
+    kept_matrices = {name.split("layers.")[-1] for name in after if after[name].ndim == 2}
+    assert {name.partition(".")[2] for name in kept_matrices if name[0].isdigit()} == {
+        "linear_attn.in_proj_a.weight", "linear_attn.in_proj_b.weight",
+    }  # fmt: skip
+    assert {"lm_head.weight", "model.language_model.embed_tokens.weight", "model.visual.pos_embed.weight"} <= set(after)
+    assert {f"model.language_model.layers.{index}.mlp.down_proj.weight" for index in range(4)} < gone
+    assert any(name.startswith("model.visual.blocks.1.") for name in gone)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_the_change_of_cognition_that_is_told_is_the_one_that_is_seen(dtype: torch.dtype) -> None:
+    """As any client sees it: the warm-up's episode, asked once of the exact weights and once of the narrow ones."""
+    exact, narrow = (engine_of(weights, dtype) for weights in ("float", "int8"))
+    frame = np.random.default_rng(0).integers(0, 256, (32, 32, 3), dtype=np.uint8)
+    seen = []
+    for engine in (exact, narrow):
+        engine.open("a", Opening(instruction="warm up"))
+        fire = engine.fire("a", (frame,))
+        assert not fire.is_transition
+        seen.append(fire.cognition)
+    change = np.linalg.norm(seen[1] - seen[0]) / np.linalg.norm(seen[0])
+    assert narrow.spec.cognition_error == pytest.approx(change, rel=1e-4)
+    assert 0 < change < 0.1
+    assert (narrow.spec.weights, narrow.spec.model_hash) == ("int8", f"{exact.spec.model_hash}-int8")
+
+
+def test_unquantised_is_the_default() -> None:
+    engine = build_engine(PonderOptions(max_context_tokens=400))
+    assert isinstance(engine, QwenEngine)
+    assert (engine.spec.weights, engine.spec.cognition_error) == ("float", 0)
+    assert not any(isinstance(module, Int8Linear) for module in engine._ponder.modules())
+
+
+def test_measuring_it_leaves_no_session_behind() -> None:
+    engine = engine_of("int8")
+    for name in range(CONFIG.max_sessions):
+        engine.open(str(name), Opening(instruction="press"))
+
+
+def test_the_server_says_it_in_its_health_and_log(new_rig: Any, caplog: pytest.LogCaptureFixture) -> None:
+    engine = engine_of("int8")
+    heartbeat = Heartbeat(new_rig().links["ponder"], "test", "host/monotonic")
+    with caplog.at_level(logging.INFO):
+        PonderServer(heartbeat._link, engine, heartbeat, "test").warm_up()
+    told = f"int8 weights: relative L2 change of cognition {engine.spec.cognition_error:.1e} at start"
+    assert heartbeat.health.detail == told
+    assert told in caplog.text
+
+
+def test_what_this_machine_cannot_run_is_refused_by_name() -> None:
+    with pytest.raises(ValueError, match="--weights fp8 needs a GPU"):
+        build_engine(PonderOptions(weights="fp8"))
+    with pytest.raises(ValueError, match="int8 weights are for a CPU"):
+        QwenEngine(Ponder.random(MODEL, seed=1, device="meta"), replace(CONFIG, weights="int8"))
