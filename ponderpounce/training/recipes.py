@@ -194,9 +194,9 @@ def small() -> Curriculum:
     joint = replace(
         grounding,
         name="small/joint",
-        example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=16, nudge=_BESIDE_THE_WAY),
-        train=replace(reaching.train, optim=replace(_FROM_SCRATCH, learning_rate=3e-4, decay=(300, 600))),
-        num_steps=600,
+        example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=32, nudge=_BESIDE_THE_WAY),
+        train=replace(reaching.train, optim=replace(_FROM_SCRATCH, learning_rate=3e-4, decay=(400, 800))),
+        num_steps=800,
         w3=0.0,
         trains="both",
     )
