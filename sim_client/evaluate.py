@@ -80,7 +80,8 @@ class EvalOptions:
 
     cognition: Literal["real", "null", "other-episode", "stand-in"] = "real"
     """null: POUNCE gets the learned null cognition. other-episode: what PONDER said in another episode of the task.
-    stand-in: the simulator's own subgoal, in the form that stage `motor` of the recipe `small` teaches."""
+    stand-in: the simulator's own subgoal, in the form that stage `motor` of the recipe `small` teaches; if its thing is
+    pushed elsewhere, its coordinates follow."""
     donors: Path | None = None
     """With --cognition other-episode: the --out of a recorded evaluation with real cognition, of the same scenes."""
     subgoal_text: Literal["ponder", "oracle"] | None = None
@@ -314,7 +315,12 @@ class EvaluationStation:
             if self._environment is not None:
                 self._environment.close()
             has_eyes = self._options.policy == "servers" or self._options.record  # the oracle alone needs none
-            self._environment = make_environment(task, max_steps=self._options.max_steps, render=has_eyes)
+            self._environment = make_environment(
+                task,
+                max_steps=self._options.max_steps,
+                render=has_eyes,
+                texts_follow=self._options.cognition == "stand-in",
+            )
             self._task = task
         return self._environment
 

@@ -26,14 +26,18 @@ class ToldPonder(PuppetPonder):
     def __init__(self, link: Link, num_carriers: int, hidden_size: int) -> None:
         self._shape = num_carriers, hidden_size
         self._subgoals = link.subscribe(topics.SUBGOAL)
-        self._text, self._answered = "", ""
+        self._text, self._is_new = "", False
         super().__init__(link)
 
     def answer(self, query: m.Query) -> Answer:
         for subgoal in self._subgoals.drain():
-            if is_of_episode(self.link, subgoal.header) and subgoal.kind == m.SubgoalKind.TASK_GROUNDED:
+            if not is_of_episode(self.link, subgoal.header):
+                continue
+            if subgoal.kind == m.SubgoalKind.TASK_GROUNDED:
                 self._text = subgoal.text
-        is_new, self._answered = self._text != self._answered, self._text
+            else:
+                self._is_new = True  # the plain text is said when a subgoal begins, and at no other time
+        is_new, self._is_new = self._is_new, False
         vector = np.repeat(stand_in(self._text, self._shape[1])[None], self._shape[0], axis=0)
         return Answer(vector=vector, is_transition=is_new, norm=float(np.linalg.norm(vector)), is_fake=True)
 
@@ -41,7 +45,7 @@ class ToldPonder(PuppetPonder):
         return self._shape
 
     def end(self) -> None:
-        self._text, self._answered = "", ""
+        self._text, self._is_new = "", False
 
     @property
     def model_hash(self) -> str:

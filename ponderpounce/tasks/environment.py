@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any
 
@@ -23,6 +23,7 @@ from ponderpounce.tasks.scene import FRONT, table_scene
 from ponderpounce.tasks.task import DIFFICULTIES, Subtask, Task, TaskError, make_task
 
 IMAGE_PX = 256  # upstream's; grounded texts count in these pixels
+_PUSHED_M = 0.01  # texts that follow are corrected from this distance on
 MAX_STEPS = 1300  # the paper's limit; upstream's own default is 10000
 
 
@@ -61,10 +62,21 @@ class EpisodeState:
 
 
 def make_environment(
-    name: str, *, image_px: int = IMAGE_PX, render: bool = True, max_steps: int = MAX_STEPS
+    name: str,
+    *,
+    image_px: int = IMAGE_PX,
+    render: bool = True,
+    max_steps: int = MAX_STEPS,
+    texts_follow: bool = False,
 ) -> Environment:
-    """Returns an environment of a registered task. Raises TaskError for an unknown name."""
-    return Environment(make_task(name), image_px=image_px, render=render, max_steps=max_steps)
+    """Returns an environment of a registered task. Raises TaskError for an unknown name.
+
+    With ``texts_follow`` the coordinates of a grounded subgoal are corrected when its things have been pushed
+    elsewhere; upstream's stay where they were first seen.
+    """
+    return Environment(
+        make_task(name), image_px=image_px, render=render, max_steps=max_steps, texts_follow=texts_follow
+    )
 
 
 class Environment:
@@ -73,8 +85,12 @@ class Environment:
     Without rendering nothing touches GL; texts and physics are the same either way.
     """
 
-    def __init__(self, task: Task[Any, Any], *, image_px: int, render: bool, max_steps: int) -> None:
+    def __init__(
+        self, task: Task[Any, Any], *, image_px: int, render: bool, max_steps: int, texts_follow: bool = False
+    ) -> None:
         self._task = task
+        self._texts_follow = texts_follow
+        self._said_of: Array = np.zeros((0, 3))  # where the things of the grounded text were when it was made
         spec = table_scene(task.robot)
         task.furnish(spec)
         self.physics = Physics(spec)
@@ -272,10 +288,28 @@ class Environment:
             self._progress = Progress(index=self._progress.index, status=Status.TIMEOUT, reason=reason)
         subtask = self._subtasks[spoken_of]
         caption = captions.follow(self._caption, spoken_of, subtask.text, lambda: self._look_for(subtask.grounds))
+        if self._texts_follow:
+            caption = self._following(caption, subtask)
         if self._progress.status is Status.SUCCESS:
             caption = captions.completed(caption)
         self._caption = caption
         return self._snapshot(look=look)
+
+    def _following(self, caption: captions.Caption, subtask: Subtask) -> captions.Caption:
+        """The caption with new coordinates, if its things were pushed elsewhere (not lifted) and can be seen."""
+        now = np.array([self.physics.position_m(body) for body in subtask.grounds]).reshape(-1, 3)
+        if caption is not self._caption:
+            self._said_of = now
+            return caption
+        moved_m = np.abs(now - self._said_of).max(axis=0, initial=0.0)
+        was_pushed = moved_m[:2].max() >= _PUSHED_M and moved_m[2] < _PUSHED_M
+        if not caption.is_latched or not was_pushed:
+            return caption
+        points = self._look_for(subtask.grounds)
+        if points is None:
+            return caption
+        self._said_of = now
+        return replace(caption, grounded=captions.grounded(subtask.text, points))
 
     def _look_for(self, bodies: Sequence[str]) -> list[captions.Pixel] | None:
         """Where the front camera sees bodies; None if one of them is hidden.

@@ -1,0 +1,57 @@
+"""Coordinates that follow: corrected when their thing is pushed over the table, and at no other time."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
+
+SEED = 3
+
+
+@pytest.fixture(scope="module")
+def worlds() -> Iterator[dict[bool, Environment]]:
+    """By whether texts follow."""
+    found = {follow: make_environment("PickXtimes", render=False, texts_follow=follow) for follow in (False, True)}
+    yield found
+    for environment in found.values():
+        environment.close()
+
+
+def pushed(environment: Environment, by_m: tuple[float, float, float]) -> tuple[Snapshot, Snapshot]:
+    """What is seen before and after the thing of the first subgoal was put elsewhere, the arm at rest."""
+    first = environment.reset(SEED, "easy")
+    (body,) = environment.subtasks[0].grounds
+    pose = environment.physics.pose(body)
+    pose[:3] += by_m
+    environment.physics.place(body, pose)
+    return first, environment.step(first.command)
+
+
+def yx_px(snapshot: Snapshot) -> np.ndarray:
+    return np.array(re.findall(r"\d+", snapshot.grounded_subgoal)[:2], float)
+
+
+@pytest.mark.parametrize("by_m", [(0.0, 0.0, 0.0), (0.005, -0.005, 0.0), (0.03, 0.03, 0.05)])
+def test_what_was_not_pushed_keeps_its_words(worlds: dict[bool, Environment], by_m: tuple[float, float, float]) -> None:
+    for environment in worlds.values():
+        before, after = pushed(environment, by_m)
+        assert before.grounded_subgoal == after.grounded_subgoal
+
+
+@pytest.mark.parametrize("by_m", [(0.03, 0.0, 0.0), (0.0, 0.04, 0.0)])
+def test_what_was_pushed_is_spoken_of_where_it_is(
+    worlds: dict[bool, Environment], by_m: tuple[float, float, float]
+) -> None:
+    before, after = pushed(worlds[False], by_m)
+    assert before.grounded_subgoal == after.grounded_subgoal
+    before, after = pushed(worlds[True], by_m)
+    moved_px = yx_px(after) - yx_px(before)
+    assert 2 < np.abs(moved_px).max() < 30
+    assert np.sign(moved_px[np.abs(moved_px).argmax()]) == 1
+    assert (before.subgoal_index, before.simple_subgoal) == (after.subgoal_index, after.simple_subgoal)
+    assert worlds[True].step(after.command).grounded_subgoal == after.grounded_subgoal
