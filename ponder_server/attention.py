@@ -4,7 +4,11 @@ The queries are always those of the *last* positions, so visibility needs no mas
 themselves they are causal. The two parts are computed apart and joined by their log-sum-exp, which is exact. A mask
 would be queries x context floats per fire, and repeating the key heads would copy the whole cache.
 
+In bfloat16 a CPU multiplies several times as fast, but torch's attention in many small products, which gain nothing by
+it. There the same sums are taken in a few large products.
+
 # H query heads, G key heads, H = G * group; M queries, S positions, P = S - M past ones, D head dimension
+# N products of R rows, the queries of one or several heads that share a key head; W positions of a window
 """
 
 from typing import Any
@@ -16,12 +20,27 @@ from torch.nn import functional as F
 # Internal, but the one CPU attention that returns its log-sum-exp; the tests compare it with the public function.
 _flash_cpu: Any = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu
 
+SHIFT = 38.0
+"""Taken off every score of :func:`attend_in_windows`."""
+_MIN_TOTAL, _MAX_TOTAL = 1e-30, 2.0**-9
+"""Of a query's shifted exponentials: below, the smallest are lost; above, they are no exponentials any more."""
+_WINDOW_STEP = 256
+_ROWS = 1024
+"""Of a product at most, if one head has no more: shares of a long window take memory."""
+_LEAST_WORK = 2**21
+"""Numbers in the queries times positions: with less, calling several functions costs more than they save."""
+HAS_FAST_BFLOAT16 = torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported()
+
 
 def attend(queries_HMD: Tensor, keys_GSD: Tensor, values_GSD: Tensor) -> Tensor:
     """What the last M of S positions see (H, M, D); scores are scaled by D ** -0.5."""
-    if queries_HMD.device.type == "cpu":
-        return attend_in_parts(queries_HMD, keys_GSD, values_GSD)
-    return attend_masked(queries_HMD, keys_GSD, values_GSD)
+    if queries_HMD.device.type != "cpu":
+        return attend_masked(queries_HMD, keys_GSD, values_GSD)
+    if queries_HMD.dtype == torch.bfloat16 and HAS_FAST_BFLOAT16:
+        seen_HMD = attend_in_windows(queries_HMD, keys_GSD, values_GSD)
+        if seen_HMD is not None:
+            return seen_HMD
+    return attend_in_parts(queries_HMD, keys_GSD, values_GSD)
 
 
 def attend_in_parts(queries_HMD: Tensor, keys_GSD: Tensor, values_GSD: Tensor) -> Tensor:
@@ -40,6 +59,45 @@ def attend_in_parts(queries_HMD: Tensor, keys_GSD: Tensor, values_GSD: Tensor) -
     past = past.reshape(num_heads, num_queries, head_dim)
     share = torch.sigmoid(past_lse.reshape(num_heads, num_queries) - recent_lse[0])[..., None]
     return torch.lerp(recent[0].float(), past.float(), share).to(queries_HMD.dtype)
+
+
+def attend_in_windows(queries_HMD: Tensor, keys_GSD: Tensor, values_GSD: Tensor) -> Tensor | None:
+    """In bfloat16 on a CPU; None where the other way is faster, or scores are too far from zero for this one.
+
+    The product of queries and keys takes the exponential along, before anything is rounded. torch fuses no exponential
+    but a logistic function; far below zero, where :data:`SHIFT` brings the scores, these two are one.
+
+    Two windows of one length cover all positions. They overlap, and the second one leaves to the first what both see:
+    lengths are multiples of a step, so that a growing context rarely meets a product of a new shape, which costs more.
+    """
+    num_heads, num_queries, head_dim = queries_HMD.shape
+    num_positions = keys_GSD.shape[1]
+    window = -(-num_positions // (2 * _WINDOW_STEP)) * _WINDOW_STEP
+    # the first window must lie in the past
+    if window > num_positions - num_queries or queries_HMD.numel() * num_positions < _LEAST_WORK:
+        return None
+    group = num_heads // keys_GSD.shape[0]
+    num_shared = max(n for n in range(1, group + 1) if group % n == 0 and n * min(num_queries, _ROWS) <= _ROWS)
+    scaled_NRD = (queries_HMD * head_dim**-0.5).view(-1, num_shared * num_queries, head_dim)
+    shift_W = scaled_NRD.new_full((window,), -SHIFT)
+    is_visible_MM = scaled_NRD.new_ones(num_queries, num_queries).tril_()
+    seen_NRD = torch.zeros(scaled_NRD.shape)
+    total_NR1 = torch.zeros(*scaled_NRD.shape[:2], 1)
+    for index, scaled_RD in enumerate(scaled_NRD):
+        head = index * num_shared // group
+        for first in (0, num_positions - window):
+            here = slice(first, first + window)
+            shares_RW = torch.ops.mkldnn._linear_pointwise(scaled_RD, keys_GSD[head, here], shift_W, "sigmoid", [], "")
+            if first:
+                shares_RW[:, : window - first] = 0
+                shares_RW.view(num_shared, num_queries, window)[..., window - num_queries :] *= is_visible_MM
+            seen_NRD[index] += shares_RW @ values_GSD[head, here]
+            # in two stages, because each sum is rounded
+            total_NR1[index] += shares_RW.unflatten(1, (-1, _WINDOW_STEP)).sum(-1).sum(-1, True, dtype=torch.float32)
+    least, most = total_NR1.aminmax()
+    if not (least >= _MIN_TOTAL and most <= _MAX_TOTAL):
+        return None
+    return (seen_NRD / total_NR1).to(queries_HMD.dtype).view(queries_HMD.shape)
 
 
 def attend_masked(queries_HMD: Tensor, keys_GSD: Tensor, values_GSD: Tensor) -> Tensor:

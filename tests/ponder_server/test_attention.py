@@ -1,10 +1,20 @@
-"""The two ways to attend are one function: parts joined by their log-sum-exp, and one call with a mask."""
+"""The ways to attend are one function: one call with a mask, parts joined by their log-sum-exp, two large windows."""
 
+import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from torch import Tensor
 
-from ponder_server.attention import attend_in_parts, attend_masked
+from ponder_server.attention import (
+    HAS_FAST_BFLOAT16,
+    attend,
+    attend_in_parts,
+    attend_in_windows,
+    attend_masked,
+)
+
+needs_fast_bfloat16 = pytest.mark.skipif(not HAS_FAST_BFLOAT16, reason="torch has no fast bfloat16 on this CPU")
 
 
 @settings(deadline=None, max_examples=30)
@@ -30,5 +40,66 @@ def test_the_newest_position_does_not_reach_an_earlier_query() -> None:
     changed = values.clone()
     changed[:, -1] += 1.0
     before, after = attend_in_parts(queries, keys, values), attend_in_parts(queries, keys, changed)
+    assert torch.equal(before[:, :-1], after[:, :-1])
+    assert not torch.equal(before[:, -1], after[:, -1])
+
+
+def rounded(
+    key_heads: int, group: int, num_queries: int, num_past: int, head_dim: int, *, scale: float = 1.0, seed: int = 0
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Queries, of which a larger ``scale`` looks at fewer positions, keys and values, in bfloat16."""
+    generator = torch.Generator().manual_seed(seed)
+    queries = scale * torch.randn(key_heads * group, num_queries, head_dim, generator=generator)
+    keys, values = torch.randn(2, key_heads, num_past + num_queries, head_dim, generator=generator)
+    return queries.bfloat16(), keys.bfloat16(), values.bfloat16()
+
+
+def error(actual: Tensor, arguments: tuple[Tensor, Tensor, Tensor]) -> float:
+    expected = attend_masked(*(argument.float() for argument in arguments))
+    return float((actual.float() - expected).norm() / expected.norm())
+
+
+@needs_fast_bfloat16
+@settings(deadline=None, max_examples=20, derandomize=True)
+@given(
+    key_heads=st.integers(1, 2),
+    group=st.integers(1, 4),
+    num_queries=st.integers(1, 400),
+    num_past=st.integers(0, 1500),
+    head_dim=st.sampled_from([64, 256]),
+    scale=st.floats(0.3, 4.0),
+    seed=st.integers(0, 99),
+)
+def test_two_windows_err_as_torchs_own_bfloat16_does(
+    key_heads: int, group: int, num_queries: int, num_past: int, head_dim: int, scale: float, seed: int
+) -> None:
+    arguments = rounded(key_heads, group, num_queries, num_past, head_dim, scale=scale, seed=seed)
+    actual = attend_in_windows(*arguments)
+    assume(actual is not None)
+    assert actual is not None
+    assert error(actual, arguments) < 1.6 * error(attend_in_parts(*arguments), arguments)
+
+
+@needs_fast_bfloat16
+@pytest.mark.parametrize(
+    ("offset", "is_taken"), [(0.0, True), (20.0, True), (-20.0, True), (50.0, False), (-90.0, False)]
+)
+def test_scores_far_from_zero_are_left_to_the_other_way(offset: float, is_taken: bool) -> None:
+    """One number more in each query and key adds the same to every score."""
+    queries, keys, values = rounded(1, 2, 40, 1000, 64)
+    queries[..., 0], keys[..., 0] = 8.0, offset
+    arguments = queries, keys, values
+    assert (attend_in_windows(*arguments) is not None) == is_taken
+    assert error(attend(*arguments), arguments) < 1.6 * error(attend_in_parts(*arguments), arguments)
+
+
+@needs_fast_bfloat16
+def test_in_windows_too_the_newest_position_does_not_reach_an_earlier_query() -> None:
+    queries, keys, values = rounded(2, 2, 60, 700, 64)
+    changed = values.clone()
+    changed[:, -1] += 1.0
+    before, after = attend_in_windows(queries, keys, values), attend_in_windows(queries, keys, changed)
+    assert before is not None
+    assert after is not None
     assert torch.equal(before[:, :-1], after[:, :-1])
     assert not torch.equal(before[:, -1], after[:, -1])

@@ -44,12 +44,13 @@ def configs(draw: st.DrawFn) -> PonderConfig:
     )
 
 
-def episode(ponder: Ponder, index: int) -> Row:
-    """Rows of different lengths, with images, text and carriers."""
+def episode(ponder: Ponder, index: int, num_more: int = 0) -> Row:
+    """Rows of different lengths, with images, text and carriers; and with so many queries more."""
     form = ponder.format
     speaks = Transition(subgoal=VOCABULARY.encode("press the button"), reasoning=VOCABULARY.encode("go"))
     opening = form.opening("pick up the cube " * (1 + index), [1] * index)
-    return form.row([*opening, *form.query(2), *form.query(2, speaks), *form.query(1 + index)])
+    more = [segment for _ in range(num_more) for segment in form.query(2)]
+    return form.row([*opening, *form.query(2), *form.query(2, speaks), *form.query(1 + index), *more])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,19 +145,25 @@ def test_garbage_in_pads_and_idle_rows_changes_nothing(second: tuple[int, ...]) 
             done[place.slot] += place.num_new
 
 
+@pytest.mark.parametrize(("num_queries", "piece"), [(0, 5), (45, 600)])
 @torch.inference_mode()
-def test_in_bfloat16_appending_adds_no_error_of_its_own() -> None:
-    """Against float32, an appended row is as good as transformers' own bfloat16 over the whole row."""
+def test_in_bfloat16_appending_adds_no_error_of_its_own(num_queries: int, piece: int) -> None:
+    """Against float32, an appended row is as good as transformers' own bfloat16 over the whole row.
+
+    The second one is long enough for attention to take it in two windows, on a CPU that multiplies bfloat16 fast.
+    """
     config = replace(tiny_cpu(), image_px=(64, 64))
     exact, rounded = (Ponder.random(config, VOCABULARY, seed=1, dtype=t) for t in (torch.float32, torch.bfloat16))
-    row = episode(exact, 2)
+    row = episode(exact, 2, num_queries)
     generator = torch.Generator().manual_seed(0)
     frames = torch.randint(0, 256, (row.num_images, 64, 64, 3), generator=generator, dtype=torch.uint8)
     expected_TH = exact.encode_row(row, frames)
-    session = Runner(rounded, num_slots=1, max_tokens=300).open("a")
+    session = Runner(rounded, num_slots=1, max_tokens=1000).open("a")
     embeds_TH = rounded.embed(row.ids, frames)
-    bounds = [i for i in range(0, len(row.ids), 5) if is_whole(rounded, row, i)]
-    pieces = [session.append(row.ids[a:b], embeds_TH[a:b]) for a, b in pairwise([*bounds, len(row.ids)])]
+    bounds = [0]
+    while bounds[-1] < len(row.ids):
+        bounds.append(next(i for i in range(min(bounds[-1] + piece, len(row.ids)), 2000) if is_whole(rounded, row, i)))
+    pieces = [session.append(row.ids[a:b], embeds_TH[a:b]) for a, b in pairwise(bounds)]
     appended = (torch.cat(pieces).float() - expected_TH).norm() / expected_TH.norm()
     at_once = (rounded.encode_row(row, frames).float() - expected_TH).norm() / expected_TH.norm()
     assert appended < 1.1 * at_once
