@@ -1,8 +1,8 @@
 """Which session may join: refused with a reason before it costs anybody else their latency. Pure arithmetic.
 
 Sessions take turns (``batching``), so the worst a query waits is one fire of every other session. One of these may be a
-slow one, not all of them: the others count with their median. Batching makes it better than that; the promise does not
-count on it.
+slow one, not all of them: the others count with their median. Contexts grow, and a fire with them: every session counts
+as if its context were full. Batching makes it better than that; the promise does not count on it.
 """
 
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ MAX_LOAD = 0.8
 
 @dataclass(slots=True, kw_only=True)
 class Admission:
-    """Bookkeeping of admitted sessions, by what a cognition-only fire was measured to take at warm-up."""
+    """Bookkeeping of admitted sessions, by what a cognition-only fire in a full context was measured to take."""
 
     fire_p50_ns: int
     fire_p99_ns: int
@@ -30,15 +30,16 @@ class Admission:
         worst_ns = len(others) * self.fire_p50_ns + self.fire_p99_ns
         if worst_ns > self.latency_budget_ns:
             raise SessionError(
-                f"session {session!r} is refused: with {len(others)} others a query may take {_ms(worst_ns)}, and the "
-                f"latency budget is {_ms(self.latency_budget_ns)}. Close a session, or raise --latency-budget-ms."
+                f"session {session!r} is refused: with {len(others)} others a query may take {_ms(worst_ns)} once "
+                f"contexts are full, and the latency budget is {_ms(self.latency_budget_ns)}. Close a session, lower "
+                "--max-context-tokens, or raise --latency-budget-ms."
             )
         load = sum(self.fire_p50_ns / period for period in (*others.values(), period_ns))
         if load > MAX_LOAD:
             raise SessionError(
                 f"session {session!r} is refused: a query every {_ms(period_ns)} beside {len(others)} others is a load "
-                f"of {load:.0%} at {_ms(self.fire_p50_ns)} each, and {MAX_LOAD:.0%} is the most. Close a session, or "
-                "query less often."
+                f"of {load:.0%} at {_ms(self.fire_p50_ns)} each once contexts are full, and {MAX_LOAD:.0%} is the "
+                "most. Close a session, lower --max-context-tokens, or query less often."
             )
         self.periods_ns[session] = period_ns
 

@@ -39,7 +39,8 @@ class PonderOptions:
     max_batch_rows: int = 8
     """Robots that share a forward at most. With 1, no device's answers depend on other robots in their last bits."""
     latency_budget_ms: int = 1000
-    """With other robots: from a query to its cognition when all ask at once; an episode that breaks it is refused."""
+    """With other robots: from a query to its cognition when all ask at once, with full contexts; an episode that
+    breaks it is refused."""
     draft_texts: Path | None = None
     """File of example texts, one a line: texts like them are written several tokens a forward."""
     draft_tokens: int = 0

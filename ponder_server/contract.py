@@ -154,6 +154,9 @@ class BatchingEngine(PonderEngine, Protocol):
     def begin(self, session: str, frames: tuple[Frame, ...]) -> None:
         """Takes on one query of a session that has none. Raises as ``fire`` does, and changes nothing then."""
 
+    def warm_up_full(self) -> list[int]:
+        """Runs throwaway forwards of a query in a context as long as one may get; durations in ns of at least 10."""
+
     def step(self, progress: Progress = no_progress) -> list[Outcome[Fire]]:
         """A piece of work, about as long as one forward; the queries that it answered or that failed in it.
 

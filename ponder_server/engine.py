@@ -51,6 +51,7 @@ WARM_UP_SESSION = "warm-up"
 WARM_UP_OPENING = Opening(instruction="warm up")
 NUM_UNMEASURED_FIRES = 5
 NUM_MEASURED_FIRES = 30
+NUM_FULL_FIRES = 10
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -355,6 +356,24 @@ class QwenEngine:
             self.close(WARM_UP_SESSION)
         return durations_ns[NUM_UNMEASURED_FIRES:]
 
+    @torch.inference_mode()
+    def warm_up_full(self) -> list[int]:
+        """Durations in ns of queries, frames to cognition, in a context that has room for one; it means nothing."""
+        self.open(WARM_UP_SESSION, WARM_UP_OPENING)
+        try:
+            context = self._episode(WARM_UP_SESSION).context
+            context.fill(max(context.num_tokens, context.max_tokens - len(self._query_ids)))
+            filled = context.save()
+            durations_ns = []
+            for _ in range(1 + NUM_FULL_FIRES):
+                context.restore(filled)
+                start_ns = time.perf_counter_ns()
+                self._example_query(context).cpu()
+                durations_ns.append(time.perf_counter_ns() - start_ns)
+        finally:
+            self.close(WARM_UP_SESSION)
+        return durations_ns[1:]
+
     def _warm_up_frames(self) -> tuple[Frame, ...]:
         noise = np.random.default_rng(0)
         shape = (*self._frame_px, 3)
@@ -363,15 +382,19 @@ class QwenEngine:
     @torch.inference_mode()
     def _example_cognition(self) -> Tensor:
         """C (K, H) after the warm-up's context and one observation, as if T_t were T_no: always the same tokens."""
-        pictures = self._see(self._warm_up_frames(), "warm-up")
         self.open(WARM_UP_SESSION, WARM_UP_OPENING)
         try:
-            embeds_TH = self._embed(self._query_ids, [*pictures])
-            context = self._episode(WARM_UP_SESSION).context
-            hidden_NH = context.append(self._query_ids, embeds_TH, num_wanted=1 + self._format.num_carriers)
-            return hidden_NH[1:].float()
+            return self._example_query(self._episode(WARM_UP_SESSION).context)
         finally:
             self.close(WARM_UP_SESSION)
+
+    def _example_query(self, context: Session) -> Tensor:
+        """C (K, H) of one observation as if T_t, which is looked at, were T_no."""
+        embeds_TH = self._embed(self._query_ids, [*self._see(self._warm_up_frames(), "warm-up")])
+        context.save(context.before_fire)
+        hidden_NH = context.append(self._query_ids, embeds_TH, num_wanted=1 + self._format.num_carriers)
+        self._gate(hidden_NH[0])
+        return hidden_NH[1:].float()
 
     def _episode(self, session: str) -> _Episode:
         episode = self._episodes.get(session)

@@ -223,6 +223,14 @@ class Session:
             tensor[:, : len(kept)] = tensor[:, kept.to(tensor.device)]
         self.num_forgotten += self.num_tokens - len(kept)
 
+    def fill(self, num_tokens: int) -> None:
+        """Makes the context so long with tokens that mean nothing: what a query costs there is measured at once."""
+        for tensor in self._memory.keys_and_values(self.slot, num_tokens):
+            tensor[:, self.num_tokens :] = 0.0
+        num_more = num_tokens - self.num_tokens
+        self.ids.extend([self.ids[-1]] * num_more)
+        self.next_position += num_more
+
     def copy(self) -> Prefix:
         """Everything in this context, for any number of sessions to start from."""
         assert self.num_forgotten == 0, "a context with holes is nobody's beginning"

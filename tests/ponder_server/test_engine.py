@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -423,6 +423,29 @@ def test_warm_up_measures_enough_and_leaves_nothing_open(engine: QwenEngine) -> 
     before = state_of(context_of(engine, "a"))
     durations_ns = engine.warm_up()
     assert len(durations_ns) >= 20
+    assert all(duration_ns > 0 for duration_ns in durations_ns)
+    assert_untouched(context_of(engine, "a"), before)
+    with pytest.raises(SessionError, match=r"open are \['a'\]"):
+        engine.close("warm-up")
+
+
+def test_a_query_in_a_full_context_is_measured_there(engine: QwenEngine) -> None:
+    engine.open("a", WITH_DEMO)
+    before = state_of(context_of(engine, "a"))
+    seen: list[int] = []
+    append = Session.append
+
+    def spy(self: Session, ids: Sequence[int], *args: Any, **kwargs: Any) -> torch.Tensor:
+        seen.append(self.num_tokens + len(ids))
+        return append(self, ids, *args, **kwargs)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Session, "append", spy)
+        durations_ns = engine.warm_up_full()
+    opening, *queries = seen
+    assert opening < engine.spec.max_context_tokens
+    assert set(queries) == {engine.spec.max_context_tokens}
+    assert 10 <= len(durations_ns) <= len(queries)
     assert all(duration_ns > 0 for duration_ns in durations_ns)
     assert_untouched(context_of(engine, "a"), before)
     with pytest.raises(SessionError, match=r"open are \['a'\]"):

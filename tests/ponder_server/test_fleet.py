@@ -29,12 +29,16 @@ Info = Callable[..., m.EpisodeInfo]
 class InTurns:
     """A batching engine of ten lines: one begun query is answered a step, by an engine that answers at once."""
 
-    def __init__(self, engine: Any) -> None:
+    def __init__(self, engine: Any, *, full_ms: int = 78) -> None:
         self._engine = engine
+        self._full_ms = full_ms
         self.begun: dict[str, Any] = {}
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._engine, name)
+
+    def warm_up_full(self) -> list[int]:
+        return [self._full_ms * MS] * 10
 
     def begin(self, session: str, frames: tuple[contract.Frame, ...]) -> None:
         assert session not in self.begun
@@ -167,14 +171,21 @@ def test_a_robot_that_asks_more_is_not_answered_more(hall: Hall, episode_info: I
     assert num_answered == {"r0": 1, "r1": 1, "r2": 1}
 
 
-def test_an_episode_that_would_break_the_budget_is_refused(
-    fake_ponder: Any, episode_info: Info, paper: m.Schedule
+@pytest.mark.parametrize(
+    ("full_ms", "is_refused"), [(53, [False] * 3), (78, [False, False, True]), (81, [False, True, True])]
+)
+def test_an_episode_that_would_break_the_budget_with_full_contexts_is_refused(
+    fake_ponder: Any, episode_info: Info, paper: m.Schedule, full_ms: int, is_refused: list[bool]
 ) -> None:
-    hall = Hall(InTurns(fake_ponder), latency_budget_ms=160)  # a fire takes 78 ms
-    assert [bool(hall.open(robot, episode_info(paper)).error) for robot in ROBOTS] == [False, False, True]
-    assert "latency budget is 160 ms" in hall.open("r2", episode_info(paper)).error
-    hall.clocks["r0"].call(topics.CLOSE, "ponder", m.CloseRequest(), timeout_ns=1)
-    assert hall.open("r2", episode_info(paper)).error == ""
+    hall = Hall(InTurns(fake_ponder, full_ms=full_ms), latency_budget_ms=160)
+    replies = {robot: hall.open(robot, episode_info(paper)) for robot in ROBOTS}
+    assert [bool(reply.error) for reply in replies.values()] == is_refused
+    for robot, reply in replies.items():
+        if reply.error:
+            assert "latency budget is 160 ms" in reply.error
+            hall.clocks["r0"].call(topics.CLOSE, "ponder", m.CloseRequest(), timeout_ns=1)
+            assert hall.open(robot, episode_info(paper)).error == ""
+            break
 
 
 def test_a_refused_query_is_told_to_its_robot_alone(hall: Hall, episode_info: Info, paper: m.Schedule) -> None:

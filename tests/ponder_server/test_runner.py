@@ -150,6 +150,19 @@ def test_a_slot_that_was_used_is_a_new_one_to_the_last_bit() -> None:
     assert torch.equal(feed(again, 0, T), feed(new_session(), 0, T))
 
 
+def test_a_filled_context_is_as_long_as_it_was_told_and_leaves_no_trace() -> None:
+    session = new_session()
+    feed(session, 0, CUTS[3])
+    saved, before = session.save(), feed(session, CUTS[3], T)
+    session.restore(saved)
+    session.fill(500)
+    assert (session.num_tokens, session.room) == (500, 12)
+    with torch.inference_mode():
+        assert session.append(ROW.ids[:12], EMBEDS[:12]).isfinite().all()
+    session.restore(saved)
+    assert torch.equal(feed(session, CUTS[3], T), before)
+
+
 def test_there_are_as_many_sessions_as_slots() -> None:
     runner = Runner(PONDER, num_slots=2, max_tokens=512)
     sessions = [runner.open(name) for name in "ab"]
