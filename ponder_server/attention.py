@@ -78,7 +78,7 @@ def attend_in_windows(queries_HMD: Tensor, keys_GSD: Tensor, values_GSD: Tensor)
         return None
     group = num_heads // keys_GSD.shape[0]
     num_shared = max(n for n in range(1, group + 1) if group % n == 0 and n * min(num_queries, _ROWS) <= _ROWS)
-    scaled_NRD = (queries_HMD * head_dim**-0.5).view(-1, num_shared * num_queries, head_dim)
+    scaled_NRD = (queries_HMD * head_dim**-0.5).reshape(-1, num_shared * num_queries, head_dim)
     shift_W = scaled_NRD.new_full((window,), -SHIFT)
     is_visible_MM = scaled_NRD.new_ones(num_queries, num_queries).tril_()
     seen_NRD = torch.zeros(scaled_NRD.shape)
