@@ -21,7 +21,7 @@ train --stage reaching
 wait $looking
 
 train --stage motor --no-progress & motor=$!
-"$bin/pp-eval" --tasks PickHighlight --episodes 100 --runs 1 --seed 1000000 --cognition stand-in \
+"$bin/pp-eval" --tasks PickHighlight --episodes 200 --runs 1 --seed 1000000 --cognition stand-in --max-steps 800 \
     --pounce-checkpoint "$out/run/reaching/pounce" --record --record-hz 5 --out "$out/hand"
 [ -d "$out/watched/meta" ] || "$bin/pp-export" "$out"/hand/*/PickHighlight/*.mcap --out "$out/watched"
 train --stage grounding --watch "$out/watched"

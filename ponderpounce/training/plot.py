@@ -16,6 +16,7 @@ _CURVES = (
     ("total", "loss"),
     ("flow_matching", "flow matching"),
     ("grounding", "grounding"),
+    ("alignment", "alignment with the stand-ins"),
     ("gradient_norm", "gradient norm"),
 )
 _RAW, _SMOOTH, _INK, _GRID = (176, 204, 235), (24, 84, 160), (40, 40, 40), (225, 225, 225)
@@ -25,7 +26,7 @@ _SMOOTHING = 0.95
 def plot_log(log: Path, png: Path) -> None:
     """Draws ``log.jsonl``: a panel per curve, every step pale and their running mean dark, on a logarithmic scale.
 
-    A curve that is zero throughout (a recipe without texts) is left out.
+    A curve that is zero throughout (a recipe without texts) is left out, as is one that an older log does not have.
 
     Raises:
         ValueError: the log has no steps.
@@ -33,7 +34,7 @@ def plot_log(log: Path, png: Path) -> None:
     lines = [json.loads(line) for line in log.read_text().splitlines()]
     if not lines:
         raise ValueError(f"{log} has no steps to draw")
-    shown = [(key, title) for key, title in _CURVES if any(line[key] > 0 for line in lines)]
+    shown = [(key, title) for key, title in _CURVES if any(line.get(key, 0.0) > 0 for line in lines)]
     image = Image.new("RGB", (WIDTH_PX, PANEL_PX * len(shown)), "white")
     draw = ImageDraw.Draw(image)
     for place, (key, title) in enumerate(shown):
