@@ -82,6 +82,8 @@ class EvalOptions:
     """null: POUNCE gets the learned null cognition. other-episode: what PONDER said in another episode of the task.
     stand-in: the simulator's own subgoal, in the form that stage `motor` of the recipe `small` teaches; if its thing is
     pushed elsewhere, its coordinates follow."""
+    stand_in_noise_px: float = 0.0
+    """With --cognition stand-in: how wrong the told places are (standard deviation); a PONDER's are by some pixels."""
     donors: Path | None = None
     """With --cognition other-episode: the --out of a recorded evaluation with real cognition, of the same scenes."""
     subgoal_text: Literal["ponder", "oracle"] | None = None
@@ -128,6 +130,8 @@ class EvalOptions:
             raise EvaluationError("--cognition other-episode and --donors go together: record the real one first")
         if self.cognition in _PUPPETS and (self.servers, self.policy) != ("in-process", "servers"):
             raise EvaluationError(f"--cognition {self.cognition} replaces PONDER: use --servers in-process")
+        if self.stand_in_noise_px < 0 or (self.stand_in_noise_px and self.cognition != "stand-in"):
+            raise EvaluationError("--stand-in-noise-px is for --cognition stand-in, and at least 0")
         if self.cognition == "stand-in" and self.pounce_checkpoint is None:
             raise EvaluationError("--cognition stand-in is for a --pounce-checkpoint that has learned from stand-ins")
         if self.subgoal_text is not None and (self.servers, self.cognition) != ("in-process", "real"):
@@ -189,6 +193,8 @@ class EvalOptions:
         own = {"tasks": self.task_names(), "runs": self.runs, "cognition": self.cognition, "donors": self.donors}
         if self.subgoal_text is not None:
             own["subgoal_text"] = self.subgoal_text
+        if self.stand_in_noise_px:
+            own["stand_in_noise_px"] = self.stand_in_noise_px
         return config | {name: as_json(value) for name, value in own.items()}
 
 
@@ -335,7 +341,7 @@ class EvaluationStation:
             shape = cognition_shape(pounce)
         except ValueError as error:
             raise EvaluationError(str(error)) from None
-        return ToldPonder(Link(bus, robot=robot, proc="ponder"), *shape).step
+        return ToldPonder(Link(bus, robot=robot, proc="ponder"), *shape, self._options.stand_in_noise_px).step
 
 
 def _workers(options: EvalOptions) -> Workers[Job, Line]:

@@ -2,13 +2,14 @@
 
 Every query is answered with the simulator's own subgoal of that instant, as the numbers that a POUNCE trained by itself
 has learned to act from (`ponderpounce.training.stand_in`, stage ``motor`` of the recipe ``small``). To any other POUNCE
-they mean nothing.
+they mean nothing. Told places can be made as wrong as a PONDER's are: the hand then misses as it would with one.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +20,20 @@ from protocol import topics
 from protocol.link import Link, is_of_episode
 from sim_client.puppet import Answer, PuppetPonder
 
+HELD_QUERIES = 4
+_NUMBER = re.compile(r"\d+(?=[^<]*>)")  # within angle brackets
+
 
 class ToldPonder(PuppetPonder):
-    """Answers with the stand-in of the task's newest grounded subgoal."""
+    """Answers with the stand-in of the task's newest grounded subgoal.
 
-    def __init__(self, link: Link, num_carriers: int, hidden_size: int) -> None:
+    Args:
+        num_carriers, hidden_size: K and H of what POUNCE reads.
+        noise_px: standard deviation of the error of every told coordinate; it stays for `HELD_QUERIES` queries.
+    """
+
+    def __init__(self, link: Link, num_carriers: int, hidden_size: int, noise_px: float = 0.0) -> None:
+        self._noise_px = noise_px
         self._shape = num_carriers, hidden_size
         self._subgoals = link.subscribe(topics.SUBGOAL)
         self._text, self._is_new = "", False
@@ -38,7 +48,8 @@ class ToldPonder(PuppetPonder):
             else:
                 self._is_new = True  # the plain text is said when a subgoal begins, and at no other time
         is_new, self._is_new = self._is_new, False
-        vector = np.repeat(stand_in(self._text, self._shape[1])[None], self._shape[0], axis=0)
+        text = self._text if not self._noise_px else misplaced(self._text, self._noise_px, query.query // HELD_QUERIES)
+        vector = np.repeat(stand_in(text, self._shape[1])[None], self._shape[0], axis=0)
         return Answer(vector=vector, is_transition=is_new, norm=float(np.linalg.norm(vector)), is_fake=True)
 
     def shape(self) -> tuple[int, int]:
@@ -54,6 +65,13 @@ class ToldPonder(PuppetPonder):
     @property
     def is_fake(self) -> bool:
         return True
+
+
+def misplaced(text: str, noise_px: float, draw: int) -> str:
+    """Returns the text with an error in each of its coordinates, which the text and the number of the draw decide."""
+    digest = hashlib.blake2b(f"{draw} {text}".encode(), digest_size=8).digest()
+    rng = np.random.default_rng(int.from_bytes(digest, "big"))
+    return _NUMBER.sub(lambda found: str(max(0, round(int(found[0]) + rng.normal(0.0, noise_px)))), text)
 
 
 def cognition_shape(pounce: Path) -> tuple[int, int]:

@@ -3,8 +3,9 @@
 #
 #     checkpoints/small/train.sh [OUT]        (`make policy` sets everything up first)
 #
-# Both systems learn side by side. Half-way the hand plays episodes by itself, told the task's own subgoals, and PONDER
-# then learns from those as well: the hand's misses are in no oracle's data. The same command goes on after a kill.
+# Both systems learn side by side. Half-way, and at its end, the hand plays episodes by itself, told the task's own
+# subgoals, and PONDER then learns from those as well: the hand's misses are in no oracle's data. The same command goes on
+# after a kill.
 set -euo pipefail
 
 out=${1:-out/small}
@@ -12,6 +13,13 @@ bin=${BIN:-.venv/bin}
 export OMP_NUM_THREADS=1 MUJOCO_GL=${MUJOCO_GL:-egl}
 
 train() { [ -d "$out/run/ponder" ] || "$bin/pp-train" --recipe small --data "$out/data" --out "$out/run" "$@"; }
+
+hand() {  # lets the POUNCE of a stage play; what it does becomes the dataset $out/STAGE
+    local stage=$1; shift
+    "$bin/pp-eval" --tasks PickHighlight --runs 1 --cognition stand-in --pounce-checkpoint "$out/run/$stage/pounce" \
+        --record --record-hz 5 --out "$out/played/$stage" "$@"
+    [ -d "$out/$stage/meta" ] || "$bin/pp-export" "$out/played/$stage"/*/PickHighlight/*.mcap --out "$out/$stage"
+}
 
 [ -d "$out/data/meta" ] || "$bin/pp-collect" --tasks PickHighlight --episodes 600 --noise dart --recovery-share 0.4 \
     --frames training --invocation-hz 5 --out "$out/data"
@@ -21,13 +29,14 @@ train --stage reaching
 wait $looking
 
 train --stage motor --no-progress & motor=$!
-"$bin/pp-eval" --tasks PickHighlight --episodes 200 --runs 1 --seed 1000000 --cognition stand-in --max-steps 800 \
-    --pounce-checkpoint "$out/run/reaching/pounce" --record --record-hz 5 --out "$out/hand"
-[ -d "$out/watched/meta" ] || "$bin/pp-export" "$out"/hand/*/PickHighlight/*.mcap --out "$out/watched"
-train --stage grounding --watch "$out/watched"
+hand reaching --episodes 200 --seed 1000000 --max-steps 800
+train --stage grounding --watch "$out/reaching"
 wait $motor
 
-train --watch "$out/watched"  # what is left: both together
+hand motor --episodes 150 --seed 1100000 --max-steps 700 --stand-in-noise-px 3
+for stage in watching joint; do
+    train --stage $stage --watch "$out/reaching" "$out/motor"
+done
 
 "$bin/pp-eval" --tasks PickHighlight --episodes 60 --runs 1 --seed 1000 \
     --ponder-checkpoint "$out/run/ponder" --pounce-checkpoint "$out/run/pounce" --out "$out/real"

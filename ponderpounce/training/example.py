@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -83,7 +84,10 @@ class ExampleConfig:
     """Share of rows without their texts although they have some: cognition must then come from what was seen."""
 
     augmentation: Augmentation = NOT_AUGMENTED
-    """Other views of the scene, for stages that train PONDER alone."""
+    """Other views of the scene. An action is that of the scene as it is, so where POUNCE learns as well, only watched
+    episodes may be seen otherwise."""
+    augments: Literal["all", "watched"] = "all"
+    """Which episodes are seen in other views."""
     nudge: Nudge = NO_NUDGE
     """Displaced starts of POUNCE's invocations."""
     max_queries: int | None = None
@@ -142,7 +146,8 @@ def make_example(
     chosen = np.sort(rng.choice(len(schedule.invocations), size=count, replace=False))
     invocations = tuple(schedule.invocations[index] for index in chosen)
     is_grounded = config.is_grounded and rng.random() >= config.text_dropout
-    view = draw_view(config.augmentation, form, set(episode.subgoals), rng)
+    is_moved = config.augments == "all" or episode.is_watched
+    view = draw_view(config.augmentation if is_moved else NOT_AUGMENTED, form, set(episode.subgoals), rng)
     nudges_I2 = None
     if config.nudge != NO_NUDGE:
         nudges_I2 = draw_nudges(config.nudge, episode.state_T8[[each.tick for each in invocations]], rng)

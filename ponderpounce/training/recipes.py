@@ -12,7 +12,7 @@ from ponderpounce.models.action_space import ActionSpace
 from ponderpounce.models.ponder_configs import PonderConfig
 from ponderpounce.models.pounce import Freeze
 from ponderpounce.models.pounce_family import AnyPounceConfig
-from ponderpounce.training.augment import Augmentation
+from ponderpounce.training.augment import NOT_AUGMENTED, Augmentation
 from ponderpounce.training.example import ExampleConfig
 from ponderpounce.training.joint import Trains
 from ponderpounce.training.nudge import Nudge
@@ -55,6 +55,8 @@ class Recipe:
     def __post_init__(self) -> None:
         if self.trains != "pounce" and self.example.is_grounded != (self.w2 > 0):
             raise ValueError(f"recipe {self.name}: is_grounded is {self.example.is_grounded}, but w2 is {self.w2}")
+        if self.trains == "both" and self.example.augmentation != NOT_AUGMENTED and self.example.augments == "all":
+            raise ValueError(f"recipe {self.name}: views are moved and actions are not; augment watched episodes only")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -141,8 +143,8 @@ def tiny_subgoal_text() -> Recipe:
 def small() -> Curriculum:
     """Both architectures at about a million weights each, from scratch on CPU cores: see docs/training.md.
 
-    Where the paper starts from pretrained weights, four stages stand in for them: two of either system, so that two
-    cores can run them side by side. Episodes that are watched (`pp-train --watch`) are for `grounding` and `joint`.
+    Where the paper starts from pretrained weights, five stages stand in for them, of one system each, so that two cores
+    can run them side by side. Episodes that are watched (`pp-train --watch`) are for the last three.
     """
     looking = Recipe(
         name="small/looking",
@@ -175,6 +177,12 @@ def small() -> Curriculum:
         num_steps=1600,
         batch_episodes=8,
     )
+    watching = replace(
+        grounding,
+        name="small/watching",
+        train=TrainConfig(seed=1, optim=replace(_FROM_SCRATCH, learning_rate=7e-4, decay=(300, 1800))),
+        num_steps=1800,
+    )
     reaching = replace(
         looking,
         name="small/reaching",
@@ -194,13 +202,15 @@ def small() -> Curriculum:
     joint = replace(
         grounding,
         name="small/joint",
-        example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=32, nudge=_BESIDE_THE_WAY),
-        train=replace(reaching.train, optim=replace(_FROM_SCRATCH, learning_rate=3e-4, decay=(400, 800))),
-        num_steps=800,
-        w3=0.0,
+        example=replace(
+            reaching.example, max_invocations=32, augmentation=looking.example.augmentation, augments="watched"
+        ),
+        train=replace(reaching.train, optim=replace(_FROM_SCRATCH, learning_rate=3e-4, decay=(100, 400))),
+        num_steps=400,
+        w3=0.3,
         trains="both",
     )
-    return Curriculum(name="small", stages=(looking, reaching, motor, grounding, joint))
+    return Curriculum(name="small", stages=(looking, reaching, motor, grounding, watching, joint))
 
 
 RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {

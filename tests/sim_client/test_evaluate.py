@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from sim_client import evaluate as module
 from sim_client.evaluate import EvalOptions, EvaluationError, EvaluationStation, Job, Line, evaluate, play
 from sim_client.ledger import LedgerError
 from sim_client.suite import run_seed
-from sim_client.told_cognition import cognition_shape
+from sim_client.told_cognition import cognition_shape, misplaced
 
 TASKS, EPISODES, RUNS = ("PickXtimes", "StopCube"), 2, 2
 NUM_JOBS = len(TASKS) * EPISODES * RUNS
@@ -292,11 +293,23 @@ def test_the_hand_alone_is_told_the_task_s_own_subgoals_and_what_it_did_can_be_w
     [
         ({}, "is for a --pounce-checkpoint"),
         ({"pounce_checkpoint": Path("nowhere"), "servers": "local"}, "use --servers in-process"),
+        ({"pounce_checkpoint": Path("nowhere"), "stand_in_noise_px": -1.0}, "and at least 0"),
+        ({"cognition": "null", "stand_in_noise_px": 1.0}, "is for --cognition stand-in"),
     ],
 )
 def test_stand_ins_where_they_mean_nothing_are_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(EvaluationError, match=message):
-        options(tmp_path, policy="servers", cognition="stand-in", **changes)
+        options(tmp_path, **{"policy": "servers", "cognition": "stand-in"} | changes)
+
+
+def test_told_places_are_wrong_by_what_was_asked_for_and_stay_so() -> None:
+    text = "pick up cube 2 at <100, 120>, which is red"
+    told = [misplaced(text, 3.0, draw) for draw in range(400)]
+    assert told == [misplaced(text, 3.0, draw) for draw in range(400)]
+    assert {re.sub(r"<.*>", "<100, 120>", each) for each in told} == {text}
+    errors = np.array([[int(n) for n in re.findall(r"\d+", each)[1:]] for each in told]) - (100, 120)
+    assert 2.7 < errors.std() < 3.3
+    assert abs(errors.mean()) < 0.5
 
 
 def test_a_folder_that_says_nothing_of_cognition_is_refused(tmp_path: Path) -> None:

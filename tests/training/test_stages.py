@@ -17,6 +17,7 @@ from ponderpounce.models.eyes import Eye
 from ponderpounce.models.ponder_checkpoint import load_ponder
 from ponderpounce.models.pounce_checkpoint import load_bundle
 from ponderpounce.training import recipes, train
+from ponderpounce.training.augment import AS_IT_IS
 from ponderpounce.training.data import Sight, TrainingSet
 from ponderpounce.training.example import ExampleConfig, make_example, row_frames
 from ponderpounce.training.joint import Draws, JointModel
@@ -138,7 +139,14 @@ def test_all_stages_follow_each_other_and_the_last_is_what_is_served(folder: Pat
 
 def test_stages_run_apart_are_the_run_in_one_go(folder: Path, tmp_path: Path) -> None:
     train.train(options(folder, tmp_path / "together"))
-    for stage in ("reaching", "motor", "looking", "grounding", "joint"):  # neither system waits for the other
+    for stage in (
+        "reaching",
+        "motor",
+        "looking",
+        "grounding",
+        "watching",
+        "joint",
+    ):  # neither system waits for the other
         train.train(options(folder, tmp_path / "apart", stage=stage))
     for system in ("ponder", "pounce"):
         one, other = (tmp_path / name / system / "model.safetensors" for name in ("together", "apart"))
@@ -146,7 +154,7 @@ def test_stages_run_apart_are_the_run_in_one_go(folder: Path, tmp_path: Path) ->
 
 
 def test_a_stage_that_does_not_exist_is_refused(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="motor, grounding, joint; there is no 'driving'"):
+    with pytest.raises(ValueError, match="grounding, watching, joint; there is no 'driving'"):
         train.train(options(folder, tmp_path / "run", stage="driving"))
     with pytest.raises(ValueError, match="tiny has no stages"):
         train.train(options(folder, tmp_path / "run", recipe="tiny", stage="joint"))
@@ -243,3 +251,19 @@ def test_shares_that_are_none_and_batches_to_look_at_only_are_refused(
     second_of_two = Batches(both, small["joint"], model, bundle, World(rank=1, size=2), 0.5)
     with pytest.raises(ValueError, match="lower --watch-share"):
         second_of_two(0)
+
+
+def test_where_pounce_learns_only_watched_episodes_are_seen_otherwise(
+    folder: Path, tmp_path: Path, small: dict[str, Recipe]
+) -> None:
+    both = TrainingSet(folder, watched=(_dataset(tmp_path / "watched", seeds=range(7, 8)),))
+    run = small["joint"]
+    model, _ = build(run, both, options(folder, tmp_path))
+    for number in range(len(both)):
+        views = [
+            make_example(both[number], model.ponder.format, run.example, np.random.default_rng(seed)).view
+            for seed in range(8)
+        ]
+        assert (set(views) == {AS_IT_IS}) == (number < NUM_EPISODES)
+    with pytest.raises(ValueError, match="augment watched episodes only"):
+        replace(run, example=replace(run.example, augments="all"))
