@@ -12,7 +12,12 @@ out=${1:-out/small}
 bin=${BIN:-.venv/bin}
 export OMP_NUM_THREADS=1 MUJOCO_GL=${MUJOCO_GL:-egl}
 
-train() { [ -d "$out/run/ponder" ] || "$bin/pp-train" --recipe small --data "$out/data" --out "$out/run" "$@"; }
+finished() { [ -d "$out/run/ponder" ]; }
+train() { finished || "$bin/pp-train" --recipe small --data "$out/data" --out "$out/run" "$@"; }
+train_on_both_cores() {
+    finished || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --recipe small --data "$out/data" \
+        --out "$out/run" "$@"
+}
 
 hand() {  # lets the POUNCE of a stage play; what it does becomes the dataset $out/STAGE
     local stage=$1; shift
@@ -35,7 +40,7 @@ wait $motor
 
 hand motor --episodes 150 --seed 1100000 --max-steps 700 --stand-in-noise-px 3
 for stage in watching joint; do
-    train --stage $stage --watch "$out/reaching" "$out/motor"
+    train_on_both_cores --stage $stage --watch "$out/reaching" "$out/motor"
 done
 
 "$bin/pp-eval" --tasks PickHighlight --episodes 60 --runs 1 --seed 1000 \
