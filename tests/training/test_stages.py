@@ -113,12 +113,14 @@ def test_a_stage_moves_its_own_system_alone(
 
 
 def test_a_stage_makes_only_what_it_reads(folder: Path, small: dict[str, Recipe]) -> None:
-    motor, looking, joint = (trainer_of(small[name], folder)._batches(0) for name in ("motor", "looking", "joint"))
+    stages = small["motor"], small["looking"], replace(small["joint"], w3=0.0), small["joint"]
+    motor, looking, joint, aligned = (trainer_of(stage, folder)._batches(0) for stage in stages)
     assert (motor[0].rows, motor[0].frames, len(motor[0].stand_ins)) == ((), (), 2)
     assert motor[1].inputs.images.shape[1] == 0  # the small POUNCE reads no pictures
     assert len(looking[0].rows) == len(looking[0].stand_ins) == 2
     assert looking[1].inputs.images.shape[1] == 0
     assert (len(joint[0].rows), joint[0].stand_ins, len(joint[1].actions_INA)) == (2, (), 4)
+    assert len(aligned[0].stand_ins) == 2
 
 
 def test_all_stages_follow_each_other_and_the_last_is_what_is_served(folder: Path, tmp_path: Path) -> None:
