@@ -144,12 +144,19 @@ def between_conditions(results: Sequence[Results]) -> str:
     return markdown(head, rows)
 
 
+_GIVEN = {
+    "null": "the null cognition",
+    "other-episode": "another episode's cognition",
+    "stand-in": "the task's own subgoal",
+}
+
+
 def _condition(results: Results) -> tuple[str, str, str, str]:
     """What POUNCE got, how often PONDER looked, its delay and K; as far as the file says."""
     config = results.config
     if config.get("policy") == "oracle":
         return "nothing: the oracle played", "", "", ""
-    gets = {"null": "the null cognition", "other-episode": "another episode's cognition"}.get(_cognition(config), "C_t")
+    gets = _GIVEN.get(_cognition(config), "C_t")
     if config.get("subgoal_text") is not None:
         gets = {"ponder": "PONDER's subgoal text", "oracle": "the oracle's subgoal text"}[config["subgoal_text"]]
     if config.get("deliver") == "held-transition":
@@ -168,6 +175,8 @@ def _about(results: Results) -> str:
     size = [_count(len(results.tasks), "task"), _count(scenes, "scene"), _count(results.num_runs, "run")]
     mode, steps = results.config.get("mode", "unknown mode"), results.config.get("max_steps", "?")
     untrained = " **Untrained weights: motion, not skill.**" if results.is_untrained else ""
+    if _cognition(results.config) == "stand-in":
+        untrained = " **In PONDER's place: the task's own subgoals.**"
     return f"- `{results.label}`: {', '.join(size)}; {mode}, at most {steps} steps.{untrained}"
 
 
