@@ -57,7 +57,6 @@ class DonorPonder(PuppetPonder):
             vector=given.vector,
             is_transition=given.is_transition and not has_ended,
             norm=given.norm,
-            is_fake=given.is_fake,
         )
 
     def end(self) -> None:

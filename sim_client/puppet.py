@@ -23,7 +23,6 @@ class Answer:
     """(K, H)."""
     is_transition: bool
     norm: float
-    is_fake: bool
 
 
 class PuppetPonder(ABC):
@@ -40,6 +39,11 @@ class PuppetPonder(ABC):
     @abstractmethod
     def model_hash(self) -> str:
         """Says in every log whose vectors these were."""
+
+    @property
+    @abstractmethod
+    def is_fake(self) -> bool:
+        """Whether nothing that was trained gives these vectors."""
 
     @abstractmethod
     def shape(self) -> tuple[int, int]:
@@ -73,7 +77,7 @@ class PuppetPonder(ABC):
             is_transition=answer.is_transition,
             norm=answer.norm,
             model_hash=self.model_hash,
-            is_fake=answer.is_fake,
+            is_fake=self.is_fake,
         )
         self.link.publish(topics.COGNITION, cognition, at_ns=now_ns, clock_id=host_clock_id())
 
@@ -87,8 +91,3 @@ class PuppetPonder(ABC):
             is_fake=self.is_fake,
             version=version(),
         )
-
-    @property
-    def is_fake(self) -> bool:
-        """Whether nothing that was trained gives these vectors."""
-        return False

@@ -19,6 +19,7 @@ import numpy as np
 from clock.report import statistics, stream_sha256
 from clock.service import ClockService
 from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
+from ponderpounce.tasks.physics import CONTROL_HZ
 from protocol import images
 from protocol import messages as m
 from protocol.errors import CallFailed, TransportError
@@ -35,7 +36,6 @@ _OPEN_NS = 130_000_000_000
 _CLOSE_NS = 5_000_000_000
 _ASK_AGAIN_S = 0.2
 _LAST_TICKS_S = 1.0
-_CONTROL_HZ = 20
 
 OnTick = Callable[[int, int], None]
 """Called with (episode index, ticks played) as an episode goes on."""
@@ -202,7 +202,7 @@ class Suite:
     def _looks(self, tick: int) -> bool:
         """Whether the pictures of a tick are wanted: by the log, or by the models when the schedule says so."""
         conductor = self._clock.conductor if self._clock is not None else None
-        is_logged = self._options.record and tick % (_CONTROL_HZ // self._options.record_hz) == 0
+        is_logged = self._options.record and tick % (CONTROL_HZ // self._options.record_hz) == 0
         return is_logged or conductor is None or conductor.will_look(tick)
 
     def _await_last_ticks(self, outcome: Outcome) -> None:

@@ -50,7 +50,7 @@ class ToldPonder(PuppetPonder):
         is_new, self._is_new = self._is_new, False
         text = self._text if not self._noise_px else misplaced(self._text, self._noise_px, query.query // HELD_QUERIES)
         vector = np.repeat(stand_in(text, self._shape[1])[None], self._shape[0], axis=0)
-        return Answer(vector=vector, is_transition=is_new, norm=float(np.linalg.norm(vector)), is_fake=True)
+        return Answer(vector=vector, is_transition=is_new, norm=float(np.linalg.norm(vector)))
 
     def shape(self) -> tuple[int, int]:
         return self._shape

@@ -23,7 +23,13 @@ hand() {  # lets the POUNCE of a stage play; what it does becomes the dataset $o
     local stage=$1; shift
     "$bin/pp-eval" --tasks PickHighlight --runs 1 --cognition stand-in --pounce-checkpoint "$out/run/$stage/pounce" \
         --record --record-hz 5 --out "$out/played/$stage" "$@"
-    [ -d "$out/$stage/meta" ] || "$bin/pp-export" "$out/played/$stage"/*/PickHighlight/*.mcap --out "$out/$stage"
+    if [ -d "$out/$stage/meta" ]; then return; fi
+    local logs  # of finished episodes: a kill leaves the beginning of one more
+    mapfile -t logs < <("$bin/python" -c 'import json, pathlib, sys
+folder = pathlib.Path(sys.argv[1])
+print(*(folder / each["mcap"] for each in json.loads((folder / "results.json").read_text())["episodes"]), sep="\n")' \
+        "$out/played/$stage")
+    "$bin/pp-export" "${logs[@]}" --out "$out/$stage"
 }
 
 [ -d "$out/data/meta" ] || "$bin/pp-collect" --tasks PickHighlight --episodes 600 --noise dart --recovery-share 0.4 \

@@ -4,9 +4,9 @@ A projection makes one input of a token and the network's hidden state before it
 and the network's own LM head reads from its output which token follows. Fed with its own output it goes on guessing.
 Source: the tensors of public Qwen3.5 checkpoints (``mtp.*``), and how vLLM puts them together; transformers leaves them
 out.
+"""
 
 # T tokens, H hidden
-"""
 
 from copy import deepcopy
 from typing import Any
