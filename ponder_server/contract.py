@@ -17,6 +17,9 @@ from ponderpounce.models.eyes import Eyes
 Frame: TypeAlias = npt.NDArray[np.uint8]
 """One camera image, (h, w, 3) uint8 RGB."""
 
+Proprio: TypeAlias = npt.NDArray[np.float32]
+"""The robot's state at the observation, (8,): 7 joint angles [rad], a finger [m]. Most networks are not told."""
+
 Result = TypeVar("Result")
 
 WeightsName: TypeAlias = Literal["float", "int8"]
@@ -66,6 +69,8 @@ class EngineSpec:
     """Of weights and activations, e.g. "float32"; cognition is float32 always."""
     eyes: Eyes = None
     """What is seen of the frames."""
+    reads_proprio: bool = False
+    """It is also told of the robot's state: a query without is refused."""
     session_bytes: int = 0
     """Memory of one session at its longest; that of all of them is allocated at start."""
     weights: WeightsName = "float"
@@ -135,7 +140,14 @@ class PonderEngine(Protocol):
     def open(self, session: str, opening: Opening, progress: Progress = no_progress) -> int:
         """Starts an episode; its context tokens. Raises SessionError, ContextFull or ValueError."""
 
-    def fire(self, session: str, frames: tuple[Frame, ...], progress: Progress = no_progress) -> Fire:
+    def fire(
+        self,
+        session: str,
+        frames: tuple[Frame, ...],
+        progress: Progress = no_progress,
+        *,
+        proprio: Proprio | None = None,
+    ) -> Fire:
         """Appends one observation and answers it, or raises SessionError, ContextFull or ValueError.
 
         All or nothing: after an error the session is as it was.
@@ -151,7 +163,7 @@ class PonderEngine(Protocol):
 class BatchingEngine(PonderEngine, Protocol):
     """Thinks about queries of several sessions at once; ``fire`` is for when it thinks about nothing else."""
 
-    def begin(self, session: str, frames: tuple[Frame, ...]) -> None:
+    def begin(self, session: str, frames: tuple[Frame, ...], *, proprio: Proprio | None = None) -> None:
         """Takes on one query of a session that has none. Raises as ``fire`` does, and changes nothing then."""
 
     def warm_up_full(self) -> list[int]:

@@ -31,6 +31,7 @@ from ponder_server.contract import (
     Opening,
     Outcome,
     Progress,
+    Proprio,
     SessionError,
     Text,
     WeightsName,
@@ -46,12 +47,14 @@ from ponderpounce.models.context import Segment, SegmentKind
 from ponderpounce.models.eyes import Pictures, check_cameras, readable_sizes, see
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import weights_hash
+from ponderpounce.models.proprioception import NUM_PROPRIO
 
 WARM_UP_SESSION = "warm-up"
 WARM_UP_OPENING = Opening(instruction="warm up")
 NUM_UNMEASURED_FIRES = 5
 NUM_MEASURED_FIRES = 30
 NUM_FULL_FIRES = 10
+WARM_UP_PROPRIO = np.zeros(NUM_PROPRIO, np.float32)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,6 +110,8 @@ class _Query:
     episode: _Episode
     pictures: Pictures
     """(images, h, w, 3): what is seen of its frames."""
+    ids: tuple[int, ...]
+    """O_t and the carriers."""
     force_text_tokens: int | None
     turn: int
 
@@ -149,6 +154,7 @@ class QwenEngine:
             image_px=ponder.image_px,
             num_cameras=config.num_cameras,
             eyes=self._format.eyes,
+            reads_proprio=self._format.proprioception is not None,
             max_context_tokens=config.max_context_tokens,
             model_hash=weights_hash(ponder),
             is_random=ponder.is_random,
@@ -159,7 +165,7 @@ class QwenEngine:
         draft = draft or NoDraft()
         self._parts = [*(layer.mlp for layer in (*model.visual.blocks, *model.language_model.layers)), *draft.parts]
         self._writer = TransitionWriter(ponder, draft, max_text_tokens=config.max_text_tokens)
-        self._query_ids = (*self._format.observation(config.num_cameras).ids, *self._format.carrier_ids)
+        self._num_query_ids = len(self._query_ids(WARM_UP_PROPRIO))
         self._prefixes = Prefixes(config.max_prefixes)
         self._begun: dict[str, _Query] = {}
         self._batch: Batch[Fire] = Batch(self._runner, max_rows=config.max_batch_rows)
@@ -240,6 +246,7 @@ class QwenEngine:
         frames: tuple[Frame, ...],
         progress: Progress = no_progress,
         *,
+        proprio: Proprio | None = None,
         force_text_tokens: int | None = None,
     ) -> Fire:
         """One query, alone; see ``PonderEngine.fire``.
@@ -251,12 +258,19 @@ class QwenEngine:
         if self._begun or self._batch:
             busy = (*self._begun, *self._batch.sessions)
             raise SessionError(f"queries of {busy} are being thought about; step until they are done.")
-        self.begin(session, frames, force_text_tokens=force_text_tokens)
+        self.begin(session, frames, proprio=proprio, force_text_tokens=force_text_tokens)
         while True:
             for outcome in self.step(progress):
                 return outcome.unwrap()
 
-    def begin(self, session: str, frames: tuple[Frame, ...], *, force_text_tokens: int | None = None) -> None:
+    def begin(
+        self,
+        session: str,
+        frames: tuple[Frame, ...],
+        *,
+        proprio: Proprio | None = None,
+        force_text_tokens: int | None = None,
+    ) -> None:
         """Takes on one query, to be answered by :meth:`step`; see ``BatchingEngine.begin``."""
         episode = self._episode(session)
         context = episode.context
@@ -265,12 +279,17 @@ class QwenEngine:
         if len(frames) != self._config.num_cameras:
             raise ValueError(f"fire got {len(frames)} frames, this engine has num_cameras {self._config.num_cameras}")
         pictures = self._see(frames, "observation")
+        ids = self._query_ids(proprio)
         if force_text_tokens is not None and force_text_tokens < 1:
             raise ValueError(f"force_text_tokens is {force_text_tokens}; at least 1, or None")
         self._make_room(episode)
-        context.check_room(len(self._query_ids))
+        context.check_room(len(ids))
         self._begun[session] = _Query(
-            episode=episode, pictures=pictures, force_text_tokens=force_text_tokens, turn=self._batch.turn()
+            episode=episode,
+            pictures=pictures,
+            ids=ids,
+            force_text_tokens=force_text_tokens,
+            turn=self._batch.turn(),
         )
 
     @torch.inference_mode()
@@ -281,8 +300,8 @@ class QwenEngine:
             begun = {session: self._begun.pop(session) for session in [*self._begun][: self._config.max_batch_rows]}
             if begun:
                 pictures = [picture for query in begun.values() for picture in query.pictures]
-                embeds_TH = self._embed(self._query_ids * len(begun), pictures)
-                pieces = embeds_TH.split(len(self._query_ids))
+                embeds_TH = self._embed([token for query in begun.values() for token in query.ids], pictures)
+                pieces = embeds_TH.split(self._num_query_ids)
                 for (session, query), query_TH in zip(begun.items(), pieces, strict=True):
                     self._batch.add(session, self._think(query, query_TH), query.turn)
             return self._batch.step(progress)
@@ -291,7 +310,7 @@ class QwenEngine:
         """One query's way through the network; whatever ends it early, the context is as it was."""
         episode, exactly = query.episode, query.force_text_tokens
         context = episode.context
-        num_observed = len(self._query_ids) - self._format.num_carriers
+        num_observed = len(query.ids) - self._format.num_carriers
         observation_TH, carriers_KH = embeds_TH[:num_observed], embeds_TH[num_observed:]
         before = context.save(context.before_fire)
         is_answered = False
@@ -300,7 +319,7 @@ class QwenEngine:
             is_transition = exactly is not None
             if not is_transition:
                 wanted = 1 + self._format.num_carriers
-                hidden_NH = yield Append(session=context, ids=self._query_ids, embeds_TH=embeds_TH, num_wanted=wanted)
+                hidden_NH = yield Append(session=context, ids=query.ids, embeds_TH=embeds_TH, num_wanted=wanted)
                 is_transition = self._gate(hidden_NH[0]) == self._format.vocabulary.t_yes
                 hidden_KH = hidden_NH[1:]
             if is_transition:
@@ -308,14 +327,14 @@ class QwenEngine:
                 texts = yield from self._writer.write(
                     context,
                     before,
-                    self._query_ids[:num_observed],
+                    query.ids[:num_observed],
                     observation_TH,
                     with_reasoning=episode.owes_reasoning and exactly is None,
                     exactly=exactly,
                 )
                 hidden_KH = yield Append(session=context, ids=self._format.carrier_ids, embeds_TH=carriers_KH)
             answer = self._answer(context, hidden_KH, texts)
-            num_written = len(context.ids) - before.num_ids - len(self._query_ids)
+            num_written = len(context.ids) - before.num_ids - len(query.ids)
             episode.spans += [
                 Span(SegmentKind.OBSERVATION, num_observed),
                 Span(SegmentKind.TEXT, num_written),
@@ -345,12 +364,12 @@ class QwenEngine:
         try:
             context = self._episode(WARM_UP_SESSION).context
             opened = context.save()
-            self.fire(WARM_UP_SESSION, frames, force_text_tokens=1)
+            self.fire(WARM_UP_SESSION, frames, proprio=WARM_UP_PROPRIO, force_text_tokens=1)
             durations_ns = []
             for _ in range(NUM_UNMEASURED_FIRES + NUM_MEASURED_FIRES):
                 context.restore(opened)
                 start_ns = time.perf_counter_ns()
-                self.fire(WARM_UP_SESSION, frames)
+                self.fire(WARM_UP_SESSION, frames, proprio=WARM_UP_PROPRIO)
                 durations_ns.append(time.perf_counter_ns() - start_ns)
         finally:
             self.close(WARM_UP_SESSION)
@@ -362,7 +381,7 @@ class QwenEngine:
         self.open(WARM_UP_SESSION, WARM_UP_OPENING)
         try:
             context = self._episode(WARM_UP_SESSION).context
-            context.fill(max(context.num_tokens, context.max_tokens - len(self._query_ids)))
+            context.fill(max(context.num_tokens, context.max_tokens - self._num_query_ids))
             filled = context.save()
             durations_ns = []
             for _ in range(1 + NUM_FULL_FIRES):
@@ -390,9 +409,10 @@ class QwenEngine:
 
     def _example_query(self, context: Session) -> Tensor:
         """C (K, H) of one observation as if T_t, which is looked at, were T_no."""
-        embeds_TH = self._embed(self._query_ids, [*self._see(self._warm_up_frames(), "warm-up")])
+        ids = self._query_ids(WARM_UP_PROPRIO)
+        embeds_TH = self._embed(ids, [*self._see(self._warm_up_frames(), "warm-up")])
         context.save(context.before_fire)
-        hidden_NH = context.append(self._query_ids, embeds_TH, num_wanted=1 + self._format.num_carriers)
+        hidden_NH = context.append(ids, embeds_TH, num_wanted=1 + self._format.num_carriers)
         self._gate(hidden_NH[0])
         return hidden_NH[1:].float()
 
@@ -401,6 +421,11 @@ class QwenEngine:
         if episode is None:
             raise SessionError(f"session {session!r} is not open; open are {sorted(self._episodes)}.")
         return episode
+
+    def _query_ids(self, proprio: Proprio | None) -> tuple[int, ...]:
+        """O_t and the carriers: always as many."""
+        observed = self._format.observation(self._config.num_cameras, proprio)
+        return (*observed.ids, *self._format.carrier_ids)
 
     def _see(self, frames: tuple[Frame, ...], where: str) -> Pictures:
         try:
@@ -417,7 +442,7 @@ class QwenEngine:
     def _make_room(self, episode: _Episode) -> None:
         """Asks the policy, early enough that a transition with texts of full length would still fit."""
         context = episode.context
-        num_wanted = len(self._query_ids) + 2 * (1 + self._config.max_text_tokens)
+        num_wanted = self._num_query_ids + 2 * (1 + self._config.max_text_tokens)
         if num_wanted <= context.room:
             return
         stays = POLICIES[self._config.when_full](episode.spans, num_wanted - context.room)

@@ -20,6 +20,7 @@ from ponder_server.contract import (
     Opening,
     Outcome,
     Progress,
+    Proprio,
     SessionError,
     no_progress,
 )
@@ -59,16 +60,23 @@ class RobotEngine:
     def open(self, session: str, opening: Opening, progress: Progress = no_progress) -> int:
         return self._shared.engine.open(self._name(session), opening, progress)
 
-    def begin(self, session: str, frames: tuple[Frame, ...]) -> None:
-        self._shared.engine.begin(self._name(session), frames)
+    def begin(self, session: str, frames: tuple[Frame, ...], *, proprio: Proprio | None = None) -> None:
+        self._shared.engine.begin(self._name(session), frames, proprio=proprio)
 
     def fetch(self, session: str) -> Outcome[Fire] | None:
         """How the query that was begun ended, if it did."""
         return self._shared.outcomes.pop(self._name(session), None)
 
-    def fire(self, session: str, frames: tuple[Frame, ...], progress: Progress = no_progress) -> Fire:
+    def fire(
+        self,
+        session: str,
+        frames: tuple[Frame, ...],
+        progress: Progress = no_progress,
+        *,
+        proprio: Proprio | None = None,
+    ) -> Fire:
         """Begins and waits; the others' queries go on meanwhile."""
-        self.begin(session, frames)
+        self.begin(session, frames, proprio=proprio)
         while (outcome := self.fetch(session)) is None:
             self._shared.step(progress)
         return outcome.unwrap()
@@ -126,7 +134,7 @@ class RobotServer(PonderServer):
         if self._thinking is not None or (work := self._next_rebuilt() or self._next_asked()) is None:
             return False
         try:
-            self._robot_engine.begin(self._link.episode, work.frames)
+            self._robot_engine.begin(self._link.episode, work.frames, proprio=work.proprio)
         except (SessionError, ValueError) as error:
             self._fail(work, error)
         else:

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from clock.rendezvous import Rendezvous
-from ponder_server.contract import EngineSpec, Fire, Frame
+from ponder_server.contract import EngineSpec, Fire, Frame, Proprio
 from ponderpounce.models.eyes import unreadable
+from ponderpounce.models.proprioception import NUM_PROPRIO
 from protocol import images
 from protocol import messages as m
 from protocol.errors import MalformedMessage
@@ -21,10 +22,11 @@ _KINDS = {"subgoal": m.SubgoalKind.SUBGOAL, "demo_reasoning": m.SubgoalKind.DEMO
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Work:
-    """One fire to do: query t and the frames of its observation."""
+    """One fire to do: query t, and of its observation the frames and the robot's state."""
 
     query: m.Query
     frames: tuple[Frame, ...]
+    proprio: Proprio
 
 
 class PonderNode:
@@ -112,7 +114,8 @@ class PonderNode:
 
 
 def _work(query: m.Query, observation: m.Observation) -> Work:
-    return Work(query=query, frames=tuple(images.unpack(image) for image in observation.images))
+    frames = tuple(images.unpack(image) for image in observation.images)
+    return Work(query=query, frames=frames, proprio=observation.proprio)
 
 
 def check_robot(robot: m.Robot, spec: EngineSpec) -> None:
@@ -121,6 +124,11 @@ def check_robot(robot: m.Robot, spec: EngineSpec) -> None:
         raise ValueError(
             f"robot {robot.name!r} has {len(robot.cameras)} cameras {list(robot.cameras)}; PONDER expects "
             f"{spec.num_cameras}"
+        )
+    if spec.reads_proprio and robot.num_proprio != NUM_PROPRIO:
+        raise ValueError(
+            f"robot {robot.name!r} tells {robot.num_proprio} numbers of itself; this PONDER reads {NUM_PROPRIO}, the "
+            "Panda's joints and a finger"
         )
     size = (robot.image_height, robot.image_width)
     found = unreadable([size] * len(robot.cameras), spec.eyes, spec.image_px)

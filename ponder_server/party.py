@@ -33,21 +33,26 @@ def build(bus: Bus, robot: str, checkpoint: Path | None) -> Callable[[], bool]:
 
 Views = Sequence[Frame]
 """One instant, camera by camera."""
-Read = Callable[[str, Sequence[Views], Sequence[Views]], NDArray[np.float32]]
+Read = Callable[[str, Sequence[Views], Sequence[Views], NDArray[np.float32]], NDArray[np.float32]]
 
 
 def build_reader(checkpoint: Path | None) -> tuple[Read, EngineSpec]:
     """A PONDER outside of any episode, for offline measurements.
 
-    Returns a function from an instruction, a demonstration at 1 Hz and the observations since to the cognition (K, H)
-    of the last one, as served: texts are PONDER's own. And what the engine is.
+    Returns a function from an instruction, a demonstration at 1 Hz and the observations since, with the robot's states
+    (T, 8) at these, to the cognition (K, H) of the last one, as served: texts are PONDER's own. And what the engine is.
     """
     engine = build_engine(PonderOptions(checkpoint=checkpoint))
 
-    def read(instruction: str, demo: Sequence[Views], seen: Sequence[Views]) -> NDArray[np.float32]:
+    def read(
+        instruction: str, demo: Sequence[Views], seen: Sequence[Views], state_T8: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
         engine.open(_OFFLINE, Opening(instruction=instruction, demo_frames=tuple(tuple(views) for views in demo)))
         try:
-            return [engine.fire(_OFFLINE, tuple(views)) for views in seen][-1].cognition
+            fires = [
+                engine.fire(_OFFLINE, tuple(views), proprio=state) for views, state in zip(seen, state_T8, strict=True)
+            ]
+            return fires[-1].cognition
         finally:
             engine.close(_OFFLINE)
 

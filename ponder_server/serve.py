@@ -104,7 +104,7 @@ class PonderServer:
                 if work.query.query == rejoined.owed_query:
                     self._fire(work)  # the clock still waits for this one (lockstep)
                 else:
-                    self._engine.fire(self._link.episode, work.frames, self._heartbeat.beat)
+                    self._think(work)
         except (CallFailed, ProtocolError, ContextFull) as error:
             self._give_up(error)
             return False
@@ -135,13 +135,16 @@ class PonderServer:
     def _fire(self, work: Work) -> None:
         start_ns = self._start()
         try:
-            fire = self._engine.fire(self._link.episode, work.frames, self._heartbeat.beat)
+            fire = self._think(work)
         except (ContextFull, SessionError, ValueError) as error:
             self._refuse(work, error)
         else:
             self._answer(work, fire, start_ns)
         finally:
             self._stop()
+
+    def _think(self, work: Work) -> Fire:
+        return self._engine.fire(self._link.episode, work.frames, self._heartbeat.beat, proprio=work.proprio)
 
     def _start(self) -> int:
         """Says that a query is being thought about; since when."""

@@ -33,7 +33,7 @@ from sim_client.robot import CAMERAS
 
 Views = tuple[NDArray[np.uint8], ...]
 Floats = NDArray[np.float32]
-Read = Callable[[str, Sequence[Views], Sequence[Views]], Floats]
+Read = Callable[[str, Sequence[Views], Sequence[Views], NDArray[np.float32]], Floats]
 """`ponder_server.party.build_reader`'s."""
 Act = Callable[[str, Views, Floats, Floats | None, int, int], Floats]
 """`pounce_server.party.build_actor`'s."""
@@ -113,7 +113,8 @@ def _answers(
     demo = [views for views, is_shown in zip(past, telling.is_demonstration, strict=True) if is_shown]
     seen = [views for views, is_shown in zip(past, telling.is_demonstration, strict=True) if not is_shown]
     now = tuple(pair.frames[camera] for camera in CAMERAS)
-    cognition = read(pair.instruction, demo, [*seen, now])
+    states = [*telling.states[~telling.is_demonstration], pair.state]
+    cognition = read(pair.instruction, demo, [*seen, now], np.stack(states))
     age_ns = options.age_ms * NS_PER_MS
     seeds = range(index * options.draws, (index + 1) * options.draws)
     return np.stack([act(pair.instruction, now, pair.state, cognition, age_ns, seed) for seed in seeds])

@@ -80,7 +80,12 @@ class FakePonder:
         return 10
 
     def fire(
-        self, session: str, frames: tuple[ponder.Frame, ...], progress: ponder.Progress = ponder.no_progress
+        self,
+        session: str,
+        frames: tuple[ponder.Frame, ...],
+        progress: ponder.Progress = ponder.no_progress,
+        *,
+        proprio: ponder.Proprio | None = None,
     ) -> ponder.Fire:
         if session not in self.contexts:
             raise ponder.SessionError(f"session {session!r} is not open.")

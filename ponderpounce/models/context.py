@@ -8,9 +8,9 @@ One episode is
     O_t  [ T_yes S_t | T_yes DR T_yes S_t ]  K carriers                               per query t
 
 where a frame is ``<|vision_start|> <|image_pad|> * n <|vision_end|>`` (n = 64 at 256 px), one per view or, where a
-PONDER has ``eyes``, one per eye. **T_no is never in
-the row.** It is only the LM *target* at the first carrier position (paper, appendix A.2), so T_t is always
-decided by the logits of the token before: the last one of O_t, or the last one of the text. Carriers are rows
+PONDER has ``eyes``, one per eye; where it has ``proprioception``, O_t ends with tokens of the robot's state.
+**T_no is never in the row.** It is only the LM *target* at the first carrier position (paper, appendix A.2), so T_t is
+always decided by the logits of the token before: the last one of O_t, or the last one of the text. Carriers are rows
 of the embedding table that no real token uses; their ids are ordinary ids.
 
 A target belongs to the position it labels: the logits that must predict ``targets[i]`` are those of position
@@ -25,8 +25,10 @@ from enum import StrEnum
 
 import numpy as np
 import numpy.typing as npt
+from numpy.typing import ArrayLike
 
 from ponderpounce.models.eyes import Eyes, num_seen
+from ponderpounce.models.proprioception import Proprioception, check_rows
 from ponderpounce.models.vocabulary import Vocabulary
 
 IGNORE = -100
@@ -61,6 +63,8 @@ class Transition:
 
     subgoal: tuple[int, ...]
     reasoning: tuple[int, ...] | None = None
+    is_learned: bool = True
+    """False: words that stand there to be read, as a slip of PONDER's own would; that there are any is learned."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -92,6 +96,8 @@ class ContextFormat:
     """Side in pixels of what one image token covers: patch times merge."""
     eyes: Eyes = None
     """What is seen of an instant's views: how many images it gives, and with ``image_px`` which pixels."""
+    proprioception: Proprioception | None = None
+    """What is told of the robot's state besides; None: nothing, as in the paper."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.num_carriers <= 16:
@@ -101,6 +107,8 @@ class ContextFormat:
                 f"first_carrier_id {self.first_carrier_id} is a real token; this tokenizer's unused rows "
                 f"start at {self.vocabulary.num_tokens}."
             )
+        if self.proprioception is not None:
+            check_rows(self.proprioception, self.vocabulary.num_tokens, self.carrier_ids)
 
     @property
     def carrier_ids(self) -> tuple[int, ...]:
@@ -133,17 +141,27 @@ class ContextFormat:
         ids = (v.im_end, *v.encode("\n"), v.im_start, *v.encode("assistant\n"))
         return _unsupervised(SegmentKind.EXECUTION, ids)
 
-    def observation(self, num_cameras: int) -> Segment:
-        """O_t: what is seen of one frame per camera."""
-        return self._seen(SegmentKind.OBSERVATION, num_cameras)
+    def observation(self, num_cameras: int, proprio: ArrayLike | None = None) -> Segment:
+        """O_t: what is seen of one frame per camera, and what is told of ``proprio`` (8,) if anything is.
+
+        Raises ValueError if it should be told and did not come.
+        """
+        seen = self._seen(SegmentKind.OBSERVATION, num_cameras)
+        if self.proprioception is None:
+            return seen
+        if proprio is None:
+            raise ValueError("this PONDER reads the robot's state with every observation; none came")
+        ids = (*seen.ids, *self.proprioception.ids(proprio))
+        return _unsupervised(SegmentKind.OBSERVATION, ids, num_images=seen.num_images)
 
     def text(self, transition: Transition) -> Segment:
-        """``[T_yes, S]`` or ``[T_yes, DR, T_yes, S]``; every token of it is a target."""
+        """``[T_yes, S]`` or ``[T_yes, DR, T_yes, S]``; every token of it is a target, if it is to be learned."""
         t_yes = self.vocabulary.t_yes
         ids = (t_yes, *transition.subgoal)
         if transition.reasoning is not None:
             ids = (t_yes, *transition.reasoning, *ids)
-        return Segment(kind=SegmentKind.TEXT, ids=ids, targets=ids)
+        targets = ids if transition.is_learned else (t_yes, *(IGNORE,) * (len(ids) - 1))
+        return Segment(kind=SegmentKind.TEXT, ids=ids, targets=targets)
 
     def carriers(self) -> Segment:
         """K carriers; the first one is labelled T_no, whether or not text came before it."""
@@ -154,10 +172,12 @@ class ContextFormat:
         """Everything before the first query; ``demo_views``: the number of views at each demo instant."""
         return (self.instruction(instruction), *(self.demo(n) for n in demo_views), self.execution())
 
-    def query(self, num_cameras: int, transition: Transition | None = None) -> tuple[Segment, ...]:
-        """One query, with text exactly if it is a transition."""
+    def query(
+        self, num_cameras: int, transition: Transition | None = None, proprio: ArrayLike | None = None
+    ) -> tuple[Segment, ...]:
+        """One query, with text exactly if it is a transition; see :meth:`observation`."""
         text = () if transition is None else (self.text(transition),)
-        return (self.observation(num_cameras), *text, self.carriers())
+        return (self.observation(num_cameras, proprio), *text, self.carriers())
 
     def row(self, segments: Iterable[Segment]) -> Row:
         """Lays segments end to end."""

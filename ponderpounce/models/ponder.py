@@ -105,6 +105,7 @@ class Ponder(nn.Module):
             image_grid=image_grid(qwen_config, config.image_px),
             token_px=token_px(qwen_config),
             eyes=config.eyes,
+            proprioception=config.proprioception,
         )
         ponder = cls(qwen_config, context_format, image_px=config.image_px, device=device, dtype=dtype)
         fill_randomly(ponder.qwen, seed=seed)

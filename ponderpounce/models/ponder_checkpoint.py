@@ -3,7 +3,7 @@
     config.json          transformers' Qwen3.5 configuration
     tokenizer.json       the tokenizer
     model.safetensors    the weights, or model.safetensors.index.json and its shards
-    ponder.json          what PONDER adds: carriers, image size, eyes
+    ponder.json          what PONDER adds: carriers, image size, eyes, proprioception
 
 A public Qwen3.5 checkpoint has no ponder.json and loads as it is; its carriers are untrained padding rows. Loaded in
 the dtype it was written in, it is written back bit for bit, multi-token prediction included.
@@ -26,6 +26,7 @@ from ponderpounce.models.config_json import from_json
 from ponderpounce.models.context import ContextFormat
 from ponderpounce.models.eyes import Eyes, check_eyes
 from ponderpounce.models.ponder import Ponder, image_grid, skeleton, token_px
+from ponderpounce.models.proprioception import Proprioception
 from ponderpounce.models.vocabulary import Vocabulary
 
 CONFIG_NAME = "config.json"
@@ -45,13 +46,14 @@ class CheckpointError(ValueError):
 class StoredPonder:
     """Contents of ponder.json. The defaults are for a public Qwen3.5, which has none; a file has every field."""
 
-    format: Literal["ponderpounce.ponder/2"] = "ponderpounce.ponder/2"
-    """/1 is the same without ``eyes``, and is read as having none."""
+    format: Literal["ponderpounce.ponder/3"] = "ponderpounce.ponder/3"
+    """/2 is the same without ``proprioception``, /1 without ``eyes`` as well; they are read as having none."""
     num_carriers: int = 1
     first_carrier_id: int | None = None
     """None: the first row after the tokenizer's last id."""
     image_px: tuple[int, int] = (256, 256)
     eyes: Eyes = None
+    proprioception: Proprioception | None = None
     is_random: bool = True
     """The carriers were never trained."""
 
@@ -82,6 +84,7 @@ def load_ponder(directory: Path, *, device: torch.device | str = "cpu", dtype: t
         image_grid=image_grid(qwen_config, stored.image_px),
         token_px=token_px(qwen_config),
         eyes=stored.eyes,
+        proprioception=stored.proprioception,
     )
     if qwen_config.image_token_id != vocabulary.image_pad:
         raise CheckpointError(
@@ -114,6 +117,7 @@ def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_S
         first_carrier_id=ponder.format.first_carrier_id,
         image_px=ponder.image_px,
         eyes=ponder.format.eyes,
+        proprioception=ponder.format.proprioception,
         is_random=ponder.is_random,
     )
     (directory / OWN_NAME).write_text(json.dumps(asdict(stored), indent=2) + "\n")
@@ -200,6 +204,8 @@ def _read_stored(directory: Path) -> StoredPonder:
     values = _read_json(path)
     if isinstance(values, dict) and values.get("format") == "ponderpounce.ponder/1":
         values |= {"format": "ponderpounce.ponder/2", "eyes": None}
+    if isinstance(values, dict) and values.get("format") == "ponderpounce.ponder/2":
+        values |= {"format": "ponderpounce.ponder/3", "proprioception": None}
     return from_json(StoredPonder, values, str(path))
 
 

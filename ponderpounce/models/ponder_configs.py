@@ -11,6 +11,7 @@ from typing import Any
 from transformers.models.qwen3_5 import Qwen3_5Config
 
 from ponderpounce.models.eyes import Eye, Eyes, check_eyes
+from ponderpounce.models.proprioception import Proprioception
 from ponderpounce.models.vocabulary import Vocabulary
 
 
@@ -54,12 +55,19 @@ class PonderConfig:
     """Height and width of every picture that the network reads, in pixels."""
     eyes: Eyes = None
     """What it looks at; None: every camera's whole picture, which must then be of ``image_px``."""
+    proprioception: Proprioception | None = None
+    """What it is told of the robot's state; None, as in the paper: nothing."""
 
     def __post_init__(self) -> None:
         if self.first_carrier_id + self.num_carriers > self.vocab_size:
             raise ValueError(
                 f"{self.num_carriers} carriers from row {self.first_carrier_id} do not fit into vocab_size "
                 f"{self.vocab_size}; lower first_carrier_id or num_carriers."
+            )
+        if self.proprioception is not None and self.proprioception.rows.stop > self.vocab_size:
+            raise ValueError(
+                f"proprioception takes rows up to {self.proprioception.rows.stop}, vocab_size is {self.vocab_size}; "
+                "lower first_id or its numbers of bins."
             )
         if 8 * sum(self.mrope_section) != self.head_dim:
             raise ValueError(f"mrope_section {self.mrope_section} must sum to head_dim / 8 = {self.head_dim / 8}")
@@ -162,6 +170,7 @@ def small() -> PonderConfig:
         first_carrier_id=448,
         image_px=(64, 64),
         eyes=(Eye(camera=0, box=(8 / 256, 64 / 256, 136 / 256, 192 / 256)),),
+        proprioception=Proprioception(first_id=464),
     )
 
 

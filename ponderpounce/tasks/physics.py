@@ -76,6 +76,13 @@ class Physics:
             self.park(name)
         self.refresh()
 
+    def pose_arm(self, qpos: Array, opening_m: float) -> None:
+        """Puts the arm elsewhere at once, at rest: joints (7,) in rad, and how far each finger is from closed."""
+        self.data.qpos[self._arm_qpos] = qpos
+        if self.robot.has_gripper:
+            self.data.qpos[self._finger_qpos] = opening_m * np.array([1.0, -1.0])
+        self.refresh()
+
     def place(self, name: str, pose_7: Array) -> None:
         """Puts a prop at a pose (7,), at rest. Call `refresh` after the last one."""
         self._set_pose(name, pose_7)

@@ -65,6 +65,15 @@ class Shown:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Thing:
+    """Something that stands in a scene and has a name; two may share one."""
+
+    name: str
+    body: str
+    is_movable: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Reasoning:
     """What must be kept in mind at one point of an episode, in words (paper, Table 6)."""
 
@@ -127,6 +136,10 @@ class Task(ABC, Generic[LayoutT, MemoryT]):
         next is wrong in the others. Where only the video is another, `retells_video`, the physics need be the same but
         for what motion leaves behind. The default is none.
         """
+        return ()
+
+    def things(self, layout: LayoutT, step: int) -> tuple[Thing, ...]:
+        """Returns all that is to be named in the observation of ``step`` (`data.album`). The default names nothing."""
         return ()
 
     @classmethod

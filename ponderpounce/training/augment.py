@@ -79,6 +79,16 @@ class View:
 AS_IT_IS = View()
 
 
+def misplaced(text: str, std_px: float, rng: np.random.Generator) -> str:
+    """The text with every coordinate wrong by a normal error, within the picture."""
+
+    def slipped(place: re.Match[str]) -> str:
+        y, x = (min(max(round(int(v) + std_px * rng.standard_normal()), 0), _TEXT_PX) for v in place.groups())
+        return f"<{y}, {x}>"
+
+    return _PLACE.sub(slipped, text)
+
+
 def draw_view(config: Augmentation, form: ContextFormat, texts: set[str], rng: np.random.Generator) -> View:
     """Draws the view of an episode.
 

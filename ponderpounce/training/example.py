@@ -20,7 +20,7 @@ from ponderpounce.models.context import ContextFormat, Row, Transition
 from ponderpounce.models.eyes import see
 from ponderpounce.models.normalisation import Floats
 from ponderpounce.models.ponder_coordinates import normalised_text
-from ponderpounce.training.augment import AS_IT_IS, NOT_AUGMENTED, Augmentation, View, draw_view
+from ponderpounce.training.augment import AS_IT_IS, NOT_AUGMENTED, Augmentation, View, draw_view, misplaced
 from ponderpounce.training.nudge import NO_NUDGE, Nudge, draw_nudges
 from ponderpounce.training.stand_in import stand_in
 
@@ -72,6 +72,14 @@ class TrainingEpisode:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Slip:
+    """What PONDER is made to have said wrongly in one row."""
+
+    std_px: float
+    seed: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ExampleConfig:
     """How an episode becomes a training example."""
 
@@ -82,6 +90,12 @@ class ExampleConfig:
     """False: texts are left out of the row, as in RoboCasa-DC."""
     text_dropout: float = 0.0
     """Share of rows without their texts although they have some: cognition must then come from what was seen."""
+
+    slips: float = 0.0
+    """Share of grounded rows in which all said places are wrong by ``slip_px`` and not to be learned. Cognition must
+    then come from what is seen; from flawless words alone it would learn to copy them, and PONDER's own are not."""
+    slip_px: float = 6.0
+    """Standard deviation of each coordinate, of a 256 px picture."""
 
     augmentation: Augmentation = NOT_AUGMENTED
     """Other views of the scene. An action is that of the scene as it is, so where POUNCE learns as well, only watched
@@ -97,8 +111,9 @@ class ExampleConfig:
     def __post_init__(self) -> None:
         if self.max_queries is not None and self.max_queries < 1:
             raise ValueError(f"max_queries must be at least 1, came {self.max_queries}")
-        if not 0 <= self.text_dropout <= 1:
-            raise ValueError(f"text_dropout must be in [0, 1], came {self.text_dropout}")
+        for name in ("text_dropout", "slips"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} must be in [0, 1], came {getattr(self, name)}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -112,13 +127,16 @@ class Example:
     """Those of the schedule that were drawn."""
     is_grounded: bool
     view: View = AS_IT_IS
+    slip: Slip | None = None
     nudge: Nudge = NO_NUDGE
     nudges_I2: Floats | None = None
     """Of each invocation's tool [m]; None: starts are as recorded."""
 
     def row(self) -> Row:
         """PONDER's tokens."""
-        return episode_row(self.episode, self.form, self.schedule, is_grounded=self.is_grounded, view=self.view)
+        return episode_row(
+            self.episode, self.form, self.schedule, is_grounded=self.is_grounded, view=self.view, slip=self.slip
+        )
 
     def frames(self) -> Tensor:
         """PONDER's pictures, (num_images, height, width, 3) uint8."""
@@ -146,6 +164,9 @@ def make_example(
     chosen = np.sort(rng.choice(len(schedule.invocations), size=count, replace=False))
     invocations = tuple(schedule.invocations[index] for index in chosen)
     is_grounded = config.is_grounded and rng.random() >= config.text_dropout
+    slip = None
+    if is_grounded and config.slips and rng.random() < config.slips:
+        slip = Slip(std_px=config.slip_px, seed=int(rng.integers(1 << 62)))
     is_moved = config.augments == "all" or episode.is_watched
     view = draw_view(config.augmentation if is_moved else NOT_AUGMENTED, form, set(episode.subgoals), rng)
     nudges_I2 = None
@@ -158,6 +179,7 @@ def make_example(
         invocations=invocations,
         is_grounded=is_grounded,
         view=view,
+        slip=slip,
         nudge=config.nudge,
         nudges_I2=nudges_I2,
     )
@@ -181,8 +203,10 @@ def episode_row(
     *,
     is_grounded: bool = True,
     view: View = AS_IT_IS,
+    slip: Slip | None = None,
 ) -> Row:
     """The tokens of the episode. The first transition of a demonstration episode begins with its reasoning."""
+    slips = None if slip is None else np.random.default_rng(slip.seed)
     views, form = _before_ponder(episode, form)
     segments = list(form.opening(episode.instruction, [len(views) for views in episode.demo]))
     encode = form.vocabulary.encode
@@ -191,9 +215,12 @@ def episode_row(
         transition = None
         text = episode.subgoals[query.tick]
         if is_grounded and query.stamp.is_transition and text:
-            transition = Transition(subgoal=encode(normalised_text(view.text(text))), reasoning=reasoning)
+            text = view.text(text)
+            if slip is not None and slips is not None:
+                text = misplaced(text, slip.std_px, slips)
+            transition = Transition(subgoal=encode(normalised_text(text)), reasoning=reasoning, is_learned=slip is None)
             reasoning = None
-        segments += form.query(len(views[query.tick]), transition)
+        segments += form.query(len(views[query.tick]), transition, episode.state_T8[query.tick])
     return form.row(segments)
 
 

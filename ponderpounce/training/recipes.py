@@ -143,8 +143,9 @@ def tiny_subgoal_text() -> Recipe:
 def small() -> Curriculum:
     """Both architectures at about a million weights each, from scratch on CPU cores: see docs/training.md.
 
-    Where the paper starts from pretrained weights, five stages stand in for them, of one system each, so that two cores
-    can run them side by side. Episodes that are watched (`pp-train --watch`) are for the last three.
+    Where the paper starts from pretrained weights, eyes that `pp-see` has opened and five stages stand in for them, of
+    one system each, so that two cores can run them side by side. Episodes that are watched (`pp-train --watch`) are for
+    the last three.
     """
     looking = Recipe(
         name="small/looking",
@@ -159,7 +160,7 @@ def small() -> Curriculum:
             augmentation=Augmentation(max_shift_px=4, mirror=True),
         ),
         train=TrainConfig(seed=0, optim=_FROM_SCRATCH),
-        num_steps=1800,
+        num_steps=1000,
         batch_episodes=16,
         w2=1.0,
         w3=1.0,
@@ -172,7 +173,7 @@ def small() -> Curriculum:
     grounding = replace(
         looking,
         name="small/grounding",
-        example=replace(looking.example, text_dropout=0.2, max_queries=None),
+        example=replace(looking.example, text_dropout=0.2, slips=0.4, max_queries=None),
         train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, decay=(1100, 1600))),
         num_steps=1600,
         batch_episodes=8,
@@ -180,8 +181,8 @@ def small() -> Curriculum:
     watching = replace(
         grounding,
         name="small/watching",
-        train=TrainConfig(seed=1, optim=replace(_FROM_SCRATCH, learning_rate=7e-4, decay=(300, 1800))),
-        num_steps=1800,
+        train=TrainConfig(seed=1, optim=replace(_FROM_SCRATCH, learning_rate=7e-4, decay=(600, 2600))),
+        num_steps=2600,
     )
     reaching = replace(
         looking,
@@ -203,7 +204,11 @@ def small() -> Curriculum:
         grounding,
         name="small/joint",
         example=replace(
-            reaching.example, max_invocations=32, augmentation=looking.example.augmentation, augments="watched"
+            reaching.example,
+            max_invocations=32,
+            slips=0.4,
+            augmentation=looking.example.augmentation,
+            augments="watched",
         ),
         train=replace(reaching.train, optim=replace(_FROM_SCRATCH, learning_rate=3e-4, decay=(100, 400))),
         num_steps=400,

@@ -23,6 +23,7 @@ from ponderpounce.models.ponder_checkpoint import (
     weights_hash,
 )
 from ponderpounce.models.ponder_configs import PonderConfig, qwen35_0p8b, qwen35_2b, qwen35_4b, qwen35_9b, tiny_cpu
+from ponderpounce.models.proprioception import Proprioception
 from ponderpounce.models.vocabulary import Vocabulary
 
 VOCABULARY = Vocabulary.tiny()
@@ -228,12 +229,22 @@ def test_a_checkpoint_remembers_its_eyes(tmp_path: Path) -> None:
     assert (loaded.format.image_grid, loaded.format.token_px, loaded.image_px) == ((4, 4), 16, (64, 64))
 
 
-def test_a_folder_from_before_there_were_eyes_has_none(ponder: Ponder, folder: Path) -> None:
+def test_a_checkpoint_remembers_what_it_is_told_of_the_robot(tmp_path: Path) -> None:
+    told = Proprioception(first_id=460, num_finger_bins=4)
+    save_ponder(Ponder.random(replace(CONFIG, proprioception=told), VOCABULARY, seed=1), tmp_path)
+    assert load_ponder(tmp_path).format.proprioception == told
+
+
+@pytest.mark.parametrize(("version", "unknown"), [(1, ["eyes", "proprioception"]), (2, ["proprioception"])])
+def test_a_folder_from_before_there_were_eyes_or_proprioception_has_none(
+    ponder: Ponder, folder: Path, version: int, unknown: list[str]
+) -> None:
     stored = json.loads((folder / "ponder.json").read_text())
-    del stored["eyes"]
-    (folder / "ponder.json").write_text(json.dumps({**stored, "format": "ponderpounce.ponder/1"}))
+    for name in unknown:
+        del stored[name]
+    (folder / "ponder.json").write_text(json.dumps({**stored, "format": f"ponderpounce.ponder/{version}"}))
     loaded = load_ponder(folder)
-    assert loaded.format.eyes is None
+    assert (loaded.format.eyes, loaded.format.proprioception) == (None, None)
     assert loaded.image_px == (64, 64)
     assert weights_hash(loaded) == weights_hash(ponder)
 

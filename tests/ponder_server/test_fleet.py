@@ -40,7 +40,9 @@ class InTurns:
     def warm_up_full(self) -> list[int]:
         return [self._full_ms * MS] * 10
 
-    def begin(self, session: str, frames: tuple[contract.Frame, ...]) -> None:
+    def begin(
+        self, session: str, frames: tuple[contract.Frame, ...], *, proprio: contract.Proprio | None = None
+    ) -> None:
         assert session not in self.begun
         self.begun[session] = frames
 

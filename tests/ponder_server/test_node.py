@@ -145,6 +145,12 @@ def test_eyes_read_cameras_of_several_sizes(px: tuple[int, int]) -> None:
     assert worked(node) == [0]
 
 
+def test_a_robot_that_tells_too_little_of_itself_is_refused_where_that_is_read() -> None:
+    check_robot(robot((4, 6)), SPEC)
+    with pytest.raises(ValueError, match="tells 1 numbers of itself; this PONDER reads 8"):
+        check_robot(robot((4, 6)), dataclasses.replace(SPEC, reads_proprio=True))
+
+
 def test_eyes_refuse_what_they_cannot_read_at_open_and_later() -> None:
     with pytest.raises(ValueError, match="camera 'wrist' gives 10 x 12 px; PONDER reads 8 x 12 or 16 x 24"):
         check_robot(robot((10, 12)), WITH_EYES)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +21,7 @@ from ponderpounce.models.pounce_configs import tiny_groot
 from ponderpounce.models.pounce_groot import GrootInputs
 from ponderpounce.models.pounce_reading import groot_inputs, pi05_inputs
 from ponderpounce.models.prompt import tiny_tokenizer_for_random_weights
+from ponderpounce.training.augment import misplaced
 from ponderpounce.training.collate import collate_ponder, collate_pounce
 from ponderpounce.training.example import (
     ExampleConfig,
@@ -170,6 +172,33 @@ def test_without_grounding_the_row_has_no_text() -> None:
     config = ExampleConfig(clocks=EVALUATION, is_grounded=False)
     example = make_example(recorded, FORM, config, np.random.default_rng(0))
     assert FORM.vocabulary.t_yes not in example.row().ids
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=20, deadline=None)
+def test_words_that_slipped_are_read_and_not_learned(seed: int) -> None:
+    recorded = replace(episode(70, changes=(0, 30)), subgoals=["pick at <120, 40>"] * 30 + ["go to <20, 200>"] * 40)
+    config = ExampleConfig(clocks=EVALUATION, slips=1.0, slip_px=5.0)
+    slipped = make_example(recorded, FORM, config, np.random.default_rng(seed)).row()
+    right = make_example(recorded, FORM, replace(config, slips=0.0), np.random.default_rng(seed)).row()
+    v = FORM.vocabulary
+    assert [t for t in slipped.targets if t >= 0] == [t for t in right.targets if t in (v.t_yes, v.t_no)]
+    said = v.decode([i for i in slipped.ids if i not in v.control_ids and i not in FORM.carrier_ids])
+    places = np.array([[int(n) for n in pair] for pair in re.findall(r"\[(\d+), (\d+)\]", said)])
+    wanted = np.array([[156, 469], [781, 78]])
+    assert places.shape == wanted.shape
+    assert 0 < np.abs(places - wanted).max() < 6 * 5 * 1000 / 256
+    assert "pick at [" in said
+
+
+def test_places_that_slip_stay_in_the_picture() -> None:
+    rng = np.random.default_rng(0)
+    texts = [misplaced("<0, 256>", 30.0, rng) for _ in range(200)]
+    numbers = np.array([[int(n) for n in text[1:-1].split(",")] for text in texts])
+    assert numbers.min() == 0
+    assert numbers.max() == 256
+    assert misplaced("put it down", 30.0, rng) == "put it down"
+    assert misplaced("at <7, 9>", 0.0, rng) == "at <7, 9>"
 
 
 def test_no_more_invocations_than_asked_for_and_in_order() -> None:

@@ -14,11 +14,23 @@ from ponder_server.engine import EngineConfig, QwenEngine
 from ponderpounce.models.eyes import Eye, see
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
+from ponderpounce.models.proprioception import Proprioception
 from ponderpounce.training.example import TrainingEpisode, episode_row, row_frames
 
 EYES = (Eye(camera=1), Eye(camera=0, box=(0.25, 0.5, 0.75, 1.0)))
 PONDER = Ponder.random(
     replace(tiny_cpu(), image_px=(32, 32), num_layers=4, vision_patch_px=8, num_carriers=2, eyes=EYES), seed=1
+)
+TOLD_PONDER = Ponder.random(
+    replace(
+        tiny_cpu(),
+        image_px=(32, 32),
+        num_layers=4,
+        vision_patch_px=8,
+        eyes=EYES,
+        proprioception=Proprioception(first_id=460),
+    ),
+    seed=2,
 )
 FRONT_PX, WRIST_PX = 128, 64
 INSTRUCTION = "press the button"
@@ -34,7 +46,7 @@ def episode(num_ticks: int = 45, num_demo: int = 2) -> TrainingEpisode:
         instruction=INSTRUCTION,
         demo=tuple(views() for _ in range(num_demo)),
         frames=[views() for _ in range(num_ticks)],
-        state_T8=np.zeros((num_ticks, 8), np.float32),
+        state_T8=rng.uniform(-1, 1, (num_ticks, 8)).astype(np.float32),
         action_T8=np.zeros((num_ticks, 8), np.float32),
         subgoals=[""] * num_ticks,
         is_transition_T=np.zeros(num_ticks, np.bool_),
@@ -45,8 +57,9 @@ def engine_of(ponder: Ponder, **changes: int) -> QwenEngine:
     return QwenEngine(ponder, EngineConfig(max_context_tokens=400, max_sessions=1, **changes))
 
 
-def test_training_and_serving_see_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    recorded, form = episode(), PONDER.format
+@pytest.mark.parametrize("ponder", [PONDER, TOLD_PONDER], ids=["pictures", "and the robot's state"])
+def test_training_and_serving_see_the_same(monkeypatch: pytest.MonkeyPatch, ponder: Ponder) -> None:
+    recorded, form = episode(), ponder.format
     schedule = sample_schedule(np.random.default_rng(0), EVALUATION, recorded.num_ticks)
     row, frames = episode_row(recorded, form, schedule), row_frames(recorded, form, schedule)
     ids: list[int] = []
@@ -59,13 +72,13 @@ def test_training_and_serving_see_the_same(monkeypatch: pytest.MonkeyPatch) -> N
         return embed(ponder, ids_T, frames_NHW3)
 
     with torch.inference_mode():
-        hidden = PONDER.encode_row(row, frames)
-    engine = engine_of(PONDER)
+        hidden = ponder.encode_row(row, frames)
+    engine = engine_of(ponder)
     monkeypatch.setattr(Ponder, "embed", listened)
     monkeypatch.setattr(engine, "_gate", lambda _: form.vocabulary.t_no)  # the episode has no texts
     engine.open("a", Opening(instruction=INSTRUCTION, demo_frames=recorded.demo))
     for query, index_K in zip(schedule.queries, row.carrier_index, strict=True):
-        fire = engine.fire("a", recorded.frames[query.tick])
+        fire = engine.fire("a", recorded.frames[query.tick], proprio=recorded.state_T8[query.tick])
         np.testing.assert_allclose(fire.cognition, hidden[index_K].numpy(), atol=1e-4)
     assert tuple(ids) == row.ids
     assert torch.equal(torch.stack(pictures), frames)
@@ -89,6 +102,19 @@ def test_the_engine_says_what_it_looks_at_and_warms_up_on_cameras_that_it_can_re
     engine = engine_of(PONDER)
     assert (engine.spec.eyes, engine.spec.num_cameras, engine.spec.image_px) == (EYES, 2, (32, 32))
     assert len(engine.warm_up()) >= 20
+
+
+def test_a_query_without_the_state_that_is_read_is_refused_and_leaves_no_trace() -> None:
+    engine, recorded = engine_of(TOLD_PONDER), episode()
+    assert engine.spec.reads_proprio
+    assert not engine_of(PONDER).spec.reads_proprio
+    engine.open("a", Opening(instruction=INSTRUCTION))
+    with pytest.raises(ValueError, match="none came"):
+        engine.fire("a", recorded.frames[0])
+    answered = engine.fire("a", recorded.frames[0], proprio=recorded.state_T8[0])
+    again = engine_of(TOLD_PONDER)
+    again.open("a", Opening(instruction=INSTRUCTION))
+    assert again.fire("a", recorded.frames[0], proprio=recorded.state_T8[0]).context_tokens == answered.context_tokens
 
 
 def test_an_engine_with_fewer_cameras_than_its_eyes_need_is_refused() -> None:

@@ -1,0 +1,187 @@
+"""``pp-album``: pictures in which everything is named and placed, as a dataset.
+
+What a pretrained model has seen by the million, and a network from scratch has not: what things look like, and where in
+a picture they are. Every row is a scene of its own, drawn as the task draws its episodes, with the arm anywhere above
+the table; the grounded text tells all that the front camera sees of it, from left to right. Nobody acts. One episode
+of the dataset is a page of such rows, so it is read, stored and looked at like any other.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+import ponderpounce.tasks.headless  # noqa: F401 - before mujoco is imported
+from ponderpounce.data.episode import About, EpisodeWriter, Row, unpack
+from ponderpounce.data.errors import DatasetError
+from ponderpounce.data.lerobot_v3 import INFO_PATH, DatasetWriter
+from ponderpounce.data.video import Frame
+from ponderpounce.tasks.environment import IMAGE_PX
+from ponderpounce.tasks.geometry import pose, pose_of, transform
+from ponderpounce.tasks.kinematics import Kinematics, UnreachableError
+from ponderpounce.tasks.panda import HOME_OPENING_M, HOME_QPOS
+from ponderpounce.tasks.physics import Physics
+from ponderpounce.tasks.rendering import Cameras
+from ponderpounce.tasks.scene import FRONT, table_scene
+from ponderpounce.tasks.sight import mean_pixel, visible_pixels
+from ponderpounce.tasks.task import DIFFICULTIES, Task, TaskError, Thing, make_task
+
+DONE, REFUSED = 0, 2
+INSTRUCTION = "tell what you see, and where"
+SEPARATOR = ", "
+
+_PAGE = 100
+_POSES = 1  # a seed's stream of random numbers, beside the layout's
+_STEPS = (0, 50)  # of an episode: some things are only shown for a while
+_MIN_PIXELS = 8  # less of a thing is not seen
+_TOOL_LOW_M, _TOOL_HIGH_M = (-0.32, -0.3, 0.02), (0.12, 0.3, 0.3)
+_HELD_SHARE, _HOME_SHARE = 0.25, 0.15
+_LIFTED_M = 0.06
+_TRIES = 20
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlbumOptions:
+    """Draws scenes of a task and names what is in their pictures."""
+
+    out: Path
+    """Folder of the new dataset."""
+    task: str = "PickHighlight"
+    pictures: int = 8000
+    """Rounded up to whole pages of 100."""
+    seed: int = 3_000_000
+    """The first scene's; episodes of these seeds should not be evaluated."""
+    image_px: int = IMAGE_PX
+    progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
+    """Show a progress bar."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    options = tyro.cli(AlbumOptions, args=argv, prog="pp-album", description=AlbumOptions.__doc__)
+    try:
+        make_album(options)
+    except (DatasetError, TaskError, OSError) as error:
+        sys.stderr.write(f"pp-album: {error}\n")
+        return REFUSED
+    sys.stdout.write(f"{_num_pages(options) * _PAGE} pictures in {options.out}\n")
+    return DONE
+
+
+def make_album(options: AlbumOptions) -> None:
+    """Writes the dataset.
+
+    Raises:
+        DatasetError: there is a dataset already.
+        TaskError: no such task, or one that does not name its things.
+        OSError: a full disk.
+    """
+    if (options.out / INFO_PATH).exists():
+        raise DatasetError(f"{options.out} holds a dataset already; use another --out")
+    with closing(Studio(options.task, options.image_px)) as studio:
+        writer = DatasetWriter(options.out)
+        for page in tqdm(range(_num_pages(options)), unit="page", disable=not options.progress):
+            first_seed = options.seed + page * _PAGE
+            rows = EpisodeWriter(options.image_px)
+            for seed in range(first_seed, first_seed + _PAGE):
+                rows.add(*studio.picture(seed))
+            about = About(
+                task=options.task,
+                instruction=INSTRUCTION,
+                seed=first_seed,
+                difficulty="",
+                origin="album",
+                is_success=True,
+                image_px=options.image_px,
+            )
+            writer.add(unpack(rows.pack(about)))
+        writer.finish()
+
+
+class Studio:
+    """Scenes of one task that stand still. Close it after use."""
+
+    def __init__(self, task: str, image_px: int) -> None:
+        """Raises TaskError if there is no such task, or it does not name its things."""
+        self._task = make_task(task)
+        if type(self._task).things is Task.things:
+            raise TaskError(f"task {task!r} does not name its things (Task.things); PickHighlight does")
+        spec = table_scene(self._task.robot)
+        self._task.furnish(spec)
+        self._physics = Physics(spec)
+        self._kinematics = Kinematics(self._physics.model)
+        self._cameras = Cameras(self._physics, image_px)
+
+    def picture(self, seed: int) -> tuple[Row, dict[str, Frame]]:
+        """One scene, what there is to say of it, and both cameras' pictures; equal seeds give equal ones."""
+        rng, physics = np.random.default_rng([seed, _POSES]), self._physics
+        layout = self._task.sample(np.random.default_rng(seed), DIFFICULTIES[seed % len(DIFFICULTIES)])
+        step = int(rng.choice(_STEPS))
+        physics.reset()
+        self._task.arrange(physics, layout)
+        physics.refresh()
+        self._task.stage(physics, layout, None, step)
+        things = self._task.things(layout, step)
+        # what is highlighted lies where it lies
+        self._pose(rng, [thing.body for thing in things if thing.is_movable] if step == 0 else [])
+        row = Row(
+            state=physics.state().astype(np.float32),
+            action=physics.command().astype(np.float32),
+            tcp_pose=pose_of(physics.tcp_transform()).astype(np.float32),
+            subgoal=INSTRUCTION,
+            grounded_subgoal=told(physics, things),
+            is_transition=True,
+        )
+        return row, self._cameras.frames()
+
+    def close(self) -> None:
+        """Frees the renderer."""
+        self._cameras.close()
+
+    def _pose(self, rng: np.random.Generator, movable: Sequence[str]) -> None:
+        """Puts the tool somewhere above the table, pointing down, sometimes with a thing between its fingers."""
+        physics = self._physics
+        if rng.random() < _HOME_SHARE:
+            return
+        opening_m = float(rng.choice([0.0, HOME_OPENING_M / 2, HOME_OPENING_M]))
+        upright = self._kinematics.tcp(HOME_QPOS)
+        for _ in range(_TRIES):
+            yaw_rad = rng.uniform(-np.pi / 4, np.pi / 4)
+            target = transform(pose(0.0, 0.0, 0.0, yaw_rad)) @ upright
+            target[:3, 3] = rng.uniform(_TOOL_LOW_M, _TOOL_HIGH_M)
+            try:
+                joints = self._kinematics.solve(target, HOME_QPOS)
+            except UnreachableError:
+                continue
+            is_held = rng.random() < _HELD_SHARE and target[2, 3] > _LIFTED_M and bool(movable)
+            physics.pose_arm(joints, HOME_OPENING_M / 2 if is_held else opening_m)
+            if is_held:
+                physics.place(str(rng.choice(movable)), np.array([*target[:3, 3], *pose(0.0, 0.0, 0.0, yaw_rad)[3:]]))
+                physics.refresh()
+            return
+
+
+def told(physics: Physics, things: Sequence[Thing]) -> str:
+    """What the front camera sees of ``things``, from left to right: "red cube at <y, x>, button at <y, x>"."""
+    seen = []
+    for thing in things:
+        pixels = visible_pixels(physics, FRONT, thing.body, IMAGE_PX)
+        point = mean_pixel(pixels) if len(pixels) >= _MIN_PIXELS else None
+        if point is not None:
+            seen.append((point[1], point[0], thing.name))
+    return SEPARATOR.join(f"{name} at <{y}, {x}>" for x, y, name in sorted(seen))
+
+
+def _num_pages(options: AlbumOptions) -> int:
+    return -(-options.pictures // _PAGE)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

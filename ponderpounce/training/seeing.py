@@ -1,0 +1,223 @@
+"""``pp-see``: a vision tower from scratch learns what stands where, from an album (`pp-album`).
+
+A pretrained PONDER brings eyes along. One from scratch would have to learn to see from the few places that it is told
+to say, through a language model that is as new: slow, and never precise. Here every image token is asked directly: does
+a thing's middle lie in your square, which one is it, and where in the square? The answers come from one linear layer
+that is thrown away afterwards, so that a token carries them plainly. No other recipe needs this, the paper has nothing
+of it, and no word is learned: the rest of PONDER stays as it was drawn.
+"""
+
+# N pictures, S image tokens of a picture, W names
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+import tyro
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from ponderpounce.data.errors import DatasetError
+from ponderpounce.models.context import ContextFormat
+from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.ponder_checkpoint import save_ponder
+from ponderpounce.models.vocabulary import Vocabulary
+from ponderpounce.training.augment import Augmentation, draw_view
+from ponderpounce.training.data import Sight, TrainingSet
+from ponderpounce.training.optim import OptimConfig, Optimiser
+from ponderpounce.training.recipes import recipe, stages_of
+
+DONE, REFUSED = 0, 2
+
+_THING = re.compile(r"([^,<>]+?) at <(\d+), (\d+)>")
+_TEXT_PX = 256  # coordinates in texts, whatever the size of a picture
+_WAYS = Augmentation(max_shift_px=4, mirror=True)
+_HELD_OUT_SHARE = 0.05
+_PLACE_WEIGHT, _NAME_WEIGHT = 16.0, 0.3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeeOptions:
+    """Teaches the vision tower of a recipe's PONDER to find and name things. A killed run begins anew."""
+
+    recipe: str
+    """Which PONDER: small."""
+    data: Path
+    """A folder that pp-collect made: PONDER's tokenizer is trained on its texts, as pp-train would."""
+    album: Path
+    """A folder that pp-album made."""
+    out: Path
+    """OUT/ponder is what `pp-train --ponder` goes on from."""
+    steps: int = 2000
+    pictures: int = 128
+    """Of one step."""
+    learning_rate: float = 2e-3
+    seed: int = 0
+    progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Album:
+    """Pictures as PONDER's eye sees them, and what is in each."""
+
+    pictures: NDArray[np.uint8]
+    """(N, height, width, 3)"""
+    texts: tuple[str, ...]
+    names: tuple[str, ...]
+    """Of all things, sorted."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Answers:
+    """What the image tokens of pictures should say."""
+
+    is_thing_NS: Tensor
+    """bool"""
+    name_NS: Tensor
+    """int64, where there is a thing."""
+    place_NS2: Tensor
+    """Down and right in a token's square, -1/2 to 1/2."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    options = tyro.cli(SeeOptions, args=argv, prog="pp-see", description=SeeOptions.__doc__)
+    try:
+        see_things(options)
+    except (DatasetError, OSError, ValueError, FloatingPointError) as error:
+        sys.stderr.write(f"pp-see: {error}\n")
+        return REFUSED
+    return DONE
+
+
+def see_things(options: SeeOptions) -> None:
+    """Trains, says how well pictures that were held out are seen, and writes PONDER.
+
+    Raises:
+        DatasetError, ValueError, OSError: what was given does not fit; the message says why.
+        FloatingPointError: the gradients are not finite.
+    """
+    run = stages_of(recipe(options.recipe))[0]
+    if not run.from_scratch:
+        raise ValueError(f"recipe {run.name} starts from pretrained weights, which can see; pp-see is for small")
+    if (options.out / "ponder").exists():
+        raise ValueError(f"{options.out} holds a PONDER already; use another --out")
+    texts = TrainingSet(options.data).texts()
+    vocabulary = Vocabulary.trained_on(texts, run.ponder.first_carrier_id) if run.has_own_tokenizers else None
+    ponder = Ponder.random(run.ponder, vocabulary, seed=options.seed)
+    album = read_album(options.album, ponder.format)
+    num_held_out = max(1, round(_HELD_OUT_SHARE * len(album.texts)))
+    num_learned = len(album.texts) - num_held_out
+    if num_learned < 1:
+        raise ValueError(f"{options.album} holds {len(album.texts)} pictures; some hundreds at least are needed")
+    torch.manual_seed(options.seed)
+    answering = nn.Linear(ponder.hidden_size, 3 + len(album.names))
+    optim = OptimConfig(
+        learning_rate=options.learning_rate,
+        weight_decay=1e-4,
+        decay=(options.steps // 2, options.steps),
+    )
+    optimiser = Optimiser(nn.ModuleList([ponder.qwen.model.visual, answering]), optim)
+    options.out.mkdir(parents=True, exist_ok=True)
+    with (options.out / "log.jsonl").open("w") as log:
+        for step in tqdm(range(options.steps), unit="step", disable=not options.progress):
+            rng = np.random.default_rng([options.seed, step])
+            chosen = rng.integers(num_learned, size=options.pictures)
+            frames_NHW3, answers = draw(album, chosen, ponder.format, rng)
+            loss = loss_of(answering(ponder.image_features(frames_NHW3)), answers)
+            loss.backward()  # type: ignore[no-untyped-call]
+            optimiser.update(step)
+            log.write(json.dumps({"step": step, "loss": loss.item()}) + "\n")
+    held_out = np.arange(num_learned, len(album.texts))
+    sys.stdout.write(f"{num_held_out} pictures held out: {examine(ponder, answering, album, held_out)}\n")
+    save_ponder(ponder, options.out / "ponder")
+
+
+def read_album(folder: Path, form: ContextFormat) -> Album:
+    """All pictures of a folder. Raises DatasetError if it is none, ValueError if its texts name nothing."""
+    if form.eyes is None or len(form.eyes) != 1 or form.eyes[0].camera != 0:
+        raise ValueError("things are placed in the front camera's picture: PONDER needs one eye, on that camera")
+    pages = TrainingSet(folder, sight=Sight(form=form, pounce_px=None))
+    pictures: list[NDArray[np.uint8]] = []
+    texts: list[str] = []
+    for number in range(len(pages)):
+        page = pages[number]
+        pictures += [sight[0] for sight in page.sights or ()]
+        texts += page.subgoals
+    names = {found[1].strip() for text in texts for found in _THING.finditer(text)}
+    if not names:
+        raise ValueError(f"no text of {folder} names a thing and its place; make it with pp-album")
+    return Album(pictures=np.stack(pictures), texts=tuple(texts), names=tuple(sorted(names)))
+
+
+def draw(
+    album: Album, chosen: NDArray[np.integer], form: ContextFormat, rng: np.random.Generator, ways: Augmentation = _WAYS
+) -> tuple[Tensor, Answers]:
+    """Pictures by number, each moved and mirrored in its own way: (N, height, width, 3) uint8, and the answers."""
+    frames, told = [], []
+    for number in chosen:
+        view = draw_view(ways, form, set(), rng)
+        frames.append(view.pictures(torch.from_numpy(album.pictures[number])[None]))
+        told.append(view.text(album.texts[number]))
+    return torch.cat(frames), answers_of(told, album.names, form)
+
+
+def answers_of(texts: Sequence[str], names: Sequence[str], form: ContextFormat) -> Answers:
+    """Which token's square holds which thing's middle; of several in one square, the last. Others are not asked for."""
+    assert form.eyes is not None
+    top, left, bottom, right = form.eyes[0].box
+    num_rows, num_columns = form.image_grid
+    is_thing_NS = torch.zeros(len(texts), num_rows * num_columns, dtype=torch.bool)
+    name_NS = torch.zeros(is_thing_NS.shape, dtype=torch.int64)
+    place_NS2 = torch.zeros(*is_thing_NS.shape, 2)
+    for number, text in enumerate(texts):
+        for name, y, x in _THING.findall(text):
+            down = (int(y) / _TEXT_PX - top) / (bottom - top) * num_rows
+            along = (int(x) / _TEXT_PX - left) / (right - left) * num_columns
+            if not (0 <= down < num_rows and 0 <= along < num_columns):
+                continue
+            token = int(down) * num_columns + int(along)
+            is_thing_NS[number, token] = True
+            name_NS[number, token] = names.index(name.strip())
+            place_NS2[number, token] = torch.tensor([down % 1 - 0.5, along % 1 - 0.5])
+    return Answers(is_thing_NS=is_thing_NS, name_NS=name_NS, place_NS2=place_NS2)
+
+
+def loss_of(said: Tensor, answers: Answers) -> Tensor:
+    """Of the answers (N * S, 3 + W): is it a thing, its place, its name; the last two where there is one."""
+    is_thing = answers.is_thing_NS.flatten()
+    named = F.cross_entropy(said[is_thing, 3:], answers.name_NS.flatten()[is_thing])
+    placed = F.mse_loss(said[is_thing, 1:3], answers.place_NS2.flatten(0, 1)[is_thing])
+    found = F.binary_cross_entropy_with_logits(said[:, 0], is_thing.float())
+    return found + _PLACE_WEIGHT * placed + _NAME_WEIGHT * named
+
+
+@torch.inference_mode()
+def examine(ponder: Ponder, answering: nn.Linear, album: Album, chosen: NDArray[np.integer]) -> str:
+    """How well these pictures are seen as they are, in words; places in pixels of the 256 px picture."""
+    assert ponder.format.eyes is not None
+    rng = np.random.default_rng(0)
+    frames_NHW3, answers = draw(album, chosen, ponder.format, rng, Augmentation())
+    said = answering(ponder.image_features(frames_NHW3))
+    is_thing = answers.is_thing_NS.flatten()
+    found = (said[is_thing, 0] > 0).float().mean().item()
+    named = (said[is_thing, 3:].argmax(-1) == answers.name_NS.flatten()[is_thing]).float().mean().item()
+    top, left, bottom, right = ponder.format.eyes[0].box
+    num_rows, num_columns = ponder.format.image_grid
+    token_px = torch.tensor([(bottom - top) / num_rows, (right - left) / num_columns]) * _TEXT_PX
+    off_px = ((said[:, 1:3] - answers.place_NS2.flatten(0, 1)) * token_px)[is_thing].norm(dim=-1)
+    p50, p95 = off_px.quantile(torch.tensor([0.5, 0.95])).tolist()
+    return f"{found:.1%} of their things found, {named:.1%} named rightly, places {p50:.2f} px off (p95 {p95:.2f})"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,71 @@
+"""An album: every scene its own, and what is said of it is what its picture shows."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ponderpounce.data.album import INSTRUCTION, REFUSED, Studio, main
+from ponderpounce.data.dataset import Dataset
+from ponderpounce.tasks.scene import CUBE_COLORS
+
+NUM_SCENES = 24
+_SAID = re.compile(r"(highlighted )?(\w+ cube|button) at <(\d+), (\d+)>")
+
+
+@pytest.fixture(scope="module")
+def studio() -> Iterator[Studio]:
+    with closing(Studio("PickHighlight", 256)) as studio:
+        yield studio
+
+
+def test_the_picture_shows_what_is_said_where_it_is_said(studio: Studio) -> None:
+    num_lit = 0
+    for seed in range(NUM_SCENES):
+        row, frames = studio.picture(seed)
+        said = _SAID.findall(row.grounded_subgoal)
+        assert ", ".join(f"{lit}{name} at <{y}, {x}>" for lit, name, y, x in said) == row.grounded_subgoal
+        columns = [int(x) for *_, x in said]
+        assert columns == sorted(columns)
+        assert sum(name != "button" for _, name, *_ in said) <= 3 + seed % 3 + (seed % 3 == 2)
+        num_lit += sum(bool(lit) for lit, *_ in said)
+        for _, name, y, x in said:
+            if name == "button":
+                continue
+            colour = np.array(CUBE_COLORS[name.split()[0]][:3])
+            near = frames["front"][int(y) - 1 : int(y) + 2, int(x) - 1 : int(x) + 2].reshape(-1, 3).astype(float)
+            # half hidden, the middle of what is seen of a cube may be the edge of a finger
+            assert (near.argmax(axis=1) == colour.argmax()).any(), (seed, name, near)
+    assert num_lit > 0
+
+
+def test_equal_seeds_are_equal_pictures_whatever_was_drawn_before(studio: Studio) -> None:
+    row, frames = studio.picture(5)
+    studio.picture(8)
+    again, seen = studio.picture(5)
+    assert row.grounded_subgoal == again.grounded_subgoal
+    assert np.array_equal(row.state, again.state)
+    assert np.array_equal(frames["front"], seen["front"])
+
+
+def test_it_is_a_dataset_of_pages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--out", str(tmp_path / "album"), "--pictures", "1", "--image-px", "128", "--no-progress"]
+    assert main(arguments) == 0
+    assert "100 pictures" in capsys.readouterr().out
+    (page,) = Dataset(tmp_path / "album").episodes
+    assert (page.instruction, page.origin, page.num_rows) == (INSTRUCTION, "album", 100)
+    rows = Dataset(tmp_path / "album").rows(0)
+    assert rows.is_transition.all()
+    assert len(set(rows.grounded_subgoal)) == 100
+    assert main(arguments) == REFUSED
+    assert "another --out" in capsys.readouterr().err
+
+
+def test_a_task_that_names_nothing_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--out", str(tmp_path), "--task", "BinFill"]) == REFUSED
+    assert "'BinFill' does not name its things" in capsys.readouterr().err

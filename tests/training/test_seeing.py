@@ -1,0 +1,91 @@
+"""Eyes that are opened: the right square is asked for the right thing, the tower learns and nothing else moves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ponderpounce.data import album
+from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.ponder_checkpoint import load_ponder
+from ponderpounce.models.ponder_configs import small
+from ponderpounce.models.vocabulary import Vocabulary
+from ponderpounce.training.seeing import REFUSED, Album, answers_of, draw, loss_of, main
+
+PONDER = Ponder.random(small(), seed=0)
+FORM = PONDER.format
+NAMES = ("blue cube", "button", "red cube")
+TOP_PX, LEFT_PX, SIDE_PX, TOKEN_PX = 8, 64, 128, 32
+
+
+@given(
+    y=st.integers(0, 255),
+    x=st.integers(0, 255),
+    name=st.sampled_from(NAMES),
+)
+def test_the_answer_says_the_place_again(y: int, x: int, name: str) -> None:
+    answers = answers_of([f"{name} at <{y}, {x}>", ""], NAMES, FORM)
+    is_in_sight = TOP_PX <= y < TOP_PX + SIDE_PX and LEFT_PX <= x < LEFT_PX + SIDE_PX
+    assert answers.is_thing_NS.sum(dim=1).tolist() == [is_in_sight, 0]
+    if is_in_sight:
+        (token,) = answers.is_thing_NS[0].nonzero().flatten().tolist()
+        down, along = answers.place_NS2[0, token].tolist()
+        assert y == pytest.approx(TOP_PX + (token // 4 + 0.5 + down) * TOKEN_PX, abs=1e-3)
+        assert x == pytest.approx(LEFT_PX + (token % 4 + 0.5 + along) * TOKEN_PX, abs=1e-3)
+        assert NAMES[int(answers.name_NS[0, token])] == name
+
+
+def test_pictures_and_answers_move_together() -> None:
+    picture = np.zeros((1, 64, 64, 3), np.uint8)
+    picture[0, 30, 20] = 255
+    seen = Album(pictures=picture, texts=(f"red cube at <{TOP_PX + 61}, {LEFT_PX + 41}>",), names=NAMES)
+    frames, answers = draw(seen, np.zeros(40, np.int64), FORM, np.random.default_rng(0))
+    assert len({tuple(place.tolist()) for place in frames[..., 0].nonzero()[:, 1:]}) > 20
+    for frame, is_thing_S, place_S2 in zip(frames, answers.is_thing_NS, answers.place_NS2, strict=True):
+        ((down, along),) = frame[..., 0].nonzero().tolist()
+        (token,) = is_thing_S.nonzero().flatten().tolist()
+        told = [(token // 4 + 0.5 + place_S2[token, 0]) * 16, (token % 4 + 0.5 + place_S2[token, 1]) * 16]
+        assert [down + 0.5, along + 0.5] == pytest.approx([float(each) for each in told], abs=0.51)
+
+
+def test_the_loss_is_least_where_everything_is_answered_rightly() -> None:
+    answers = answers_of(["red cube at <40, 90>, button at <70, 120>"], NAMES, FORM)
+    said = torch.full((16, 3 + len(NAMES)), -20.0)
+    for token in answers.is_thing_NS[0].nonzero().flatten().tolist():
+        said[token, 0] = 20
+        said[token, 1:3] = answers.place_NS2[0, token]
+        said[token, 3 + int(answers.name_NS[0, token])] = 20
+    assert loss_of(said, answers) < 1e-6
+    for column in range(3):
+        worse = said.clone()
+        worse[answers.is_thing_NS[0], column] -= 30
+        assert loss_of(worse, answers) > 1
+
+
+def test_the_tower_learns_and_nothing_else_moves(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder, out = tmp_path / "album", tmp_path / "eyes"
+    assert album.main(["--out", str(folder), "--pictures", "100", "--image-px", "128", "--no-progress"]) == 0
+    arguments = ["--recipe", "small", "--data", str(folder), "--album", str(folder), "--out", str(out)]
+    assert main([*arguments, "--steps", "6", "--pictures", "32", "--no-progress"]) == 0
+    assert "5 pictures held out: " in capsys.readouterr().out
+    losses = [float(line.split('"loss": ')[1].rstrip("}\n")) for line in (out / "log.jsonl").read_text().splitlines()]
+    assert len(losses) == 6
+    assert losses[-1] < losses[0]
+    seeing = load_ponder(out / "ponder")
+    drawn = Ponder.random(small(), Vocabulary.load(out / "ponder"), seed=0)
+    before = dict(drawn.qwen.named_parameters())
+    moved = {name for name, weight in seeing.qwen.named_parameters() if not torch.equal(weight, before[name])}
+    assert moved == {name for name in before if ".visual." in name}
+    assert main(arguments) == REFUSED
+    assert "another --out" in capsys.readouterr().err
+
+
+def test_a_recipe_that_can_see_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    where = ["--data", str(tmp_path), "--album", str(tmp_path), "--out", str(tmp_path)]
+    assert main(["--recipe", "robomme", *where]) == REFUSED
+    assert "can see" in capsys.readouterr().err
