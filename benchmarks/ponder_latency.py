@@ -3,7 +3,8 @@
 One fire: two 256 px frames on the host become a cognition on the host; vision tower, append, T gate and copies are all
 inside. The same query is asked at every context length, after which the context goes back, so lengths do not drift.
 What the longest context adds is set against what its attention's products must take at the speed that this machine
-multiplies large matrices with, in the same run and in the same precision: no code that computes them can add less.
+multiplies large matrices with, in the same run, in the same precision and on as many threads: no code that computes
+them can add less.
 
 Beside it what a server without an append-only context pays, the whole context encoded again in one forward, and a
 transition with a text of 45 tokens (the paper's), decoded one by one and with a draft that knows it; and what an
@@ -25,8 +26,9 @@ import torch
 import tyro
 
 from benchmarks.report import Report, Row, show, spread
+from ponder_server.config import NUM_TORCH_THREADS
 from ponder_server.contract import Opening
-from ponder_server.draft import NoDraft, TrieDraft
+from ponder_server.draft import Draft, NoDraft, TrieDraft
 from ponder_server.engine import EngineConfig, QwenEngine
 from ponderpounce.models import ponder_configs
 from ponderpounce.models.context import Row as EpisodeRow
@@ -47,8 +49,8 @@ class LatencyOptions:
     device: str = "cpu"
     dtypes: tuple[Literal["float32", "bfloat16"], ...] = ("float32", "bfloat16")
     """Of the same network, one after the other."""
-    threads: tuple[int, ...] = (1,)
-    """Of torch; all but the fires is measured with the first."""
+    attention_threads: tuple[int, ...] = (1, 2)
+    """That share attention, one run of fires each; torch has one thread, and so has everything but these fires."""
     contexts: tuple[int, ...] = (800, 4_000, 14_000)
     """Tokens in the context before the fire, about."""
     fires: int = 60
@@ -60,7 +62,7 @@ class LatencyOptions:
 
 def main(argv: list[str] | None = None) -> int:
     options = tyro.cli(LatencyOptions, args=argv, prog="ponder-latency")
-    torch.set_num_threads(options.threads[0])
+    torch.set_num_threads(NUM_TORCH_THREADS)
     report = Report(
         name="ponder_latency",
         question="How long does PONDER think about one query, and how does that grow with its context?",
@@ -87,24 +89,20 @@ def _measured(dtype: str, options: LatencyOptions, report: Report) -> dict[str, 
     """Title to rows of every table, in one precision."""
     config = getattr(ponder_configs, options.size)()
     ponder = Ponder.random(config, seed=0, device=options.device, dtype=getattr(torch, dtype))
-    engines = {
-        name: QwenEngine(ponder, EngineConfig(max_context_tokens=max(options.contexts) + 600, max_sessions=1), draft)
-        for name, draft in (("one by one", NoDraft()), ("with a draft", TrieDraft([_own_text(ponder)])))
-    }
+    drafts: dict[str, Draft] = {"one by one": NoDraft(), "with a draft": TrieDraft([_own_text(ponder)])}
     fires: list[Row] = []
     floors: list[Row] = []
-    for threads in options.threads:
-        torch.set_num_threads(threads)
-        of_contexts = _fires(engines["one by one"], options)
-        fires += [{"threads": threads} | row for row in of_contexts]
-        floors.append({"threads": threads} | _floor(engines["one by one"], options, of_contexts))
-    torch.set_num_threads(options.threads[0])
+    for threads in options.attention_threads:
+        engine = _engine(ponder, options, attention_threads=threads)
+        of_contexts = _fires(engine, options)
+        fires += [{"attention_threads": threads} | row for row in of_contexts]
+        floors.append({"attention_threads": threads} | _floor(engine, options, of_contexts, threads))
     longest_p50_ms = float(fires[len(options.contexts) - 1]["p50_ms"] or 0)
     encode_ms = _encodes(ponder, options)
-    size = engines["one by one"].spec.session_bytes
+    size = engine.spec.session_bytes
     report.notes.append(
-        f"{options.size} with random weights, {dtype} on {options.device}, {options.threads[0]} thread(s) if "
-        f"nothing else is said; a session of {max(options.contexts) + 600} tokens takes {size / 2**20:.1f} MiB."
+        f"{options.size} with random weights, {dtype} on {options.device}, one thread if nothing else is "
+        f"said; a session of {max(options.contexts) + 600} tokens takes {size / 2**20:.1f} MiB."
     )
     return {
         "A cognition fire: two frames in, C_t out": fires,
@@ -113,12 +111,21 @@ def _measured(dtype: str, options: LatencyOptions, report: Report) -> dict[str, 
             spread(encode_ms, "ms") | {"fires_per_encode": round(float(np.median(encode_ms)) / longest_p50_ms, 1)}
         ],
         f"A transition: the same, and a text of {TEXT_TOKENS} tokens": [
-            {"decoded": name} | _texts(engine, options) for name, engine in engines.items()
+            {"decoded": name, **_texts(_engine(ponder, options, draft), options)} for name, draft in drafts.items()
         ],
         f"A demonstration of {DEMO_S} s, two views at 1 Hz, encoded when the episode is opened": [
             _demonstration(ponder, name, tokens, options) for name, tokens in WAYS_TO_ENCODE.items()
         ],
     }
+
+
+def _engine(
+    ponder: Ponder, options: LatencyOptions, draft: Draft | None = None, *, attention_threads: int = 1
+) -> QwenEngine:
+    config = EngineConfig(
+        max_context_tokens=max(options.contexts) + 600, max_sessions=1, attention_threads=attention_threads
+    )
+    return QwenEngine(ponder, config, draft)
 
 
 def _fires(engine: QwenEngine, options: LatencyOptions) -> list[Row]:
@@ -139,7 +146,7 @@ def _fires(engine: QwenEngine, options: LatencyOptions) -> list[Row]:
     return rows
 
 
-def _floor(engine: QwenEngine, options: LatencyOptions, fires: list[Row]) -> Row:
+def _floor(engine: QwenEngine, options: LatencyOptions, fires: list[Row], threads: int) -> Row:
     """The longest context beside the first one."""
     text = engine._ponder.qwen.config.text_config
     last = text.num_hidden_layers - 1
@@ -152,7 +159,9 @@ def _floor(engine: QwenEngine, options: LatencyOptions, fires: list[Row]) -> Row
     num_keys = options.contexts[-1] - options.contexts[0]
     # two products, of queries and keys and of shares and values; a multiplication and an addition each
     flop = 4 * sum(num_queries) * num_keys * text.num_attention_heads * text.head_dim
+    torch.set_num_threads(threads)
     flop_per_ms = _product_flop_per_ms(engine)
+    torch.set_num_threads(NUM_TORCH_THREADS)
     first_ms, longest_ms = (float(fires[at]["p50_ms"] or 0) for at in (0, -1))
     return {
         "more keys": num_keys,

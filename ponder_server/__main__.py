@@ -29,6 +29,7 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     from ponder_server.draft import Draft, FirstOf, TrieDraft
     from ponder_server.engine import EngineConfig, QwenEngine
     from ponder_server.mtp import MtpDraft
+    from ponder_server.threads import num_usable_cores
     from ponderpounce.models import ponder_configs
     from ponderpounce.models.ponder import Ponder
     from ponderpounce.models.ponder_checkpoint import load_ponder
@@ -42,6 +43,9 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
             "--dtype bfloat16 on a GPU."
         )
     torch.set_num_threads(NUM_TORCH_THREADS)
+    num_cores = num_usable_cores()
+    if options.attention_threads > num_cores:
+        log.warning("--attention-threads %d: this process may use %d core(s)", options.attention_threads, num_cores)
     dtype = {"float32": torch.float32, "bfloat16": torch.bfloat16}[options.dtype]
     if options.checkpoint is not None:
         ponder = load_ponder(options.checkpoint, device=options.device, dtype=dtype)
@@ -54,6 +58,7 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
         max_sessions=options.max_sessions,
         max_text_tokens=options.max_text_tokens,
         max_batch_rows=options.max_batch_rows,
+        attention_threads=min(options.attention_threads, num_cores),
         weights=options.weights,
     )
     drafts: list[Draft] = []

@@ -7,15 +7,21 @@ would be queries x context floats per fire, and repeating the key heads would co
 In bfloat16 a CPU multiplies several times as fast, but torch's attention in many small products, which gain nothing by
 it. There the same sums are taken in a few large products.
 
+Both ways come in pieces, by key heads and windows, for one thread or several: a large past is the one thing in a fire
+that is large enough to be shared out.
+
 # H query heads, G key heads, H = G * group; M queries, S positions, P = S - M past ones, D head dimension
 # N products of R rows, the queries of one or several heads that share a key head; W positions of a window
 """
 
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
+
+from ponder_server.threads import ALONE, Threads
 
 # Internal, but the one CPU attention that returns its log-sum-exp; the tests compare it with the public function.
 _flash_cpu: Any = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu
@@ -28,22 +34,26 @@ _WINDOW_STEP = 256
 _ROWS = 1024
 """Of a product at most, if one head has no more: shares of a long window take memory."""
 _LEAST_WORK = 2**21
-"""Numbers in the queries times positions: with less, calling several functions costs more than they save."""
+"""Numbers in the queries times positions: with less, calling several functions, or a second thread, costs more than it
+saves."""
 HAS_FAST_BFLOAT16 = torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported()
 
 
-def attend(queries_HMD: Tensor, keys_GSD: Tensor, values_GSD: Tensor) -> Tensor:
-    """What the last M of S positions see (H, M, D); scores are scaled by D ** -0.5."""
+def attend(queries_HMD: Tensor, keys_GSD: Tensor, values_GSD: Tensor, threads: Threads = ALONE) -> Tensor:
+    """What the last M of S positions see (H, M, D); scores are scaled by D ** -0.5.
+
+    No bit of it depends on the number of ``threads``, which are for a CPU.
+    """
     if queries_HMD.device.type != "cpu":
         return attend_masked(queries_HMD, keys_GSD, values_GSD)
     if queries_HMD.dtype == torch.bfloat16 and HAS_FAST_BFLOAT16:
-        seen_HMD = attend_in_windows(queries_HMD, keys_GSD, values_GSD)
+        seen_HMD = attend_in_windows(queries_HMD, keys_GSD, values_GSD, threads)
         if seen_HMD is not None:
             return seen_HMD
-    return attend_in_parts(queries_HMD, keys_GSD, values_GSD)
+    return attend_in_parts(queries_HMD, keys_GSD, values_GSD, threads)
 
 
-def attend_in_parts(queries_HMD: Tensor, keys_GSD: Tensor, values_GSD: Tensor) -> Tensor:
+def attend_in_parts(queries_HMD: Tensor, keys_GSD: Tensor, values_GSD: Tensor, threads: Threads = ALONE) -> Tensor:
     """On a CPU: past and present apart, nothing of the past copied."""
     num_heads, num_queries, head_dim = queries_HMD.shape
     num_key_heads, num_past = keys_GSD.shape[0], keys_GSD.shape[1] - num_queries
@@ -55,13 +65,23 @@ def attend_in_parts(queries_HMD: Tensor, keys_GSD: Tensor, values_GSD: Tensor) -
         return recent[0]  # type: ignore[no-any-return]
     # Without a mask every query is alike: the heads that share a key head are one longer list of queries.
     shared = queries_HMD.reshape(1, num_key_heads, group * num_queries, head_dim)
-    past, past_lse = _flash_cpu(shared, keys_GSD[None, :, :num_past], values_GSD[None, :, :num_past])
+    past, past_lse = torch.empty_like(shared), torch.empty(1, num_key_heads, group * num_queries)
+
+    def look_back(heads: slice) -> None:
+        seen = _flash_cpu(shared[:, heads], keys_GSD[None, heads, :num_past], values_GSD[None, heads, :num_past])
+        past[:, heads], past_lse[:, heads] = seen
+
+    is_large = threads.count > 1 and queries_HMD.numel() * num_past >= _LEAST_WORK
+    pieces = [slice(head, head + 1) for head in range(num_key_heads)] if is_large else [slice(None)]
+    threads.do(partial(look_back, heads) for heads in pieces)
     past = past.reshape(num_heads, num_queries, head_dim)
     share = torch.sigmoid(past_lse.reshape(num_heads, num_queries) - recent_lse[0])[..., None]
     return torch.lerp(recent[0].float(), past.float(), share).to(queries_HMD.dtype)
 
 
-def attend_in_windows(queries_HMD: Tensor, keys_GSD: Tensor, values_GSD: Tensor) -> Tensor | None:
+def attend_in_windows(
+    queries_HMD: Tensor, keys_GSD: Tensor, values_GSD: Tensor, threads: Threads = ALONE
+) -> Tensor | None:
     """In bfloat16 on a CPU; None where the other way is faster, or scores are too far from zero for this one.
 
     The product of queries and keys takes the exponential along, before anything is rounded. torch fuses no exponential
@@ -81,23 +101,28 @@ def attend_in_windows(queries_HMD: Tensor, keys_GSD: Tensor, values_GSD: Tensor)
     scaled_NRD = (queries_HMD * head_dim**-0.5).reshape(-1, num_shared * num_queries, head_dim)
     shift_W = scaled_NRD.new_full((window,), -SHIFT)
     is_visible_MM = scaled_NRD.new_ones(num_queries, num_queries).tril_()
-    seen_NRD = torch.zeros(scaled_NRD.shape)
-    total_NR1 = torch.zeros(*scaled_NRD.shape[:2], 1)
-    for index, scaled_RD in enumerate(scaled_NRD):
-        head = index * num_shared // group
-        for first in (0, num_positions - window):
-            here = slice(first, first + window)
-            shares_RW = torch.ops.mkldnn._linear_pointwise(scaled_RD, keys_GSD[head, here], shift_W, "sigmoid", [], "")
-            if first:
-                shares_RW[:, : window - first] = 0
-                shares_RW.view(num_shared, num_queries, window)[..., window - num_queries :] *= is_visible_MM
-            seen_NRD[index] += shares_RW @ values_GSD[head, here]
-            # in two stages, because each sum is rounded
-            total_NR1[index] += shares_RW.unflatten(1, (-1, _WINDOW_STEP)).sum(-1).sum(-1, True, dtype=torch.float32)
+    seen_2NRD = torch.empty(2, *scaled_NRD.shape, dtype=queries_HMD.dtype)
+    total_2NR1 = torch.empty(*seen_2NRD.shape[:-1], 1)
+
+    def look_into(part: int, index: int) -> None:
+        head, first = index * num_shared // group, part * (num_positions - window)
+        here = slice(first, first + window)
+        shares_RW = torch.ops.mkldnn._linear_pointwise(
+            scaled_NRD[index], keys_GSD[head, here], shift_W, "sigmoid", [], ""
+        )
+        if first:
+            shares_RW[:, : window - first] = 0
+            shares_RW.view(num_shared, num_queries, window)[..., window - num_queries :] *= is_visible_MM
+        seen_2NRD[part, index] = shares_RW @ values_GSD[head, here]
+        # in two stages, because each sum is rounded
+        total_2NR1[part, index] = shares_RW.unflatten(1, (-1, _WINDOW_STEP)).sum(-1).sum(-1, True, dtype=torch.float32)
+
+    threads.do(partial(look_into, part, index) for index in range(len(scaled_NRD)) for part in (0, 1))
+    total_NR1 = total_2NR1.sum(0)
     least, most = total_NR1.aminmax()
     if not (least >= _MIN_TOTAL and most <= _MAX_TOTAL):
         return None
-    return (seen_NRD / total_NR1).to(queries_HMD.dtype).view(queries_HMD.shape)
+    return (seen_2NRD.sum(0, dtype=torch.float32) / total_NR1).to(queries_HMD.dtype).view(queries_HMD.shape)
 
 
 def attend_masked(queries_HMD: Tensor, keys_GSD: Tensor, values_GSD: Tensor) -> Tensor:

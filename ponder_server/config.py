@@ -28,6 +28,9 @@ class PonderOptions:
     """Of the random weights, if there is no checkpoint."""
     device: str = "cpu"
     dtype: Literal["float32", "bfloat16"] = "float32"
+    attention_threads: int = 1
+    """That share a long context's attention on a CPU, as many as this process may use cores at most. The answers stay
+    the same. By default 1: the next core is POUNCE's, whose deadlines are nearer."""
     max_context_tokens: int = 16_384
     """Per session (paper, section 3.4)."""
     when_full: PolicyName = "refuse"

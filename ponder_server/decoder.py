@@ -17,6 +17,7 @@ from torch.nn import functional as F
 
 from ponder_server.attention import attend
 from ponder_server.slots import AttentionMemory, RecurrentMemory, SlotMemory
+from ponder_server.threads import ALONE, Threads
 from ponderpounce.models.gated_delta import gated_delta_rule
 from ponderpounce.models.ponder_kernels import DeltaRule, delta_rule_of_many, delta_rule_of_one, rotate
 
@@ -38,7 +39,12 @@ class Place:
 
 
 def decode(
-    text_model: Any, memory: SlotMemory, places: Sequence[Place], embeds_BTH: Tensor, positions_3BT: Tensor
+    text_model: Any,
+    memory: SlotMemory,
+    places: Sequence[Place],
+    embeds_BTH: Tensor,
+    positions_3BT: Tensor,
+    threads: Threads = ALONE,
 ) -> list[Tensor]:
     """Appends each row to its slot; final hidden states (num_wanted, H) of each.
 
@@ -55,7 +61,9 @@ def decode(
         if index in memory.attention:
             # What nobody wants to know of the last layer need not look around: its keys and values are enough.
             num_queries = [place.num_wanted if index == last else place.num_new for place in places]
-            mixed_BTH = _attention(layer.self_attn, memory.attention[index], places, num_queries, normed_BTH, cos_sin)
+            mixed_BTH = _attention(
+                layer.self_attn, memory.attention[index], places, num_queries, normed_BTH, cos_sin, threads
+            )
         else:
             mixed_BTH = _gated_delta(layer.linear_attn, memory.recurrent[index], slot_B, num_new_B, normed_BTH)
         hidden = hidden + mixed_BTH
@@ -75,6 +83,7 @@ def _attention(
     num_queries: Sequence[int],
     hidden_BTH: Tensor,
     cos_sin: tuple[Tensor, Tensor],
+    threads: Threads,
 ) -> Tensor:
     """Stores every row's keys and values; (B, T, H), zero but for the last ``num_queries`` valid tokens of a row."""
     batch, length, _ = hidden_BTH.shape
@@ -92,7 +101,7 @@ def _attention(
         if count:
             asking = slice(place.num_new - count, place.num_new)
             seen[row, asking] = attend(
-                queries[row, :, asking], memory.keys[place.slot, :, :end], memory.values[place.slot, :, :end]
+                queries[row, :, asking], memory.keys[place.slot, :, :end], memory.values[place.slot, :, :end], threads
             ).transpose(0, 1)
     mixed_BTH: Tensor = attention.o_proj((seen * gate.sigmoid()).flatten(2))
     return mixed_BTH

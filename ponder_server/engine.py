@@ -42,6 +42,7 @@ from ponder_server.int8 import quantise
 from ponder_server.prefixes import Prefixes
 from ponder_server.runner import BUCKETS, NUM_SAVED_STATES, Append, Runner, Session
 from ponder_server.slots import slot_size
+from ponder_server.threads import Threads
 from ponder_server.writer import Steps, TransitionWriter
 from ponderpounce.models.context import Segment, SegmentKind
 from ponderpounce.models.eyes import Pictures, check_cameras, readable_sizes, see
@@ -79,6 +80,8 @@ class EngineConfig:
     """Demonstrations kept encoded for further episodes that begin with the same one."""
     buckets: tuple[int, ...] = BUCKETS
     """Lengths that a forward's rows are padded to, growing."""
+    attention_threads: int = 1
+    """That share a long context's attention on a CPU. No bit of an answer depends on them."""
     weights: WeightsName = "float"
     """int8: a quarter of the layers' memory, on a CPU; the change of cognition is measured when the engine is built."""
 
@@ -141,6 +144,7 @@ class QwenEngine:
                 num_slots=config.max_sessions,
                 max_tokens=config.max_context_tokens,
                 buckets=config.buckets,
+                threads=Threads(config.attention_threads),
             )
         except (RuntimeError, MemoryError) as error:  # torch's own on a GPU and on a CPU
             raise ValueError(

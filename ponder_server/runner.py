@@ -22,6 +22,7 @@ from torch import Tensor
 from ponder_server.contract import ContextFull, SessionError
 from ponder_server.decoder import LEAST_TOKENS, Place, decode
 from ponder_server.slots import SlotMemory
+from ponder_server.threads import ALONE, Threads
 from ponderpounce.models.ponder import Ponder
 
 NUM_SAVED_STATES = 2
@@ -67,8 +68,18 @@ class Append:
 class Runner:
     """Appends to sessions of one network. Calls must run under ``torch.inference_mode``."""
 
-    def __init__(self, ponder: Ponder, *, num_slots: int, max_tokens: int, buckets: tuple[int, ...] = BUCKETS) -> None:
+    def __init__(
+        self,
+        ponder: Ponder,
+        *,
+        num_slots: int,
+        max_tokens: int,
+        buckets: tuple[int, ...] = BUCKETS,
+        threads: Threads = ALONE,
+    ) -> None:
+        """``threads`` are for attention on a CPU."""
         self._ponder = ponder
+        self._threads = threads
         self._text_model = ponder.qwen.model.language_model
         self._buckets = buckets
         text_config = ponder.qwen.config.text_config
@@ -133,7 +144,7 @@ class Runner:
             row.num_done = end
         positions = torch.from_numpy(positions_3BT).to(embeds_BTH.device)
         for row, hidden_NH in zip(
-            rows, decode(self._text_model, self.memory, places, embeds_BTH, positions), strict=True
+            rows, decode(self._text_model, self.memory, places, embeds_BTH, positions, self._threads), strict=True
         ):
             row.hidden.append(hidden_NH)
 

@@ -1,8 +1,10 @@
-"""The ways to attend are one function: one call with a mask, parts joined by their log-sum-exp, two large windows."""
+"""The ways to attend are one: with a mask, in parts joined by log-sum-exp, in two windows; on any number of threads."""
+
+from collections.abc import Iterable
 
 import pytest
 import torch
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
@@ -13,6 +15,7 @@ from ponder_server.attention import (
     attend_in_windows,
     attend_masked,
 )
+from ponder_server.threads import Piece, Threads
 
 needs_fast_bfloat16 = pytest.mark.skipif(not HAS_FAST_BFLOAT16, reason="torch has no fast bfloat16 on this CPU")
 
@@ -104,3 +107,55 @@ def test_in_windows_too_the_newest_position_does_not_reach_an_earlier_query() ->
     assert after is not None
     assert torch.equal(before[:, :-1], after[:, :-1])
     assert not torch.equal(before[:, -1], after[:, -1])
+
+
+# -- on several threads
+
+
+class Watched(Threads):
+    """Counts the pieces."""
+
+    num_pieces = 0
+
+    def do(self, pieces: Iterable[Piece]) -> None:
+        pieces = list(pieces)
+        self.num_pieces += len(pieces)
+        super().do(pieces)
+
+
+TWO, THREE = Threads(2), Threads(3)
+
+
+@settings(deadline=None, max_examples=25)
+@given(
+    dtype=st.sampled_from([torch.float32, torch.bfloat16]),
+    key_heads=st.integers(1, 3),
+    group=st.integers(1, 4),
+    num_queries=st.integers(1, 300),
+    num_past=st.integers(0, 3000),
+    seed=st.integers(0, 99),
+)
+@example(dtype=torch.float32, key_heads=2, group=2, num_queries=133, num_past=2500, seed=0)
+@example(dtype=torch.bfloat16, key_heads=2, group=2, num_queries=133, num_past=2500, seed=0)
+@example(dtype=torch.bfloat16, key_heads=1, group=1, num_queries=133, num_past=2500, seed=0)
+def test_no_bit_depends_on_the_number_of_threads(
+    dtype: torch.dtype, key_heads: int, group: int, num_queries: int, num_past: int, seed: int
+) -> None:
+    arguments = rounded(key_heads, group, num_queries, num_past, 32, seed=seed)
+    queries, keys, values = (tensor.to(dtype) for tensor in arguments)
+    alone = attend(queries, keys, values)
+    for threads in (TWO, THREE):
+        assert torch.equal(attend(queries, keys, values, threads), alone)
+
+
+@pytest.mark.parametrize(("dtype", "num_pieces"), [(torch.float32, 2), (torch.bfloat16, 4)])
+def test_only_a_large_past_is_shared_out(dtype: torch.dtype, num_pieces: int) -> None:
+    """Two key heads, in bfloat16 in two windows each; a token of text is not worth a second thread's waking up."""
+    if dtype == torch.bfloat16 and not HAS_FAST_BFLOAT16:
+        num_pieces = 2
+    queries, keys, values = (tensor.to(dtype) for tensor in rounded(2, 2, 133, 2500, 32))
+    threads = Watched(2)
+    attend(queries, keys, values, threads)
+    assert threads.num_pieces == num_pieces
+    attend(queries[:, -1:], keys, values, threads)
+    assert threads.num_pieces == num_pieces + 1
