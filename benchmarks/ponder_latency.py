@@ -7,32 +7,36 @@ multiplies large matrices with, in the same run, in the same precision and on as
 them can add less.
 
 Beside it what a server without an append-only context pays, the whole context encoded again in one forward, and a
-transition with a text of 45 tokens (the paper's), decoded one by one and with a draft that knows it; and what an
-episode's opening with a long demonstration takes, in a few large forwards and instant by instant.
+transition with a text of 45 tokens (the paper's), decoded one by one, with a draft that knows it and with multi-token
+prediction; the fire with int8 weights; and what an episode's opening with a long demonstration takes, in a few large
+forwards and instant by instant.
 
-The networks have random weights: their speed is a trained one's, what they say is not.
+The networks have random weights: their speed is a trained one's, what they say is not, nor how well it is guessed.
 """
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 import torch
 import tyro
+from torch import Tensor, nn
 
 from benchmarks.report import Report, Row, show, spread
 from ponder_server.config import NUM_TORCH_THREADS
-from ponder_server.contract import Opening
+from ponder_server.contract import Opening, WeightsName
 from ponder_server.draft import Draft, NoDraft, TrieDraft
 from ponder_server.engine import EngineConfig, QwenEngine
+from ponder_server.mtp import MtpDraft
 from ponderpounce.models import ponder_configs
 from ponderpounce.models.context import Row as EpisodeRow
 from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.ponder_checkpoint import mtp_shapes
 
 SESSION = "bench"
 WAYS_TO_ENCODE = {"in forwards of 2048 tokens": 2048, "an instant a forward": 1}
@@ -58,6 +62,8 @@ class LatencyOptions:
     encodes: int = 3
     """Of the longest context, from nothing."""
     texts: int = 5
+    draft_tokens: int = 3
+    """That multi-token prediction guesses at a time."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -79,6 +85,9 @@ def main(argv: list[str] | None = None) -> int:
     report.notes += [
         "The draft knows the text beforehand, which is the best a draft can do. In bfloat16 one token and sixteen are "
         "rounded further apart than a random network's likeliest tokens lie: its text goes another way than the draft.",
+        "A step is the guessing and a forward that checks it: one certain token, and what was rightly guessed. "
+        "Multi-token prediction has random weights too, and is hardly ever right: what it accepts, and so how long the "
+        "text takes, says nothing of a trained head's; what a step costs does.",
     ]
     show(report)
     print(f"\nwritten: {report.write().name}")
@@ -89,21 +98,36 @@ def _measured(dtype: str, options: LatencyOptions, report: Report) -> dict[str, 
     """Title to rows of every table, in one precision."""
     config = getattr(ponder_configs, options.size)()
     ponder = Ponder.random(config, seed=0, device=options.device, dtype=getattr(torch, dtype))
-    drafts: dict[str, Draft] = {"one by one": NoDraft(), "with a draft": TrieDraft([_own_text(ponder)])}
+    ponder.mtp = _untrained_prediction(ponder)
+    drafts: dict[str, Draft] = {
+        "one by one": NoDraft(),
+        "with a draft that knows it": TrieDraft([_own_text(ponder)]),
+        f"with multi-token prediction, {options.draft_tokens} at a time": MtpDraft(
+            ponder, num_tokens=options.draft_tokens
+        ),
+    }
     fires: list[Row] = []
     floors: list[Row] = []
     for threads in options.attention_threads:
         engine = _engine(ponder, options, attention_threads=threads)
         of_contexts = _fires(engine, options)
-        fires += [{"attention_threads": threads} | row for row in of_contexts]
+        fires += [{"weights": "float", "attention_threads": threads, **row} for row in of_contexts]
         floors.append({"attention_threads": threads} | _floor(engine, options, of_contexts, threads))
-    longest_p50_ms = float(fires[len(options.contexts) - 1]["p50_ms"] or 0)
+    first_p50_ms, longest_p50_ms = (float(fires[at]["p50_ms"] or 0) for at in (0, len(options.contexts) - 1))
     encode_ms = _encodes(ponder, options)
     size = engine.spec.session_bytes
     report.notes.append(
         f"{options.size} with random weights, {dtype} on {options.device}, one thread if nothing else is "
         f"said; a session of {max(options.contexts) + 600} tokens takes {size / 2**20:.1f} MiB."
     )
+    if options.device == "cpu":
+        # of another network, because its layers are replaced
+        narrow = _engine(Ponder.random(config, seed=0, dtype=getattr(torch, dtype)), options, weights="int8")
+        fires += [{"weights": "int8", "attention_threads": 1, **row} for row in _fires(narrow, options)]
+        report.notes.append(
+            f"int8 weights of this network change cognition by {narrow.spec.cognition_error:.1e} in {dtype} (relative "
+            "L2), which says nothing of a trained one. Each layer is widened as it is called, which takes the time."
+        )
     return {
         "A cognition fire: two frames in, C_t out": fires,
         "What the longest context adds, and what its attention's products alone must take": floors,
@@ -111,7 +135,7 @@ def _measured(dtype: str, options: LatencyOptions, report: Report) -> dict[str, 
             spread(encode_ms, "ms") | {"fires_per_encode": round(float(np.median(encode_ms)) / longest_p50_ms, 1)}
         ],
         f"A transition: the same, and a text of {TEXT_TOKENS} tokens": [
-            {"decoded": name, **_texts(_engine(ponder, options, draft), options)} for name, draft in drafts.items()
+            {"decoded": name, **_texts(ponder, draft, options, first_p50_ms)} for name, draft in drafts.items()
         ],
         f"A demonstration of {DEMO_S} s, two views at 1 Hz, encoded when the episode is opened": [
             _demonstration(ponder, name, tokens, options) for name, tokens in WAYS_TO_ENCODE.items()
@@ -120,10 +144,18 @@ def _measured(dtype: str, options: LatencyOptions, report: Report) -> dict[str, 
 
 
 def _engine(
-    ponder: Ponder, options: LatencyOptions, draft: Draft | None = None, *, attention_threads: int = 1
+    ponder: Ponder,
+    options: LatencyOptions,
+    draft: Draft | None = None,
+    *,
+    attention_threads: int = 1,
+    weights: WeightsName = "float",
 ) -> QwenEngine:
     config = EngineConfig(
-        max_context_tokens=max(options.contexts) + 600, max_sessions=1, attention_threads=attention_threads
+        max_context_tokens=max(options.contexts) + 600,
+        max_sessions=1,
+        attention_threads=attention_threads,
+        weights=weights,
     )
     return QwenEngine(ponder, config, draft)
 
@@ -152,7 +184,7 @@ def _floor(engine: QwenEngine, options: LatencyOptions, fires: list[Row], thread
     last = text.num_hidden_layers - 1
     num_read = 1 + engine.spec.num_carriers  # the last layer answers for these alone
     num_queries = [
-        num_read if index == last else len(engine._query_ids)
+        num_read if index == last else engine._num_query_ids
         for index, kind in enumerate(text.layer_types)
         if kind == "full_attention"
     ]
@@ -184,13 +216,59 @@ def _product_flop_per_ms(engine: QwenEngine, size: int = 1024) -> float:
     return 2 * size**3 / min(took_ms)
 
 
-def _texts(engine: QwenEngine, options: LatencyOptions) -> Row:
+class _Watched:
+    """A draft whose proposals are kept: how much was written, and what was guessed to follow."""
+
+    def __init__(self, draft: Draft) -> None:
+        self._draft = draft
+        self.parts: Sequence[nn.Module] = draft.parts
+        self.proposals: list[tuple[int, tuple[int, ...]]] = []
+
+    def propose(self, written: Sequence[int], max_tokens: int, hidden_TH: Tensor | None = None) -> tuple[int, ...]:
+        guesses = self._draft.propose(written, max_tokens, hidden_TH)
+        self.proposals.append((len(written), guesses))
+        return guesses
+
+
+def _texts(ponder: Ponder, draft: Draft, options: LatencyOptions, fire_p50_ms: float) -> Row:
+    """A step is one certain token and what was rightly guessed; all steps cost what the text adds to a fire."""
+    watched = _Watched(draft)
+    engine = _engine(ponder, options, watched)
     frames = _frames(engine, 2, seed=0)
     _open(engine, options.contexts[0])
-    fire = lambda: engine.fire(SESSION, frames, force_text_tokens=TEXT_TOKENS)  # noqa: E731
+    said: list[tuple[int, ...]] = []
+
+    def fire() -> None:
+        watched.proposals.clear()
+        said.append(engine.fire(SESSION, frames, force_text_tokens=TEXT_TOKENS).texts[0].token_ids)
+
     took_ms = _timed(fire, engine, 1, options.texts)
     engine.close(SESSION)
-    return spread(took_ms, "ms")
+    num_guessed = sum(len(guesses) for _, guesses in watched.proposals)
+    num_accepted = sum(_num_right(guesses, said[-1][written:]) for written, guesses in watched.proposals)
+    num_steps = TEXT_TOKENS - num_accepted
+    return {
+        "guessed": num_guessed,
+        "accepted": num_accepted,
+        "steps": num_steps,
+        **spread(took_ms, "ms"),
+        "adds_ms_per_step": round((float(np.median(took_ms)) - fire_p50_ms) / num_steps, 2),
+    }
+
+
+def _num_right(guesses: Sequence[int], said: Sequence[int]) -> int:
+    """Of the guesses, those before the first wrong one; ``said`` is at least as long."""
+    return next((n for n, pair in enumerate(zip(guesses, said, strict=False)) if pair[0] != pair[1]), len(guesses))
+
+
+def _untrained_prediction(ponder: Ponder) -> dict[str, Tensor]:
+    """Random tensors of a multi-token prediction for this network."""
+    shapes = {name: tuple(tensor.shape) for name, tensor in ponder.qwen.state_dict().items()}
+    generator = torch.Generator().manual_seed(0)
+    return {
+        name: torch.randn(shape, generator=generator) * (shape[-1] ** -0.5 if len(shape) > 1 else 0.1)
+        for name, shape in mtp_shapes(ponder.qwen.config.text_config, shapes).items()
+    }
 
 
 def _encodes(ponder: Ponder, options: LatencyOptions) -> list[float]:
