@@ -1,7 +1,8 @@
 """How long does PONDER think about one query, and how does that grow with what it has in mind?
 
 One fire: two 256 px frames on the host become a cognition on the host; vision tower, append, T gate and copies are all
-inside. The same query is asked at every context length, after which the context goes back, so lengths do not drift.
+inside. The same query is asked at every context length, after which the context goes back, so lengths do not drift. The
+lengths take turns, so that a machine that gets slower meanwhile is as slow for one as for the other.
 What the longest context adds is set against what its attention's products must take at the speed that this machine
 multiplies large matrices with, in the same run, in the same precision and on as many threads: no code that computes
 them can add less.
@@ -20,6 +21,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -40,6 +42,7 @@ from ponderpounce.models.ponder_checkpoint import mtp_shapes
 
 SESSION = "bench"
 WAYS_TO_ENCODE = {"in forwards of 2048 tokens": 2048, "an instant a forward": 1}
+ROUNDS = 5
 TEXT_TOKENS = 45
 DEMO_S = 48
 """Two views at 1 Hz: some 6.4K tokens, with two frames of 256 px an instant."""
@@ -58,7 +61,7 @@ class LatencyOptions:
     contexts: tuple[int, ...] = (800, 4_000, 14_000)
     """Tokens in the context before the fire, about."""
     fires: int = 60
-    """Per context length, after ten that are not counted."""
+    """Per context length, in several rounds, each after two that are not counted."""
     encodes: int = 3
     """Of the longest context, from nothing."""
     texts: int = 5
@@ -73,7 +76,7 @@ def main(argv: list[str] | None = None) -> int:
         name="ponder_latency",
         question="How long does PONDER think about one query, and how does that grow with its context?",
         config=options,
-        warm_up="ten fires per context length; one encode of each kind; one text.",
+        warm_up="two fires per context length and round; one encode of each kind; one text.",
     )
     tables: dict[str, list[Row]] = {}
     for dtype in options.dtypes:
@@ -153,7 +156,7 @@ def _engine(
 ) -> QwenEngine:
     config = EngineConfig(
         max_context_tokens=max(options.contexts) + 600,
-        max_sessions=1,
+        max_sessions=len(options.contexts),
         attention_threads=attention_threads,
         weights=weights,
     )
@@ -163,19 +166,23 @@ def _engine(
 def _fires(engine: QwenEngine, options: LatencyOptions) -> list[Row]:
     """A row per context length."""
     frames = _frames(engine, 2, seed=0)
-    rows: list[Row] = []
-    p50_ms: list[float] = []
-    for context_tokens in options.contexts:
-        _open(engine, context_tokens)
-        took_ms = _timed(lambda: engine.fire(SESSION, frames), engine, 10, options.fires)
-        engine.close(SESSION)
-        p50_ms.append(float(np.median(took_ms)))
-        rows.append(
-            {"context_tokens": context_tokens}
-            | spread(took_ms, "ms")
-            | {"p50_against_first": round(p50_ms[-1] / p50_ms[0], 2)}
-        )
-    return rows
+    sessions = {context_tokens: f"{SESSION} {context_tokens}" for context_tokens in options.contexts}
+    took_ms: dict[int, list[float]] = {context_tokens: [] for context_tokens in options.contexts}
+    for context_tokens, session in sessions.items():
+        _open(engine, context_tokens, session)
+    for _ in range(ROUNDS):
+        for context_tokens, session in sessions.items():
+            fire = partial(engine.fire, session, frames)
+            took_ms[context_tokens] += _timed(fire, engine, 2, -(-options.fires // ROUNDS), session)
+    for session in sessions.values():
+        engine.close(session)
+    p50_ms = {context_tokens: float(np.median(took)) for context_tokens, took in took_ms.items()}
+    return [
+        {"context_tokens": context_tokens}
+        | spread(took, "ms")
+        | {"p50_against_first": round(p50_ms[context_tokens] / p50_ms[options.contexts[0]], 2)}
+        for context_tokens, took in took_ms.items()
+    ]
 
 
 def _floor(engine: QwenEngine, options: LatencyOptions, fires: list[Row], threads: int) -> Row:
@@ -309,11 +316,11 @@ def _own_text(ponder: Ponder) -> tuple[int, ...]:
     return engine.fire(SESSION, _frames(engine, 2, seed=0), force_text_tokens=TEXT_TOKENS).texts[0].token_ids
 
 
-def _open(engine: QwenEngine, context_tokens: int) -> None:
+def _open(engine: QwenEngine, context_tokens: int, session: str = SESSION) -> None:
     """A session of about so many tokens: a demonstration of one view, as long as it takes."""
     view_tokens = engine._format.num_image_tokens + 2
     demo = tuple((frame,) for frame in _frames(engine, max(1, context_tokens // view_tokens), seed=1))
-    engine.open(SESSION, Opening(instruction="pick up the red cube", demo_frames=demo))
+    engine.open(session, Opening(instruction="pick up the red cube", demo_frames=demo))
 
 
 def _frames(
@@ -323,15 +330,18 @@ def _frames(
     return tuple(np.random.default_rng(seed).integers(0, 256, (count, height, width, 3), dtype=np.uint8))
 
 
-def _timed(fire: Callable[[], object], engine: QwenEngine, num_unmeasured: int, num_measured: int) -> list[float]:
-    context = engine._episode(SESSION).context
+def _timed(
+    fire: Callable[[], object], engine: QwenEngine, num_unmeasured: int, num_measured: int, session: str = SESSION
+) -> list[float]:
+    """Durations in ms; the context is as it was, before every fire and in the end."""
+    context = engine._episode(session).context
     opened = context.save()
     took_ms = []
     for _ in range(num_unmeasured + num_measured):
-        context.restore(opened)
         start_ns = time.perf_counter_ns()
         fire()
         took_ms.append((time.perf_counter_ns() - start_ns) / 1e6)
+        context.restore(opened)
     return took_ms[num_unmeasured:]
 
 
