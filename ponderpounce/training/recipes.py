@@ -160,7 +160,7 @@ def small() -> Curriculum:
             augmentation=Augmentation(max_shift_px=4, mirror=True),
         ),
         train=TrainConfig(seed=0, optim=_FROM_SCRATCH),
-        num_steps=1000,
+        num_steps=900,
         batch_episodes=16,
         w2=1.0,
         w3=1.0,
@@ -174,15 +174,15 @@ def small() -> Curriculum:
         looking,
         name="small/grounding",
         example=replace(looking.example, text_dropout=0.2, slips=0.4, max_queries=None),
-        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, decay=(1100, 1600))),
-        num_steps=1600,
+        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, decay=(900, 1300))),
+        num_steps=1300,
         batch_episodes=8,
     )
     watching = replace(
         grounding,
         name="small/watching",
-        train=TrainConfig(seed=1, optim=replace(_FROM_SCRATCH, learning_rate=7e-4, decay=(600, 2600))),
-        num_steps=2600,
+        train=TrainConfig(seed=1, optim=replace(_FROM_SCRATCH, learning_rate=7e-4, decay=(600, 2400))),
+        num_steps=2400,
     )
     reaching = replace(
         looking,

@@ -2,12 +2,14 @@
 
 A pretrained PONDER brings eyes along. One from scratch would have to learn to see from the few places that it is told
 to say, through a language model that is as new: slow, and never precise. Here every image token is asked directly: does
-a thing's middle lie in your square, which one is it, and where in the square? The answers come from one linear layer
-that is thrown away afterwards, so that a token carries them plainly. No other recipe needs this, the paper has nothing
-of it, and no word is learned: the rest of PONDER stays as it was drawn.
+a thing's middle lie in your square, which one is it, and where is it, in the square and in the picture? The place in
+the picture is asked for in the form that cognition will have (`stand_in`), for attention passes on what a token holds
+and not where it stood. The answers come from one linear layer that is thrown away afterwards, so that a token carries
+them plainly. No other recipe needs this, the paper has nothing of it, and no word is learned: the rest of PONDER stays
+as it was drawn.
 """
 
-# N pictures, S image tokens of a picture, W names
+# N pictures, S image tokens of a picture, W names, P numbers that tell a place
 
 from __future__ import annotations
 
@@ -36,6 +38,7 @@ from ponderpounce.training.augment import Augmentation, draw_view
 from ponderpounce.training.data import Sight, TrainingSet
 from ponderpounce.training.optim import OptimConfig, Optimiser
 from ponderpounce.training.recipes import recipe, stages_of
+from ponderpounce.training.stand_in import NUM_PLACE_FEATURES, place_features
 
 DONE, REFUSED = 0, 2
 
@@ -43,7 +46,8 @@ _THING = re.compile(r"([^,<>]+?) at <(\d+), (\d+)>")
 _TEXT_PX = 256  # coordinates in texts, whatever the size of a picture
 _WAYS = Augmentation(max_shift_px=4, mirror=True)
 _HELD_OUT_SHARE = 0.05
-_PLACE_WEIGHT, _NAME_WEIGHT = 16.0, 0.3
+_PLACE_WEIGHT, _TOLD_WEIGHT, _NAME_WEIGHT = 16.0, 0.5, 0.3
+_NUM_ASKED = 3 + NUM_PLACE_FEATURES  # beside names
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,6 +91,8 @@ class Answers:
     """int64, where there is a thing."""
     place_NS2: Tensor
     """Down and right in a token's square, -1/2 to 1/2."""
+    told_NSP: Tensor
+    """The place in the picture, as `place_features`."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -120,7 +126,7 @@ def see_things(options: SeeOptions) -> None:
     if num_learned < 1:
         raise ValueError(f"{options.album} holds {len(album.texts)} pictures; some hundreds at least are needed")
     torch.manual_seed(options.seed)
-    answering = nn.Linear(ponder.hidden_size, 3 + len(album.names))
+    answering = nn.Linear(ponder.hidden_size, _NUM_ASKED + len(album.names))
     optim = OptimConfig(
         learning_rate=options.learning_rate,
         weight_decay=1e-4,
@@ -179,6 +185,7 @@ def answers_of(texts: Sequence[str], names: Sequence[str], form: ContextFormat) 
     is_thing_NS = torch.zeros(len(texts), num_rows * num_columns, dtype=torch.bool)
     name_NS = torch.zeros(is_thing_NS.shape, dtype=torch.int64)
     place_NS2 = torch.zeros(*is_thing_NS.shape, 2)
+    told_NSP = torch.zeros(*is_thing_NS.shape, NUM_PLACE_FEATURES)
     for number, text in enumerate(texts):
         for name, y, x in _THING.findall(text):
             down = (int(y) / _TEXT_PX - top) / (bottom - top) * num_rows
@@ -189,16 +196,18 @@ def answers_of(texts: Sequence[str], names: Sequence[str], form: ContextFormat) 
             is_thing_NS[number, token] = True
             name_NS[number, token] = names.index(name.strip())
             place_NS2[number, token] = torch.tensor([down % 1 - 0.5, along % 1 - 0.5])
-    return Answers(is_thing_NS=is_thing_NS, name_NS=name_NS, place_NS2=place_NS2)
+            told_NSP[number, token] = torch.from_numpy(place_features((int(y), int(x))))
+    return Answers(is_thing_NS=is_thing_NS, name_NS=name_NS, place_NS2=place_NS2, told_NSP=told_NSP)
 
 
 def loss_of(said: Tensor, answers: Answers) -> Tensor:
-    """Of the answers (N * S, 3 + W): is it a thing, its place, its name; the last two where there is one."""
+    """Of the answers (N * S, 3 + P + W): is it a thing, and where it is one, its place in both ways and its name."""
     is_thing = answers.is_thing_NS.flatten()
-    named = F.cross_entropy(said[is_thing, 3:], answers.name_NS.flatten()[is_thing])
+    named = F.cross_entropy(said[is_thing, _NUM_ASKED:], answers.name_NS.flatten()[is_thing])
     placed = F.mse_loss(said[is_thing, 1:3], answers.place_NS2.flatten(0, 1)[is_thing])
     found = F.binary_cross_entropy_with_logits(said[:, 0], is_thing.float())
-    return found + _PLACE_WEIGHT * placed + _NAME_WEIGHT * named
+    told = F.mse_loss(said[is_thing, 3:_NUM_ASKED], answers.told_NSP.flatten(0, 1)[is_thing])
+    return found + _PLACE_WEIGHT * placed + _TOLD_WEIGHT * told + _NAME_WEIGHT * named
 
 
 @torch.inference_mode()
@@ -210,7 +219,7 @@ def examine(ponder: Ponder, answering: nn.Linear, album: Album, chosen: NDArray[
     said = answering(ponder.image_features(frames_NHW3))
     is_thing = answers.is_thing_NS.flatten()
     found = (said[is_thing, 0] > 0).float().mean().item()
-    named = (said[is_thing, 3:].argmax(-1) == answers.name_NS.flatten()[is_thing]).float().mean().item()
+    named = (said[is_thing, _NUM_ASKED:].argmax(-1) == answers.name_NS.flatten()[is_thing]).float().mean().item()
     top, left, bottom, right = ponder.format.eyes[0].box
     num_rows, num_columns = ponder.format.image_grid
     token_px = torch.tensor([(bottom - top) / num_rows, (right - left) / num_columns]) * _TEXT_PX

@@ -43,12 +43,13 @@ def stand_in(subgoal: str, size: int) -> NDArray[np.float32]:
         raise ValueError(f"a stand-in of {size} numbers is too small; expected at least {2 * NUM_PLACE_FEATURES}")
     place = _PLACE.search(subgoal)
     yx_px = (int(place[1]), int(place[2])) if place else _NOWHERE
-    values = np.concatenate([_place_features(yx_px), _code(_COLOUR.sub("", _PLACE.sub("<>", subgoal)), num_code)])
+    values = np.concatenate([place_features(yx_px), _code(_COLOUR.sub("", _PLACE.sub("<>", subgoal)), num_code)])
     values.flags.writeable = False
     return values
 
 
-def _place_features(yx_px: tuple[int, int]) -> NDArray[np.float32]:
+def place_features(yx_px: tuple[int, int]) -> NDArray[np.float32]:
+    """A place in a 256 px picture as (NUM_PLACE_FEATURES,) numbers, rms 1."""
     yx = np.array(yx_px, np.float64) / _IMAGE_PX
     angles = 2 * np.pi * np.outer(1 / _PERIODS, yx).ravel()
     waves = 2**0.5 * np.concatenate([np.sin(angles), np.cos(angles)])

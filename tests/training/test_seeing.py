@@ -16,6 +16,7 @@ from ponderpounce.models.ponder_checkpoint import load_ponder
 from ponderpounce.models.ponder_configs import small
 from ponderpounce.models.vocabulary import Vocabulary
 from ponderpounce.training.seeing import REFUSED, Album, answers_of, draw, loss_of, main
+from ponderpounce.training.stand_in import NUM_PLACE_FEATURES, place_features
 
 PONDER = Ponder.random(small(), seed=0)
 FORM = PONDER.format
@@ -38,6 +39,7 @@ def test_the_answer_says_the_place_again(y: int, x: int, name: str) -> None:
         assert y == pytest.approx(TOP_PX + (token // 4 + 0.5 + down) * TOKEN_PX, abs=1e-3)
         assert x == pytest.approx(LEFT_PX + (token % 4 + 0.5 + along) * TOKEN_PX, abs=1e-3)
         assert NAMES[int(answers.name_NS[0, token])] == name
+        assert answers.told_NSP[0, token].tolist() == place_features((y, x)).tolist()
 
 
 def test_pictures_and_answers_move_together() -> None:
@@ -55,13 +57,14 @@ def test_pictures_and_answers_move_together() -> None:
 
 def test_the_loss_is_least_where_everything_is_answered_rightly() -> None:
     answers = answers_of(["red cube at <40, 90>, button at <70, 120>"], NAMES, FORM)
-    said = torch.full((16, 3 + len(NAMES)), -20.0)
+    said = torch.full((16, 3 + NUM_PLACE_FEATURES + len(NAMES)), -20.0)
     for token in answers.is_thing_NS[0].nonzero().flatten().tolist():
         said[token, 0] = 20
         said[token, 1:3] = answers.place_NS2[0, token]
-        said[token, 3 + int(answers.name_NS[0, token])] = 20
+        said[token, 3 : 3 + NUM_PLACE_FEATURES] = answers.told_NSP[0, token]
+        said[token, 3 + NUM_PLACE_FEATURES + int(answers.name_NS[0, token])] = 20
     assert loss_of(said, answers) < 1e-6
-    for column in range(3):
+    for column in (0, 1, 2, 3, 2 + NUM_PLACE_FEATURES):
         worse = said.clone()
         worse[answers.is_thing_NS[0], column] -= 30
         assert loss_of(worse, answers) > 1
