@@ -143,9 +143,9 @@ def tiny_subgoal_text() -> Recipe:
 def small() -> Curriculum:
     """Both architectures at about a million weights each, from scratch on CPU cores: see docs/training.md.
 
-    Where the paper starts from pretrained weights, eyes that `pp-see` has opened and five stages stand in for them, of
+    Where the paper starts from pretrained weights, eyes that `pp-see` has opened and four stages stand in for them, of
     one system each, so that two cores can run them side by side. Episodes that are watched (`pp-train --watch`) are for
-    the last three.
+    the last two.
     """
     looking = Recipe(
         name="small/looking",
@@ -174,15 +174,10 @@ def small() -> Curriculum:
         looking,
         name="small/grounding",
         example=replace(looking.example, text_dropout=0.2, slips=0.4, max_queries=None),
-        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, decay=(900, 1300))),
-        num_steps=1300,
+        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, decay=(1400, 3200))),
+        num_steps=3200,
         batch_episodes=8,
-    )
-    watching = replace(
-        grounding,
-        name="small/watching",
-        train=TrainConfig(seed=1, optim=replace(_FROM_SCRATCH, learning_rate=7e-4, decay=(600, 2400))),
-        num_steps=2400,
+        w3=3.0,
     )
     reaching = replace(
         looking,
@@ -215,7 +210,7 @@ def small() -> Curriculum:
         w3=0.3,
         trains="both",
     )
-    return Curriculum(name="small", stages=(looking, reaching, motor, grounding, watching, joint))
+    return Curriculum(name="small", stages=(looking, reaching, motor, grounding, joint))
 
 
 RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
