@@ -97,6 +97,8 @@ class FakePonder:
         progress()
         for frame in frames:
             self.contexts[session].update(frame.tobytes())
+        if proprio is not None:
+            self.contexts[session].update(proprio.tobytes())
         self.num_tokens[session] += 8
         digest = self.contexts[session].digest()
         return ponder.Fire(

@@ -24,7 +24,7 @@ def telling(mark: int, num_demo: int = 2, num_seen: int = 2, px: int = 2) -> Tel
     count = num_demo + num_seen
     return Telling(
         frames=dict.fromkeys(("front", "wrist"), np.full((count, px, px, 3), mark, np.uint8)),
-        states=np.zeros((count, 8), np.float32),
+        states=np.repeat(np.arange(count, dtype=np.float32)[:, None], 8, axis=1),
         steps=np.arange(count),
         is_demonstration=np.arange(count) < num_demo,
         oracle=np.full((20, 8), mark, np.float32),
@@ -37,14 +37,15 @@ def pair(seed: int, own: int = 10, twin: int = 200, px: int = 2) -> Pair:
     now = dict.fromkeys(("front", "wrist"), np.full((px, px, 3), 99, np.uint8))
     return Pair(
         task="VideoRepick", family="reference", seed=seed, difficulty="easy", variant=0, is_cut=False, seam=0.0,
-        instruction="pick it again", frames=now, state=np.zeros(8, np.float32),
+        instruction="pick it again", frames=now, state=np.full(8, 7, np.float32),
         own=telling(own, px=px), twin=telling(twin, px=px),
     )  # fmt: skip
 
 
-def remembers(instruction: str, demo: Any, seen: Any) -> np.ndarray:
-    """The first brightness that was shown; the last one is the present."""
+def remembers(instruction: str, demo: Any, seen: Any, states: Any) -> np.ndarray:
+    """The first brightness that was shown; the last one is the present, and so is the last state."""
     assert (len(demo), len(seen), int(seen[-1][0].max())) == (2, 3, 99)
+    assert states.tolist() == [[2] * 8, [3] * 8, [7] * 8]
     return np.full((1, 4), demo[0][0].max(), np.float32)
 
 
