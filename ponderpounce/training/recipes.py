@@ -205,9 +205,11 @@ def small() -> Curriculum:
             augmentation=looking.example.augmentation,
             augments="watched",
         ),
-        train=replace(reaching.train, optim=replace(_FROM_SCRATCH, learning_rate=3e-4, decay=(100, 400))),
-        num_steps=400,
-        w3=0.3,
+        train=replace(
+            reaching.train, optim=replace(_FROM_SCRATCH, learning_rate=2e-4, warmup_steps=50, decay=(50, 200))
+        ),
+        num_steps=200,
+        w3=1.0,
         trains="both",
     )
     return Curriculum(name="small", stages=(looking, reaching, motor, grounding, joint))
