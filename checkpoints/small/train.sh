@@ -36,7 +36,7 @@ print(*(folder / each["mcap"] for each in json.loads((folder / "results.json").r
     --frames training --invocation-hz 5 --out "$out/data"
 
 [ -d "$out/album/meta" ] || "$bin/pp-album" --pictures 10000 --out "$out/album"
-[ -d "$out/eyes/ponder" ] || "$bin/pp-see" --recipe small --data "$out/data" --album "$out/album" --out "$out/eyes"
+[ -d "$out/eyes/ponder" ] || OMP_NUM_THREADS=2 "$bin/pp-see" --recipe small --data "$out/data" --album "$out/album" --out "$out/eyes"
 
 train --stage looking --no-progress & looking=$!
 train --stage reaching
