@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 from pathlib import Path
 
 import numpy as np
 
+from ponderpounce.training.places import misplaced
 from ponderpounce.training.stand_in import stand_in
 from protocol import messages as m
 from protocol import topics
@@ -21,7 +21,6 @@ from protocol.link import Link, is_of_episode
 from sim_client.puppet import Answer, PuppetPonder
 
 HELD_QUERIES = 4
-_NUMBER = re.compile(r"\d+(?=[^<]*>)")  # within angle brackets
 
 
 class ToldPonder(PuppetPonder):
@@ -48,7 +47,7 @@ class ToldPonder(PuppetPonder):
             else:
                 self._is_new = True  # the plain text is said when a subgoal begins, and at no other time
         is_new, self._is_new = self._is_new, False
-        text = self._text if not self._noise_px else misplaced(self._text, self._noise_px, query.query // HELD_QUERIES)
+        text = self._text if not self._noise_px else mistold(self._text, self._noise_px, query.query // HELD_QUERIES)
         vector = np.repeat(stand_in(text, self._shape[1])[None], self._shape[0], axis=0)
         return Answer(vector=vector, is_transition=is_new, norm=float(np.linalg.norm(vector)))
 
@@ -67,11 +66,10 @@ class ToldPonder(PuppetPonder):
         return True
 
 
-def misplaced(text: str, noise_px: float, draw: int) -> str:
+def mistold(text: str, noise_px: float, draw: int) -> str:
     """Returns the text with an error in each of its coordinates, which the text and the number of the draw decide."""
     digest = hashlib.blake2b(f"{draw} {text}".encode(), digest_size=8).digest()
-    rng = np.random.default_rng(int.from_bytes(digest, "big"))
-    return _NUMBER.sub(lambda found: str(max(0, round(int(found[0]) + rng.normal(0.0, noise_px)))), text)
+    return misplaced(text, noise_px, np.random.default_rng(int.from_bytes(digest, "big")))
 
 
 def cognition_shape(pounce: Path) -> tuple[int, int]:

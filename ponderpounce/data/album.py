@@ -163,7 +163,8 @@ class Studio:
             is_held = rng.random() < _HELD_SHARE and target[2, 3] > _LIFTED_M and bool(movable)
             physics.pose_arm(joints, HOME_OPENING_M / 2 if is_held else opening_m)
             if is_held:
-                physics.place(str(rng.choice(movable)), np.array([*target[:3, 3], *pose(0.0, 0.0, 0.0, yaw_rad)[3:]]))
+                x_m, y_m, z_m = target[:3, 3]
+                physics.place(str(rng.choice(movable)), pose(x_m, y_m, z_m, yaw_rad))
                 physics.refresh()
             return
 

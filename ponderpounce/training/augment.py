@@ -16,10 +16,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ponderpounce.models.context import ContextFormat
+from ponderpounce.training.places import PLACE, TEXT_PX
 
-_PLACE = re.compile(r"<\s*(\d+)\s*,\s*(\d+)\s*>")
 _SIDED = re.compile(r"left|right|clockwise", re.IGNORECASE)
-_TEXT_PX = 256  # coordinates in texts, whatever the size of a picture
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,26 +66,16 @@ class View:
         """Its coordinates as they are in this view; at the picture's edge where they would leave it."""
         if self == View(text_px=self.text_px):
             return text
-        return _PLACE.sub(self._moved, text)
+        return PLACE.sub(self._moved, text)
 
     def _moved(self, place: re.Match[str]) -> str:
         y, x = int(place[1]), int(place[2])
-        x = _TEXT_PX - x if self.is_mirrored else x
+        x = TEXT_PX - x if self.is_mirrored else x
         y, x = (round(v + shift * self.text_px) for v, shift in ((y, self.down_px), (x, self.right_px)))
-        return f"<{min(max(y, 0), _TEXT_PX)}, {min(max(x, 0), _TEXT_PX)}>"
+        return f"<{min(max(y, 0), TEXT_PX)}, {min(max(x, 0), TEXT_PX)}>"
 
 
 AS_IT_IS = View()
-
-
-def misplaced(text: str, std_px: float, rng: np.random.Generator) -> str:
-    """The text with every coordinate wrong by a normal error, within the picture."""
-
-    def slipped(place: re.Match[str]) -> str:
-        y, x = (min(max(round(int(v) + std_px * rng.standard_normal()), 0), _TEXT_PX) for v in place.groups())
-        return f"<{y}, {x}>"
-
-    return _PLACE.sub(slipped, text)
 
 
 def draw_view(config: Augmentation, form: ContextFormat, texts: set[str], rng: np.random.Generator) -> View:
@@ -105,5 +94,5 @@ def draw_view(config: Augmentation, form: ContextFormat, texts: set[str], rng: n
         raise ValueError(f"an eye from {left} to {right} is not symmetric about the middle and cannot be mirrored")
     down_px, right_px = rng.integers(-config.max_shift_px, config.max_shift_px + 1, size=2).tolist()
     is_mirrored = config.mirror and bool(rng.integers(2)) and not any(_SIDED.search(text) for text in texts)
-    text_px = (bottom - top) * _TEXT_PX / form.image_px[0]
+    text_px = (bottom - top) * TEXT_PX / form.image_px[0]
     return View(down_px=down_px, right_px=right_px, is_mirrored=is_mirrored, text_px=text_px)

@@ -6,7 +6,7 @@ hold them equal.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -20,8 +20,9 @@ from ponderpounce.models.context import ContextFormat, Row, Transition
 from ponderpounce.models.eyes import see
 from ponderpounce.models.normalisation import Floats
 from ponderpounce.models.ponder_coordinates import normalised_text
-from ponderpounce.training.augment import AS_IT_IS, NOT_AUGMENTED, Augmentation, View, draw_view, misplaced
+from ponderpounce.training.augment import AS_IT_IS, NOT_AUGMENTED, Augmentation, View, draw_view
 from ponderpounce.training.nudge import NO_NUDGE, Nudge, draw_nudges
+from ponderpounce.training.places import misplaced
 from ponderpounce.training.stand_in import stand_in
 
 Frame = NDArray[np.uint8]  # (height, width, 3) RGB
@@ -77,6 +78,11 @@ class Slip:
 
     std_px: float
     seed: int
+
+    def saying(self, view: View) -> Callable[[str], str]:
+        """Tells one text after the other of a row as it is in this view, its places wrong."""
+        rng = np.random.default_rng(self.seed)
+        return lambda text: misplaced(view.text(text), self.std_px, rng)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -206,19 +212,17 @@ def episode_row(
     slip: Slip | None = None,
 ) -> Row:
     """The tokens of the episode. The first transition of a demonstration episode begins with its reasoning."""
-    slips = None if slip is None else np.random.default_rng(slip.seed)
+    say = view.text if slip is None else slip.saying(view)
     views, form = _before_ponder(episode, form)
     segments = list(form.opening(episode.instruction, [len(views) for views in episode.demo]))
     encode = form.vocabulary.encode
-    reasoning = encode(normalised_text(view.text(episode.reasoning))) if episode.reasoning else None
+    reasoning = encode(normalised_text(say(episode.reasoning))) if episode.reasoning else None
     for query in schedule.queries:
         transition = None
         text = episode.subgoals[query.tick]
         if is_grounded and query.stamp.is_transition and text:
-            text = view.text(text)
-            if slip is not None and slips is not None:
-                text = misplaced(text, slip.std_px, slips)
-            transition = Transition(subgoal=encode(normalised_text(text)), reasoning=reasoning, is_learned=slip is None)
+            subgoal = encode(normalised_text(say(text)))
+            transition = Transition(subgoal=subgoal, reasoning=reasoning, is_learned=slip is None)
             reasoning = None
         segments += form.query(len(views[query.tick]), transition, episode.state_T8[query.tick])
     return form.row(segments)

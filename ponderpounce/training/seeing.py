@@ -37,13 +37,13 @@ from ponderpounce.models.vocabulary import Vocabulary
 from ponderpounce.training.augment import Augmentation, draw_view
 from ponderpounce.training.data import Sight, TrainingSet
 from ponderpounce.training.optim import OptimConfig, Optimiser
+from ponderpounce.training.places import TEXT_PX
 from ponderpounce.training.recipes import recipe, stages_of
 from ponderpounce.training.stand_in import NUM_PLACE_FEATURES, place_features
 
 DONE, REFUSED = 0, 2
 
 _THING = re.compile(r"([^,<>]+?) at <(\d+), (\d+)>")
-_TEXT_PX = 256  # coordinates in texts, whatever the size of a picture
 _WAYS = Augmentation(max_shift_px=4, mirror=True)
 _HELD_OUT_SHARE = 0.05
 _PLACE_WEIGHT, _TOLD_WEIGHT, _NAME_WEIGHT = 16.0, 0.5, 0.3
@@ -188,8 +188,8 @@ def answers_of(texts: Sequence[str], names: Sequence[str], form: ContextFormat) 
     told_NSP = torch.zeros(*is_thing_NS.shape, NUM_PLACE_FEATURES)
     for number, text in enumerate(texts):
         for name, y, x in _THING.findall(text):
-            down = (int(y) / _TEXT_PX - top) / (bottom - top) * num_rows
-            along = (int(x) / _TEXT_PX - left) / (right - left) * num_columns
+            down = (int(y) / TEXT_PX - top) / (bottom - top) * num_rows
+            along = (int(x) / TEXT_PX - left) / (right - left) * num_columns
             if not (0 <= down < num_rows and 0 <= along < num_columns):
                 continue
             token = int(down) * num_columns + int(along)
@@ -222,7 +222,7 @@ def examine(ponder: Ponder, answering: nn.Linear, album: Album, chosen: NDArray[
     named = (said[is_thing, _NUM_ASKED:].argmax(-1) == answers.name_NS.flatten()[is_thing]).float().mean().item()
     top, left, bottom, right = ponder.format.eyes[0].box
     num_rows, num_columns = ponder.format.image_grid
-    token_px = torch.tensor([(bottom - top) / num_rows, (right - left) / num_columns]) * _TEXT_PX
+    token_px = torch.tensor([(bottom - top) / num_rows, (right - left) / num_columns]) * TEXT_PX
     off_px = ((said[:, 1:3] - answers.place_NS2.flatten(0, 1)) * token_px)[is_thing].norm(dim=-1)
     p50, p95 = off_px.quantile(torch.tensor([0.5, 0.95])).tolist()
     return f"{found:.1%} of their things found, {named:.1%} named rightly, places {p50:.2f} px off (p95 {p95:.2f})"

@@ -20,13 +20,13 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
-_PLACE = re.compile(r"<\s*(\d+)\s*,\s*(\d+)\s*>")
+from ponderpounce.training.places import PLACE, TEXT_PX
+
 _COLOUR = re.compile(r", which is \w+")
-_IMAGE_PX = 256
 _PERIODS = 2.0 ** np.arange(1, -5, -1)  # of the picture's side: two pictures down to 16 px
 NUM_PLACE_FEATURES = 2 * (2 * len(_PERIODS) + 1)
 _VALUE_SCALE = 2 * 3**0.5  # a coordinate is uniform in [-1/2, 1/2] at most: rms 1
-_NOWHERE = (_IMAGE_PX // 2, _IMAGE_PX // 2)
+_NOWHERE = (TEXT_PX // 2, TEXT_PX // 2)
 
 
 @functools.lru_cache(maxsize=1 << 16)
@@ -41,16 +41,16 @@ def stand_in(subgoal: str, size: int) -> NDArray[np.float32]:
     num_code = size - NUM_PLACE_FEATURES
     if num_code < NUM_PLACE_FEATURES:
         raise ValueError(f"a stand-in of {size} numbers is too small; expected at least {2 * NUM_PLACE_FEATURES}")
-    place = _PLACE.search(subgoal)
+    place = PLACE.search(subgoal)
     yx_px = (int(place[1]), int(place[2])) if place else _NOWHERE
-    values = np.concatenate([place_features(yx_px), _code(_COLOUR.sub("", _PLACE.sub("<>", subgoal)), num_code)])
+    values = np.concatenate([place_features(yx_px), _code(_COLOUR.sub("", PLACE.sub("<>", subgoal)), num_code)])
     values.flags.writeable = False
     return values
 
 
 def place_features(yx_px: tuple[int, int]) -> NDArray[np.float32]:
     """A place in a 256 px picture as (NUM_PLACE_FEATURES,) numbers, rms 1."""
-    yx = np.array(yx_px, np.float64) / _IMAGE_PX
+    yx = np.array(yx_px, np.float64) / TEXT_PX
     angles = 2 * np.pi * np.outer(1 / _PERIODS, yx).ravel()
     waves = 2**0.5 * np.concatenate([np.sin(angles), np.cos(angles)])
     return np.concatenate([waves, (yx - 0.5) * _VALUE_SCALE]).astype(np.float32)

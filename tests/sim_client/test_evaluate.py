@@ -30,7 +30,7 @@ from sim_client import evaluate as module
 from sim_client.evaluate import EvalOptions, EvaluationError, EvaluationStation, Job, Line, evaluate, play
 from sim_client.ledger import LedgerError
 from sim_client.suite import run_seed
-from sim_client.told_cognition import cognition_shape, misplaced
+from sim_client.told_cognition import cognition_shape, mistold
 
 TASKS, EPISODES, RUNS = ("PickXtimes", "StopCube"), 2, 2
 NUM_JOBS = len(TASKS) * EPISODES * RUNS
@@ -304,8 +304,8 @@ def test_stand_ins_where_they_mean_nothing_are_refused(tmp_path: Path, changes: 
 
 def test_told_places_are_wrong_by_what_was_asked_for_and_stay_so() -> None:
     text = "pick up cube 2 at <100, 120>, which is red"
-    told = [misplaced(text, 3.0, draw) for draw in range(400)]
-    assert told == [misplaced(text, 3.0, draw) for draw in range(400)]
+    told = [mistold(text, 3.0, draw) for draw in range(400)]
+    assert told == [mistold(text, 3.0, draw) for draw in range(400)]
     assert {re.sub(r"<.*>", "<100, 120>", each) for each in told} == {text}
     errors = np.array([[int(n) for n in re.findall(r"\d+", each)[1:]] for each in told]) - (100, 120)
     assert 2.7 < errors.std() < 3.3

@@ -21,7 +21,6 @@ from ponderpounce.models.pounce_configs import tiny_groot
 from ponderpounce.models.pounce_groot import GrootInputs
 from ponderpounce.models.pounce_reading import groot_inputs, pi05_inputs
 from ponderpounce.models.prompt import tiny_tokenizer_for_random_weights
-from ponderpounce.training.augment import misplaced
 from ponderpounce.training.collate import collate_ponder, collate_pounce
 from ponderpounce.training.example import (
     ExampleConfig,
@@ -31,6 +30,7 @@ from ponderpounce.training.example import (
     row_frames,
     target_rows,
 )
+from ponderpounce.training.places import misplaced
 from pounce_server.contract import Request
 
 PONDER = Ponder.random(replace(tiny_ponder(), image_px=(64, 64), num_layers=4), seed=1)

@@ -114,7 +114,9 @@ def test_a_query_without_the_state_that_is_read_is_refused_and_leaves_no_trace()
     answered = engine.fire("a", recorded.frames[0], proprio=recorded.state_T8[0])
     again = engine_of(TOLD_PONDER)
     again.open("a", Opening(instruction=INSTRUCTION))
-    assert again.fire("a", recorded.frames[0], proprio=recorded.state_T8[0]).context_tokens == answered.context_tokens
+    alike = again.fire("a", recorded.frames[0], proprio=recorded.state_T8[0])
+    assert alike.context_tokens == answered.context_tokens
+    assert np.array_equal(alike.cognition, answered.cognition)
 
 
 def test_an_engine_with_fewer_cameras_than_its_eyes_need_is_refused() -> None:

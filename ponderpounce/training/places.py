@@ -1,0 +1,21 @@
+"""Places as the simulator's texts tell them, ``<y, x>`` in pixels of a 256 px picture, and how to tell them wrongly."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+PLACE = re.compile(r"<\s*(\d+)\s*,\s*(\d+)\s*>")
+TEXT_PX = 256
+"""Side of the picture that texts speak of, whatever the size of a picture."""
+
+
+def misplaced(text: str, std_px: float, rng: np.random.Generator) -> str:
+    """The text with every coordinate wrong by a normal error, within the picture."""
+
+    def slipped(place: re.Match[str]) -> str:
+        y, x = (min(max(round(int(v) + rng.normal(0.0, std_px)), 0), TEXT_PX) for v in place.groups())
+        return f"<{y}, {x}>"
+
+    return PLACE.sub(slipped, text)
