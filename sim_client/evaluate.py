@@ -29,7 +29,7 @@ from ponderpounce.data.errors import DatasetError
 from ponderpounce.data.seeds import TRAIN_SEED
 from ponderpounce.data.workers import LocalWorkers, RayWorkers, Workers
 from ponderpounce.tasks.environment import Environment, make_environment
-from ponderpounce.tasks.task import TaskError, chosen_tasks
+from ponderpounce.tasks.task import Order, TaskError, chosen_tasks
 from protocol.bus import Bus
 from protocol.errors import TransportError
 from protocol.link import Link
@@ -70,6 +70,9 @@ class EvalOptions:
     """Of the first scene; all lie below 2,000,000, where the training seeds begin."""
     difficulty: Literal["easy", "medium", "hard"] | None = None
     """None: by seed, as the benchmark does."""
+    order: Order = "drawn"
+    """Of the simulator's own subgoals, where a task leaves it open: see pp-collect. What counts as success is the
+    same."""
     policy: Literal["servers", "oracle"] = "servers"
     """oracle: the tasks' own scripts, to test the machine."""
     ponder_checkpoint: Path | None = None
@@ -195,6 +198,8 @@ class EvalOptions:
             own["subgoal_text"] = self.subgoal_text
         if self.stand_in_noise_px:
             own["stand_in_noise_px"] = self.stand_in_noise_px
+        if self.order != "drawn":
+            own["order"] = self.order
         return config | {name: as_json(value) for name, value in own.items()}
 
 
@@ -326,6 +331,7 @@ class EvaluationStation:
                 max_steps=self._options.max_steps,
                 render=has_eyes,
                 texts_follow=self._options.cognition == "stand-in",
+                order=self._options.order,
             )
             self._task = task
         return self._environment

@@ -23,13 +23,13 @@ from tqdm import tqdm
 from ponderpounce.data.dart import DART, NoiseKind
 from ponderpounce.data.episode import Package, Rejection, unpack
 from ponderpounce.data.errors import DatasetError
-from ponderpounce.data.jobs import RECOVERY_SHARE, Job, Look, jobs_of
+from ponderpounce.data.jobs import DIFFICULTY_CYCLE, RECOVERY_SHARE, Difficulty, Job, Look, jobs_of
 from ponderpounce.data.lerobot_v3 import COLLECTION_PATH, INFO_PATH, DatasetWriter
 from ponderpounce.data.rollout import UNSOLVED, work_out
 from ponderpounce.data.seeds import TRAIN_SEED
 from ponderpounce.data.store import Store
 from ponderpounce.data.workers import LocalWorkers, RayWorkers, Workers
-from ponderpounce.tasks.task import TaskError, chosen_tasks
+from ponderpounce.tasks.task import Order, TaskError, chosen_tasks
 
 SCALES = {"1x": 1, "9x": 9}
 COLLECTING, JOINED = ".collecting", "joined"
@@ -60,6 +60,11 @@ class CollectOptions:
     """dart: nudge the executed joint targets off the oracle's way; `action` stays the way, the label."""
     recovery_share: float = RECOVERY_SHARE
     """Of the episodes, those with a grasp that closes too high or aside before it is made right."""
+    difficulties: tuple[Difficulty, ...] = DIFFICULTY_CYCLE
+    """Of the episodes of a task in turn, again and again."""
+    order: Order = "drawn"
+    """Where a task leaves open what is done first: as the scene was drawn (upstream), or what is nearest to the front
+    camera first, which a learner can foresee."""
     max_steps: int = 1300
     """An episode that takes longer is not kept."""
     workers: int = os.cpu_count() or 1
@@ -100,6 +105,8 @@ class CollectOptions:
             look=self.look,
             noise=self.noise,
             recovery_share=self.recovery_share,
+            difficulties=self.difficulties,
+            order=self.order,
         )
         return list(jobs)
 
@@ -115,6 +122,10 @@ class CollectOptions:
         }
         if self.recovery_share != RECOVERY_SHARE:
             settings["recovery_share"] = self.recovery_share
+        if self.difficulties != DIFFICULTY_CYCLE:
+            settings["difficulties"] = list(self.difficulties)
+        if self.order != "drawn":
+            settings["order"] = self.order
         return settings if self.noise == "none" else {**settings, "noise": DART.settings()}
 
 

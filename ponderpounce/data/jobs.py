@@ -1,15 +1,15 @@
 """What is to be collected: one job per kept episode, each with its own row of seeds.
 
 Jobs know nothing of each other, so any number of workers in any order make the same set: a job tries its seeds in turn
-until the oracle solves one. As in RoboMME two of four episodes are easy, one is medium and one hard, and unless told
-otherwise three of every hundred have a grasp that closes too high before it is made right, and three one that closes
-aside.
+until the oracle solves one. As in RoboMME two of four episodes are easy, one is medium and one hard, and three of every hundred have a grasp that closes too high before it is made right, and three one that closes
+aside, unless told otherwise.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -19,9 +19,11 @@ from ponderpounce.data.episode import Recovery
 from ponderpounce.data.seeds import TRAIN_SEED
 from ponderpounce.data.video import FPS
 from ponderpounce.tasks.oracle import FailedGrasp
+from ponderpounce.tasks.task import Order
 
 ATTEMPTS = 100
-DIFFICULTY_CYCLE = ("easy", "easy", "medium", "hard")
+Difficulty = Literal["easy", "medium", "hard"]
+DIFFICULTY_CYCLE: tuple[Difficulty, ...] = ("easy", "easy", "medium", "hard")
 RECOVERY_SHARE = 0.06  # upstream's
 _RECOVERY_CYCLE = 100
 _RECOVERY_STREAM = 1  # of a seed's random numbers; the scene draws from another
@@ -47,6 +49,8 @@ class Job:
     look: Look
     noise: NoiseKind = "none"
     recovery_share: float = RECOVERY_SHARE
+    difficulties: tuple[Difficulty, ...] = DIFFICULTY_CYCLE
+    order: Order = "drawn"
 
     @property
     def key(self) -> str:
@@ -55,7 +59,7 @@ class Job:
 
     @property
     def difficulty(self) -> str:
-        return DIFFICULTY_CYCLE[self.slot % len(DIFFICULTY_CYCLE)]
+        return self.difficulties[self.slot % len(self.difficulties)]
 
     @property
     def recovery(self) -> Recovery:
@@ -77,6 +81,8 @@ def jobs_of(
     look: Look,
     noise: NoiseKind = "none",
     recovery_share: float = RECOVERY_SHARE,
+    difficulties: tuple[Difficulty, ...] = DIFFICULTY_CYCLE,
+    order: Order = "drawn",
 ) -> Iterator[Job]:
     """Yields the jobs task by task, in the order their episodes have in the dataset."""
     for task in tasks:
@@ -89,6 +95,8 @@ def jobs_of(
                 look=look,
                 noise=noise,
                 recovery_share=recovery_share,
+                difficulties=difficulties,
+                order=order,
             )
 
 

@@ -22,6 +22,7 @@ from ponderpounce.tasks.geometry import pose_of
 from ponderpounce.tasks.kinematics import Kinematics, UnreachableError
 from ponderpounce.tasks.oracle import FailedGrasp, Motions
 from ponderpounce.tasks.scene import SceneFullError
+from ponderpounce.tasks.task import Order
 
 UNSOLVED = "unsolved.json"
 """The only file of a package whose job found no seed that the oracle solves: the list of what was tried."""
@@ -67,7 +68,7 @@ class Narrator:
 
 def work_out(job: Job) -> Package:
     """Tries the job's seeds in turn; returns the first solved episode, or why there is none."""
-    environment = _environment(job.task, job.image_px, job.max_steps)
+    environment = _environment(job.task, job.image_px, job.max_steps, job.order)
     rejected: list[Rejection] = []
     for attempt in range(ATTEMPTS):
         seed = job.seed(attempt)
@@ -144,8 +145,8 @@ def play(
 
 
 @functools.lru_cache(maxsize=1)  # building a scene takes seconds, and jobs come task by task
-def _environment(task: str, image_px: int, max_steps: int) -> Environment:
-    environment = make_environment(task, image_px=image_px, max_steps=max_steps)
+def _environment(task: str, image_px: int, max_steps: int, order: Order) -> Environment:
+    environment = make_environment(task, image_px=image_px, max_steps=max_steps, order=order)
     atexit.unregister(_environment.cache_clear)
     atexit.register(
         _environment.cache_clear

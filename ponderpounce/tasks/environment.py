@@ -20,7 +20,7 @@ from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.physics import CONTROL_HZ, Physics, PhysicsState
 from ponderpounce.tasks.rendering import Cameras
 from ponderpounce.tasks.scene import FRONT, table_scene
-from ponderpounce.tasks.task import DIFFICULTIES, Subtask, Task, TaskError, make_task
+from ponderpounce.tasks.task import DIFFICULTIES, Order, Subtask, Task, TaskError, make_task
 
 IMAGE_PX = 256  # upstream's; grounded texts count in these pixels
 _PUSHED_M = 0.01  # texts that follow are corrected from this distance on
@@ -68,14 +68,16 @@ def make_environment(
     render: bool = True,
     max_steps: int = MAX_STEPS,
     texts_follow: bool = False,
+    order: Order = "drawn",
 ) -> Environment:
     """Returns an environment of a registered task. Raises TaskError for an unknown name.
 
     With ``texts_follow`` the coordinates of a grounded subgoal are corrected when its things have been pushed
-    elsewhere; upstream's stay where they were first seen.
+    elsewhere; upstream's stay where they were first seen. An ``order`` other than upstream's changes the list of
+    subtasks, and with it texts and oracle; scenes and what counts as success stay the same.
     """
     return Environment(
-        make_task(name), image_px=image_px, render=render, max_steps=max_steps, texts_follow=texts_follow
+        make_task(name), image_px=image_px, render=render, max_steps=max_steps, texts_follow=texts_follow, order=order
     )
 
 
@@ -86,9 +88,17 @@ class Environment:
     """
 
     def __init__(
-        self, task: Task[Any, Any], *, image_px: int, render: bool, max_steps: int, texts_follow: bool = False
+        self,
+        task: Task[Any, Any],
+        *,
+        image_px: int,
+        render: bool,
+        max_steps: int,
+        texts_follow: bool = False,
+        order: Order = "drawn",
     ) -> None:
         self._task = task
+        self._order = order
         self._texts_follow = texts_follow
         self._said_of: Array = np.zeros((0, 3))  # where the things of the grounded text were when it was made
         spec = table_scene(task.robot)
@@ -136,6 +146,8 @@ class Environment:
             raise TaskError(f"unknown difficulty {difficulty!r}; expected one of {', '.join(DIFFICULTIES)}")
         if layout is None:
             layout = self._task.sample(np.random.default_rng(seed), difficulty)
+        if self._order == "near-first":
+            layout = self._task.near_first(layout)
         self._begin(difficulty, layout)
         parts = self._task.demonstration(layout)
         self._video, last_action = demonstration.perform(self._task, layout, parts, self.physics, self._look_for)

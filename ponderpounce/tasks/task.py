@@ -15,7 +15,7 @@ import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 import mujoco
 import numpy as np
@@ -26,6 +26,8 @@ from ponderpounce.tasks.panda import PANDA_WRISTCAM, Robot
 from ponderpounce.tasks.physics import Physics
 
 DIFFICULTIES = ("easy", "medium", "hard")
+Order = Literal["drawn", "near-first"]
+"""What is done first where a task leaves it open: as its layout was drawn, or by a rule that can be seen."""
 FAMILIES = ("counting", "permanence", "reference", "imitation")
 
 LayoutT = TypeVar("LayoutT")
@@ -137,6 +139,14 @@ class Task(ABC, Generic[LayoutT, MemoryT]):
         for what motion leaves behind. The default is none.
         """
         return ()
+
+    def near_first(self, layout: LayoutT) -> LayoutT:
+        """Returns the same episode with an order that can be seen: what is nearest to the front camera comes first.
+
+        What counts as success is the same. Where a task asks for one order, or for one thing only, there is nothing to
+        choose: the default returns the layout. A drawn order nobody can foresee, so a learner can only guess at it.
+        """
+        return layout
 
     def things(self, layout: LayoutT, step: int) -> tuple[Thing, ...]:
         """Returns all that is to be named in the observation of ``step`` (`data.album`). The default names nothing."""

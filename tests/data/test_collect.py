@@ -133,6 +133,17 @@ def test_noise_is_told_and_counted_and_never_mixed_with_none(tmp_path: Path, pre
         collect(options(tmp_path, noise="none"), InOrder(pretend))
 
 
+def test_orders_and_difficulties_are_told_and_never_mixed(tmp_path: Path, pretend: WorkOut) -> None:
+    ours = options(tmp_path, order="near-first", difficulties=("hard", "easy"))
+    collect(ours, InOrder(pretend))
+    told = json.loads((tmp_path / COLLECTION_PATH).read_text())["settings"]
+    assert told["order"] == "near-first"
+    assert told["difficulties"] == ["hard", "easy"]
+    for other in ({"order": "near-first"}, {"difficulties": ("hard", "easy")}):
+        with pytest.raises(DatasetError, match="another --out"):
+            collect(options(tmp_path, **other), InOrder(pretend))
+
+
 def test_without_noise_nothing_is_said_of_it(whole: dict[str, bytes]) -> None:
     assert "noise" not in whole[COLLECTION_PATH].decode()
 

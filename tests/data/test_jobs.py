@@ -32,6 +32,12 @@ def test_shares_are_the_benchmark_s() -> None:
     assert Counter(job.recovery for job in hundred) == {"none": 94, "z": 3, "xy": 3}
 
 
+def test_difficulties_come_in_turn() -> None:
+    turn = ("hard", "easy", "hard")
+    jobs = list(jobs_of(("A", "B"), 7, image_px=256, max_steps=1300, look=Look(), difficulties=turn))
+    assert [job.difficulty for job in jobs] == [*turn, *turn, "hard"] * 2
+
+
 def test_a_share_of_failed_grasps_is_split_evenly_and_over_all_difficulties() -> None:
     jobs = list(jobs_of(("A",), 200, image_px=256, max_steps=1300, look=Look(), recovery_share=0.4))
     assert Counter(job.recovery for job in jobs) == {"none": 120, "z": 40, "xy": 40}

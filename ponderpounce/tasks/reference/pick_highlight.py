@@ -130,6 +130,10 @@ class PickHighlight(Task[Layout, Memory]):
         text = f"Highlighted: {', '.join(marked)}; after {num_chosen} of {len(marked)}, choose {next_one}."
         return Reasoning(text=text, grounds=tuple(_CUBES[target] for target in chosen))
 
+    def near_first(self, layout: Layout) -> Layout:
+        nearest = sorted(layout.targets, key=lambda target: -layout.cubes[target].x_m)
+        return replace(layout, targets=tuple(nearest))
+
     def things(self, layout: Layout, step: int) -> tuple[Thing, ...]:
         lit = layout.targets if step in HIGHLIGHT_STEPS else ()
         names = [f"{'highlighted ' * (i in lit)}{cube.color} cube" for i, cube in enumerate(layout.cubes)]
