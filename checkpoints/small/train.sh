@@ -21,7 +21,7 @@ train_on_both_cores() {
 
 hand() {  # lets the POUNCE of a stage play; what it does becomes the dataset $out/NAME
     local name=$1 stage=$2; shift 2
-    "$bin/pp-eval" --tasks PickHighlight --runs 1 --cognition stand-in --pounce-checkpoint "$out/run/$stage/pounce" \
+    "$bin/pp-eval" --tasks PickHighlight --runs 1 --cognition stand-in --order near-first --pounce-checkpoint "$out/run/$stage/pounce" \
         --record --record-hz 5 --out "$out/played/$name" "$@"
     if [ -d "$out/$name/meta" ]; then return; fi
     local logs  # of finished episodes: a kill leaves the beginning of one more
@@ -33,7 +33,7 @@ print(*(folder / each["mcap"] for each in json.loads((folder / "results.json").r
 }
 
 [ -d "$out/data/meta" ] || "$bin/pp-collect" --tasks PickHighlight --episodes 600 --noise dart --recovery-share 0.4 \
-    --frames training --invocation-hz 5 --out "$out/data"
+    --frames training --invocation-hz 5 --difficulties easy medium hard --order near-first --out "$out/data"
 
 [ -d "$out/album/meta" ] || "$bin/pp-album" --pictures 10000 --out "$out/album"
 [ -d "$out/eyes/ponder" ] || OMP_NUM_THREADS=2 "$bin/pp-see" --recipe small --data "$out/data" --album "$out/album" --out "$out/eyes"

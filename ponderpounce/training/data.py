@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,8 +21,10 @@ from ponderpounce.models.images import resized
 from ponderpounce.models.normalisation import Quantiles, RobotStatistics
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.training.example import Frame, TrainingEpisode, chunk_ticks
+from ponderpounce.training.sight_store import SightStore, Views
 
 _QUANTILES = (0.01, 0.99)
+_SYSTEMS = ("pounce", "ponder")
 _MIN_REACH = 1e-3
 _MIN_SPAN = 1e-3
 """A dimension that hardly moves is not blown up to fill [-1, 1]."""
@@ -43,6 +45,12 @@ class Sight:
             return True
         return camera <= max(eye.camera for eye in self.form.eyes)  # eyes count from the first camera
 
+    @property
+    def kind(self) -> str:
+        """All that makes two sights of one episode differ."""
+        eyes = None if self.form is None else (self.form.eyes, self.form.image_px)
+        return f"{eyes} {self.pounce_px}"
+
     def of_ponder(self, views: tuple[Frame, ...]) -> tuple[Frame, ...]:
         return () if self.form is None else tuple(see(views, self.form.eyes, self.form.image_px))
 
@@ -61,6 +69,17 @@ class _Source:
     def rows(self) -> Rows:
         return self.dataset.rows(self.entry.index)
 
+    def frames(self, cameras: Sequence[str], rows: Sequence[int]) -> Iterator[tuple[Frame, ...]]:
+        """Every camera's picture at each of these rows."""
+        return zip(*(self.dataset.frames(self.entry.index, camera, rows) for camera in cameras), strict=True)
+
+    @property
+    def key(self) -> bytes:
+        """Of what can be seen: the scene, what was done in it, and when it was looked at."""
+        rows = self.rows()
+        scene = f"{self.entry.task} {self.entry.seed} {self.entry.difficulty} {self.dataset.image_px}"
+        return b" ".join((scene.encode(), rows.state.tobytes(), rows.action.tobytes(), rows.is_rendered.tobytes()))
+
 
 class TrainingSet:
     """Episodes by number. ``pp-collect`` and ``pp-export`` make the folders.
@@ -77,6 +96,7 @@ class TrainingSet:
         tasks: Sequence[str] = (),
         sight: Sight | None = None,
         cache_mb: int = 4000,
+        sights: Path | None = None,
     ) -> None:
         """Reads the episodes of ``tasks``, or all; their pictures whole, or as ``sight`` says.
 
@@ -86,12 +106,14 @@ class TrainingSet:
             tasks: those to read; () for all.
             sight: see its class.
             cache_mb: of pictures that are kept.
+            sights: a folder for what ``sight`` makes of pictures, to be read instead of videos from then on.
 
         Raises:
             DatasetError: a folder holds no dataset of ours.
             ValueError: no episode of these tasks is in a folder, or the folders' pictures differ in size.
         """
         self._sight = sight
+        self._store = None if sights is None or sight is None else SightStore(sights, sight.kind)
         self._sources = _sources(Dataset(root), tasks, is_watched=False)
         self.num_imitated = len(self._sources)
         for folder in watched:
@@ -178,17 +200,22 @@ class TrainingSet:
         own = np.maximum.accumulate(np.where(is_rendered, np.arange(len(is_rendered)), 0))
         taken = [int(own[row]) for row in shown]  # rows between two looks repeat the one before
         once = sorted(set(taken))
-        wanted = CAMERAS if sight is None else [c for n, c in enumerate(CAMERAS) if sight.needs(n)]
-        pictures = {
-            camera: dict(zip(once, source.dataset.frames(source.entry.index, camera, once), strict=True))
-            for camera in wanted
-        }
-        whole = {row: tuple(pictures[camera][row] for camera in wanted) for row in once}
         if sight is None:
+            whole = dict(zip(once, source.frames(CAMERAS, once), strict=True))
             return [whole[row] for row in taken], None
-        views = {row: sight.of_pounce(whole[row]) for row in once}
-        sights = {row: sight.of_ponder(whole[row]) for row in once}
+        views, sights = (dict(zip(once, each, strict=True)) for each in self._seen(source, sight, once))
         return [views[row] for row in taken], [sights[row] for row in taken]
+
+    def _seen(self, source: _Source, sight: Sight, rows: Sequence[int]) -> tuple[Views, ...]:
+        """What POUNCE and what PONDER see in these rows; from the store, if there is one and it has them."""
+        key = source.key
+        if self._store is not None and (kept := self._store.read(key, len(rows), _SYSTEMS)) is not None:
+            return kept
+        whole = list(source.frames([c for n, c in enumerate(CAMERAS) if sight.needs(n)], rows))
+        views, sights = [sight.of_pounce(each) for each in whole], [sight.of_ponder(each) for each in whole]
+        if self._store is not None:
+            self._store.write(key, dict(zip(_SYSTEMS, (views, sights), strict=True)))
+        return views, sights
 
     def statistics(self, horizon: int, space: ActionSpace = "joint_delta", *, by_row: bool = False) -> RobotStatistics:
         """Quantiles of the states as the network reads them, and of the actions as it learns them in an `action_space`.

@@ -78,6 +78,8 @@ class Slip:
 
     std_px: float
     seed: int
+    is_learned: bool = False
+    """True: errors so small that PONDER learns to say the words all the same, around the right ones."""
 
     def saying(self, view: View) -> Callable[[str], str]:
         """Tells one text after the other of a row as it is in this view, its places wrong."""
@@ -102,6 +104,8 @@ class ExampleConfig:
     then come from what is seen; from flawless words alone it would learn to copy them, and PONDER's own are not."""
     slip_px: float = 6.0
     """Standard deviation of each coordinate, of a 256 px picture."""
+    tremble_px: float = 0.0
+    """The same in all other grounded rows, whose words are learned: no word is then exact enough to be copied."""
 
     augmentation: Augmentation = NOT_AUGMENTED
     """Other views of the scene. An action is that of the scene as it is, so where POUNCE learns as well, only watched
@@ -117,6 +121,8 @@ class ExampleConfig:
     def __post_init__(self) -> None:
         if self.max_queries is not None and self.max_queries < 1:
             raise ValueError(f"max_queries must be at least 1, came {self.max_queries}")
+        if min(self.slip_px, self.tremble_px) < 0:
+            raise ValueError(f"slip_px {self.slip_px} and tremble_px {self.tremble_px} must be at least 0")
         for name in ("text_dropout", "slips"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be in [0, 1], came {getattr(self, name)}")
@@ -173,6 +179,8 @@ def make_example(
     slip = None
     if is_grounded and config.slips and rng.random() < config.slips:
         slip = Slip(std_px=config.slip_px, seed=int(rng.integers(1 << 62)))
+    elif is_grounded and config.tremble_px:
+        slip = Slip(std_px=config.tremble_px, seed=int(rng.integers(1 << 62)), is_learned=True)
     is_moved = config.augments == "all" or episode.is_watched
     view = draw_view(config.augmentation if is_moved else NOT_AUGMENTED, form, set(episode.subgoals), rng)
     nudges_I2 = None
@@ -222,7 +230,7 @@ def episode_row(
         text = episode.subgoals[query.tick]
         if is_grounded and query.stamp.is_transition and text:
             subgoal = encode(normalised_text(say(text)))
-            transition = Transition(subgoal=subgoal, reasoning=reasoning, is_learned=slip is None)
+            transition = Transition(subgoal=subgoal, reasoning=reasoning, is_learned=slip is None or slip.is_learned)
             reasoning = None
         segments += form.query(len(views[query.tick]), transition, episode.state_T8[query.tick])
     return form.row(segments)

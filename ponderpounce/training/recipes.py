@@ -173,9 +173,9 @@ def small() -> Curriculum:
     grounding = replace(
         looking,
         name="small/grounding",
-        example=replace(looking.example, text_dropout=0.2, slips=0.4, max_queries=None),
-        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, decay=(1400, 3200))),
-        num_steps=3200,
+        example=replace(looking.example, text_dropout=0.2, slips=0.4, tremble_px=1.0, max_queries=None),
+        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, decay=(900, 2000))),
+        num_steps=2000,
         batch_episodes=8,
         w3=3.0,
     )
@@ -202,6 +202,7 @@ def small() -> Curriculum:
             reaching.example,
             max_invocations=32,
             slips=0.4,
+            tremble_px=1.0,
             augmentation=looking.example.augmentation,
             augments="watched",
         ),

@@ -95,6 +95,8 @@ class TrainOptions:
     """Also write OUT/tensorboard: losses, pictures and samples."""
     cache_mb: int = 6000
     """Memory for pictures, at the sizes that the networks read; what does not fit is decoded again."""
+    sights: Path | None = None
+    """Keep pictures there as well, at those sizes: further processes, stages and runs then need not decode videos."""
     device: Literal["cpu", "cuda"] = "cpu"
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Of PONDER's weights and of what POUNCE's stream runs in, when they are loaded."""
@@ -227,6 +229,7 @@ def _train(run: Recipe, data: TrainingSet, options: TrainOptions, world: World) 
         tasks=options.tasks,
         sight=_sight(run, model),
         cache_mb=options.cache_mb,
+        sights=options.sights,
     )
     batches = Batches(data, run, model, bundle, world, options.watch_share)
     trainer = Trainer(model, batches, run.train, data_hash=data.hash, world=world)

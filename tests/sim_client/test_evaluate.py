@@ -117,6 +117,8 @@ def test_one_folder_holds_one_condition(tmp_path: Path) -> None:
     evaluate(options(tmp_path), InOrder(pretended))
     with pytest.raises(LedgerError, match="delay_ms = 300, and this is 1000"):
         evaluate(options(tmp_path, delay_ms=1000), InOrder(pretended))
+    with pytest.raises(LedgerError, match="near-first"):
+        evaluate(options(tmp_path, order="near-first"), InOrder(pretended))
 
 
 @pytest.mark.parametrize(

@@ -191,6 +191,20 @@ def test_words_that_slipped_are_read_and_not_learned(seed: int) -> None:
     assert "pick at [" in said
 
 
+def test_words_that_tremble_are_read_and_learned() -> None:
+    recorded = replace(episode(70, changes=(0, 30)), subgoals=["pick at <120, 40>"] * 30 + ["go to <20, 200>"] * 40)
+    config = ExampleConfig(clocks=EVALUATION, tremble_px=2.0)
+    v = FORM.vocabulary
+    told = set()
+    for seed in range(10):
+        row = make_example(recorded, FORM, config, np.random.default_rng(seed)).row()
+        read = v.decode([i for i in row.ids if i not in v.control_ids and i not in FORM.carrier_ids])
+        learned = v.decode([t for t in row.targets if t >= 0 and t not in v.control_ids])
+        assert re.findall(r"\[.*?\]", learned) == re.findall(r"\[.*?\]", read) != []
+        told.update(re.findall(r"\[.*?\]", learned))
+    assert len(told) > 10  # of 20 places, drawn anew
+
+
 def test_places_that_slip_stay_in_the_picture() -> None:
     rng = np.random.default_rng(0)
     texts = [misplaced("<0, 256>", 30.0, rng) for _ in range(200)]

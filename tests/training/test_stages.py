@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from ponderpounce.data.dataset import Dataset
 from ponderpounce.data.episode import About, EpisodeWriter, Row, unpack
 from ponderpounce.data.lerobot_v3 import DatasetWriter
 from ponderpounce.models import flow
@@ -19,7 +21,7 @@ from ponderpounce.models.pounce_checkpoint import load_bundle
 from ponderpounce.training import recipes, train
 from ponderpounce.training.augment import AS_IT_IS
 from ponderpounce.training.data import Sight, TrainingSet
-from ponderpounce.training.example import ExampleConfig, make_example, row_frames
+from ponderpounce.training.example import ExampleConfig, TrainingEpisode, make_example, row_frames
 from ponderpounce.training.joint import Draws, JointModel
 from ponderpounce.training.parallel import World
 from ponderpounce.training.recipes import Curriculum, Recipe, stages_of
@@ -174,6 +176,47 @@ def test_pictures_kept_small_are_what_whole_ones_become(folder: Path, small: dic
         train.collate_pounce([e], model.pounce.config, bundle.tokenizer, bundle.statistics).inputs for e in examples
     ]
     assert torch.equal(batches[0].images, batches[1].images)
+
+
+@pytest.mark.parametrize("pounce_px", [None, 32])
+def test_sights_kept_on_disk_are_those_of_the_videos(
+    folder: Path, small: dict[str, Recipe], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pounce_px: int | None
+) -> None:
+    model, _ = build(small["joint"], TrainingSet(folder), options(folder, folder / "unused"))
+    sight = Sight(form=model.ponder.format, pounce_px=pounce_px)
+    decoded = list(TrainingSet(folder, sight=sight))
+    assert_alike(decoded, list(TrainingSet(folder, sight=sight, sights=tmp_path)))
+    files = sorted(tmp_path.glob("*/*.npz"))
+    assert len(files) == NUM_EPISODES
+    files[0].write_bytes(files[0].read_bytes()[:-40])
+    assert_alike(decoded, list(TrainingSet(folder, sight=sight, sights=tmp_path)))  # made again
+    monkeypatch.setattr(Dataset, "frames", lambda *_: pytest.fail("a video was read"))
+    assert_alike(decoded, list(TrainingSet(folder, sight=sight, sights=tmp_path)))
+    other = replace(sight, pounce_px=16)
+    with pytest.raises(pytest.fail.Exception, match="a video was read"):
+        TrainingSet(folder, sight=other, sights=tmp_path)[0]
+
+
+def assert_alike(some: list[TrainingEpisode], others: list[TrainingEpisode]) -> None:
+    for one, other in zip(some, others, strict=True):
+        assert one.sights is not None
+        assert other.sights is not None
+        for its, theirs in ((one.frames, other.frames), (one.sights, other.sights)):
+            for views, same in zip(its, theirs, strict=True):
+                assert all(np.array_equal(*pair) for pair in zip(views, same, strict=True))
+
+
+def test_a_full_disk_keeps_no_sights_and_loses_nothing(
+    folder: Path, small: dict[str, Recipe], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    model, _ = build(small["joint"], TrainingSet(folder), options(folder, folder / "unused"))
+    sight = Sight(form=model.ponder.format, pounce_px=None)
+    monkeypatch.setattr(np, "savez", full)
+    assert_alike(list(TrainingSet(folder, sight=sight)), list(TrainingSet(folder, sight=sight, sights=tmp_path)))
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
 
 
 def test_several_flow_samples_are_the_mean_of_single_ones(folder: Path, small: dict[str, Recipe]) -> None:
