@@ -187,11 +187,11 @@ class _Window:
         num_past_B1, num_new_B1 = num_past_B[:, None], num_new_B[:, None]
         position_K = torch.arange(num_positions, device=token_T.device)
         self.slot_B1 = slot_B[:, None]
-        self.stored_BT = torch.where(token_T < num_new_B1, token_T, 0)
+        self.stored_BT = token_T * (token_T < num_new_B1)
         """Tokens whose keys and values are written. A pad stands for the first one: the same bits to the same place,
         whoever comes last. It has no place of its own where the slot ends before the bucket does."""
         self.places_BT = num_past_B1 + self.stored_BT
-        self.seen_BK = torch.where(position_K < num_past_B1 + num_new_B1, position_K, 0)
+        self.seen_BK = position_K * (position_K < num_past_B1 + num_new_B1)
         """Positions that are read: what is past the last one is garbage, and need not be finite."""
         self._is_visible_BTK = position_K <= (num_past_B1 + token_T)[..., None]
 

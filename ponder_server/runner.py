@@ -11,10 +11,9 @@ allocated at construction, and everything writes in place.
 # T new tokens, H hidden
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Self, TypeAlias
+from typing import Self
 
 import numpy as np
 import torch
@@ -27,9 +26,6 @@ from ponder_server.slots import SlotMemory
 from ponder_server.threads import ALONE, Threads
 from ponderpounce.models.graphs import Capture
 from ponderpounce.models.ponder import Ponder
-
-Decode: TypeAlias = Callable[[Sequence[Place], Tensor, Tensor], list[Tensor]]
-"""(places, embeddings (B, T, H), positions (3, B, T) on the CPU) to the wanted hidden states of each place."""
 
 NUM_SAVED_STATES = 2
 """Per slot, allocated with it: before a query, and before a draft."""
@@ -85,13 +81,13 @@ class Runner:
     ) -> None:
         """``threads`` are for attention on a CPU."""
         self._ponder = ponder
+        self._threads = threads
         self._text_model = ponder.qwen.model.language_model
         self._buckets = buckets
         text_config = ponder.qwen.config.text_config
         self.memory = SlotMemory(
             text_config, num_slots=num_slots, max_tokens=max_tokens, device=ponder.device, dtype=ponder.dtype
         )
-        self._decode: Decode = partial(decode, self._text_model, self.memory, threads=threads)
         self._captured: CapturedDecoder | None = None
         self._free_slots = list(reversed(range(num_slots)))
         self._saved = [tuple(self._blank_state(slot) for _ in range(NUM_SAVED_STATES)) for slot in range(num_slots)]
@@ -103,7 +99,6 @@ class Runner:
         ``num_read`` at most; forwards that are asked for more run as they did.
         """
         self._captured = CapturedDecoder(self._text_model, self.memory, capture, num_read=num_read)
-        self._decode = self._captured
 
     def prepare(self, num_tokens: int, *, max_rows: int) -> int:
         """Captures all forwards that appends of up to so many tokens to so many sessions at once can need, and any
@@ -169,7 +164,11 @@ class Runner:
             )
             places.append(place)
             row.num_done = end
-        hidden = self._decode(places, embeds_BTH, torch.from_numpy(positions_3BT))
+        positions = torch.from_numpy(positions_3BT)
+        if self._captured is not None:
+            hidden = self._captured(places, embeds_BTH, positions)
+        else:
+            hidden = decode(self._text_model, self.memory, places, embeds_BTH, positions, self._threads)
         for row, hidden_NH in zip(rows, hidden, strict=True):
             row.hidden.append(hidden_NH)
 

@@ -19,9 +19,12 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from ponder_server import decoder
 from ponder_server.captured import CapturedDecoder, position_buckets
+from ponder_server.contract import WeightsName
 from ponder_server.decoder import Place, decode
+from ponder_server.narrow import quantise
 from ponder_server.runner import Append, Runner, Session
 from ponder_server.slots import SlotMemory
+from ponderpounce.models import fp8
 from ponderpounce.models.graphs import Capture, Work, directly
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
@@ -248,6 +251,26 @@ def test_no_operation_depends_on_a_number_and_none_waits_for_one(ponder: Ponder,
             seen.append(watch.operations)
     assert len(seen[0]) > 100
     assert seen[0] == seen[1]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("weights", ["float", "fp8"])
+@pytest.mark.parametrize("length", [1, 16, 70])
+@torch.inference_mode()
+def test_it_runs_on_a_device_that_has_no_numbers(
+    dtype: torch.dtype, weights: WeightsName, length: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every choice as on a GPU, fp8 products among them: whatever were read there, or lay elsewhere, would raise."""
+    monkeypatch.setattr(fp8, "has_products", lambda device: True)
+    ponder = Ponder.random(replace(SMALL, num_layers=4), seed=1, device="meta", dtype=dtype)
+    quantise(ponder, weights)
+    captured = CapturedDecoder(ponder.qwen.model.language_model, memory_of(ponder), directly, num_read=16)
+    places = [Place(slot=slot, num_past=3, num_new=1, num_wanted=1) for slot in range(2)]
+    embeds_BTH = torch.zeros(2, length, ponder.hidden_size, device="meta", dtype=dtype)
+    with Watch():
+        captured.forward(2, length, 200).run()
+    hidden = captured(places, embeds_BTH, torch.zeros(3, 2, length, dtype=torch.long))
+    assert [(row_NH.shape, row_NH.dtype) for row_NH in hidden] == [((1, ponder.hidden_size), dtype)] * 2
 
 
 @torch.inference_mode()
