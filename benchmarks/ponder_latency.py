@@ -9,8 +9,9 @@ them can add less.
 
 Beside it what a server without an append-only context pays, the whole context encoded again in one forward, and a
 transition with a text of 45 tokens (the paper's), decoded one by one, with a draft that knows it and with multi-token
-prediction; the fire with int8 weights; and what an episode's opening with a long demonstration takes, in a few large
-forwards and instant by instant.
+prediction; the fire with narrow weights, int8 on a CPU and fp8 on a GPU; and what an episode's opening with a long
+demonstration takes, in a few large forwards and instant by instant. On a GPU forwards are CUDA graphs, and one more row
+has the fire without them.
 
 The networks have random weights: their speed is a trained one's, what they say is not, nor how well it is guessed.
 """
@@ -114,7 +115,7 @@ def _measured(dtype: str, options: LatencyOptions, report: Report) -> dict[str, 
     for threads in options.attention_threads:
         engine = _engine(ponder, options, attention_threads=threads)
         of_contexts = _fires(engine, options)
-        fires += [{"weights": "float", "attention_threads": threads, **row} for row in of_contexts]
+        fires += [_labelled(row, options, threads=threads) for row in of_contexts]
         floors.append({"attention_threads": threads} | _floor(engine, options, of_contexts, threads))
     first_p50_ms, longest_p50_ms = (float(fires[at]["p50_ms"] or 0) for at in (0, len(options.contexts) - 1))
     encode_ms = _encodes(ponder, options)
@@ -123,14 +124,21 @@ def _measured(dtype: str, options: LatencyOptions, report: Report) -> dict[str, 
         f"{options.size} with random weights, {dtype} on {options.device}, one thread if nothing else is "
         f"said; a session of {max(options.contexts) + 600} tokens takes {size / 2**20:.1f} MiB."
     )
-    if options.device == "cpu":
-        # of another network, because its layers are replaced
-        narrow = _engine(Ponder.random(config, seed=0, dtype=getattr(torch, dtype)), options, weights="int8")
-        fires += [{"weights": "int8", "attention_threads": 1, **row} for row in _fires(narrow, options)]
-        report.notes.append(
-            f"int8 weights of this network change cognition by {narrow.spec.cognition_error:.1e} in {dtype} (relative "
-            "L2), which says nothing of a trained one. Each layer is widened as it is called, which takes the time."
-        )
+    if _is_on_gpu(options):
+        eager = _engine(ponder, options, graphs=False)
+        fires += [_labelled(row, options, graphs=False) for row in _fires(eager, options)]
+    weights: WeightsName = "fp8" if _is_on_gpu(options) else "int8"
+    # of another network, because its layers are replaced
+    another = Ponder.random(config, seed=0, device=options.device, dtype=getattr(torch, dtype))
+    narrow = _engine(another, options, weights=weights)
+    fires += [_labelled(row, options, weights=weights) for row in _fires(narrow, options)]
+    took = "Each layer is widened as it is called, which takes the time."
+    if weights == "fp8":
+        took = "In bfloat16 a GPU with fp8 products takes these; elsewhere each layer is widened as it is called."
+    report.notes.append(
+        f"{weights} weights of this network change cognition by {narrow.spec.cognition_error:.1e} in {dtype} (relative "
+        f"L2), which says nothing of a trained one. {took}"
+    )
     return {
         "A cognition fire: two frames in, C_t out": fires,
         "What the longest context adds, and what its attention's products alone must take": floors,
@@ -146,6 +154,18 @@ def _measured(dtype: str, options: LatencyOptions, report: Report) -> dict[str, 
     }
 
 
+def _is_on_gpu(options: LatencyOptions) -> bool:
+    return torch.device(options.device).type == "cuda"
+
+
+def _labelled(
+    row: Row, options: LatencyOptions, *, threads: int = 1, weights: WeightsName = "float", graphs: bool = True
+) -> Row:
+    """Says whose fires they are. Where there are no graphs, nothing is said of them."""
+    engine: Row = {"engine": "ours graphs" if graphs else "ours eager"} if _is_on_gpu(options) else {}
+    return {**engine, "weights": weights, "attention_threads": threads, **row}
+
+
 def _engine(
     ponder: Ponder,
     options: LatencyOptions,
@@ -153,12 +173,14 @@ def _engine(
     *,
     attention_threads: int = 1,
     weights: WeightsName = "float",
+    graphs: bool = True,
 ) -> QwenEngine:
     config = EngineConfig(
         max_context_tokens=max(options.contexts) + 600,
         max_sessions=len(options.contexts),
         attention_threads=attention_threads,
         weights=weights,
+        graphs=graphs,
     )
     return QwenEngine(ponder, config, draft)
 

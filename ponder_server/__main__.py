@@ -37,11 +37,6 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     num_robots = 1 + len(options.other_robots)
     if options.max_sessions < num_robots:
         raise ValueError(f"{num_robots} robots need as many sessions: --max-sessions is {options.max_sessions}.")
-    if options.weights == "fp8":
-        raise ValueError(
-            "--weights fp8 needs a GPU's fp8 products, and this engine has no such path; take --weights int8 on a CPU, "
-            "--dtype bfloat16 on a GPU."
-        )
     torch.set_num_threads(NUM_TORCH_THREADS)
     num_cores = num_usable_cores()
     if options.attention_threads > num_cores:
@@ -60,6 +55,7 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
         max_batch_rows=options.max_batch_rows,
         attention_threads=min(options.attention_threads, num_cores),
         weights=options.weights,
+        graphs=options.graphs,
     )
     drafts: list[Draft] = []
     if options.draft_texts is not None:

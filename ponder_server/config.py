@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from ponder_server.context_policy import PolicyName
+from ponder_server.contract import WeightsName
 from protocol.options import LinkOptions
 
 SizeName = Literal["tiny_cpu", "qwen35_0p8b", "qwen35_2b", "qwen35_4b", "qwen35_9b"]
@@ -49,6 +50,8 @@ class PonderOptions:
     draft_tokens: int = 0
     """Tokens that the checkpoint's multi-token prediction guesses at a time where the examples have no guess, 15 at
     most. The texts stay the same ones."""
-    weights: Literal["float", "int8", "fp8"] = "float"
-    """int8: a quarter of the layers' memory on a CPU; the change of cognition is measured at start and told. fp8 is
-    refused."""
+    weights: WeightsName = "float"
+    """int8, on a CPU, and fp8: a byte a weight of the layers, a quarter of float32's memory; the change of cognition is
+    measured at start and told. fp8 products are taken by GPUs that have them (compute capability 8.9), in bfloat16."""
+    graphs: bool = True
+    """On a GPU forwards are CUDA graphs, recorded at start. --no-graphs: as on a CPU, where there are none."""

@@ -22,7 +22,7 @@ Proprio: TypeAlias = npt.NDArray[np.float32]
 
 Result = TypeVar("Result")
 
-WeightsName: TypeAlias = Literal["float", "int8"]
+WeightsName: TypeAlias = Literal["float", "int8", "fp8"]
 
 Progress: TypeAlias = Callable[[], None]
 """Called between pieces of work, so that a heartbeat comes from the loop that works and not from a timer."""

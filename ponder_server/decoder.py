@@ -48,12 +48,13 @@ def decode(
 ) -> list[Tensor]:
     """Appends each row to its slot; final hidden states (num_wanted, H) of each.
 
-    Rows must be of different slots, and padding must be finite. Rows beyond the places are nobody's: see LEAST_TOKENS.
+    Rows must be of different slots, and padding must be finite; positions may lie on any device. Rows beyond the places
+    are nobody's: see LEAST_TOKENS.
     """
     assert len({place.slot for place in places}) == len(places), "two rows of one slot"
     num_new_B = torch.tensor([place.num_new for place in places], device=embeds_BTH.device)
     slot_B = torch.tensor([place.slot for place in places], device=embeds_BTH.device)
-    cos_sin = text_model.rotary_emb(embeds_BTH, positions_3BT)
+    cos_sin = text_model.rotary_emb(embeds_BTH, positions_3BT.to(embeds_BTH.device))
     hidden = embeds_BTH
     last = len(text_model.layers) - 1
     for index, layer in enumerate(text_model.layers):
@@ -65,7 +66,7 @@ def decode(
                 layer.self_attn, memory.attention[index], places, num_queries, normed_BTH, cos_sin, threads
             )
         else:
-            mixed_BTH = _gated_delta(layer.linear_attn, memory.recurrent[index], slot_B, num_new_B, normed_BTH)
+            mixed_BTH = gated_delta(layer.linear_attn, memory.recurrent[index], slot_B, num_new_B, normed_BTH)
         hidden = hidden + mixed_BTH
         if index == last:
             wanted = [slice(place.num_new - place.num_wanted, place.num_new) for place in places]
@@ -74,6 +75,19 @@ def decode(
         hidden = hidden + layer.mlp(layer.post_attention_layernorm(hidden))
     num_wanted = [place.num_wanted for place in places]
     return list(text_model.norm(hidden)[: sum(num_wanted)].split(num_wanted))
+
+
+def project(
+    attention: Any, hidden_BTH: Tensor, cos_sin: tuple[Tensor, Tensor]
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Queries, keys and values (B, heads, T, D), rotated by their positions, and the output gate (B, T, heads, D)."""
+    batch, length, _ = hidden_BTH.shape
+    heads = (batch, length, -1, attention.head_dim)
+    queries, gate = attention.q_proj(hidden_BTH).view(batch, length, -1, 2 * attention.head_dim).chunk(2, dim=-1)
+    queries = attention.q_norm(queries).transpose(1, 2)
+    keys = attention.k_norm(attention.k_proj(hidden_BTH).view(heads)).transpose(1, 2)
+    values = attention.v_proj(hidden_BTH).view(heads).transpose(1, 2)
+    return *rotate(queries, keys, *cos_sin), values, gate
 
 
 def _attention(
@@ -86,13 +100,7 @@ def _attention(
     threads: Threads,
 ) -> Tensor:
     """Stores every row's keys and values; (B, T, H), zero but for the last ``num_queries`` valid tokens of a row."""
-    batch, length, _ = hidden_BTH.shape
-    heads = (batch, length, -1, attention.head_dim)
-    queries, gate = attention.q_proj(hidden_BTH).view(batch, length, -1, 2 * attention.head_dim).chunk(2, dim=-1)
-    queries = attention.q_norm(queries).transpose(1, 2)
-    keys = attention.k_norm(attention.k_proj(hidden_BTH).view(heads)).transpose(1, 2)
-    values = attention.v_proj(hidden_BTH).view(heads).transpose(1, 2)
-    queries, keys = rotate(queries, keys, *cos_sin)
+    queries, keys, values, gate = project(attention, hidden_BTH, cos_sin)
     seen = torch.zeros_like(gate)
     for row, (place, count) in enumerate(zip(places, num_queries, strict=True)):
         first, end = place.num_past, place.num_past + place.num_new
@@ -114,8 +122,11 @@ def _rule(length: int, device: torch.device) -> DeltaRule:
     return cast(DeltaRule, gated_delta_rule) if device.type == "cpu" else delta_rule_of_many
 
 
-def _gated_delta(delta: Any, memory: RecurrentMemory, slot_B: Tensor, num_new_B: Tensor, hidden_BTH: Tensor) -> Tensor:
-    """Advances every row's states by its valid tokens; (B, T, H), of which rows beyond the slots mean nothing."""
+def gated_delta(delta: Any, memory: RecurrentMemory, slot_B: Tensor, num_new_B: Tensor, hidden_BTH: Tensor) -> Tensor:
+    """Advances every row's states by its valid tokens; (B, T, H), of which rows beyond the slots mean nothing.
+
+    Where the states are and how many tokens are valid it reads on the device, so it can be captured (``captured``).
+    """
     batch, length = len(slot_B), hidden_BTH.shape[1]
     width = delta.conv_kernel_size
     inputs_BCT = torch.cat([memory.conv[slot_B], delta.in_proj_qkv(hidden_BTH)[:batch].transpose(1, 2)], dim=-1)

@@ -38,14 +38,15 @@ from ponder_server.contract import (
     no_progress,
 )
 from ponder_server.draft import Draft, NoDraft
-from ponder_server.int8 import quantise
+from ponder_server.narrow import check_weights, quantise
 from ponder_server.prefixes import Prefixes
 from ponder_server.runner import BUCKETS, NUM_SAVED_STATES, Append, Runner, Session
 from ponder_server.slots import slot_size
 from ponder_server.threads import Threads
-from ponder_server.writer import Steps, TransitionWriter
-from ponderpounce.models.context import Segment, SegmentKind
+from ponder_server.writer import MAX_CHECKED_TOKENS, Steps, TransitionWriter
+from ponderpounce.models.context import Segment, SegmentKind, in_groups
 from ponderpounce.models.eyes import Pictures, check_cameras, readable_sizes, see
+from ponderpounce.models.graphs import Capture, graphs_for
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import weights_hash
 from ponderpounce.models.proprioception import NUM_PROPRIO
@@ -83,13 +84,15 @@ class EngineConfig:
     attention_threads: int = 1
     """That share a long context's attention on a CPU. No bit of an answer depends on them."""
     weights: WeightsName = "float"
-    """int8: a quarter of the layers' memory, on a CPU; the change of cognition is measured when the engine is built."""
+    """int8, fp8: a byte a weight of the layers; the change of cognition is measured when the engine is built."""
+    graphs: bool = True
+    """On a GPU forwards are CUDA graphs (``captured``)."""
 
     def __post_init__(self) -> None:
         for name in self.__slots__:
             value = getattr(self, name)
             least = 0 if name == "max_prefixes" else 1
-            if isinstance(value, int) and value < least:
+            if type(value) is int and value < least:
                 raise ValueError(f"{name} is {value}; it must be at least {least}.")
         if not self.buckets or self.buckets[0] < 1 or list(self.buckets) != sorted(set(self.buckets)):
             raise ValueError(f"buckets are {self.buckets}; they must be at least 1 and grow.")
@@ -122,14 +125,17 @@ class _Query:
 class QwenEngine:
     """A ``BatchingEngine`` on one device, one call at a time."""
 
-    def __init__(self, ponder: Ponder, config: EngineConfig, draft: Draft | None = None) -> None:
+    def __init__(
+        self, ponder: Ponder, config: EngineConfig, draft: Draft | None = None, *, capture: Capture | None = None
+    ) -> None:
         """Takes over ``ponder``, whose layers are replaced if ``config.weights`` says so.
 
+        ``capture`` is how forwards are captured; by default as CUDA graphs on a GPU and not at all on a CPU.
+
         Raises ValueError if the sessions do not fit in memory, if the cameras are not those that the network was made
-        for, or for int8 weights elsewhere than on a CPU.
+        for, or for narrow weights that its device cannot have.
         """
-        if config.weights == "int8" and ponder.device.type != "cpu":
-            raise ValueError("int8 weights are for a CPU; leave --weights out, and take --dtype bfloat16.")
+        check_weights(config.weights, ponder.device)
         self._ponder = ponder
         self._config = config
         self._format = ponder.format
@@ -173,12 +179,16 @@ class QwenEngine:
         self._prefixes = Prefixes(config.max_prefixes)
         self._begun: dict[str, _Query] = {}
         self._batch: Batch[Fire] = Batch(self._runner, max_rows=config.max_batch_rows)
-        if config.weights == "int8":
+        if config.weights != "float":
             exact_KH = self._example_cognition()
-            quantise(ponder)
+            quantise(ponder, config.weights)
             change = float((self._example_cognition() - exact_KH).norm() / exact_KH.norm())
-            hash_ = f"{self._spec.model_hash}-int8"
-            self._spec = replace(self._spec, weights="int8", model_hash=hash_, cognition_error=change)
+            hash_ = f"{self._spec.model_hash}-{config.weights}"
+            self._spec = replace(self._spec, weights=config.weights, model_hash=hash_, cognition_error=change)
+        if capture is None and config.graphs:
+            capture = graphs_for(ponder.device)
+        if capture is not None:  # last: what is captured keeps the weights that it saw
+            self._runner.capture(capture, num_read=max(MAX_CHECKED_TOKENS, 1 + self._format.num_carriers))
 
     @property
     def spec(self) -> EngineSpec:
@@ -235,7 +245,7 @@ class QwenEngine:
             progress()
             return
         pictures = [picture for instant in demo for picture in instant]
-        for chunk in _chunks(segments, self._config.prefill_chunk_tokens):
+        for chunk in in_groups(segments, self._config.prefill_chunk_tokens):
             ids = [token for segment in chunk for token in segment.ids]
             num_images = sum(segment.num_images for segment in chunk)
             context.append(ids, self._embed(ids, pictures[:num_images]), num_wanted=0)
@@ -362,7 +372,12 @@ class QwenEngine:
 
     @torch.inference_mode()
     def warm_up(self) -> list[int]:
-        """Durations in ns of cognition-only fires at one and the same short context, results on the host."""
+        """Durations in ns of cognition-only fires at one and the same short context, results on the host.
+
+        Before, everything that an episode may need is captured, if anything is: no robot waits for that.
+        """
+        num_tokens = max(self._num_query_ids, MAX_CHECKED_TOKENS)
+        self._runner.prepare(num_tokens, max_rows=self._config.max_batch_rows)
         frames = self._warm_up_frames()
         self.open(WARM_UP_SESSION, WARM_UP_OPENING)
         try:
@@ -481,16 +496,3 @@ class QwenEngine:
             texts=texts,
             context_tokens=context.num_tokens,
         )
-
-
-def _chunks(segments: tuple[Segment, ...], max_tokens: int) -> list[list[Segment]]:
-    """Consecutive segments in groups of at most ``max_tokens``, or of one that is longer."""
-    chunks: list[list[Segment]] = []
-    num_tokens = 0
-    for segment in segments:
-        if not chunks or num_tokens + len(segment) > max_tokens:
-            chunks.append([])
-            num_tokens = 0
-        chunks[-1].append(segment)
-        num_tokens += len(segment)
-    return chunks

@@ -19,10 +19,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ponder_server.captured import CapturedDecoder
 from ponder_server.contract import ContextFull, SessionError
 from ponder_server.decoder import LEAST_TOKENS, Place, decode
 from ponder_server.slots import SlotMemory
 from ponder_server.threads import ALONE, Threads
+from ponderpounce.models.graphs import Capture
 from ponderpounce.models.ponder import Ponder
 
 NUM_SAVED_STATES = 2
@@ -86,8 +88,28 @@ class Runner:
         self.memory = SlotMemory(
             text_config, num_slots=num_slots, max_tokens=max_tokens, device=ponder.device, dtype=ponder.dtype
         )
+        self._captured: CapturedDecoder | None = None
         self._free_slots = list(reversed(range(num_slots)))
         self._saved = [tuple(self._blank_state(slot) for _ in range(NUM_SAVED_STATES)) for slot in range(num_slots)]
+
+    def capture(self, capture: Capture, *, num_read: int) -> None:
+        """Forwards are captured from now on (``captured``), when they are first met or by :meth:`prepare`.
+
+        What is captured keeps the weights that it saw: replace none afterwards. A row's hidden states are handed out
+        ``num_read`` at most; forwards that are asked for more run as they did.
+        """
+        self._captured = CapturedDecoder(self._text_model, self.memory, capture, num_read=num_read)
+
+    def prepare(self, num_tokens: int, *, max_rows: int) -> int:
+        """Captures all forwards that appends of up to so many tokens to so many sessions at once can need, and any
+        append to one session; how many graphs there are then, 0 without :meth:`capture`. Raises RuntimeError if the
+        device cannot."""
+        if self._captured is None:
+            return 0
+        shared = [bucket for bucket in self._buckets if bucket <= self.bucket(num_tokens)]
+        self._captured.prepare(shared, max_rows=min(max_rows, self.memory.num_slots))
+        self._captured.prepare(self._buckets, max_rows=1)
+        return len(self._captured)
 
     def open(self, name: str) -> "Session":
         """An empty context in a free slot. Raises SessionError if there is none."""
@@ -142,10 +164,12 @@ class Runner:
             )
             places.append(place)
             row.num_done = end
-        positions = torch.from_numpy(positions_3BT).to(embeds_BTH.device)
-        for row, hidden_NH in zip(
-            rows, decode(self._text_model, self.memory, places, embeds_BTH, positions, self._threads), strict=True
-        ):
+        positions = torch.from_numpy(positions_3BT)
+        if self._captured is not None:
+            hidden = self._captured(places, embeds_BTH, positions)
+        else:
+            hidden = decode(self._text_model, self.memory, places, embeds_BTH, positions, self._threads)
+        for row, hidden_NH in zip(rows, hidden, strict=True):
             row.hidden.append(hidden_NH)
 
 

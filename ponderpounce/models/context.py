@@ -242,3 +242,16 @@ class ContextFormat:
 
 def _unsupervised(kind: SegmentKind, ids: tuple[int, ...], num_images: int = 0) -> Segment:
     return Segment(kind=kind, ids=ids, targets=(IGNORE,) * len(ids), num_images=num_images)
+
+
+def in_groups(segments: Sequence[Segment], max_tokens: int) -> list[list[Segment]]:
+    """Consecutive segments in groups of at most ``max_tokens``, or of one that is longer."""
+    groups: list[list[Segment]] = []
+    num_tokens = 0
+    for segment in segments:
+        if not groups or num_tokens + len(segment) > max_tokens:
+            groups.append([])
+            num_tokens = 0
+        groups[-1].append(segment)
+        num_tokens += len(segment)
+    return groups

@@ -34,12 +34,17 @@ class Int8Linear(nn.Module):
         return out if self.bias is None else out + self.bias.to(x.dtype)
 
 
-def quantise_where(model: nn.Module, is_narrow: Callable[[str], bool]) -> int:
-    """Replaces linear layers in place, those whose weight has such a name; returns how many bytes that saved."""
+def quantise_where(
+    model: nn.Module, is_narrow: Callable[[str], bool], narrowed: Callable[[nn.Linear], nn.Module] = Int8Linear
+) -> int:
+    """Replaces linear layers in place, those whose weight has such a name; returns how many bytes that saved.
+
+    ``narrowed`` makes of each a layer with a byte a weight.
+    """
     saved = 0
     for name, module in list(model.named_modules()):
         for child_name, child in list(module.named_children()):
             if type(child) is nn.Linear and is_narrow(f"{name}.{child_name}.weight"):
                 saved += child.weight.numel() * (child.weight.element_size() - 1)
-                setattr(module, child_name, Int8Linear(child))
+                setattr(module, child_name, narrowed(child))
     return saved

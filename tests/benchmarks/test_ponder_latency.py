@@ -7,7 +7,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from benchmarks.ponder_latency import TEXT_TOKENS, LatencyOptions, _num_right, _own_text, _texts, _untrained_prediction
+from benchmarks.ponder_latency import (
+    TEXT_TOKENS,
+    LatencyOptions,
+    _labelled,
+    _num_right,
+    _own_text,
+    _texts,
+    _untrained_prediction,
+)
 from ponder_server.draft import Draft, NoDraft, TrieDraft
 from ponder_server.mtp import MtpDraft
 from ponderpounce.models.ponder import Ponder
@@ -37,3 +45,9 @@ def test_a_draft_that_knows_the_text_needs_few_steps_and_one_that_was_never_trai
     assert known["steps"] == 3
     assert guessed["guessed"] > 20
     assert guessed["steps"] > TEXT_TOKENS / 2
+
+
+def test_graphs_are_told_of_where_there_are_some() -> None:
+    gpu = LatencyOptions(device="cuda:0")
+    assert _labelled({"p50_ms": 1.0}, OPTIONS) == {"weights": "float", "attention_threads": 1, "p50_ms": 1.0}
+    assert [_labelled({}, gpu, graphs=graphs)["engine"] for graphs in (True, False)] == ["ours graphs", "ours eager"]

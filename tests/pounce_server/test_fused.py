@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ponderpounce.models.gemma import GemmaConfig
+from ponderpounce.models.graphs import Capture, Work, directly
 from ponderpounce.models.pounce import Pounce, PounceConfig, PounceInputs
 from ponderpounce.models.pounce_checkpoint import random_bundle
 from ponderpounce.models.pounce_configs import tiny_cpu, tiny_groot
@@ -18,7 +19,6 @@ from pounce_server.contract import DTypeName, example_request
 from pounce_server.engine import EagerEngine
 from pounce_server.fused import BUCKET_TOKENS, FusedPounce, fused_for
 from pounce_server.fused_stream import KERNELS, TWINS, Operations
-from pounce_server.graphs import Capture, Work, directly
 from pounce_server.kernels.launch import missing_for
 from pounce_server.precision import cast_for_serving
 

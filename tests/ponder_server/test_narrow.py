@@ -1,9 +1,10 @@
-"""PONDER in int8: near its exact self, and who serves it says how near."""
+"""PONDER in int8 and fp8: near its exact self, and who serves it says how near."""
 
 from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,10 +15,12 @@ from ponder_server.__main__ import build_engine
 from ponder_server.config import PonderOptions
 from ponder_server.contract import Opening, WeightsName
 from ponder_server.engine import EngineConfig, QwenEngine
-from ponder_server.int8 import quantise
+from ponder_server.narrow import quantise
 from ponder_server.serve import PonderServer
+from ponderpounce.models.fp8 import Fp8Linear
 from ponderpounce.models.int8 import Int8Linear
 from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.ponder_checkpoint import save_ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
 from protocol.heartbeat import Heartbeat
 
@@ -25,14 +28,18 @@ MODEL = replace(tiny_cpu(), num_layers=4, hidden_size=48, ffn_size=96, image_px=
 CONFIG = EngineConfig(num_cameras=1, max_context_tokens=200, max_sessions=2)
 
 
+narrow = pytest.mark.parametrize("weights", ["int8", "fp8"])
+
+
 def engine_of(weights: WeightsName, dtype: torch.dtype = torch.float32) -> QwenEngine:
     return QwenEngine(Ponder.random(MODEL, seed=1, dtype=dtype), replace(CONFIG, weights=weights))
 
 
-def test_the_layers_take_a_quarter_and_the_rest_is_untouched() -> None:
+@narrow
+def test_the_layers_take_a_quarter_and_the_rest_is_untouched(weights: WeightsName) -> None:
     ponder = Ponder.random(MODEL, seed=0)
     before = {name: parameter.clone() for name, parameter in ponder.qwen.named_parameters()}
-    saved = quantise(ponder)
+    saved = quantise(ponder, weights)
     after = dict(ponder.qwen.named_parameters())
     gone = {name for name in before if name not in after}
     assert saved == 3 * sum(before[name].numel() for name in gone)
@@ -46,28 +53,29 @@ def test_the_layers_take_a_quarter_and_the_rest_is_untouched() -> None:
     assert any(name.startswith("model.visual.blocks.1.") for name in gone)
 
 
+@narrow
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_the_change_of_cognition_that_is_told_is_the_one_that_is_seen(dtype: torch.dtype) -> None:
+def test_the_change_of_cognition_that_is_told_is_the_one_that_is_seen(weights: WeightsName, dtype: torch.dtype) -> None:
     """As any client sees it: the warm-up's episode, asked once of the exact weights and once of the narrow ones."""
-    exact, narrow = (engine_of(weights, dtype) for weights in ("float", "int8"))
+    exact, changed = engine_of("float", dtype), engine_of(weights, dtype)
     frame = np.random.default_rng(0).integers(0, 256, (32, 32, 3), dtype=np.uint8)
     seen = []
-    for engine in (exact, narrow):
+    for engine in (exact, changed):
         engine.open("a", Opening(instruction="warm up"))
         fire = engine.fire("a", (frame,))
         assert not fire.is_transition
         seen.append(fire.cognition)
     change = np.linalg.norm(seen[1] - seen[0]) / np.linalg.norm(seen[0])
-    assert narrow.spec.cognition_error == pytest.approx(change, rel=1e-4)
-    assert 0 < change < 0.1
-    assert (narrow.spec.weights, narrow.spec.model_hash) == ("int8", f"{exact.spec.model_hash}-int8")
+    assert changed.spec.cognition_error == pytest.approx(change, rel=1e-4)
+    assert 0 < change < {"int8": 0.1, "fp8": 0.2}[weights]
+    assert (changed.spec.weights, changed.spec.model_hash) == (weights, f"{exact.spec.model_hash}-{weights}")
 
 
 def test_unquantised_is_the_default() -> None:
     engine = build_engine(PonderOptions(max_context_tokens=400))
     assert isinstance(engine, QwenEngine)
     assert (engine.spec.weights, engine.spec.cognition_error) == ("float", 0)
-    assert not any(isinstance(module, Int8Linear) for module in engine._ponder.modules())
+    assert not any(isinstance(module, Int8Linear | Fp8Linear) for module in engine._ponder.modules())
 
 
 def test_measuring_it_leaves_no_session_behind() -> None:
@@ -76,18 +84,46 @@ def test_measuring_it_leaves_no_session_behind() -> None:
         engine.open(str(name), Opening(instruction="press"))
 
 
-def test_the_server_says_it_in_its_health_and_log(new_rig: Any, caplog: pytest.LogCaptureFixture) -> None:
-    engine = engine_of("int8")
+@narrow
+def test_the_server_says_it_in_its_health_and_log(
+    weights: WeightsName, new_rig: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    engine = engine_of(weights)
     heartbeat = Heartbeat(new_rig().links["ponder"], "test", "host/monotonic")
     with caplog.at_level(logging.INFO):
         PonderServer(heartbeat._link, engine, heartbeat, "test").warm_up()
-    told = f"int8 weights: relative L2 change of cognition {engine.spec.cognition_error:.1e} at start"
+    told = f"{weights} weights: relative L2 change of cognition {engine.spec.cognition_error:.1e} at start"
     assert heartbeat.health.detail == told
     assert told in caplog.text
 
 
-def test_what_this_machine_cannot_run_is_refused_by_name() -> None:
-    with pytest.raises(ValueError, match="--weights fp8 needs a GPU"):
-        build_engine(PonderOptions(weights="fp8"))
-    with pytest.raises(ValueError, match="int8 weights are for a CPU"):
-        QwenEngine(Ponder.random(MODEL, seed=1, device="meta"), replace(CONFIG, weights="int8"))
+@narrow
+def test_a_checkpoint_is_loaded_as_ever_and_then_made_narrow(weights: WeightsName, tmp_path: Path) -> None:
+    save_ponder(Ponder.random(MODEL, seed=1), tmp_path)
+    options = PonderOptions(checkpoint=tmp_path, weights=weights, max_context_tokens=200)
+    config = replace(CONFIG, num_cameras=2)
+    loaded, made = build_engine(options), QwenEngine(Ponder.random(MODEL, seed=1), replace(config, weights=weights))
+    assert isinstance(loaded, QwenEngine)
+    assert loaded.spec.model_hash == made.spec.model_hash
+    assert loaded.spec.cognition_error == made.spec.cognition_error
+    tensors = [dict(engine._ponder.qwen.state_dict()) for engine in (loaded, made)]
+    assert tensors[0].keys() == tensors[1].keys()
+    assert all(torch.equal(tensor.float(), tensors[1][name].float()) for name, tensor in tensors[0].items())
+
+
+@pytest.mark.parametrize(
+    ("weights", "device", "why"),
+    [
+        ("int8", "meta", "int8 weights are for a CPU; take --weights fp8, or leave it out"),
+        ("fp8", "meta", "fp8 weights are for a CPU or a CUDA GPU, not for 'meta'; take --weights int8 on a CPU"),
+    ],
+)
+def test_what_a_device_cannot_have_is_refused_by_name(weights: WeightsName, device: str, why: str) -> None:
+    with pytest.raises(ValueError, match=why):
+        QwenEngine(Ponder.random(MODEL, seed=1, device=device), replace(CONFIG, weights=weights))
+
+
+def test_a_torch_without_fp8_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(torch, "float8_e4m3fn")
+    with pytest.raises(ValueError, match=r"torch .* has no float8_e4m3fn; take --weights int8 on a CPU"):
+        engine_of("fp8")

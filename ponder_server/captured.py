@@ -1,0 +1,247 @@
+"""One forward over several contexts as work that can be captured: every number that varies is read on the device.
+
+What ``decoder.decode`` does with Python numbers (which slot, how long its past, how many tokens are new, whose hidden
+states are wanted) is done here with index tensors. A shape is rows, tokens of a row, and positions that attention
+reads; a forward of one shape is always the same operations, so a CUDA graph of it serves every slot and every length.
+The tests hold it to ``decode`` on a CPU, where it runs without a graph.
+
+Attention gathers the slots' keys and values, past their last one the first one again. So it reads from memory what is
+valid and no more, and meets nothing that somebody else left behind. What it computes is at most twice as much as with
+the exact length, which lies between one power of two and the next.
+
+# B rows, T tokens of a row with its padding, H hidden, D head dimension, Q query heads, G key heads
+# K positions that are read, W hidden states of a row that are handed out
+"""
+
+from collections.abc import Sequence
+from itertools import product
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from ponder_server.decoder import Place, decode, gated_delta, project
+from ponder_server.slots import AttentionMemory, SlotMemory
+from ponderpounce.models.graphs import Capture, Work
+
+LEAST_POSITIONS = 1024
+"""That attention reads: what shorter contexts would save is no time on a GPU, and every further shape is a graph."""
+
+
+def position_buckets(max_tokens: int, least: int = LEAST_POSITIONS) -> tuple[int, ...]:
+    """Powers of two times ``least`` up to ``max_tokens``, itself the last: a context fills half of its own at least."""
+    buckets = []
+    while least < max_tokens:
+        buckets.append(least)
+        least *= 2
+    return (*buckets, max_tokens)
+
+
+class CapturedDecoder:
+    """Forwards over one memory, each shape captured when it is first met.
+
+    ``max_rows`` rows of ``b`` lengths reading ``k`` numbers of positions are ``max_rows * b * k`` graphs at most.
+    """
+
+    def __init__(
+        self,
+        text_model: Any,
+        memory: SlotMemory,
+        capture: Capture,
+        *,
+        num_read: int,
+        least_positions: int = LEAST_POSITIONS,
+    ) -> None:
+        """``num_read``: hidden states of a row that a forward hands out at most; one that is asked for more is run
+        by ``decode``."""
+        self._text_model = text_model
+        self._memory = memory
+        self._capture = capture
+        self._num_read = num_read
+        self.position_buckets = position_buckets(memory.max_tokens, least_positions)
+        self._forwards: dict[tuple[int, int, int], Forward] = {}
+
+    def __len__(self) -> int:
+        """Graphs so far."""
+        return len(self._forwards)
+
+    def __call__(self, places: Sequence[Place], embeds_BTH: Tensor, positions_3BT: Tensor) -> list[Tensor]:
+        """Appends each row to its slot; final hidden states (num_wanted, H) of each, as ``decode`` does.
+
+        No row may be idle. Rows beyond the places are nobody's and are left out.
+        """
+        assert len({place.slot for place in places}) == len(places), "two rows of one slot"
+        assert all(place.num_new for place in places), "an idle row"
+        num_rows, length = len(places), embeds_BTH.shape[1]
+        if max(place.num_wanted for place in places) > min(length, self._num_read):
+            return decode(self._text_model, self._memory, places, embeds_BTH, positions_3BT)
+        longest = max(place.num_past + place.num_new for place in places)
+        num_positions = next(bucket for bucket in self.position_buckets if bucket >= longest)
+        forward = self.forward(num_rows, length, num_positions)
+        forward.load(places, embeds_BTH[:num_rows], positions_3BT[:, :num_rows])
+        forward.run()
+        return forward.hidden(places)
+
+    def prepare(self, lengths: Sequence[int], *, max_rows: int) -> None:
+        """Captures every forward of 1 to ``max_rows`` rows of these lengths, whatever the contexts'.
+
+        Raises RuntimeError if the device has no memory for them, or cannot record them; the message has the way out.
+        """
+        # Large ones first: what they need is in the pool, for the others to use again.
+        for shape in product(range(max_rows, 0, -1), sorted(lengths, reverse=True), reversed(self.position_buckets)):
+            try:
+                self.forward(*shape)
+            except RuntimeError as error:
+                raise RuntimeError(
+                    f"the forward of {shape[0]} rows of {shape[1]} tokens over {shape[2]} positions could not be "
+                    f"captured after {len(self)} others: {error}. If memory lacks, lower --max-sessions or "
+                    "--max-context-tokens; ponder-serve --no-graphs does without graphs."
+                ) from error
+
+    def forward(self, num_rows: int, length: int, num_positions: int) -> "Forward":
+        """The one of this shape; captures it if it is new, which leaves the memory as it was."""
+        key = (num_rows, length, num_positions)
+        if key not in self._forwards:
+            num_read = min(length, self._num_read)
+            self._forwards[key] = Forward(self._text_model, self._memory, key, num_read, self._capture)
+        return self._forwards[key]
+
+
+class Forward:
+    """Static buffers of one shape, and the captured work over them."""
+
+    def __init__(
+        self, text_model: Any, memory: SlotMemory, shape: tuple[int, int, int], num_read: int, capture: Capture
+    ) -> None:
+        num_rows, length, num_positions = shape
+        self._text_model = text_model
+        self._memory = memory
+        self._num_positions = num_positions
+        weight: Tensor = text_model.norm.weight
+        self._embeds_BTH = weight.new_zeros(num_rows, length, len(weight))
+        self._hidden_BWH = weight.new_zeros(num_rows, num_read, len(weight))
+        # All numbers in one tensor, for one copy to the device.
+        self._numbers = torch.zeros((4 + 3 * length) * num_rows, dtype=torch.long, device=weight.device)
+        rows, positions = self._numbers.split([4 * num_rows, 3 * length * num_rows])
+        self._slot_B, self._num_past_B, self._num_new_B, self._num_wanted_B = rows.view(4, num_rows)
+        self._positions_3BT = positions.view(3, num_rows, length)
+        self.run: Work = self._captured(capture)
+
+    def load(self, places: Sequence[Place], embeds_BTH: Tensor, positions_3BT: Tensor) -> None:
+        """Fills the buffers; pads must be finite."""
+        self._embeds_BTH.copy_(embeds_BTH)
+        rows = [[getattr(p, name) for p in places] for name in ("slot", "num_past", "num_new", "num_wanted")]
+        self._numbers.copy_(torch.cat([torch.tensor(rows).flatten(), positions_3BT.cpu().flatten()]))
+
+    def hidden(self, places: Sequence[Place]) -> list[Tensor]:
+        """Of the last run (num_wanted, H) each; copies, because the next run writes where they lay."""
+        return [row_WH[: place.num_wanted].clone() for row_WH, place in zip(self._hidden_BWH, places, strict=True)]
+
+    def _captured(self, capture: Capture) -> Work:
+        """Capturing runs the work, which appends: to slot 0 from its beginning, where all of it is put back."""
+        self._num_new_B.fill_(1)
+        changed = [*self._memory.states(0), *self._memory.keys_and_values(0, 1)]
+        kept = [tensor.clone() for tensor in changed]
+        try:
+            return capture(self._work)
+        finally:
+            for tensor, was in zip(changed, kept, strict=True):
+                tensor.copy_(was)
+
+    def _work(self) -> None:
+        """``decode`` without a number that Python knows."""
+        device, length = self._embeds_BTH.device, self._embeds_BTH.shape[1]
+        token_T = torch.arange(length, device=device)
+        num_read = self._hidden_BWH.shape[1]
+        read_BW = (self._num_new_B - self._num_wanted_B)[:, None] + token_T[:num_read]
+        read_BW.clamp_(0, length - 1)
+        row_B1 = torch.arange(len(read_BW), device=device)[:, None]
+        window = _Window(self._slot_B, self._num_past_B, self._num_new_B, token_T, self._num_positions)
+        cos_sin = self._text_model.rotary_emb(self._embeds_BTH, self._positions_3BT)
+        bias_BTK = window.bias(self._embeds_BTH.dtype)
+        hidden, last = self._embeds_BTH, len(self._text_model.layers) - 1
+        for index, layer in enumerate(self._text_model.layers):
+            normed_BTH = layer.input_layernorm(hidden)
+            if index in self._memory.attention:
+                # Of the last layer's queries only those that somebody wants to know of.
+                asking_BW = (row_B1, read_BW) if index == last else None
+                mixed = _attention(
+                    layer.self_attn, self._memory.attention[index], window, normed_BTH, cos_sin, bias_BTK, asking_BW
+                )
+            else:
+                memory = self._memory.recurrent[index]
+                mixed = gated_delta(layer.linear_attn, memory, self._slot_B, self._num_new_B, normed_BTH)
+                mixed = mixed[row_B1, read_BW] if index == last else mixed
+            hidden = (hidden[row_B1, read_BW] if index == last else hidden) + mixed
+            hidden = hidden + layer.mlp(layer.post_attention_layernorm(hidden))
+        self._hidden_BWH.copy_(self._text_model.norm(hidden))
+
+
+class _Window:
+    """Where rows write and read keys and values: the first K positions of their slots."""
+
+    def __init__(
+        self, slot_B: Tensor, num_past_B: Tensor, num_new_B: Tensor, token_T: Tensor, num_positions: int
+    ) -> None:
+        num_past_B1, num_new_B1 = num_past_B[:, None], num_new_B[:, None]
+        position_K = torch.arange(num_positions, device=token_T.device)
+        self.slot_B1 = slot_B[:, None]
+        self.stored_BT = token_T * (token_T < num_new_B1)
+        """Tokens whose keys and values are written. A pad stands for the first one: the same bits to the same place,
+        whoever comes last. It has no place of its own where the slot ends before the bucket does."""
+        self.places_BT = num_past_B1 + self.stored_BT
+        self.seen_BK = position_K * (position_K < num_past_B1 + num_new_B1)
+        """Positions that are read: what is past the last one is garbage, and need not be finite."""
+        self._is_visible_BTK = position_K <= (num_past_B1 + token_T)[..., None]
+
+    def bias(self, dtype: torch.dtype) -> Tensor:
+        """What is added to scores (B, T, K): a token sees itself and what is before it. Every pad sees something."""
+        is_hidden_BTK = ~self._is_visible_BTK
+        return torch.zeros_like(is_hidden_BTK, dtype=dtype).masked_fill_(is_hidden_BTK, float("-inf"))
+
+    def store(self, memory: Tensor, new_BGTD: Tensor) -> None:
+        """Writes the rows' new keys or values (B, G, T, D) into theirs (N, G, S, D)."""
+        stored_BT1 = self.stored_BT[:, :, None, None].expand(-1, -1, new_BGTD.shape[1], new_BGTD.shape[3])
+        memory[self.slot_B1, :, self.places_BT] = new_BGTD.transpose(1, 2).gather(1, stored_BT1)
+
+    def read(self, memory: Tensor) -> Tensor:
+        """The rows' keys or values (B, G, K, D)."""
+        head_G1 = torch.arange(memory.shape[1], device=memory.device)[:, None]
+        return memory[self.slot_B1[..., None], head_G1, self.seen_BK[:, None]]
+
+
+def _attention(
+    attention: Any,
+    memory: AttentionMemory,
+    window: _Window,
+    hidden_BTH: Tensor,
+    cos_sin: tuple[Tensor, Tensor],
+    bias_BTK: Tensor,
+    asking: tuple[Tensor, Tensor] | None,
+) -> Tensor:
+    """Stores every row's keys and values; what its tokens see (B, T, H), or the ``asking`` ones alone (B, W, H)."""
+    queries, keys, values, gate = project(attention, hidden_BTH, cos_sin)
+    window.store(memory.keys, keys)
+    window.store(memory.values, values)
+    if asking is not None:
+        queries, gate, bias_BTK = queries.transpose(1, 2)[asking].transpose(1, 2), gate[asking], bias_BTK[asking]
+    seen_BTQD = _attend(queries, window.read(memory.keys), window.read(memory.values), bias_BTK).transpose(1, 2)
+    mixed: Tensor = attention.o_proj((seen_BTQD.reshape(gate.shape) * gate.sigmoid()).flatten(2))
+    return mixed
+
+
+def _attend(queries_BQTD: Tensor, keys_BGKD: Tensor, values_BGKD: Tensor, bias_BTK: Tensor) -> Tensor:
+    """(B, Q, T, D). Key heads are rows, their query heads its heads: kernels that know masks know no grouped heads,
+    and to repeat the keys would copy them once more for every query head."""
+    num_rows, num_heads, num_queries, head_dim = queries_BQTD.shape
+    num_key_heads = keys_BGKD.shape[1]
+    group = num_heads // num_key_heads
+
+    def shared(x_BGKD: Tensor) -> Tensor:
+        return x_BGKD.flatten(0, 1)[:, None].expand(-1, group, -1, -1)
+
+    bias = bias_BTK[:, None].expand(-1, num_key_heads, -1, -1).flatten(0, 1)[:, None].expand(-1, group, -1, -1)
+    queries = queries_BQTD.reshape(num_rows * num_key_heads, group, num_queries, head_dim)
+    seen = F.scaled_dot_product_attention(queries, shared(keys_BGKD), shared(values_BGKD), attn_mask=bias)
+    return seen.view(queries_BQTD.shape)
