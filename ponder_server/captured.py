@@ -28,6 +28,9 @@ from ponderpounce.models.graphs import Capture, Work
 LEAST_POSITIONS = 1024
 """That attention reads: what shorter contexts would save is no time on a GPU, and every further shape is a graph."""
 
+MOST_CHANGE = {torch.float32: 1e-3, torch.bfloat16: 5e-2, torch.float16: 1e-2}
+"""Of cognition by capturing, relative L2. TF32 products and other orders of summation stay below."""
+
 
 def position_buckets(max_tokens: int, least: int = LEAST_POSITIONS) -> tuple[int, ...]:
     """Powers of two times ``least`` up to ``max_tokens``, itself the last: a context fills half of its own at least."""
@@ -36,6 +39,19 @@ def position_buckets(max_tokens: int, least: int = LEAST_POSITIONS) -> tuple[int
         buckets.append(least)
         least *= 2
     return (*buckets, max_tokens)
+
+
+def check_captured(captured_KH: Tensor, eager_KH: Tensor, dtype: torch.dtype) -> None:
+    """Raises RuntimeError unless both are the same cognition, up to sums that a device takes in another order.
+
+    No robot shall be the first to find out that a driver records something else than it was given.
+    """
+    change, most = float((captured_KH - eager_KH).norm() / eager_KH.norm()), MOST_CHANGE[dtype]
+    if not change <= most:  # NaN is no cognition either
+        raise RuntimeError(
+            f"captured forwards change cognition by {change:.1e} (relative L2) against the same ones run directly; at "
+            f"most {most:.0e} is rounding in {dtype}. ponder-serve --no-graphs does without graphs; please report it."
+        )
 
 
 class CapturedDecoder:

@@ -374,10 +374,12 @@ class QwenEngine:
     def warm_up(self) -> list[int]:
         """Durations in ns of cognition-only fires at one and the same short context, results on the host.
 
-        Before, everything that an episode may need is captured, if anything is: no robot waits for that.
+        Before, all that an episode may need is captured, if anything is: no robot waits for that. Raises RuntimeError
+        if it cannot be, or gives another cognition.
         """
-        num_tokens = max(self._num_query_ids, MAX_CHECKED_TOKENS)
-        self._runner.prepare(num_tokens, max_rows=self._config.max_batch_rows)
+        longest = max(self._num_query_ids, MAX_CHECKED_TOKENS)
+        if self._runner.prepare(longest, max_rows=self._config.max_batch_rows):
+            self._runner.check(self._example_cognition)
         frames = self._warm_up_frames()
         self.open(WARM_UP_SESSION, WARM_UP_OPENING)
         try:

@@ -11,7 +11,7 @@ allocated at construction, and everything writes in place.
 # T new tokens, H hidden
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ponder_server.captured import CapturedDecoder
+from ponder_server.captured import CapturedDecoder, check_captured
 from ponder_server.contract import ContextFull, SessionError
 from ponder_server.decoder import LEAST_TOKENS, Place, decode
 from ponder_server.slots import SlotMemory
@@ -110,6 +110,15 @@ class Runner:
         self._captured.prepare(shared, max_rows=min(max_rows, self.memory.num_slots))
         self._captured.prepare(self._buckets, max_rows=1)
         return len(self._captured)
+
+    def check(self, appended: Callable[[], Tensor]) -> None:
+        """Raises RuntimeError if what is appended comes out otherwise with what was captured than without it."""
+        with_it, captured = appended(), self._captured
+        self._captured = None
+        try:
+            check_captured(with_it, appended(), self._ponder.dtype)
+        finally:
+            self._captured = captured
 
     def open(self, name: str) -> "Session":
         """An empty context in a free slot. Raises SessionError if there is none."""

@@ -1,8 +1,9 @@
 """What is to be collected: one job per kept episode, each with its own row of seeds.
 
 Jobs know nothing of each other, so any number of workers in any order make the same set: a job tries its seeds in turn
-until the oracle solves one. As in RoboMME two of four episodes are easy, one is medium and one hard, and three of every hundred have a grasp that closes too high before it is made right, and three one that closes
-aside, unless told otherwise.
+until the oracle solves one. Unless told otherwise two of four episodes are easy, one is medium and one hard, as in
+RoboMME, and three of every hundred have a grasp that closes too high before it is made right, and three one that
+closes aside.
 """
 
 from __future__ import annotations

@@ -98,6 +98,26 @@ def test_no_robot_waits_for_a_capture() -> None:
     assert num_captured == 6
 
 
+def test_what_a_device_records_wrongly_never_drives_a_robot() -> None:
+    def forgetful(work: Work) -> Work:
+        def replay() -> None:
+            if recorded:
+                work()
+
+        recorded = [True]
+        replays.append(recorded)
+        return replay
+
+    replays: list[list[bool]] = []
+    engine = engine_of(forgetful)
+    with torch.inference_mode():
+        engine._runner.prepare(100, max_rows=2)
+    for recorded in replays:
+        recorded.clear()
+    with pytest.raises(RuntimeError, match=r"change cognition by .* --no-graphs"):
+        engine.warm_up()
+
+
 @pytest.mark.parametrize("graphs", [True, False])
 def test_on_a_cpu_nothing_is_captured_whatever_the_option_says(graphs: bool) -> None:
     engine = build_engine(PonderOptions(max_context_tokens=400, graphs=graphs))
