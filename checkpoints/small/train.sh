@@ -13,16 +13,14 @@ bin=${BIN:-.venv/bin}
 export OMP_NUM_THREADS=1 MUJOCO_GL=${MUJOCO_GL:-egl}
 
 finished() { [ -d "$out/run/ponder" ]; }
-train() { finished || "$bin/pp-train" --recipe small --data "$out/data" --out "$out/run" --ponder "$out/eyes/ponder" "$@"; }
-train_on_both_cores() {
-    finished || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --recipe small --data "$out/data" \
-        --out "$out/run" --ponder "$out/eyes/ponder" "$@"
-}
+how=(--recipe small --data "$out/data" --out "$out/run" --ponder "$out/eyes/ponder" --sights "$out/sights")
+train() { finished || "$bin/pp-train" "${how[@]}" "$@"; }
+train_on_both_cores() { finished || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train "${how[@]}" "$@"; }
 
 hand() {  # lets the POUNCE of a stage play; what it does becomes the dataset $out/NAME
     local name=$1 stage=$2; shift 2
-    "$bin/pp-eval" --tasks PickHighlight --runs 1 --cognition stand-in --order near-first --pounce-checkpoint "$out/run/$stage/pounce" \
-        --record --record-hz 5 --out "$out/played/$name" "$@"
+    "$bin/pp-eval" --tasks PickHighlight --runs 1 --cognition stand-in --order near-first \
+        --pounce-checkpoint "$out/run/$stage/pounce" --record --record-hz 5 --out "$out/played/$name" "$@"
     if [ -d "$out/$name/meta" ]; then return; fi
     local logs  # of finished episodes: a kill leaves the beginning of one more
     mapfile -t logs < <("$bin/python" -c 'import json, pathlib, sys

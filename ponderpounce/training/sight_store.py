@@ -46,7 +46,7 @@ class SightStore:
         partial = path.with_suffix(f".{os.getpid()}")
         try:
             with partial.open("wb") as file:
-                np.savez(file, **_arrays(views))
+                np.savez(file, **_arrays(views))  # type: ignore[arg-type]  # no view is called allow_pickle
             partial.rename(path)
         except OSError:
             partial.unlink(missing_ok=True)
