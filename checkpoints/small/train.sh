@@ -44,7 +44,7 @@ wait $looking $playing
 
 hand motor motor --episodes 150 --seed 1100000 --max-steps 700 --stand-in-noise-px 3
 hand longer motor --episodes 240 --seed 1200000 --max-steps 900 --stand-in-noise-px 3
-for stage in grounding joint; do
+for stage in grounding refining joint; do
     train_on_both_cores --stage $stage --watch "$out/reaching" "$out/motor" "$out/longer"
 done
 

@@ -143,9 +143,9 @@ def tiny_subgoal_text() -> Recipe:
 def small() -> Curriculum:
     """Both architectures at about a million weights each, from scratch on CPU cores: see docs/training.md.
 
-    Where the paper starts from pretrained weights, eyes that `pp-see` has opened and four stages stand in for them, of
+    Where the paper starts from pretrained weights, eyes that `pp-see` has opened and five stages stand in for them, of
     one system each, so that two cores can run them side by side. Episodes that are watched (`pp-train --watch`) are for
-    the last two.
+    the last three.
     """
     looking = Recipe(
         name="small/looking",
@@ -174,10 +174,16 @@ def small() -> Curriculum:
         looking,
         name="small/grounding",
         example=replace(looking.example, text_dropout=0.2, slips=0.4, tremble_px=1.0, max_queries=None),
-        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, decay=(900, 2000))),
-        num_steps=2000,
+        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, decay=(1400, 3200))),
+        num_steps=3200,
         batch_episodes=8,
         w3=3.0,
+    )
+    refining = replace(  # once more at the full rate: it was still learning
+        grounding,
+        name="small/refining",
+        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, decay=(900, 2000))),
+        num_steps=2000,
     )
     reaching = replace(
         looking,
@@ -213,7 +219,7 @@ def small() -> Curriculum:
         w3=1.0,
         trains="both",
     )
-    return Curriculum(name="small", stages=(looking, reaching, motor, grounding, joint))
+    return Curriculum(name="small", stages=(looking, reaching, motor, grounding, refining, joint))
 
 
 RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {

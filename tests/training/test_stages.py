@@ -148,6 +148,7 @@ def test_stages_run_apart_are_the_run_in_one_go(folder: Path, tmp_path: Path) ->
         "motor",
         "looking",
         "grounding",
+        "refining",
         "joint",
     ):  # neither system waits for the other
         train.train(options(folder, tmp_path / "apart", stage=stage))
@@ -157,7 +158,7 @@ def test_stages_run_apart_are_the_run_in_one_go(folder: Path, tmp_path: Path) ->
 
 
 def test_a_stage_that_does_not_exist_is_refused(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="grounding, joint; there is no 'driving'"):
+    with pytest.raises(ValueError, match="refining, joint; there is no 'driving'"):
         train.train(options(folder, tmp_path / "run", stage="driving"))
     with pytest.raises(ValueError, match="tiny has no stages"):
         train.train(options(folder, tmp_path / "run", recipe="tiny", stage="joint"))
