@@ -175,7 +175,7 @@ def test_twin_of_the_gate_is_the_model_s() -> None:
     mlp = GeGlu(GemmaConfig(width=6, depth=1, mlp_width=10))
     x, out = torch.randn(3, 6, generator=torch.Generator().manual_seed(0)), torch.empty(3, 10)
     geglu.geglu_eager(torch.cat([mlp.gate_proj(x), mlp.up_proj(x)], dim=-1), out)
-    assert torch.equal(mlp.down_proj(out), mlp(x))
+    torch.testing.assert_close(mlp.down_proj(out), mlp(x))  # not bit for bit on every CPU: strides choose kernels
 
 
 # -- what does not fit is refused before a pointer is followed
