@@ -10,7 +10,8 @@ import torch
 
 from ponder_server.contract import WeightsName
 from ponderpounce.models.fp8 import Fp8Linear, missing_for
-from ponderpounce.models.int8 import Int8Linear, quantise_where
+from ponderpounce.models.int8 import Int8Linear
+from ponderpounce.models.narrow_linear import quantise_where
 from ponderpounce.models.ponder import Ponder
 
 _NARROW = ("model.language_model.layers.", "model.visual.blocks.", "model.visual.merger.")

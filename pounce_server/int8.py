@@ -1,6 +1,7 @@
 """Which of POUNCE's matrices are int8: the streams'. Embeddings, norms, small projections stay, as in `precision`."""
 
-from ponderpounce.models.int8 import quantise_where
+from ponderpounce.models.int8 import Int8Linear
+from ponderpounce.models.narrow_linear import quantise_where
 from ponderpounce.models.pounce_family import AnyPounce
 from pounce_server.precision import is_of_a_stream
 
@@ -9,4 +10,4 @@ _KEPT = "groot.dit.proj_out_2.weight"  # tells GR00T's action stream in which ty
 
 def quantise(model: AnyPounce) -> int:
     """Replaces the streams' matrices in place; returns how many bytes that saved."""
-    return quantise_where(model, lambda name: is_of_a_stream(name) and name != _KEPT)
+    return quantise_where(model, lambda name: is_of_a_stream(name) and name != _KEPT, Int8Linear)

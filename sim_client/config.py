@@ -10,6 +10,7 @@ import tyro
 
 from clock import schedules
 from clock.timebase import NS_PER_MS
+from ponderpounce.tasks.difficulty import Difficulty
 from protocol.messages import Delay, DelayKind, Delivery, DeliveryKind, Schedule, Seam, SeamKind, WaitKind
 from protocol.options import LinkOptions
 
@@ -25,7 +26,7 @@ class SimOptions:
     episodes: int = 1
     seed: int = 0
     """Of the first episode; the i-th one (from 0) uses seed + i."""
-    difficulty: Literal["easy", "medium", "hard"] | None = None
+    difficulty: Difficulty | None = None
     """None: by seed, as the benchmark does."""
     mode: Literal["lockstep", "realtime"] = "lockstep"
     """lockstep: simulated time waits for results, delays are modelled, bit-reproducible. realtime: nobody waits."""

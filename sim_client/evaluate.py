@@ -28,8 +28,9 @@ import ponderpounce.tasks.headless  # noqa: F401 - before anything that imports 
 from ponderpounce.data.errors import DatasetError
 from ponderpounce.data.seeds import TRAIN_SEED
 from ponderpounce.data.workers import LocalWorkers, RayWorkers, Workers
+from ponderpounce.tasks.difficulty import Difficulty, Order
 from ponderpounce.tasks.environment import Environment, make_environment
-from ponderpounce.tasks.task import Order, TaskError, chosen_tasks
+from ponderpounce.tasks.task import TaskError, chosen_tasks
 from protocol.bus import Bus
 from protocol.errors import TransportError
 from protocol.link import Link
@@ -68,7 +69,7 @@ class EvalOptions:
     """How often every scene is played, each time with other flow noise (paper: 3)."""
     seed: int = 0
     """Of the first scene; all lie below 2,000,000, where the training seeds begin."""
-    difficulty: Literal["easy", "medium", "hard"] | None = None
+    difficulty: Difficulty | None = None
     """None: by seed, as the benchmark does."""
     order: Order = "drawn"
     """Of the simulator's own subgoals, where a task leaves it open: see pp-collect. What counts as success is the

@@ -24,6 +24,7 @@ from ponderpounce.data.episode import About, EpisodeWriter, Row, unpack
 from ponderpounce.data.errors import DatasetError
 from ponderpounce.data.lerobot_v3 import INFO_PATH, DatasetWriter
 from ponderpounce.data.video import Frame
+from ponderpounce.tasks.difficulty import DIFFICULTIES
 from ponderpounce.tasks.environment import IMAGE_PX
 from ponderpounce.tasks.geometry import pose, pose_of, transform
 from ponderpounce.tasks.kinematics import Kinematics, UnreachableError
@@ -32,7 +33,7 @@ from ponderpounce.tasks.physics import Physics
 from ponderpounce.tasks.rendering import Cameras
 from ponderpounce.tasks.scene import FRONT, table_scene
 from ponderpounce.tasks.sight import mean_pixel, visible_pixels
-from ponderpounce.tasks.task import DIFFICULTIES, Task, TaskError, Thing, make_task
+from ponderpounce.tasks.task import Task, TaskError, Thing, make_task
 
 DONE, REFUSED = 0, 2
 INSTRUCTION = "tell what you see, and where"

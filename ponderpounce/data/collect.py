@@ -23,13 +23,14 @@ from tqdm import tqdm
 from ponderpounce.data.dart import DART, NoiseKind
 from ponderpounce.data.episode import Package, Rejection, unpack
 from ponderpounce.data.errors import DatasetError
-from ponderpounce.data.jobs import DIFFICULTY_CYCLE, RECOVERY_SHARE, Difficulty, Job, Look, jobs_of
+from ponderpounce.data.jobs import DIFFICULTY_CYCLE, RECOVERY_SHARE, Job, Look, jobs_of
 from ponderpounce.data.lerobot_v3 import COLLECTION_PATH, INFO_PATH, DatasetWriter
 from ponderpounce.data.rollout import UNSOLVED, work_out
 from ponderpounce.data.seeds import TRAIN_SEED
 from ponderpounce.data.store import Store
 from ponderpounce.data.workers import LocalWorkers, RayWorkers, Workers
-from ponderpounce.tasks.task import Order, TaskError, chosen_tasks
+from ponderpounce.tasks.difficulty import Difficulty, Order
+from ponderpounce.tasks.task import TaskError, chosen_tasks
 
 SCALES = {"1x": 1, "9x": 9}
 COLLECTING, JOINED = ".collecting", "joined"

@@ -35,6 +35,7 @@ class Entry:
     noise_rad: float  # 0 where nobody added noise
     num_rows: int
     num_demonstration_rows: int
+    corrected_from: int  # see `About`
     first_row: int  # its number among all rows of the dataset
 
 
@@ -93,6 +94,7 @@ def _entry(listed: dict[str, Any]) -> Entry:
         num_rows=listed["length"],
         first_row=listed["dataset_from_index"],
         noise_rad=listed.get("noise_rad", 0.0),
+        corrected_from=listed.get("corrected_from", 0),
         **{name: listed[name] for name in same},
     )
 

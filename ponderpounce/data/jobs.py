@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -19,11 +18,10 @@ from ponderpounce.data.dart import NoiseKind
 from ponderpounce.data.episode import Recovery
 from ponderpounce.data.seeds import TRAIN_SEED
 from ponderpounce.data.video import FPS
+from ponderpounce.tasks.difficulty import Difficulty, Order
 from ponderpounce.tasks.oracle import FailedGrasp
-from ponderpounce.tasks.task import Order
 
 ATTEMPTS = 100
-Difficulty = Literal["easy", "medium", "hard"]
 DIFFICULTY_CYCLE: tuple[Difficulty, ...] = ("easy", "easy", "medium", "hard")
 RECOVERY_SHARE = 0.06  # upstream's
 _RECOVERY_CYCLE = 100

@@ -103,6 +103,7 @@ class DatasetWriter:
             "recovery": about.recovery,
             "num_rejected": len(about.rejected),
             "num_demonstration_rows": int(episode.rows.is_demonstration.sum()),
+            "corrected_from": about.corrected_from,
         }
         if has_executed:
             placed["noise_rad"] = about.noise_rad

@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 import ponderpounce.tasks.headless  # noqa: F401 - before mujoco is imported
 from ponderpounce.data.dart import Dart, episode_std_rad
 from ponderpounce.data.episode import About, EpisodeWriter, Package, Rejection, Row
-from ponderpounce.data.jobs import ATTEMPTS, Job, failed_grasp
+from ponderpounce.data.jobs import ATTEMPTS, Job, Look, failed_grasp
 from ponderpounce.data.video import FPS, Frame
+from ponderpounce.tasks.difficulty import Order
 from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
 from ponderpounce.tasks.geometry import pose_of
 from ponderpounce.tasks.kinematics import Kinematics, UnreachableError
 from ponderpounce.tasks.oracle import FailedGrasp, Motions
 from ponderpounce.tasks.scene import SceneFullError
-from ponderpounce.tasks.task import Order
 
 UNSOLVED = "unsolved.json"
 """The only file of a package whose job found no seed that the oracle solves: the list of what was tried."""
@@ -66,9 +66,45 @@ class Narrator:
         )
 
 
+class Scribe:
+    """Plays and tells: hands every row on before its action is carried out, as `EpisodeWriter.add` takes it.
+
+    ``take`` may be None: then nobody looks.
+    """
+
+    def __init__(self, environment: Environment, take: Take | None, look: Look) -> None:
+        self._environment, self._take, self._look = environment, take, look
+        self._narrator = Narrator(environment)
+        self._subgoal_index, self._reasoning = -1, ""
+
+    def begin(self) -> None:
+        """The conditioning video, if there is one. The environment has just been reset."""
+        if self._take is None:
+            return
+        for row, frames in self._narrator.demonstration(self._look.demonstration_hz):
+            self._take(row, frames)
+        self._reasoning = self._narrator.reasoning()
+
+    def step(self, snapshot: Snapshot, action: Action, executed: Action | None = None) -> Snapshot:
+        """Carries ``executed`` out, or the action itself, which is what the row holds."""
+        done = action if executed is None else executed
+        if self._take is None:
+            return self._environment.step(done, look=False)
+        row = replace(
+            self._narrator.row(snapshot, action),
+            is_transition=snapshot.subgoal_index != self._subgoal_index,
+            demonstration_reasoning=self._reasoning,
+            executed_action=executed,
+        )
+        self._take(row, dict(snapshot.frames))
+        self._subgoal_index, self._reasoning = snapshot.subgoal_index, ""
+        looks = (snapshot.step + 1) % (FPS // self._look.execution_hz) == 0
+        return self._environment.step(done, look=looks)
+
+
 def work_out(job: Job) -> Package:
     """Tries the job's seeds in turn; returns the first solved episode, or why there is none."""
-    environment = _environment(job.task, job.image_px, job.max_steps, job.order)
+    environment = kept_environment(job.task, job.image_px, job.max_steps, job.order)
     rejected: list[Rejection] = []
     for attempt in range(ATTEMPTS):
         seed = job.seed(attempt)
@@ -110,45 +146,39 @@ def play(
 
     Returns what the arm did. Raises UnsolvedError unless it ends with success.
     """
-    look_every = FPS // job.look.execution_hz
     snapshot = environment.reset(seed, job.difficulty)
-    narrator = Narrator(environment)
-    reasoning = ""
-    if take is not None:
-        for row, frames in narrator.demonstration(job.look.demonstration_hz):
-            take(row, frames)
-        reasoning = narrator.reasoning()
+    scribe = Scribe(environment, take, job.look)
+    scribe.begin()
     motions = Motions(environment.physics, fails)
     script = environment.oracle(motions)
     dart = Dart(environment.physics, seed) if job.noise == "dart" else None
-    subgoal_index = -1
     while snapshot.status is Status.ONGOING:
-        action = next(script, None)
-        if action is None:
-            raise UnsolvedError(f"the script ended after {snapshot.step} steps and the episode did not")
-        executed = action if dart is None else dart.executed(action)
-        if take is not None:
-            is_transition = snapshot.subgoal_index != subgoal_index
-            row = replace(
-                narrator.row(snapshot, action),
-                is_transition=is_transition,
-                demonstration_reasoning=reasoning,
-                executed_action=None if dart is None else executed,
-            )
-            take(row, dict(snapshot.frames))
-            subgoal_index, reasoning = snapshot.subgoal_index, ""
-        looks = take is not None and (snapshot.step + 1) % look_every == 0
-        snapshot = environment.step(executed, look=looks)
-    if snapshot.status is not Status.SUCCESS:
-        raise UnsolvedError(f"{snapshot.status.value} after {snapshot.step} steps: {snapshot.reason}")
+        action = asked(script, snapshot)
+        snapshot = scribe.step(snapshot, action, None if dart is None else dart.executed(action))
+    check_solved(snapshot)
     return motions
 
 
+def asked(script: Iterator[Action], snapshot: Snapshot) -> Action:
+    """The script's next action. Raises UnsolvedError if it has none."""
+    action = next(script, None)
+    if action is None:
+        raise UnsolvedError(f"the script ended after {snapshot.step} steps and the episode did not")
+    return action
+
+
+def check_solved(snapshot: Snapshot) -> None:
+    """Raises UnsolvedError unless the episode ended with success."""
+    if snapshot.status is not Status.SUCCESS:
+        raise UnsolvedError(f"{snapshot.status.value} after {snapshot.step} steps: {snapshot.reason}")
+
+
 @functools.lru_cache(maxsize=1)  # building a scene takes seconds, and jobs come task by task
-def _environment(task: str, image_px: int, max_steps: int, order: Order) -> Environment:
-    environment = make_environment(task, image_px=image_px, max_steps=max_steps, order=order)
-    atexit.unregister(_environment.cache_clear)
+def kept_environment(task: str, image_px: int, max_steps: int, order: Order, texts_follow: bool = False) -> Environment:
+    """This process's own, until it needs another one or ends. See `make_environment`."""
+    environment = make_environment(task, image_px=image_px, max_steps=max_steps, order=order, texts_follow=texts_follow)
+    atexit.unregister(kept_environment.cache_clear)
     atexit.register(
-        _environment.cache_clear
+        kept_environment.cache_clear
     )  # after MuJoCo has registered its own: the last one in is the first to run
     return environment

@@ -8,11 +8,12 @@ A GPU of compute capability 8.9 or more multiplies bfloat16 activations as fp8, 
 own, taken as it comes (``torch._scaled_mm``). Everywhere else weights are widened as a layer is called, as int8's are.
 """
 
-# O output rows, I input columns, M rows of activations
+# O output rows, R rows of either matrix, I input columns, M rows of activations
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
+
+from ponderpounce.models.narrow_linear import NarrowLinear, row_scale
 
 LEAST_CAPABILITY = (8, 9)
 """Ada and Hopper: the first with fp8 products."""
@@ -37,41 +38,31 @@ def has_products(device: torch.device) -> bool:
     return torch.cuda.get_device_capability(device) >= LEAST_CAPABILITY
 
 
-class Fp8Linear(nn.Module):
+class Fp8Linear(NarrowLinear):
     """`nn.Linear` over fp8 weights. Its device must stay: it decides how products are taken."""
 
-    weight_OI: Tensor
-    scale_O: Tensor
-
     def __init__(self, linear: nn.Linear) -> None:
-        super().__init__()
-        exact_OI = linear.weight.detach().float()
-        weight_OI, scale_O = _narrowed(exact_OI)
-        self.register_buffer("weight_OI", weight_OI)
-        self.register_buffer("scale_O", scale_O)
-        self.bias = linear.bias
-        is_even = all(size % _MULTIPLE == 0 for size in exact_OI.shape)
-        self._multiplies = is_even and has_products(exact_OI.device)
+        super().__init__(linear)
+        is_even = all(size % _MULTIPLE == 0 for size in linear.weight.shape)
+        self._multiplies = is_even and has_products(linear.weight.device)
 
-    def forward(self, x: Tensor) -> Tensor:
+    @staticmethod
+    def narrowed(exact_RI: Tensor) -> tuple[Tensor, Tensor]:
+        """As `NarrowLinear`'s. What is not finite stays so."""
+        scale_R = row_scale(exact_RI, _MOST)
+        # Beyond the largest number a conversion gives NaN, and the division may be rounded there.
+        return (exact_RI / scale_R[:, None]).clamp(-_MOST, _MOST).to(torch.float8_e4m3fn), scale_R
+
+    def product(self, x: Tensor) -> Tensor:
         # Products come out in bfloat16: a float32 network has asked for more.
         if self._multiplies and x.dtype == torch.bfloat16:
-            out = _product(x.flatten(0, -2), self.weight_OI, self.scale_O).unflatten(0, x.shape[:-1])
-        else:
-            out = F.linear(x, self.weight_OI.to(x.dtype)) * self.scale_O.to(x.dtype)
-        return out if self.bias is None else out + self.bias.to(x.dtype)
-
-
-def _narrowed(exact_RI: Tensor) -> tuple[Tensor, Tensor]:
-    """Rows as fp8, and the scale of each (R) float32. What is not finite stays so."""
-    scale_R = (exact_RI.abs().amax(dim=1) / _MOST).clamp(min=torch.finfo(torch.float32).tiny)
-    # Beyond the largest number a conversion gives NaN, and the division may be rounded there.
-    return (exact_RI / scale_R[:, None]).clamp(-_MOST, _MOST).to(torch.float8_e4m3fn), scale_R
+            return _product(x.flatten(0, -2), self.weight_OI, self.scale_O).unflatten(0, x.shape[:-1])
+        return super().product(x)
 
 
 def _product(x_MI: Tensor, weight_OI: Tensor, scale_O: Tensor) -> Tensor:
     """(M, O) in bfloat16. The second matrix is read by columns, as the weight lies."""
-    narrow_MI, scale_M = _narrowed(x_MI.float())
+    narrow_MI, scale_M = Fp8Linear.narrowed(x_MI.float())
     return torch._scaled_mm(
         narrow_MI, weight_OI.t(), scale_a=scale_M[:, None], scale_b=scale_O[None], out_dtype=torch.bfloat16
     )

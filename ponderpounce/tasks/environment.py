@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from ponderpounce.tasks import captions, demonstration, engine, forks, panda, sight
 from ponderpounce.tasks.captions import Caption
 from ponderpounce.tasks.demonstration import Row
+from ponderpounce.tasks.difficulty import DIFFICULTIES, Order
 from ponderpounce.tasks.engine import Progress, Status
 from ponderpounce.tasks.forks import Fork
 from ponderpounce.tasks.geometry import Array, pose_of
@@ -20,7 +21,7 @@ from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.physics import CONTROL_HZ, Physics, PhysicsState
 from ponderpounce.tasks.rendering import Cameras
 from ponderpounce.tasks.scene import FRONT, table_scene
-from ponderpounce.tasks.task import DIFFICULTIES, Order, Subtask, Task, TaskError, make_task
+from ponderpounce.tasks.task import Subtask, Task, TaskError, make_task
 
 IMAGE_PX = 256  # upstream's; grounded texts count in these pixels
 _PUSHED_M = 0.01  # texts that follow are corrected from this distance on

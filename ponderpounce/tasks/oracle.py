@@ -35,6 +35,9 @@ _SWING_M = 0.10
 _TIP_M = 0.07  # of the stick, over what it points at
 _ARC_POINTS, _ARC_PAUSE = 45, 5  # control steps
 _MISS_M, _MISS_CONTAINER_M = 0.04, 0.035
+_OVER_M, _OVER_COS, _OVER_Z_M = 0.01, 0.98, 0.02  # of the tool over a grasp: aside, turned (11 degrees), in height
+_UPRIGHT = 0.7  # of a cube's axis: one that points up this much is none to close along
+_EMPTY_M = 0.01  # of a finger: closed that far, there is nothing between them
 _BAR_LIFTS_M = (0.20, 0.16, 0.13)  # a bar counts as lifted above 0.10
 _PUSH_FROM_M, _PUSH_SHORT_M, _PUSH_BACK_M = 0.05, 0.02, 0.02  # of the tool: behind the body, before the target
 _HOOK_FROM_M, _HOOK_SHORT_M, _HOOK_ASIDE_M, _HOOK_ABOVE_M = 0.1, 0.03, 0.1, 0.1
@@ -56,11 +59,16 @@ class Motions:
     """What the oracle can do with one arm. Actions are (8,) float32: seven joint targets [rad], gripper in [-1, 1].
 
     ``num_grasps`` counts the grasps begun so far, without the failed ones.
+
+    With ``resumes`` the first grasp takes over from whoever moved the arm before: it goes on from where the tool is,
+    down upon the thing, up with it, or up and over it once more. ``has_resumed`` is true from then on.
     """
 
-    def __init__(self, physics: Physics, failed_grasp: FailedGrasp | None = None) -> None:
+    def __init__(self, physics: Physics, failed_grasp: FailedGrasp | None = None, *, resumes: bool = False) -> None:
         self.num_grasps = 0
+        self.has_resumed = False
         self._failed_grasp = failed_grasp
+        self._resumes = resumes
         self._physics = physics
         self._kinematics = Kinematics(physics.model)
         self._max_speed_rad_s = physics.robot.oracle_speed_rad_s
@@ -280,6 +288,11 @@ class Motions:
         return start_m, ahead, np.cross(-_DOWN, ahead)
 
     def _grasp(self, body: str, *, from_z_m: float, grasp_z_m: float, miss_m: float) -> Actions:
+        resumes, self._resumes = self._resumes, False
+        if resumes:
+            self.has_resumed = True
+            yield from self._resume(body, from_z_m, grasp_z_m)
+            return
         yield from self.open()
         failed, self.num_grasps = self._failed_grasp, self.num_grasps + 1
         if failed is not None and failed.before == self.num_grasps - 1:
@@ -287,6 +300,33 @@ class Motions:
         above = self._above_block(body, from_z_m, grasp_z_m)
         yield from self.open_at(above)
         yield from self.move(_at_height(above, grasp_z_m))
+        yield from self.close()
+        yield from self.move(above)
+
+    def _resume(self, body: str, from_z_m: float, grasp_z_m: float) -> Actions:
+        """A grasp that somebody else has begun, well or badly."""
+        self.num_grasps += 1
+        here = self._physics.tcp_transform()
+        if self._physics.is_grasped(body):
+            yield from self.close()
+            yield from self.move(_at_height(here, from_z_m))
+            return
+        above = self._above_block(body, from_z_m, grasp_z_m)
+        is_closed = self._gripper < 0
+        is_empty = is_closed and float(np.min(self._physics.finger_openings_m())) < _EMPTY_M
+        if _is_over(here, above, grasp_z_m) and not is_empty:
+            if here[2, 3] > grasp_z_m + _OVER_Z_M:
+                if is_closed:
+                    yield from self.open()
+                yield from self.move(_at_height(above, grasp_z_m))
+        else:
+            if here[2, 3] < from_z_m - _OVER_Z_M:
+                yield from self.move(_at_height(here, from_z_m))  # beside the thing there may be others
+            if is_closed:
+                yield from self.open()
+            above = self._above_block(body, from_z_m, grasp_z_m)
+            yield from self.open_at(above)
+            yield from self.move(_at_height(above, grasp_z_m))
         yield from self.close()
         yield from self.move(above)
 
@@ -321,8 +361,8 @@ class Motions:
         """
         x_m, y_m, _ = self._physics.position_m(body)
         closing = self._physics.tcp_transform()[:3, 1]
-        sides = transform(self._physics.pose(body))[:3, :2].T
-        directions = sorted([*sides, *-sides], key=lambda side: -float(side @ closing))
+        sides = [side for side in transform(self._physics.pose(body))[:3, :3].T if abs(side[2]) < _UPRIGHT]
+        directions = sorted([*sides, *(-side for side in sides)], key=lambda side: -float(side @ closing))
         waiting = [_at(_tool(direction), x_m, y_m, from_z_m) for direction in directions]
         return self._first_reachable(sorted(waiting, key=lambda above: self._overlap_m(above, grasp_z_m, body)))
 
@@ -380,6 +420,13 @@ def _tool(closing: Array) -> Array:
     T = np.eye(4)
     T[:3, :3] = np.column_stack([np.cross(y, _DOWN), y, _DOWN])
     return T
+
+
+def _is_over(tool: Array, above: Array, grasp_z_m: float) -> bool:
+    """Whether a tool (4, 4) is on the straight way down from where it would wait above a thing."""
+    aside_m = np.linalg.norm(tool[:2, 3] - above[:2, 3])
+    is_between = grasp_z_m - _OVER_Z_M < tool[2, 3] < above[2, 3] + _OVER_Z_M
+    return bool(aside_m < _OVER_M and is_between and tool[:3, 1] @ above[:3, 1] > _OVER_COS)
 
 
 def _at_height(T: Array, z_m: float) -> Array:

@@ -15,12 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ponderpounce.tasks.difficulty import DIFFICULTIES
 from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import Environment, EpisodeState, Snapshot
 from ponderpounce.tasks.forks import Branch, Fork, ForkError, retell
 from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.physics import CONTROL_HZ
-from ponderpounce.tasks.task import DIFFICULTIES, Task, make_task
+from ponderpounce.tasks.task import Task, make_task
 
 PAST_HZ = 1  # the rate at which PONDER looks
 ORACLE_STEPS = 20  # one chunk

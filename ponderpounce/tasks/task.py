@@ -15,7 +15,7 @@ import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Generic, Literal, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import mujoco
 import numpy as np
@@ -25,9 +25,6 @@ from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.panda import PANDA_WRISTCAM, Robot
 from ponderpounce.tasks.physics import Physics
 
-DIFFICULTIES = ("easy", "medium", "hard")
-Order = Literal["drawn", "near-first"]
-"""What is done first where a task leaves it open: as its layout was drawn, or by a rule that can be seen."""
 FAMILIES = ("counting", "permanence", "reference", "imitation")
 
 LayoutT = TypeVar("LayoutT")

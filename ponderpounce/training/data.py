@@ -90,8 +90,7 @@ class TrainingSet:
 
     def __init__(
         self,
-        root: Path,
-        *,
+        *roots: Path,
         watched: Sequence[Path] = (),
         tasks: Sequence[str] = (),
         sight: Sight | None = None,
@@ -101,7 +100,7 @@ class TrainingSet:
         """Reads the episodes of ``tasks``, or all; their pictures whole, or as ``sight`` says.
 
         Args:
-            root: episodes to imitate; those that did not succeed are left out.
+            roots: folders of episodes to imitate; those that did not succeed are left out.
             watched: folders of episodes that come after them, to be looked at only (`TrainingEpisode.is_watched`).
             tasks: those to read; () for all.
             sight: see its class.
@@ -114,13 +113,13 @@ class TrainingSet:
         """
         self._sight = sight
         self._store = None if sights is None or sight is None else SightStore(sights, sight.kind)
-        self._sources = _sources(Dataset(root), tasks, is_watched=False)
+        self._sources = [source for root in roots for source in _sources(Dataset(root), tasks, is_watched=False)]
         self.num_imitated = len(self._sources)
         for folder in watched:
             self._sources += _sources(Dataset(folder), tasks, is_watched=True)
         sizes = {source.dataset.image_px for source in self._sources}
         if len(sizes) > 1:
-            folders = ", ".join(map(str, (root, *watched)))
+            folders = ", ".join(map(str, (*roots, *watched)))
             raise ValueError(f"pictures of {sorted(sizes)} px in {folders}; collect all at one --image-px")
         (self.image_px,) = sizes
         self._cache: OrderedDict[int, TrainingEpisode] = OrderedDict()
@@ -187,6 +186,7 @@ class TrainingSet:
             subgoals=rows.grounded_subgoal[start:],
             is_transition_T=rows.is_transition[start:],
             reasoning=rows.demonstration_reasoning[start],
+            imitated_from=entry.corrected_from,
             is_watched=source.is_watched,
         )
 
@@ -227,7 +227,10 @@ class TrainingSet:
         for source in self._sources[: self.num_imitated]:
             rows = source.rows()
             state, action = _own(rows, rows.state), _own(rows, rows.action)
-            chunks_TND = actions_in(space, action, state, chunk_ticks(np.arange(len(action)), horizon, len(action)))
+            begin = source.entry.corrected_from
+            ticks = chunk_ticks(np.arange(begin, len(action)), horizon, len(action))
+            state = state[begin:]
+            chunks_TND = actions_in(space, action, state, ticks)
             states.append(states_in(space, state).astype(np.float32))
             actions.append(chunks_TND.astype(np.float32))
         actions_MND = np.concatenate(actions)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -22,7 +23,7 @@ from ponderpounce.models.normalisation import Floats
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.training.augment import AS_IT_IS, NOT_AUGMENTED, Augmentation, View, draw_view
 from ponderpounce.training.nudge import NO_NUDGE, Nudge, draw_nudges
-from ponderpounce.training.places import misplaced
+from ponderpounce.training.places import PLACE, misplaced
 from ponderpounce.training.stand_in import stand_in
 
 Frame = NDArray[np.uint8]  # (height, width, 3) RGB
@@ -47,6 +48,8 @@ class TrainingEpisode:
     comes into sight."""
     reasoning: str = ""
     """What PONDER writes at the first transition after a demonstration; empty without one."""
+    imitated_from: int = 0
+    """The tick from which POUNCE imitates; before it somebody else acted (`pp-correct`)."""
     is_watched: bool = False
     """Somebody else's doing, good or bad: PONDER learns to follow it, POUNCE does not imitate it."""
     sights: Sequence[tuple[Frame, ...]] | None = None
@@ -56,6 +59,8 @@ class TrainingEpisode:
     def __post_init__(self) -> None:
         rows = (self.frames, self.state_T8, self.action_T8, self.subgoals, self.is_transition_T)
         sizes = {len(column) for column in rows}
+        if not 0 <= self.imitated_from < len(self.subgoals):
+            raise ValueError(f"imitated_from {self.imitated_from} is none of the {len(self.subgoals)} ticks")
         if len(sizes) != 1 or 0 in sizes:
             raise ValueError(
                 "an episode needs one frame, state, action, text and transition flag per tick; it has "
@@ -65,6 +70,20 @@ class TrainingEpisode:
     @property
     def num_ticks(self) -> int:
         return len(self.subgoals)
+
+    def with_foresight(self) -> TrainingEpisode:
+        """The same with a place in every text that gets one later, while its subgoal lasts.
+
+        Upstream's texts have none as long as the arm hides the thing. Nothing in the picture tells where it is then,
+        but what was seen before may, and a PONDER that learns to say such a text points nowhere.
+        """
+        begins = np.flatnonzero(self.is_transition_T | (np.arange(self.num_ticks) == 0)).tolist()
+        subgoals: list[str] = []
+        for begin, end in pairwise([*begins, self.num_ticks]):
+            texts = self.subgoals[begin:end]
+            placed = next((text for text in texts if PLACE.search(text)), "")
+            subgoals += [text if PLACE.search(text) else placed or text for text in texts]
+        return replace(self, subgoals=subgoals)
 
     @property
     def transition_ticks(self) -> frozenset[int]:
@@ -99,11 +118,14 @@ class ExampleConfig:
     text_dropout: float = 0.0
     """Share of rows without their texts although they have some: cognition must then come from what was seen."""
 
+    has_foresight: bool = False
+    """See `TrainingEpisode.with_foresight`."""
     slips: float = 0.0
     """Share of grounded rows in which all said places are wrong by ``slip_px`` and not to be learned. Cognition must
     then come from what is seen; from flawless words alone it would learn to copy them, and PONDER's own are not."""
-    slip_px: float = 6.0
-    """Standard deviation of each coordinate, of a 256 px picture."""
+    slip_px: tuple[float, float] = (6.0, 6.0)
+    """Standard deviation of each coordinate, of a 256 px picture: from the first to the second, drawn for each row,
+    every factor as likely. A thing that was pushed lies further from where it was said to be than PONDER errs."""
     tremble_px: float = 0.0
     """The same in all other grounded rows, whose words are learned: no word is then exact enough to be copied."""
 
@@ -121,8 +143,10 @@ class ExampleConfig:
     def __post_init__(self) -> None:
         if self.max_queries is not None and self.max_queries < 1:
             raise ValueError(f"max_queries must be at least 1, came {self.max_queries}")
-        if min(self.slip_px, self.tremble_px) < 0:
-            raise ValueError(f"slip_px {self.slip_px} and tremble_px {self.tremble_px} must be at least 0")
+        if not 0 < self.slip_px[0] <= self.slip_px[1] or self.tremble_px < 0:
+            raise ValueError(
+                f"slip_px {self.slip_px} must ascend from above 0, tremble_px {self.tremble_px} be at least 0"
+            )
         for name in ("text_dropout", "slips"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be in [0, 1], came {getattr(self, name)}")
@@ -170,15 +194,18 @@ def make_example(
     episode: TrainingEpisode, form: ContextFormat, config: ExampleConfig, rng: np.random.Generator
 ) -> Example:
     """Draws a schedule and lays the episode out under it."""
+    episode = episode.with_foresight() if config.has_foresight else episode
     schedule = sample_schedule(rng, config.clocks, episode.num_ticks, transition_ticks=episode.transition_ticks)
     schedule = _shortened(schedule, config.max_queries)
-    count = 0 if episode.is_watched else min(config.max_invocations, len(schedule.invocations))
-    chosen = np.sort(rng.choice(len(schedule.invocations), size=count, replace=False))
-    invocations = tuple(schedule.invocations[index] for index in chosen)
+    imitated = [i for i, each in enumerate(schedule.invocations) if each.tick >= episode.imitated_from]
+    count = 0 if episode.is_watched else min(config.max_invocations, len(imitated))
+    chosen = np.sort(rng.choice(len(imitated), size=count, replace=False)) if count else ()
+    invocations = tuple(schedule.invocations[imitated[index]] for index in chosen)
     is_grounded = config.is_grounded and rng.random() >= config.text_dropout
     slip = None
     if is_grounded and config.slips and rng.random() < config.slips:
-        slip = Slip(std_px=config.slip_px, seed=int(rng.integers(1 << 62)))
+        std_px = float(np.exp(rng.uniform(*np.log(config.slip_px))))
+        slip = Slip(std_px=std_px, seed=int(rng.integers(1 << 62)))
     elif is_grounded and config.tremble_px:
         slip = Slip(std_px=config.tremble_px, seed=int(rng.integers(1 << 62)), is_learned=True)
     is_moved = config.augments == "all" or episode.is_watched

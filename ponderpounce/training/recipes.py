@@ -157,6 +157,7 @@ def small() -> Curriculum:
             max_invocations=1,
             text_dropout=0.4,
             max_queries=8,
+            has_foresight=True,
             augmentation=Augmentation(max_shift_px=4, mirror=True),
         ),
         train=TrainConfig(seed=0, optim=_FROM_SCRATCH),
@@ -173,7 +174,9 @@ def small() -> Curriculum:
     grounding = replace(
         looking,
         name="small/grounding",
-        example=replace(looking.example, text_dropout=0.2, slips=0.4, tremble_px=1.0, max_queries=None),
+        example=replace(
+            looking.example, text_dropout=0.2, slips=0.4, slip_px=(3.0, 24.0), tremble_px=1.0, max_queries=None
+        ),
         train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, decay=(1400, 3200))),
         num_steps=3200,
         batch_episodes=8,
@@ -188,7 +191,7 @@ def small() -> Curriculum:
     reaching = replace(
         looking,
         name="small/reaching",
-        example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=16, nudge=_BESIDE_THE_WAY),
+        example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=16, nudge=_BESIDE_THE_WAY, has_foresight=True),
         train=TrainConfig(seed=0, dropout=0.1, flow_samples=2, optim=_FROM_SCRATCH),
         num_steps=6000,
         batch_episodes=8,
@@ -208,6 +211,7 @@ def small() -> Curriculum:
             reaching.example,
             max_invocations=32,
             slips=0.4,
+            slip_px=(3.0, 24.0),
             tremble_px=1.0,
             augmentation=looking.example.augmentation,
             augments="watched",

@@ -6,7 +6,7 @@ One file per episode and sight. Whoever misses one makes it; several may do so a
 from __future__ import annotations
 
 import hashlib
-import os
+import uuid
 import zipfile
 from pathlib import Path
 
@@ -43,7 +43,7 @@ class SightStore:
     def write(self, episode: bytes, views: dict[str, Views]) -> None:
         """Keeps pictures (height, width, 3) uint8. A disk that is full keeps nothing, and training goes on."""
         path = self._folder / f"{_name(episode)}.npz"
-        partial = path.with_suffix(f".{os.getpid()}")
+        partial = path.with_suffix(f".{uuid.uuid4().hex}")  # of no other process, on whichever host
         try:
             with partial.open("wb") as file:
                 np.savez(file, **_arrays(views))  # type: ignore[arg-type]  # no view is called allow_pickle

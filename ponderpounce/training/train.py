@@ -61,8 +61,8 @@ class TrainOptions:
     recipe: str
     """robomme and robocasa_dc are the paper's; small learns from scratch on CPU cores; tiny and tiny_groot are for a
     try."""
-    data: Path
-    """A folder that pp-collect or pp-export made."""
+    data: tuple[Path, ...]
+    """Folders that pp-collect, pp-export or pp-correct made: episodes to imitate."""
     out: Path
     """Folder for checkpoints, log and the trained models."""
     watch: tuple[Path, ...] = ()
@@ -184,7 +184,7 @@ def train(options: TrainOptions) -> None:
     chosen = recipe(options.recipe)
     if _is_finished(options.out):
         raise CheckpointError(f"{options.out} holds a finished run; use another --out")
-    data = TrainingSet(options.data, tasks=options.tasks)
+    data = TrainingSet(*options.data, tasks=options.tasks)
     with joined(options.device) as world:
         if isinstance(chosen, Recipe):
             if options.stage is not None:
@@ -224,7 +224,7 @@ def _train(run: Recipe, data: TrainingSet, options: TrainOptions, world: World) 
     model, bundle = build(run, data, options)
     shard(model, world)
     data = TrainingSet(
-        options.data,
+        *options.data,
         watched=options.watch if run.trains != "pounce" else (),
         tasks=options.tasks,
         sight=_sight(run, model),
@@ -285,7 +285,8 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
         check_cameras([(data.image_px, data.image_px)] * len(CAMERAS), ponder.format.eyes, ponder.image_px)
     except ValueError as error:
         wanted_px = readable_sizes(ponder.format.eyes, ponder.image_px)[0][0]
-        raise ValueError(f"{options.data}: {error}; collect with --image-px {wanted_px}") from None
+        folders = ", ".join(map(str, options.data))
+        raise ValueError(f"{folders}: {error}; collect with --image-px {wanted_px}") from None
     measured = partial(data.statistics, run.pounce.horizon, run.space, by_row=run.statistics_by_row)
     if options.pounce is None:
         is_own = run.has_own_tokenizers and isinstance(run.pounce, PounceConfig)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from ponderpounce.analysis.ceiling import NUM_CUBES_AND_TARGETS, ceiling_of, pick_highlight_ceiling
-from ponderpounce.tasks.task import DIFFICULTIES, make_task
+from ponderpounce.tasks.difficulty import DIFFICULTIES
+from ponderpounce.tasks.task import make_task
 
 
 def test_over_the_benchmark_s_mix_it_is_eleven_sixtieths() -> None:

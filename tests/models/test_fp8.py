@@ -12,7 +12,7 @@ from torch import nn
 
 from ponderpounce.models import fp8
 from ponderpounce.models.fp8 import Fp8Linear, has_products, missing_for
-from ponderpounce.models.int8 import quantise_where
+from ponderpounce.models.narrow_linear import quantise_where
 
 MODEL_TYPE = torch.bfloat16
 

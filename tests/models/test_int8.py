@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from ponderpounce.models.int8 import Int8Linear, quantise_where
+from ponderpounce.models.int8 import Int8Linear
+from ponderpounce.models.narrow_linear import quantise_where
 
 
 @given(seed=st.integers(0, 2**31), rows=st.integers(1, 9), columns=st.integers(1, 9), scale=st.floats(1e-6, 1e6))
@@ -33,6 +34,6 @@ def test_only_what_was_asked_for_is_narrow() -> None:
     model = nn.Sequential(nn.Linear(4, 3), nn.Sequential(nn.Linear(3, 2), nn.LayerNorm(2)))
     x = torch.ones(1, 4)
     exact = model(x)
-    assert quantise_where(model, lambda name: name == "1.0.weight") == 3 * 6
+    assert quantise_where(model, lambda name: name == "1.0.weight", Int8Linear) == 3 * 6
     assert [type(child) for child in (model[0], *model[1])] == [nn.Linear, Int8Linear, nn.LayerNorm]
     assert model(x).shape == exact.shape

@@ -205,6 +205,22 @@ def test_oracle_episodes_of_two_tasks_end_to_end(tmp_path: Path) -> None:
 
 
 @pytest.mark.sim
+def test_an_order_reaches_the_task(tmp_path: Path) -> None:
+    rows = {}
+    for order in ("drawn", "near-first"):
+        shared: dict[str, Any] = {"tasks": ("PickHighlight",), "episodes": 1, "runs": 1, "difficulty": "hard"}
+        chosen = options(tmp_path / order, order=order, record=True, record_hz=1, **shared)
+        with contextlib.closing(EvaluationStation(chosen)) as station:
+            (played,) = evaluate(chosen, InOrder(station.play))["episodes"]
+        assert played["success"]
+        log = read_log(tmp_path / order / played["mcap"])
+        seen = [re.search(r"pick up the (\w+) .*<(\d+), ", subgoal.text) for subgoal in log.subgoals]
+        picked = {match[1]: int(match[2]) for match in reversed(seen) if match}  # the first time that each is told
+        rows[order] = [picked[ordinal] for ordinal in ("first", "second", "third")]
+    assert rows["near-first"] == sorted(rows["near-first"], reverse=True) != rows["drawn"]
+
+
+@pytest.mark.sim
 def test_another_episode_s_cognition_reaches_the_servers(tmp_path: Path) -> None:
     """Two recorded episodes of the tiny models; then the first again, with what PONDER said in the second."""
     shared: dict[str, Any] = {"tasks": ("StopCube",), "runs": 1, "policy": "servers", "difficulty": "easy"}

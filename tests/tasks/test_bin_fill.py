@@ -11,12 +11,12 @@ import pytest
 
 from ponderpounce.tasks import panda
 from ponderpounce.tasks.counting.bin_fill import BinFill, Layout
+from ponderpounce.tasks.difficulty import DIFFICULTIES
 from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import Environment, Snapshot
 from ponderpounce.tasks.geometry import Footprint, is_clear
 from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.scene import BUTTON_HALF_M, CUBE_COLORS
-from ponderpounce.tasks.task import DIFFICULTIES
 
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]
 HOME = np.append(panda.HOME_QPOS, 1.0)

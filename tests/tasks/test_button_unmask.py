@@ -10,12 +10,12 @@ import pytest
 
 from ponderpounce.tasks import panda
 from ponderpounce.tasks.containers import EMPTY_Z_M, HIDDEN_HALF_M, HIDING_Z_M
+from ponderpounce.tasks.difficulty import DIFFICULTIES
 from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import Environment, Snapshot
 from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.permanence.button_unmask import ButtonUnmask
 from ponderpounce.tasks.scene import CUBE_COLORS
-from ponderpounce.tasks.task import DIFFICULTIES
 
 Until = Callable[[Environment, int], Snapshot]
 Hoist = Callable[[Environment, str], Snapshot]

@@ -9,12 +9,12 @@ import pytest
 
 from ponderpounce.tasks import panda, swaps
 from ponderpounce.tasks.containers import EMPTY_Z_M, HIDING_Z_M
+from ponderpounce.tasks.difficulty import DIFFICULTIES
 from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import Environment, Snapshot
 from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.permanence.button_unmask_swap import ButtonUnmaskSwap
 from ponderpounce.tasks.permanence.scenes import LANE_M
-from ponderpounce.tasks.task import DIFFICULTIES
 
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]
 Until = Callable[[Environment, int], Snapshot]

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from ponderpounce.tasks import panda, sight
+from ponderpounce.tasks.difficulty import DIFFICULTIES
 from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import (
     IMAGE_PX,
@@ -26,7 +27,7 @@ from ponderpounce.tasks.environment import (
     make_environment,
 )
 from ponderpounce.tasks.scene import CAMERAS, FRONT
-from ponderpounce.tasks.task import DIFFICULTIES, TaskError, make_task, task_names
+from ponderpounce.tasks.task import TaskError, make_task, task_names
 
 EnvironmentOf = Callable[[str], Environment]
 HOME = np.append(panda.HOME_QPOS, 1.0)

@@ -10,10 +10,11 @@ from itertools import islice
 import numpy as np
 import pytest
 
+from ponderpounce.tasks.difficulty import DIFFICULTIES
 from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
 from ponderpounce.tasks.forks import MAX_SEAM, ForkError
 from ponderpounce.tasks.pairs import Pair, find_pair, oracle_chunk
-from ponderpounce.tasks.task import DIFFICULTIES, make_task, task_names
+from ponderpounce.tasks.task import make_task, task_names
 
 EnvironmentOf = Callable[[str], Environment]
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]

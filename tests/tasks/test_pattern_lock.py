@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from ponderpounce.tasks import panda, predicates
+from ponderpounce.tasks.difficulty import DIFFICULTIES
 from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
 from ponderpounce.tasks.imitation.pattern_lock import Layout, PatternLock
 from ponderpounce.tasks.imitation.traces import RED_STEPS, TRAIL_STEPS
 from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.scene import FRONT, WRIST
-from ponderpounce.tasks.task import DIFFICULTIES
 
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]
 SIDE = {"easy": 3, "medium": 4, "hard": 5}

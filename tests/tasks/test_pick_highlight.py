@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from ponderpounce.tasks import panda
+from ponderpounce.tasks.difficulty import DIFFICULTIES
 from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
 from ponderpounce.tasks.geometry import Footprint, is_clear
@@ -17,7 +18,6 @@ from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.reference.pick_highlight import Layout, PickHighlight
 from ponderpounce.tasks.scene import BUTTON_HALF_M, CUBE_COLORS, CUBE_HALF_M, FRONT
 from ponderpounce.tasks.sight import visible_pixels
-from ponderpounce.tasks.task import DIFFICULTIES
 
 HOME = np.append(panda.HOME_QPOS, 1.0)
 NUM_CUBES = {"easy": 3, "medium": 4, "hard": 6}

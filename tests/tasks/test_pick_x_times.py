@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from ponderpounce.tasks.counting.pick_x_times import PickXtimes
+from ponderpounce.tasks.difficulty import DIFFICULTIES
 from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import Environment, Snapshot
 from ponderpounce.tasks.geometry import Footprint, distance_m, is_clear
 from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.scene import BUTTON_HALF_M, CUBE_COLORS
-from ponderpounce.tasks.task import DIFFICULTIES
 
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]
 NUM_CUBES = {"easy": 1, "medium": 3, "hard": 3}

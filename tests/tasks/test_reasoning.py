@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from ponderpounce.tasks import captions
+from ponderpounce.tasks.difficulty import DIFFICULTIES
 from ponderpounce.tasks.environment import Environment
-from ponderpounce.tasks.task import DIFFICULTIES, make_task, task_names
+from ponderpounce.tasks.task import make_task, task_names
 
 EnvironmentOf = Callable[[str], Environment]
 

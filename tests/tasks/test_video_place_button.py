@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ponderpounce.tasks.difficulty import DIFFICULTIES
 from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
 from ponderpounce.tasks.geometry import Footprint, distance_m, is_clear, pose
@@ -16,7 +17,6 @@ from ponderpounce.tasks.placing import BUTTON_ROOM_HALF_M
 from ponderpounce.tasks.reference.video_place import Layout
 from ponderpounce.tasks.reference.video_place_button import VideoPlaceButton
 from ponderpounce.tasks.scene import FRONT
-from ponderpounce.tasks.task import DIFFICULTIES
 
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]
 Until = Callable[[Environment, int], Snapshot]

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from ponderpounce.tasks import panda, swaps
+from ponderpounce.tasks.difficulty import DIFFICULTIES
 from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import Environment, Snapshot
 from ponderpounce.tasks.geometry import Footprint, Spot, is_clear
 from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.placing import BUTTON_ROOM_HALF_M, has_finger_room
 from ponderpounce.tasks.reference.video_repick import LANE_M, Layout, VideoRepick
-from ponderpounce.tasks.task import DIFFICULTIES
 
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]
 Until = Callable[[Environment, int], Snapshot]

@@ -9,13 +9,13 @@ import pytest
 
 from ponderpounce.tasks import swaps
 from ponderpounce.tasks.containers import HIDING_Z_M
+from ponderpounce.tasks.difficulty import DIFFICULTIES
 from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import Environment, Snapshot
 from ponderpounce.tasks.geometry import Spot
 from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.permanence.scenes import LANE_M, Layout
 from ponderpounce.tasks.permanence.video_unmask_swap import VideoUnmaskSwap
-from ponderpounce.tasks.task import DIFFICULTIES
 
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]
 Until = Callable[[Environment, int], Snapshot]

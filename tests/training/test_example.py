@@ -178,7 +178,7 @@ def test_without_grounding_the_row_has_no_text() -> None:
 @settings(max_examples=20, deadline=None)
 def test_words_that_slipped_are_read_and_not_learned(seed: int) -> None:
     recorded = replace(episode(70, changes=(0, 30)), subgoals=["pick at <120, 40>"] * 30 + ["go to <20, 200>"] * 40)
-    config = ExampleConfig(clocks=EVALUATION, slips=1.0, slip_px=5.0)
+    config = ExampleConfig(clocks=EVALUATION, slips=1.0, slip_px=(5.0, 5.0))
     slipped = make_example(recorded, FORM, config, np.random.default_rng(seed)).row()
     right = make_example(recorded, FORM, replace(config, slips=0.0), np.random.default_rng(seed)).row()
     v = FORM.vocabulary
@@ -203,6 +203,64 @@ def test_words_that_tremble_are_read_and_learned() -> None:
         assert re.findall(r"\[.*?\]", learned) == re.findall(r"\[.*?\]", read) != []
         told.update(re.findall(r"\[.*?\]", learned))
     assert len(told) > 10  # of 20 places, drawn anew
+
+
+def test_how_far_words_slip_is_drawn_for_each_row() -> None:
+    recorded = replace(episode(70, changes=(0,)), subgoals=["pick at <120, 120>"] * 70)
+    config = ExampleConfig(clocks=EVALUATION, slips=1.0, slip_px=(2.0, 20.0))
+    slips = [make_example(recorded, FORM, config, np.random.default_rng(seed)).slip for seed in range(60)]
+    drawn = np.array([slip.std_px for slip in slips if slip is not None])
+    assert len(drawn) == 60
+    assert 2.0 <= drawn.min() < 3.0 < 15.0 < drawn.max() <= 20.0
+    assert abs(np.log(drawn).mean() - np.log(40.0**0.5)) < 0.3
+    for wrong in ((0.0, 1.0), (3.0, 2.0)):
+        with pytest.raises(ValueError, match="must ascend"):
+            ExampleConfig(clocks=EVALUATION, slip_px=wrong)
+
+
+@given(data=st.data())
+@settings(max_examples=40, deadline=None)
+def test_with_foresight_a_text_has_the_place_that_it_gets_later(data: st.DataObject) -> None:
+    """Of its own subgoal only; what has a place keeps it, what never gets one stays as it is."""
+    lengths = data.draw(st.lists(st.integers(1, 6), min_size=1, max_size=4))
+    texts: list[str] = []
+    expected: list[str] = []
+    for number, length in enumerate(lengths):
+        hidden = data.draw(st.integers(0, length))
+        texts += [f"pick cube {number}"] * hidden + [
+            f"pick cube {number} at <{tick}, 9>" for tick in range(hidden, length)
+        ]
+        expected += [f"pick cube {number} at <{hidden}, 9>" if hidden < length else f"pick cube {number}"] * hidden
+        expected += texts[len(expected) :]
+    begins = np.cumsum([0, *lengths[:-1]])
+    recorded = replace(episode(len(texts), changes=tuple(begins.tolist())), subgoals=texts)
+    foreseen = recorded.with_foresight()
+    assert list(foreseen.subgoals) == expected
+    assert list(foreseen.with_foresight().subgoals) == expected
+    np.testing.assert_array_equal(foreseen.state_T8, recorded.state_T8)
+    config = ExampleConfig(clocks=EVALUATION, has_foresight=True)
+    assert list(make_example(recorded, FORM, config, np.random.default_rng(0)).episode.subgoals) == expected
+
+
+@given(num_ticks=st.integers(2, 120), data=st.data())
+@settings(max_examples=25, deadline=None)
+def test_pounce_imitates_from_where_the_correction_begins(num_ticks: int, data: st.DataObject) -> None:
+    begin = data.draw(st.integers(0, num_ticks - 1))
+    recorded = replace(episode(num_ticks), imitated_from=begin)
+    config = ExampleConfig(clocks=ROBOMME, max_invocations=4)
+    for seed in range(3):
+        example = make_example(recorded, FORM, config, np.random.default_rng(seed))
+        whole = make_example(replace(recorded, imitated_from=0), FORM, config, np.random.default_rng(seed))
+        assert example.schedule == whole.schedule
+        open_ticks = [each for each in example.schedule.invocations if each.tick >= begin]
+        assert len(example.invocations) == min(4, len(open_ticks))
+        assert set(example.invocations) <= set(open_ticks)
+
+
+def test_a_correction_begins_within_its_episode() -> None:
+    for wrong in (-1, 70):
+        with pytest.raises(ValueError, match="none of the 70 ticks"):
+            replace(episode(70), imitated_from=wrong)
 
 
 def test_places_that_slip_stay_in_the_picture() -> None:

@@ -82,7 +82,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> dict[str, Recipe]:
 
 def options(folder: Path, out: Path, **changes: object) -> TrainOptions:
     return replace(
-        TrainOptions(recipe="small", data=folder, out=out, save_every=1, progress=False),
+        TrainOptions(recipe="small", data=(folder,), out=out, save_every=1, progress=False),
         **changes,  # type: ignore[arg-type]
     )
 

@@ -77,7 +77,7 @@ def small_recipe(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def options(folder: Path, out: Path, **changes: object) -> TrainOptions:
     return replace(
-        TrainOptions(recipe="tiny", data=folder, out=out, steps=2, save_every=1, progress=False),
+        TrainOptions(recipe="tiny", data=(folder,), out=out, steps=2, save_every=1, progress=False),
         **changes,  # type: ignore[arg-type]
     )
 

@@ -1,0 +1,139 @@
+"""A recorded episode that the oracle takes over: what was recorded until then, and what should be done from then on."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clock.sampling import ROBOMME
+from ponderpounce.data import correct as module
+from ponderpounce.data.correct import CorrectOptions, Job, correct, main, work_out
+from ponderpounce.data.dataset import Dataset
+from ponderpounce.data.episode import unpack
+from ponderpounce.data.errors import DatasetError
+from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.ponder_configs import tiny_cpu
+from ponderpounce.training.data import TrainingSet
+from ponderpounce.training.example import ExampleConfig, make_example
+from protocol.bus import LocalBus
+from protocol.link import Link
+from protocol.mcap_log import EpisodeRecord, read_log
+from sim_client.config import SimOptions
+from sim_client.suite import Suite
+
+PARTS = 4
+
+pytestmark = pytest.mark.sim
+
+
+class HereAndNow:
+    """Works jobs out in this process, the last one first."""
+
+    def run(self, jobs):  # type: ignore[no-untyped-def]
+        for job in reversed(jobs):
+            yield job, work_out(job)
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What sim-client writes of an episode whose pictures nobody keeps."""
+    out = tmp_path_factory.mktemp("recorded")
+    options = SimOptions(task="PickXtimes", seed=6, difficulty="easy", policy="oracle", out=out, record_hz=1)
+    bus = LocalBus()
+    results = Suite(options, Link(bus, robot="r0", proc="sim"), None, lambda: "").run()
+    bus.close()
+    return out / results["episodes"][0]["mcap"]
+
+
+@pytest.fixture(scope="module")
+def record(log: Path) -> EpisodeRecord:
+    return read_log(log)
+
+
+def options(log: Path, out: Path) -> CorrectOptions:
+    return CorrectOptions(files=(log,), out=out, per_episode=PARTS, look_hz=1, workers=1, progress=False)
+
+
+@pytest.fixture(scope="module")
+def corrected(log: Path, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    out = tmp_path_factory.mktemp("corrected") / "dataset"
+    reasons = correct(options(log, out), HereAndNow())
+    assert len(Dataset(out).episodes) + len(reasons) == PARTS
+    return Dataset(out)
+
+
+def test_until_then_it_is_the_log_and_then_the_oracle_solves_it(corrected: Dataset, record: EpisodeRecord) -> None:
+    begun = []
+    for entry in corrected.episodes:
+        rows, begin = corrected.rows(entry.index), entry.corrected_from
+        logged = np.stack([tick.action for tick in record.ticks])
+        parts = [int(part / PARTS * len(logged)) for part in range(PARTS + 1)]
+        same = int(np.argmin((rows.action[: len(logged)] == logged[: len(rows)]).all(axis=1)))
+        begun.append(begin)
+        assert begin >= next(first for first, last in itertools.pairwise(parts) if same < last)
+        np.testing.assert_array_equal(
+            rows.state[: same + 1], [each.proprio for each in record.observations[: same + 1]]
+        )
+        assert (entry.is_success, entry.origin, entry.difficulty) == (True, "oracle, corrected", "easy")
+        assert 0 < begin < entry.num_rows
+    assert begun == sorted(set(begun))  # as the parts of the log are
+
+
+def test_only_what_the_oracle_did_is_imitated(corrected: Dataset) -> None:
+    form = Ponder.random(dataclasses.replace(tiny_cpu(), image_px=(64, 64), num_layers=4), seed=1).format
+    data = TrainingSet(corrected.root, corrected.root)
+    assert len(data) == 2 * len(corrected.episodes)
+    for number, entry in enumerate(corrected.episodes):
+        episode = data[number]
+        for seed in range(5):
+            config = ExampleConfig(clocks=ROBOMME, max_invocations=8)
+            example = make_example(episode, form, config, np.random.default_rng(seed))
+            assert example.invocations
+            assert all(each.tick >= entry.corrected_from for each in example.invocations)
+            assert any(query.tick < entry.corrected_from for query in example.schedule.queries)  # PONDER follows all
+
+
+def test_it_is_a_function_of_the_log(log: Path, tmp_path: Path) -> None:
+    job = Job(path=log, part=1, options=options(log, tmp_path))
+    assert work_out(job) == work_out(job)
+
+
+def test_another_scene_is_refused(log: Path, record: EpisodeRecord, monkeypatch: pytest.MonkeyPatch) -> None:
+    moved = [dataclasses.replace(each, proprio=each.proprio + 1e-3) for each in record.observations]
+    monkeypatch.setattr(module, "read_log", lambda path: dataclasses.replace(record, observations=moved))
+    with pytest.raises(DatasetError, match="with those versions"):
+        work_out(Job(path=log, part=1, options=options(log, log.parent)))
+
+
+def test_a_log_with_a_gap_is_refused(log: Path, record: EpisodeRecord, monkeypatch: pytest.MonkeyPatch) -> None:
+    holed = dataclasses.replace(record, ticks=record.ticks[:7] + record.ticks[8:])
+    monkeypatch.setattr(module, "read_log", lambda path: holed)
+    with pytest.raises(DatasetError, match="tick 7"):
+        work_out(Job(path=log, part=1, options=options(log, log.parent)))
+
+
+def test_what_the_oracle_cannot_solve_is_counted(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(module, "LocalWorkers", lambda num_workers, work_out: HereAndNow())
+    arguments = [str(log), "--out", str(tmp_path / "a"), "--max-steps", "60", "--per-episode", "2", "--no-progress"]
+    assert main(arguments) == module.REFUSED
+    assert "no episode was left to write" in capsys.readouterr().err
+    assert not (tmp_path / "a" / "meta").exists()
+
+
+def test_nothing_is_overwritten(log: Path, corrected: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(log), "--out", str(corrected.root), "--no-progress"]) == module.REFUSED
+    assert "another --out" in capsys.readouterr().err
+
+
+def test_a_corrected_episode_is_unpacked_as_it_was_packed(log: Path, tmp_path: Path) -> None:
+    package = work_out(Job(path=log, part=2, options=options(log, tmp_path))).package
+    assert package is not None
+    episode = unpack(package)
+    assert episode.about.corrected_from > 0
+    assert len(episode.rows) > episode.about.corrected_from
