@@ -21,15 +21,21 @@ def render(reports: list[dict[str, Any]]) -> str:
     return "\n".join([HEAD, *(section(report) for report in reports)])
 
 
+def reports_in(folder: Path) -> list[dict[str, Any]]:
+    """Each under the name of its file: one benchmark may have run on several machines."""
+    return [json.loads(path.read_text()) | {"name": path.stem} for path in sorted(folder.glob("*.json"))]
+
+
 def section(report: dict[str, Any]) -> str:
     machine, versions = report["machine"], report["versions"]
+    cpu = " ".join(filter(None, (machine["cpu"], machine.get("instructions"))))
     loads = f"{machine['load_average_before'][0]} before, {machine['load_average_after'][0]} after"
     lines = [
         f"## {report['name']}",
         "",
         report["question"],
         "",
-        f"{report['date']}, commit `{report['git']}`, {machine['cpu']}, {machine['cores']} cores, "
+        f"{report['date']}, commit `{report['git']}`, {cpu}, {machine['cores']} cores, "
         f"load average {loads}, {machine['took_s']:.0f} s. Not counted: {report['warm_up']}",
         "",
     ]
@@ -45,7 +51,7 @@ def _inline(values: dict[str, Any]) -> str:
 
 
 def main(folder: Path = REPORTS) -> int:
-    reports = [json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))]
+    reports = reports_in(folder)
     (folder / "README.md").write_text(render(reports))
     print(f"{len(reports)} reports in {(folder / 'README.md').name}")
     return 0

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 REPORTS = Path(__file__).parent / "reports"
+_SIMD = ("avx2", "avx512f", "avx512_bf16", "amx_bf16")
 _PACKAGES = (
     "numpy", "eclipse-zenoh", "protobuf", "mujoco", "torch", "mcap", "websockets", "msgpack", "openpi-client",
 )  # fmt: skip
@@ -59,6 +60,7 @@ class Report:
             "git": _git_version(),
             "machine": {
                 "cpu": _cpu_model(),
+                "instructions": _instructions(),
                 "cores": os.cpu_count(),
                 "load_average_before": [round(value, 2) for value in self._load],
                 "load_average_after": [round(value, 2) for value in os.getloadavg()],
@@ -110,9 +112,19 @@ def lines_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _cpu_model() -> str:
+    return _cpu_info("model name") or platform.machine()
+
+
+def _instructions() -> str:
+    """The widest vectors and matrix units that the CPU has: one name may stand for very different ones."""
+    return " ".join(flag for flag in _SIMD if flag in _cpu_info("flags").split())
+
+
+def _cpu_info(name: str) -> str:
+    """What Linux says of the first core; empty elsewhere."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith(name)), "")
 
 
 def _git_version() -> str:

@@ -63,8 +63,13 @@ def test_the_page_is_made_of_the_reports(written: Path, capsys: pytest.CaptureFi
     assert "- measured by nobody" in page
 
 
+def test_a_report_of_another_machine_stands_beside_under_its_file_s_name(written: Path) -> None:
+    (written.parent / "speed_elsewhere.json").write_text(written.read_text())
+    assert [each["name"] for each in render.reports_in(written.parent)] == ["speed", "speed_elsewhere"]
+
+
 def test_the_committed_page_is_what_the_committed_reports_give() -> None:
-    reports = [json.loads(path.read_text()) for path in sorted(report.REPORTS.glob("*.json"))]
+    reports = render.reports_in(report.REPORTS)
     page = report.REPORTS / "README.md"
     assert not reports or page.read_text() == render.render(reports)
 
