@@ -4,8 +4,9 @@
 #     checkpoints/small/train.sh [OUT]        (`make policy` sets everything up first)
 #
 # PONDER's eyes are opened first. Then both systems learn side by side. Half-way, and at its end, the hand plays episodes by
-# itself, told the task's own subgoals, and PONDER learns from those as well: the hand's misses are in no oracle's data. The
-# same command goes on after a kill.
+# itself, told the task's own subgoals, and PONDER learns from those as well: the hand's misses are in no oracle's data. Then
+# the pair plays, the oracle takes its episodes over (pp-correct), and both learn from that. The same command goes on after
+# a kill.
 set -euo pipefail
 
 out=${1:-out/small}
@@ -13,21 +14,44 @@ bin=${BIN:-.venv/bin}
 export OMP_NUM_THREADS=1 MUJOCO_GL=${MUJOCO_GL:-egl}
 
 finished() { [ -d "$out/run/ponder" ]; }
-how=(--recipe small --data "$out/data" --out "$out/run" --ponder "$out/eyes/ponder" --sights "$out/sights")
+how=(--recipe small --out "$out/run" --ponder "$out/eyes/ponder" --sights "$out/sights")
+oracle=(--data "$out/data")
+both=(--data "$out/data" "$out"/mended/{hand,hand-stuck,pair,pair-stuck})
 train() { finished || "$bin/pp-train" "${how[@]}" "$@"; }
 train_on_both_cores() { finished || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train "${how[@]}" "$@"; }
 
-hand() {  # lets the POUNCE of a stage play; what it does becomes the dataset $out/NAME
+play() {  # records episodes of $out/played/NAME
+    local name=$1; shift
+    "$bin/pp-eval" --tasks PickHighlight --runs 1 --order near-first --record --record-hz 5 --out "$out/played/$name" "$@"
+}
+
+hand() {  # lets the POUNCE of a stage play, told the task's own subgoals
     local name=$1 stage=$2; shift 2
-    "$bin/pp-eval" --tasks PickHighlight --runs 1 --cognition stand-in --order near-first \
-        --pounce-checkpoint "$out/run/$stage/pounce" --record --record-hz 5 --out "$out/played/$name" "$@"
-    if [ -d "$out/$name/meta" ]; then return; fi
-    local logs  # of finished episodes: a kill leaves the beginning of one more
-    mapfile -t logs < <("$bin/python" -c 'import json, pathlib, sys
-folder = pathlib.Path(sys.argv[1])
-print(*(folder / each["mcap"] for each in json.loads((folder / "results.json").read_text())["episodes"]), sep="\n")' \
-        "$out/played/$name")
-    "$bin/pp-export" "${logs[@]}" --out "$out/$name"
+    play "$name" --cognition stand-in --pounce-checkpoint "$out/run/$stage/pounce" "$@"
+}
+
+logs() {  # of finished episodes in $out/played/NAME, all or with a STATUS: a kill leaves the beginning of one more
+    "$bin/python" -c 'import json, pathlib, sys
+folder, *wanted = map(pathlib.Path, sys.argv[1:])
+for each in json.loads((folder / "results.json").read_text())["episodes"]:
+    if not wanted or each["status"] == str(wanted[0]):
+        print(folder / each["mcap"])' "$out/played/$1" "${@:2}"
+}
+
+export_played() {  # makes a dataset of them
+    local found
+    mapfile -t found < <(logs "$1")
+    [ -d "$out/$1/meta" ] || "$bin/pp-export" "${found[@]}" --out "$out/$1"
+}
+
+mend() {  # the oracle takes over the episodes of $out/played/NAME, those that got stuck often
+    local name=$1 as=$2 stuck=$3 found
+    mapfile -t found < <(logs "$name" SUCCESS)
+    [ -d "$out/mended/$as/meta" ] || "$bin/pp-correct" "${found[@]}" --order near-first --look-hz 1 --per-episode 1 \
+        --out "$out/mended/$as"
+    mapfile -t found < <(logs "$name" TIMEOUT)
+    [ -d "$out/mended/$as-stuck/meta" ] || "$bin/pp-correct" "${found[@]}" --order near-first --look-hz 1 \
+        --per-episode "$stuck" --out "$out/mended/$as-stuck"
 }
 
 [ -d "$out/data/meta" ] || "$bin/pp-collect" --tasks PickHighlight --episodes 600 --noise dart --recovery-share 0.4 \
@@ -36,17 +60,24 @@ print(*(folder / each["mcap"] for each in json.loads((folder / "results.json").r
 [ -d "$out/album/meta" ] || "$bin/pp-album" --pictures 10000 --out "$out/album"
 [ -d "$out/eyes/ponder" ] || OMP_NUM_THREADS=2 "$bin/pp-see" --recipe small --data "$out/data" --album "$out/album" --out "$out/eyes"
 
-train --stage looking --no-progress & looking=$!
-train --stage reaching
-hand reaching reaching --episodes 200 --seed 1000000 --max-steps 800 & playing=$!
-train --stage motor --no-progress
+train "${oracle[@]}" --stage looking --no-progress & looking=$!
+train "${oracle[@]}" --stage reaching
+{ hand reaching reaching --episodes 200 --seed 1000000 --max-steps 800; export_played reaching; } & playing=$!
+train "${oracle[@]}" --stage motor --no-progress
 wait $looking $playing
 
-hand motor motor --episodes 150 --seed 1100000 --max-steps 700 --stand-in-noise-px 3
+hand motor motor --episodes 150 --seed 1100000 --max-steps 900 --stand-in-noise-px 3
 hand longer motor --episodes 240 --seed 1200000 --max-steps 900 --stand-in-noise-px 3
-for stage in grounding refining joint; do
-    train_on_both_cores --stage $stage --watch "$out/reaching" "$out/motor" "$out/longer"
-done
+export_played motor
+export_played longer
+train_on_both_cores "${oracle[@]}" --stage grounding --watch "$out/reaching" "$out/motor" "$out/longer"
+
+play pair --episodes 105 --seed 1300000 --max-steps 1000 \
+    --ponder-checkpoint "$out/run/grounding/ponder" --pounce-checkpoint "$out/run/motor/pounce"
+mend motor hand 4
+mend pair pair 2
+train_on_both_cores "${both[@]}" --stage refining
+train_on_both_cores "${both[@]}" --stage joint
 
 "$bin/pp-eval" --tasks PickHighlight --episodes 60 --runs 1 --seed 1000 \
     --ponder-checkpoint "$out/run/ponder" --pounce-checkpoint "$out/run/pounce" --out "$out/real"

@@ -17,7 +17,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
@@ -26,6 +26,7 @@ from tqdm import tqdm
 import ponderpounce.tasks.headless  # noqa: F401 - before mujoco is imported
 from ponderpounce.data.episode import About, EpisodeWriter, Package, unpack
 from ponderpounce.data.errors import DatasetError
+from ponderpounce.data.export import texts_by_tick
 from ponderpounce.data.jobs import Look
 from ponderpounce.data.lerobot_v3 import INFO_PATH, DatasetWriter
 from ponderpounce.data.rollout import Scribe, UnsolvedError, asked, check_solved, kept_environment
@@ -52,11 +53,11 @@ class CorrectOptions:
     out: Path
     """Folder of the new dataset."""
     per_episode: int = 2
-    """Datasets' episodes of each log, each taken over elsewhere."""
+    """Episodes made of each log, each taken over elsewhere."""
     order: Order = "drawn"
     """With which the logs were played (pp-eval --order)."""
-    look_hz: int = 5
-    """How often pictures are rendered; divides 20."""
+    look_hz: Literal[1, 2, 4, 5, 10, 20] = 5
+    """How often pictures are rendered."""
     image_px: int = 256
     """Even; the paper's and the benchmark's is 256."""
     max_steps: int = 1300
@@ -69,8 +70,6 @@ class CorrectOptions:
     def __post_init__(self) -> None:
         if self.per_episode < 1 or self.workers < 1:
             raise ValueError(f"per_episode and workers must be at least 1, came {self.per_episode} and {self.workers}")
-        if self.look_hz < 1 or 20 % self.look_hz:
-            raise ValueError(f"look_hz must divide 20, came {self.look_hz}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -207,7 +206,7 @@ def _acted_out(
     """The world after these actions.
 
     Raises:
-        DatasetError: it is not the one that the log tells of.
+        DatasetError: it is not the one that the log tells of, or something else is to be done in it.
         UnsolvedError: no time is left there.
     """
     snapshot = first
@@ -222,8 +221,13 @@ def _acted_out(
         raise DatasetError(
             f"{path}: after {len(actions)} ticks the robot stands at {snapshot.state.tolist()} here "
             f"({snapshot.status.value}) and at {None if logged is None else logged.tolist()} in the log, which was "
-            f"made with {record.info.versions}; "
-            "correct it with those versions, and with the --order that it was played in"
+            f"made with {record.info.versions}; correct it with those versions"
+        )
+    text, _, _ = texts_by_tick(record.subgoals, len(actions) + 1)[-1]
+    if text != snapshot.simple_subgoal:
+        raise DatasetError(
+            f"{path}: after {len(actions)} ticks the subgoal is {snapshot.simple_subgoal!r} here and {text!r} in the "
+            "log; correct it with the --order that it was played in"
         )
     return snapshot
 

@@ -98,7 +98,7 @@ def read_episode(path: Path, record: EpisodeRecord) -> Episode:
         narrator = _again(path, environment, info, observations[0])
         for row, frames in narrator.demonstration(FPS):
             writer.add(row, frames)
-        said = _said(record.subgoals, len(actions))
+        said = texts_by_tick(record.subgoals, len(actions))
         reasoning = narrator.reasoning()
         for observation, action, (plain, grounded, is_new), seen in zip(
             observations, actions, said, _pictures(path, observations), strict=True
@@ -151,7 +151,7 @@ def _joined(path: Path, record: EpisodeRecord) -> tuple[list[m.Observation], lis
     return [seen[tick] for tick in range(num_ticks)], [done[tick] for tick in range(num_ticks)]
 
 
-def _said(subgoals: Sequence[m.Subgoal], num_ticks: int) -> list[tuple[str, str, bool]]:
+def texts_by_tick(subgoals: Sequence[m.Subgoal], num_ticks: int) -> list[tuple[str, str, bool]]:
     """The simulator's plain and grounded text in force at each tick, and whether a subgoal is new there.
 
     Texts are logged when they change, and both whenever a subtask begins; a plain one changes at no other time.

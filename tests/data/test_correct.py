@@ -109,6 +109,13 @@ def test_another_scene_is_refused(log: Path, record: EpisodeRecord, monkeypatch:
         work_out(Job(path=log, part=1, options=options(log, log.parent)))
 
 
+def test_another_order_is_refused(log: Path, record: EpisodeRecord, monkeypatch: pytest.MonkeyPatch) -> None:
+    other = [dataclasses.replace(each, text="pick up the second cube") for each in record.subgoals]
+    monkeypatch.setattr(module, "read_log", lambda path: dataclasses.replace(record, subgoals=other))
+    with pytest.raises(DatasetError, match="--order that it was played in"):
+        work_out(Job(path=log, part=1, options=options(log, log.parent)))
+
+
 def test_a_log_with_a_gap_is_refused(log: Path, record: EpisodeRecord, monkeypatch: pytest.MonkeyPatch) -> None:
     holed = dataclasses.replace(record, ticks=record.ticks[:7] + record.ticks[8:])
     monkeypatch.setattr(module, "read_log", lambda path: holed)
