@@ -76,7 +76,9 @@ play pair --episodes 105 --seed 1300000 --max-steps 1000 \
     --ponder-checkpoint "$out/run/grounding/ponder" --pounce-checkpoint "$out/run/motor/pounce"
 mend motor hand 4
 mend pair pair 2
+train "${both[@]}" --stage mending --no-progress & mending=$!
 train_on_both_cores "${both[@]}" --stage refining
+wait $mending
 train_on_both_cores "${both[@]}" --stage joint
 
 "$bin/pp-eval" --tasks PickHighlight --episodes 60 --runs 1 --seed 1000 \

@@ -143,9 +143,9 @@ def tiny_subgoal_text() -> Recipe:
 def small() -> Curriculum:
     """Both architectures at about a million weights each, from scratch on CPU cores: see docs/training.md.
 
-    Where the paper starts from pretrained weights, eyes that `pp-see` has opened and five stages stand in for them, of
+    Where the paper starts from pretrained weights, eyes that `pp-see` has opened and six stages stand in for them, of
     one system each, so that two cores can run them side by side. Episodes that are watched (`pp-train --watch`) are for
-    the last three.
+    the stages that train PONDER, corrected ones (`pp-correct`) for the last three.
     """
     looking = Recipe(
         name="small/looking",
@@ -204,6 +204,12 @@ def small() -> Curriculum:
         train=replace(reaching.train, optim=replace(_FROM_SCRATCH, decay=(6000, 11000))),
         num_steps=11000,
     )
+    mending = replace(  # from what went wrong (`pp-correct`)
+        motor,
+        name="small/mending",
+        train=replace(reaching.train, optim=replace(_FROM_SCRATCH, learning_rate=5e-4, decay=(400, 2000))),
+        num_steps=2000,
+    )
     joint = replace(
         grounding,
         name="small/joint",
@@ -223,7 +229,7 @@ def small() -> Curriculum:
         w3=1.0,
         trains="both",
     )
-    return Curriculum(name="small", stages=(looking, reaching, motor, grounding, refining, joint))
+    return Curriculum(name="small", stages=(looking, reaching, motor, grounding, mending, refining, joint))
 
 
 RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {

@@ -148,6 +148,7 @@ def test_stages_run_apart_are_the_run_in_one_go(folder: Path, tmp_path: Path) ->
         "motor",
         "looking",
         "grounding",
+        "mending",
         "refining",
         "joint",
     ):  # neither system waits for the other
