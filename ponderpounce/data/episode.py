@@ -68,7 +68,7 @@ class About:
     recovery: Recovery = "none"  # where a grasp was made to fail before the right one
     rejected: tuple[Rejection, ...] = ()
     noise_rad: float = 0.0  # standard deviation of the joint targets' noise, far from everything; see `dart`
-    corrected_from: int = 0  # the first row after the demonstration from which the oracle acts; see `correct`
+    corrected_from: int = 0  # the first row after the demonstration that POUNCE imitates; see `correct`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

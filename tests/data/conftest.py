@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,10 @@ import pytest
 
 from ponderpounce.data.episode import CAMERAS, About, EpisodeWriter, Package, Row
 from ponderpounce.data.jobs import Job
+from protocol.bus import LocalBus
+from protocol.link import Link
+from sim_client.config import SimOptions
+from sim_client.suite import Suite
 
 PX = 16
 
@@ -64,6 +69,21 @@ def work_out(job: Job) -> Package:
     """What the oracle would have made of a job."""
     noise = {} if job.noise == "none" else {"nudge_rad": 0.5, "noise_rad": 0.01 * (job.slot % 2)}
     return make_package(job.seed(0), num_rows=3 + job.slot % 3, task=job.task, difficulty=job.difficulty, **noise)
+
+
+@pytest.fixture(scope="session")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Records what sim-client writes of an easy oracle episode; returns the log."""
+
+    def record(task: str, seed: int, **changes: Any) -> Path:
+        out = tmp_path_factory.mktemp("recorded")
+        options = SimOptions(task=task, seed=seed, difficulty="easy", policy="oracle", out=out, **changes)
+        bus = LocalBus()
+        results = Suite(options, Link(bus, robot="r0", proc="sim"), None, lambda: "").run()
+        bus.close()
+        return out / str(results["episodes"][0]["mcap"])
+
+    return record
 
 
 @pytest.fixture(scope="session")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,7 @@ from ponderpounce.data.export import ExportOptions, export, main, read_episode
 from ponderpounce.data.jobs import Job, Look
 from ponderpounce.data.rollout import play
 from ponderpounce.tasks.environment import make_environment
-from protocol.bus import LocalBus
-from protocol.link import Link
 from protocol.mcap_log import EpisodeRecord, read_log
-from sim_client.config import SimOptions
-from sim_client.suite import Suite
 
 SEED, TASK = 3, "VideoUnmask"
 JOB = Job(task=TASK, slot=0, image_px=256, max_steps=1300, look=Look())
@@ -28,14 +25,8 @@ pytestmark = pytest.mark.sim
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What sim-client writes about an oracle episode."""
-    out = tmp_path_factory.mktemp("recorded")
-    options = SimOptions(task=TASK, seed=SEED, difficulty="easy", policy="oracle", out=out, pixels="exact")
-    bus = LocalBus()
-    results = Suite(options, Link(bus, robot="r0", proc="sim"), None, lambda: "").run()
-    bus.close()
-    return out / results["episodes"][0]["mcap"]
+def log(recorded: Callable[..., Path]) -> Path:
+    return recorded(TASK, SEED, pixels="exact")
 
 
 @pytest.fixture(scope="module")
