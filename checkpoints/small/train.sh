@@ -16,7 +16,6 @@ export OMP_NUM_THREADS=1 MUJOCO_GL=${MUJOCO_GL:-egl}
 finished() { [ -d "$out/run/ponder" ]; }
 how=(--recipe small --out "$out/run" --ponder "$out/eyes/ponder" --sights "$out/sights")
 oracle=(--data "$out/data")
-both=(--data "$out/data" "$out"/mended/{hand,hand-stuck,pair,pair-stuck})
 train() { finished || "$bin/pp-train" "${how[@]}" "$@"; }
 train_on_both_cores() { finished || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train "${how[@]}" "$@"; }
 
@@ -44,14 +43,18 @@ export_played() {  # makes a dataset of them
     [ -d "$out/$1/meta" ] || "$bin/pp-export" "${found[@]}" --out "$out/$1"
 }
 
-mend() {  # the oracle takes over the episodes of $out/played/NAME, those that got stuck often
-    local name=$1 as=$2 stuck=$3 found
-    mapfile -t found < <(logs "$name" SUCCESS)
-    [ -d "$out/mended/$as/meta" ] || "$bin/pp-correct" "${found[@]}" --order near-first --look-hz 1 --per-episode 1 \
-        --out "$out/mended/$as"
-    mapfile -t found < <(logs "$name" TIMEOUT)
-    [ -d "$out/mended/$as-stuck/meta" ] || "$bin/pp-correct" "${found[@]}" --order near-first --look-hz 1 \
-        --per-episode "$stuck" --out "$out/mended/$as-stuck"
+correct() {  # the oracle takes over the episodes of $out/played/NAME that ended with a STATUS, each so many times
+    local name=$1 status=$2 as=$3 times=$4 found
+    mapfile -t found < <(logs "$name" "$status")
+    if [ ${#found[@]} -gt 0 ] && [ ! -d "$out/mended/$as/meta" ]; then
+        rm -rf "$out/mended/$as"  # a kill left the beginning
+        "$bin/pp-correct" "${found[@]}" --order near-first --look-hz 1 --per-episode "$times" --out "$out/mended/$as"
+    fi
+}
+
+mend() {  # those that got stuck often
+    correct "$1" SUCCESS "$2" 1
+    correct "$1" TIMEOUT "$2-stuck" "$3"
 }
 
 [ -d "$out/data/meta" ] || "$bin/pp-collect" --tasks PickHighlight --episodes 600 --noise dart --recovery-share 0.4 \
@@ -76,6 +79,8 @@ play pair --episodes 105 --seed 1300000 --max-steps 1000 \
     --ponder-checkpoint "$out/run/grounding/ponder" --pounce-checkpoint "$out/run/motor/pounce"
 mend motor hand 4
 mend pair pair 2
+mended=("$out"/mended/*/)
+both=(--data "$out/data" "${mended[@]%/}")
 train "${both[@]}" --stage mending --no-progress & mending=$!
 train_on_both_cores "${both[@]}" --stage refining
 wait $mending

@@ -13,10 +13,11 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 import ponderpounce.tasks.headless  # noqa: F401 - before mujoco is imported
@@ -24,7 +25,8 @@ from ponderpounce.data.episode import About, EpisodeWriter, Row, unpack
 from ponderpounce.data.errors import DatasetError
 from ponderpounce.data.lerobot_v3 import INFO_PATH, DatasetWriter
 from ponderpounce.data.video import Frame
-from ponderpounce.tasks.difficulty import DIFFICULTIES
+from ponderpounce.tasks.captions import Pixel
+from ponderpounce.tasks.difficulty import DIFFICULTIES, Difficulty
 from ponderpounce.tasks.environment import IMAGE_PX
 from ponderpounce.tasks.geometry import pose, pose_of, transform
 from ponderpounce.tasks.kinematics import Kinematics, UnreachableError
@@ -111,44 +113,62 @@ class Studio:
 
     def __init__(self, task: str, image_px: int) -> None:
         """Raises TaskError if there is no such task, or it does not name its things."""
-        self._task = make_task(task)
-        if type(self._task).things is Task.things:
+        self.task = make_task(task)
+        if type(self.task).things is Task.things:
             raise TaskError(f"task {task!r} does not name its things (Task.things); PickHighlight does")
-        spec = table_scene(self._task.robot)
-        self._task.furnish(spec)
-        self._physics = Physics(spec)
-        self._kinematics = Kinematics(self._physics.model)
-        self._cameras = Cameras(self._physics, image_px)
+        spec = table_scene(self.task.robot)
+        self.task.furnish(spec)
+        self.physics = Physics(spec)
+        self._kinematics = Kinematics(self.physics.model)
+        self._cameras = Cameras(self.physics, image_px)
 
     def picture(self, seed: int) -> tuple[Row, dict[str, Frame]]:
         """One scene, what there is to say of it, and both cameras' pictures; equal seeds give equal ones."""
-        rng, physics = np.random.default_rng([seed, _POSES]), self._physics
-        layout = self._task.sample(np.random.default_rng(seed), DIFFICULTIES[seed % len(DIFFICULTIES)])
+        rng, physics = np.random.default_rng([seed, _POSES]), self.physics
+        layout, _ = self.arranged(seed)
         step = int(rng.choice(_STEPS))
-        physics.reset()
-        self._task.arrange(physics, layout)
-        physics.refresh()
-        self._task.stage(physics, layout, None, step)
-        things = self._task.things(layout, step)
+        self.task.stage(physics, layout, None, step)
+        things = self.task.things(layout, step)
         # what is highlighted lies where it lies
-        self._pose(rng, [thing.body for thing in things if thing.is_movable] if step == 0 else [])
+        self.pose_tool(rng, [thing.body for thing in things if thing.is_movable] if step == 0 else [])
         row = Row(
             state=physics.state().astype(np.float32),
             action=physics.command().astype(np.float32),
-            tcp_pose=pose_of(physics.tcp_transform()).astype(np.float32),
+            tcp_pose=self.tcp_pose(),
             subgoal=INSTRUCTION,
             grounded_subgoal=told(physics, things),
             is_transition=True,
         )
-        return row, self._cameras.frames()
+        return row, self.frames()
+
+    def arranged(self, seed: int) -> tuple[Any, Difficulty]:
+        """Puts up the scene of a seed; returns its layout and how difficult it is."""
+        difficulty = DIFFICULTIES[seed % len(DIFFICULTIES)]
+        layout = self.task.sample(np.random.default_rng(seed), difficulty)
+        self.physics.reset()
+        self.task.arrange(self.physics, layout)
+        self.physics.refresh()
+        return layout, difficulty
+
+    def tcp_pose(self) -> NDArray[np.float32]:
+        """The tool's, (7,)."""
+        return pose_of(self.physics.tcp_transform()).astype(np.float32)
+
+    def frames(self) -> dict[str, Frame]:
+        """What both cameras see now."""
+        return self._cameras.frames()
+
+    def point(self, body: str) -> Pixel | None:
+        """Where the front camera sees the middle of a body, row and column; None if too little of it shows."""
+        return _point(self.physics, body)
 
     def close(self) -> None:
         """Frees the renderer."""
         self._cameras.close()
 
-    def _pose(self, rng: np.random.Generator, movable: Sequence[str]) -> None:
+    def pose_tool(self, rng: np.random.Generator, movable: Sequence[str]) -> None:
         """Puts the tool somewhere above the table, pointing down, sometimes with a thing between its fingers."""
-        physics = self._physics
+        physics = self.physics
         if rng.random() < _HOME_SHARE:
             return
         opening_m = float(rng.choice([0.0, HOME_OPENING_M / 2, HOME_OPENING_M]))
@@ -174,11 +194,15 @@ def told(physics: Physics, things: Sequence[Thing]) -> str:
     """What the front camera sees of ``things``, from left to right: "red cube at <y, x>, button at <y, x>"."""
     seen = []
     for thing in things:
-        pixels = visible_pixels(physics, FRONT, thing.body, IMAGE_PX)
-        point = mean_pixel(pixels) if len(pixels) >= _MIN_PIXELS else None
+        point = _point(physics, thing.body)
         if point is not None:
             seen.append((point[1], point[0], thing.name))
     return SEPARATOR.join(f"{name} at <{y}, {x}>" for x, y, name in sorted(seen))
+
+
+def _point(physics: Physics, body: str) -> Pixel | None:
+    pixels = visible_pixels(physics, FRONT, body, IMAGE_PX)
+    return mean_pixel(pixels) if len(pixels) >= _MIN_PIXELS else None
 
 
 def _num_pages(options: AlbumOptions) -> int:

@@ -136,6 +136,13 @@ def _origin(dataset: Dataset) -> list[str]:
         )
         if (noise := settings.get("noise")) is not None:
             lines.append(_noise(noise, dataset.episodes))
+        if (shoves := settings.get("shoves")) is not None:
+            lines.append(
+                f"In {round(100 * shoves['share'])} % of the episodes things may be moved aside by "
+                f"{shoves['least_m'] * 100:g} to {shoves['most_m'] * 100:g} cm while the hand is on its way."
+            )
+        if settings.get("texts") == "follow":
+            lines.append("Coordinates in subgoals follow what was pushed.")
     return lines
 
 

@@ -27,6 +27,7 @@ from ponderpounce.data.jobs import DIFFICULTY_CYCLE, RECOVERY_SHARE, Job, Look, 
 from ponderpounce.data.lerobot_v3 import COLLECTION_PATH, INFO_PATH, DatasetWriter
 from ponderpounce.data.rollout import UNSOLVED, work_out
 from ponderpounce.data.seeds import TRAIN_SEED
+from ponderpounce.data.shove import SHOVES
 from ponderpounce.data.store import Store
 from ponderpounce.data.workers import LocalWorkers, RayWorkers, Workers
 from ponderpounce.tasks.difficulty import Difficulty, Order
@@ -66,6 +67,11 @@ class CollectOptions:
     order: Order = "drawn"
     """Where a task leaves open what is done first: as the scene was drawn (upstream), or what is nearest to the front
     camera first, which a learner can foresee."""
+    texts: Literal["latched", "follow"] = "latched"
+    """Coordinates in subgoals: as first seen (upstream), or corrected when their thing was pushed elsewhere."""
+    shove_share: float = 0.0
+    """Of the episodes, those in which things are moved aside while the hand is on its way to them; with --texts
+    follow."""
     max_steps: int = 1300
     """An episode that takes longer is not kept."""
     workers: int = os.cpu_count() or 1
@@ -84,6 +90,11 @@ class CollectOptions:
             raise DatasetError(f"--image-px {self.image_px}: videos need an even number of at least 16")
         if not 0 <= self.recovery_share <= 1:
             raise DatasetError(f"--recovery-share {self.recovery_share} is not a share, in [0, 1]")
+
+        if not 0 <= self.shove_share <= 1:
+            raise DatasetError(f"--shove-share {self.shove_share} is not a share, in [0, 1]")
+        if self.shove_share and self.texts != "follow":
+            raise DatasetError("--shove-share would make every told place wrong; give --texts follow with it")
 
     @property
     def look(self) -> Look:
@@ -108,6 +119,8 @@ class CollectOptions:
             recovery_share=self.recovery_share,
             difficulties=self.difficulties,
             order=self.order,
+            texts_follow=self.texts == "follow",
+            shove_share=self.shove_share,
         )
         return list(jobs)
 
@@ -127,6 +140,10 @@ class CollectOptions:
             settings["difficulties"] = list(self.difficulties)
         if self.order != "drawn":
             settings["order"] = self.order
+        if self.texts != "latched":
+            settings["texts"] = self.texts
+        if self.shove_share:
+            settings["shoves"] = SHOVES.settings(self.shove_share)
         return settings if self.noise == "none" else {**settings, "noise": DART.settings()}
 
 

@@ -24,6 +24,7 @@ from ponderpounce.data.video import FPS, Frame, VideoWriter
 
 CAMERAS = ("front", "wrist")
 ROWS, ABOUT = "rows.parquet", "episode.json"
+WANDERING = "wandering things"  # the origin of what pp-wander made
 EXECUTED = "executed_action"  # the one column that only some datasets have
 
 Package = dict[str, bytes]  # file name -> content

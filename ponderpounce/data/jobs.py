@@ -50,6 +50,8 @@ class Job:
     recovery_share: float = RECOVERY_SHARE
     difficulties: tuple[Difficulty, ...] = DIFFICULTY_CYCLE
     order: Order = "drawn"
+    texts_follow: bool = False
+    shove_share: float = 0.0
 
     @property
     def key(self) -> str:
@@ -82,6 +84,8 @@ def jobs_of(
     recovery_share: float = RECOVERY_SHARE,
     difficulties: tuple[Difficulty, ...] = DIFFICULTY_CYCLE,
     order: Order = "drawn",
+    texts_follow: bool = False,
+    shove_share: float = 0.0,
 ) -> Iterator[Job]:
     """Yields the jobs task by task, in the order their episodes have in the dataset."""
     for task in tasks:
@@ -96,6 +100,8 @@ def jobs_of(
                 recovery_share=recovery_share,
                 difficulties=difficulties,
                 order=order,
+                texts_follow=texts_follow,
+                shove_share=shove_share,
             )
 
 

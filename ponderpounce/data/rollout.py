@@ -15,6 +15,7 @@ import ponderpounce.tasks.headless  # noqa: F401 - before mujoco is imported
 from ponderpounce.data.dart import Dart, episode_std_rad
 from ponderpounce.data.episode import About, EpisodeWriter, Package, Rejection, Row
 from ponderpounce.data.jobs import ATTEMPTS, Job, Look, failed_grasp
+from ponderpounce.data.shove import Shoves, is_shoved
 from ponderpounce.data.video import FPS, Frame
 from ponderpounce.tasks.difficulty import Order
 from ponderpounce.tasks.engine import Status
@@ -104,7 +105,7 @@ class Scribe:
 
 def work_out(job: Job) -> Package:
     """Tries the job's seeds in turn; returns the first solved episode, or why there is none."""
-    environment = kept_environment(job.task, job.image_px, job.max_steps, job.order)
+    environment = kept_environment(job.task, job.image_px, job.max_steps, job.order, job.texts_follow)
     rejected: list[Rejection] = []
     for attempt in range(ATTEMPTS):
         seed = job.seed(attempt)
@@ -142,17 +143,20 @@ def _solve(environment: Environment, job: Job, seed: int, rejected: tuple[Reject
 def play(
     environment: Environment, job: Job, seed: int, fails: FailedGrasp | None = None, take: Take | None = None
 ) -> Motions:
-    """Plays an episode with the oracle, under the job's noise, and hands its rows to ``take``; without, nobody looks.
+    """Plays an episode with the oracle, under the job's noise and shoves, and hands its rows to ``take``.
 
-    Returns what the arm did. Raises UnsolvedError unless it ends with success.
+    Without ``take`` nobody looks. Returns what the arm did. Raises UnsolvedError unless it ends with success.
     """
     snapshot = environment.reset(seed, job.difficulty)
     scribe = Scribe(environment, take, job.look)
     scribe.begin()
-    motions = Motions(environment.physics, fails)
+    shoves = Shoves(environment.physics, environment.subtasks, seed) if is_shoved(seed, job.shove_share) else None
+    motions = Motions(environment.physics, fails, watches=shoves is not None)
     script = environment.oracle(motions)
     dart = Dart(environment.physics, seed) if job.noise == "dart" else None
     while snapshot.status is Status.ONGOING:
+        if shoves is not None:
+            shoves.step(snapshot.subtask_index)
         action = asked(script, snapshot)
         snapshot = scribe.step(snapshot, action, None if dart is None else dart.executed(action))
     check_solved(snapshot)

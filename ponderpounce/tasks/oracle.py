@@ -7,7 +7,7 @@ the arm's speed and acceleration limits; a gripper command holds the arm still f
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +20,8 @@ from ponderpounce.tasks.kinematics import Kinematics, UnreachableError
 from ponderpounce.tasks.physics import CONTROL_HZ, Physics
 from ponderpounce.tasks.scene import BUTTON_BASE_HEIGHT_M
 
-Actions = Iterator[NDArray[np.float32]]
+Action = NDArray[np.float32]
+Actions = Iterator[Action]
 
 MAX_ACCELERATION_RAD_S2 = 0.9
 GRIPPER_STEPS = 6
@@ -60,15 +61,25 @@ class Motions:
 
     ``num_grasps`` counts the grasps begun so far, without the failed ones.
 
+    With ``watches`` a grasp follows a thing that is moved meanwhile; without, as upstream, it closes where that was.
+
     With ``resumes`` the first grasp takes over from whoever moved the arm before: it goes on from where the tool is,
     down upon the thing, up with it, or up and over it once more. ``has_resumed`` is true from then on.
     """
 
-    def __init__(self, physics: Physics, failed_grasp: FailedGrasp | None = None, *, resumes: bool = False) -> None:
+    def __init__(
+        self,
+        physics: Physics,
+        failed_grasp: FailedGrasp | None = None,
+        *,
+        resumes: bool = False,
+        watches: bool = False,
+    ) -> None:
         self.num_grasps = 0
         self.has_resumed = False
         self._failed_grasp = failed_grasp
         self._resumes = resumes
+        self._watches = watches
         self._physics = physics
         self._kinematics = Kinematics(physics.model)
         self._max_speed_rad_s = physics.robot.oracle_speed_rad_s
@@ -297,11 +308,26 @@ class Motions:
         failed, self.num_grasps = self._failed_grasp, self.num_grasps + 1
         if failed is not None and failed.before == self.num_grasps - 1:
             yield from self._miss(body, from_z_m, grasp_z_m, miss_m * np.array(failed.offset))
-        above = self._above_block(body, from_z_m, grasp_z_m)
-        yield from self.open_at(above)
-        yield from self.move(_at_height(above, grasp_z_m))
+        above = yield from self._reach_down(body, from_z_m, grasp_z_m)
+        while self._watches and self._is_elsewhere(body, above):
+            yield from self.move(above)
+            above = yield from self._reach_down(body, from_z_m, grasp_z_m)
         yield from self.close()
         yield from self.move(above)
+
+    def _reach_down(self, body: str, from_z_m: float, grasp_z_m: float) -> Generator[Action, None, Array]:
+        """Brings the open fingers around a body; returns where it was taken to be: the tool waiting above it (4, 4)."""
+        above = self._above_block(body, from_z_m, grasp_z_m)
+        yield from self.open_at(above)
+        while self._watches and self._is_elsewhere(body, above):
+            above = self._above_block(body, from_z_m, grasp_z_m)
+            yield from self.open_at(above)
+        yield from self.move(_at_height(above, grasp_z_m))
+        return above
+
+    def _is_elsewhere(self, body: str, above: Array) -> bool:
+        """Whether a body has left the place below a transform (4, 4)."""
+        return bool(np.linalg.norm(self._physics.position_m(body)[:2] - above[:2, 3]) > _OVER_M)
 
     def _resume(self, body: str, from_z_m: float, grasp_z_m: float) -> Actions:
         """A grasp that somebody else has begun, well or badly."""
@@ -409,7 +435,7 @@ class Motions:
                 return way
         raise UnreachableError("no straight way leads there: " + "; ".join(failures))
 
-    def _action(self, qpos: Array) -> NDArray[np.float32]:
+    def _action(self, qpos: Array) -> Action:
         return np.append(qpos, self._gripper).astype(np.float32)
 
 

@@ -62,7 +62,7 @@ class Physics:
             if int(model.body_parentid[body]) in self._owner:
                 self._owner[body] = self._owner[int(model.body_parentid[body])]
         self._compiled_rgba = model.geom_rgba.copy()
-        self._props = [model.body(b).name for b in range(model.nbody) if _is_prop(model, b)]
+        self.props = tuple(model.body(b).name for b in range(model.nbody) if _is_prop(model, b))
         self.reset()
 
     def reset(self) -> None:
@@ -72,7 +72,7 @@ class Physics:
         self.data.qpos[self._arm_qpos] = panda.HOME_QPOS
         self.data.qpos[self._finger_qpos] = self.robot.open_fingers_m
         self.data.ctrl[:] = self.robot.control_of(np.append(panda.HOME_QPOS, self.robot.rest_command))
-        for name in self._props:
+        for name in self.props:
             self.park(name)
         self.refresh()
 
@@ -90,10 +90,14 @@ class Physics:
         if body.mocapid[0] < 0:
             self.data.xfrc_applied[body.id] = 0.0
 
+    def is_free(self, name: str) -> bool:
+        """Whether a body is a prop that the arm can push about."""
+        return name in self.props and int(self.model.body(name).mocapid[0]) < 0
+
     def park(self, name: str) -> None:
         """Puts a prop out of sight of both cameras, where it floats at rest until it is placed again."""
         body = self.model.body(name)
-        x_m = _PARK_XYZ_M[0] + self._props.index(name) * _PARK_SPACING_M
+        x_m = _PARK_XYZ_M[0] + self.props.index(name) * _PARK_SPACING_M
         self._set_pose(name, pose(x_m, *_PARK_XYZ_M[1:]))
         if body.mocapid[0] < 0:
             # An upward push equal to its weight; unlike model.body_gravcomp it is part of the saved state.

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ponderpounce.data.dataset import Dataset, Entry
-from ponderpounce.data.episode import CAMERAS, Rows
+from ponderpounce.data.episode import CAMERAS, WANDERING, Rows
 from ponderpounce.data.video import FPS
 from ponderpounce.models.action_space import ActionSpace, actions_in, num_dims, states_in
 from ponderpounce.models.context import ContextFormat
@@ -188,6 +188,7 @@ class TrainingSet:
             reasoning=rows.demonstration_reasoning[start],
             imitated_from=entry.corrected_from,
             is_watched=source.is_watched,
+            is_told=entry.origin == WANDERING,
         )
 
     def _pictures(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from clock.sampling import Clocks, SampledInvocation, SampledSchedule, sample_schedule
-from ponderpounce.models.context import ContextFormat, Row, Transition
+from ponderpounce.models.context import IGNORE, ContextFormat, Row, Transition
 from ponderpounce.models.eyes import see
 from ponderpounce.models.normalisation import Floats
 from ponderpounce.models.ponder_coordinates import normalised_text
@@ -52,6 +52,8 @@ class TrainingEpisode:
     """The tick from which POUNCE imitates; before it somebody else acted (`pp-correct`)."""
     is_watched: bool = False
     """Somebody else's doing, good or bad: PONDER learns to follow it, POUNCE does not imitate it."""
+    is_told: bool = False
+    """PONDER cannot know what is to be said, or when (`pp-wander`): it learns to follow what texts point at, only."""
     sights: Sequence[tuple[Frame, ...]] | None = None
     """T ticks of what PONDER's eyes make of the views, where ``frames`` are not the cameras' own; ``demo`` then is what
     they make of it, too."""
@@ -170,9 +172,10 @@ class Example:
 
     def row(self) -> Row:
         """PONDER's tokens."""
-        return episode_row(
+        row = episode_row(
             self.episode, self.form, self.schedule, is_grounded=self.is_grounded, view=self.view, slip=self.slip
         )
+        return replace(row, targets=(IGNORE,) * len(row.targets)) if self.episode.is_told else row
 
     def frames(self) -> Tensor:
         """PONDER's pictures, (num_images, height, width, 3) uint8."""
@@ -201,9 +204,9 @@ def make_example(
     count = 0 if episode.is_watched else min(config.max_invocations, len(imitated))
     chosen = np.sort(rng.choice(len(imitated), size=count, replace=False)) if count else ()
     invocations = tuple(schedule.invocations[imitated[index]] for index in chosen)
-    is_grounded = config.is_grounded and rng.random() >= config.text_dropout
+    is_grounded = config.is_grounded and (rng.random() >= config.text_dropout or episode.is_told)
     slip = None
-    if is_grounded and config.slips and rng.random() < config.slips:
+    if is_grounded and config.slips and not episode.is_told and rng.random() < config.slips:
         std_px = float(np.exp(rng.uniform(*np.log(config.slip_px))))
         slip = Slip(std_px=std_px, seed=int(rng.integers(1 << 62)))
     elif is_grounded and config.tremble_px:

@@ -183,8 +183,12 @@ class JointModel(nn.Module):
         w2: float = 0.1,
         w3: float = 0.0,
         trains: Trains = "both",
+        keeps_eyes: bool = False,
     ) -> None:
-        """Raises ValueError if POUNCE was built for another cognition than PONDER gives."""
+        """With ``keeps_eyes`` PONDER's vision tower stays as it is.
+
+        Raises ValueError if POUNCE was built for another cognition than PONDER gives.
+        """
         super().__init__()
         wanted = (pounce.config.cognition.num_carriers, pounce.config.cognition.cognition_size)
         given = (ponder.format.num_carriers, ponder.hidden_size)
@@ -197,6 +201,8 @@ class JointModel(nn.Module):
         for name, system in (("ponder", ponder), ("pounce", pounce)):
             if trains not in ("both", name):
                 system.requires_grad_(False)
+        if keeps_eyes:
+            ponder.qwen.model.visual.requires_grad_(False)
 
     @property
     def needs_stand_ins(self) -> bool:

@@ -43,6 +43,9 @@ class Recipe:
     """Of the auxiliary alignment with the stand-ins (`stand_in`); the paper has no such loss."""
     trains: Trains = "both"
     """Which systems; the other is not run."""
+    keeps_eyes: bool = False
+    """PONDER's vision tower stays as it is: a language model that needs few of the things in a picture lets the eyes
+    forget the others."""
     space: ActionSpace = "joint_delta"
     """What POUNCE's actions are."""
     statistics_by_row: bool = False
@@ -232,6 +235,27 @@ def small() -> Curriculum:
     return Curriculum(name="small", stages=(looking, reaching, motor, grounding, mending, refining, joint))
 
 
+def small_following() -> Curriculum:
+    """The pair that `small` has left learns to follow what moves: see docs/training.md, "A PONDER that follows".
+
+    Begins with eyes that `pp-see --ponder` has opened again, and keeps them. Between the first two stages `pp-follow`
+    changes PONDER.
+    """
+    *_, refining, joint = small().stages
+    refocusing = replace(
+        refining,
+        name="small_following/refocusing",
+        example=replace(refining.example, max_queries=12),
+        train=TrainConfig(seed=0, optim=_FROM_SCRATCH),
+        num_steps=500,
+        keeps_eyes=True,
+    )
+    following = replace(refocusing, name="small_following/following", num_steps=300)
+    refining = replace(refining, name="small_following/refining", keeps_eyes=True)
+    joint = replace(joint, name="small_following/joint", keeps_eyes=True)
+    return Curriculum(name="small_following", stages=(refocusing, following, refining, joint))
+
+
 RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
     "robomme": robomme,
     "robocasa_dc": robocasa_dc,
@@ -239,6 +263,7 @@ RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
     "tiny_groot": tiny_groot,
     "tiny_subgoal_text": tiny_subgoal_text,
     "small": small,
+    "small_following": small_following,
 }
 
 

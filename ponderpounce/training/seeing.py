@@ -16,7 +16,7 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -32,7 +32,7 @@ from tqdm import tqdm
 from ponderpounce.data.errors import DatasetError
 from ponderpounce.models.context import ContextFormat
 from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_checkpoint import save_ponder
+from ponderpounce.models.ponder_checkpoint import load_ponder, save_ponder
 from ponderpounce.models.vocabulary import Vocabulary
 from ponderpounce.training.augment import Augmentation, draw_view
 from ponderpounce.training.data import Sight, TrainingSet
@@ -60,6 +60,8 @@ class SeeOptions:
     """A folder that pp-collect made: PONDER's tokenizer is trained on its texts, as pp-train would."""
     album: Path
     """A folder that pp-album made."""
+    ponder: Path | None = None
+    """Open the eyes of this one again, all else as it is; --recipe and --data are then not read."""
     out: Path
     """OUT/ponder is what `pp-train --ponder` goes on from."""
     steps: int = 2000
@@ -112,14 +114,9 @@ def see_things(options: SeeOptions) -> None:
         DatasetError, ValueError, OSError: what was given does not fit; the message says why.
         FloatingPointError: the gradients are not finite.
     """
-    run = stages_of(recipe(options.recipe))[0]
-    if not run.from_scratch:
-        raise ValueError(f"recipe {run.name} starts from pretrained weights, which can see; pp-see is for small")
     if (options.out / "ponder").exists():
         raise ValueError(f"{options.out} holds a PONDER already; use another --out")
-    texts = TrainingSet(options.data).texts()
-    vocabulary = Vocabulary.trained_on(texts, run.ponder.first_carrier_id) if run.has_own_tokenizers else None
-    ponder = Ponder.random(run.ponder, vocabulary, seed=options.seed)
+    ponder = _newborn(options) if options.ponder is None else load_ponder(options.ponder)
     album = read_album(options.album, ponder.format)
     num_held_out = max(1, round(_HELD_OUT_SHARE * len(album.texts)))
     num_learned = len(album.texts) - num_held_out
@@ -148,6 +145,16 @@ def see_things(options: SeeOptions) -> None:
     save_ponder(ponder, options.out / "ponder")
 
 
+def _newborn(options: SeeOptions) -> Ponder:
+    """The recipe's, as it is drawn."""
+    run = stages_of(recipe(options.recipe))[0]
+    if not run.from_scratch:
+        raise ValueError(f"recipe {run.name} starts from pretrained weights, which can see; pp-see is for small")
+    texts = TrainingSet(options.data).texts()
+    vocabulary = Vocabulary.trained_on(texts, run.ponder.first_carrier_id) if run.has_own_tokenizers else None
+    return Ponder.random(run.ponder, vocabulary, seed=options.seed)
+
+
 def read_album(folder: Path, form: ContextFormat) -> Album:
     """All pictures of a folder. Raises DatasetError if it is none, ValueError if its texts name nothing."""
     if form.eyes is None or len(form.eyes) != 1 or form.eyes[0].camera != 0:
@@ -159,10 +166,18 @@ def read_album(folder: Path, form: ContextFormat) -> Album:
         page = pages[number]
         pictures += [sight[0] for sight in page.sights or ()]
         texts += page.subgoals
+    try:
+        return Album(pictures=np.stack(pictures), texts=tuple(texts), names=names_in(texts))
+    except ValueError as error:
+        raise ValueError(f"{folder}: {error}; make it with pp-album") from None
+
+
+def names_in(texts: Iterable[str]) -> tuple[str, ...]:
+    """What an album's texts call things, sorted. Raises ValueError if they name nothing."""
     names = {found[1].strip() for text in texts for found in _THING.finditer(text)}
     if not names:
-        raise ValueError(f"no text of {folder} names a thing and its place; make it with pp-album")
-    return Album(pictures=np.stack(pictures), texts=tuple(texts), names=tuple(sorted(names)))
+        raise ValueError("no text names a thing and its place")
+    return tuple(sorted(names))
 
 
 def draw(

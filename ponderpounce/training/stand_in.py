@@ -25,6 +25,7 @@ from ponderpounce.training.places import PLACE, TEXT_PX
 _COLOUR = re.compile(r", which is \w+")
 _PERIODS = 2.0 ** np.arange(1, -5, -1)  # of the picture's side: two pictures down to 16 px
 NUM_PLACE_FEATURES = 2 * (2 * len(_PERIODS) + 1)
+_WAVE_PX = tuple(round(period * TEXT_PX) for period in _PERIODS)
 _VALUE_SCALE = 2 * 3**0.5  # a coordinate is uniform in [-1/2, 1/2] at most: rms 1
 _NOWHERE = (TEXT_PX // 2, TEXT_PX // 2)
 
@@ -54,6 +55,12 @@ def place_features(yx_px: tuple[int, int]) -> NDArray[np.float32]:
     angles = 2 * np.pi * np.outer(1 / _PERIODS, yx).ravel()
     waves = 2**0.5 * np.concatenate([np.sin(angles), np.cos(angles)])
     return np.concatenate([waves, (yx - 0.5) * _VALUE_SCALE]).astype(np.float32)
+
+
+def wave_columns(period_px: int) -> list[int]:
+    """Which of `place_features` turn once in so many pixels: sine and cosine of y and x. Raises ValueError if none."""
+    first = 2 * _WAVE_PX.index(period_px)
+    return [first, first + 1, first + 2 * len(_PERIODS), first + 1 + 2 * len(_PERIODS)]
 
 
 @functools.lru_cache(maxsize=1 << 10)

@@ -59,8 +59,8 @@ class TrainOptions:
     """Trains PONDER and POUNCE together. The same command again resumes a run that was killed."""
 
     recipe: str
-    """robomme and robocasa_dc are the paper's; small learns from scratch on CPU cores; tiny and tiny_groot are for a
-    try."""
+    """robomme and robocasa_dc are the paper's; small learns from scratch on CPU cores, and small_following goes on from
+    there; tiny and tiny_groot are for a try."""
     data: tuple[Path, ...]
     """Folders that pp-collect, pp-export or pp-correct made: episodes to imitate."""
     out: Path
@@ -144,6 +144,8 @@ class Batches:
             with_rows=run.trains != "pounce",
             stand_in_size=model.ponder.hidden_size if model.needs_stand_ins else 0,
         )
+        if run.trains == "ponder":  # nobody acts: any moment will do, also one that is not to be imitated
+            examples = [replace(each, invocations=each.schedule.invocations[:1], nudges_I2=None) for each in examples]
         invocations = collate_pounce(examples, model.pounce.config, bundle.tokenizer, bundle.statistics)
         return episodes.to(self._device), invocations.to(self._device)
 
@@ -303,7 +305,9 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
     if isinstance(pounce.config, PounceConfig) and isinstance(run.pounce, PounceConfig):
         pounce.config = replace(pounce.config, max_committed_rows=run.pounce.max_committed_rows)
     freeze(pounce, run.freeze)
-    return JointModel(ponder, pounce, w1=run.w1, w2=run.w2, w3=run.w3, trains=run.trains), bundle
+    return JointModel(
+        ponder, pounce, w1=run.w1, w2=run.w2, w3=run.w3, trains=run.trains, keeps_eyes=run.keeps_eyes
+    ), bundle
 
 
 def export(model: JointModel, bundle: PounceBundle, out: Path, *, trained: Trains = "both") -> None:

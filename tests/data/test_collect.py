@@ -23,6 +23,7 @@ from ponderpounce.data.episode import Package
 from ponderpounce.data.errors import DatasetError
 from ponderpounce.data.jobs import Job
 from ponderpounce.data.rollout import UNSOLVED
+from ponderpounce.data.shove import SHOVES
 from ponderpounce.data.store import Store
 
 TASKS, EPISODES = ("PickHighlight", "VideoUnmask"), 3  # names only: nothing is simulated here
@@ -139,7 +140,20 @@ def test_orders_and_difficulties_are_told_and_never_mixed(tmp_path: Path, preten
     told = json.loads((tmp_path / COLLECTION_PATH).read_text())["settings"]
     assert told["order"] == "near-first"
     assert told["difficulties"] == ["hard", "easy"]
+    assert not {"texts", "shoves"} & set(told)
     for other in ({"order": "near-first"}, {"difficulties": ("hard", "easy")}):
+        with pytest.raises(DatasetError, match="another --out"):
+            collect(options(tmp_path, **other), InOrder(pretend))
+
+
+def test_shoves_and_texts_that_follow_are_told_and_never_mixed(tmp_path: Path, pretend: WorkOut) -> None:
+    ours = options(tmp_path, texts="follow", shove_share=0.7)
+    collect(ours, InOrder(pretend))
+    told = json.loads((tmp_path / COLLECTION_PATH).read_text())["settings"]
+    assert told["texts"] == "follow"
+    assert told["shoves"] == SHOVES.settings(0.7)
+    assert "70 %" in card(Dataset(tmp_path))
+    for other in ({"texts": "follow"}, {}, {"texts": "follow", "shove_share": 0.6}):
         with pytest.raises(DatasetError, match="another --out"):
             collect(options(tmp_path, **other), InOrder(pretend))
 
@@ -227,7 +241,10 @@ def test_the_estimate_is_what_was_measured_as_soon_as_something_was() -> None:
     assert disk_needed(10, [], 128) == disk_needed(10, [], 256) // 2
 
 
-@pytest.mark.parametrize("changes", [{"image_px": 65}, {"episodes": 0}, {"workers": 0}])
+@pytest.mark.parametrize(
+    "changes",
+    [{"image_px": 65}, {"episodes": 0}, {"workers": 0}, {"texts": "follow", "shove_share": 1.1}, {"shove_share": 0.5}],
+)
 def test_options_that_make_no_sense_are_refused(tmp_path: Path, changes: dict[str, Any]) -> None:
     with pytest.raises(DatasetError):
         options(tmp_path, **changes)

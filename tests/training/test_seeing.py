@@ -86,6 +86,12 @@ def test_the_tower_learns_and_nothing_else_moves(tmp_path: Path, capsys: pytest.
     assert moved == {name for name in before if ".visual." in name}
     assert main(arguments) == REFUSED
     assert "another --out" in capsys.readouterr().err
+    again = [*arguments[:-1], str(tmp_path / "again"), "--ponder", str(out / "ponder"), "--steps", "3"]
+    assert main([*again, "--pictures", "32", "--no-progress"]) == 0
+    reopened = load_ponder(tmp_path / "again" / "ponder")
+    once = dict(seeing.qwen.named_parameters())
+    moved = {name for name, weight in reopened.qwen.named_parameters() if not torch.equal(weight, once[name])}
+    assert moved == {name for name in once if ".visual." in name}
 
 
 def test_a_recipe_that_can_see_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -114,6 +114,43 @@ def test_a_stage_moves_its_own_system_alone(
     assert (reports[0].num_supervised > 0) == (stage == "looking")
 
 
+def test_eyes_that_are_kept_stay_as_they_are(folder: Path, small: dict[str, Recipe]) -> None:
+    trainer = trainer_of(replace(small["looking"], keeps_eyes=True), folder)
+    before = snapshot(trainer.model, "ponder.")
+    list(trainer.run(2))
+    is_same = {name: torch.equal(now, before[name]) for name, now in snapshot(trainer.model, "ponder.").items()}
+    assert all(same for name, same in is_same.items() if ".visual." in name)
+    assert not all(same for name, same in is_same.items() if ".visual." not in name)
+
+
+def test_who_only_follows_says_nothing_and_always_reads(folder: Path, small: dict[str, Recipe]) -> None:
+    model, _ = build(small["looking"], TrainingSet(folder), options(folder, folder / "unused"))
+    config = replace(small["looking"].example, text_dropout=1.0, slips=1.0)
+    told = replace(TrainingSet(folder)[0], is_told=True)
+    silent, wordless = (
+        make_example(episode, model.ponder.format, config, np.random.default_rng(0))
+        for episode in (told, replace(told, is_told=False))
+    )
+    assert silent.is_grounded
+    assert not wordless.is_grounded
+    assert silent.slip is None
+    assert len(silent.row().ids) > len(wordless.row().ids)
+    assert not len(silent.row().supervised_index)
+    assert len(wordless.row().supervised_index)
+
+
+def test_ponder_learns_from_episodes_that_nobody_is_to_imitate(folder: Path, small: dict[str, Recipe]) -> None:
+    """Corrections may begin after a short row has ended."""
+    data = TrainingSet(folder)
+    late = [replace(data[number], imitated_from=data[number].num_ticks - 1) for number in range(len(data))]
+    data._cache.update(enumerate(late))
+    run = replace(small["looking"], example=replace(small["looking"].example, max_queries=1))
+    model, bundle = build(run, data, options(folder, folder / "unused"))
+    episodes, invocations = Batches(data, run, model, bundle, World())(0)
+    assert episodes.num_episodes == run.batch_episodes
+    assert len(invocations.actions_INA) > 0
+
+
 def test_a_stage_makes_only_what_it_reads(folder: Path, small: dict[str, Recipe]) -> None:
     stages = small["motor"], small["looking"], replace(small["joint"], w3=0.0), small["joint"]
     motor, looking, joint, aligned = (trainer_of(stage, folder)._batches(0) for stage in stages)
