@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # A PONDER that follows what moves, from the pair that train.sh has left, on two CPU cores: see docs/training.md, "A PONDER
-# that follows". The shipped policy is the one of train.sh; this one solved as many scenes, not more.
+# that follows".
 #
 #     checkpoints/small/follow.sh [OUT]       (the OUT of train.sh)
 #
@@ -12,56 +12,41 @@ set -euo pipefail
 out=${1:-out/small}
 bin=${BIN:-.venv/bin}
 more=$out/follow
+source "$(dirname "$0")/common.sh"
 export OMP_NUM_THREADS=1 MUJOCO_GL=${MUJOCO_GL:-egl}
-
-logs() {  # of finished episodes that the pair played and that ended with a STATUS
-    "$bin/python" -c 'import json, pathlib, sys
-folder, wanted = pathlib.Path(sys.argv[1]), sys.argv[2]
-for each in json.loads((folder / "results.json").read_text())["episodes"]:
-    if each["status"] == wanted:
-        print(folder / each["mcap"])' "$more/played" "$1"
-}
-
-correct() {  # the oracle takes them over, each so many times
-    local status=$1 times=$2 found
-    mapfile -t found < <(logs "$status")
-    if [ ${#found[@]} -gt 0 ] && [ ! -d "$more/mended/$status/meta" ]; then
-        rm -rf "$more/mended/$status"  # a kill left the beginning
-        "$bin/pp-correct" "${found[@]}" --order near-first --look-hz 1 --per-episode "$times" --out "$more/mended/$status"
-    fi
-}
 
 [ -d "$more/data/meta" ] || "$bin/pp-collect" --tasks PickHighlight --episodes 600 --noise dart --recovery-share 0.4 \
     --frames training --invocation-hz 5 --difficulties easy medium hard hard medium --order near-first --texts follow \
     --shove-share 0.7 --out "$more/data"
-[ -d "$more/wander/meta" ] || "$bin/pp-wander" --episodes 600 --out "$more/wander"
+{ [ -d "$more/wander/meta" ] || "$bin/pp-wander" --episodes 600 --out "$more/wander"; } & wandering=$!
 [ -d "$out/album/meta" ] || "$bin/pp-album" --pictures 10000 --out "$out/album"
+wait $wandering
 
-"$bin/pp-eval" --tasks PickHighlight --runs 1 --order near-first --record --record-hz 5 --workers 2 --episodes 150 \
-    --seed 1400000 --max-steps 1000 --ponder-checkpoint "$out/run/ponder" --pounce-checkpoint "$out/run/pounce" \
-    --out "$more/played"
-correct TIMEOUT 3
-correct SUCCESS 1
+for difficulty in medium hard; do
+    played=$more/played/$difficulty
+    "$bin/pp-eval" --tasks PickHighlight --difficulty $difficulty --runs 1 --order near-first --record --record-hz 5 --workers 2 \
+        --episodes 120 --seed 1400000 --max-steps 1000 --ponder-checkpoint "$out/run/ponder" \
+        --pounce-checkpoint "$out/run/pounce" --out "$played"
+    correct "$played" TIMEOUT 3 "$more/mended/$difficulty-stuck"
+    correct "$played" SUCCESS 1 "$more/mended/$difficulty"
+done
 mended=("$more"/mended/*/)
 
-[ -d "$more/eyes/ponder" ] || OMP_NUM_THREADS=2 "$bin/pp-see" --recipe small_following --data "$more/data" \
+[ -d "$more/eyes/ponder" ] || OMP_NUM_THREADS=2 "$bin/pp-see" --recipe small_refocusing --data "$more/data" \
     --album "$out/album" --ponder "$out/run/ponder" --steps 1500 --learning-rate 1e-3 --out "$more/eyes"
 
-train() {
-    [ -d "$more/run/ponder" ] || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --recipe small_following \
-        --data "$more/data" "${mended[@]%/}" --out "$more/run" --pounce "$out/run/pounce" --sights "$more/sights" "$@"
+train() {  # the RECIPE from a PONDER into OUT
+    local recipe=$1 ponder=$2 into=$3; shift 3
+    [ -d "$into/ponder" ] || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --weights whole \
+        --recipe "$recipe" --data "$more/data" "${mended[@]%/}" --ponder "$ponder" --pounce "$out/run/pounce" \
+        --sights "$more/sights" --out "$into" "$@"
 }
 
-train --stage refocusing --ponder "$more/eyes/ponder" --watch "$more/wander"
-[ -d "$more/heads/ponder" ] || "$bin/pp-follow" --ponder "$more/run/refocusing/ponder" --album "$out/album" \
+train small_refocusing "$more/eyes/ponder" "$more/refocusing" --watch "$more/wander"
+[ -d "$more/heads/ponder" ] || "$bin/pp-follow" --ponder "$more/refocusing/ponder" --album "$out/album" \
     --data "$more/data" "$more/wander" --out "$more/heads"
-if [ ! -d "$more/run/refocusing/unled" ]; then  # what comes next goes on from the one with heads
-    mv "$more/run/refocusing/ponder" "$more/run/refocusing/unled"
-    cp -r "$more/heads/ponder" "$more/run/refocusing/ponder"
-fi
-train --stage following --watch "$more/wander"
-train --stage refining --watch "$more/wander" --watch-share 0.3
-train --stage joint
+train small_following "$more/heads/ponder" "$more/run" --stage refining --watch "$more/wander" --watch-share 0.3
+train small_following "$more/heads/ponder" "$more/run" --stage joint
 
 "$bin/pp-eval" --tasks PickHighlight --episodes 60 --runs 1 --seed 1000 \
     --ponder-checkpoint "$more/run/ponder" --pounce-checkpoint "$more/run/pounce" --out "$more/real"

@@ -11,13 +11,16 @@ set -euo pipefail
 
 out=${1:-out/small}
 bin=${BIN:-.venv/bin}
+source "$(dirname "$0")/common.sh"
 export OMP_NUM_THREADS=1 MUJOCO_GL=${MUJOCO_GL:-egl}
 
 finished() { [ -d "$out/run/ponder" ]; }
 how=(--recipe small --out "$out/run" --ponder "$out/eyes/ponder" --sights "$out/sights")
 oracle=(--data "$out/data")
 train() { finished || "$bin/pp-train" "${how[@]}" "$@"; }
-train_on_both_cores() { finished || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train "${how[@]}" "$@"; }
+train_on_both_cores() {
+    finished || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --weights whole "${how[@]}" "$@"
+}
 
 play() {  # records episodes of $out/played/NAME
     local name=$1; shift
@@ -29,32 +32,15 @@ hand() {  # lets the POUNCE of a stage play, told the task's own subgoals
     play "$name" --cognition stand-in --pounce-checkpoint "$out/run/$stage/pounce" "$@"
 }
 
-logs() {  # of finished episodes in $out/played/NAME, all or with a STATUS: a kill leaves the beginning of one more
-    "$bin/python" -c 'import json, pathlib, sys
-folder, *wanted = map(pathlib.Path, sys.argv[1:])
-for each in json.loads((folder / "results.json").read_text())["episodes"]:
-    if not wanted or each["status"] == str(wanted[0]):
-        print(folder / each["mcap"])' "$out/played/$1" "${@:2}"
-}
-
 export_played() {  # makes a dataset of them
     local found
-    mapfile -t found < <(logs "$1")
+    mapfile -t found < <(logs "$out/played/$1")
     [ -d "$out/$1/meta" ] || "$bin/pp-export" "${found[@]}" --out "$out/$1"
 }
 
-correct() {  # the oracle takes over the episodes of $out/played/NAME that ended with a STATUS, each so many times
-    local name=$1 status=$2 as=$3 times=$4 found
-    mapfile -t found < <(logs "$name" "$status")
-    if [ ${#found[@]} -gt 0 ] && [ ! -d "$out/mended/$as/meta" ]; then
-        rm -rf "$out/mended/$as"  # a kill left the beginning
-        "$bin/pp-correct" "${found[@]}" --order near-first --look-hz 1 --per-episode "$times" --out "$out/mended/$as"
-    fi
-}
-
 mend() {  # those that got stuck often
-    correct "$1" SUCCESS "$2" 1
-    correct "$1" TIMEOUT "$2-stuck" "$3"
+    correct "$out/played/$1" SUCCESS 1 "$out/mended/$2"
+    correct "$out/played/$1" TIMEOUT "$3" "$out/mended/$2-stuck"
 }
 
 [ -d "$out/data/meta" ] || "$bin/pp-collect" --tasks PickHighlight --episodes 600 --noise dart --recovery-share 0.4 \

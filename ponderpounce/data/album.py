@@ -113,7 +113,7 @@ class Studio:
 
     def __init__(self, task: str, image_px: int) -> None:
         """Raises TaskError if there is no such task, or it does not name its things."""
-        self.task = make_task(task)
+        self.task, self.image_px = make_task(task), image_px
         if type(self.task).things is Task.things:
             raise TaskError(f"task {task!r} does not name its things (Task.things); PickHighlight does")
         spec = table_scene(self.task.robot)

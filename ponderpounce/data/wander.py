@@ -82,7 +82,7 @@ def make(options: WanderOptions) -> None:
         seeds = range(options.seed, options.seed + options.episodes)
         for seed in tqdm(seeds, unit="episode", disable=not options.progress):
             rows = EpisodeWriter(options.image_px)
-            about = wanderers.film(seed, options.looks, rows, options.image_px)
+            about = wanderers.film(seed, options.looks, rows)
             writer.add(unpack(rows.pack(about)))
         writer.finish()
 
@@ -90,7 +90,7 @@ def make(options: WanderOptions) -> None:
 class Wanderers(Studio):
     """Scenes of one task whose things move between two looks."""
 
-    def film(self, seed: int, num_looks: int, rows: EpisodeWriter, image_px: int) -> About:
+    def film(self, seed: int, num_looks: int, rows: EpisodeWriter) -> About:
         """Writes one episode, a second of rows for every look; equal seeds give equal ones."""
         rng = np.random.default_rng([seed, 1])
         layout, difficulty = self.arranged(seed)
@@ -131,7 +131,7 @@ class Wanderers(Studio):
             difficulty=difficulty,
             origin=WANDERING,
             is_success=True,
-            image_px=image_px,
+            image_px=self.image_px,
         )
 
     def _told(self, layout: Any) -> list[tuple[str, str]]:

@@ -65,6 +65,8 @@ class Transition:
     reasoning: tuple[int, ...] | None = None
     is_learned: bool = True
     """False: words that stand there to be read, as a slip of PONDER's own would; that there are any is learned."""
+    is_due: bool = True
+    """False: there should be none, and that is learned: the label of T_yes is T_no."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -155,17 +157,23 @@ class ContextFormat:
         return _unsupervised(SegmentKind.OBSERVATION, ids, num_images=seen.num_images)
 
     def text(self, transition: Transition) -> Segment:
-        """``[T_yes, S]`` or ``[T_yes, DR, T_yes, S]``; every token of it is a target, if it is to be learned."""
+        """``[T_yes, S]`` or ``[T_yes, DR, T_yes, S]``; every token of it is a target, if it is due and to be learned."""
         t_yes = self.vocabulary.t_yes
         ids = (t_yes, *transition.subgoal)
         if transition.reasoning is not None:
             ids = (t_yes, *transition.reasoning, *ids)
-        targets = ids if transition.is_learned else (t_yes, *(IGNORE,) * (len(ids) - 1))
+        is_learned = transition.is_learned and transition.is_due
+        label = t_yes if transition.is_due else self.vocabulary.t_no
+        targets = ids if is_learned else (label, *(IGNORE,) * (len(ids) - 1))
         return Segment(kind=SegmentKind.TEXT, ids=ids, targets=targets)
 
-    def carriers(self) -> Segment:
-        """K carriers; the first one is labelled T_no, whether or not text came before it."""
-        targets = (self.vocabulary.t_no, *(IGNORE,) * (self.num_carriers - 1))
+    def carriers(self, *, is_owed: bool = False) -> Segment:
+        """K carriers; the first one is labelled T_no, whether or not text came before it.
+
+        If text should have come, and did not (``is_owed``), the label is T_yes.
+        """
+        label = self.vocabulary.t_yes if is_owed else self.vocabulary.t_no
+        targets = (label, *(IGNORE,) * (self.num_carriers - 1))
         return Segment(kind=SegmentKind.CARRIERS, ids=self.carrier_ids, targets=targets)
 
     def opening(self, instruction: str, demo_views: Sequence[int] = ()) -> tuple[Segment, ...]:
@@ -173,11 +181,16 @@ class ContextFormat:
         return (self.instruction(instruction), *(self.demo(n) for n in demo_views), self.execution())
 
     def query(
-        self, num_cameras: int, transition: Transition | None = None, proprio: ArrayLike | None = None
+        self,
+        num_cameras: int,
+        transition: Transition | None = None,
+        proprio: ArrayLike | None = None,
+        *,
+        is_owed: bool = False,
     ) -> tuple[Segment, ...]:
-        """One query, with text exactly if it is a transition; see :meth:`observation`."""
+        """One query, with text exactly if it is a transition; see :meth:`observation` and :meth:`carriers`."""
         text = () if transition is None else (self.text(transition),)
-        return (self.observation(num_cameras, proprio), *text, self.carriers())
+        return (self.observation(num_cameras, proprio), *text, self.carriers(is_owed=is_owed))
 
     def row(self, segments: Iterable[Segment]) -> Row:
         """Lays segments end to end."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, repeat
 from typing import Literal
 
 import numpy as np
@@ -22,11 +22,13 @@ from ponderpounce.models.eyes import see
 from ponderpounce.models.normalisation import Floats
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.training.augment import AS_IT_IS, NOT_AUGMENTED, Augmentation, View, draw_view
+from ponderpounce.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses, without_lapses
 from ponderpounce.training.nudge import NO_NUDGE, Nudge, draw_nudges
 from ponderpounce.training.places import PLACE, misplaced
 from ponderpounce.training.stand_in import stand_in
 
 Frame = NDArray[np.uint8]  # (height, width, 3) RGB
+_SILENCE = repeat(Words())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -131,6 +133,9 @@ class ExampleConfig:
     tremble_px: float = 0.0
     """The same in all other grounded rows, whose words are learned: no word is then exact enough to be copied."""
 
+    lapses: Lapses = NO_LAPSES
+    """Words that come late or are wrong, and are put right."""
+
     augmentation: Augmentation = NOT_AUGMENTED
     """Other views of the scene. An action is that of the scene as it is, so where POUNCE learns as well, only watched
     episodes may be seen otherwise."""
@@ -166,6 +171,8 @@ class Example:
     is_grounded: bool
     view: View = AS_IT_IS
     slip: Slip | None = None
+    words: tuple[Words, ...] | None = None
+    """Of every query; None: those of the recording."""
     nudge: Nudge = NO_NUDGE
     nudges_I2: Floats | None = None
     """Of each invocation's tool [m]; None: starts are as recorded."""
@@ -173,7 +180,13 @@ class Example:
     def row(self) -> Row:
         """PONDER's tokens."""
         row = episode_row(
-            self.episode, self.form, self.schedule, is_grounded=self.is_grounded, view=self.view, slip=self.slip
+            self.episode,
+            self.form,
+            self.schedule,
+            is_grounded=self.is_grounded,
+            view=self.view,
+            slip=self.slip,
+            words=self.words,
         )
         return replace(row, targets=(IGNORE,) * len(row.targets)) if self.episode.is_told else row
 
@@ -211,6 +224,9 @@ def make_example(
         slip = Slip(std_px=std_px, seed=int(rng.integers(1 << 62)))
     elif is_grounded and config.tremble_px:
         slip = Slip(std_px=config.tremble_px, seed=int(rng.integers(1 << 62)), is_learned=True)
+    words = None
+    if is_grounded and not episode.is_told and config.lapses.rows and rng.random() < config.lapses.rows:
+        words = drawn_lapses(config.lapses, *_subgoals(episode, schedule), rng)
     is_moved = config.augments == "all" or episode.is_watched
     view = draw_view(config.augmentation if is_moved else NOT_AUGMENTED, form, set(episode.subgoals), rng)
     nudges_I2 = None
@@ -224,6 +240,7 @@ def make_example(
         is_grounded=is_grounded,
         view=view,
         slip=slip,
+        words=words,
         nudge=config.nudge,
         nudges_I2=nudges_I2,
     )
@@ -248,22 +265,35 @@ def episode_row(
     is_grounded: bool = True,
     view: View = AS_IT_IS,
     slip: Slip | None = None,
+    words: Sequence[Words] | None = None,
 ) -> Row:
-    """The tokens of the episode. The first transition of a demonstration episode begins with its reasoning."""
+    """The tokens of the episode. The first transition of a demonstration episode begins with its reasoning.
+
+    ``words`` are those of every query, if not those of the recording.
+    """
+    if words is None:
+        words = without_lapses(*_subgoals(episode, schedule))
     say = view.text if slip is None else slip.saying(view)
     views, form = _before_ponder(episode, form)
     segments = list(form.opening(episode.instruction, [len(views) for views in episode.demo]))
     encode = form.vocabulary.encode
     reasoning = encode(normalised_text(say(episode.reasoning))) if episode.reasoning else None
-    for query in schedule.queries:
+    is_learned = slip is None or slip.is_learned
+    for query, said in zip(schedule.queries, words if is_grounded else _SILENCE, strict=is_grounded):
         transition = None
-        text = episode.subgoals[query.tick]
-        if is_grounded and query.stamp.is_transition and text:
-            subgoal = encode(normalised_text(say(text)))
-            transition = Transition(subgoal=subgoal, reasoning=reasoning, is_learned=slip is None or slip.is_learned)
+        if said.text:
+            subgoal = encode(normalised_text(say(said.text)))
+            transition = Transition(subgoal=subgoal, reasoning=reasoning, is_learned=is_learned, is_due=said.is_due)
             reasoning = None
-        segments += form.query(len(views[query.tick]), transition, episode.state_T8[query.tick])
+        is_owed = said.is_due and not said.text
+        segments += form.query(len(views[query.tick]), transition, episode.state_T8[query.tick], is_owed=is_owed)
     return form.row(segments)
+
+
+def _subgoals(episode: TrainingEpisode, schedule: SampledSchedule) -> tuple[list[str], list[bool]]:
+    """In force at every query, and whether it is the first to see a change."""
+    queries = schedule.queries
+    return [episode.subgoals[query.tick] for query in queries], [query.stamp.is_transition for query in queries]
 
 
 def said_by_query(episode: TrainingEpisode, schedule: SampledSchedule) -> tuple[str, ...]:

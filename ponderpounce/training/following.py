@@ -128,45 +128,33 @@ def samples_of(
 
     Raises ValueError if the album names nothing, or no episode has a query.
     """
-    with _listening(ponder) as (read, hidden):
-        return _read_through(ponder, album, folders, num_episodes, seed, read, hidden)
-
-
-def _read_through(
-    ponder: Ponder,
-    album: TrainingSet,
-    folders: Sequence[TrainingSet],
-    num_episodes: int,
-    seed: int,
-    read: Callable[[], Tensor],
-    hidden: Callable[[], Tensor],
-) -> Samples:
     names = names_in(text for number in range(len(album)) for text in album[number].subgoals)
     things, places, others, carriers, pointing, rms, distances = [], [], [], [], [], [], []
-    for example in _views(ponder, album, seed):
-        _, is_image_T = _encoded(ponder, example)
-        tokens_NSH = read()[is_image_T].unflatten(0, (-1, ponder.format.num_image_tokens))
-        texts = [example.view.text(example.episode.subgoals[query.tick]) for query in example.schedule.queries]
-        answers = answers_of(texts, names, ponder.format)
-        things.append(tokens_NSH[answers.is_thing_NS])
-        places.append(answers.told_NSP[answers.is_thing_NS])
-        others += [tokens_NSH[~answers.is_thing_NS], read()[~is_image_T]]
-    config = ExampleConfig(clocks=sampling.ROBOMME, max_invocations=1, has_foresight=True)
-    for data in folders:
-        for number in range(min(num_episodes, len(data))):
-            example = make_example(data[number], ponder.format, config, np.random.default_rng([seed, number]))
-            cognition_QH, is_image_T = _encoded(ponder, example)
-            row = example.row()
-            index_Q = torch.from_numpy(row.carrier_index[:, 0])
-            carriers.append(read()[index_Q])
-            pointing.append(cognition_QH[:, :NUM_PLACE_FEATURES])
-            rms.append(hidden()[index_Q].square().mean(-1).sqrt())
-            is_other_T = ~is_image_T
-            is_other_T[index_Q] = False
-            others.append(read()[is_other_T])
-            positions_T = torch.from_numpy(ponder.format.positions(row.ids)[0][1])
-            own_Q = torch.where(is_image_T)[0].unflatten(0, (len(index_Q), -1))[:, 0]
-            distances.append(positions_T[index_Q] - positions_T[own_Q])
+    with _listening(ponder) as (read, hidden):
+        for example in _views(ponder, album, seed):
+            _, is_image_T = _encoded(ponder, example)
+            tokens_NSH = read()[is_image_T].unflatten(0, (-1, ponder.format.num_image_tokens))
+            texts = [example.view.text(example.episode.subgoals[query.tick]) for query in example.schedule.queries]
+            answers = answers_of(texts, names, ponder.format)
+            things.append(tokens_NSH[answers.is_thing_NS])
+            places.append(answers.told_NSP[answers.is_thing_NS])
+            others += [tokens_NSH[~answers.is_thing_NS], read()[~is_image_T]]
+        config = ExampleConfig(clocks=sampling.ROBOMME, max_invocations=1, has_foresight=True)
+        for data in folders:
+            for number in range(min(num_episodes, len(data))):
+                example = make_example(data[number], ponder.format, config, np.random.default_rng([seed, number]))
+                cognition_QH, is_image_T = _encoded(ponder, example)
+                row = example.row()
+                index_Q = torch.from_numpy(row.carrier_index[:, 0])
+                carriers.append(read()[index_Q])
+                pointing.append(cognition_QH[:, :NUM_PLACE_FEATURES])
+                rms.append(hidden()[index_Q].square().mean(-1).sqrt())
+                is_other_T = ~is_image_T
+                is_other_T[index_Q] = False
+                others.append(read()[is_other_T])
+                positions_T = torch.from_numpy(ponder.format.positions(row.ids)[0][1])
+                own_Q = torch.where(is_image_T)[0].unflatten(0, (len(index_Q), -1))[:, 0]
+                distances.append(positions_T[index_Q] - positions_T[own_Q])
     if not carriers:
         raise ValueError("no episode was given for what carriers hold")
     others_OH = torch.cat(others)

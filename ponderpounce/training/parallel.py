@@ -1,8 +1,9 @@
 """Several processes, one run: torchrun's environment, FSDP2 over both systems, and sums over all processes.
 
-A process is given its share of a batch's episodes. FSDP2 averages gradients over processes, so each scales its part of
-the loss such that the average is the gradient of the whole batch (``trainer``). Parameters keep their names; a process
-holds its rows of each.
+A process is given its share of a batch's episodes. Gradients are averaged over processes, so each scales its part of
+the loss such that the average is the gradient of the whole batch (``trainer``). Parameters keep their names. Sharded, a
+process holds its rows of each, and FSDP2 averages; whole, it holds all of them, and `average_gradients` does: what
+CPUs can train is small, and there the processes then need not wait for each other at every layer.
 """
 
 from __future__ import annotations
@@ -105,6 +106,27 @@ def shard(model: nn.Module, world: World) -> None:
     for unit in units_of(model):
         fully_shard(unit, mesh=mesh)
     fully_shard(model, mesh=mesh)
+
+
+@torch.no_grad()
+def average_gradients(model: nn.Module, world: World) -> None:
+    """Replaces gradients of whole weights by their mean over all processes, which must all call it.
+
+    A gradient that only some have counts as zero on the others; FSDP2 has averaged those of sharded weights already.
+    """
+    if world.size == 1:
+        return
+    trained = [each for each in model.parameters() if each.requires_grad and not isinstance(each, DTensor)]
+    if not trained:
+        return
+    has_one = torch.tensor([float(each.grad is not None) for each in trained], device=world.device)
+    gradients = [torch.zeros_like(each) if each.grad is None else each.grad for each in trained]
+    total = torch.cat([has_one, *(each.flatten().float() for each in gradients)])
+    dist.all_reduce(total)
+    counts, *means = total.split([len(trained), *(each.numel() for each in trained)])
+    for parameter, count, mean in zip(trained, counts.tolist(), means, strict=True):
+        if count:
+            parameter.grad = (mean / world.size).view_as(parameter).to(parameter.dtype)
 
 
 def local(tensor: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ from ponderpounce.models.pounce_family import AnyPounceConfig
 from ponderpounce.training.augment import NOT_AUGMENTED, Augmentation
 from ponderpounce.training.example import ExampleConfig
 from ponderpounce.training.joint import Trains
+from ponderpounce.training.lapses import Lapses
 from ponderpounce.training.nudge import Nudge
 from ponderpounce.training.optim import OptimConfig
 from ponderpounce.training.trainer import TrainConfig
@@ -235,25 +236,37 @@ def small() -> Curriculum:
     return Curriculum(name="small", stages=(looking, reaching, motor, grounding, mending, refining, joint))
 
 
-def small_following() -> Curriculum:
-    """The pair that `small` has left learns to follow what moves: see docs/training.md, "A PONDER that follows".
-
-    Begins with eyes that `pp-see --ponder` has opened again, and keeps them. Between the first two stages `pp-follow`
-    changes PONDER.
-    """
-    *_, refining, joint = small().stages
-    refocusing = replace(
+def small_refocusing() -> Recipe:
+    """PONDER of `small` gets used to eyes that `pp-see --ponder` has opened again, on short rows, and keeps them."""
+    *_, refining, _ = small().stages
+    return replace(
         refining,
-        name="small_following/refocusing",
+        name="small_refocusing",
         example=replace(refining.example, max_queries=12),
         train=TrainConfig(seed=0, optim=_FROM_SCRATCH),
-        num_steps=500,
+        num_steps=400,
         keeps_eyes=True,
     )
-    following = replace(refocusing, name="small_following/following", num_steps=300)
-    refining = replace(refining, name="small_following/refining", keeps_eyes=True)
-    joint = replace(joint, name="small_following/joint", keeps_eyes=True)
-    return Curriculum(name="small_following", stages=(refocusing, following, refining, joint))
+
+
+def small_following() -> Curriculum:
+    """The pair of `small` learns to follow what moves: see docs/training.md, "A PONDER that follows".
+
+    Begins with a PONDER that `small_refocusing` has left and `pp-follow` has changed.
+    """
+    *_, refining, joint = small().stages
+    refining = replace(
+        refining,
+        name="small_following/refining",
+        example=replace(refining.example, lapses=Lapses(rows=0.5)),
+        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, decay=(1500, 3000))),
+        num_steps=3000,
+        keeps_eyes=True,
+    )
+    joint = replace(
+        joint, name="small_following/joint", example=replace(joint.example, lapses=Lapses(rows=0.5)), keeps_eyes=True
+    )
+    return Curriculum(name="small_following", stages=(refining, joint))
 
 
 RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
@@ -263,6 +276,7 @@ RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
     "tiny_groot": tiny_groot,
     "tiny_subgoal_text": tiny_subgoal_text,
     "small": small,
+    "small_refocusing": small_refocusing,
     "small_following": small_following,
 }
 

@@ -22,9 +22,12 @@ from protocol import disk
 
 
 def write_rows(tensors: Mapping[str, Tensor], folder: Path, stem: str, world: World) -> None:
-    """Writes this process's rows to ``folder/stem-RANK-of-SIZE.safetensors``, down to the disk."""
+    """Writes this process's rows to ``folder/stem-RANK-of-SIZE.safetensors``, down to the disk.
+
+    Of a tensor that every process holds whole, its rows are the ones that it would hold if it were cut.
+    """
     path = folder / f"{stem}-{world.rank:05d}-of-{world.size:05d}.safetensors"
-    save_file({name: local(tensor.detach()).contiguous() for name, tensor in tensors.items()}, path)
+    save_file({name: _rows_to_write(tensor.detach(), world).contiguous() for name, tensor in tensors.items()}, path)
     disk.sync(path)
 
 
@@ -78,9 +81,19 @@ class RowReader:
 
 
 def held_rows(tensor: Tensor, world: World) -> tuple[int, int]:
-    """First row that this process holds, and the one after the last: FSDP2 cuts as ``torch.chunk`` does."""
+    """First row that this process holds, and the one after the last."""
     count = tensor.shape[0] if tensor.ndim else 1
-    if not isinstance(tensor, DTensor):
-        return 0, count
+    return _cut(count, world) if isinstance(tensor, DTensor) else (0, count)
+
+
+def _rows_to_write(tensor: Tensor, world: World) -> Tensor:
+    if isinstance(tensor, DTensor) or not tensor.ndim:
+        return local(tensor)
+    start, stop = _cut(len(tensor), world)
+    return tensor[start:stop]
+
+
+def _cut(count: int, world: World) -> tuple[int, int]:
+    """This process's of so many rows: FSDP2 cuts as ``torch.chunk`` does."""
     rows = -(-count // world.size)
     return min(world.rank * rows, count), min((world.rank + 1) * rows, count)

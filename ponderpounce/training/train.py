@@ -59,8 +59,8 @@ class TrainOptions:
     """Trains PONDER and POUNCE together. The same command again resumes a run that was killed."""
 
     recipe: str
-    """robomme and robocasa_dc are the paper's; small learns from scratch on CPU cores, and small_following goes on from
-    there; tiny and tiny_groot are for a try."""
+    """robomme and robocasa_dc are the paper's; small learns from scratch on CPU cores, small_refocusing and
+    small_following go on from there; tiny and tiny_groot are for a try."""
     data: tuple[Path, ...]
     """Folders that pp-collect, pp-export or pp-correct made: episodes to imitate."""
     out: Path
@@ -97,6 +97,8 @@ class TrainOptions:
     """Memory for pictures, at the sizes that the networks read; what does not fit is decoded again."""
     sights: Path | None = None
     """Keep pictures there as well, at those sizes: further processes, stages and runs then need not decode videos."""
+    weights: Literal["sharded", "whole"] = "sharded"
+    """Of several processes each holds its rows (FSDP2), or all: faster where they fit many times over, as on CPUs."""
     device: Literal["cpu", "cuda"] = "cpu"
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Of PONDER's weights and of what POUNCE's stream runs in, when they are loaded."""
@@ -224,7 +226,9 @@ def _is_finished(out: Path) -> bool:
 
 def _train(run: Recipe, data: TrainingSet, options: TrainOptions, world: World) -> None:
     model, bundle = build(run, data, options)
-    shard(model, world)
+    model.reads_together = options.device != "cpu" or (world.size > 1 and options.weights == "sharded")
+    if options.weights == "sharded":
+        shard(model, world)
     data = TrainingSet(
         *options.data,
         watched=options.watch if run.trains != "pounce" else (),

@@ -21,7 +21,7 @@ from torch import Tensor
 from ponderpounce.models.pounce_family import max_committed_rows, sample_times
 from ponderpounce.training.joint import Draws, JointModel, PonderBatch, PounceBatch
 from ponderpounce.training.optim import OptimConfig, Optimiser
-from ponderpounce.training.parallel import World, local
+from ponderpounce.training.parallel import World, average_gradients, local
 from ponderpounce.training.shards import RowReader, write_rows
 from protocol import disk
 
@@ -78,7 +78,10 @@ class Trainer:
         data_hash: str = "",
         world: World | None = None,
     ) -> None:
-        """``data_hash`` names the data: a checkpoint made with other data is refused. ``model`` is sharded already."""
+        """``data_hash`` names the data: a checkpoint made with other data is refused.
+
+        Where there are several processes, ``model`` is sharded already or the same on all of them.
+        """
         self.model = model
         self.config = config
         self.step = 0
@@ -117,7 +120,8 @@ class Trainer:
                 f"step {self.step}: the loss is {total} (flow matching {flow_matching}, grounding {text}). Look at "
                 "that batch's data, or lower learning_rate; the last checkpoint is untouched."
             )
-        (part * world.size).backward()  # FSDP2 divides by the number of processes
+        (part * world.size).backward()  # the average over processes divides by their number
+        average_gradients(model, world)
         norm = self._optimiser.update(self.step)
         report = StepReport(
             step=self.step,

@@ -37,7 +37,7 @@ def film(wanderers: Wanderers, seed: int) -> tuple[Rows, list[dict[str, np.ndarr
             super().add(row, pictures)
 
     writer = Watching(256)
-    about = wanderers.film(seed, LOOKS, writer, 256)
+    about = wanderers.film(seed, LOOKS, writer)
     return unpack(writer.pack(about)).rows, frames
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,9 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from ponderpounce.data import album, wander
 from ponderpounce.models import ponder_configs
 from ponderpounce.models.ponder import Ponder
-from ponderpounce.training.following import Samples, lay_out
+from ponderpounce.models.ponder_checkpoint import load_ponder, save_ponder
+from ponderpounce.training.data import Sight, TrainingSet
+from ponderpounce.training.following import REFUSED, Samples, lay_out, main, samples_of
 from ponderpounce.training.stand_in import NUM_PLACE_FEATURES, place_features, wave_columns
 
 SIZE = 128
@@ -129,6 +133,54 @@ def test_columns_are_the_waves_of_their_period() -> None:
         torch.testing.assert_close(here, further, atol=1e-4, rtol=0)
         half = code((100 + period // 2, 90 - period // 2))[columns]
         torch.testing.assert_close(here, -half, atol=1e-4, rtol=0)
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("page")
+    assert album.main(["--out", str(out), "--pictures", "100", "--image-px", "128", "--no-progress"]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def films(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("films")
+    size = ["--episodes", "3", "--looks", "5", "--image-px", "128"]
+    assert wander.main(["--out", str(out), *size, "--no-progress"]) == 0
+    return out
+
+
+def test_a_folder_becomes_one_of_two_layers_more(
+    page: Path, films: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old, out = tmp_path / "old", tmp_path / "out"
+    save_ponder(Ponder.random(ponder_configs.small(), seed=0), old)
+    arguments = ["--ponder", str(old), "--album", str(page), "--data", str(films), "--out", str(out)]
+    assert main([*arguments, "--episodes", "2"]) == 0
+    assert "has to be trained on" in capsys.readouterr().out
+    layers = load_ponder(out / "ponder").qwen.model.language_model.layers
+    assert len(layers) == ponder_configs.small().num_layers + 2
+    out_HD = layers[-1].self_attn.o_proj.weight
+    told = torch.zeros_like(out_HD, dtype=torch.bool)
+    place = torch.arange(NUM_PLACE_FEATURES)
+    told[place, place] = told[place, layers[-1].self_attn.head_dim + place] = True
+    assert torch.equal(out_HD != 0, told)
+    assert main(arguments) == REFUSED
+    assert "another --out" in capsys.readouterr().err
+
+
+def test_what_is_read_belongs_together(page: Path, films: Path) -> None:
+    ponder = Ponder.random(ponder_configs.small(), seed=0)
+    sight = Sight(form=ponder.format, pounce_px=None)
+    read = samples_of(ponder, TrainingSet(page, sight=sight), [TrainingSet(films, sight=sight)], 2, 0)
+    assert len(read.things_NH) == len(read.places_NP) > 100
+    assert len(read.carriers_MH) == len(read.pointing_MP) >= 2 * 5  # a query a second, and some more
+    ids, carrier_index = row(ponder)
+    positions = positions_of(ponder, ids)[1]
+    pictures = torch.where(ids == ponder.format.vocabulary.image_pad)[0].unflatten(0, (3, -1))[:, 0]
+    assert read.own_distance == int((positions[carrier_index] - positions[pictures])[0])
+    with pytest.raises(ValueError, match="no episode"):
+        samples_of(ponder, TrainingSet(page, sight=sight), [], 2, 0)
 
 
 def test_a_last_layer_without_attention_is_refused() -> None:

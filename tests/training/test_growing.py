@@ -1,4 +1,4 @@
-"""A grown PONDER is the old one, until it learns; then all of the new layers do."""
+"""A grown PONDER is the old one, until it learns; and it can."""
 
 from __future__ import annotations
 

@@ -67,10 +67,11 @@ def gradients(loss: Tensor, model: JointModel) -> dict[str, Tensor]:
     return {name: grad for name, grad in zip(named, found, strict=True) if grad is not None and grad.abs().max() > 0}
 
 
-def test_rows_of_a_batch_are_read_as_if_alone(model: JointModel) -> None:
+@pytest.mark.parametrize("together", [True, False])
+def test_rows_of_a_batch_are_read_as_if_alone(model: JointModel, together: bool) -> None:
     both = episodes(model.ponder, 1, 3)
-    together = encode_rows(model.ponder, both)
-    for row, frames, hidden in zip(both.rows, both.frames, together, strict=True):
+    read = encode_rows(model.ponder, both, together=together)
+    for row, frames, hidden in zip(both.rows, both.frames, read, strict=True):
         alone = model.ponder.encode_row(row, frames)
         torch.testing.assert_close(hidden, alone, atol=2e-5, rtol=1e-4)
 

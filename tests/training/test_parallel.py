@@ -64,9 +64,12 @@ def batch_of(model: JointModel, places: range, step: int) -> tuple[PonderBatch, 
     )
 
 
-def trainer_of(world: World) -> Trainer:
+def trainer_of(world: World, weights: str = "sharded") -> Trainer:
     model = joint()
-    shard(model, world)
+    if weights == "sharded":
+        shard(model, world)
+    else:
+        model.reads_together = False
     return Trainer(model, lambda step: batch_of(model, world.share(3), step), TRAIN, world=world)
 
 
@@ -76,16 +79,16 @@ def weights_of(trainer: Trainer) -> dict[str, Tensor]:
     return {name: parameter.detach().clone() for name, parameter in whole.named_parameters()}
 
 
-def run_as_one_of_several(folder: Path) -> None:
+def run_as_one_of_several(folder: Path, weights: str) -> None:
     """What each process of torchrun does."""
     with joined("cpu") as world:
-        trainer = trainer_of(world)
+        trainer = trainer_of(world, weights)
         reports = [asdict(report) for report in trainer.run(STEPS)]
         trainer.save(folder / "two")
         last = weights_of(trainer)
         trainer.take_average()
         average = weights_of(trainer)
-        resumed = trainer_of(world)
+        resumed = trainer_of(world, weights)
         resumed.resume(folder / "one")
         reports += [asdict(report) for report in resumed.run(STEPS + 1)]
         if world.is_first:
@@ -94,23 +97,26 @@ def run_as_one_of_several(folder: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def one(tmp_path_factory: pytest.TempPathFactory) -> tuple[Trainer, list[dict[str, float]], Path]:
-    """One process, and a checkpoint after its three steps."""
+def one(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[dict[str, float]], Path]:
+    """What one process did in three steps, and where its checkpoint is."""
     folder = tmp_path_factory.mktemp("parallel")
     trainer = trainer_of(World())
     reports = [asdict(report) for report in trainer.run(STEPS)]
     trainer.save(folder / "one")
-    return trainer, reports, folder
+    return reports, folder
 
 
 @pytest.mark.e2e
 @pytest.mark.slow
-def test_two_processes_are_one(one: tuple[Trainer, list[dict[str, float]], Path]) -> None:
-    trainer, reports, folder = one
+@pytest.mark.parametrize("held", ["sharded", "whole"])
+def test_two_processes_are_one(one: tuple[list[dict[str, float]], Path], held: str) -> None:
+    reports, folder = one
+    trainer = trainer_of(World())
+    assert trainer.resume(folder / "one")
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", __file__]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     done = subprocess.run(
-        [*command, str(folder)], env=environment, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+        [*command, str(folder), held], env=environment, capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
     assert done.returncode == 0, done.stderr[-3000:]
     theirs = json.loads((folder / "reports.json").read_text())
@@ -162,4 +168,4 @@ def test_weights_of_several_dtypes_are_refused() -> None:
 
 
 if __name__ == "__main__":
-    run_as_one_of_several(Path(sys.argv[1]))
+    run_as_one_of_several(Path(sys.argv[1]), sys.argv[2])

@@ -1,0 +1,18 @@
+# What train.sh and follow.sh have in common; both set $bin.
+
+logs() {  # of finished episodes that were played into FOLDER, all or with a STATUS: a kill leaves the beginning of one more
+    "$bin/python" -c 'import json, pathlib, sys
+folder, *wanted = sys.argv[1:]
+for each in json.loads(pathlib.Path(folder, "results.json").read_text())["episodes"]:
+    if each["status"] in (wanted or [each["status"]]):
+        print(pathlib.Path(folder, each["mcap"]))' "$@"
+}
+
+correct() {  # the oracle takes over the episodes that were played into FOLDER and ended with a STATUS, each so many TIMES
+    local folder=$1 status=$2 times=$3 out=$4 found
+    mapfile -t found < <(logs "$folder" "$status")
+    if [ ${#found[@]} -gt 0 ] && [ ! -d "$out/meta" ]; then
+        rm -rf "$out"  # a kill left the beginning
+        "$bin/pp-correct" "${found[@]}" --order near-first --look-hz 1 --per-episode "$times" --out "$out"
+    fi
+}
