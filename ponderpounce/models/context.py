@@ -157,7 +157,7 @@ class ContextFormat:
         return _unsupervised(SegmentKind.OBSERVATION, ids, num_images=seen.num_images)
 
     def text(self, transition: Transition) -> Segment:
-        """``[T_yes, S]`` or ``[T_yes, DR, T_yes, S]``; every token of it is a target, if it is due and to be learned."""
+        """``[T_yes, S]`` or ``[T_yes, DR, T_yes, S]``; its tokens are targets if they are due and to be learned."""
         t_yes = self.vocabulary.t_yes
         ids = (t_yes, *transition.subgoal)
         if transition.reasoning is not None:
