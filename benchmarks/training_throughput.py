@@ -1,9 +1,9 @@
 """How fast does training go, where does a step spend its time, and how far is that from what the machine can multiply?
 
 One step is the trainer's own: forward, backward, clipping, AdamW, average. Timed apart, forward and backward: PONDER's
-rows (pictures and text of whole episodes, with the LM head on supervised tokens) and POUNCE's invocations with their
-cognition given. Episodes are noise, as long as ``--ticks`` says, under the recipe's own schedules; decoding and reading
-of a dataset are not in the numbers.
+rows (pictures and text of whole episodes, with the LM head on supervised tokens), read together and one after the other
+in turns, and POUNCE's invocations with their cognition given. Episodes are noise, as long as ``--ticks`` says, under the
+recipe's own schedules; decoding and reading of a dataset are not in the numbers.
 
 Operations are those that torch counts in matrix products and attention (``FlopCounterMode``), forward and backward; the
 peak is a square product of the same dtype, measured here. A network of a few dozen channels spends its time elsewhere.
@@ -47,9 +47,8 @@ class ThroughputOptions:
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Of PONDER's weights and of the product that the peak is measured with."""
     threads: int = 1
-    batch_episodes: int = 2
-    ticks: int = 100
-    """20 Hz steps of an episode."""
+    ticks: tuple[int, ...] = (100, 100)
+    """20 Hz steps of each episode of the batch."""
     demo: int = 5
     """Seconds of demonstration, a picture of each camera for each."""
     steps: int = 5
@@ -75,13 +74,14 @@ def main(argv: list[str] | None = None) -> int:
     count = len(invocations.actions_INA)
     parts: list[tuple[str, Callable[[], object]]] = [
         ("a whole step", lambda: list(trainer.run(trainer.step + 1))),
-        ("PONDER's rows", lambda: _ponder(model, episodes)),
+        ("PONDER's rows, together", lambda: _ponder(model, episodes, together=True)),
+        ("PONDER's rows, one after the other", lambda: _ponder(model, episodes, together=False)),
         ("POUNCE's invocations", lambda: _pounce(model, invocations)),
     ]
     rows: list[Row] = []
-    for name, once in parts:
-        flops = _flops(once)
-        took_ms = [_timed_ms(once, options.device) for _ in range(options.steps)]
+    flops_of = [_flops(once) for _, once in parts]
+    turns = [[_timed_ms(once, options.device) for _, once in parts] for _ in range(options.steps)]
+    for (name, _), flops, took_ms in zip(parts, flops_of, map(list, zip(*turns, strict=True)), strict=True):
         p50_s = float(np.median(took_ms)) / 1e3
         rows.append(
             {"part": name}
@@ -96,7 +96,7 @@ def main(argv: list[str] | None = None) -> int:
         )
     report.add_table("Forward and backward; the whole step with its update", rows)
     report.notes += [
-        f"{len(episodes.rows)} episodes of {options.ticks} ticks: rows of {num_tokens} tokens in all with "
+        f"Episodes of {', '.join(map(str, options.ticks))} ticks: rows of {num_tokens} tokens in all with "
         f"{sum(row.num_images for row in episodes.rows)} pictures, {count} invocations.",
         f"Measured peak: {peak / 1e9:.1f} GFLOP/s, a product of {options.peak_size} x {options.peak_size} in "
         f"{options.dtype} on {options.device}, {options.threads} thread(s).",
@@ -118,7 +118,8 @@ def _build(options: ThroughputOptions) -> tuple[JointModel, PounceBundle, Recipe
     bundle = random_bundle(run.pounce, seed=0)
     bundle.model.to(options.device)
     freeze(bundle.model, run.freeze)
-    return JointModel(ponder, bundle.model, w1=run.w1, w2=run.w2), bundle, run
+    reads_together = options.device != "cpu"  # as pp-train has it
+    return JointModel(ponder, bundle.model, w1=run.w1, w2=run.w2, reads_together=reads_together), bundle, run
 
 
 def _batch(
@@ -127,24 +128,27 @@ def _batch(
     rng = np.random.default_rng(0)
     height, width = model.ponder.image_px
     views = tuple(rng.integers(0, 256, (height, width, 3), np.uint8) for _ in range(2))
-    episode = TrainingEpisode(
-        instruction="watch the video, then do the same",
-        demo=(views,) * options.demo,
-        frames=[views] * options.ticks,
-        state_T8=rng.uniform(-0.2, 0.2, (options.ticks, 8)).astype(np.float32),
-        action_T8=rng.uniform(-0.2, 0.2, (options.ticks, 8)).astype(np.float32),
-        subgoals=[f"pick cube {1 + tick // 50} at <{50 + tick // 50}, 120>" for tick in range(options.ticks)],
-        is_transition_T=np.arange(options.ticks) % 50 == 0,
-    )
+    recorded = [
+        TrainingEpisode(
+            instruction="watch the video, then do the same",
+            demo=(views,) * options.demo,
+            frames=[views] * ticks,
+            state_T8=rng.uniform(-0.2, 0.2, (ticks, 8)).astype(np.float32),
+            action_T8=rng.uniform(-0.2, 0.2, (ticks, 8)).astype(np.float32),
+            subgoals=[f"pick cube {1 + tick // 50} at <{50 + tick // 50}, 120>" for tick in range(ticks)],
+            is_transition_T=np.arange(ticks) % 50 == 0,
+        )
+        for ticks in options.ticks
+    ]
     form = model.ponder.format
-    examples = [make_example(episode, form, run.example, rng) for _ in range(options.batch_episodes)]
+    examples = [make_example(episode, form, run.example, rng) for episode in recorded]
     episodes = collate_ponder(examples)
     invocations = collate_pounce(examples, bundle.model.config, bundle.tokenizer, bundle.statistics)
     return episodes.to(options.device), invocations.to(options.device)
 
 
-def _ponder(model: JointModel, episodes: PonderBatch) -> None:
-    hidden = encode_rows(model.ponder, episodes)
+def _ponder(model: JointModel, episodes: PonderBatch, *, together: bool) -> None:
+    hidden = encode_rows(model.ponder, episodes, together=together)
     read = [hidden_TH[row.supervised_index] for row, hidden_TH in zip(episodes.rows, hidden, strict=True)]
     model.ponder.logits(torch.cat(read)).float().logsumexp(dim=-1).mean().backward()
     model.zero_grad(set_to_none=True)
