@@ -2,7 +2,7 @@
 
 One step is the trainer's own: forward, backward, clipping, AdamW, average. Timed apart, forward and backward: PONDER's
 rows (pictures and text of whole episodes, with the LM head on supervised tokens), read together and one after the other
-in turns, and POUNCE's invocations with their cognition given. Episodes are noise, as long as ``--ticks`` says, under the
+in turns, and POUNCE's invocations with their cognition given. Episodes are noise, of ``--ticks``, under the
 recipe's own schedules; decoding and reading of a dataset are not in the numbers.
 
 Operations are those that torch counts in matrix products and attention (``FlopCounterMode``), forward and backward; the
