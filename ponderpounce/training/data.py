@@ -144,6 +144,10 @@ class TrainingSet:
         """Task and seed of every episode, in order."""
         return [(source.entry.task, source.entry.seed) for source in self._sources]
 
+    def num_rows(self, number: int) -> int:
+        """How long an episode is, without reading it; a demonstration counts."""
+        return self._sources[number].entry.num_rows
+
     def instructions(self) -> list[str]:
         """Every instruction once, in order."""
         return sorted({source.entry.instruction for source in self._sources})

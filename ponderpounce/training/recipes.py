@@ -259,8 +259,8 @@ def small_following() -> Curriculum:
         refining,
         name="small_following/refining",
         example=replace(refining.example, lapses=Lapses(rows=0.5)),
-        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, decay=(1500, 3000))),
-        num_steps=3000,
+        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, decay=(1150, 2300))),
+        num_steps=2300,
         keeps_eyes=True,
     )
     joint = replace(

@@ -152,13 +152,16 @@ class Batches:
         return episodes.to(self._device), invocations.to(self._device)
 
     def _draw(self, rng: np.random.Generator) -> NDArray[np.integer]:
-        """Numbers of the batch's episodes; the last of them are watched ones."""
+        """Numbers of the batch's episodes; the last of them are watched ones.
+
+        Long ones come first among their kind, so that the processes' shares are as long as each other.
+        """
         size, first = self._run.batch_episodes, self._data.num_imitated
         numbers = rng.integers(first, size=size)
         if first < len(self._data):
             num_watched = min(round(self._watch_share * size), size - 1)
             numbers[size - num_watched :] = rng.integers(first, len(self._data), size=num_watched)
-        return numbers
+        return np.array(sorted(numbers.tolist(), key=lambda number: (number >= first, -self._data.num_rows(number))))
 
 
 def main(argv: list[str] | None = None) -> int:

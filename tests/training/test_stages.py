@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -149,6 +150,40 @@ def test_ponder_learns_from_episodes_that_nobody_is_to_imitate(folder: Path, sma
     episodes, invocations = Batches(data, run, model, bundle, World())(0)
     assert episodes.num_episodes == run.batch_episodes
     assert len(invocations.actions_INA) > 0
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_shares_of_a_batch_are_as_long_as_each_other(folder: Path, small: dict[str, Recipe], share: float) -> None:
+    class Lengths:
+        """Seven episodes to imitate and four that are watched."""
+
+        num_imitated = 7
+        rows = (30, 900, 200, 400, 650, 80, 510, 260, 120, 300, 240)
+
+        def __len__(self) -> int:
+            return len(self.rows)
+
+        def num_rows(self, number: int) -> int:
+            return self.rows[number]
+
+    run = replace(small["looking"], batch_episodes=8)
+    model, bundle = build(run, TrainingSet(folder), options(folder, folder / "unused"))
+    lengths: Any = Lengths()
+    shares = [Batches(lengths, run, model, bundle, World(rank=rank, size=2), share) for rank in (0, 1)]
+    seen = set()
+    for seed in range(30):
+        drawn = [each._draw(np.random.default_rng(seed)) for each in shares]
+        np.testing.assert_array_equal(*drawn)
+        numbers = drawn[0].tolist()
+        watched = [number for number in numbers if number >= Lengths.num_imitated]
+        assert len(watched) == min(round(8 * share), 7)
+        assert watched == numbers[8 - len(watched) :]
+        long, short = (sum(Lengths.rows[numbers[place]] for place in each._places) for each in shares)
+        kinds = numbers[: 8 - len(watched)], watched
+        longest = [max((Lengths.rows[number] for number in kind), default=0) for kind in kinds]
+        assert abs(long - short) <= sum(longest)  # of either kind; in any order it could be that of all
+        seen.update(numbers)
+    assert len(seen) == {0.0: 7, 0.3: 11, 1.0: 11}[share]
 
 
 def test_a_stage_makes_only_what_it_reads(folder: Path, small: dict[str, Recipe]) -> None:
