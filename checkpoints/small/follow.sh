@@ -47,6 +47,7 @@ train small_refocusing "$more/eyes/ponder" "$more/refocusing" --watch "$more/wan
     --data "$more/data" "$more/wander" --out "$more/heads"
 train small_following "$more/heads/ponder" "$more/run" --stage refining --watch "$more/wander" --watch-share 0.3
 train small_following "$more/heads/ponder" "$more/run" --stage joint
+train small_planning "$more/run/ponder" "$more/planning" --watch "$more/wander" --watch-share 0.125
 
 "$bin/pp-eval" --tasks PickHighlight --episodes 60 --runs 1 --seed 1000 \
-    --ponder-checkpoint "$more/run/ponder" --pounce-checkpoint "$more/run/pounce" --out "$more/real"
+    --ponder-checkpoint "$more/planning/ponder" --pounce-checkpoint "$more/run/pounce" --out "$more/real"

@@ -56,6 +56,8 @@ class TrainingEpisode:
     """Somebody else's doing, good or bad: PONDER learns to follow it, POUNCE does not imitate it."""
     is_told: bool = False
     """PONDER cannot know what is to be said, or when (`pp-wander`): it learns to follow what texts point at, only."""
+    told: Sequence[str] | None = None
+    """T texts that PONDER says instead of the subgoals; None: the subgoals."""
     sights: Sequence[tuple[Frame, ...]] | None = None
     """T ticks of what PONDER's eyes make of the views, where ``frames`` are not the cameras' own; ``demo`` then is what
     they make of it, too."""
@@ -88,6 +90,29 @@ class TrainingEpisode:
             placed = next((text for text in texts if PLACE.search(text)), "")
             subgoals += [text if PLACE.search(text) else placed or text for text in texts]
         return replace(self, subgoals=subgoals)
+
+    def with_plans(self) -> TrainingEpisode:
+        """The same, every subgoal but the first told with the places of those that come later: ``S, <y, x>, <y, x>``.
+
+        What was shown is then written down soon after, and read off from there later; without, a small network loses
+        the third of three things. At the first subgoal nothing has been seen. One that is tried again counts once.
+        """
+        begins = np.flatnonzero(self.is_transition_T | (np.arange(self.num_ticks) == 0)).tolist()
+        told: list[str] = []
+        for begin, end in pairwise([*begins, self.num_ticks]):
+            own = PLACE.sub("", self.subgoals[begin])
+            later: dict[str, str] = {}
+            for text in (self.subgoals[other] for other in begins if other >= end and begin > 0):
+                place = PLACE.search(text)
+                if place is not None and PLACE.sub("", text) != own:
+                    later.setdefault(PLACE.sub("", text), place[0])
+            told += ["".join((text, *(f", {place}" for place in later.values()))) for text in self.subgoals[begin:end]]
+        return replace(self, told=told)
+
+    @property
+    def words(self) -> Sequence[str]:
+        """What is to be said at each tick."""
+        return self.subgoals if self.told is None else self.told
 
     @property
     def transition_ticks(self) -> frozenset[int]:
@@ -124,6 +149,8 @@ class ExampleConfig:
 
     has_foresight: bool = False
     """See `TrainingEpisode.with_foresight`."""
+    has_plans: bool = False
+    """See `TrainingEpisode.with_plans`."""
     slips: float = 0.0
     """Share of grounded rows in which all said places are wrong by ``slip_px`` and not to be learned. Cognition must
     then come from what is seen; from flawless words alone it would learn to copy them, and PONDER's own are not."""
@@ -211,6 +238,7 @@ def make_example(
 ) -> Example:
     """Draws a schedule and lays the episode out under it."""
     episode = episode.with_foresight() if config.has_foresight else episode
+    episode = episode.with_plans() if config.has_plans else episode
     schedule = sample_schedule(rng, config.clocks, episode.num_ticks, transition_ticks=episode.transition_ticks)
     schedule = _shortened(schedule, config.max_queries)
     imitated = [i for i, each in enumerate(schedule.invocations) if each.tick >= episode.imitated_from]
@@ -291,9 +319,9 @@ def episode_row(
 
 
 def _subgoals(episode: TrainingEpisode, schedule: SampledSchedule) -> tuple[list[str], list[bool]]:
-    """In force at every query, and whether it is the first to see a change."""
+    """What is to be said at every query, and whether it is the first to see a change."""
     queries = schedule.queries
-    return [episode.subgoals[query.tick] for query in queries], [query.stamp.is_transition for query in queries]
+    return [episode.words[query.tick] for query in queries], [query.stamp.is_transition for query in queries]
 
 
 def said_by_query(episode: TrainingEpisode, schedule: SampledSchedule) -> tuple[str, ...]:
@@ -302,7 +330,7 @@ def said_by_query(episode: TrainingEpisode, schedule: SampledSchedule) -> tuple[
     newest = ""
     for query in schedule.queries:
         if query.stamp.is_transition and episode.subgoals[query.tick]:
-            newest = normalised_text(episode.subgoals[query.tick])
+            newest = normalised_text(episode.words[query.tick])
         texts.append(newest)
     return tuple(texts)
 

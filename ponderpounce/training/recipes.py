@@ -269,6 +269,18 @@ def small_following() -> Curriculum:
     return Curriculum(name="small_following", stages=(refining, joint))
 
 
+def small_planning() -> Recipe:
+    """PONDER of `small_following` learns to write down what comes later (`TrainingEpisode.with_plans`)."""
+    refining, _ = small_following().stages
+    return replace(
+        refining,
+        name="small_planning",
+        example=replace(refining.example, has_plans=True),
+        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(500, 1050))),
+        num_steps=1050,
+    )
+
+
 RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
     "robomme": robomme,
     "robocasa_dc": robocasa_dc,
@@ -278,6 +290,7 @@ RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
     "small": small,
     "small_refocusing": small_refocusing,
     "small_following": small_following,
+    "small_planning": small_planning,
 }
 
 

@@ -242,6 +242,41 @@ def test_with_foresight_a_text_has_the_place_that_it_gets_later(data: st.DataObj
     assert list(make_example(recorded, FORM, config, np.random.default_rng(0)).episode.subgoals) == expected
 
 
+@given(stints=st.lists(st.tuples(st.sampled_from("abcd"), st.booleans(), st.integers(1, 4)), min_size=1, max_size=7))
+@settings(max_examples=60, deadline=None)
+def test_a_plan_tells_the_places_of_what_comes_later(stints: list[tuple[str, bool, int]]) -> None:
+    """Once each, in order; not at the first subgoal, and not of the one in force."""
+    names = [name for name, _, _ in stints]
+    heads = [f"pick {name} at <{n}, 9>" if has_place else name for n, (name, has_place, _) in enumerate(stints)]
+    texts = [head for head, (_, _, length) in zip(heads, stints, strict=True) for _ in range(length)]
+    begins = np.cumsum([0, *(length for _, _, length in stints[:-1])]).tolist()
+    planned = replace(episode(len(texts), changes=tuple(begins)), subgoals=texts).with_plans()
+    assert list(planned.subgoals) == texts
+    for n, begin in enumerate(begins):
+        end = begins[n + 1] if n + 1 < len(begins) else len(texts)
+        told = set(planned.words[begin:end])
+        assert len(told) == 1
+        head, *later = told.pop().replace(", 9>", "; 9>").split(", ")
+        assert head == heads[n].replace(", 9>", "; 9>")
+        shown = [m for m in range(n + 1, len(heads)) if stints[m][1] and not (names[m] == names[n] and stints[n][1])]
+        once = [m for place, m in enumerate(shown) if names[m] not in {names[k] for k in shown[:place]}]
+        assert later == ([f"<{m}; 9>" for m in once] if n else [])
+
+
+def test_a_plan_is_said_and_cognition_is_of_the_subgoal() -> None:
+    texts = ["press at <1, 1>"] * 30 + ["pick at <100, 40>"] * 40 + ["put at <20, 200>"] * 50
+    recorded = replace(episode(120, changes=(0, 30, 70)), subgoals=texts)
+    config = ExampleConfig(clocks=EVALUATION, has_plans=True)
+    planned = make_example(recorded, FORM, config, np.random.default_rng(0))
+    plain = make_example(recorded, FORM, replace(config, has_plans=False), np.random.default_rng(0))
+    assert planned.said[-1] == plain.said[-1]
+    assert planned.said[2].startswith(plain.said[2] + ", [")
+    assert torch.equal(planned.stand_ins(64), plain.stand_ins(64))
+    v = FORM.vocabulary
+    learned = v.decode([t for t in planned.row().targets if t >= 0 and t not in v.control_ids])
+    assert learned.count("[") == 4
+
+
 @given(num_ticks=st.integers(2, 120), data=st.data())
 @settings(max_examples=25, deadline=None)
 def test_pounce_imitates_from_where_the_correction_begins(num_ticks: int, data: st.DataObject) -> None:
