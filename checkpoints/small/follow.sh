@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
-# A PONDER that follows what moves, from the pair that train.sh has left, on two CPU cores: see docs/training.md, "A PONDER
-# that follows".
+# A PONDER that follows what moves and writes its plans down, from the pair that train.sh has left, on two CPU cores: see
+# docs/training.md, "A PONDER that follows, and plans". The shipped policy is the one of train.sh; this one solved fewer.
 #
 #     checkpoints/small/follow.sh [OUT]       (the OUT of train.sh)
 #
 # PONDER's eyes are opened again and kept. It learns from things that are moved aside, from the pair's own mistakes, and from
-# films in which everything moves; it gets two more layers, laid out so that cognition stays with its thing. The same command
-# goes on after a kill.
+# films in which everything moves; it gets two more layers, laid out so that cognition stays with its thing; at last it learns to
+# write down what comes later. The same command goes on after a kill.
 set -euo pipefail
 
 out=${1:-out/small}

@@ -250,7 +250,7 @@ def small_refocusing() -> Recipe:
 
 
 def small_following() -> Curriculum:
-    """The pair of `small` learns to follow what moves: see docs/training.md, "A PONDER that follows".
+    """The pair of `small` learns to follow what moves: docs/training.md, "A PONDER that follows, and plans".
 
     Begins with a PONDER that `small_refocusing` has left and `pp-follow` has changed.
     """
