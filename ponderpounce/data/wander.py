@@ -25,14 +25,13 @@ from ponderpounce.data.album import Studio
 from ponderpounce.data.episode import WANDERING, About, EpisodeWriter, Row, unpack
 from ponderpounce.data.errors import DatasetError
 from ponderpounce.data.lerobot_v3 import INFO_PATH, DatasetWriter
-from ponderpounce.data.shove import ShoveConfig, moved_aside
+from ponderpounce.data.shove import moved_aside
 from ponderpounce.data.video import FPS
 from ponderpounce.tasks import captions
 from ponderpounce.tasks.environment import IMAGE_PX
 from ponderpounce.tasks.task import TaskError
 
 DONE, REFUSED = 0, 2
-_MOVES = ShoveConfig()
 _MOVE_SHARE = 0.8  # of the things, those that are elsewhere at the next look
 _ROAM_M = 0.07  # from where a thing was first put: further on, others would be as near
 _STINT_LOOKS = (3, 8)  # how long one thing is followed
@@ -144,7 +143,7 @@ class Wanderers(Studio):
     def _move(self, rng: np.random.Generator, homes: Mapping[str, NDArray[np.floating]]) -> None:
         """Puts most things elsewhere, each near where it was and not far from its home."""
         for body, home_m in homes.items():
-            place = moved_aside(self.physics, body, rng, _MOVES) if rng.random() < _MOVE_SHARE else None
+            place = moved_aside(self.physics, body, rng) if rng.random() < _MOVE_SHARE else None
             if place is not None and np.linalg.norm(place[:2] - home_m) < _ROAM_M:
                 self.physics.place(body, place)
                 self.physics.refresh()

@@ -56,8 +56,8 @@ class TrainingEpisode:
     """Somebody else's doing, good or bad: PONDER learns to follow it, POUNCE does not imitate it."""
     is_told: bool = False
     """PONDER cannot know what is to be said, or when (`pp-wander`): it learns to follow what texts point at, only."""
-    told: Sequence[str] | None = None
-    """T texts that PONDER says instead of the subgoals; None: the subgoals."""
+    planned: Sequence[str] | None = None
+    """T texts that PONDER says instead of the subgoals (`with_plans`); None: the subgoals."""
     sights: Sequence[tuple[Frame, ...]] | None = None
     """T ticks of what PONDER's eyes make of the views, where ``frames`` are not the cameras' own; ``demo`` then is what
     they make of it, too."""
@@ -98,7 +98,7 @@ class TrainingEpisode:
         the third of three things. At the first subgoal nothing has been seen. One that is tried again counts once.
         """
         begins = np.flatnonzero(self.is_transition_T | (np.arange(self.num_ticks) == 0)).tolist()
-        told: list[str] = []
+        planned: list[str] = []
         for begin, end in pairwise([*begins, self.num_ticks]):
             own = PLACE.sub("", self.subgoals[begin])
             later: dict[str, str] = {}
@@ -106,13 +106,14 @@ class TrainingEpisode:
                 place = PLACE.search(text)
                 if place is not None and PLACE.sub("", text) != own:
                     later.setdefault(PLACE.sub("", text), place[0])
-            told += ["".join((text, *(f", {place}" for place in later.values()))) for text in self.subgoals[begin:end]]
-        return replace(self, told=told)
+            plan = "".join(f", {place}" for place in later.values())
+            planned += [text + plan for text in self.subgoals[begin:end]]
+        return replace(self, planned=planned)
 
     @property
     def words(self) -> Sequence[str]:
         """What is to be said at each tick."""
-        return self.subgoals if self.told is None else self.told
+        return self.subgoals if self.planned is None else self.planned
 
     @property
     def transition_ticks(self) -> frozenset[int]:

@@ -56,10 +56,6 @@ class Words:
     is_due: bool = False
     """Whether anything should be."""
 
-    @property
-    def is_wrong(self) -> bool:
-        return bool(self.text) and not self.is_due
-
 
 def without_lapses(subgoals: Sequence[str], is_change: Sequence[bool]) -> tuple[Words, ...]:
     """Every change is told when it is seen: `drawn_lapses` without any."""
