@@ -77,6 +77,8 @@ class Row:
     targets: tuple[int, ...]
     carrier_index: npt.NDArray[np.int64]
     """(Q, K): where each query's carriers are; their final hidden states are C_t."""
+    gate_index: npt.NDArray[np.int64]
+    """(Q,): the last token of each query's observation; its logits say whether text comes."""
     num_images: int
 
     @property
@@ -197,6 +199,7 @@ class ContextFormat:
         ids: list[int] = []
         targets: list[int] = []
         carriers: list[range] = []
+        gates: list[int] = []
         num_images = 0
         for segment in segments:
             if segment.kind is SegmentKind.CARRIERS:
@@ -204,10 +207,13 @@ class ContextFormat:
             ids.extend(segment.ids)
             targets.extend(segment.targets)
             num_images += segment.num_images
+            if segment.kind is SegmentKind.OBSERVATION:
+                gates.append(len(ids) - 1)
         return Row(
             ids=tuple(ids),
             targets=tuple(targets),
             carrier_index=np.array(carriers, dtype=np.int64).reshape(-1, self.num_carriers),
+            gate_index=np.array(gates, dtype=np.int64),
             num_images=num_images,
         )
 

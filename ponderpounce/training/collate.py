@@ -64,10 +64,16 @@ class _Asked:
         return "" if query is None else self.example.said[query]
 
 
-def collate_ponder(examples: Sequence[Example], *, with_rows: bool = True, stand_in_size: int = 0) -> PonderBatch:
-    """PONDER's side: rows and pictures, stand-ins of ``stand_in_size`` numbers; what is not asked is not made."""
+def collate_ponder(
+    examples: Sequence[Example], *, with_rows: bool = True, stand_in_size: int = 0, place_size: int = 0
+) -> PonderBatch:
+    """PONDER's side: rows and pictures, stand-ins of ``stand_in_size`` numbers, place lessons for hidden states of
+    ``place_size``; what is not asked is not made."""
+    rows = tuple(each.row() for each in examples) if with_rows else ()
+    taught = zip(examples, rows, strict=True) if place_size else ()
     return PonderBatch(
-        rows=tuple(each.row() for each in examples) if with_rows else (),
+        rows=rows,
+        place_lessons=tuple(each.place_lessons(row, place_size) for each, row in taught),
         frames=tuple(each.frames() for each in examples) if with_rows else (),
         stand_ins=tuple(each.stand_ins(stand_in_size) for each in examples) if stand_in_size else (),
     )

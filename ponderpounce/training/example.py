@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise, repeat
+from itertools import accumulate, pairwise, repeat
 from typing import Literal
 
 import numpy as np
@@ -24,6 +24,7 @@ from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.training.augment import AS_IT_IS, NOT_AUGMENTED, Augmentation, View, draw_view
 from ponderpounce.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses, without_lapses
 from ponderpounce.training.nudge import NO_NUDGE, Nudge, draw_nudges
+from ponderpounce.training.place_lessons import PlaceLessons, place_lessons
 from ponderpounce.training.places import PLACE, misplaced
 from ponderpounce.training.stand_in import stand_in
 
@@ -163,6 +164,8 @@ class ExampleConfig:
 
     lapses: Lapses = NO_LAPSES
     """Words that come late or are wrong, and are put right."""
+    retold_px: float | None = None
+    """Words are said again once the place that they told is farther than that from its thing; None: never."""
 
     augmentation: Augmentation = NOT_AUGMENTED
     """Other views of the scene. An action is that of the scene as it is, so where POUNCE learns as well, only watched
@@ -181,6 +184,11 @@ class ExampleConfig:
         if not 0 < self.slip_px[0] <= self.slip_px[1] or self.tremble_px < 0:
             raise ValueError(
                 f"slip_px {self.slip_px} must ascend from above 0, tremble_px {self.tremble_px} be at least 0"
+            )
+        if self.retold_px is not None and (self.slips or self.retold_px <= 0):
+            raise ValueError(
+                f"retold_px {self.retold_px} must be above 0, and slips 0, came {self.slips}: a row whose words all "
+                "slip never puts them right; let them slip in `Lapses.slipped`"
             )
         for name in ("text_dropout", "slips"):
             if not 0 <= getattr(self, name) <= 1:
@@ -225,13 +233,21 @@ class Example:
     @property
     def said(self) -> tuple[str, ...]:
         """Per query, the subgoal that PONDER had last written by then; empty texts without grounding."""
-        queries = self.schedule.queries
-        return said_by_query(self.episode, self.schedule) if self.is_grounded else ("",) * len(queries)
+        if not self.is_grounded:
+            return ("",) * len(self.schedule.queries)
+        if self.words is None:
+            return said_by_query(self.episode, self.schedule)
+        return tuple(accumulate((normalised_text(each.text) for each in self.words), lambda old, new: new or old))
 
     def stand_ins(self, size: int) -> Tensor:
         """`stand_in` of the subgoal in force at every query, (Q, size)."""
         texts = [self.view.text(self.episode.subgoals[query.tick]) for query in self.schedule.queries]
         return torch.from_numpy(np.stack([stand_in(text, size) for text in texts]))
+
+    def place_lessons(self, row: Row, size: int) -> PlaceLessons:
+        """`place_lessons` of ``row``, this example's."""
+        texts = [self.view.text(self.episode.words[query.tick]) for query in self.schedule.queries]
+        return place_lessons(row, texts, self.form.vocabulary, size)
 
 
 def make_example(
@@ -254,8 +270,10 @@ def make_example(
     elif is_grounded and config.tremble_px:
         slip = Slip(std_px=config.tremble_px, seed=int(rng.integers(1 << 62)), is_learned=True)
     words = None
-    if is_grounded and not episode.is_told and config.lapses.rows and rng.random() < config.lapses.rows:
-        words = drawn_lapses(config.lapses, *_subgoals(episode, schedule), rng)
+    if is_grounded and not episode.is_told:
+        lapses = config.lapses if config.lapses.rows and rng.random() < config.lapses.rows else NO_LAPSES
+        if lapses != NO_LAPSES or config.retold_px is not None:
+            words = drawn_lapses(lapses, *_subgoals(episode, schedule), rng, config.retold_px)
     is_moved = config.augments == "all" or episode.is_watched
     view = draw_view(config.augmentation if is_moved else NOT_AUGMENTED, form, set(episode.subgoals), rng)
     nudges_I2 = None
@@ -312,7 +330,8 @@ def episode_row(
         transition = None
         if said.text:
             subgoal = encode(normalised_text(say(said.text)))
-            transition = Transition(subgoal=subgoal, reasoning=reasoning, is_learned=is_learned, is_due=said.is_due)
+            learns = is_learned and said.is_learned
+            transition = Transition(subgoal=subgoal, reasoning=reasoning, is_learned=learns, is_due=said.is_due)
             reasoning = None
         is_owed = said.is_due and not said.text
         segments += form.query(len(views[query.tick]), transition, episode.state_T8[query.tick], is_owed=is_owed)

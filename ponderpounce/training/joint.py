@@ -5,8 +5,8 @@ the schedule referred it to, so many invocations share one; their action loss re
 (A.3). The LM head runs only where a token is supervised.
 
 What stands in for pretraining, where networks start from nothing, runs through the same graph with one system left out:
-POUNCE alone acts from the stand-in cognition (``stand_in``), PONDER alone learns its words and, by an auxiliary loss
-w3 L_align that is off otherwise, to carry the stand-in.
+POUNCE alone acts from the stand-in cognition (``stand_in``), PONDER alone learns its words and, by auxiliary losses
+that are off otherwise, to carry the stand-in (w3 L_align) and to have places in mind (w4 L_place, ``place_lessons``).
 """
 
 # B episodes, T tokens, H hidden, Q queries, I invocations of all episodes, K carriers, N horizon, A padded action dim
@@ -29,6 +29,7 @@ from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.pounce import PounceInputs
 from ponderpounce.models.pounce_family import AnyPounce, action_loss
 from ponderpounce.models.pounce_groot import GrootInputs
+from ponderpounce.training.place_lessons import PlaceLessons
 
 Trains = Literal["both", "ponder", "pounce"]
 """Which systems a stage trains. The other one is not even run."""
@@ -50,6 +51,8 @@ class PonderBatch:
     """Per row, (num_images, height, width, 3) uint8 in the order of its image positions; None without images."""
     stand_ins: tuple[Tensor, ...] = ()
     """Per row, (its queries, H): `stand_in` of the subgoal in force; () where no stage asks for them."""
+    place_lessons: tuple[PlaceLessons, ...] = ()
+    """Per row; () where no stage asks for them."""
 
     def __post_init__(self) -> None:
         if len(self.rows) != len(self.frames):
@@ -66,6 +69,7 @@ class PonderBatch:
             self,
             frames=tuple(None if f is None else f.to(device) for f in self.frames),
             stand_ins=tuple(each.to(device) for each in self.stand_ins),
+            place_lessons=tuple(each.to(device) for each in self.place_lessons),
         )
 
 
@@ -157,6 +161,8 @@ class JointLoss(NamedTuple):
     grounding: Tensor
     alignment: Tensor
     """Mean squared distance of C from the stand-ins; 0 unless w3 is set."""
+    placing: Tensor
+    """Mean squared error of places that PONDER has in mind; 0 unless w4 is set."""
     said_N: Tensor
     """int64: at every token under the LM head's cross-entropy, row after row, the likeliest one instead."""
     num_null: int
@@ -165,6 +171,8 @@ class JointLoss(NamedTuple):
     """Rows of chunks that flow matching is the mean over: those that were not given."""
     num_queries: int
     """What alignment is the mean over."""
+    num_placed: int
+    """What placing is the mean over."""
 
     @property
     def num_supervised(self) -> int:
@@ -182,6 +190,7 @@ class JointModel(nn.Module):
         w1: float = 1.0,
         w2: float = 0.1,
         w3: float = 0.0,
+        w4: float = 0.0,
         trains: Trains = "both",
         keeps_eyes: bool = False,
         reads_together: bool = True,
@@ -197,7 +206,7 @@ class JointModel(nn.Module):
             raise ValueError(f"POUNCE reads (K, H) = {wanted}, PONDER gives {given}; build them for each other")
         self.ponder = ponder
         self.pounce = pounce
-        self.w1, self.w2, self.w3 = w1, w2, w3
+        self.w1, self.w2, self.w3, self.w4 = w1, w2, w3, w4
         self.trains = trains
         self.reads_together = reads_together
         for name, system in (("ponder", ponder), ("pounce", pounce)):
@@ -213,9 +222,12 @@ class JointModel(nn.Module):
     def forward(self, episodes: PonderBatch, invocations: PounceBatch, draws: Draws) -> JointLoss:
         if self.needs_stand_ins and not episodes.stand_ins:
             raise ValueError("this stage needs the stand-ins of every row; the batch has none")
+        if self.w4 > 0 and not episodes.place_lessons:
+            raise ValueError("this stage needs the place lessons of every row; the batch has none")
         device = invocations.actions_INA.device
         zero = torch.zeros((), device=device)
-        matching, grounding, alignment = zero, zero, zero
+        matching, grounding, alignment, placing = zero, zero, zero, zero
+        num_placed = 0
         said_N = torch.zeros(0, dtype=torch.int64)
         num_null = 0
         if self.trains == "pounce":
@@ -228,6 +240,8 @@ class JointModel(nn.Module):
             if self.w3 > 0:
                 wanted_QKH = torch.cat(episodes.stand_ins)[:, None].expand_as(cognition_QKH)
                 alignment = F.mse_loss(cognition_QKH.float(), wanted_QKH)
+            if self.w4 > 0:
+                placing, num_placed = _placing(episodes.place_lessons, hidden)
         if self.trains != "ponder":
             is_null_I = (invocations.query_I == NO_QUERY) | draws.is_dropped_I
             num_null = int(is_null_I.sum())
@@ -237,19 +251,21 @@ class JointModel(nn.Module):
                 self.pounce, inputs, invocations.actions_INA, draws.noise_SNA, draws.time_S, draws.num_committed_S
             )
         return JointLoss(
-            total=self.weigh(matching, grounding, alignment),
+            total=self.weigh(matching, grounding, alignment, placing),
             flow_matching=matching,
             grounding=grounding,
             alignment=alignment,
+            placing=placing,
             said_N=said_N,
             num_rows=draws.num_counted_rows if self.trains != "ponder" else 0,
             num_queries=len(cognition_QKH),
+            num_placed=num_placed,
             num_null=num_null,
         )
 
-    def weigh(self, matching: Tensor, grounding: Tensor, alignment: Tensor) -> Tensor:
+    def weigh(self, matching: Tensor, grounding: Tensor, alignment: Tensor, placing: Tensor) -> Tensor:
         """L of its parts."""
-        return self.w1 * matching + self.w2 * grounding + self.w3 * alignment
+        return self.w1 * matching + self.w2 * grounding + self.w3 * alignment + self.w4 * placing
 
     def _grounding(self, episodes: PonderBatch, hidden: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         """Mean cross-entropy over every supervised token of the batch; zero, on the graph, if there is none."""
@@ -264,6 +280,14 @@ class JointModel(nn.Module):
         logits_NV = self.ponder.logits(torch.cat(read))
         said_N = logits_NV.detach().argmax(dim=-1)
         return F.cross_entropy(logits_NV.float(), targets_N) if len(targets_N) else logits_NV.sum(), said_N
+
+
+def _placing(lessons: Sequence[PlaceLessons], hidden: Sequence[Tensor]) -> tuple[Tensor, int]:
+    """The loss over all lessons of all rows, and how many there were; zero, on the graph, without any."""
+    answers_MP = torch.cat([each.answers(hidden_TH) for each, hidden_TH in zip(lessons, hidden, strict=True)]).float()
+    if not len(answers_MP):
+        return answers_MP.sum(), 0
+    return F.mse_loss(answers_MP, torch.cat([each.features_MP for each in lessons])), len(answers_MP)
 
 
 def encode_rows(ponder: Ponder, episodes: PonderBatch, *, together: bool = True) -> list[Tensor]:

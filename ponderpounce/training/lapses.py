@@ -2,9 +2,14 @@
 
 In a row made from a recording every subgoal is told by the first query that sees it. A PONDER that misses a change, or
 speaks of the wrong thing, then reads a row such as it has never learned from, and nothing has taught it that the right
-words are still owed. So some rows are made to err: a change is passed over in silence for a few queries, or words of
-another subgoal of the same episode are said when nothing changed. The errors themselves are not learned: where PONDER
-should have spoken, or should have been silent, that is its label, and the words that put it right are learned.
+words are still owed. So some rows are made to err: a change is passed over in silence for a few queries, words of
+another subgoal of the same episode are said when nothing changed, or a place is told beside its thing. The errors
+themselves are not learned: where PONDER should have spoken, or should have been silent, that is its label, and the
+words that put it right are learned.
+
+A place can be wrong without an error: the thing was pushed. With ``retold_px`` words are owed again as soon as the
+place that they tell lies that far from where the thing is, for whichever reason. Cognition then never has to follow
+farther than that.
 
 The paper has nothing of it; it is to words what DAgger (Ross et al. 2011) is to actions.
 """
@@ -18,7 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ponderpounce.training.places import PLACE
+from ponderpounce.training.places import PLACE, misplaced
 
 _APART_PX = 16.0  # texts that differ by their places alone: less than that is the same thing, pushed
 
@@ -33,18 +38,24 @@ class Lapses:
     """In these, the share of changes that are told late, and"""
     wrong: float = 0.05
     """of other queries at which something else is said."""
+    slipped: float = 0.0
+    """Of all that is said, the share whose own place is wrong by ``slip_px``; put right only with a ``retold_px``."""
+    slip_px: tuple[float, float] = (3.0, 24.0)
+    """Standard deviation of each coordinate, of a 256 px picture: from the first to the second, log-uniform."""
     longest: int = 3
     """Queries until it is put right: from 1 up to so many, each as likely."""
 
     def __post_init__(self) -> None:
-        for name in ("rows", "missed", "wrong"):
+        for name in ("rows", "missed", "wrong", "slipped"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be in [0, 1], came {getattr(self, name)}")
         if self.longest < 1:
             raise ValueError(f"longest must be at least 1, came {self.longest}")
+        if not 0 < self.slip_px[0] <= self.slip_px[1]:
+            raise ValueError(f"slip_px {self.slip_px} must ascend from above 0")
 
 
-NO_LAPSES = Lapses()
+NO_LAPSES = Lapses(missed=0.0, wrong=0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,6 +66,8 @@ class Words:
     """Empty: nothing is said."""
     is_due: bool = False
     """Whether anything should be."""
+    is_learned: bool = True
+    """False: the place slipped; that something is said is learned, what is said is not."""
 
 
 def without_lapses(subgoals: Sequence[str], is_change: Sequence[bool]) -> tuple[Words, ...]:
@@ -66,37 +79,61 @@ def without_lapses(subgoals: Sequence[str], is_change: Sequence[bool]) -> tuple[
 
 
 def drawn_lapses(
-    lapses: Lapses, subgoals: Sequence[str], is_change: Sequence[bool], rng: np.random.Generator
+    lapses: Lapses,
+    subgoals: Sequence[str],
+    is_change: Sequence[bool],
+    rng: np.random.Generator,
+    retold_px: float | None = None,
 ) -> tuple[Words, ...]:
     """Words of Q queries, ``subgoals`` in force at each and whether it is the first to see a change.
 
-    The first query errs never. A change ends what lapsed before it, also by making it true.
+    The first query is never late. A change ends what lapsed before it, also by making it true. ``retold_px``: words are
+    also owed where the first place that was told last is farther than that from the subgoal's; None: never.
     """
     known = [text for text, changes in zip(subgoals, is_change, strict=True) if changes and text]
     words: list[Words] = []
     wait: int | None = None  # queries until the words that are owed come; None: none are
     mistaken = ""
+    last = ""  # of all words that stand there
     for index, (text, changes) in enumerate(zip(subgoals, is_change, strict=True)):
         others = [other for other in known if _is_other(other, text)]
         if changes and mistaken and not _is_other(mistaken, text):
             wait = None
-        elif changes:
+        elif changes or (wait is None and retold_px is not None and _has_moved(last, text, retold_px)):
             is_late = index > 0 and rng.random() < lapses.missed
             wait = int(rng.integers(1, lapses.longest + 1)) if is_late else 0
         elif wait is not None:
             wait -= 1
         elif text and others and rng.random() < lapses.wrong:
-            mistaken = str(rng.choice(others))
+            last = mistaken = str(rng.choice(others))
             words.append(Words(text=mistaken))
             wait = int(rng.integers(1, lapses.longest + 1))
             continue
         is_owed = wait is not None and bool(text)
-        words.append(Words(text=text if wait == 0 else "", is_due=is_owed))
         if wait == 0:
+            last, is_right = _said(text, lapses, rng)
+            words.append(Words(text=last, is_due=is_owed, is_learned=is_right))
             wait = None
+        else:
+            words.append(Words(is_due=is_owed))
         if wait is None:
             mistaken = ""
     return tuple(words)
+
+
+def _said(text: str, lapses: Lapses, rng: np.random.Generator) -> tuple[str, bool]:
+    """The words, and whether they are right."""
+    if not lapses.slipped or rng.random() >= lapses.slipped or PLACE.search(text) is None:
+        return text, True
+    return misplaced(text, float(np.exp(rng.uniform(*np.log(lapses.slip_px)))), rng, count=1), False
+
+
+def _has_moved(told: str, now: str, by_px: float) -> bool:
+    """Whether the first place of both is farther away than that."""
+    first, second = PLACE.search(told), PLACE.search(now)
+    if first is None or second is None:
+        return False
+    return float(np.hypot(int(first[1]) - int(second[1]), int(first[2]) - int(second[2]))) > by_px
 
 
 def _is_other(text: str, than: str) -> bool:

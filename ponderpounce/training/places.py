@@ -11,11 +11,11 @@ TEXT_PX = 256
 """Side of the picture that texts speak of, whatever the size of a picture."""
 
 
-def misplaced(text: str, std_px: float, rng: np.random.Generator) -> str:
-    """The text with every coordinate wrong by a normal error, within the picture."""
+def misplaced(text: str, std_px: float, rng: np.random.Generator, count: int = 0) -> str:
+    """The text with coordinates wrong by a normal error, in the picture: of the first ``count`` places; 0: of all."""
 
     def slipped(place: re.Match[str]) -> str:
         y, x = (min(max(round(int(v) + rng.normal(0.0, std_px)), 0), TEXT_PX) for v in place.groups())
         return f"<{y}, {x}>"
 
-    return PLACE.sub(slipped, text)
+    return PLACE.sub(slipped, text, count=count)

@@ -17,6 +17,7 @@ _CURVES = (
     ("flow_matching", "flow matching"),
     ("grounding", "grounding"),
     ("alignment", "alignment with the stand-ins"),
+    ("placing", "places in mind"),
     ("gradient_norm", "gradient norm"),
 )
 _RAW, _SMOOTH, _INK, _GRID = (176, 204, 235), (24, 84, 160), (40, 40, 40), (225, 225, 225)

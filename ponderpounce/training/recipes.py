@@ -23,6 +23,7 @@ from ponderpounce.training.trainer import TrainConfig
 _FROM_SCRATCH = OptimConfig(learning_rate=1e-3, warmup_steps=200, betas=(0.9, 0.95), weight_decay=1e-4, ema_decay=0.998)
 
 _BESIDE_THE_WAY = Nudge(std_m=0.04)
+_RETOLD_PX = 4.0  # of a 256 px picture: what cognition follows well, and more than PONDER's own error
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,6 +43,8 @@ class Recipe:
     w2: float = 0.1
     w3: float = 0.0
     """Of the auxiliary alignment with the stand-ins (`stand_in`); the paper has no such loss."""
+    w4: float = 0.0
+    """Of the auxiliary lessons in places to have in mind (`place_lessons`); the paper has no such loss."""
     trains: Trains = "both"
     """Which systems; the other is not run."""
     keeps_eyes: bool = False
@@ -281,6 +284,28 @@ def small_planning() -> Recipe:
     )
 
 
+def small_retelling() -> Curriculum:
+    """PONDER of `small_planning` learns to say words again whose place is no longer right, its own mistakes as well."""
+    planning = small_planning()
+    _, joint = small_following().stages
+    lapses = replace(planning.example.lapses, rows=0.6, slipped=0.4)
+    refining = replace(
+        planning,
+        name="small_retelling/refining",
+        example=replace(planning.example, slips=0.0, retold_px=_RETOLD_PX, lapses=lapses),
+        w4=1.0,
+        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(1200, 2400))),
+        num_steps=2400,
+    )
+    joint = replace(
+        joint,
+        name="small_retelling/joint",
+        example=replace(joint.example, slips=0.0, retold_px=_RETOLD_PX, lapses=lapses, has_plans=True),
+        w4=1 / 3,
+    )
+    return Curriculum(name="small_retelling", stages=(refining, joint))
+
+
 RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
     "robomme": robomme,
     "robocasa_dc": robocasa_dc,
@@ -291,6 +316,7 @@ RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
     "small_refocusing": small_refocusing,
     "small_following": small_following,
     "small_planning": small_planning,
+    "small_retelling": small_retelling,
 }
 
 

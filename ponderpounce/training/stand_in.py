@@ -49,7 +49,7 @@ def stand_in(subgoal: str, size: int) -> NDArray[np.float32]:
     return values
 
 
-def place_features(yx_px: tuple[int, int]) -> NDArray[np.float32]:
+def place_features(yx_px: tuple[float, float]) -> NDArray[np.float32]:
     """A place in a 256 px picture as (NUM_PLACE_FEATURES,) numbers, rms 1."""
     yx = np.array(yx_px, np.float64) / TEXT_PX
     angles = 2 * np.pi * np.outer(1 / _PERIODS, yx).ravel()

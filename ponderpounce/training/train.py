@@ -145,6 +145,7 @@ class Batches:
             examples,
             with_rows=run.trains != "pounce",
             stand_in_size=model.ponder.hidden_size if model.needs_stand_ins else 0,
+            place_size=model.ponder.hidden_size if model.w4 > 0 else 0,
         )
         if run.trains == "ponder":  # nobody acts: any moment will do, also one that is not to be imitated
             examples = [replace(each, invocations=each.schedule.invocations[:1], nudges_I2=None) for each in examples]
@@ -313,7 +314,7 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
         pounce.config = replace(pounce.config, max_committed_rows=run.pounce.max_committed_rows)
     freeze(pounce, run.freeze)
     return JointModel(
-        ponder, pounce, w1=run.w1, w2=run.w2, w3=run.w3, trains=run.trains, keeps_eyes=run.keeps_eyes
+        ponder, pounce, w1=run.w1, w2=run.w2, w3=run.w3, w4=run.w4, trains=run.trains, keeps_eyes=run.keeps_eyes
     ), bundle
 
 
@@ -358,7 +359,7 @@ def _watch(options: TrainOptions, step: int) -> Watch:
 
 
 def _postfix(report: StepReport) -> str:
-    parts = {"flow": report.flow_matching, "text": report.grounding, "align": report.alignment}
+    parts = {"flow": report.flow_matching, "text": report.grounding, "align": report.alignment, "place": report.placing}
     return " ".join(f"{name} {value:.3f}" for name, value in parts.items() if value)
 
 

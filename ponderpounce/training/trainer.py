@@ -49,6 +49,7 @@ class StepReport:
     flow_matching: float
     grounding: float
     alignment: float
+    placing: float
     gradient_norm: float
     num_supervised: int
     num_null: int
@@ -105,15 +106,15 @@ class Trainer:
         episodes, invocations = self._batches(self.step)
         loss = model(episodes, invocations, self._draws(episodes.num_episodes, invocations))
         # The parts are means over the whole batch: a process's own weigh as much as it has of what they count.
-        num_rows, num_supervised, num_queries, num_null = (
-            int(number) for number in world.sums([loss.num_rows, loss.num_supervised, loss.num_queries, loss.num_null])
-        )
+        counts = (loss.num_rows, loss.num_supervised, loss.num_queries, loss.num_placed, loss.num_null)
+        num_rows, num_supervised, num_queries, num_placed, num_null = (int(number) for number in world.sums(counts))
         matching = loss.flow_matching * (loss.num_rows / max(1, num_rows))
         grounding = loss.grounding * (loss.num_supervised / max(1, num_supervised))
         alignment = loss.alignment * (loss.num_queries / max(1, num_queries))
-        part = model.weigh(matching, grounding, alignment)
-        total, flow_matching, text, aligned = world.sums(
-            [part.detach(), matching.detach(), grounding.detach(), alignment.detach()]
+        placing = loss.placing * (loss.num_placed / max(1, num_placed))
+        part = model.weigh(matching, grounding, alignment, placing)
+        total, flow_matching, text, aligned, placed = world.sums(
+            [each.detach() for each in (part, matching, grounding, alignment, placing)]
         )
         if not np.isfinite(total):
             raise FloatingPointError(
@@ -129,6 +130,7 @@ class Trainer:
             flow_matching=flow_matching,
             grounding=text,
             alignment=aligned,
+            placing=placed,
             gradient_norm=norm,
             num_supervised=num_supervised,
             num_null=num_null,

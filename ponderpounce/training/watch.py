@@ -23,6 +23,7 @@ _TAGS = {
     "loss/flow_matching": "flow_matching",
     "loss/grounding": "grounding",
     "loss/alignment": "alignment",
+    "loss/placing": "placing",
     "gradient/norm": "gradient_norm",
     "batch/supervised_tokens": "num_supervised",
     "batch/null_invocations": "num_null",

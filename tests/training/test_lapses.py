@@ -13,8 +13,10 @@ from clock.sampling import EVALUATION
 from ponderpounce.models.context import IGNORE
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
+from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.training.example import ExampleConfig, TrainingEpisode, make_example
-from ponderpounce.training.lapses import Lapses, Words, drawn_lapses, without_lapses
+from ponderpounce.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses, without_lapses
+from ponderpounce.training.places import PLACE
 
 FORM = Ponder.random(replace(tiny_cpu(), image_px=(32, 32), num_layers=4), seed=1).format
 OFTEN = Lapses(rows=1.0, missed=0.5, wrong=0.3, longest=3)
@@ -111,3 +113,71 @@ def test_shares_are_shares() -> None:
         Lapses(missed=1.5)
     with pytest.raises(ValueError, match="longest must be at least 1"):
         Lapses(longest=0)
+
+
+PATHS = st.lists(st.tuples(st.integers(0, 255), st.integers(0, 255)), min_size=1, max_size=20)
+
+
+@given(path=PATHS, by_px=st.floats(0.5, 50.0))
+def test_told_again_words_are_never_farther_off_than_allowed(path: list[tuple[int, int]], by_px: float) -> None:
+    texts = [f"pick at <{y}, {x}>, <9, 9>" for y, x in path]
+    words = drawn_lapses(NO_LAPSES, texts, [k == 0 for k in range(len(path))], np.random.default_rng(0), by_px)
+    last = (-1e3, -1e3)
+    for place, text, said in zip(path, texts, words, strict=True):
+        off_px = np.hypot(place[0] - last[0], place[1] - last[1])
+        assert said == (Words(text=text, is_due=True) if off_px > by_px else Words())
+        last = place if said.text else last
+
+
+@given(stints=STINTS, seed=st.integers(0, 2**32 - 1))
+def test_a_slip_is_not_learned_and_is_put_right(stints: list[tuple[str, int]], seed: int) -> None:
+    texts, is_change = told(stints)
+    slipping = Lapses(rows=1.0, missed=0.3, wrong=0.0, slipped=0.5, slip_px=(20.0, 40.0))
+    words = drawn_lapses(slipping, texts, is_change, np.random.default_rng(seed), 4.0)
+    last = ""
+    for index, (text, said) in enumerate(zip(texts, words, strict=True)):
+        if said.text:
+            assert said.is_due
+            assert said.is_learned == (said.text == text)
+        far = bool(last) and far_px(last, text) > 4.0
+        assert said.is_due == (is_change[index] or far or is_owed(words, index))
+        last = said.text or last
+
+
+def far_px(one: str, other: str) -> float:
+    first, second = (np.array([int(v) for v in PLACE.findall(text)[0]]) for text in (one, other))
+    return float(np.hypot(*(first - second)))
+
+
+def is_owed(words: tuple[Words, ...], index: int) -> bool:
+    """Whether the query before was due and stayed silent."""
+    return index > 0 and words[index - 1].is_due and not words[index - 1].text
+
+
+def test_a_slip_moves_only_the_own_place() -> None:
+    slipping = Lapses(rows=1.0, missed=0.0, wrong=0.0, slipped=1.0, slip_px=(20.0, 20.0))
+    (said,) = drawn_lapses(slipping, ["pick at <100, 100>, <50, 60>"], [True], np.random.default_rng(0))
+    assert said.text.endswith(", <50, 60>")
+    assert far_px(said.text, "<100, 100>") > 4.0
+    assert not said.is_learned
+
+
+@pytest.mark.parametrize("seed", [0, 2, 3])
+def test_a_row_is_told_again_where_a_slip_is_due(seed: int) -> None:
+    slipping = Lapses(rows=1.0, missed=0.0, wrong=0.0, slipped=0.9, slip_px=(20.0, 40.0))
+    config = ExampleConfig(clocks=EVALUATION, lapses=slipping, retold_px=4.0)
+    example = make_example(recorded((0, 60, 120)), FORM, config, np.random.default_rng(seed))
+    assert example.words is not None
+    assert sum(bool(said.text) for said in example.words) > 3
+    assert example.said[-1] == normalised_text([said.text for said in example.words if said.text][-1])
+    row = example.row()
+    t_yes = FORM.vocabulary.t_yes
+    begins = [index for index, label in enumerate(row.targets) if label == t_yes]
+    for begin, said in zip(begins, (said for said in example.words if said.text), strict=True):
+        assert row.ids[begin] == t_yes
+        assert (row.targets[begin + 1] != IGNORE) == said.is_learned
+
+
+def test_rows_that_slip_whole_cannot_be_told_again() -> None:
+    with pytest.raises(ValueError, match="never puts them right"):
+        ExampleConfig(clocks=EVALUATION, slips=0.4, retold_px=4.0)

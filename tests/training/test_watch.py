@@ -102,6 +102,7 @@ def test_tensorboard_gets_scalars_words_and_pictures(tmp_path: Path, form: Conte
         flow_matching=1.0,
         grounding=1.5,
         alignment=0.0,
+        placing=0.0,
         gradient_norm=1.0,
         num_supervised=3,
         num_null=0,

@@ -1,0 +1,83 @@
+"""Places that PONDER is to have in mind where it is about to speak: lessons of the auxiliary loss w4.
+
+A place is said once in a subgoal, in some eight tokens, and cross-entropy over digits tells little of which of the
+things that were lit is meant. Cognition, asked for one place at every query and as numbers, learned the same much
+faster. So hidden states are asked for places in that form (`place_features`) where words come from:
+
+- at the end of every observation, for all places that the words in force name, one after the other in the first
+  numbers: what is to be said, and later read, whether or not it is said now;
+- at every token before one of a coordinate's, for the place that is being told.
+
+Only networks from scratch need it; the paper has nothing of it. Nothing reads these numbers in serving.
+"""
+
+# Q queries, M lessons of a row, P numbers that tell a place
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ponderpounce.models.context import IGNORE, Row
+from ponderpounce.models.vocabulary import Vocabulary
+from ponderpounce.training.places import PLACE, TEXT_PX
+from ponderpounce.training.stand_in import NUM_PLACE_FEATURES, place_features
+
+_TOLD = re.compile(r"\[(\d+), (\d+)\]")  # x, y in thousandths
+_FULL = 1000
+
+
+class PlaceLessons(NamedTuple):
+    """Which numbers of which hidden states of a row should tell which place."""
+
+    index_M: Tensor
+    """int64: positions in the row."""
+    first_M: Tensor
+    """int64: the first of the P numbers."""
+    features_MP: Tensor
+
+    def answers(self, hidden_TH: Tensor) -> Tensor:
+        """What is there, (M, P)."""
+        columns_MP = self.first_M[:, None] + torch.arange(NUM_PLACE_FEATURES, device=hidden_TH.device)
+        return hidden_TH[self.index_M[:, None], columns_MP]
+
+    def to(self, device: torch.device | str) -> PlaceLessons:
+        return PlaceLessons(*(each.to(device) for each in self))
+
+
+def place_lessons(row: Row, texts_Q: Sequence[str], vocabulary: Vocabulary, size: int) -> PlaceLessons:
+    """The lessons of a row with hidden states of ``size`` numbers.
+
+    ``texts_Q``: the simulator's words in force at every query. Of more places than fit the last are left out.
+    """
+    found = [*_in_mind(row, texts_Q, size // NUM_PLACE_FEATURES), *_being_told(row, vocabulary)]
+    features = [place_features(yx_px) for _, _, yx_px in found]
+    return PlaceLessons(
+        index_M=torch.tensor([index for index, _, _ in found], dtype=torch.int64),
+        first_M=torch.tensor([slot * NUM_PLACE_FEATURES for _, slot, _ in found], dtype=torch.int64),
+        features_MP=torch.from_numpy(np.array(features, np.float32).reshape(-1, NUM_PLACE_FEATURES)),
+    )
+
+
+def _in_mind(row: Row, texts_Q: Sequence[str], num_slots: int) -> Iterator[tuple[int, int, tuple[float, float]]]:
+    for index, text in zip(row.gate_index.tolist(), texts_Q, strict=True):
+        for slot, (y, x) in enumerate(PLACE.findall(text)[:num_slots]):
+            yield index, slot, (int(y), int(x))
+
+
+def _being_told(row: Row, vocabulary: Vocabulary) -> Iterator[tuple[int, int, tuple[float, float]]]:
+    """Of the words that are learned: what slipped is not to be kept in mind."""
+    positions = np.flatnonzero(np.asarray(row.targets) != IGNORE)
+    pieces = {id_: vocabulary.decode([id_]) for id_ in {row.targets[position] for position in positions}}
+    for run in np.split(positions, np.flatnonzero(np.diff(positions) > 1) + 1):
+        spelled = [pieces[row.targets[position]] for position in run]
+        begins = np.cumsum([0, *map(len, spelled)])[:-1]
+        for told in _TOLD.finditer("".join(spelled)):
+            x, y = (int(value) * TEXT_PX / _FULL for value in told.groups())
+            for position in run[(begins >= told.start(1)) & (begins < told.end(2))].tolist():
+                yield position - 1, 0, (y, x)

@@ -1,0 +1,121 @@
+"""Places to have in mind: each lesson lies where its place is about to be told, and gradients reach no other number."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from clock.sampling import EVALUATION
+from ponderpounce.models.context import IGNORE
+from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.ponder_configs import tiny_cpu
+from ponderpounce.models.ponder_coordinates import normalised_text
+from ponderpounce.training.collate import collate_ponder
+from ponderpounce.training.example import Example, ExampleConfig, TrainingEpisode, make_example
+from ponderpounce.training.joint import encode_rows
+from ponderpounce.training.lapses import Lapses
+from ponderpounce.training.place_lessons import PlaceLessons
+from ponderpounce.training.stand_in import NUM_PLACE_FEATURES, place_features
+
+PONDER = Ponder.random(replace(tiny_cpu(), image_px=(32, 32), num_layers=4), seed=1)
+FORM, SIZE = PONDER.format, PONDER.hidden_size
+CONFIG = ExampleConfig(clocks=EVALUATION, has_plans=True)
+PLACES = [(30, 100), (70, 20), (110, 250)]
+
+
+def episode(num_ticks: int = 180) -> TrainingEpisode:
+    stint = np.arange(num_ticks) // 60
+    return TrainingEpisode(
+        instruction="pick them",
+        demo=(),
+        frames=[(np.zeros((32, 32, 3), np.uint8),) * 2] * num_ticks,
+        state_T8=np.zeros((num_ticks, 8), np.float32),
+        action_T8=np.zeros((num_ticks, 8), np.float32),
+        subgoals=[f"pick cube {n} at <{PLACES[n][0]}, {PLACES[n][1]}>" for n in stint],
+        is_transition_T=np.arange(num_ticks) % 60 == 0,
+    )
+
+
+def lessons_of(example: Example) -> tuple[PlaceLessons, list[tuple[int, int, tuple[int, int]]]]:
+    """The lessons, and each as position, slot and the place that is nearest."""
+    made = example.place_lessons(example.row(), SIZE)
+    codes = np.stack([place_features(place) for place in PLACES])
+    nearest = ((made.features_MP[:, None] - torch.from_numpy(codes)) ** 2).sum(-1).argmin(1).tolist()
+    slots = (made.first_M // NUM_PLACE_FEATURES).tolist()
+    return made, [
+        (index, slot, PLACES[place]) for index, slot, place in zip(made.index_M.tolist(), slots, nearest, strict=True)
+    ]
+
+
+def test_the_end_of_every_observation_has_all_places_of_its_words_in_mind() -> None:
+    example = make_example(episode(), FORM, CONFIG, np.random.default_rng(0))
+    row, (_, found) = example.row(), lessons_of(example)
+    for query, gate in zip(example.schedule.queries, row.gate_index.tolist(), strict=True):
+        stint = query.tick // 60
+        expected = [PLACES[stint]] if stint == 0 else PLACES[stint:]
+        at_gate = sorted((slot, place) for index, slot, place in found if index == gate)
+        assert at_gate == list(enumerate(expected))[: SIZE // NUM_PLACE_FEATURES]
+
+
+def test_a_gate_is_where_the_next_token_says_whether_text_comes() -> None:
+    row, v = make_example(episode(), FORM, CONFIG, np.random.default_rng(0)).row(), FORM.vocabulary
+    assert len(row.gate_index) == len(row.carrier_index)
+    assert {row.targets[gate + 1] for gate in row.gate_index.tolist()} == {v.t_yes, v.t_no}
+    texts = sum(row.targets[gate + 1] == v.t_yes for gate in row.gate_index.tolist())
+    assert texts == 3
+
+
+def test_while_a_place_is_told_that_place_is_in_mind() -> None:
+    example = make_example(episode(), FORM, CONFIG, np.random.default_rng(0))
+    row, (made, found) = example.row(), lessons_of(example)
+    gates = set(row.gate_index.tolist())
+    told = {index: place for index, slot, place in found if index not in gates and slot == 0}
+    assert told
+    v = FORM.vocabulary
+    texts = [normalised_text(f"<{y}, {x}>") for y, x in told.values()]
+    for (index, _), text in zip(told.items(), texts, strict=True):
+        assert v.decode([row.ids[index + 1]]).strip("[] ,") in text  # the token that comes is of this place
+        assert row.targets[index + 1] != IGNORE
+    features = made.features_MP.numpy()
+    errors = [np.abs(features[m] - place_features(told[at])).max() for m, (at, _, _) in enumerate(found) if at in told]
+    assert max(errors) < 0.2  # thousandths of the picture are not its pixels
+
+
+def test_words_that_are_not_learned_are_no_lesson() -> None:
+    slipping = replace(CONFIG, lapses=Lapses(rows=1.0, missed=0.0, wrong=0.0, slipped=1.0), retold_px=4.0)
+    example = make_example(episode(), FORM, slipping, np.random.default_rng(0))
+    gates = set(example.row().gate_index.tolist())
+    _, found = lessons_of(example)
+    assert found
+    assert {index for index, _, _ in found} <= gates
+
+
+def test_gradients_reach_the_numbers_of_the_slot_alone() -> None:
+    example = make_example(episode(), FORM, CONFIG, np.random.default_rng(0))
+    batch = collate_ponder([example], place_size=SIZE)
+    (hidden_TH,) = (each.detach().requires_grad_() for each in encode_rows(PONDER, batch))
+    (lessons,) = batch.place_lessons
+    (lessons.answers(hidden_TH) - lessons.features_MP).square().mean().backward()
+    assert hidden_TH.grad is not None
+    reached = {(int(t), int(h)) for t, h in zip(*torch.where(hidden_TH.grad != 0), strict=True)}
+    allowed = {
+        (index, first + k)
+        for index, first in zip(lessons.index_M.tolist(), lessons.first_M.tolist(), strict=True)
+        for k in range(NUM_PLACE_FEATURES)
+    }
+    assert reached <= allowed
+    assert len(reached) > len(allowed) // 2
+
+
+def test_who_asks_for_none_gets_none() -> None:
+    assert collate_ponder([make_example(episode(), FORM, CONFIG, np.random.default_rng(0))]).place_lessons == ()
+
+
+@pytest.mark.parametrize("num_slots", [1, 2])
+def test_places_that_do_not_fit_are_left_out(num_slots: int) -> None:
+    example = make_example(episode(), FORM, CONFIG, np.random.default_rng(0))
+    made = example.place_lessons(example.row(), num_slots * NUM_PLACE_FEATURES)
+    assert int(made.first_M.max()) == (num_slots - 1) * NUM_PLACE_FEATURES
