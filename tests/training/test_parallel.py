@@ -22,6 +22,7 @@ from ponderpounce.models.pounce_init import random_pounce
 from ponderpounce.training.joint import NO_QUERY, JointModel, PonderBatch, PounceBatch
 from ponderpounce.training.optim import OptimConfig
 from ponderpounce.training.parallel import World, gather, joined, shard
+from ponderpounce.training.place_lessons import place_lessons
 from ponderpounce.training.trainer import TrainConfig, Trainer
 
 CONFIG = replace(tiny_ponder(), image_px=(32, 32), num_layers=4)
@@ -34,22 +35,25 @@ def joint() -> JointModel:
     config = tiny_pounce(num_carriers=1, cognition_size=CONFIG.hidden_size, horizon=4)
     pounce = random_pounce(replace(config, max_committed_rows=2), seed=2)
     freeze(pounce, "vision")
-    return JointModel(Ponder.random(CONFIG, seed=1), pounce)
+    return JointModel(Ponder.random(CONFIG, seed=1), pounce, w4=0.5)
 
 
 def batch_of(model: JointModel, places: range, step: int) -> tuple[PonderBatch, PounceBatch]:
-    """Three unequal episodes: one query or two, texts of another length, one to three invocations."""
+    """Three unequal episodes: one query or two, texts of another length, one to three places and invocations."""
     form, config = model.ponder.format, model.pounce.config
-    rows, frames, invocations = [], [], []
+    rows, frames, lessons, invocations = [], [], [], []
     for index, place in enumerate(places):
         said = Transition(subgoal=form.vocabulary.encode("pick the cube" + " now" * (5 * place)))
         rows.append(form.row([*form.opening("press"), *form.query(1, said), *form.query(1) * (place % 2)]))
+        texts = [" ".join(f"<{20 * n}, {90 * place}>" for n in range(place + 1))] * len(rows[-1].gate_index)
+        lessons.append(place_lessons(rows[-1], texts, form.vocabulary, model.ponder.hidden_size))
         generator = torch.Generator().manual_seed(100 * step + place)
         shape = (rows[-1].num_images, 32, 32, 3)
         frames.append(torch.randint(0, 256, shape, generator=generator, dtype=torch.uint8))
         invocations += [(index, query, 100 * step + 10 * place + query) for query in (NO_QUERY, 0, 0)[: place + 1]]
     inputs = [config.example_inputs(1, seed=seed) for _, _, seed in invocations]
-    return PonderBatch(rows=tuple(rows), frames=tuple(frames)), PounceBatch(
+    episodes = PonderBatch(rows=tuple(rows), frames=tuple(frames), place_lessons=tuple(lessons))
+    return episodes, PounceBatch(
         inputs=replace(
             inputs[0],
             **{

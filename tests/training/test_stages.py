@@ -115,6 +115,25 @@ def test_a_stage_moves_its_own_system_alone(
     assert (reports[0].num_supervised > 0) == (stage == "looking")
 
 
+def test_places_in_mind_are_learned_where_they_weigh(folder: Path, small: dict[str, Recipe]) -> None:
+    without, some, more = (
+        next(iter(trainer_of(replace(small["looking"], w4=w4), folder).run(1))) for w4 in (0.0, 0.5, 1.5)
+    )
+    assert without.placing == 0.0
+    assert some.placing == more.placing > 0.0
+    assert more.total - some.total == pytest.approx(some.placing, rel=1e-4)
+    trainer = trainer_of(replace(small["looking"], w3=0.0, w4=1.0), folder)
+    reports = list(trainer.run(30))
+    assert reports[-1].placing < reports[0].placing
+
+
+def test_lessons_that_are_missing_are_missed(folder: Path, small: dict[str, Recipe]) -> None:
+    trainer = trainer_of(replace(small["looking"], w4=1.0), folder)
+    episodes, invocations = trainer._batches(0)
+    with pytest.raises(ValueError, match="place lessons of every row; the batch has none"):
+        trainer.model(replace(episodes, place_lessons=()), invocations, None)  # type: ignore[arg-type]
+
+
 def test_eyes_that_are_kept_stay_as_they_are(folder: Path, small: dict[str, Recipe]) -> None:
     trainer = trainer_of(replace(small["looking"], keeps_eyes=True), folder)
     before = snapshot(trainer.model, "ponder.")
