@@ -5,8 +5,9 @@
 #     checkpoints/small/follow.sh [OUT]       (the OUT of train.sh)
 #
 # PONDER's eyes are opened again and kept. It learns from things that are moved aside, from the pair's own mistakes, and from
-# films in which everything moves; it gets two more layers, laid out so that cognition stays with its thing; at last it learns to
-# write down what comes later. The same command goes on after a kill.
+# films in which everything moves; it gets two more layers, laid out so that cognition stays with its thing; it learns to write
+# down what comes later, and at last, from its own mistakes once more, to say again what is no longer right. The same command
+# goes on after a kill.
 set -euo pipefail
 
 out=${1:-out/small}
@@ -22,32 +23,42 @@ export OMP_NUM_THREADS=1 MUJOCO_GL=${MUJOCO_GL:-egl}
 [ -d "$out/album/meta" ] || "$bin/pp-album" --pictures 10000 --out "$out/album"
 wait $wandering
 
-for difficulty in medium hard; do
-    played=$more/played/$difficulty
-    "$bin/pp-eval" --tasks PickHighlight --difficulty $difficulty --runs 1 --order near-first --record --record-hz 5 --workers 2 \
-        --episodes 120 --seed 1400000 --max-steps 1000 --ponder-checkpoint "$out/run/ponder" \
-        --pounce-checkpoint "$out/run/pounce" --out "$played"
-    correct "$played" TIMEOUT 3 "$more/mended/$difficulty-stuck"
-    correct "$played" SUCCESS 1 "$more/mended/$difficulty"
-done
+mend() {  # what a PONDER and a POUNCE do in scenes from SEED on is played into PLAYED and corrected into INTO
+    local ponder=$1 pounce=$2 seed=$3 played=$4 into=$5 difficulty
+    for difficulty in medium hard; do
+        "$bin/pp-eval" --tasks PickHighlight --difficulty $difficulty --runs 1 --order near-first --record --record-hz 5 \
+            --workers 2 --episodes 120 --seed "$seed" --max-steps 1000 --ponder-checkpoint "$ponder" \
+            --pounce-checkpoint "$pounce" --out "$played/$difficulty"
+        correct "$played/$difficulty" TIMEOUT 3 "$into/$difficulty-stuck"
+        correct "$played/$difficulty" SUCCESS 1 "$into/$difficulty"
+    done
+}
+
+mend "$out/run/ponder" "$out/run/pounce" 1400000 "$more/played" "$more/mended"
 mended=("$more"/mended/*/)
 
 [ -d "$more/eyes/ponder" ] || OMP_NUM_THREADS=2 "$bin/pp-see" --recipe small_refocusing --data "$more/data" \
     --album "$out/album" --ponder "$out/run/ponder" --steps 1500 --learning-rate 1e-3 --out "$more/eyes"
 
-train() {  # the RECIPE from a PONDER into OUT
-    local recipe=$1 ponder=$2 into=$3; shift 3
+train() {  # the RECIPE from a PONDER and a POUNCE into OUT
+    local recipe=$1 ponder=$2 pounce=$3 into=$4; shift 4
     [ -d "$into/ponder" ] || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --weights whole \
-        --recipe "$recipe" --data "$more/data" "${mended[@]%/}" --ponder "$ponder" --pounce "$out/run/pounce" \
+        --recipe "$recipe" --data "$more/data" "${mended[@]%/}" --ponder "$ponder" --pounce "$pounce" \
         --sights "$more/sights" --out "$into" "$@"
 }
 
-train small_refocusing "$more/eyes/ponder" "$more/refocusing" --watch "$more/wander"
+train small_refocusing "$more/eyes/ponder" "$out/run/pounce" "$more/refocusing" --watch "$more/wander"
 [ -d "$more/heads/ponder" ] || "$bin/pp-follow" --ponder "$more/refocusing/ponder" --album "$out/album" \
     --data "$more/data" "$more/wander" --out "$more/heads"
-train small_following "$more/heads/ponder" "$more/run" --stage refining --watch "$more/wander" --watch-share 0.3
-train small_following "$more/heads/ponder" "$more/run" --stage joint
-train small_planning "$more/run/ponder" "$more/planning" --watch "$more/wander" --watch-share 0.125
+train small_following "$more/heads/ponder" "$out/run/pounce" "$more/run" --stage refining --watch "$more/wander" --watch-share 0.3
+train small_following "$more/heads/ponder" "$out/run/pounce" "$more/run" --stage joint
+train small_planning "$more/run/ponder" "$out/run/pounce" "$more/planning" --watch "$more/wander" --watch-share 0.125
+
+mend "$more/planning/ponder" "$more/run/pounce" 1500000 "$more/played-again" "$more/mended-again"
+mended+=("$more"/mended-again/*/)
+train small_retelling "$more/planning/ponder" "$more/run/pounce" "$more/last" --stage refining --watch "$more/wander" \
+    --watch-share 0.125
+train small_retelling "$more/planning/ponder" "$more/run/pounce" "$more/last" --stage joint
 
 "$bin/pp-eval" --tasks PickHighlight --episodes 60 --runs 1 --seed 1000 \
-    --ponder-checkpoint "$more/planning/ponder" --pounce-checkpoint "$more/run/pounce" --out "$more/real"
+    --ponder-checkpoint "$more/last/ponder" --pounce-checkpoint "$more/last/pounce" --out "$more/real"

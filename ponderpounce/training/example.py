@@ -92,18 +92,19 @@ class TrainingEpisode:
             subgoals += [text if PLACE.search(text) else placed or text for text in texts]
         return replace(self, subgoals=subgoals)
 
-    def with_plans(self) -> TrainingEpisode:
+    def with_plans(self, *, even_the_first: bool = False) -> TrainingEpisode:
         """The same, every subgoal but the first told with the places of those that come later: ``S, <y, x>, <y, x>``.
 
         What was shown is then written down soon after, and read off from there later; without, a small network loses
-        the third of three things. At the first subgoal nothing has been seen. One that is tried again counts once.
+        the third of three things. When the first subgoal is told nothing has been seen. One that is tried again counts
+        once.
         """
         begins = np.flatnonzero(self.is_transition_T | (np.arange(self.num_ticks) == 0)).tolist()
         planned: list[str] = []
         for begin, end in pairwise([*begins, self.num_ticks]):
             own = PLACE.sub("", self.subgoals[begin])
             later: dict[str, str] = {}
-            for text in (self.subgoals[other] for other in begins if other >= end and begin > 0):
+            for text in (self.subgoals[other] for other in begins if other >= end and (begin > 0 or even_the_first)):
                 place = PLACE.search(text)
                 if place is not None and PLACE.sub("", text) != own:
                     later.setdefault(PLACE.sub("", text), place[0])
@@ -245,8 +246,15 @@ class Example:
         return torch.from_numpy(np.stack([stand_in(text, size) for text in texts]))
 
     def place_lessons(self, row: Row, size: int) -> PlaceLessons:
-        """`place_lessons` of ``row``, this example's."""
-        texts = [self.view.text(self.episode.words[query.tick]) for query in self.schedule.queries]
+        """`place_lessons` of ``row``, this example's.
+
+        While the first subgoal lasts more is seen than there was when it was told: what comes later is in mind then,
+        too.
+        """
+        episode = self.episode
+        if episode.planned is not None and not episode.is_told:
+            episode = episode.with_plans(even_the_first=True)
+        texts = [self.view.text(episode.words[query.tick]) for query in self.schedule.queries]
         return place_lessons(row, texts, self.form.vocabulary, size)
 
 

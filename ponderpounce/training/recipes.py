@@ -292,10 +292,10 @@ def small_retelling() -> Curriculum:
     refining = replace(
         planning,
         name="small_retelling/refining",
-        example=replace(planning.example, slips=0.0, retold_px=_RETOLD_PX, lapses=lapses),
+        example=replace(planning.example, text_dropout=0.4, slips=0.0, retold_px=_RETOLD_PX, lapses=lapses),
         w4=1.0,
-        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(1200, 2400))),
-        num_steps=2400,
+        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(1400, 2700))),
+        num_steps=2700,
     )
     joint = replace(
         joint,
