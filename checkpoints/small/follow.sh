@@ -59,6 +59,8 @@ mended+=("$more"/mended-again/*/)
 train small_retelling "$more/planning/ponder" "$more/run/pounce" "$more/last" --stage refining --watch "$more/wander" \
     --watch-share 0.125
 train small_retelling "$more/planning/ponder" "$more/run/pounce" "$more/last" --stage joint
+train small_retelling "$more/planning/ponder" "$more/run/pounce" "$more/last" --stage following --watch "$more/wander" \
+    --watch-share 0.375
 
 "$bin/pp-eval" --tasks PickHighlight --episodes 60 --runs 1 --seed 1000 \
     --ponder-checkpoint "$more/last/ponder" --pounce-checkpoint "$more/last/pounce" --out "$more/real"

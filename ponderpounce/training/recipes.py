@@ -303,7 +303,15 @@ def small_retelling() -> Curriculum:
         example=replace(joint.example, slips=0.0, retold_px=_RETOLD_PX, lapses=lapses, has_plans=True),
         w4=1 / 3,
     )
-    return Curriculum(name="small_retelling", stages=(refining, joint))
+    following = replace(  # what moved was followed less well after these: words that are told again never get far away
+        planning,
+        name="small_retelling/following",
+        example=replace(planning.example, text_dropout=0.3),
+        w4=1.0,
+        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, learning_rate=7e-4, warmup_steps=50, decay=(200, 500))),
+        num_steps=500,
+    )
+    return Curriculum(name="small_retelling", stages=(refining, joint, following))
 
 
 RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {

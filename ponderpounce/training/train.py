@@ -5,7 +5,7 @@
     OUT/samples.jsonl   what PONDER says at intervals, beside what it should
     OUT/ponder, pounce  at the end: what ponder-serve and pounce-serve take as --checkpoint
 
-A recipe of several stages leaves all of that in a folder for each, and the last stage's models in OUT as well.
+A recipe of several stages leaves all of that in a folder for each, and the newest of either model in OUT as well.
 
 The same command again resumes. On several GPUs or hosts:
 
@@ -220,8 +220,9 @@ def _train_stages(curriculum: Curriculum, data: TrainingSet, options: TrainOptio
             pounce=out / "pounce" if (out / "pounce").exists() else latest.pounce,
         )
     if world.is_first and _is_finished(options.out / names[-1]):
-        for system in _SYSTEMS:
-            shutil.copytree(options.out / names[-1] / system, options.out / system)
+        for newest in (latest.ponder, latest.pounce):  # which a stage of the other system alone did not touch
+            if newest is not None and newest.is_relative_to(options.out):
+                shutil.copytree(newest, options.out / newest.name)
 
 
 def _is_finished(out: Path) -> bool:

@@ -232,6 +232,19 @@ def test_all_stages_follow_each_other_and_the_last_is_what_is_served(folder: Pat
         train.train(options(folder, out))
 
 
+def test_the_newest_of_either_system_is_served(
+    folder: Path, tmp_path: Path, small: dict[str, Recipe], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also if the last stage trains one of them alone."""
+    monkeypatch.setitem(
+        recipes.RECIPES, "small", lambda: Curriculum(name="small", stages=(small["joint"], small["looking"]))
+    )
+    train.train(options(folder, tmp_path))
+    for stage, system in (("looking", "ponder"), ("joint", "pounce")):
+        one, other = (at / system / "model.safetensors" for at in (tmp_path, tmp_path / stage))
+        assert one.read_bytes() == other.read_bytes()
+
+
 def test_stages_run_apart_are_the_run_in_one_go(folder: Path, tmp_path: Path) -> None:
     train.train(options(folder, tmp_path / "together"))
     for stage in (
