@@ -52,6 +52,7 @@ demo: setup
 ## make policy  train the demo's policy again from nothing, on two cores, and measure it; goes on after a kill
 policy: setup
 	BIN=$(BIN) checkpoints/small/train.sh out/small
+	BIN=$(BIN) checkpoints/small/follow.sh out/small
 
 ## make test    everything that needs no GPU; make unit: without processes and long runs
 test: setup

@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
-# A PONDER that follows what moves and writes its plans down, from the pair that train.sh has left, on two CPU cores: see
-# docs/training.md, "A PONDER that follows, and plans". The shipped policy is the one of train.sh; this one solved fewer.
+# The shipped policy from the pair that train.sh has left, on two CPU cores: a PONDER that follows what moves and writes its plans
+# down. See docs/training.md, "A PONDER that follows, and plans".
 #
 #     checkpoints/small/follow.sh [OUT]       (the OUT of train.sh)
 #
 # PONDER's eyes are opened again and kept. It learns from things that are moved aside, from the pair's own mistakes, and from
 # films in which everything moves; it gets two more layers, laid out so that cognition stays with its thing; it learns to write
-# down what comes later, and at last, from its own mistakes once more, to say again what is no longer right. The same command
-# goes on after a kill.
+# down what comes later, and at last, from its own mistakes once more, to have all places in mind. The same command goes on after
+# a kill.
 set -euo pipefail
 
 out=${1:-out/small}

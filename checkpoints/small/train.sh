@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# The shipped policy from nothing, on two CPU cores, measured at its end: see docs/training.md, "The small recipe".
+# A pair from nothing, on two CPU cores, measured at its end: see docs/training.md, "The small recipe". follow.sh goes on from it to
+# the shipped policy.
 #
 #     checkpoints/small/train.sh [OUT]        (`make policy` sets everything up first)
 #

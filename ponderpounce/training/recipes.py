@@ -285,7 +285,10 @@ def small_planning() -> Recipe:
 
 
 def small_retelling() -> Curriculum:
-    """PONDER of `small_planning` learns to say words again whose place is no longer right, its own mistakes as well."""
+    """PONDER of `small_planning` learns from its own mistakes, with all places in mind.
+
+    Words told again, which its first two stages ask for as well, it did not learn to tell: docs/training.md.
+    """
     planning = small_planning()
     _, joint = small_following().stages
     lapses = replace(planning.example.lapses, rows=0.6, slipped=0.4)
