@@ -74,11 +74,12 @@ def test_while_a_place_is_told_that_place_is_in_mind() -> None:
     gates = set(row.gate_index.tolist())
     told = {index: place for index, slot, place in found if index not in gates and slot == 0}
     assert told
-    v = FORM.vocabulary
-    texts = [normalised_text(f"<{y}, {x}>") for y, x in told.values()]
-    for (index, _), text in zip(told.items(), texts, strict=True):
-        assert v.decode([row.ids[index + 1]]).strip("[] ,") in text  # the token that comes is of this place
-        assert row.targets[index + 1] != IGNORE
+    begins = [index for index in told if index - 1 not in told]
+    for begin in begins:
+        run = [index for index in range(begin, max(told) + 1) if all(k in told for k in range(begin, index + 1))]
+        spelled = FORM.vocabulary.decode([row.ids[index + 1] for index in run])
+        assert f"[{spelled}]" == normalised_text(f"<{told[begin][0]}, {told[begin][1]}>")
+        assert all(row.targets[index + 1] != IGNORE for index in run)
     features = made.features_MP.numpy()
     errors = [np.abs(features[m] - place_features(told[at])).max() for m, (at, _, _) in enumerate(found) if at in told]
     assert max(errors) < 0.2  # thousandths of the picture are not its pixels
