@@ -65,10 +65,15 @@ class _Asked:
 
 
 def collate_ponder(
-    examples: Sequence[Example], *, with_rows: bool = True, stand_in_size: int = 0, place_size: int = 0
+    examples: Sequence[Example],
+    *,
+    with_rows: bool = True,
+    stand_in_size: int = 0,
+    moved_weight: float = 1.0,
+    place_size: int = 0,
 ) -> PonderBatch:
     """PONDER's side: rows and pictures, stand-ins of ``stand_in_size`` numbers, place lessons for hidden states of
-    ``place_size``; what is not asked is not made."""
+    ``place_size``; what is not asked is not made. ``moved_weight``: see `Example.stand_in_weights`."""
     rows = tuple(each.row() for each in examples) if with_rows else ()
     taught = zip(examples, rows, strict=True) if place_size else ()
     return PonderBatch(
@@ -76,6 +81,7 @@ def collate_ponder(
         place_lessons=tuple(each.place_lessons(row, place_size) for each, row in taught),
         frames=tuple(each.frames() for each in examples) if with_rows else (),
         stand_ins=tuple(each.stand_ins(stand_in_size) for each in examples) if stand_in_size else (),
+        stand_in_weights=tuple(each.stand_in_weights(moved_weight) for each in examples) if moved_weight != 1 else (),
     )
 
 

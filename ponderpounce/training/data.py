@@ -85,7 +85,7 @@ class TrainingSet:
     """Episodes by number. ``pp-collect`` and ``pp-export`` make the folders.
 
     Where a dataset holds only some pictures (``--frames training``), a tick without its own has the one before it,
-    as in the video.
+    as in the video, and what PONDER is to say there is of the tick that it shows (`TrainingEpisode.as_seen`).
     """
 
     def __init__(
@@ -179,8 +179,9 @@ class TrainingSet:
         start = entry.num_demonstration_rows
         shown = [*range(0, start, FPS), *range(start, entry.num_rows)]
         num_shown = len(range(0, start, FPS))
-        views, sights = self._pictures(source, rows.is_rendered, shown)
-        return TrainingEpisode(
+        own = np.maximum.accumulate(np.where(rows.is_rendered, np.arange(len(rows.is_rendered)), 0))
+        views, sights = self._pictures(source, own, shown)
+        episode = TrainingEpisode(
             instruction=entry.instruction,
             demo=tuple((views if sights is None else sights)[:num_shown]),
             frames=views[num_shown:],
@@ -194,15 +195,16 @@ class TrainingSet:
             is_watched=source.is_watched,
             is_told=entry.origin == WANDERING,
         )
+        sees = self._sight is None or self._sight.form is not None
+        return episode.as_seen((own[start:] - start).clip(min=0)) if sees else episode
 
     def _pictures(
-        self, source: _Source, is_rendered: NDArray[np.bool_], shown: Sequence[int]
+        self, source: _Source, own: NDArray[np.intp], shown: Sequence[int]
     ) -> tuple[list[tuple[Frame, ...]], list[tuple[Frame, ...]] | None]:
-        """POUNCE's views of the rows, and PONDER's where they are other ones."""
+        """POUNCE's views of the rows, and PONDER's where they are other ones. ``own``: the row each picture is of."""
         sight = self._sight
         if sight is not None and sight.form is None and sight.pounce_px is None:
             return [()] * len(shown), [()] * len(shown)
-        own = np.maximum.accumulate(np.where(is_rendered, np.arange(len(is_rendered)), 0))
         taken = [int(own[row]) for row in shown]  # rows between two looks repeat the one before
         once = sorted(set(taken))
         if sight is None:

@@ -22,7 +22,7 @@ from ponderpounce.models.eyes import see
 from ponderpounce.models.normalisation import Floats
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.training.augment import AS_IT_IS, NOT_AUGMENTED, Augmentation, View, draw_view
-from ponderpounce.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses, without_lapses
+from ponderpounce.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses, has_moved, without_lapses
 from ponderpounce.training.nudge import NO_NUDGE, Nudge, draw_nudges
 from ponderpounce.training.place_lessons import PlaceLessons, place_lessons
 from ponderpounce.training.places import PLACE, misplaced
@@ -30,6 +30,7 @@ from ponderpounce.training.stand_in import stand_in
 
 Frame = NDArray[np.uint8]  # (height, width, 3) RGB
 _SILENCE = repeat(Words())
+_MOVED_PX = 3.0  # of a 256 px picture: farther than PONDER errs where nothing moves
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -62,6 +63,8 @@ class TrainingEpisode:
     sights: Sequence[tuple[Frame, ...]] | None = None
     """T ticks of what PONDER's eyes make of the views, where ``frames`` are not the cameras' own; ``demo`` then is what
     they make of it, too."""
+    seen_at_T: NDArray[np.intp] | None = None
+    """The tick that PONDER's view of each tick is of (`as_seen`); None: itself."""
 
     def __post_init__(self) -> None:
         rows = (self.frames, self.state_T8, self.action_T8, self.subgoals, self.is_transition_T)
@@ -77,6 +80,26 @@ class TrainingEpisode:
     @property
     def num_ticks(self) -> int:
         return len(self.subgoals)
+
+    def as_seen(self, seen_at_T: NDArray[np.intp]) -> TrainingEpisode:
+        """The same where pictures were taken now and then only: what is shown at tick t was taken at ``seen_at_T[t]``.
+
+        What PONDER is told and is to say must be of that instant, too. A thing that is being pushed lies elsewhere a
+        second later; a PONDER whose pictures lag behind its words learns not to look. POUNCE's state and commands stay.
+        Changes that no picture shows apart are seen as one.
+        """
+        count_T = np.cumsum(self.is_transition_T)[seen_at_T]
+        return replace(
+            self,
+            subgoals=[self.subgoals[tick] for tick in seen_at_T],
+            is_transition_T=np.diff(count_T, prepend=0) > 0,
+            seen_at_T=seen_at_T,
+        )
+
+    def ponder_state(self, tick: int) -> NDArray[np.float32]:
+        """The robot's state (8,) as it was when the picture of this tick was taken."""
+        state_8: NDArray[np.float32] = self.state_T8[tick if self.seen_at_T is None else self.seen_at_T[tick]]
+        return state_8
 
     def with_foresight(self) -> TrainingEpisode:
         """The same with a place in every text that gets one later, while its subgoal lasts.
@@ -245,6 +268,22 @@ class Example:
         texts = [self.view.text(self.episode.subgoals[query.tick]) for query in self.schedule.queries]
         return torch.from_numpy(np.stack([stand_in(text, size) for text in texts]))
 
+    def stand_in_weights(self, moved: float) -> Tensor:
+        """How much each query's stand-in counts, (Q,): ``moved`` where the words said last tell another place, else 1.
+
+        The thing was moved, or they are an earlier subgoal's. Everywhere else, and that is nearly everywhere, C can be
+        copied from the words.
+        """
+        if not self.is_grounded:
+            return torch.ones(len(self.schedule.queries))
+        subgoals, is_change = _subgoals(self.episode, self.schedule)
+        words = without_lapses(subgoals, is_change) if self.words is None else self.words
+        weights, said = [], ""
+        for each, now in zip(words, subgoals, strict=True):
+            said = each.text or said
+            weights.append(moved if has_moved(said, now, _MOVED_PX) else 1.0)
+        return torch.tensor(weights)
+
     def place_lessons(self, row: Row, size: int) -> PlaceLessons:
         """`place_lessons` of ``row``, this example's.
 
@@ -342,7 +381,7 @@ def episode_row(
             transition = Transition(subgoal=subgoal, reasoning=reasoning, is_learned=learns, is_due=said.is_due)
             reasoning = None
         is_owed = said.is_due and not said.text
-        segments += form.query(len(views[query.tick]), transition, episode.state_T8[query.tick], is_owed=is_owed)
+        segments += form.query(len(views[query.tick]), transition, episode.ponder_state(query.tick), is_owed=is_owed)
     return form.row(segments)
 
 

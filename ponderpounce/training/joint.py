@@ -19,6 +19,7 @@ from dataclasses import dataclass, fields, replace
 from itertools import accumulate
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -30,6 +31,7 @@ from ponderpounce.models.pounce import PounceInputs
 from ponderpounce.models.pounce_family import AnyPounce, action_loss
 from ponderpounce.models.pounce_groot import GrootInputs
 from ponderpounce.training.place_lessons import PlaceLessons
+from ponderpounce.training.stand_in import even_weights
 
 Trains = Literal["both", "ponder", "pounce"]
 """Which systems a stage trains. The other one is not even run."""
@@ -51,6 +53,8 @@ class PonderBatch:
     """Per row, (num_images, height, width, 3) uint8 in the order of its image positions; None without images."""
     stand_ins: tuple[Tensor, ...] = ()
     """Per row, (its queries, H): `stand_in` of the subgoal in force; () where no stage asks for them."""
+    stand_in_weights: tuple[Tensor, ...] = ()
+    """Per row, (its queries,): how much alignment with each counts; () for one each."""
     place_lessons: tuple[PlaceLessons, ...] = ()
     """Per row; () where no stage asks for them."""
 
@@ -69,6 +73,7 @@ class PonderBatch:
             self,
             frames=tuple(None if f is None else f.to(device) for f in self.frames),
             stand_ins=tuple(each.to(device) for each in self.stand_ins),
+            stand_in_weights=tuple(each.to(device) for each in self.stand_in_weights),
             place_lessons=tuple(each.to(device) for each in self.place_lessons),
         )
 
@@ -160,7 +165,7 @@ class JointLoss(NamedTuple):
     flow_matching: Tensor
     grounding: Tensor
     alignment: Tensor
-    """Mean squared distance of C from the stand-ins; 0 unless w3 is set."""
+    """Mean squared distance of C from the stand-ins, each times its weights; 0 unless w3 is set."""
     placing: Tensor
     """Mean squared error of places that PONDER has in mind; 0 unless w4 is set."""
     said_N: Tensor
@@ -191,11 +196,13 @@ class JointModel(nn.Module):
         w2: float = 0.1,
         w3: float = 0.0,
         w4: float = 0.0,
+        aligns_evenly: bool = False,
         trains: Trains = "both",
         keeps_eyes: bool = False,
         reads_together: bool = True,
     ) -> None:
-        """With ``keeps_eyes`` PONDER's vision tower stays as it is; ``reads_together`` is `encode_rows`'s ``together``.
+        """With ``keeps_eyes`` PONDER's vision tower stays as it is; ``reads_together`` is `encode_rows`'s ``together``;
+        ``aligns_evenly``: numbers of C count as `even_weights` says.
 
         Raises ValueError if POUNCE was built for another cognition than PONDER gives.
         """
@@ -207,6 +214,8 @@ class JointModel(nn.Module):
         self.ponder = ponder
         self.pounce = pounce
         self.w1, self.w2, self.w3, self.w4 = w1, w2, w3, w4
+        weights_H = even_weights(ponder.hidden_size) if aligns_evenly else np.ones(ponder.hidden_size, np.float32)
+        self._column_weights_H = torch.from_numpy(weights_H)
         self.trains = trains
         self.reads_together = reads_together
         for name, system in (("ponder", ponder), ("pounce", pounce)):
@@ -239,7 +248,10 @@ class JointModel(nn.Module):
             cognition_QKH, first_query = gather_cognition(episodes.rows, hidden)
             if self.w3 > 0:
                 wanted_QKH = torch.cat(episodes.stand_ins)[:, None].expand_as(cognition_QKH)
-                alignment = F.mse_loss(cognition_QKH.float(), wanted_QKH)
+                errors_QKH = (cognition_QKH.float() - wanted_QKH).square()
+                errors_Q = (errors_QKH * self._column_weights_H.to(device)).mean(dim=(1, 2))
+                weights = episodes.stand_in_weights
+                alignment = (errors_Q * torch.cat(weights) if weights else errors_Q).mean()
             if self.w4 > 0:
                 placing, num_placed = _placing(episodes.place_lessons, hidden)
         if self.trains != "ponder":

@@ -99,7 +99,7 @@ def drawn_lapses(
         others = [other for other in known if _is_other(other, text)]
         if changes and mistaken and not _is_other(mistaken, text):
             wait = None
-        elif changes or (wait is None and retold_px is not None and _has_moved(last, text, retold_px)):
+        elif changes or (wait is None and retold_px is not None and has_moved(last, text, retold_px)):
             is_late = index > 0 and rng.random() < lapses.missed
             wait = int(rng.integers(1, lapses.longest + 1)) if is_late else 0
         elif wait is not None:
@@ -125,10 +125,11 @@ def _said(text: str, lapses: Lapses, rng: np.random.Generator) -> tuple[str, boo
     """The words, and whether they are right."""
     if not lapses.slipped or rng.random() >= lapses.slipped or PLACE.search(text) is None:
         return text, True
-    return misplaced(text, float(np.exp(rng.uniform(*np.log(lapses.slip_px)))), rng, count=1), False
+    said = misplaced(text, float(np.exp(rng.uniform(*np.log(lapses.slip_px)))), rng, count=1)
+    return said, said == text  # at the edge of the picture, or by chance, it may be right all the same
 
 
-def _has_moved(told: str, now: str, by_px: float) -> bool:
+def has_moved(told: str, now: str, by_px: float) -> bool:
     """Whether the first place of both is farther away than that."""
     first, second = PLACE.search(told), PLACE.search(now)
     if first is None or second is None:

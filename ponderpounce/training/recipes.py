@@ -23,6 +23,7 @@ from ponderpounce.training.trainer import TrainConfig
 _FROM_SCRATCH = OptimConfig(learning_rate=1e-3, warmup_steps=200, betas=(0.9, 0.95), weight_decay=1e-4, ema_decay=0.998)
 
 _BESIDE_THE_WAY = Nudge(std_m=0.04)
+_MOVED_WEIGHT = 4.0
 _RETOLD_PX = 4.0  # of a 256 px picture: what cognition follows well, and more than PONDER's own error
 
 
@@ -43,6 +44,10 @@ class Recipe:
     w2: float = 0.1
     w3: float = 0.0
     """Of the auxiliary alignment with the stand-ins (`stand_in`); the paper has no such loss."""
+    moved_weight: float = 1.0
+    """How much alignment counts at queries whose words tell another place than the stand-in (`stand_in_weights`)."""
+    aligns_evenly: bool = False
+    """Numbers of C that tell a place slowly count for more (`even_weights`)."""
     w4: float = 0.0
     """Of the auxiliary lessons in places to have in mind (`place_lessons`); the paper has no such loss."""
     trains: Trains = "both"
@@ -317,6 +322,34 @@ def small_retelling() -> Curriculum:
     return Curriculum(name="small_retelling", stages=(refining, joint, following))
 
 
+def small_keeping_up() -> Curriculum:
+    """The pair of `small_retelling` learns, from pictures that are of the same instant as what is told of them, that C
+    has to stay with what is pushed: docs/training.md."""
+    _, joint, following = small_retelling().stages
+    following = replace(
+        following,
+        name="small_keeping_up/following",
+        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, learning_rate=7e-4, warmup_steps=50, decay=(800, 1700))),
+        num_steps=1700,
+        moved_weight=_MOVED_WEIGHT,
+    )
+    pointing = replace(  # C's fast numbers had followed, and the slow ones, which POUNCE reads, only half-way
+        following,
+        name="small_keeping_up/pointing",
+        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, learning_rate=7e-4, warmup_steps=50, decay=(300, 800))),
+        num_steps=800,
+        aligns_evenly=True,
+    )
+    joint = replace(
+        joint,
+        name="small_keeping_up/joint",
+        aligns_evenly=True,
+        example=replace(joint.example, slips=0.4, retold_px=None, lapses=following.example.lapses),
+        moved_weight=_MOVED_WEIGHT,
+    )
+    return Curriculum(name="small_keeping_up", stages=(following, pointing, joint))
+
+
 RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
     "robomme": robomme,
     "robocasa_dc": robocasa_dc,
@@ -328,6 +361,7 @@ RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
     "small_following": small_following,
     "small_planning": small_planning,
     "small_retelling": small_retelling,
+    "small_keeping_up": small_keeping_up,
 }
 
 

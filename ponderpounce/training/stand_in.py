@@ -27,6 +27,7 @@ _PERIODS = 2.0 ** np.arange(1, -5, -1)  # of the picture's side: two pictures do
 NUM_PLACE_FEATURES = 2 * (2 * len(_PERIODS) + 1)
 _WAVE_PX = tuple(round(period * TEXT_PX) for period in _PERIODS)
 _VALUE_SCALE = 2 * 3**0.5  # a coordinate is uniform in [-1/2, 1/2] at most: rms 1
+_MAX_EVEN_WEIGHT = 64.0
 _NOWHERE = (TEXT_PX // 2, TEXT_PX // 2)
 
 
@@ -55,6 +56,20 @@ def place_features(yx_px: tuple[float, float]) -> NDArray[np.float32]:
     angles = 2 * np.pi * np.outer(1 / _PERIODS, yx).ravel()
     waves = 2**0.5 * np.concatenate([np.sin(angles), np.cos(angles)])
     return np.concatenate([waves, (yx - 0.5) * _VALUE_SCALE]).astype(np.float32)
+
+
+def even_weights(size: int) -> NDArray[np.float32]:
+    """How much each number's squared error should count so that a place counts alike in all that tell it, (size,).
+
+    A place 5 px off changes a wave of 16 px by all that it can change, and the plain coordinate by a fifteenth of its
+    spread: left alone, the slow numbers may say another place than the fast ones at next to no loss. What turns once in
+    64 px or less counts once, and nothing more than 64 times.
+    """
+    slopes = 2**0.5 * 2 * np.pi / np.repeat(_WAVE_PX, 2)
+    place = np.concatenate([slopes, slopes, np.full(2, _VALUE_SCALE / TEXT_PX)])
+    weights = np.ones(size, np.float32)
+    weights[:NUM_PLACE_FEATURES] = np.clip((slopes[_WAVE_PX.index(64) * 2] / place) ** 2, 1.0, _MAX_EVEN_WEIGHT)
+    return weights
 
 
 def wave_columns(period_px: int) -> list[int]:

@@ -145,6 +145,7 @@ class Batches:
             examples,
             with_rows=run.trains != "pounce",
             stand_in_size=model.ponder.hidden_size if model.needs_stand_ins else 0,
+            moved_weight=run.moved_weight,
             place_size=model.ponder.hidden_size if model.w4 > 0 else 0,
         )
         if run.trains == "ponder":  # nobody acts: any moment will do, also one that is not to be imitated
@@ -315,7 +316,15 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
         pounce.config = replace(pounce.config, max_committed_rows=run.pounce.max_committed_rows)
     freeze(pounce, run.freeze)
     return JointModel(
-        ponder, pounce, w1=run.w1, w2=run.w2, w3=run.w3, w4=run.w4, trains=run.trains, keeps_eyes=run.keeps_eyes
+        ponder,
+        pounce,
+        w1=run.w1,
+        w2=run.w2,
+        w3=run.w3,
+        w4=run.w4,
+        aligns_evenly=run.aligns_evenly,
+        trains=run.trains,
+        keeps_eyes=run.keeps_eyes,
     ), bundle
 
 

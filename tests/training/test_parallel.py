@@ -35,13 +35,13 @@ def joint() -> JointModel:
     config = tiny_pounce(num_carriers=1, cognition_size=CONFIG.hidden_size, horizon=4)
     pounce = random_pounce(replace(config, max_committed_rows=2), seed=2)
     freeze(pounce, "vision")
-    return JointModel(Ponder.random(CONFIG, seed=1), pounce, w4=0.5)
+    return JointModel(Ponder.random(CONFIG, seed=1), pounce, w3=0.5, w4=0.5)
 
 
 def batch_of(model: JointModel, places: range, step: int) -> tuple[PonderBatch, PounceBatch]:
     """Three unequal episodes: one query or two, texts of another length, one to three places and invocations."""
     form, config = model.ponder.format, model.pounce.config
-    rows, frames, lessons, invocations = [], [], [], []
+    rows, frames, stand_ins, weights, lessons, invocations = [], [], [], [], [], []
     for index, place in enumerate(places):
         said = Transition(subgoal=form.vocabulary.encode("pick the cube" + " now" * (5 * place)))
         rows.append(form.row([*form.opening("press"), *form.query(1, said), *form.query(1) * (place % 2)]))
@@ -50,9 +50,17 @@ def batch_of(model: JointModel, places: range, step: int) -> tuple[PonderBatch, 
         generator = torch.Generator().manual_seed(100 * step + place)
         shape = (rows[-1].num_images, 32, 32, 3)
         frames.append(torch.randint(0, 256, shape, generator=generator, dtype=torch.uint8))
+        stand_ins.append(torch.randn(len(rows[-1].gate_index), model.ponder.hidden_size, generator=generator))
+        weights.append(torch.arange(1.0, 1 + len(stand_ins[-1])) * (1 + place))
         invocations += [(index, query, 100 * step + 10 * place + query) for query in (NO_QUERY, 0, 0)[: place + 1]]
     inputs = [config.example_inputs(1, seed=seed) for _, _, seed in invocations]
-    episodes = PonderBatch(rows=tuple(rows), frames=tuple(frames), place_lessons=tuple(lessons))
+    episodes = PonderBatch(
+        rows=tuple(rows),
+        frames=tuple(frames),
+        stand_ins=tuple(stand_ins),
+        stand_in_weights=tuple(weights),
+        place_lessons=tuple(lessons),
+    )
     return episodes, PounceBatch(
         inputs=replace(
             inputs[0],

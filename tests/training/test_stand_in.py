@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ponderpounce.training.stand_in import NUM_PLACE_FEATURES, stand_in
+from ponderpounce.training.stand_in import NUM_PLACE_FEATURES, even_weights, place_features, stand_in, wave_columns
 
 PIXELS = st.integers(0, 255)
 PICK = "pick up the {nth} highlighted cube at <{y}, {x}>, which is {colour}"
@@ -52,3 +52,22 @@ def test_a_text_without_a_place_points_at_the_middle() -> None:
 def test_too_small_a_carrier_is_refused() -> None:
     with pytest.raises(ValueError, match="expected at least 52"):
         stand_in("press", 40)
+
+
+@pytest.mark.parametrize(("period_px", "weight"), [(16, 1), (32, 1), (64, 1), (128, 4), (256, 16)])
+def test_evenly_weighed_waves_that_turn_slowly_say_as_much_of_a_small_step(period_px: int, weight: float) -> None:
+    weights = even_weights(40)
+    columns, known = wave_columns(period_px), wave_columns(64)
+    assert weights[columns] == pytest.approx(weight, rel=1e-6)
+    steps = np.array([place_features((y + 1, x)) - place_features((y, x)) for y in range(0, 256, 5) for x in (0, 99)])
+    if period_px >= 64:
+        said, expected = ((steps**2 * weights[: steps.shape[1]])[:, each].sum(1).mean() for each in (columns, known))
+        assert said == pytest.approx(expected, rel=0.01)
+
+
+def test_nothing_counts_more_than_64_times_and_what_tells_no_place_once() -> None:
+    weights = even_weights(40)
+    assert weights.max() == 64
+    assert weights[wave_columns(512)].tolist() == [64] * 4
+    assert set(weights[NUM_PLACE_FEATURES:]) == {1}
+    assert weights[NUM_PLACE_FEATURES - 2 : NUM_PLACE_FEATURES].tolist() == [64, 64]  # the coordinates themselves
