@@ -97,8 +97,11 @@ def test_a_frozen_pounce_is_noticed_and_the_robot_stops(machine: Any, ponder_str
     machine.thaw("pounce")
     player.wait_for_event("pounce_back")
     episode = player.wait_for_end()
-    (lost,) = (e.tick for e in episode.record.events if e.name == "pounce_lost")
-    levels = [level.name for level, _ in groupby(t.level for t in _decided(episode.record) if t.tick >= lost)]
+    decided = _decided(episode.record)
+    stopped = next(t.tick for t in decided if t.level == m.Level.STOPPED)
+    # the one that stopped it: on a busy machine a server is late, and lost for a moment, before or after it, too
+    lost = max(e.tick for e in episode.record.events if e.name == "pounce_lost" and e.tick <= stopped)
+    levels = [level.name for level, _ in groupby(t.level for t in decided if t.tick >= lost)]
     assert levels == LADDER  # back, but nobody engaged
     _is_whole(episode)
 
