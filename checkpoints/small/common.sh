@@ -13,6 +13,6 @@ correct() {  # the oracle takes over the episodes that were played into FOLDER a
     mapfile -t found < <(logs "$folder" "$status")
     if [ ${#found[@]} -gt 0 ] && [ ! -d "$out/meta" ]; then
         rm -rf "$out"  # a kill left the beginning
-        "$bin/pp-correct" "${found[@]}" --order near-first --look-hz 1 --per-episode "$times" --out "$out"
+        "$bin/pp-correct" "${found[@]}" --order near-first --per-episode "$times" --out "$out"
     fi
 }

@@ -6,8 +6,8 @@
 #
 # PONDER's eyes are opened again and kept. It learns from things that are moved aside, from the pair's own mistakes, and from
 # films in which everything moves; it gets two more layers, laid out so that cognition stays with its thing; it learns to write
-# down what comes later, and at last, from its own mistakes once more, to have all places in mind. The same command goes on after
-# a kill.
+# down what comes later, from its own mistakes once more to have all places in mind, and at last, a third time, to stay with what
+# the hand has pushed. The same command goes on after a kill.
 set -euo pipefail
 
 out=${1:-out/small}
@@ -62,5 +62,11 @@ train small_retelling "$more/planning/ponder" "$more/run/pounce" "$more/last" --
 train small_retelling "$more/planning/ponder" "$more/run/pounce" "$more/last" --stage following --watch "$more/wander" \
     --watch-share 0.375
 
+mend "$more/last/ponder" "$more/last/pounce" 1600000 "$more/played-thirdly" "$more/mended-thirdly"
+mended+=("$more"/mended-thirdly/*/)
+train small_keeping_up "$more/last/ponder" "$more/last/pounce" "$more/kept" --stage following --watch "$more/wander" \
+    --watch-share 0.25
+train small_keeping_up "$more/last/ponder" "$more/last/pounce" "$more/kept" --stage joint
+
 "$bin/pp-eval" --tasks PickHighlight --episodes 60 --runs 1 --seed 1000 \
-    --ponder-checkpoint "$more/last/ponder" --pounce-checkpoint "$more/last/pounce" --out "$more/real"
+    --ponder-checkpoint "$more/kept/ponder" --pounce-checkpoint "$more/kept/pounce" --out "$more/real"
