@@ -64,9 +64,7 @@ train small_retelling "$more/planning/ponder" "$more/run/pounce" "$more/last" --
 
 mend "$more/last/ponder" "$more/last/pounce" 1600000 "$more/played-thirdly" "$more/mended-thirdly"
 mended+=("$more"/mended-thirdly/*/)
-train small_keeping_up "$more/last/ponder" "$more/last/pounce" "$more/kept" --stage following --watch "$more/wander" \
-    --watch-share 0.25
-train small_keeping_up "$more/last/ponder" "$more/last/pounce" "$more/kept" --stage joint
+train small_keeping_up "$more/last/ponder" "$more/last/pounce" "$more/kept" --watch "$more/wander" --watch-share 0.25
 
 "$bin/pp-eval" --tasks PickHighlight --episodes 60 --runs 1 --seed 1000 \
-    --ponder-checkpoint "$more/kept/ponder" --pounce-checkpoint "$more/kept/pounce" --out "$more/real"
+    --ponder-checkpoint "$more/kept/ponder" --pounce-checkpoint "$more/last/pounce" --out "$more/real"

@@ -323,9 +323,8 @@ def small_retelling() -> Curriculum:
 
 
 def small_keeping_up() -> Curriculum:
-    """The pair of `small_retelling` learns, from pictures that are of the same instant as what is told of them, that C
-    has to stay with what is pushed: docs/training.md."""
-    _, joint, following = small_retelling().stages
+    """PONDER of `small_retelling` learns, from its own mistakes once more, that C has to stay with what is pushed."""
+    *_, following = small_retelling().stages
     following = replace(
         following,
         name="small_keeping_up/following",
@@ -340,14 +339,7 @@ def small_keeping_up() -> Curriculum:
         num_steps=800,
         aligns_evenly=True,
     )
-    joint = replace(
-        joint,
-        name="small_keeping_up/joint",
-        aligns_evenly=True,
-        example=replace(joint.example, slips=0.4, retold_px=None, lapses=following.example.lapses),
-        moved_weight=_MOVED_WEIGHT,
-    )
-    return Curriculum(name="small_keeping_up", stages=(following, pointing, joint))
+    return Curriculum(name="small_keeping_up", stages=(following, pointing))
 
 
 RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
