@@ -18,6 +18,7 @@ from ponderpounce.training.joint import Trains
 from ponderpounce.training.lapses import Lapses
 from ponderpounce.training.nudge import Nudge
 from ponderpounce.training.optim import OptimConfig
+from ponderpounce.training.stand_in import NO_DOUBT, Doubt
 from ponderpounce.training.trainer import TrainConfig
 
 _FROM_SCRATCH = OptimConfig(learning_rate=1e-3, warmup_steps=200, betas=(0.9, 0.95), weight_decay=1e-4, ema_decay=0.998)
@@ -67,6 +68,10 @@ class Recipe:
     def __post_init__(self) -> None:
         if self.trains != "pounce" and self.example.is_grounded != (self.w2 > 0):
             raise ValueError(f"recipe {self.name}: is_grounded is {self.example.is_grounded}, but w2 is {self.w2}")
+        if self.trains != "pounce" and self.example.doubt != NO_DOUBT:
+            raise ValueError(
+                f"recipe {self.name}: doubt is for stages that train POUNCE alone; PONDER should have none"
+            )
         if self.trains == "both" and self.example.augmentation != NOT_AUGMENTED and self.example.augments == "all":
             raise ValueError(f"recipe {self.name}: views are moved and actions are not; augment watched episodes only")
 
@@ -342,6 +347,26 @@ def small_keeping_up() -> Curriculum:
     return Curriculum(name="small_keeping_up", stages=(following, pointing))
 
 
+def small_reading() -> Curriculum:
+    """PONDER of `small_keeping_up` goes on as it ended; POUNCE learns to read cognition that is in doubt (`Doubt`)."""
+    *_, pointing = small_keeping_up().stages
+    pointing = replace(
+        pointing,
+        name="small_reading/pointing",
+        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, learning_rate=7e-4, warmup_steps=50, decay=(500, 1300))),
+        num_steps=1300,
+    )
+    mending = next(stage for stage in small().stages if stage.name == "small/mending")
+    reading = replace(
+        mending,
+        name="small_reading/reading",
+        example=replace(mending.example, doubt=Doubt(share=0.7)),
+        train=replace(mending.train, optim=replace(_FROM_SCRATCH, learning_rate=5e-4, decay=(1200, 3000))),
+        num_steps=3000,
+    )
+    return Curriculum(name="small_reading", stages=(pointing, reading))
+
+
 RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
     "robomme": robomme,
     "robocasa_dc": robocasa_dc,
@@ -354,6 +379,7 @@ RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
     "small_planning": small_planning,
     "small_retelling": small_retelling,
     "small_keeping_up": small_keeping_up,
+    "small_reading": small_reading,
 }
 
 
