@@ -6,8 +6,8 @@
 #
 # PONDER's eyes are opened again and kept. It learns from things that are moved aside, from the pair's own mistakes, and from
 # films in which everything moves; it gets two more layers, laid out so that cognition stays with its thing; it learns to write
-# down what comes later, from its own mistakes once more to have all places in mind, and at last, a third time, to stay with what
-# the hand has pushed. The same command goes on after a kill.
+# down what comes later, from its own mistakes once more to have all places in mind, a third time to stay with what the hand has
+# pushed, and a fourth time, in short rows, to see what is lit. The same command goes on after a kill.
 set -euo pipefail
 
 out=${1:-out/small}
@@ -66,5 +66,12 @@ mend "$more/last/ponder" "$more/last/pounce" 1600000 "$more/played-thirdly" "$mo
 mended+=("$more"/mended-thirdly/*/)
 train small_keeping_up "$more/last/ponder" "$more/last/pounce" "$more/kept" --watch "$more/wander" --watch-share 0.25
 
+mend "$more/kept/ponder" "$more/last/pounce" 1700000 "$more/played-fourthly" "$more/mended-fourthly"
+mended+=("$more"/mended-fourthly/*/)
+train small_noticing "$more/kept/ponder" "$more/last/pounce" "$more/noticed" --stage noticing --watch "$more/wander" \
+    --watch-share 0.125
+train small_noticing "$more/kept/ponder" "$more/last/pounce" "$more/noticed" --stage pointing --watch "$more/wander" \
+    --watch-share 0.25
+
 "$bin/pp-eval" --tasks PickHighlight --episodes 60 --runs 1 --seed 1000 \
-    --ponder-checkpoint "$more/kept/ponder" --pounce-checkpoint "$more/last/pounce" --out "$more/real"
+    --ponder-checkpoint "$more/noticed/ponder" --pounce-checkpoint "$more/last/pounce" --out "$more/real"

@@ -16,6 +16,8 @@ import torch
 from torch import Tensor, nn
 
 from clock.timebase import NS_PER_S
+from ponderpounce.models.place_code import NUM_PLACE_FEATURES
+from ponderpounce.models.place_rounding import nearest_code
 from ponderpounce.models.sinusoid import sinusoid
 
 MAX_CARRIERS = 16
@@ -39,6 +41,9 @@ class CognitionConfig:
     projector_std: float | None = None
     """Initial std of W_c. None: for C of rms 1, W_c C has the rms of the text embeddings. (The paper's 1e-3
     is for GR00T.)"""
+    rounds_places: bool = False
+    """The first numbers of every carrier are read as the nearest place's code (`place_rounding`). Only for networks
+    from scratch whose C was taught to have that form; the paper has nothing of it."""
     age_features: int = 64
     age_min_period_s: float = 0.1
     age_max_period_s: float = 100.0
@@ -50,6 +55,10 @@ class CognitionConfig:
             raise ValueError(f"cognition_size must be at least 1, came {self.cognition_size}")
         if self.age_features < 2 or self.age_features % 2:
             raise ValueError(f"age_features must be even and at least 2, came {self.age_features}")
+        if self.rounds_places and self.cognition_size < NUM_PLACE_FEATURES:
+            raise ValueError(
+                f"rounds_places needs a cognition_size of at least {NUM_PLACE_FEATURES}, came {self.cognition_size}"
+            )
         if self.attention not in ("full", "isolated"):
             raise ValueError(f"attention must be 'full' or 'isolated', came {self.attention!r}")
 
@@ -134,6 +143,9 @@ class CognitionPrefix(nn.Module):
         else:
             # Scaled before the null is chosen: C_null is POUNCE's own parameter and learns at full rate.
             source_BKH = scale_gradient(cognition_BKH.float(), self.config.gradient_scale)
+            if self.config.rounds_places:
+                place_BKF, rest_BKR = source_BKH.tensor_split([NUM_PLACE_FEATURES], dim=-1)
+                source_BKH = torch.cat([nearest_code(place_BKF), rest_BKR], dim=-1)
             if is_null_B is not None:
                 source_BKH = torch.where(is_null_B[:, None, None], null_BKH, source_BKH)
                 age_ns_B = age_ns_B.masked_fill(is_null_B, 0)

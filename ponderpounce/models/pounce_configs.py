@@ -61,7 +61,7 @@ def small(*, num_carriers: int = 1, cognition_size: int = 128, horizon: int = RO
     """0.9 M weights, to be trained from scratch on CPU cores: end-effector deltas, the state as a token, no pictures.
 
     The action expert's samples are what CPU minutes buy; pictures would cost several times as many, and where the hand
-    should go is what cognition tells.
+    should go is what cognition tells, in a form of its own (`CognitionConfig.rounds_places`).
     """
     config = PounceConfig(
         pi05=Pi05Config(
@@ -72,7 +72,7 @@ def small(*, num_carriers: int = 1, cognition_size: int = 128, horizon: int = RO
             action_dim=8,
             horizon=horizon,
         ),
-        cognition=CognitionConfig(num_carriers=num_carriers, cognition_size=cognition_size),
+        cognition=CognitionConfig(num_carriers=num_carriers, cognition_size=cognition_size, rounds_places=True),
         state_input="token",
         num_cameras=0,
         num_steps=4,

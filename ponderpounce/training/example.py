@@ -26,7 +26,7 @@ from ponderpounce.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses,
 from ponderpounce.training.nudge import NO_NUDGE, Nudge, draw_nudges
 from ponderpounce.training.place_lessons import PlaceLessons, place_lessons
 from ponderpounce.training.places import PLACE, misplaced
-from ponderpounce.training.stand_in import NO_DOUBT, Doubt, doubted
+from ponderpounce.training.stand_in import stand_in
 
 Frame = NDArray[np.uint8]  # (height, width, 3) RGB
 _SILENCE = repeat(Words())
@@ -191,8 +191,6 @@ class ExampleConfig:
     retold_px: float | None = None
     """Words are said again once the place that they told is farther than that from its thing; None: never."""
 
-    doubt: Doubt = NO_DOUBT
-    """Of stand-ins. For POUNCE alone: to PONDER a stand-in is what C should be."""
     augmentation: Augmentation = NOT_AUGMENTED
     """Other views of the scene. An action is that of the scene as it is, so where POUNCE learns as well, only watched
     episodes may be seen otherwise."""
@@ -238,8 +236,6 @@ class Example:
     nudge: Nudge = NO_NUDGE
     nudges_I2: Floats | None = None
     """Of each invocation's tool [m]; None: starts are as recorded."""
-    doubt: Doubt = NO_DOUBT
-    doubt_seed: int = 0
 
     def row(self) -> Row:
         """PONDER's tokens."""
@@ -268,10 +264,9 @@ class Example:
         return tuple(accumulate((normalised_text(each.text) for each in self.words), lambda old, new: new or old))
 
     def stand_ins(self, size: int) -> Tensor:
-        """`stand_in` of the subgoal in force at every query, in doubt where that was asked for, (Q, size)."""
+        """`stand_in` of the subgoal in force at every query, (Q, size)."""
         texts = [self.view.text(self.episode.subgoals[query.tick]) for query in self.schedule.queries]
-        rng = np.random.default_rng(self.doubt_seed)
-        return torch.from_numpy(np.stack([doubted(text, size, self.doubt, rng) for text in texts]))
+        return torch.from_numpy(np.stack([stand_in(text, size) for text in texts]))
 
     def stand_in_weights(self, moved: float) -> Tensor:
         """How much each query's stand-in counts, (Q,): ``moved`` where the words said last tell another place, else 1.
@@ -342,8 +337,6 @@ def make_example(
         words=words,
         nudge=config.nudge,
         nudges_I2=nudges_I2,
-        doubt=config.doubt,
-        doubt_seed=int(rng.integers(1 << 62)) if config.doubt != NO_DOUBT else 0,
     )
 
 

@@ -33,6 +33,7 @@ from torch import Tensor
 
 from clock import sampling
 from ponderpounce.data.errors import DatasetError
+from ponderpounce.models.place_code import NUM_PLACE_FEATURES, wave_columns
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import load_ponder, save_ponder
 from ponderpounce.training.augment import Augmentation
@@ -42,7 +43,6 @@ from ponderpounce.training.example import Example, ExampleConfig, make_example
 from ponderpounce.training.growing import grown
 from ponderpounce.training.joint import encode_rows
 from ponderpounce.training.seeing import answers_of, names_in
-from ponderpounce.training.stand_in import NUM_PLACE_FEATURES, wave_columns
 
 DONE, REFUSED = 0, 2
 _COARSE = [*wave_columns(128), *wave_columns(64)]

@@ -24,9 +24,9 @@ import torch
 from torch import Tensor
 
 from ponderpounce.models.context import IGNORE, Row
+from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features
 from ponderpounce.models.vocabulary import Vocabulary
 from ponderpounce.training.places import PLACE, TEXT_PX
-from ponderpounce.training.stand_in import NUM_PLACE_FEATURES, place_features
 
 _TOLD = re.compile(r"\[(\d+), (\d+)\]")  # x, y in thousandths
 _FULL = 1000

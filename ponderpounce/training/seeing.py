@@ -31,6 +31,7 @@ from tqdm import tqdm
 
 from ponderpounce.data.errors import DatasetError
 from ponderpounce.models.context import ContextFormat
+from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import load_ponder, save_ponder
 from ponderpounce.models.vocabulary import Vocabulary
@@ -39,7 +40,6 @@ from ponderpounce.training.data import Sight, TrainingSet
 from ponderpounce.training.optim import OptimConfig, Optimiser
 from ponderpounce.training.places import TEXT_PX
 from ponderpounce.training.recipes import recipe, stages_of
-from ponderpounce.training.stand_in import NUM_PLACE_FEATURES, place_features
 
 DONE, REFUSED = 0, 2
 

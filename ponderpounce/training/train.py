@@ -59,8 +59,8 @@ class TrainOptions:
     """Trains PONDER and POUNCE together. The same command again resumes a run that was killed."""
 
     recipe: str
-    """robomme and robocasa_dc are the paper's; small learns from scratch on CPU cores, small_refocusing,
-    small_following and small_planning go on from there; tiny and tiny_groot are for a try."""
+    """robomme and robocasa_dc are the paper's; small learns from scratch on CPU cores, those whose names begin with
+    small_ go on from there; tiny and tiny_groot are for a try."""
     data: tuple[Path, ...]
     """Folders that pp-collect, pp-export or pp-correct made: episodes to imitate."""
     out: Path

@@ -1,5 +1,8 @@
 """Laws of the cognition prefix: order, null, age, scale, and the halved gradient."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -7,6 +10,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from ponderpounce.models.interface import CognitionConfig, CognitionPrefix, scale_gradient
+from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features
 
 WIDTH = 32
 SIZE = 24
@@ -124,6 +128,7 @@ def test_one_playback_tick_of_age_is_visible() -> None:
         ({"cognition_size": 0}, "at least 1, came 0"),
         ({"age_features": 7}, "even and at least 2, came 7"),
         ({"attention": "half"}, "'full' or 'isolated', came 'half'"),
+        ({"rounds_places": True, "cognition_size": 25}, "at least 26, came 25"),
     ],
 )
 def test_wrong_configurations_are_refused(wrong: dict, message: str) -> None:
@@ -140,3 +145,20 @@ def test_cognition_of_another_shape_is_refused(shape: tuple[int, ...]) -> None:
 def test_no_carriers_no_module() -> None:
     with pytest.raises(ValueError, match="K = 0"):
         _prefix(num_carriers=0)
+
+
+def test_rounded_cognition_is_that_of_the_nearest_place_and_the_rest_is_left() -> None:
+    config = CognitionConfig(num_carriers=2, cognition_size=40)
+    plain, rounding = CognitionPrefix(config, WIDTH), CognitionPrefix(replace(config, rounds_places=True), WIDTH)
+    plain.initialise(1.0, torch.Generator().manual_seed(0))
+    rounding.load_state_dict(plain.state_dict())
+    cognition = torch.randn(2, 2, 40, generator=torch.Generator().manual_seed(1))
+    clean, places = cognition.clone(), ((10.0, 20.0), (100.5, 3.0), (255.0, 0.0), (128.0, 64.0))
+    clean[..., :NUM_PLACE_FEATURES] = torch.from_numpy(np.stack([place_features(each) for each in places])).view(
+        2, 2, -1
+    )
+    blurred = clean.clone()
+    blurred[..., :NUM_PLACE_FEATURES] += 0.02
+    torch.testing.assert_close(rounding(blurred, AGES_NS), plain(clean, AGES_NS))
+    is_null = torch.tensor([True, True])
+    assert torch.equal(rounding(blurred, AGES_NS, is_null), plain(None, AGES_NS))

@@ -14,11 +14,11 @@ from torch import Tensor
 
 from ponderpounce.data import album, wander
 from ponderpounce.models import ponder_configs
+from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features, wave_columns
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import load_ponder, save_ponder
 from ponderpounce.training.data import Sight, TrainingSet
 from ponderpounce.training.following import REFUSED, Samples, lay_out, main, samples_of
-from ponderpounce.training.stand_in import NUM_PLACE_FEATURES, place_features, wave_columns
 
 SIZE = 128
 RMS = 10.0

@@ -10,6 +10,7 @@ import torch
 
 from clock.sampling import EVALUATION
 from ponderpounce.models.context import IGNORE
+from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
 from ponderpounce.models.ponder_coordinates import normalised_text
@@ -18,7 +19,6 @@ from ponderpounce.training.example import Example, ExampleConfig, TrainingEpisod
 from ponderpounce.training.joint import encode_rows
 from ponderpounce.training.lapses import Lapses
 from ponderpounce.training.place_lessons import PlaceLessons
-from ponderpounce.training.stand_in import NUM_PLACE_FEATURES, place_features
 
 PONDER = Ponder.random(replace(tiny_cpu(), image_px=(32, 32), num_layers=4), seed=1)
 FORM, SIZE = PONDER.format, PONDER.hidden_size

@@ -11,12 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ponderpounce.data import album
+from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import load_ponder
 from ponderpounce.models.ponder_configs import small
 from ponderpounce.models.vocabulary import Vocabulary
 from ponderpounce.training.seeing import REFUSED, Album, answers_of, draw, loss_of, main
-from ponderpounce.training.stand_in import NUM_PLACE_FEATURES, place_features
 
 PONDER = Ponder.random(small(), seed=0)
 FORM = PONDER.format

@@ -25,9 +25,7 @@ from ponderpounce.training.data import Sight, TrainingSet
 from ponderpounce.training.example import ExampleConfig, TrainingEpisode, make_example, row_frames
 from ponderpounce.training.joint import Draws, JointModel
 from ponderpounce.training.parallel import World
-from ponderpounce.training.places import PLACE
 from ponderpounce.training.recipes import Curriculum, Recipe, stages_of
-from ponderpounce.training.stand_in import Doubt
 from ponderpounce.training.train import Batches, TrainOptions, build
 from ponderpounce.training.trainer import Trainer
 
@@ -419,23 +417,3 @@ def test_where_pounce_learns_only_watched_episodes_are_seen_otherwise(
         assert (set(views) == {AS_IT_IS}) == (number < NUM_EPISODES)
     with pytest.raises(ValueError, match="augment watched episodes only"):
         replace(run, example=replace(run.example, augments="all"))
-
-
-def test_only_who_reads_stand_ins_may_be_told_them_in_doubt(
-    folder: Path, tmp_path: Path, small: dict[str, Recipe]
-) -> None:
-    doubt = Doubt(share=1.0)
-    for stage in ("joint", "refining"):
-        with pytest.raises(ValueError, match="doubt is for stages that train POUNCE alone"):
-            replace(small[stage], example=replace(small[stage].example, doubt=doubt))
-    data, config = TrainingSet(folder), small["mending"].example
-    form = build(small["mending"], data, options(folder, tmp_path))[0].ponder.format
-    episode = data[0]
-    sure, unsure = (
-        make_example(episode, form, each, np.random.default_rng(3)) for each in (config, replace(config, doubt=doubt))
-    )
-    assert (sure.schedule, sure.invocations) == (unsure.schedule, unsure.invocations)
-    assert np.array_equal(sure.nudges_I2, unsure.nudges_I2)  # type: ignore[arg-type]
-    assert torch.equal(unsure.stand_ins(128), unsure.stand_ins(128))
-    is_changed = (sure.stand_ins(128) != unsure.stand_ins(128)).any(dim=1).tolist()
-    assert is_changed == [bool(PLACE.search(episode.subgoals[query.tick])) for query in sure.schedule.queries]

@@ -7,16 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ponderpounce.training.stand_in import (
-    NO_DOUBT,
-    NUM_PLACE_FEATURES,
-    Doubt,
-    doubted,
-    even_weights,
-    place_features,
-    stand_in,
-    wave_columns,
-)
+from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features, wave_columns
+from ponderpounce.training.stand_in import even_weights, stand_in
 
 PIXELS = st.integers(0, 255)
 PICK = "pick up the {nth} highlighted cube at <{y}, {x}>, which is {colour}"
@@ -80,55 +72,3 @@ def test_nothing_counts_more_than_64_times_and_what_tells_no_place_once() -> Non
     assert weights[wave_columns(512)].tolist() == [64] * 4
     assert set(weights[NUM_PLACE_FEATURES:]) == {1}
     assert weights[NUM_PLACE_FEATURES - 2 : NUM_PLACE_FEATURES].tolist() == [64, 64]  # the coordinates themselves
-
-
-ALWAYS = Doubt(share=1.0, noise=0.0)
-
-
-def numbers_in_doubt(yx_px: tuple[int, int], doubt: Doubt, seed: int) -> np.ndarray:
-    y, x = yx_px
-    values = doubted(PICK.format(nth="first", y=y, x=x, colour="red"), 64, doubt, np.random.default_rng(seed))
-    np.testing.assert_array_equal(
-        values[NUM_PLACE_FEATURES:],
-        stand_in(PICK.format(nth="first", y=y, x=x, colour="red"), 64)[NUM_PLACE_FEATURES:],
-    )
-    return values[:NUM_PLACE_FEATURES]
-
-
-@given(yx_px=st.tuples(PIXELS, PIXELS), seed=st.integers(0, 2**32 - 1))
-def test_a_doubt_lies_between_two_places_nearer_to_the_right_one(yx_px: tuple[int, int], seed: int) -> None:
-    numbers, right = numbers_in_doubt(yx_px, ALWAYS, seed), place_features(yx_px)
-    between_px = (numbers[-2:] / (2 * 3**0.5) + 0.5) * 256  # the coordinates tell where between
-    best = min(
-        (np.square(numbers - right - weight * (place_features(other) - right)).sum(), weight)
-        for weight in np.linspace(0.005, 0.45, 90)
-        for other in [tuple((np.array(yx_px) + (between_px - yx_px) / weight).tolist())]
-    )
-    assert best[0] < 0.3  # some second place, weighed less than a half, explains all numbers
-
-
-@given(yx_px=st.tuples(PIXELS, PIXELS), seed=st.integers(0, 2**32 - 1))
-def test_no_doubt_is_the_stand_in_itself(yx_px: tuple[int, int], seed: int) -> None:
-    for doubt in (NO_DOUBT, Doubt(share=0.0, noise=0.0), Doubt(share=1.0, most=0.0, noise=0.0)):
-        np.testing.assert_allclose(numbers_in_doubt(yx_px, doubt, seed), place_features(yx_px), atol=1e-6)
-
-
-def test_what_tells_no_place_is_never_in_doubt() -> None:
-    values = doubted("place the cube", 64, Doubt(share=1.0), np.random.default_rng(0))
-    np.testing.assert_array_equal(values, stand_in("place the cube", 64))
-
-
-def test_fast_waves_tell_the_right_place_where_the_coordinates_do_not() -> None:
-    drawn = np.stack([numbers_in_doubt((100, 120), ALWAYS, seed) for seed in range(200)])
-    grid = np.array([(y, x) for y in range(70, 131, 2) for x in range(90, 151, 2)])
-    known = np.stack([place_features((y, x)) for y, x in grid])
-    nearest = grid[np.square(drawn[:, None] - known).sum(axis=2).argmin(axis=1)]
-    by_coordinates = (drawn[:, -2:] / (2 * 3**0.5) + 0.5) * 256
-    by_all_px, slow_px = (np.percentile(np.hypot(*(each - (100, 120)).T), 80) for each in (nearest, by_coordinates))
-    assert by_all_px < slow_px / 2
-
-
-@pytest.mark.parametrize("wrong", [{"share": 1.2}, {"most": 0.5}, {"away_px": (8.0, 4.0)}, {"noise": -1.0}])
-def test_doubts_that_make_no_sense_are_refused(wrong: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        Doubt(**wrong)  # type: ignore[arg-type]
