@@ -6,8 +6,10 @@ import re
 
 import numpy as np
 
+from ponderpounce.models.place_code import PLACE_PX
+
 PLACE = re.compile(r"<\s*(\d+)\s*,\s*(\d+)\s*>")
-TEXT_PX = 256
+TEXT_PX = PLACE_PX
 """Side of the picture that texts speak of, whatever the size of a picture."""
 
 
