@@ -334,7 +334,7 @@ class QwenEngine:
             if not is_transition:
                 wanted = 1 + self._format.num_carriers
                 hidden_NH = yield Append(session=context, ids=query.ids, embeds_TH=embeds_TH, num_wanted=wanted)
-                is_transition = self._gate(hidden_NH[0]) == self._format.vocabulary.t_yes
+                is_transition = self._format.speaks and self._gate(hidden_NH[0]) == self._format.vocabulary.t_yes
                 hidden_KH = hidden_NH[1:]
             if is_transition:
                 context.restore(before)

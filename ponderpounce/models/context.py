@@ -102,6 +102,8 @@ class ContextFormat:
     """What is seen of an instant's views: how many images it gives, and with ``image_px`` which pixels."""
     proprioception: Proprioception | None = None
     """What is told of the robot's state besides; None: nothing, as in the paper."""
+    speaks: bool = True
+    """False: trained without words (RoboCasa-DC), its LM head on nothing. Serving then asks it for none."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.num_carriers <= 16:

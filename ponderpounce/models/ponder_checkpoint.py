@@ -46,14 +46,16 @@ class CheckpointError(ValueError):
 class StoredPonder:
     """Contents of ponder.json. The defaults are for a public Qwen3.5, which has none; a file has every field."""
 
-    format: Literal["ponderpounce.ponder/3"] = "ponderpounce.ponder/3"
-    """/2 is the same without ``proprioception``, /1 without ``eyes`` as well; they are read as having none."""
+    format: Literal["ponderpounce.ponder/4"] = "ponderpounce.ponder/4"
+    """/3 is the same without ``speaks``, /2 without ``proprioception`` as well, /1 without ``eyes``: such a PONDER
+    speaks and has none of the others."""
     num_carriers: int = 1
     first_carrier_id: int | None = None
     """None: the first row after the tokenizer's last id."""
     image_px: tuple[int, int] = (256, 256)
     eyes: Eyes = None
     proprioception: Proprioception | None = None
+    speaks: bool = True
     is_random: bool = True
     """The carriers were never trained."""
 
@@ -85,6 +87,7 @@ def load_ponder(directory: Path, *, device: torch.device | str = "cpu", dtype: t
         token_px=token_px(qwen_config),
         eyes=stored.eyes,
         proprioception=stored.proprioception,
+        speaks=stored.speaks,
     )
     if qwen_config.image_token_id != vocabulary.image_pad:
         raise CheckpointError(
@@ -118,6 +121,7 @@ def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_S
         image_px=ponder.image_px,
         eyes=ponder.format.eyes,
         proprioception=ponder.format.proprioception,
+        speaks=ponder.format.speaks,
         is_random=ponder.is_random,
     )
     (directory / OWN_NAME).write_text(json.dumps(asdict(stored), indent=2) + "\n")
@@ -206,6 +210,8 @@ def _read_stored(directory: Path) -> StoredPonder:
         values |= {"format": "ponderpounce.ponder/2", "eyes": None}
     if isinstance(values, dict) and values.get("format") == "ponderpounce.ponder/2":
         values |= {"format": "ponderpounce.ponder/3", "proprioception": None}
+    if isinstance(values, dict) and values.get("format") == "ponderpounce.ponder/3":
+        values |= {"format": "ponderpounce.ponder/4", "speaks": True}
     return from_json(StoredPonder, values, str(path))
 
 

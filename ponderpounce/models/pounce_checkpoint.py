@@ -44,6 +44,7 @@ _LATER_STATISTICS = {"space": "joint_delta", "reach": []}
 _LATER_FIELDS = {"max_committed_rows": 0, "reads_subgoal": False, "state_input": "prompt", "robot_state_dim": 8}
 """Of pi0.5's config: what it meant where a folder was written before there was such a field."""
 _LATER_GROOT_FIELDS = {"reads_subgoal": False}
+_LATER_COGNITION_FIELDS = {"rounds_places": False}
 TOKENIZER_FILE = "tokenizer.model"
 EAGLE_TOKENIZER_FILE = "tokenizer.json"
 
@@ -245,10 +246,10 @@ def _read_config(path: Path) -> AnyStoredConfig | None:
         return None
     if isinstance(values.get("statistics"), dict):
         values["statistics"] = _LATER_STATISTICS | values["statistics"]
-    if values["format"] == FORMAT:
-        if isinstance(values.get("config"), dict):
-            values["config"] = _LATER_FIELDS | values["config"]
-        return from_json(StoredConfig, values, path.name)
-    if isinstance(values.get("config"), dict):
-        values["config"] = _LATER_GROOT_FIELDS | values["config"]
-    return from_json(StoredGrootConfig, values, path.name)
+    is_pi05 = values["format"] == FORMAT
+    config = values.get("config")
+    if isinstance(config, dict):
+        values["config"] = config = (_LATER_FIELDS if is_pi05 else _LATER_GROOT_FIELDS) | config
+        if isinstance(config.get("cognition"), dict):
+            config["cognition"] = _LATER_COGNITION_FIELDS | config["cognition"]
+    return from_json(StoredConfig if is_pi05 else StoredGrootConfig, values, path.name)

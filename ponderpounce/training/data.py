@@ -20,6 +20,7 @@ from ponderpounce.models.eyes import see
 from ponderpounce.models.images import resized
 from ponderpounce.models.normalisation import Quantiles, RobotStatistics
 from ponderpounce.models.ponder_coordinates import normalised_text
+from ponderpounce.models.prompt import with_subgoal
 from ponderpounce.training.example import Frame, TrainingEpisode, chunk_ticks
 from ponderpounce.training.sight_store import SightStore, Views
 
@@ -151,6 +152,15 @@ class TrainingSet:
     def instructions(self) -> list[str]:
         """Every instruction once, in order."""
         return sorted({source.entry.instruction for source in self._sources})
+
+    def told(self) -> list[str]:
+        """Every instruction, alone and with each subgoal of its episodes, in order: see `prompt.with_subgoal`."""
+        found = {
+            with_subgoal(source.entry.instruction, normalised_text(text))
+            for source in self._sources
+            for text in {"", *source.rows().grounded_subgoal}
+        }
+        return sorted(found)
 
     def texts(self) -> list[str]:
         """All that PONDER reads or says in these episodes, each text once, in order."""

@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
+from functools import partial
 
 from clock import sampling
+from clock.sampling import LogNormal
+from clock.timebase import NS_PER_S
 from ponderpounce.models import ponder_configs, pounce_configs
 from ponderpounce.models.action_space import ActionSpace
 from ponderpounce.models.ponder_configs import PonderConfig
@@ -363,6 +366,56 @@ def small_noticing() -> Curriculum:
     return Curriculum(name="small_noticing", stages=(noticing, pointing))
 
 
+def small_refresh(period_s: int) -> Recipe:
+    """Figure 4 at small scale: the shipped pair goes on by the paper's two losses, PONDER looking every 1, 2 or 4 s."""
+    *_, pointing = small_noticing().stages
+    return replace(
+        pointing,
+        name=f"small_refresh_{period_s}s",
+        example=replace(
+            pointing.example,
+            clocks=replace(sampling.ROBOMME, query=LogNormal(mean_ns=period_s * NS_PER_S, sigma=0.05)),
+            max_invocations=16,
+            nudge=_BESIDE_THE_WAY,
+            augments="watched",
+        ),
+        train=TrainConfig(
+            seed=0,
+            dropout=0.1,
+            flow_samples=2,
+            optim=replace(_FROM_SCRATCH, learning_rate=5e-4, warmup_steps=50, decay=(150, 300)),
+        ),
+        num_steps=300,
+        w3=0.0,
+        w4=0.0,
+        moved_weight=1.0,
+        aligns_evenly=False,
+        trains="both",
+    )
+
+
+def small_wordless() -> Recipe:
+    """Table 3 at small scale, "w/o LM-head grounding": `small_refresh_1s` with no word in its rows."""
+    spoken = small_refresh(1)
+    return replace(
+        spoken, name="small_wordless", example=replace(spoken.example, is_grounded=False, lapses=NO_LAPSES), w2=0.0
+    )
+
+
+def small_subgoal_text() -> Recipe:
+    """Table 3 at small scale, "subgoal-text reference": the shipped POUNCE learns to read PONDER's words instead."""
+    _, _, motor, *_ = small().stages
+    silent = pounce_configs.small(num_carriers=0)
+    return replace(
+        motor,
+        name="small_subgoal_text",
+        pounce=replace(silent, cognition=replace(silent.cognition, rounds_places=False), reads_subgoal=True),
+        example=replace(motor.example, has_plans=True),
+        train=replace(motor.train, optim=replace(_FROM_SCRATCH, decay=(1000, 2000))),
+        num_steps=2000,
+    )
+
+
 RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
     "robomme": robomme,
     "robocasa_dc": robocasa_dc,
@@ -376,6 +429,11 @@ RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
     "small_retelling": small_retelling,
     "small_keeping_up": small_keeping_up,
     "small_noticing": small_noticing,
+    "small_refresh_1s": partial(small_refresh, 1),
+    "small_refresh_2s": partial(small_refresh, 2),
+    "small_refresh_4s": partial(small_refresh, 4),
+    "small_wordless": small_wordless,
+    "small_subgoal_text": small_subgoal_text,
 }
 
 

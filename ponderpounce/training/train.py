@@ -37,11 +37,12 @@ from ponderpounce.models.ponder_checkpoint import load_ponder, save_ponder
 from ponderpounce.models.pounce import PounceConfig, freeze
 from ponderpounce.models.pounce_checkpoint import PounceBundle, load_bundle, random_bundle, save_bundle
 from ponderpounce.models.pounce_init import open_gates
-from ponderpounce.models.prompt import tokenizer_of_instructions
+from ponderpounce.models.prompt import Tokenizer, tokenizer_of_instructions
 from ponderpounce.models.vocabulary import Vocabulary
 from ponderpounce.training.collate import collate_ponder, collate_pounce
 from ponderpounce.training.data import Sight, TrainingSet
 from ponderpounce.training.example import make_example
+from ponderpounce.training.in_words import told_in_words
 from ponderpounce.training.joint import JointModel, PonderBatch, PounceBatch, Trains
 from ponderpounce.training.parallel import World, gather, joined, shard
 from ponderpounce.training.plot import plot_log
@@ -299,14 +300,16 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
         wanted_px = readable_sizes(ponder.format.eyes, ponder.image_px)[0][0]
         folders = ", ".join(map(str, options.data))
         raise ValueError(f"{folders}: {error}; collect with --image-px {wanted_px}") from None
+    if run.trains != "pounce":
+        ponder.format = replace(ponder.format, speaks=run.w2 > 0)
     measured = partial(data.statistics, run.pounce.horizon, run.space, by_row=run.statistics_by_row)
     if options.pounce is None:
-        is_own = run.has_own_tokenizers and isinstance(run.pounce, PounceConfig)
-        tokenizer = tokenizer_of_instructions(data.instructions()) if is_own else None
-        bundle = random_bundle(run.pounce, seed, statistics=measured(), tokenizer=tokenizer)
+        bundle = random_bundle(run.pounce, seed, statistics=measured(), tokenizer=_own_tokenizer(run, data))
         open_gates(bundle.model)
     else:
         bundle = load_bundle(options.pounce)
+        if run.pounce.reads_subgoal and not bundle.model.config.reads_subgoal:
+            bundle = told_in_words(bundle, run.pounce, _own_tokenizer(run, data), seed)
         if bundle.statistics == ROBOMME:  # a public folder; our own act in the measure that they were trained in
             bundle = replace(bundle, statistics=measured())
     pounce = bundle.model.to(options.device)
@@ -326,6 +329,13 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
         trains=run.trains,
         keeps_eyes=run.keeps_eyes,
     ), bundle
+
+
+def _own_tokenizer(run: Recipe, data: TrainingSet) -> Tokenizer | None:
+    """POUNCE's, of all that it will be told in the data; None: the family's."""
+    if not run.has_own_tokenizers or not isinstance(run.pounce, PounceConfig):
+        return None
+    return tokenizer_of_instructions(data.told() if run.pounce.reads_subgoal else data.instructions())
 
 
 def export(model: JointModel, bundle: PounceBundle, out: Path, *, trained: Trains = "both") -> None:

@@ -235,8 +235,18 @@ def test_a_checkpoint_remembers_what_it_is_told_of_the_robot(tmp_path: Path) -> 
     assert load_ponder(tmp_path).format.proprioception == told
 
 
-@pytest.mark.parametrize(("version", "unknown"), [(1, ["eyes", "proprioception"]), (2, ["proprioception"])])
-def test_a_folder_from_before_there_were_eyes_or_proprioception_has_none(
+def test_a_checkpoint_remembers_that_it_has_no_words(tmp_path: Path) -> None:
+    silent = Ponder.random(CONFIG, VOCABULARY, seed=1)
+    silent.format = replace(silent.format, speaks=False)
+    save_ponder(silent, tmp_path)
+    assert not load_ponder(tmp_path).format.speaks
+
+
+@pytest.mark.parametrize(
+    ("version", "unknown"),
+    [(1, ["speaks", "eyes", "proprioception"]), (2, ["speaks", "proprioception"]), (3, ["speaks"])],
+)
+def test_a_folder_from_before_there_were_eyes_or_proprioception_has_none_and_speaks(
     ponder: Ponder, folder: Path, version: int, unknown: list[str]
 ) -> None:
     stored = json.loads((folder / "ponder.json").read_text())
@@ -244,7 +254,7 @@ def test_a_folder_from_before_there_were_eyes_or_proprioception_has_none(
         del stored[name]
     (folder / "ponder.json").write_text(json.dumps({**stored, "format": f"ponderpounce.ponder/{version}"}))
     loaded = load_ponder(folder)
-    assert (loaded.format.eyes, loaded.format.proprioception) == (None, None)
+    assert (loaded.format.eyes, loaded.format.proprioception, loaded.format.speaks) == (None, None, True)
     assert loaded.image_px == (64, 64)
     assert weights_hash(loaded) == weights_hash(ponder)
 

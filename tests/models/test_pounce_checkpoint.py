@@ -1,5 +1,6 @@
 """The checkpoint folder: all of a bundle survives it, and a public folder gets a flagged fresh prefix."""
 
+import functools
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -43,11 +44,25 @@ def test_a_bundle_survives_its_folder(bundle: PounceBundle, folder: Path) -> Non
     assert loaded.digest() == bundle.digest()
 
 
-def test_a_folder_from_before_a_field_means_what_it_meant(bundle: PounceBundle, folder: Path) -> None:
-    stored = json.loads((folder / "config.json").read_text())
-    del stored["config"]["max_committed_rows"]
-    (folder / "config.json").write_text(json.dumps(stored))
-    assert load_bundle(folder).digest() == bundle.digest()
+@pytest.mark.parametrize(
+    ("config", "path"),
+    [
+        (tiny_cpu(), ("max_committed_rows",)),
+        (tiny_cpu(), ("cognition", "rounds_places")),
+        (tiny_groot(), ("reads_subgoal",)),
+        (tiny_groot(), ("cognition", "rounds_places")),
+    ],
+)
+def test_a_folder_from_before_a_field_means_what_it_meant(
+    config: AnyPounceConfig, path: tuple[str, ...], tmp_path: Path
+) -> None:
+    bundle = random_bundle(config, seed=0)
+    save_bundle(bundle, tmp_path)
+    stored = json.loads((tmp_path / "config.json").read_text())
+    *parents, name = ("config", *path)
+    del functools.reduce(lambda inside, parent: inside[parent], parents, stored)[name]
+    (tmp_path / "config.json").write_text(json.dumps(stored))
+    assert load_bundle(tmp_path).digest() == bundle.digest()
 
 
 def test_flags_of_trained_weights_survive(bundle: PounceBundle, tmp_path: Path) -> None:

@@ -126,6 +126,22 @@ def test_serving_regenerates_the_training_row(ponder: Ponder, engine: QwenEngine
     assert answers[-1].context_tokens == len(row.ids)
 
 
+def test_serving_regenerates_the_row_of_a_ponder_that_learned_without_words() -> None:
+    """Its LM head has learned nothing: here it says T_yes wherever it is asked."""
+    ponder = taught(SCRIPT)
+    ponder.format = replace(ponder.format, speaks=False)
+    silence: Script = (None,) * len(SCRIPT)
+    row = training_row(ponder, silence)
+    engine = QwenEngine(ponder, CONFIG)
+    engine.open("a", WITH_DEMO)
+    answers = [engine.fire("a", observation(query)) for query in range(len(silence))]
+    assert context_of(engine, "a").ids == list(row.ids)
+    assert [(each.is_transition, each.texts) for each in answers] == [(False, ())] * len(silence)
+    expected = encode(ponder, row)[torch.from_numpy(row.carrier_index)]
+    for answer, C_t in zip(answers, expected, strict=True):
+        assert np.abs(answer.cognition - C_t.numpy()).max() < TOLERANCE
+
+
 def test_a_transition_has_forgotten_its_speculative_carriers_to_the_last_bit(engine: QwenEngine) -> None:
     engine.open("a", WITH_DEMO)
     engine.open("b", WITH_DEMO)

@@ -129,7 +129,9 @@ def test_a_run_leaves_folders_that_the_servers_load(folder: Path, tmp_path: Path
     assert (tmp_path / "run" / "run.png").exists()
     samples = [json.loads(line) for line in (tmp_path / "run" / "samples.jsonl").read_text().splitlines()]
     assert {sample["step"] for sample in samples} == (set() if name == "tiny_groot" else {0})  # actions only: no words
-    assert not load_ponder(tmp_path / "run" / "ponder").is_random
+    ponder = load_ponder(tmp_path / "run" / "ponder")
+    assert not ponder.is_random
+    assert ponder.format.speaks == (name != "tiny_groot")
     bundle = load_bundle(tmp_path / "run" / "pounce")
     assert not bundle.is_random
     assert not bundle.has_fresh_prefix
