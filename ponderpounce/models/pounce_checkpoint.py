@@ -41,9 +41,14 @@ CONFIG_FILE = "config.json"
 JAX_FOLDER = "params"
 WEIGHTS_FILE = "model.safetensors"
 _LATER_STATISTICS = {"space": "joint_delta", "reach": []}
-_LATER_FIELDS = {"max_committed_rows": 0, "reads_subgoal": False, "state_input": "prompt", "robot_state_dim": 8}
+_LATER_FIELDS: dict[str, Any] = {
+    "max_committed_rows": 0,
+    "reads_subgoal": False,
+    "state_input": "prompt",
+    "robot_state_dim": 8,
+}
 """Of pi0.5's config: what it meant where a folder was written before there was such a field."""
-_LATER_GROOT_FIELDS = {"reads_subgoal": False}
+_LATER_GROOT_FIELDS: dict[str, Any] = {"reads_subgoal": False}
 _LATER_COGNITION_FIELDS = {"rounds_places": False}
 TOKENIZER_FILE = "tokenizer.model"
 EAGLE_TOKENIZER_FILE = "tokenizer.json"
@@ -252,4 +257,6 @@ def _read_config(path: Path) -> AnyStoredConfig | None:
         values["config"] = config = (_LATER_FIELDS if is_pi05 else _LATER_GROOT_FIELDS) | config
         if isinstance(config.get("cognition"), dict):
             config["cognition"] = _LATER_COGNITION_FIELDS | config["cognition"]
-    return from_json(StoredConfig if is_pi05 else StoredGrootConfig, values, path.name)
+    if is_pi05:
+        return from_json(StoredConfig, values, path.name)
+    return from_json(StoredGrootConfig, values, path.name)
