@@ -6,6 +6,7 @@ TORCH ?= torch==2.13.0
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 PB := protocol/ponderpounce/v1
+JOBS ?= $(shell getconf _NPROCESSORS_ONLN)
 export MUJOCO_GL ?= egl
 export OMP_NUM_THREADS ?= 1
 
@@ -55,10 +56,12 @@ policy: setup
 	BIN=$(BIN) checkpoints/small/follow.sh out/small
 
 ## make test    everything that needs no GPU; make unit: without processes and long runs
+# Files share the cores; a test that starts processes of its own has them all.
 test: setup
-	$(BIN)/python -m pytest -q -m "not gpu and not acceptance" --durations=10
+	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile -m "not gpu and not acceptance and not e2e" --durations=10
+	$(BIN)/python -m pytest -q -m "e2e and not gpu and not acceptance" --durations=10
 unit: setup
-	$(BIN)/python -m pytest -q -m "not gpu and not acceptance and not e2e and not slow"
+	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile -m "not gpu and not acceptance and not e2e and not slow"
 
 ## make accept  a hundred oracle episodes of every task (about ten minutes)
 accept: setup

@@ -1,4 +1,4 @@
-# What train.sh and follow.sh have in common; both set $bin.
+# What the scripts beside it have in common; each sets $bin.
 
 logs() {  # of finished episodes that were played into FOLDER, all or with a STATUS: a kill leaves the beginning of one more
     "$bin/python" -c 'import json, pathlib, sys

@@ -13,12 +13,14 @@ import torch
 from ponderpounce.data.episode import About, EpisodeWriter, Row, unpack
 from ponderpounce.data.lerobot_v3 import DatasetWriter
 from ponderpounce.models.action_space import ActionSpace, num_dims
+from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import load_ponder
 from ponderpounce.models.pounce import PounceConfig
 from ponderpounce.models.pounce_checkpoint import load_bundle
+from ponderpounce.models.prompt import with_subgoal
 from ponderpounce.training import recipes, train
 from ponderpounce.training.data import TrainingSet
-from ponderpounce.training.example import chunk_ticks
+from ponderpounce.training.example import chunk_ticks, make_example
 from ponderpounce.training.parallel import World
 from ponderpounce.training.train import TrainOptions
 from pounce_server.contract import example_request
@@ -100,6 +102,19 @@ def test_a_small_cache_reads_the_same(folder: Path) -> None:
     for number in (0, 1, 0):
         assert np.array_equal(large[number].frames[3][0], small[number].frames[3][0])
     assert len(small._cache) == 1
+
+
+def test_a_tokenizer_of_its_own_has_read_all_that_pounce_will_be_told(folder: Path) -> None:
+    data = TrainingSet(folder)
+    told = data.told()
+    form = recipes.recipe("tiny_subgoal_text")
+    assert isinstance(form, recipes.Recipe)
+    ponder = Ponder.random(form.ponder, seed=0)
+    for number in range(len(data)):
+        example = make_example(data[number], ponder.format, form.example, np.random.default_rng(number))
+        assert example.said[-1]
+        assert {with_subgoal(example.episode.instruction, text) for text in ("", *example.said)} <= set(told)
+    assert set(data.instructions()) < set(told)
 
 
 @pytest.mark.parametrize("space", ["joint_delta", "ee_delta"])
