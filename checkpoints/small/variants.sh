@@ -5,8 +5,9 @@
 #     checkpoints/small/variants.sh [OUT]     (`make setup` sets everything up first)
 #
 # The shipped pair goes on in four ways, with the same data and as many steps: PONDER looking every 1, 2 or 4 s, and every
-# second without a word. A POUNCE learns to read the words. Each is played in the first 60 test scenes; the pairs that look
-# are asked offline what older cognition costs. The same command goes on after a kill.
+# second without a word. A POUNCE learns to read the words. All are played in the first 60 test scenes, and the shipped PONDER
+# as well, asked for no words; pairs that look now and then are asked offline what older cognition costs. The same command goes
+# on after a kill.
 set -euo pipefail
 
 out=${1:-out/small/variants}
@@ -70,7 +71,6 @@ tables() {  # NAME of a table, folders of results
     "$bin/pp-tables" "${@/#/$out/results/}" --out "$out/results/tables/$name"
 }
 
-tables variants refresh1s wordless silent text text-oracle
+tables variants refresh1s wordless text text-oracle
 tables slow refresh1s refresh2s refresh4s
-tables offline offline1s offline2s offline4s
-tables counterfactual offline
+tables offline offline1s offline2s offline4s offline
