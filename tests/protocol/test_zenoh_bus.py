@@ -66,6 +66,9 @@ def test_bytes_arrive_with_key_encoding_and_attachment(buses: tuple[ZenohBus, Ze
 def test_a_call_is_answered_from_another_thread(buses: tuple[ZenohBus, ZenohBus]) -> None:
     server, client = buses
     inbox, is_over = server.serve("r0/@rpc/twice"), threading.Event()
+    seen_by_client = client.watch_alive("alive/server")
+    server.declare_alive("alive/server")
+    assert await_(client, seen_by_client.drain)  # declared later: by now it knows who answers, too
 
     def answer() -> None:
         while not is_over.is_set():
