@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Tables 3 and 4 and Figure 4 of the paper at small scale, from the shipped pair: see docs/training.md, "Table 3, Table 4 and
-# Figure 4 at small scale". About two hours on two CPU cores.
+# Table 3 and Figure 4 of the paper at small scale, from the shipped pair: see docs/training.md, "Table 3, Table 4 and Figure 4
+# at small scale". Some two hours on two CPU cores, by its parts; it was not run in one go.
 #
 #     checkpoints/small/variants.sh [OUT]     (`make setup` sets everything up first)
 #
