@@ -127,7 +127,8 @@ class Studio:
         rng, physics = np.random.default_rng([seed, _POSES]), self.physics
         layout, _ = self.arranged(seed)
         step = int(rng.choice(_STEPS))
-        self.task.stage(physics, layout, None, step)
+        for now in range(step + 1):  # scripts move things at their own steps only
+            self.task.stage(physics, layout, None, now)
         things = self.task.things(layout, step)
         # what is highlighted lies where it lies
         self.pose_tool(rng, [thing.body for thing in things if thing.is_movable] if step == 0 else [])

@@ -7,9 +7,12 @@ written down anywhere: T_yes is 248060 in one tokenizer and 400 in the other.
 Source: Qwen3.5's public tokenizer files; T_yes and T_no: paper, appendix A.2.
 """
 
+import json
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from tokenizers import Regex, Tokenizer, decoders, models, normalizers, pre_tokenizers, trainers
 
@@ -124,6 +127,35 @@ class Vocabulary:
         tokenizer.add_special_tokens(list(CONTROL_TOKENS))
         return cls(tokenizer)
 
+    def extended(self, texts: Iterable[str], num_tokens: int) -> Self:
+        """The same with as many pieces more as fit below id ``num_tokens``, of what ``texts`` say most often.
+
+        Every id keeps its meaning, control tokens included. A text whose words are single pieces already is encoded as
+        before. Equal texts give the same tokenizer. Only for tokenizers of `trained_on`.
+        """
+        split, normalise = self._tokenizer.pre_tokenizer.pre_tokenize_str, self._tokenizer.normalizer.normalize_str
+        counts = Counter(word for text in texts for word, _ in split(normalise(text)))
+        state: dict[str, Any] = json.loads(self._tokenizer.to_str())
+        model = state["model"]
+        words = {word: [piece.value for piece in self._tokenizer.model.tokenize(word)] for word in counts}
+        next_id = self.num_tokens
+        while next_id < num_tokens:
+            pairs: Counter[tuple[str, str]] = Counter()
+            for word, pieces in words.items():
+                for pair in pairwise(pieces):
+                    pairs[pair] += counts[word]
+            if not pairs:
+                break
+            first, second = min(pairs, key=lambda pair: (-pairs[pair], pair))
+            if first + second not in model["vocab"]:
+                model["vocab"][first + second] = next_id
+                next_id += 1
+            model["merges"].append([first, second])
+            words = {word: _merged(pieces, first, second) for word, pieces in words.items()}
+        # Loaded without, they would be numbered anew behind the pieces.
+        model["vocab"] |= {each["content"]: each["id"] for each in state["added_tokens"]}
+        return type(self)(Tokenizer.from_str(json.dumps(state)))
+
     def save(self, directory: Path) -> None:
         """Writes ``tokenizer.json`` into an existing folder."""
         self._tokenizer.save(str(directory / "tokenizer.json"))
@@ -155,3 +187,14 @@ class Vocabulary:
     def names(self) -> Mapping[str, int]:
         """Every token name with its id."""
         return dict(self._tokenizer.get_vocab(with_added_tokens=True))
+
+
+def _merged(pieces: Sequence[str], first: str, second: str) -> list[str]:
+    """Every ``first`` that is followed by ``second``, in one piece with it."""
+    merged: list[str] = []
+    for piece in pieces:
+        if piece == second and merged and merged[-1] == first:
+            merged[-1] = first + second
+        else:
+            merged.append(piece)
+    return merged

@@ -30,6 +30,7 @@ from ponderpounce.training.stand_in import stand_in
 
 Frame = NDArray[np.uint8]  # (height, width, 3) RGB
 _SILENCE = repeat(Words())
+_SAME_PX = 6.0  # of a 256 px picture: less than any two things lie apart
 _MOVED_PX = 3.0  # of a 256 px picture: farther than PONDER errs where nothing moves
 
 
@@ -120,7 +121,7 @@ class TrainingEpisode:
 
         What was shown is then written down soon after, and read off from there later; without, a small network loses
         the third of three things. When the first subgoal is told nothing has been seen. One that is tried again counts
-        once.
+        once, and so does a place that was told already: where things are carried to and fro every text has one.
         """
         begins = np.flatnonzero(self.is_transition_T | (np.arange(self.num_ticks) == 0)).tolist()
         planned: list[str] = []
@@ -131,7 +132,11 @@ class TrainingEpisode:
                 place = PLACE.search(text)
                 if place is not None and PLACE.sub("", text) != own:
                     later.setdefault(PLACE.sub("", text), place[0])
-            plan = "".join(f", {place}" for place in later.values())
+            told = [self.subgoals[begin]]
+            for there in later.values():
+                if all(not PLACE.search(text) or has_moved(text, there, _SAME_PX) for text in told):
+                    told.append(there)
+            plan = "".join(f", {there}" for there in told[1:])
             planned += [text + plan for text in self.subgoals[begin:end]]
         return replace(self, planned=planned)
 
@@ -175,6 +180,9 @@ class ExampleConfig:
 
     has_foresight: bool = False
     """See `TrainingEpisode.with_foresight`."""
+    has_reasoning: bool = True
+    """False: nothing is written after a demonstration but the subgoal. The paper's PONDER can write; one from scratch
+    would learn little else."""
     has_plans: bool = False
     """See `TrainingEpisode.with_plans`."""
     slips: float = 0.0
@@ -303,6 +311,7 @@ def make_example(
     """Draws a schedule and lays the episode out under it."""
     episode = episode.with_foresight() if config.has_foresight else episode
     episode = episode.with_plans() if config.has_plans else episode
+    episode = episode if config.has_reasoning else replace(episode, reasoning="")
     schedule = sample_schedule(rng, config.clocks, episode.num_ticks, transition_ticks=episode.transition_ticks)
     schedule = _shortened(schedule, config.max_queries)
     imitated = [i for i, each in enumerate(schedule.invocations) if each.tick >= episode.imitated_from]

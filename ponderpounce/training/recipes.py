@@ -366,6 +366,36 @@ def small_noticing() -> Curriculum:
     return Curriculum(name="small_noticing", stages=(noticing, pointing))
 
 
+def small_several() -> Curriculum:
+    """The shipped pair learns further tasks: docs/training.md, "Several tasks". `pp-widen` gives it their words first.
+
+    `hand` trains POUNCE and needs none of the others.
+    """
+    _, _, motor, *_ = small().stages
+    noticing, pointing = small_noticing().stages
+    hand = replace(
+        motor,
+        name="small_several/hand",
+        train=replace(motor.train, optim=replace(_FROM_SCRATCH, decay=(5000, 9000))),
+        num_steps=9000,
+    )
+    noticing = replace(
+        noticing,
+        name="small_several/noticing",
+        example=replace(noticing.example, max_queries=10, has_reasoning=False),
+        train=TrainConfig(seed=0, optim=_FROM_SCRATCH),
+        num_steps=700,
+    )
+    pointing = replace(
+        pointing,
+        name="small_several/pointing",
+        example=replace(pointing.example, has_reasoning=False),
+        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(800, 1600))),
+        num_steps=1600,
+    )
+    return Curriculum(name="small_several", stages=(hand, noticing, pointing))
+
+
 def small_refresh(period_s: int) -> Recipe:
     """Figure 4 at small scale: the shipped pair goes on by the paper's two losses, PONDER looking every 1, 2 or 4 s."""
     *_, pointing = small_noticing().stages
@@ -429,6 +459,7 @@ RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
     "small_retelling": small_retelling,
     "small_keeping_up": small_keeping_up,
     "small_noticing": small_noticing,
+    "small_several": small_several,
     "small_refresh_1s": partial(small_refresh, 1),
     "small_refresh_2s": partial(small_refresh, 2),
     "small_refresh_4s": partial(small_refresh, 4),

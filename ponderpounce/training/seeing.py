@@ -58,8 +58,8 @@ class SeeOptions:
     """Which PONDER: small."""
     data: Path
     """A folder that pp-collect made: PONDER's tokenizer is trained on its texts, as pp-train would."""
-    album: Path
-    """A folder that pp-album made."""
+    album: tuple[Path, ...]
+    """Folders that pp-album made."""
     ponder: Path | None = None
     """Open the eyes of this one again, all else as it is; --recipe and --data are then not read."""
     out: Path
@@ -117,11 +117,12 @@ def see_things(options: SeeOptions) -> None:
     if (options.out / "ponder").exists():
         raise ValueError(f"{options.out} holds a PONDER already; use another --out")
     ponder = _newborn(options) if options.ponder is None else load_ponder(options.ponder)
-    album = read_album(options.album, ponder.format)
+    album = read_album(ponder.format, *options.album)
     num_held_out = max(1, round(_HELD_OUT_SHARE * len(album.texts)))
     num_learned = len(album.texts) - num_held_out
     if num_learned < 1:
-        raise ValueError(f"{options.album} holds {len(album.texts)} pictures; some hundreds at least are needed")
+        folders = ", ".join(map(str, options.album))
+        raise ValueError(f"{folders}: {len(album.texts)} pictures; some hundreds at least are needed")
     torch.manual_seed(options.seed)
     answering = nn.Linear(ponder.hidden_size, _NUM_ASKED + len(album.names))
     optim = OptimConfig(
@@ -155,11 +156,11 @@ def _newborn(options: SeeOptions) -> Ponder:
     return Ponder.random(run.ponder, vocabulary, seed=options.seed)
 
 
-def read_album(folder: Path, form: ContextFormat) -> Album:
-    """All pictures of a folder. Raises DatasetError if it is none, ValueError if its texts name nothing."""
+def read_album(form: ContextFormat, *folders: Path) -> Album:
+    """All pictures of the folders, mixed. Raises DatasetError if it is none, ValueError if its texts name nothing."""
     if form.eyes is None or len(form.eyes) != 1 or form.eyes[0].camera != 0:
         raise ValueError("things are placed in the front camera's picture: PONDER needs one eye, on that camera")
-    pages = TrainingSet(folder, sight=Sight(form=form, pounce_px=None))
+    pages = TrainingSet(*folders, sight=Sight(form=form, pounce_px=None))
     pictures: list[NDArray[np.uint8]] = []
     texts: list[str] = []
     for number in range(len(pages)):
@@ -167,9 +168,12 @@ def read_album(folder: Path, form: ContextFormat) -> Album:
         pictures += [sight[0] for sight in page.sights or ()]
         texts += page.subgoals
     try:
-        return Album(pictures=np.stack(pictures), texts=tuple(texts), names=names_in(texts))
+        names = names_in(texts)
     except ValueError as error:
-        raise ValueError(f"{folder}: {error}; make it with pp-album") from None
+        raise ValueError(f"{', '.join(map(str, folders))}: {error}; make it with pp-album") from None
+    # one album's pictures stay as they lie, of several each has its share of what is held out, at the end
+    order = np.arange(len(texts)) if len(folders) == 1 else np.random.default_rng(0).permutation(len(texts))
+    return Album(pictures=np.stack([pictures[i] for i in order]), texts=tuple(texts[i] for i in order), names=names)
 
 
 def names_in(texts: Iterable[str]) -> tuple[str, ...]:

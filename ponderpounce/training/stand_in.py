@@ -6,7 +6,7 @@ to say the subgoal and to carry it in this form, and then both are trained toget
 here is learned, so the two first stages need not wait for each other. Serving never sees it.
 
 Layout of one carrier's H numbers, rms 1: sines, cosines and the value itself of both coordinates, the rest a fixed
-random code of the text without its coordinates and its colour.
+random code of the skill that it asks for: the text without its coordinates, and without what the hand need not know.
 """
 
 # H hidden size, K carriers
@@ -23,7 +23,24 @@ from numpy.typing import NDArray
 from ponderpounce.models.place_code import NUM_PLACE_FEATURES, PLACE_PX, VALUE_SCALE, WAVE_PX, place_features
 from ponderpounce.training.places import PLACE
 
-_COLOUR = re.compile(r", which is \w+")
+_AT = r"( at <>)?"
+_SKILLS = tuple(
+    (re.compile(words), skill)
+    for words, skill in (
+        (r", which is \w+", ""),
+        (
+            rf"^pick up the (?:\w+ )?(?:red|green|blue) cube{_AT}(?: for the \w+ time)?$",
+            r"pick up the first highlighted cube\1",
+        ),
+        (rf"^pick up the container{_AT} that hides the \w+ cube$", r"pick up the container\1"),
+        (rf"^press the (?:first |second )?button{_AT}(?: to stop| to finish)?$", r"press the button\1"),
+        (rf"^place the \w+ cube onto the target{_AT}$", r"place the cube onto the target\1"),
+        (rf"^move to the top of the \w+-side target{_AT} for the \w+ time$", r"move to the top of the target\1"),
+        (r"^put the \w+ cube on the table$", "place the cube onto the table"),
+    )
+)
+"""What one skill is called in several tasks, by one name. Of PickHighlight only a cube's colour is left out: POUNCE may
+tell its first from its second."""
 _MAX_EVEN_WEIGHT = 64.0
 _NOWHERE = (PLACE_PX // 2, PLACE_PX // 2)
 
@@ -42,9 +59,18 @@ def stand_in(subgoal: str, size: int) -> NDArray[np.float32]:
         raise ValueError(f"a stand-in of {size} numbers is too small; expected at least {2 * NUM_PLACE_FEATURES}")
     place = PLACE.search(subgoal)
     yx_px = (int(place[1]), int(place[2])) if place else _NOWHERE
-    values = np.concatenate([place_features(yx_px), _code(_COLOUR.sub("", PLACE.sub("<>", subgoal)), num_code)])
+    values = np.concatenate([place_features(yx_px), _code(skill_of(subgoal), num_code)])
     values.flags.writeable = False
     return values
+
+
+@functools.lru_cache(maxsize=1 << 16)
+def skill_of(subgoal: str) -> str:
+    """What the hand is to do, wherever it is and with whatever: "press the button at <>"."""
+    text = PLACE.sub("<>", subgoal)
+    for words, skill in _SKILLS:
+        text = words.sub(skill, text)
+    return text
 
 
 def even_weights(size: int) -> NDArray[np.float32]:

@@ -247,7 +247,7 @@ def test_with_foresight_a_text_has_the_place_that_it_gets_later(data: st.DataObj
 def test_a_plan_tells_the_places_of_what_comes_later(stints: list[tuple[str, bool, int]]) -> None:
     """Once each, in order; not at the first subgoal, and not of the one in force."""
     names = [name for name, _, _ in stints]
-    heads = [f"pick {name} at <{n}, 9>" if has_place else name for n, (name, has_place, _) in enumerate(stints)]
+    heads = [f"pick {name} at <{10 * n}, 9>" if has_place else name for n, (name, has_place, _) in enumerate(stints)]
     texts = [head for head, (_, _, length) in zip(heads, stints, strict=True) for _ in range(length)]
     begins = np.cumsum([0, *(length for _, _, length in stints[:-1])]).tolist()
     planned = replace(episode(len(texts), changes=tuple(begins)), subgoals=texts).with_plans()
@@ -260,7 +260,29 @@ def test_a_plan_tells_the_places_of_what_comes_later(stints: list[tuple[str, boo
         assert head == heads[n].replace(", 9>", "; 9>")
         shown = [m for m in range(n + 1, len(heads)) if stints[m][1] and not (names[m] == names[n] and stints[n][1])]
         once = [m for place, m in enumerate(shown) if names[m] not in {names[k] for k in shown[:place]}]
-        assert later == ([f"<{m}; 9>" for m in once] if n else [])
+        assert later == ([f"<{10 * m}; 9>" for m in once] if n else [])
+
+
+def test_a_plan_tells_a_place_once() -> None:
+    """Where things are carried to and fro every text has one, and most are the same."""
+    places = ["<9, 9>", "<40, 90>", "<80, 20>", "<42, 91>", "<80, 24>", "<7, 60>"]
+    texts = [f"carry it to {place} for the {n}th time" for n, place in enumerate(places)]
+    planned = replace(episode(len(texts), changes=tuple(range(len(texts)))), subgoals=texts).with_plans()
+    assert [text.count("<") for text in planned.words] == [1, 3, 3, 3, 2, 1]
+    assert planned.words[1] == texts[1] + ", <80, 20>, <7, 60>"
+
+
+def test_reasoning_can_be_left_unwritten() -> None:
+    recorded = replace(episode(60, changes=(0,)), reasoning="the red one was under the left one")
+    written, left_out = (
+        make_example(recorded, FORM, ExampleConfig(clocks=EVALUATION, has_reasoning=has), np.random.default_rng(0))
+        for has in (True, False)
+    )
+    assert "under the left one" in FORM.vocabulary.decode(written.row().ids)
+    expected = make_example(
+        replace(recorded, reasoning=""), FORM, ExampleConfig(clocks=EVALUATION), np.random.default_rng(0)
+    )
+    assert left_out.row().ids == expected.row().ids
 
 
 def test_a_plan_is_said_and_cognition_is_of_the_subgoal() -> None:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features, wave_columns
-from ponderpounce.training.stand_in import even_weights, stand_in
+from ponderpounce.training.stand_in import even_weights, skill_of, stand_in
 
 PIXELS = st.integers(0, 255)
 PICK = "pick up the {nth} highlighted cube at <{y}, {x}>, which is {colour}"
@@ -48,6 +48,31 @@ def test_other_texts_are_nearly_orthogonal() -> None:
 def test_a_text_without_a_place_points_at_the_middle() -> None:
     nowhere, middle = (stand_in(f"place the cube{at}", 64) for at in ("", " at <128, 128>"))
     np.testing.assert_array_equal(nowhere[:NUM_PLACE_FEATURES], middle[:NUM_PLACE_FEATURES])
+
+
+@pytest.mark.parametrize(
+    ("subgoal", "skill"),
+    [
+        (PICK.format(nth="second", y=1, x=2, colour="red"), "pick up the second highlighted cube at <>"),
+        ("pick up the highlighted cube at <1, 2>, which is green", "pick up the highlighted cube at <>"),
+        ("pick up the highlighted cube, which is green", "pick up the highlighted cube"),
+        ("place the cube onto the table", "place the cube onto the table"),
+        ("put the blue cube on the table", "place the cube onto the table"),
+        ("press the second button at <64, 103>", "press the button at <>"),
+        ("press the button at <64, 103> to stop", "press the button at <>"),
+        ("press the button to stop", "press the button"),
+        ("pick up the third blue cube at <76, 176>", "pick up the first highlighted cube at <>"),
+        ("pick up the green cube at <99, 126> for the second time", "pick up the first highlighted cube at <>"),
+        ("pick up the container at <85, 165> that hides the red cube", "pick up the container at <>"),
+        ("put down the container", "put down the container"),
+        ("place the green cube onto the target at <101, 127>", "place the cube onto the target at <>"),
+        ("move to the top of the left-side target at <8, 7> for the first time", "move to the top of the target at <>"),
+        ("put it into the bin at <102, 174>", "put it into the bin at <>"),
+    ],
+)
+def test_one_skill_has_one_name_in_all_tasks(subgoal: str, skill: str) -> None:
+    assert skill_of(subgoal) == skill
+    assert skill_of(skill) == skill
 
 
 def test_too_small_a_carrier_is_refused() -> None:

@@ -27,7 +27,7 @@ from ponderpounce.tasks.oracle import Actions, Motions
 from ponderpounce.tasks.permanence.scenes import LANE_M, SWAP_STEP, Hidden, Layout
 from ponderpounce.tasks.physics import Physics
 from ponderpounce.tasks.scene import CUBE_COLORS, add_button, add_cube
-from ponderpounce.tasks.task import Reasoning, Shown, Subtask, Task
+from ponderpounce.tasks.task import Reasoning, Shown, Subtask, Task, Thing
 
 COVER_STEP = 32  # the first observation that shows the containers
 
@@ -77,6 +77,15 @@ class Unmask(Task[Layout, Pressed]):
         else:
             return
         physics.refresh()
+
+    def things(self, layout: Layout, step: int) -> tuple[Thing, ...]:
+        """Cubes as long as they lie bare, then containers."""
+        caps = [f"{name}/cap" for name in button_names(self.num_buttons)]
+        buttons = [Thing(name="button", body=cap, is_movable=False) for cap in caps]
+        if step < COVER_STEP:
+            return (*buttons, *(Thing(name=f"{c.color} cube", body=cube_name(c.container)) for c in layout.hidden))
+        names = map(container_name, range(len(layout.containers)))
+        return (*buttons, *(Thing(name="container", body=name) for name in names))
 
     def instruction(self, layout: Layout) -> str:
         first, *others = (cube.color for cube in layout.hidden[: layout.num_picks])

@@ -1,0 +1,120 @@
+"""A pair that is given words for more tasks thinks of the old ones what it did before."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ponderpounce.data.episode import About, EpisodeWriter, Row, unpack
+from ponderpounce.data.lerobot_v3 import DatasetWriter
+from ponderpounce.models import pounce_configs
+from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.ponder_checkpoint import load_ponder, save_ponder
+from ponderpounce.models.ponder_configs import small
+from ponderpounce.models.pounce_checkpoint import load_bundle, random_bundle, save_bundle
+from ponderpounce.models.prompt import stateless_prompt_text
+from ponderpounce.models.vocabulary import Vocabulary
+from ponderpounce.training.data import TrainingSet
+from ponderpounce.training.widening import REFUSED, main, widened
+
+OLD = ["press the button at [255, 470]", "pick up the first cube at [441, 430], which is blue"]
+NEW = [f"pick up the container at [{y}, {3 * y}] that hides the red cube" for y in range(100, 300, 7)]
+
+
+PX = 64
+
+
+@pytest.fixture(scope="module")
+def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One short episode of another task."""
+    episode = EpisodeWriter(PX)
+    for index in range(len(NEW)):
+        row = Row(
+            state=np.zeros(8, np.float32),
+            action=np.zeros(8, np.float32),
+            tcp_pose=np.zeros(7, np.float32),
+            subgoal="pick up the container that hides the red cube",
+            grounded_subgoal=f"pick up the container at <{index}, 90> that hides the red cube",
+            is_transition=index == 0,
+        )
+        episode.add(row, {camera: np.full((PX, PX, 3), index, np.uint8) for camera in ("front", "wrist")})
+    about = About(
+        task="VideoUnmask", instruction="watch the video carefully, then pick up the container hiding the red cube",
+        seed=0, difficulty="easy", origin="oracle", is_success=True, image_px=PX,
+    )  # fmt: skip
+    root = tmp_path_factory.mktemp("data") / "set"
+    writer = DatasetWriter(root)
+    writer.add(unpack(episode.pack(about)))
+    writer.finish()
+    return root
+
+
+def known() -> Ponder:
+    return Ponder.random(small(), Vocabulary.trained_on(OLD * 9, num_tokens=388), seed=2)
+
+
+def hidden(of: Ponder, text: str) -> torch.Tensor:
+    ids = of.format.vocabulary.encode(text)
+    positions, _ = of.format.positions(ids)
+    return of(of.embed(ids)[None], torch.from_numpy(positions)[:, None])
+
+
+def test_every_id_keeps_its_meaning_and_new_texts_are_shorter() -> None:
+    old = Vocabulary.trained_on(OLD * 9, num_tokens=388)
+    new = old.extended(NEW, 448)
+    assert old.num_tokens < new.num_tokens <= 448
+    assert {name: id_ for name, id_ in new.names().items() if id_ < old.num_tokens} == old.names()
+    assert new.control_ids == old.control_ids
+    for text in OLD:
+        assert new.encode(text) == old.encode(text)
+    for text in NEW:
+        assert new.decode(new.encode(text)) == text
+        assert len(new.encode(text)) < len(old.encode(text))
+    with pytest.raises(ValueError, match="spells the control tokens"):
+        new.encode("press <|fim_prefix|>")
+
+
+def test_equal_texts_give_equal_tokenizers_and_none_leaves_it_as_it_is() -> None:
+    old = Vocabulary.trained_on(OLD * 9, num_tokens=388)
+    assert old.extended(NEW, 448).names() == old.extended(list(NEW), 448).names()
+    assert old.extended([], 448).names() == old.names()
+
+
+def test_the_longest_word_is_learned_to_its_end() -> None:
+    """With room for all, every word is one piece, and training ends."""
+    old = Vocabulary.trained_on(OLD * 9, num_tokens=388)
+    new = old.extended(["abracadabra abracadabra"], 5000)
+    assert len(new.encode("abracadabra abracadabra")) == 2
+
+
+def test_it_thinks_of_what_it_knew_the_same_and_of_new_words_what_their_spelling_meant() -> None:
+    old, wide = known(), widened(known(), NEW)
+    for text in OLD:
+        torch.testing.assert_close(hidden(wide, text), hidden(old, text), rtol=0, atol=0)
+    (piece,) = wide.format.vocabulary.encode(" container")
+    spelt = old.embed(old.format.vocabulary.encode(" container")).mean(dim=0)
+    torch.testing.assert_close(wide.embed([piece])[0], spelt)
+
+
+def test_a_widened_pair_is_read_back(tmp_path: Path, collected: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save_ponder(known(), tmp_path / "ponder")
+    skilled = random_bundle(pounce_configs.tiny_cpu(), seed=1)
+    save_bundle(skilled, tmp_path / "pounce")
+    pair = ["--ponder", str(tmp_path / "ponder"), "--pounce", str(tmp_path / "pounce")]
+    arguments = [*pair, "--data", str(collected), "--out", str(tmp_path / "wide")]
+    assert main(arguments) == 0
+    ponder, bundle = load_ponder(tmp_path / "wide" / "ponder"), load_bundle(tmp_path / "wide" / "pounce")
+    data = TrainingSet(collected)
+    assert ponder.format.vocabulary.names() == known().format.vocabulary.extended(data.texts(), 448).names()
+    for text in data.texts():
+        assert ponder.format.vocabulary.decode(ponder.format.vocabulary.encode(text)) == text
+    told = [stateless_prompt_text(instruction) for instruction in data.instructions()]
+    assert max(len(bundle.tokenizer.encode(text)) for text in told) < len(skilled.tokenizer.encode(told[0]))
+    known_weights = skilled.model.state_dict()
+    for name, taken in bundle.model.state_dict().items():
+        assert torch.equal(taken, known_weights[name]) == ("embed_tokens" not in name), name
+    assert main(arguments) == REFUSED
+    assert "another --out" in capsys.readouterr().err
