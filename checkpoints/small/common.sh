@@ -16,3 +16,13 @@ correct() {  # the oracle takes over the episodes that were played into FOLDER a
         "$bin/pp-correct" "${found[@]}" --order near-first --per-episode "$times" --out "$out"
     fi
 }
+
+halve() {  # a PONDER's or a POUNCE's folder INTO another, its weights in half precision
+    local folder=$1 into=$2
+    mkdir -p "$into"
+    cp "$folder"/* "$into"
+    "$bin/python" -c 'import pathlib, sys
+from safetensors.torch import load_file, save_file
+path = pathlib.Path(sys.argv[1], "model.safetensors")
+save_file({name: tensor.half() for name, tensor in load_file(path).items()}, path, metadata={"format": "pt"})' "$into"
+}

@@ -376,24 +376,37 @@ def small_several() -> Curriculum:
     hand = replace(
         motor,
         name="small_several/hand",
-        train=replace(motor.train, optim=replace(_FROM_SCRATCH, decay=(5000, 9000))),
-        num_steps=9000,
+        train=replace(motor.train, optim=replace(_FROM_SCRATCH, decay=(2500, 4000))),
+        num_steps=4000,
     )
     noticing = replace(
         noticing,
         name="small_several/noticing",
         example=replace(noticing.example, max_queries=10, has_reasoning=False),
         train=TrainConfig(seed=0, optim=_FROM_SCRATCH),
-        num_steps=700,
+        num_steps=500,
     )
     pointing = replace(
         pointing,
         name="small_several/pointing",
         example=replace(pointing.example, has_reasoning=False),
-        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(800, 1600))),
+        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, warmup_steps=50)),
+        num_steps=800,
+    )
+    binding = replace(  # which of the things the instruction means is mostly asked early: short rows once more
+        noticing,
+        name="small_several/binding",
+        example=replace(noticing.example, text_dropout=0.4),
+        train=TrainConfig(seed=1, optim=replace(_FROM_SCRATCH, warmup_steps=50)),
+        num_steps=1100,
+    )
+    finishing = replace(
+        pointing,
+        name="small_several/finishing",
+        train=TrainConfig(seed=1, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(600, 1600))),
         num_steps=1600,
     )
-    return Curriculum(name="small_several", stages=(hand, noticing, pointing))
+    return Curriculum(name="small_several", stages=(hand, noticing, pointing, binding, finishing))
 
 
 def small_refresh(period_s: int) -> Recipe:

@@ -47,7 +47,7 @@ def test_the_picture_shows_what_is_said_where_it_is_said(studio: Studio) -> None
 @pytest.mark.parametrize("task", ["ButtonUnmask", "VideoUnmaskSwap", "PickXtimes", "BinFill", "SwingXtimes"])
 def test_other_tasks_name_their_things(task: str) -> None:
     """All of them, where the picture shows them: of what is said the colour is there, or what has none."""
-    colours = {**{f"{name} cube": np.array(rgba[:3]) for name, rgba in CUBE_COLORS.items()}}
+    colours = {f"{name} cube": np.array(rgba[:3]) for name, rgba in CUBE_COLORS.items()}
     names = set()
     with closing(Studio(task, 256)) as studio:
         for seed in range(12):

@@ -11,17 +11,33 @@ from ponderpounce.models.ponder_checkpoint import load_ponder
 from ponderpounce.models.pounce_checkpoint import load_bundle
 from sim_client import evaluate
 
-SHIPPED = Path(__file__).parents[2] / "checkpoints" / "small"
+CHECKPOINTS = Path(__file__).parents[2] / "checkpoints"
+SHIPPED = CHECKPOINTS / "small"
 NUM_SCENES, FIRST_SEED = 6, 100_000
 MOST_BYTES = 20_000_000
 
 
-def test_it_is_trained_and_small() -> None:
-    assert not load_ponder(SHIPPED / "ponder").is_random
-    bundle = load_bundle(SHIPPED / "pounce")
+@pytest.mark.parametrize("name", ["small", "several"])
+def test_it_is_trained(name: str) -> None:
+    assert not load_ponder(CHECKPOINTS / name / "ponder").is_random
+    bundle = load_bundle(CHECKPOINTS / name / "pounce")
     assert not bundle.is_random
     assert not bundle.has_fresh_prefix
-    assert sum(path.stat().st_size for path in SHIPPED.rglob("*") if path.is_file()) < MOST_BYTES
+
+
+def test_all_together_are_small() -> None:
+    assert sum(path.stat().st_size for path in CHECKPOINTS.rglob("*") if path.is_file()) < MOST_BYTES
+
+
+def test_who_knows_several_tasks_was_told_of_them_in_few_words() -> None:
+    """Without pieces of their own its texts would take half as many tokens again."""
+    vocabulary = load_ponder(CHECKPOINTS / "several" / "ponder").format.vocabulary
+    old = load_ponder(SHIPPED / "ponder").format.vocabulary
+    text = "pick up the container at [334, 646] that hides the red cube"
+    assert vocabulary.decode(vocabulary.encode(text)) == text
+    assert len(vocabulary.encode(text)) < 0.75 * len(old.encode(text))
+    known = "pick up the first highlighted cube at [441, 430], which is blue"
+    assert vocabulary.encode(known) == old.encode(known)
 
 
 @pytest.mark.slow

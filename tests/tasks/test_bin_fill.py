@@ -169,3 +169,29 @@ def test_the_oracle_solves_98_of_100_seeds_in_upstreams_time(env: Environment, p
     assert sum(map(len, steps.values())) >= 98
     for difficulty, upstream_mean in {"easy": 448, "medium": 662, "hard": 851}.items():
         assert np.mean(steps[difficulty]) == pytest.approx(upstream_mean, rel=0.2)
+
+
+@pytest.mark.parametrize("difficulty", DIFFICULTIES)
+def test_near_first_is_another_order_of_the_same_cubes(difficulty: str) -> None:
+    for seed in range(12):
+        layout = BinFill().sample(np.random.default_rng(seed), difficulty)
+        sorted_ = BinFill().near_first(layout)
+        if layout.is_filling_up:
+            assert sorted_ == layout
+            continue
+        assert replace(sorted_, cubes=layout.cubes) == layout
+        assert sorted(sorted_.cubes, key=repr) == sorted(layout.cubes, key=repr)
+        assert [cube.color for cube in sorted_.cubes] == [cube.color for cube in layout.cubes]
+        for color, _ in layout.wanted:
+            towards_camera = [cube.x_m for cube in sorted_.cubes if cube.color == color]
+            assert towards_camera == sorted(towards_camera, reverse=True)
+
+
+@pytest.mark.parametrize("step", [0, 60])
+def test_only_what_has_appeared_has_a_name(step: int) -> None:
+    layout = replace(BinFill().sample(np.random.default_rng(1), "hard"), is_filling_up=True)
+    named = Counter(thing.name for thing in BinFill().things(layout, step))
+    for color in CUBE_COLORS:
+        cubes = len(layout.of_color(color))
+        assert named[f"{color} cube"] == min(cubes, 1 + step // 50)
+    assert named["bin"] == named["button"] == 1

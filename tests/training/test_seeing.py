@@ -11,12 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ponderpounce.data import album
+from ponderpounce.data.dataset import Dataset
 from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import load_ponder
 from ponderpounce.models.ponder_configs import small
 from ponderpounce.models.vocabulary import Vocabulary
-from ponderpounce.training.seeing import REFUSED, Album, answers_of, draw, loss_of, main
+from ponderpounce.training.seeing import REFUSED, Album, answers_of, draw, loss_of, main, read_album
 
 PONDER = Ponder.random(small(), seed=0)
 FORM = PONDER.format
@@ -92,6 +93,24 @@ def test_the_tower_learns_and_nothing_else_moves(tmp_path: Path, capsys: pytest.
     once = dict(seeing.qwen.named_parameters())
     moved = {name for name, weight in reopened.qwen.named_parameters() if not torch.equal(weight, once[name])}
     assert moved == {name for name in once if ".visual." in name}
+
+
+def test_several_albums_are_mixed_and_one_stays_in_order(tmp_path: Path) -> None:
+    """What is held out at the end is then of all of them."""
+    folders = {task: tmp_path / task for task in ("PickHighlight", "PickXtimes")}
+    for task, folder in folders.items():
+        arguments = ["--out", str(folder), "--task", task, "--pictures", "100", "--image-px", "128", "--no-progress"]
+        assert album.main(arguments) == 0
+    apart = [read_album(FORM, folder) for folder in folders.values()]
+    for one, folder in zip(apart, folders.values(), strict=True):
+        assert one.texts == Dataset(folder).rows(0).grounded_subgoal
+    mixed = read_album(FORM, *folders.values())
+    known = {text: picture for one in apart for text, picture in zip(one.texts, one.pictures, strict=True)}
+    assert sorted(mixed.texts) == sorted([*apart[0].texts, *apart[1].texts])
+    for text, picture in zip(mixed.texts, mixed.pictures, strict=True):
+        assert np.array_equal(picture, known[text])
+    assert 0 < sum("target" in text for text in mixed.texts[-20:]) < 20
+    assert set(mixed.names) == {*apart[0].names, *apart[1].names}
 
 
 def test_a_recipe_that_can_see_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
