@@ -1,4 +1,5 @@
-"""A POUNCE that reads subgoals learns from what one that reads cognition can do: the paper's subgoal-text reference.
+"""A POUNCE that reads other words goes on from what one can do already: subgoals in place of cognition, which is the
+paper's subgoal-text reference, or the instructions of more tasks (`widening`).
 
 Everything of the same name and shape is taken; what has no counterpart is drawn.
 """
@@ -19,14 +20,15 @@ _WORDS = "pi05.language.embed_tokens.weight"
 def told_in_words(
     knowing: PounceBundle, config: AnyPounceConfig, tokenizer: Tokenizer | None, seed: int
 ) -> PounceBundle:
-    """A POUNCE of ``config``, which reads subgoals, with the skill of one that reads cognition.
+    """A POUNCE of ``config`` with the skill of another.
 
-    Its cognition prefix is left out. Words are drawn anew: with another tokenizer they are other words.
+    If ``config`` reads subgoals the cognition prefix is left out. Words are drawn anew: with another
+    tokenizer they are other words.
 
     Raises ValueError unless both are pi0.5 of one size.
     """
     if not isinstance(config, PounceConfig) or not isinstance(knowing.model.config, PounceConfig):
-        raise ValueError("only a pi0.5 is taken over as one that reads subgoals; start GR00T from its public folder")
+        raise ValueError("only a pi0.5 is taken over as one that reads other words; start GR00T from its public folder")
     fresh = random_bundle(config, seed, statistics=knowing.statistics, tokenizer=tokenizer or knowing.tokenizer)
     known, weights = knowing.model.state_dict(), fresh.model.state_dict()
     taken = {name for name in weights if name in known and (name != _WORDS or tokenizer is None)}
