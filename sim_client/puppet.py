@@ -30,6 +30,7 @@ class PuppetPonder(ABC):
 
     def __init__(self, link: Link) -> None:
         self.link = link
+        self.instruction = ""
         self._heartbeat = Heartbeat(link, version(), host_clock_id())
         self._membership = Membership(link, self._heartbeat, self._open, self.end)
         self._queries = link.subscribe(topics.QUERY)
@@ -83,6 +84,7 @@ class PuppetPonder(ABC):
 
     def _open(self, request: m.OpenRequest) -> m.Contract:
         num_carriers, hidden_size = self.shape()
+        self.instruction = request.info.instruction
         return m.Contract(
             proc="ponder",
             num_carriers=num_carriers,

@@ -48,7 +48,8 @@ class ToldPonder(PuppetPonder):
                 self._is_new = True  # the plain text is said when a subgoal begins, and at no other time
         is_new, self._is_new = self._is_new, False
         text = self._text if not self._noise_px else mistold(self._text, self._noise_px, query.query // HELD_QUERIES)
-        vector = np.repeat(stand_in(text, self._shape[1])[None], self._shape[0], axis=0)
+        num_carriers, size = self._shape
+        vector = np.repeat(stand_in(text, size, self.instruction)[None], num_carriers, axis=0)
         return Answer(vector=vector, is_transition=is_new, norm=float(np.linalg.norm(vector)))
 
     def shape(self) -> tuple[int, int]:

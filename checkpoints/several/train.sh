@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# The shipped pair learns seven more tasks, on two CPU cores: see docs/training.md, "Several tasks".
+# The shipped pair learns seven more tasks, on two CPU cores: see docs/training.md, "Several tasks". further.sh goes on from it.
 #
 #     checkpoints/several/train.sh [OUT]      (`make setup` sets everything up first)
 #
@@ -15,12 +15,6 @@ small=$(dirname "$0")/../small
 source "$small/common.sh"
 export OMP_NUM_THREADS=1 MUJOCO_GL=${MUJOCO_GL:-egl}
 others=(ButtonUnmask ButtonUnmaskSwap VideoUnmask VideoUnmaskSwap PickXtimes BinFill SwingXtimes)
-
-collect() {  # into a folder, the oracle's way with these options
-    local into=$1; shift
-    [ -d "$into/meta" ] || "$bin/pp-collect" --frames training --invocation-hz 5 --difficulties easy medium hard \
-        --order near-first --texts follow --noise dart --out "$into" "$@"
-}
 
 collect "$out/data" --tasks "${others[@]}" --episodes 100 --recovery-share 0.2 --shove-share 0.3
 collect "$out/highlight" --tasks PickHighlight --episodes 150 --recovery-share 0.4 --shove-share 0.7

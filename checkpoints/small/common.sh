@@ -26,3 +26,9 @@ from safetensors.torch import load_file, save_file
 path = pathlib.Path(sys.argv[1], "model.safetensors")
 save_file({name: tensor.half() for name, tensor in load_file(path).items()}, path, metadata={"format": "pt"})' "$into"
 }
+
+collect() {  # into a folder, the oracle's way with these options
+    local into=$1; shift
+    [ -d "$into/meta" ] || "$bin/pp-collect" --frames training --invocation-hz 5 --difficulties easy medium hard \
+        --order near-first --texts follow --noise dart --out "$into" "$@"
+}

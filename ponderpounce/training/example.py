@@ -274,7 +274,7 @@ class Example:
     def stand_ins(self, size: int) -> Tensor:
         """`stand_in` of the subgoal in force at every query, (Q, size)."""
         texts = [self.view.text(self.episode.subgoals[query.tick]) for query in self.schedule.queries]
-        return torch.from_numpy(np.stack([stand_in(text, size) for text in texts]))
+        return torch.from_numpy(np.stack([stand_in(text, size, self.episode.instruction) for text in texts]))
 
     def stand_in_weights(self, moved: float) -> Tensor:
         """How much each query's stand-in counts, (Q,): ``moved`` where the words said last tell another place, else 1.
@@ -334,7 +334,9 @@ def make_example(
     view = draw_view(config.augmentation if is_moved else NOT_AUGMENTED, form, set(episode.subgoals), rng)
     nudges_I2 = None
     if config.nudge != NO_NUDGE:
-        nudges_I2 = draw_nudges(config.nudge, episode.state_T8[[each.tick for each in invocations]], rng)
+        first_I = np.array([each.tick for each in invocations], np.intp)
+        chunks_IN8 = episode.action_T8[chunk_ticks(first_I, config.nudge.return_rows + 1, episode.num_ticks)]
+        nudges_I2 = draw_nudges(config.nudge, episode.state_T8[first_I], chunks_IN8, rng)
     return Example(
         episode=episode,
         form=form,

@@ -18,6 +18,7 @@ from torch import Tensor
 from ponderpounce.models.action_space import states_in
 from ponderpounce.models.normalisation import Floats, RobotStatistics
 
+_GRIP_CHANGE = 0.5  # of a command from -1, closed, to 1, open
 _TOUCH_M, _FREE_M = 0.03, 0.13  # heights of the tool between which nudges grow from nothing, as the DART noise does
 
 
@@ -29,6 +30,9 @@ class Nudge:
     """Of each horizontal direction, high above the table; 0: starts are as recorded."""
     return_rows: int = 8
     """Rows until the commands are the recorded ones again, in equal steps."""
+    spares_release: bool = False
+    """Starts stay as recorded where the gripper is told to open or close before that: a hand that is moved aside there
+    learns to let go where it is."""
 
     def __post_init__(self) -> None:
         if self.std_m < 0 or self.return_rows < 1:
@@ -38,10 +42,13 @@ class Nudge:
 NO_NUDGE = Nudge()
 
 
-def draw_nudges(nudge: Nudge, states_I8: Floats, rng: np.random.Generator) -> Floats:
-    """Returns horizontal displacements (I, 2) [m] of the tool at these states."""
+def draw_nudges(nudge: Nudge, states_I8: Floats, chunks_IN8: Floats, rng: np.random.Generator) -> Floats:
+    """Returns horizontal displacements (I, 2) [m] of the tool at these states, from which these commands go on."""
     height_I = states_in("ee_delta", states_I8)[:, 2]
     share_I = ((height_I - _TOUCH_M) / (_FREE_M - _TOUCH_M)).clip(0.0, 1.0)
+    if nudge.spares_release:
+        grip_IN = chunks_IN8[:, : nudge.return_rows + 1, 7]
+        share_I = np.where(np.ptp(grip_IN, axis=1) > _GRIP_CHANGE, 0.0, share_I)
     return (rng.normal(0.0, nudge.std_m, (len(states_I8), 2)) * share_I[:, None]).astype(np.float32)
 
 

@@ -409,6 +409,47 @@ def small_several() -> Curriculum:
     return Curriculum(name="small_several", stages=(hand, noticing, pointing, binding, finishing))
 
 
+def small_further() -> Curriculum:
+    """The pair of `small_several` learns three tasks more, what things are picked up for, and from the hand's misses.
+
+    `hand` and `releasing` train POUNCE and need none of the others; `finishing` is for what the hand has played
+    (`pp-train --watch`).
+    """
+    hand, _, _, binding, finishing = small_several().stages
+    hand = replace(
+        hand,
+        name="small_further/hand",
+        train=replace(hand.train, seed=1, optim=replace(_FROM_SCRATCH, warmup_steps=100, decay=(1900, 3100))),
+        num_steps=3100,
+    )
+    releasing = replace(  # cubes fell beside the bin
+        hand,
+        name="small_further/releasing",
+        example=replace(hand.example, nudge=replace(_BESIDE_THE_WAY, spares_release=True)),
+        train=replace(hand.train, seed=2, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(400, 1200))),
+        num_steps=1200,
+    )
+    binding = replace(
+        binding,
+        name="small_further/binding",
+        train=TrainConfig(seed=2, optim=replace(_FROM_SCRATCH, warmup_steps=50)),
+        num_steps=300,
+    )
+    pointing = replace(  # of a short row with a long demonstration little is learned for what it costs
+        finishing,
+        name="small_further/pointing",
+        train=TrainConfig(seed=2, optim=replace(_FROM_SCRATCH, warmup_steps=50)),
+        num_steps=450,
+    )
+    finishing = replace(
+        finishing,
+        name="small_further/finishing",
+        train=TrainConfig(seed=3, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(300, 750))),
+        num_steps=750,
+    )
+    return Curriculum(name="small_further", stages=(hand, releasing, binding, pointing, finishing))
+
+
 def small_refresh(period_s: int) -> Recipe:
     """Figure 4 at small scale: the shipped pair goes on by the paper's two losses, PONDER looking every 1, 2 or 4 s."""
     *_, pointing = small_noticing().stages
@@ -473,6 +514,7 @@ RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
     "small_keeping_up": small_keeping_up,
     "small_noticing": small_noticing,
     "small_several": small_several,
+    "small_further": small_further,
     "small_refresh_1s": partial(small_refresh, 1),
     "small_refresh_2s": partial(small_refresh, 2),
     "small_refresh_4s": partial(small_refresh, 4),

@@ -24,32 +24,40 @@ from ponderpounce.models.place_code import NUM_PLACE_FEATURES, PLACE_PX, VALUE_S
 from ponderpounce.training.places import PLACE
 
 _AT = r"( at <>)?"
+_PICK = "pick up the first highlighted cube"
+_THEN = ", then "
+_THEN_WEIGHT = 0.6
 _SKILLS = tuple(
     (re.compile(words), skill)
     for words, skill in (
         (r", which is \w+", ""),
-        (
-            rf"^pick up the (?:\w+ )?(?:red|green|blue) cube{_AT}(?: for the \w+ time)?$",
-            r"pick up the first highlighted cube\1",
-        ),
+        (rf"^pick up the correct cube{_AT} for the \w+ time$", rf"{_PICK}\1"),
+        (rf"^pick up the (?:red|green|blue) cube{_AT} for the \w+ time$", rf"{_PICK}\1, then place it"),
+        (rf"^pick up the cube{_AT}$", rf"{_PICK}\1, then place it"),
+        (rf"^pick up the \w+ (?:red|green|blue) cube{_AT}$", rf"{_PICK}\1, then drop it"),
+        (rf"^pick up the (?:red|green|blue) cube{_AT}$", rf"{_PICK}\1, then swing it"),
         (rf"^pick up the container{_AT} that hides the \w+ cube$", r"pick up the container\1"),
         (rf"^press the (?:first |second )?button{_AT}(?: to stop| to finish)?$", r"press the button\1"),
-        (rf"^place the \w+ cube onto the target{_AT}$", r"place the cube onto the target\1"),
+        (rf"^place the (?:\w+ cube onto the|cube onto the correct) target{_AT}$", r"place the cube onto the target\1"),
         (rf"^move to the top of the \w+-side target{_AT} for the \w+ time$", r"move to the top of the target\1"),
-        (r"^put the \w+ cube on the table$", "place the cube onto the table"),
+        (r"^put (?:the \w+ cube on the table|it down)$", "place the cube onto the table"),
     )
 )
 """What one skill is called in several tasks, by one name. Of PickHighlight only a cube's colour is left out: POUNCE may
 tell its first from its second."""
+_LAST_SWING = re.compile(r"^move to the top of the left-side target.* for the (\w+) time$")
+_SWINGS = re.compile(r" repeating this back-and-forth motion (\w+) times,")
+_ORDINAL_OF = {"two": "second", "three": "third", "four": "fourth", "five": "fifth"}
 _MAX_EVEN_WEIGHT = 64.0
 _NOWHERE = (PLACE_PX // 2, PLACE_PX // 2)
 
 
 @functools.lru_cache(maxsize=1 << 16)
-def stand_in(subgoal: str, size: int) -> NDArray[np.float32]:
+def stand_in(subgoal: str, size: int, instruction: str = "") -> NDArray[np.float32]:
     """Returns the stand-in (size,) for a grounded subgoal, ``<y, x>`` in pixels of a 256 px picture.
 
-    Of several coordinates the first counts; a subgoal without any points at the middle.
+    Of several coordinates the first counts; a subgoal without any points at the middle. The instruction tells what
+    follows where the subgoal does not (`skill_of`).
 
     Raises:
         ValueError: ``size`` leaves no room for the text's code.
@@ -59,18 +67,32 @@ def stand_in(subgoal: str, size: int) -> NDArray[np.float32]:
         raise ValueError(f"a stand-in of {size} numbers is too small; expected at least {2 * NUM_PLACE_FEATURES}")
     place = PLACE.search(subgoal)
     yx_px = (int(place[1]), int(place[2])) if place else _NOWHERE
-    values = np.concatenate([place_features(yx_px), _code(skill_of(subgoal), num_code)])
+    values = np.concatenate([place_features(yx_px), _code(skill_of(subgoal, instruction), num_code)])
     values.flags.writeable = False
     return values
 
 
 @functools.lru_cache(maxsize=1 << 16)
-def skill_of(subgoal: str) -> str:
-    """What the hand is to do, wherever it is and with whatever: "press the button at <>"."""
+def skill_of(subgoal: str, instruction: str = "") -> str:
+    """What the hand is to do, wherever it is and with whatever: "press the button at <>".
+
+    What is picked up is carried on in a way of each task's own, and that is part of it. The hand hears of the next
+    subgoal up to 1.3 s after it has begun and acts for one more second on what it knew, so it must know what follows: a
+    hand that was told the same in PickHighlight, where cubes are put down where they were, and in PickXtimes let go of
+    the cube half-way. Of SwingXtimes' swings the last is another skill, and only the instruction tells which it is.
+    """
     text = PLACE.sub("<>", subgoal)
+    is_last = _is_last_swing(text, instruction)
     for words, skill in _SKILLS:
         text = words.sub(skill, text)
-    return text
+    return f"{text}{_THEN}put it down" if is_last else text
+
+
+def _is_last_swing(text: str, instruction: str) -> bool:
+    swing, swings = _LAST_SWING.match(text), _SWINGS.search(instruction)
+    if swing is None or not instruction:
+        return False
+    return swing[1] == (_ORDINAL_OF.get(swings[1]) if swings else "first")
 
 
 def even_weights(size: int) -> NDArray[np.float32]:
@@ -89,6 +111,9 @@ def even_weights(size: int) -> NDArray[np.float32]:
 
 @functools.lru_cache(maxsize=1 << 10)
 def _code(text: str, size: int) -> NDArray[np.float32]:
-    """Drawn from the text alone: nearly orthogonal to every other text's."""
+    """Drawn from the text alone: nearly orthogonal to every other's, but for the same thing that goes on otherwise."""
+    first, _, then = text.partition(_THEN)
+    if then:
+        return np.sqrt(1 - _THEN_WEIGHT**2).astype(np.float32) * _code(first, size) + _THEN_WEIGHT * _code(then, size)
     seed = int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "big")
     return np.random.default_rng(seed).normal(size=size).astype(np.float32)

@@ -30,7 +30,7 @@ def test_commands_begin_where_the_tool_is_put_and_end_where_they_ended(seed: int
     targets = HOME + rng.uniform(-0.1, 0.1, (N, 8)).astype(np.float32)
     rows = np.tile(np.arange(N), (3, 1))
     nudge = Nudge(std_m=0.03, return_rows=return_rows)
-    moves = draw_nudges(nudge, states, rng)
+    moves = draw_nudges(nudge, states, np.tile(targets, (3, 1, 1)), rng)
     state, actions = apply_nudges(
         nudge,
         moves,
@@ -55,8 +55,32 @@ def test_near_the_table_nobody_is_nudged() -> None:
     low = np.array([0.0, 0.75, 0.0, -2.2, 0.0, 2.95, 0.8, 0.04], np.float32)
     height_m = states_in("ee_delta", low[None])[0, 2]
     assert height_m < 0.03
-    assert not draw_nudges(Nudge(std_m=0.1), low[None], np.random.default_rng(0)).any()
-    assert draw_nudges(Nudge(std_m=0.1), HOME[None], np.random.default_rng(0)).all()
+    stays = np.tile(HOME, (1, N, 1))
+    assert not draw_nudges(Nudge(std_m=0.1), low[None], stays, np.random.default_rng(0)).any()
+    assert draw_nudges(Nudge(std_m=0.1), HOME[None], stays, np.random.default_rng(0)).all()
+
+
+@given(row=st.integers(0, N), return_rows=st.integers(1, N - 1))
+@settings(max_examples=30, deadline=None)
+def test_where_something_is_let_go_of_before_the_tool_is_back_starts_are_spared_if_asked(
+    row: int, return_rows: int
+) -> None:
+    carries = np.tile(HOME, (2, N, 1))
+    carries[:, :, 7] = -1.0
+    carries[1, row:, 7] = 1.0  # from its first row on it is open already: nothing is let go of
+    draw = {
+        spares: draw_nudges(
+            Nudge(std_m=0.1, return_rows=return_rows, spares_release=spares),
+            np.tile(HOME, (2, 1)),
+            carries,
+            np.random.default_rng(0),
+        )
+        for spares in (False, True)
+    }
+    is_spared = 0 < row <= return_rows
+    np.testing.assert_array_equal(draw[True][0], draw[False][0])
+    np.testing.assert_array_equal(draw[True][1], 0.0 if is_spared else draw[False][1])
+    assert draw[False].all()
 
 
 def test_joint_deltas_are_refused() -> None:

@@ -61,8 +61,13 @@ def test_a_text_without_a_place_points_at_the_middle() -> None:
         ("press the second button at <64, 103>", "press the button at <>"),
         ("press the button at <64, 103> to stop", "press the button at <>"),
         ("press the button to stop", "press the button"),
-        ("pick up the third blue cube at <76, 176>", "pick up the first highlighted cube at <>"),
-        ("pick up the green cube at <99, 126> for the second time", "pick up the first highlighted cube at <>"),
+        ("pick up the third blue cube at <76, 176>", "pick up the first highlighted cube at <>, then drop it"),
+        ("pick up the red cube for the second time", "pick up the first highlighted cube, then place it"),
+        ("pick up the cube at <99, 126>", "pick up the first highlighted cube at <>, then place it"),
+        ("pick up the blue cube at <99, 126>", "pick up the first highlighted cube at <>, then swing it"),
+        ("pick up the correct cube at <3, 4> for the third time", "pick up the first highlighted cube at <>"),
+        ("put it down", "place the cube onto the table"),
+        ("place the cube onto the correct target at <7, 8>", "place the cube onto the target at <>"),
         ("pick up the container at <85, 165> that hides the red cube", "pick up the container at <>"),
         ("put down the container", "put down the container"),
         ("place the green cube onto the target at <101, 127>", "place the cube onto the target at <>"),
@@ -73,6 +78,33 @@ def test_a_text_without_a_place_points_at_the_middle() -> None:
 def test_one_skill_has_one_name_in_all_tasks(subgoal: str, skill: str) -> None:
     assert skill_of(subgoal) == skill
     assert skill_of(skill) == skill
+
+
+SWING = "move to the top of the {side}-side target at <8, 7> for the {nth} time"
+ONE_SWING = "move it to the top of the right-side target, then put it down on the left-side target, finally press"
+TWO_SWINGS = "left-side target, repeating this back-and-forth motion two times, finally press the button to stop"
+
+
+@pytest.mark.parametrize(
+    ("instruction", "last"),
+    [(ONE_SWING, ("left", "first")), (TWO_SWINGS, ("left", "second")), ("", None)],
+)
+def test_the_swing_after_which_the_cube_is_put_down_is_another_skill(
+    instruction: str, last: tuple[str, str] | None
+) -> None:
+    for side in ("left", "right"):
+        for nth in ("first", "second"):
+            skill = skill_of(SWING.format(side=side, nth=nth), instruction)
+            then = ", then put it down" if (side, nth) == last else ""
+            assert skill == f"move to the top of the target at <>{then}"
+
+
+def test_what_goes_on_in_another_way_is_told_by_a_like_code() -> None:
+    first = "pick up the first highlighted cube at <9, 9>"
+    told = (first, "pick up the cube at <9, 9>", "pick up the red cube at <9, 9>")
+    codes = np.stack([stand_in(text, 1024)[NUM_PLACE_FEATURES:] for text in told])
+    likeness = codes @ codes.T / codes.shape[1]
+    np.testing.assert_allclose(likeness, [[1, 0.8, 0.8], [0.8, 1, 0.64], [0.8, 0.64, 1]], atol=0.12)
 
 
 def test_too_small_a_carrier_is_refused() -> None:
