@@ -32,7 +32,8 @@ from ponderpounce.models.pounce_family import action_loss, sample_times
 from ponderpounce.training.collate import collate_ponder, collate_pounce
 from ponderpounce.training.example import TrainingEpisode, make_example
 from ponderpounce.training.joint import Draws, JointModel, PonderBatch, PounceBatch, encode_rows
-from ponderpounce.training.recipes import Recipe, recipe, stages_of
+from ponderpounce.training.recipe import Recipe, stages_of
+from ponderpounce.training.recipes import recipe
 from ponderpounce.training.trainer import Trainer
 
 

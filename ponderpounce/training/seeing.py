@@ -39,7 +39,8 @@ from ponderpounce.training.augment import Augmentation, draw_view
 from ponderpounce.training.data import Sight, TrainingSet
 from ponderpounce.training.optim import OptimConfig, Optimiser
 from ponderpounce.training.places import TEXT_PX
-from ponderpounce.training.recipes import recipe, stages_of
+from ponderpounce.training.recipe import stages_of
+from ponderpounce.training.recipes import recipe
 
 DONE, REFUSED = 0, 2
 

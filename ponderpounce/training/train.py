@@ -46,7 +46,8 @@ from ponderpounce.training.in_words import told_in_words
 from ponderpounce.training.joint import JointModel, PonderBatch, PounceBatch, Trains
 from ponderpounce.training.parallel import World, gather, joined, shard
 from ponderpounce.training.plot import plot_log
-from ponderpounce.training.recipes import Curriculum, Recipe, recipe, stages_of
+from ponderpounce.training.recipe import Curriculum, Recipe, stages_of
+from ponderpounce.training.recipes import recipe
 from ponderpounce.training.trainer import CheckpointError, SaveError, StepReport, Trainer
 from ponderpounce.training.watch import LOG_FILE, Watch
 

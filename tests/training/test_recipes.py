@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from ponderpounce.training.recipes import RECIPES, recipe, stages_of
+from ponderpounce.training.recipe import stages_of
+from ponderpounce.training.recipes import RECIPES, recipe
 
 
 def test_robomme_is_the_papers() -> None:

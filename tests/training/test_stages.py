@@ -25,7 +25,7 @@ from ponderpounce.training.data import Sight, TrainingSet
 from ponderpounce.training.example import ExampleConfig, TrainingEpisode, make_example, row_frames
 from ponderpounce.training.joint import Draws, JointModel
 from ponderpounce.training.parallel import World
-from ponderpounce.training.recipes import Curriculum, Recipe, stages_of
+from ponderpounce.training.recipe import Curriculum, Recipe, stages_of
 from ponderpounce.training.train import Batches, TrainOptions, build
 from ponderpounce.training.trainer import Trainer
 

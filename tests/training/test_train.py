@@ -22,6 +22,7 @@ from ponderpounce.training import recipes, train
 from ponderpounce.training.data import TrainingSet
 from ponderpounce.training.example import chunk_ticks, make_example
 from ponderpounce.training.parallel import World
+from ponderpounce.training.recipe import Recipe, stages_of
 from ponderpounce.training.train import TrainOptions
 from pounce_server.contract import example_request
 from pounce_server.engine import EagerEngine
@@ -108,7 +109,7 @@ def test_a_tokenizer_of_its_own_has_read_all_that_pounce_will_be_told(folder: Pa
     data = TrainingSet(folder)
     told = data.told()
     form = recipes.recipe("tiny_subgoal_text")
-    assert isinstance(form, recipes.Recipe)
+    assert isinstance(form, Recipe)
     ponder = Ponder.random(form.ponder, seed=0)
     for number in range(len(data)):
         example = make_example(data[number], ponder.format, form.example, np.random.default_rng(number))
@@ -190,7 +191,7 @@ def test_what_does_not_fit_is_said_in_one_sentence(
 
 
 def test_pictures_of_another_size_are_refused(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (small,) = recipes.stages_of(recipes.recipe("tiny"))
+    (small,) = stages_of(recipes.recipe("tiny"))
     larger = replace(small, ponder=replace(small.ponder, image_px=(96, 96)))
     monkeypatch.setitem(recipes.RECIPES, "tiny", lambda: larger)
     with pytest.raises(ValueError, match="collect with --image-px 96"):
@@ -210,7 +211,7 @@ def test_a_finished_run_is_not_overwritten(folder: Path, tmp_path: Path) -> None
 
 
 def test_a_step_draws_the_same_batch_whenever_it_is_asked(folder: Path, tmp_path: Path) -> None:
-    (run,) = recipes.stages_of(recipes.recipe("tiny"))
+    (run,) = stages_of(recipes.recipe("tiny"))
     data = TrainingSet(folder)
     model, bundle = train.build(run, data, options(folder, tmp_path))
     batches = train.Batches(data, run, model, bundle, World())

@@ -1,0 +1,78 @@
+"""What a training run is, apart from its data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ponderpounce.models.action_space import ActionSpace
+from ponderpounce.models.ponder_configs import PonderConfig
+from ponderpounce.models.pounce import Freeze
+from ponderpounce.models.pounce_family import AnyPounceConfig
+from ponderpounce.training.augment import NOT_AUGMENTED
+from ponderpounce.training.example import ExampleConfig
+from ponderpounce.training.joint import Trains
+from ponderpounce.training.trainer import TrainConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recipe:
+    """A training run, apart from its data."""
+
+    name: str
+    ponder: PonderConfig
+    pounce: AnyPounceConfig
+    freeze: Freeze
+    """Which of POUNCE's pretrained parts stay as they are."""
+    example: ExampleConfig
+    train: TrainConfig
+    num_steps: int
+    batch_episodes: int
+    w1: float = 1.0
+    w2: float = 0.1
+    w3: float = 0.0
+    """Of the auxiliary alignment with the stand-ins (`stand_in`); the paper has no such loss."""
+    moved_weight: float = 1.0
+    """How much alignment counts at queries whose words tell another place than the stand-in (`stand_in_weights`)."""
+    aligns_evenly: bool = False
+    """Numbers of C that tell a place slowly count for more (`even_weights`)."""
+    w4: float = 0.0
+    """Of the auxiliary lessons in places to have in mind (`place_lessons`); the paper has no such loss."""
+    trains: Trains = "both"
+    """Which systems; the other is not run."""
+    keeps_eyes: bool = False
+    """PONDER's vision tower stays as it is: a language model that needs few of the things in a picture lets the eyes
+    forget the others."""
+    space: ActionSpace = "joint_delta"
+    """What POUNCE's actions are."""
+    statistics_by_row: bool = False
+    """Every row of a chunk in its own measure (`RobotStatistics.reach`)."""
+    has_own_tokenizers: bool = False
+    """From scratch: both tokenizers are trained on the data's texts, which then take fewer tokens."""
+    from_scratch: bool = False
+    """True: weights are drawn. False: both systems start from pretrained checkpoints, given to the program."""
+
+    def __post_init__(self) -> None:
+        if self.trains != "pounce" and self.example.is_grounded != (self.w2 > 0):
+            raise ValueError(f"recipe {self.name}: is_grounded is {self.example.is_grounded}, but w2 is {self.w2}")
+        if self.trains == "both" and self.example.augmentation != NOT_AUGMENTED and self.example.augments == "all":
+            raise ValueError(f"recipe {self.name}: views are moved and actions are not; augment watched episodes only")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Curriculum:
+    """Stages, each a run of its own; a later one starts from what earlier ones have left of either system."""
+
+    name: str
+    stages: tuple[Recipe, ...]
+    """Named ``curriculum/stage``."""
+
+    def __post_init__(self) -> None:
+        first, *others = self.stages
+        for other in others:
+            if (other.ponder, other.pounce, other.space) != (first.ponder, first.pounce, first.space):
+                raise ValueError(f"{other.name} trains other networks than {first.name}; stages share them")
+
+
+def stages_of(chosen: Recipe | Curriculum) -> tuple[Recipe, ...]:
+    """The runs that it takes."""
+    return (chosen,) if isinstance(chosen, Recipe) else chosen.stages
