@@ -18,7 +18,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import tyro
@@ -33,6 +33,8 @@ APPLICATION_ID = "ponderpounce"
 _OPEN_S = 60.0  # software rendering on a busy machine
 _SETTLE_S = 3.0  # the viewer tells nobody when it has decoded and drawn what is on screen
 _STEP_S = 0.1
+_END_S = 5.0  # for a viewer that nobody hears any more to be gone
+_TAIL_CHARS = 500
 
 
 class ReplayError(RuntimeError):
@@ -133,14 +135,25 @@ def _headless() -> Iterator[Any]:
         try:
             _await(lambda: process.poll() is not None or _listens(port), "the viewer did not start")
             if process.poll() is not None:
-                output.seek(0)
-                tail = output.read()[-500:].strip()
-                raise ReplayError(f"the viewer ended at once; is a Vulkan driver installed? It said: {tail}")
+                raise ReplayError(_last_words(output))
             yield ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+        except ConnectionError as error:  # it listens before it looks for a driver, and ends if there is none
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(_END_S)
+                raise ReplayError(_last_words(output)) from error
+            raise ReplayError(f"the viewer does not answer: {error}") from error
         finally:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)  # it holds nothing that would be lost
             process.wait()
+
+
+def _last_words(output: IO[str]) -> str:
+    output.seek(0)
+    text = output.read()
+    panic = text.find("panicked at")  # what follows is a backtrace
+    said = text[-_TAIL_CHARS:].strip() if panic < 0 else text[panic:].partition("\n")[0]
+    return f"the viewer ended at once; is a Vulkan driver installed (mesa-vulkan-drivers has one)? It said: {said}"
 
 
 def _has_opened(viewer: Any) -> bool:

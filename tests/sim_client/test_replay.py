@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +21,15 @@ from sim_client import replay
 T0 = 1_700_000_000_000_000_000
 MS = 1_000_000
 RED, BLUE = (200, 30, 30), (30, 30, 200)
+STUB = """#!{python}
+import socket, subprocess, sys, time
+if "--headless" not in sys.argv:
+    sys.exit(subprocess.run(["{rerun}", *sys.argv[1:]]).returncode)
+if {listens}:
+    server = socket.create_server(("127.0.0.1", int(sys.argv[sys.argv.index("--port") + 1])))
+    time.sleep(1)
+sys.exit("{words}")
+"""
 
 
 @pytest.fixture(scope="module")
@@ -134,6 +144,30 @@ def test_what_is_no_log_is_exit_1(content: bytes | None, tmp_path: Path, capsys:
     assert replay.main([str(path), "--save", str(tmp_path / "odd.rrd")]) == 1
     assert "odd.mcap" in capsys.readouterr().err
     assert not (tmp_path / "odd.rrd").exists()
+
+
+@pytest.mark.parametrize("words", ["no adapter", "panicked at 'no adapter'\\n 6: main\\n" + 60 * " 7: frame\\n"])
+@pytest.mark.parametrize("listens", [False, True])
+def test_a_viewer_that_finds_no_driver_is_told_as_that(
+    listens: bool,
+    words: str,
+    record: Callable[..., Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """At once, and after it has begun to listen, which is when the real one looks for a driver."""
+    stub = tmp_path / "rerun"
+    stub.write_text(STUB.format(python=sys.executable, rerun=replay._rerun(), listens=listens, words=words))
+    stub.chmod(0o755)
+    monkeypatch.setattr(replay, "_rerun", lambda: str(stub))
+    png = tmp_path / "a.png"
+    assert replay.main([str(record(tmp_path / "a.mcap")), "--screenshot", str(png)]) == 1
+    said = capsys.readouterr().err
+    assert "is a Vulkan driver installed" in said
+    assert "no adapter" in said
+    assert "frame" not in said
+    assert not png.exists()
 
 
 @pytest.mark.e2e
