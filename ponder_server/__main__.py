@@ -31,6 +31,7 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     from ponder_server.mtp import MtpDraft
     from ponder_server.threads import num_usable_cores
     from ponderpounce.models import ponder_configs
+    from ponderpounce.models.bfloat16 import warn_of_slow
     from ponderpounce.models.ponder import Ponder
     from ponderpounce.models.ponder_checkpoint import load_ponder
 
@@ -41,6 +42,8 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     num_cores = num_usable_cores()
     if options.attention_threads > num_cores:
         log.warning("--attention-threads %d: this process may use %d core(s)", options.attention_threads, num_cores)
+    if warning := warn_of_slow(options.dtype, options.device):
+        log.warning("%s", warning)
     dtype = {"float32": torch.float32, "bfloat16": torch.bfloat16}[options.dtype]
     if options.checkpoint is not None:
         ponder = load_ponder(options.checkpoint, device=options.device, dtype=dtype)

@@ -22,6 +22,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from ponder_server.threads import ALONE, Threads
+from ponderpounce.models.bfloat16 import HAS_FAST_BFLOAT16
 
 # Internal, but the one CPU attention that returns its log-sum-exp; the tests compare it with the public function.
 _flash_cpu: Any = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu
@@ -36,7 +37,6 @@ _ROWS = 1024
 _LEAST_WORK = 2**21
 """Numbers in the queries times positions: with less, calling several functions, or a second thread, costs more than it
 saves."""
-HAS_FAST_BFLOAT16 = torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported()
 
 
 def attend(queries_HMD: Tensor, keys_GSD: Tensor, values_GSD: Tensor, threads: Threads = ALONE) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 
 import tyro
@@ -10,6 +11,8 @@ from clock.daemon import serve_model
 from pounce_server.config import NUM_TORCH_THREADS, PounceOptions
 from pounce_server.contract import PounceEngine
 from pounce_server.serve import PounceServer
+
+log = logging.getLogger(__name__)
 
 
 def build_engine(options: PounceOptions) -> PounceEngine:
@@ -20,6 +23,7 @@ def build_engine(options: PounceOptions) -> PounceEngine:
     """
     import torch
 
+    from ponderpounce.models.bfloat16 import warn_of_slow
     from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
     from ponderpounce.models.pounce_checkpoint import load_bundle, random_bundle
     from ponderpounce.models.pounce_configs import tiny_cpu, tiny_groot
@@ -27,6 +31,8 @@ def build_engine(options: PounceOptions) -> PounceEngine:
     from pounce_server.engine import EagerEngine
 
     torch.set_num_threads(NUM_TORCH_THREADS)
+    if warning := warn_of_slow(options.dtype, options.device):
+        log.warning("%s", warning)
     if options.checkpoint is not None:
         bundle = load_bundle(options.checkpoint, tokenizer=options.tokenizer)
         family = family_of_config(bundle.model.config)

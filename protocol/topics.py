@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import lru_cache
 from typing import Generic, TypeVar
 
 from protocol import messages as m
@@ -117,6 +118,7 @@ def alive_key(robot: str, proc: str) -> str:
     return f"{ROOT}/{robot}/alive/{proc}"
 
 
+@lru_cache(maxsize=4096)  # a bus in one process asks it of every subscription at every message
 def matches(expression: str, key: str) -> bool:
     """Zenoh's rule for '*' (one chunk, never one that starts with '@'); '**' is not used here."""
     left, right = expression.split("/"), key.split("/")

@@ -39,7 +39,8 @@ from sim_client.config import SimOptions
 from sim_client.donor import DonorError, DonorPonder, donors_in
 from sim_client.launch import Daemons
 from sim_client.ledger import Ledger, LedgerError, write_json
-from sim_client.station import Party, open_station
+from sim_client.silent import SilentPonder
+from sim_client.station import Build, Party, open_station
 from sim_client.suite import Suite, as_json, versions
 from sim_client.told_cognition import ToldPonder, cognition_shape
 
@@ -297,8 +298,7 @@ class EvaluationStation:
         self._donor: DonorPonder | None = None
         self._open = contextlib.ExitStack()
         daemons = self._open.enter_context(Daemons(options.out / "servers" / str(os.getpid())))
-        replaced = {"other-episode": self._build_donor, "stand-in": self._build_told}.get(options.cognition)
-        station = open_station(sim, daemons, replaced, options.subgoal_text)
+        station = open_station(sim, daemons, self._replacement(), options.subgoal_text)
         self._open.callback(station.bus.close)
         self._suite = Suite(sim, station.link, station.clock, daemons.dead)
         self._task = ""
@@ -336,6 +336,20 @@ class EvaluationStation:
             )
             self._task = task
         return self._environment
+
+    def _replacement(self) -> Build | None:
+        """What stands in PONDER's place, if it is not to be asked."""
+        options = self._options
+        if options.cognition == "other-episode":
+            return self._build_donor
+        if options.cognition == "stand-in":
+            return self._build_told
+        is_unheard = options.cognition == "null" and options.servers == "in-process" and not options.record
+        if is_unheard and options.pounce_checkpoint is not None:
+            with contextlib.suppress(ValueError):  # a public folder does not say K and H: PONDER does
+                shape = cognition_shape(options.pounce_checkpoint)
+                return lambda bus, robot, _: SilentPonder(Link(bus, robot=robot, proc="ponder"), *shape).step
+        return None
 
     def _build_donor(self, bus: Bus, robot: str, checkpoint: Path | None) -> Party:
         self._donor = DonorPonder(Link(bus, robot=robot, proc="ponder"))

@@ -30,6 +30,7 @@ from tqdm import tqdm
 
 from ponderpounce.data.episode import CAMERAS
 from ponderpounce.data.errors import DatasetError
+from ponderpounce.models.bfloat16 import warn_of_slow
 from ponderpounce.models.eyes import check_cameras, readable_sizes
 from ponderpounce.models.normalisation import ROBOMME
 from ponderpounce.models.ponder import Ponder
@@ -170,6 +171,8 @@ class Batches:
 
 def main(argv: list[str] | None = None) -> int:
     options = tyro.cli(TrainOptions, args=argv, prog="pp-train", description=TrainOptions.__doc__)
+    if warning := warn_of_slow(options.dtype, options.device):
+        sys.stderr.write(f"pp-train: {warning}\n")
     try:
         train(options)
     except (DatasetError, CheckpointError, SaveError, OSError, ValueError, FloatingPointError) as error:

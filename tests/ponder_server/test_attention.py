@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from ponder_server.attention import (
-    HAS_FAST_BFLOAT16,
     attend,
     attend_in_parts,
     attend_in_windows,
     attend_masked,
 )
 from ponder_server.threads import Piece, Threads
+from ponderpounce.models.bfloat16 import HAS_FAST_BFLOAT16
 
 needs_fast_bfloat16 = pytest.mark.skipif(not HAS_FAST_BFLOAT16, reason="torch has no fast bfloat16 on this CPU")
 

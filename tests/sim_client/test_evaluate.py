@@ -5,7 +5,10 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import os
 import re
+import subprocess
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -304,6 +307,37 @@ def test_the_hand_alone_is_told_the_task_s_own_subgoals_and_what_it_did_can_be_w
     assert {entry.origin for entry in Dataset(tmp_path / "set").episodes} == {"servers"}
     rows = Dataset(tmp_path / "set").rows(1)
     assert set(np.flatnonzero(rows.is_rendered)) == looks - {65}  # what was seen after the last action is left out
+
+
+@pytest.mark.sim
+def test_null_cognition_needs_no_ponder(tmp_path: Path) -> None:
+    """What is commanded is the same whether a PONDER is asked, as where its answers are recorded, or nobody is."""
+    save_bundle(random_bundle(tiny_cpu(cognition_size=tiny_ponder().hidden_size), seed=0), tmp_path / "pounce")
+    streams, models = {}, {}
+    for name, record in (("asked", True), ("silent", False)):
+        chosen = options(
+            tmp_path / name, tasks=("PickHighlight",), episodes=1, runs=1, policy="servers", max_steps=65,
+            record=record, record_hz=1, cognition="null", pounce_checkpoint=tmp_path / "pounce",
+        )  # fmt: skip
+        with contextlib.closing(EvaluationStation(chosen)) as station:
+            line = station.play(chosen.jobs()[0])
+        assert line["schedule"]["null_invocations"] == line["schedule"]["num_invocations"] == 4
+        streams[name], models[name] = line["stream_sha256"], line["models"]["ponder"]["model_hash"]
+    assert streams["asked"] == streams["silent"]
+    assert models["silent"] == "silent" != models["asked"]
+
+
+def test_sums_are_rounded_alike_whichever_server_a_process_has() -> None:
+    """MKL reads it once, at torch's first product, so it is asked in a process of its own."""
+    code = "import os, {}; print(os.environ['MKL_CBWR'])"
+    said = {
+        subprocess.run(
+            [sys.executable, "-c", code.format(name)], capture_output=True, text=True, check=True,
+            env={name: value for name, value in os.environ.items() if name != "MKL_CBWR"},
+        ).stdout
+        for name in ("ponder_server", "pounce_server")
+    }  # fmt: skip
+    assert len(said) == 1
 
 
 @pytest.mark.parametrize(

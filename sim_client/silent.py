@@ -1,0 +1,42 @@
+"""Nobody in PONDER's place, for episodes in which no cognition is delivered.
+
+The schedule is kept as with a PONDER, so the episode is the same one, tick for tick. What is answered reaches nobody.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from protocol import messages as m
+from protocol.link import Link
+from sim_client.puppet import Answer, PuppetPonder
+
+
+class SilentPonder(PuppetPonder):
+    """Answers every query at once, with zeros.
+
+    Args:
+        num_carriers, hidden_size: K and H of what POUNCE would read.
+    """
+
+    def __init__(self, link: Link, num_carriers: int, hidden_size: int) -> None:
+        self._vector = np.zeros((num_carriers, hidden_size), np.float32)
+        super().__init__(link)
+
+    @property
+    def model_hash(self) -> str:
+        return "silent"
+
+    @property
+    def is_fake(self) -> bool:
+        return False  # nobody acts on it, so there is nothing to warn of
+
+    def shape(self) -> tuple[int, int]:
+        num_carriers, hidden_size = self._vector.shape
+        return num_carriers, hidden_size
+
+    def answer(self, query: m.Query) -> Answer:
+        return Answer(vector=self._vector, is_transition=False, norm=0.0)
+
+    def end(self) -> None:
+        pass
