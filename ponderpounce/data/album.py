@@ -108,14 +108,20 @@ def make_album(options: AlbumOptions) -> None:
         writer.finish()
 
 
+def require_named(name: str) -> Task[Any, Any]:
+    """Makes a task. Raises TaskError if there is none of that name, or it does not name its things."""
+    task = make_task(name)
+    if type(task).things is Task.things:
+        raise TaskError(f"task {name!r} does not name its things (Task.things); PickHighlight does")
+    return task
+
+
 class Studio:
     """Scenes of one task that stand still. Close it after use."""
 
     def __init__(self, task: str, image_px: int) -> None:
         """Raises TaskError if there is no such task, or it does not name its things."""
-        self.task, self.image_px = make_task(task), image_px
-        if type(self.task).things is Task.things:
-            raise TaskError(f"task {task!r} does not name its things (Task.things); PickHighlight does")
+        self.task, self.image_px = require_named(task), image_px
         spec = table_scene(self.task.robot)
         self.task.furnish(spec)
         self.physics = Physics(spec)

@@ -28,6 +28,8 @@ EPISODES_PATH, TASKS_PATH = "meta/episodes/chunk-000/file-000.parquet", "meta/ta
 INFO_PATH, STATS_PATH = "meta/info.json", "meta/stats.json"
 COLLECTION_PATH = "meta/collection.json"
 """Ours: how `pp-collect` made the folder."""
+ALBUM = "album"
+"""Ours: the folder, inside, of a task's still scenes (`pp-collect --album`), each a dataset of its own."""
 
 _JOINTS = [f"joint_{number}" for number in range(1, 8)]
 _POSE = ["x", "y", "z", "qw", "qx", "qy", "qz"]

@@ -65,6 +65,8 @@ class Curriculum:
     name: str
     stages: tuple[Recipe, ...]
     """Named ``curriculum/stage``."""
+    eyes_steps: int = 0
+    """So long PONDER's eyes are opened first, with an album (`seeing`); 0: it comes with eyes that see."""
 
     def __post_init__(self) -> None:
         first, *others = self.stages

@@ -88,6 +88,7 @@ RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
     "tiny": tiny,
     "tiny_groot": tiny_groot,
     "tiny_subgoal_text": tiny_subgoal_text,
+    "starter": small.starter,
     "small": small.small,
     "small_refocusing": small.small_refocusing,
     "small_following": small.small_following,

@@ -57,8 +57,8 @@ class SeeOptions:
 
     recipe: str
     """Which PONDER: small."""
-    data: Path
-    """A folder that pp-collect made: PONDER's tokenizer is trained on its texts, as pp-train would."""
+    data: tuple[Path, ...]
+    """Folders that pp-collect made: PONDER's tokenizer is trained on their texts, as pp-train would."""
     album: tuple[Path, ...]
     """Folders that pp-album made."""
     ponder: Path | None = None
@@ -152,7 +152,7 @@ def _newborn(options: SeeOptions) -> Ponder:
     run = stages_of(recipe(options.recipe))[0]
     if not run.from_scratch:
         raise ValueError(f"recipe {run.name} starts from pretrained weights, which can see; pp-see is for small")
-    texts = TrainingSet(options.data).texts()
+    texts = TrainingSet(*options.data).texts()
     vocabulary = Vocabulary.trained_on(texts, run.ponder.first_carrier_id) if run.has_own_tokenizers else None
     return Ponder.random(run.ponder, vocabulary, seed=options.seed)
 

@@ -115,6 +115,32 @@ def small() -> Curriculum:
     return Curriculum(name="small", stages=(looking, reaching, motor, grounding, mending, refining, joint))
 
 
+def starter() -> Curriculum:
+    """`small` cut short, for a first pair within two hours on two cores: docs/training.md, "The starter".
+
+    Every stage is for all processes, one after the other, and nothing is played or corrected in between.
+    """
+    looking, _, motor, grounding, *_, joint = small().stages
+    looking = replace(looking, name="starter/looking", num_steps=800)
+    grounding = replace(
+        grounding,
+        name="starter/grounding",
+        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(900, 1800))),
+        num_steps=1800,
+    )
+    motor = replace(
+        motor, name="starter/motor", train=replace(motor.train, optim=replace(_FROM_SCRATCH, decay=(5000, 9000)))
+    )
+    motor = replace(motor, num_steps=9000)
+    joint = replace(
+        joint,
+        name="starter/joint",
+        train=replace(joint.train, optim=replace(joint.train.optim, warmup_steps=30, decay=(40, 150))),
+        num_steps=150,
+    )
+    return Curriculum(name="starter", stages=(looking, grounding, motor, joint), eyes_steps=1200)
+
+
 def small_refocusing() -> Recipe:
     """PONDER of `small` gets used to eyes that `pp-see --ponder` has opened again, on short rows, and keeps them."""
     *_, refining, _ = small().stages

@@ -30,6 +30,7 @@ from tqdm import tqdm
 
 from ponderpounce.data.episode import CAMERAS
 from ponderpounce.data.errors import DatasetError
+from ponderpounce.data.lerobot_v3 import ALBUM, INFO_PATH
 from ponderpounce.models.bfloat16 import warn_of_slow
 from ponderpounce.models.eyes import check_cameras, readable_sizes
 from ponderpounce.models.normalisation import ROBOMME
@@ -49,6 +50,7 @@ from ponderpounce.training.parallel import World, gather, joined, shard
 from ponderpounce.training.plot import plot_log
 from ponderpounce.training.recipe import Curriculum, Recipe, stages_of
 from ponderpounce.training.recipes import recipe
+from ponderpounce.training.seeing import SeeOptions, see_things
 from ponderpounce.training.trainer import CheckpointError, SaveError, StepReport, Trainer
 from ponderpounce.training.watch import LOG_FILE, Watch
 
@@ -62,8 +64,8 @@ class TrainOptions:
     """Trains PONDER and POUNCE together. The same command again resumes a run that was killed."""
 
     recipe: str
-    """robomme and robocasa_dc are the paper's; small learns from scratch on CPU cores, those whose names begin with
-    small_ go on from there; tiny and tiny_groot are for a try."""
+    """robomme and robocasa_dc are the paper's; starter and small learn from scratch on CPU cores, those whose names
+    begin with small_ go on from there; tiny and tiny_groot are for a try."""
     data: tuple[Path, ...]
     """Folders that pp-collect, pp-export or pp-correct made: episodes to imitate."""
     out: Path
@@ -72,6 +74,8 @@ class TrainOptions:
     """Further folders, of pp-export: what policies did, with the simulator's words. PONDER alone learns from them."""
     watch_share: float = 0.5
     """With --watch: how much of a batch is watched; one episode at least is not."""
+    album: tuple[Path, ...] = ()
+    """Folders of pp-album, for a recipe that opens PONDER's eyes first; () for those that lie in DATA/album."""
     stage: str | None = None
     """Of a recipe with stages, only this one: stages that do not need each other can run side by side."""
     tasks: tuple[str, ...] = ()
@@ -99,7 +103,8 @@ class TrainOptions:
     cache_mb: int = 6000
     """Memory for pictures, at the sizes that the networks read; what does not fit is decoded again."""
     sights: Path | None = None
-    """Keep pictures there as well, at those sizes: further processes, stages and runs then need not decode videos."""
+    """Keep pictures there as well, at those sizes: further processes, stages and runs then need not decode videos.
+    A recipe that opens eyes has OUT/sights."""
     weights: Literal["sharded", "whole"] = "sharded"
     """Of several processes each holds its rows (FSDP2), or all: faster where they fit many times over, as on CPUs."""
     device: Literal["cpu", "cuda"] = "cpu"
@@ -212,7 +217,7 @@ def _train_stages(curriculum: Curriculum, data: TrainingSet, options: TrainOptio
     names = [stage.name.rpartition("/")[2] for stage in curriculum.stages]
     if options.stage is not None and options.stage not in names:
         raise ValueError(f"recipe {curriculum.name} has the stages {', '.join(names)}; there is no {options.stage!r}")
-    latest = options
+    latest = options if curriculum.eyes_steps == 0 else _with_open_eyes(curriculum, options, world)
     for name, stage in zip(names, curriculum.stages, strict=True):
         out = options.out / name
         is_wanted = options.stage in (None, name)
@@ -229,6 +234,40 @@ def _train_stages(curriculum: Curriculum, data: TrainingSet, options: TrainOptio
         for newest in (latest.ponder, latest.pounce):  # which a stage of the other system alone did not touch
             if newest is not None and newest.is_relative_to(options.out):
                 shutil.copytree(newest, options.out / newest.name)
+
+
+def _with_open_eyes(curriculum: Curriculum, options: TrainOptions, world: World) -> TrainOptions:
+    """A new PONDER learns to see, into OUT/eyes, unless it did already or one is given; the stages go on from it."""
+    options = replace(options, sights=options.sights or options.out / "sights")
+    eyes = options.out / "eyes"
+    if options.ponder is not None:
+        return options
+    albums = options.album or tuple(
+        info.parent.parent for folder in options.data for info in sorted(folder.glob(f"{ALBUM}/*/{INFO_PATH}"))
+    )
+    if not albums:
+        raise ValueError(
+            f"recipe {curriculum.name} opens PONDER's eyes first and needs an album: collect with --album 6000, or "
+            "give one of pp-album with --album; or a PONDER that can see with --ponder"
+        )
+    if world.is_first and not (eyes / "ponder").exists():
+        tqdm.write("eyes", file=sys.stderr)
+        num_threads = torch.get_num_threads()
+        torch.set_num_threads(max(world.size, num_threads))  # the others wait
+        see_things(
+            SeeOptions(
+                recipe=curriculum.name,
+                data=options.data,
+                album=albums,
+                out=eyes,
+                steps=curriculum.eyes_steps,
+                seed=options.seed or 0,
+                progress=options.progress,
+            )
+        )
+        torch.set_num_threads(num_threads)
+    world.wait()
+    return replace(options, ponder=eyes / "ponder")
 
 
 def _is_finished(out: Path) -> bool:

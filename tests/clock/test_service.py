@@ -297,7 +297,7 @@ def test_a_clock_known_too_badly_is_refused(
 ) -> None:
     monkeypatch.setattr(membership, "host_clock_id", lambda: "attic/monotonic")
     reply = new_rig(ServiceConfig(watches=False, max_clock_bound_ns=0)).open(episode_info(paper))
-    assert reply.error.startswith("the clock of ponder (attic/monotonic) is known to 0.0")
+    assert reply.error.startswith("the clock of ponder (attic/monotonic) is known to ")  # how well, its load says
     assert "--max-clock-bound-ms" in reply.error
 
 

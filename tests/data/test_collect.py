@@ -6,6 +6,7 @@ import contextlib
 import json
 import shutil
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ponderpounce.data import collect as module
+from ponderpounce.data.album import AlbumOptions
 from ponderpounce.data.card import card
 from ponderpounce.data.collect import COLLECTING, COLLECTION_PATH, CollectOptions, collect, disk_needed
 from ponderpounce.data.dart import DART
@@ -22,6 +24,7 @@ from ponderpounce.data.dataset import Dataset
 from ponderpounce.data.episode import Package
 from ponderpounce.data.errors import DatasetError
 from ponderpounce.data.jobs import Job
+from ponderpounce.data.lerobot_v3 import ALBUM
 from ponderpounce.data.rollout import UNSOLVED
 from ponderpounce.data.shove import SHOVES
 from ponderpounce.data.store import Store
@@ -243,8 +246,50 @@ def test_the_estimate_is_what_was_measured_as_soon_as_something_was() -> None:
 
 @pytest.mark.parametrize(
     "changes",
-    [{"image_px": 65}, {"episodes": 0}, {"workers": 0}, {"texts": "follow", "shove_share": 1.1}, {"shove_share": 0.5}],
+    [
+        {"image_px": 65},
+        {"episodes": 0},
+        {"workers": 0},
+        {"album": -1},
+        {"texts": "follow", "shove_share": 1.1},
+        {"shove_share": 0.5},
+    ],
 )
 def test_options_that_make_no_sense_are_refused(tmp_path: Path, changes: dict[str, Any]) -> None:
     with pytest.raises(DatasetError):
         options(tmp_path, **changes)
+
+
+def test_albums_lie_in_the_dataset_one_for_each_task(
+    tmp_path: Path, pretend: WorkOut, whole: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are made once, and the dataset itself is as without."""
+    made: list[tuple[str, int]] = []
+    make = module.make_album
+
+    def pretended(album: AlbumOptions) -> None:
+        made.append((album.task, album.pictures))
+        make(replace(album, task="PickHighlight", pictures=1, image_px=32))
+
+    monkeypatch.setattr(module, "make_album", pretended)
+    monkeypatch.setattr(module, "_workers", lambda _: InOrder(pretend))
+    arguments = ["--out", str(tmp_path), "--tasks", *TASKS, "--episodes", str(EPISODES), "--album", "300"]
+    assert module.main([*arguments, "--no-progress"]) == module.DONE
+    assert made == [(task, 300) for task in TASKS]
+    assert {name: data for name, data in files(tmp_path).items() if not name.startswith(ALBUM)} == whole
+    for task in TASKS:
+        assert len(Dataset(tmp_path / ALBUM / task).episodes) == 1
+    shutil.rmtree(tmp_path / ALBUM / TASKS[0])
+    assert module.main([*arguments, "--no-progress"]) == module.DONE
+    assert made[2:] == [(TASKS[0], 300)], "what is there is left alone"
+
+
+def test_an_album_of_a_task_that_names_nothing_is_refused_before_anything_starts(
+    tmp_path: Path, pretend: WorkOut, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    idle = InOrder(pretend)
+    monkeypatch.setattr(module, "_workers", lambda _: idle)
+    arguments = ["--out", str(tmp_path), "--tasks", "PickHighlight", "StopCube", "--episodes", "1"]
+    assert module.main([*arguments, "--album", "100", "--no-progress"]) == module.REFUSED
+    assert "'StopCube' does not name its things" in capsys.readouterr().err
+    assert idle.done == []
