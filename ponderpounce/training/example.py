@@ -22,6 +22,7 @@ from ponderpounce.models.eyes import see
 from ponderpounce.models.normalisation import Floats
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.training.augment import AS_IT_IS, NOT_AUGMENTED, Augmentation, View, draw_view
+from ponderpounce.training.events import draw_near, event_ticks
 from ponderpounce.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses, has_moved, without_lapses
 from ponderpounce.training.nudge import NO_NUDGE, Nudge, draw_nudges
 from ponderpounce.training.place_lessons import PlaceLessons, place_lessons
@@ -173,6 +174,8 @@ class ExampleConfig:
     clocks: Clocks
     max_invocations: int = 16
     """Of those that the schedule has, so many are drawn: they cost most."""
+    event_weight: float = 1.0
+    """How much likelier those are whose chunk reaches into an event (`events`): a grasp, a release, a new subgoal."""
     is_grounded: bool = True
     """False: texts are left out of the row, as in RoboCasa-DC."""
     text_dropout: float = 0.0
@@ -213,6 +216,8 @@ class ExampleConfig:
     def __post_init__(self) -> None:
         if self.max_queries is not None and self.max_queries < 1:
             raise ValueError(f"max_queries must be at least 1, came {self.max_queries}")
+        if not 0 < self.event_weight < np.inf:
+            raise ValueError(f"event_weight must be above 0 and finite, came {self.event_weight}")
         if not 0 < self.slip_px[0] <= self.slip_px[1] or self.tremble_px < 0:
             raise ValueError(
                 f"slip_px {self.slip_px} must ascend from above 0, tremble_px {self.tremble_px} be at least 0"
@@ -316,7 +321,9 @@ def make_example(
     schedule = _shortened(schedule, config.max_queries)
     imitated = [i for i, each in enumerate(schedule.invocations) if each.tick >= episode.imitated_from]
     count = 0 if episode.is_watched else min(config.max_invocations, len(imitated))
-    chosen = np.sort(rng.choice(len(imitated), size=count, replace=False)) if count else ()
+    events = event_ticks(episode.action_T8, episode.transition_ticks)
+    ticks = [schedule.invocations[index].tick for index in imitated]
+    chosen = draw_near(ticks, events, count, config.event_weight, rng)
     invocations = tuple(schedule.invocations[imitated[index]] for index in chosen)
     is_grounded = config.is_grounded and (rng.random() >= config.text_dropout or episode.is_told)
     slip = None

@@ -92,6 +92,9 @@ class TrainOptions:
     """Instead of the recipe's: episodes a step, of all processes together."""
     max_invocations: int | None = None
     """Instead of the recipe's: POUNCE's invocations an episode."""
+    event_weight: float | None = None
+    """Instead of the recipe's: how much likelier invocations are drawn that come just before a grasp, a release or a
+    new subgoal."""
     max_committed_rows: int | None = None
     """Instead of the recipe's: pi0.5 learns to continue up to so many rows, for `pounce-serve --continuity trained`."""
     save_every: int = 100
@@ -403,7 +406,11 @@ def _adjusted(run: Recipe, options: TrainOptions) -> Recipe:
         pounce=pounce,
         num_steps=options.steps or run.num_steps,
         batch_episodes=options.batch_episodes or run.batch_episodes,
-        example=replace(run.example, max_invocations=options.max_invocations or run.example.max_invocations),
+        example=replace(
+            run.example,
+            max_invocations=options.max_invocations or run.example.max_invocations,
+            event_weight=run.example.event_weight if options.event_weight is None else options.event_weight,
+        ),
         train=replace(run.train, seed=seed),
     )
 
