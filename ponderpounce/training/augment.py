@@ -1,7 +1,9 @@
-"""Other views of the same scene for a PONDER that learns to see from few hundred of them: moved, and mirrored.
+"""Other views of the same scene for a PONDER that learns to see from few hundred of them: moved, mirrored, relit.
 
 Pictures and words change together, so nothing that was shown is lost and every text stays true. A patch then sees its
 cubes at every place within itself, which is what a vision tower from scratch otherwise learns only from many scenes.
+The light is one for a whole row and the same for red, green and blue: what is lit up for a second, and what is called
+by its colour, can be told from the rest as before.
 POUNCE acts in the real scene: stages that train it do not use this.
 """
 
@@ -29,10 +31,19 @@ class Augmentation:
     """Of PONDER's picture, either way in both directions; edges are repeated."""
     mirror: bool = False
     """Half of the episodes are mirrored, unless their texts speak of sides."""
+    max_gain: float = 0.0
+    """Pictures are brighter or darker, at most 1 + that times or 1 / (1 + that); every factor is as likely."""
 
     def __post_init__(self) -> None:
+        if not 0 <= self.max_gain < np.inf:
+            raise ValueError(f"max_gain must be at least 0 and finite, came {self.max_gain}")
         if self.max_shift_px < 0:
             raise ValueError(f"max_shift_px must be at least 0, came {self.max_shift_px}")
+
+    @property
+    def moves(self) -> bool:
+        """Things may be shown elsewhere than they are."""
+        return self.max_shift_px > 0 or self.mirror
 
 
 NOT_AUGMENTED = Augmentation()
@@ -49,9 +60,13 @@ class View:
     """First left and right change places, then it moves."""
     text_px: float = 1.0
     """Pixels of a text's coordinates to one of PONDER's picture."""
+    gain: float = 1.0
+    """Of all pictures' brightness."""
 
     def pictures(self, frames_NHW3: Tensor) -> Tensor:
         """(N, height, width, 3) uint8"""
+        if self.gain != 1.0:
+            frames_NHW3 = (frames_NHW3.float() * self.gain).round().clamp(max=255).to(torch.uint8)
         if self.is_mirrored:
             frames_NHW3 = frames_NHW3.flip(2)
         margin = max(abs(self.down_px), abs(self.right_px))
@@ -64,7 +79,7 @@ class View:
 
     def text(self, text: str) -> str:
         """Its coordinates as they are in this view; at the picture's edge where they would leave it."""
-        if self == View(text_px=self.text_px):
+        if not (self.down_px or self.right_px or self.is_mirrored):
             return text
         return PLACE.sub(self._moved, text)
 
@@ -85,14 +100,15 @@ def draw_view(config: Augmentation, form: ContextFormat, texts: set[str], rng: n
         ValueError: PONDER has several eyes or none, or one that is not symmetric and is to be mirrored: where its
             pictures lie in the texts' coordinates is then not told by one number.
     """
-    if config == NOT_AUGMENTED:
-        return AS_IT_IS
+    gain = float(np.exp(rng.uniform(-1, 1) * np.log1p(config.max_gain))) if config.max_gain else 1.0
+    if not config.moves:
+        return View(gain=gain)
     if form.eyes is None or len(form.eyes) != 1:
-        raise ValueError("views are drawn for a PONDER with one eye; leave the recipe's augmentation out")
+        raise ValueError("moved views are drawn for a PONDER with one eye; leave max_shift_px and mirror out")
     top, left, bottom, right = form.eyes[0].box
     if config.mirror and abs(left + right - 1) > 1e-9:
         raise ValueError(f"an eye from {left} to {right} is not symmetric about the middle and cannot be mirrored")
     down_px, right_px = rng.integers(-config.max_shift_px, config.max_shift_px + 1, size=2).tolist()
     is_mirrored = config.mirror and bool(rng.integers(2)) and not any(_SIDED.search(text) for text in texts)
     text_px = (bottom - top) * TEXT_PX / form.image_px[0]
-    return View(down_px=down_px, right_px=right_px, is_mirrored=is_mirrored, text_px=text_px)
+    return View(down_px=down_px, right_px=right_px, is_mirrored=is_mirrored, text_px=text_px, gain=gain)

@@ -8,7 +8,6 @@ from ponderpounce.models.action_space import ActionSpace
 from ponderpounce.models.ponder_configs import PonderConfig
 from ponderpounce.models.pounce import Freeze
 from ponderpounce.models.pounce_family import AnyPounceConfig
-from ponderpounce.training.augment import NOT_AUGMENTED
 from ponderpounce.training.example import ExampleConfig
 from ponderpounce.training.joint import Trains
 from ponderpounce.training.trainer import TrainConfig
@@ -54,7 +53,7 @@ class Recipe:
     def __post_init__(self) -> None:
         if self.trains != "pounce" and self.example.is_grounded != (self.w2 > 0):
             raise ValueError(f"recipe {self.name}: is_grounded is {self.example.is_grounded}, but w2 is {self.w2}")
-        if self.trains == "both" and self.example.augmentation != NOT_AUGMENTED and self.example.augments == "all":
+        if self.trains == "both" and self.example.augmentation.moves and self.example.augments == "all":
             raise ValueError(f"recipe {self.name}: views are moved and actions are not; augment watched episodes only")
 
 

@@ -71,9 +71,43 @@ def test_who_speaks_of_sides_is_not_mirrored() -> None:
         assert views == ({False, True} if may_be else {False})
 
 
+@given(seed=st.integers(0, 10_000), max_gain=st.floats(0.05, 2.0))
+def test_light_is_one_for_a_row_and_keeps_what_is_brighter_and_of_which_colour(seed: int, max_gain: float) -> None:
+    rng = np.random.default_rng(seed)
+    view = draw_view(Augmentation(max_gain=max_gain), replace(FORM, eyes=None), {"at <7,8>"}, rng)
+    assert 1 / (1 + max_gain) - 1e-9 <= view.gain <= 1 + max_gain + 1e-9
+    assert view.text("at < 7,8 >") == "at < 7,8 >", "nothing moves"
+    frames = torch.from_numpy(rng.integers(0, 256, (2, 4, 4, 3), np.uint8))
+    once, twice = view.pictures(frames), view.pictures(frames[1:])
+    assert torch.equal(once[1:], twice), "a picture does not depend on the others of its row"
+    was, now = frames.flatten().long(), once.flatten().long()
+    is_brighter = was[:, None] > was[None]
+    assert (now[:, None] >= now[None])[is_brighter].all(), "neither of two pictures nor of two colours"
+
+
+def test_light_is_as_often_more_as_less() -> None:
+    gains = [
+        draw_view(Augmentation(max_gain=0.5), FORM, set(), np.random.default_rng(seed)).gain for seed in range(2000)
+    ]
+    assert np.mean(np.log(gains)) == pytest.approx(0.0, abs=0.02)
+    assert (min(gains), max(gains)) == (pytest.approx(1 / 1.5, rel=0.01), pytest.approx(1.5, rel=0.01))
+
+
+def test_light_leaves_what_else_is_drawn_as_it_was() -> None:
+    moved = Augmentation(max_shift_px=4, mirror=True)
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        plain = draw_view(moved, FORM, set(), np.random.default_rng(seed))
+        assert plain.gain == 1.0
+        lit = draw_view(replace(moved, max_gain=0.3), FORM, set(), rng)
+        after_light = np.random.default_rng(seed)
+        after_light.uniform()
+        assert replace(lit, gain=1.0) == draw_view(moved, FORM, set(), after_light)
+
+
 def test_without_augmentation_nothing_is_drawn() -> None:
     rng = np.random.default_rng(0)
-    assert draw_view(NOT_AUGMENTED, FORM, set(), rng) is AS_IT_IS
+    assert draw_view(NOT_AUGMENTED, FORM, set(), rng) == AS_IT_IS
     assert rng.integers(1 << 30) == np.random.default_rng(0).integers(1 << 30)
 
 
@@ -90,3 +124,5 @@ def test_eyes_that_one_number_does_not_describe_are_refused(eyes: tuple[Eye, ...
         draw_view(Augmentation(mirror=True), replace(FORM, eyes=eyes), set(), np.random.default_rng(0))
     with pytest.raises(ValueError, match="at least 0, came -1"):
         Augmentation(max_shift_px=-1)
+    with pytest.raises(ValueError, match="at least 0 and finite, came -1"):
+        Augmentation(max_gain=-1)

@@ -20,7 +20,7 @@ from ponderpounce.models.eyes import Eye
 from ponderpounce.models.ponder_checkpoint import load_ponder
 from ponderpounce.models.pounce_checkpoint import load_bundle
 from ponderpounce.training import recipes, train
-from ponderpounce.training.augment import AS_IT_IS
+from ponderpounce.training.augment import AS_IT_IS, Augmentation
 from ponderpounce.training.data import Sight, TrainingSet
 from ponderpounce.training.example import ExampleConfig, TrainingEpisode, make_example, row_frames
 from ponderpounce.training.joint import Draws, JointModel
@@ -417,3 +417,5 @@ def test_where_pounce_learns_only_watched_episodes_are_seen_otherwise(
         assert (set(views) == {AS_IT_IS}) == (number < NUM_EPISODES)
     with pytest.raises(ValueError, match="augment watched episodes only"):
         replace(run, example=replace(run.example, augments="all"))
+    relit = replace(run.example, augments="all", augmentation=Augmentation(max_gain=0.2))
+    assert replace(run, example=relit).example == relit  # light moves nothing
