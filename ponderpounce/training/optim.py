@@ -1,6 +1,9 @@
 """AdamW as the paper runs it: linear warm-up, then constant; joint gradient norm clipped; weights averaged.
 
 Networks that learn from scratch may end with a falling rate, which the paper's do not need.
+
+Weights of fewer than 32 bits have float32 masters that are updated in their place, and are rounded from them: in
+bfloat16 itself an update of a thousandth is less than half of a weight's last bit, and nothing would ever move.
 """
 
 from __future__ import annotations
@@ -51,21 +54,22 @@ def learning_rate(config: OptimConfig, step: int) -> float:
 
 
 class Optimiser:
-    """Updates the parameters that want gradients, and their average."""
+    """Updates the parameters that want gradients, and their average. Both are kept in float32."""
 
     def __init__(self, model: nn.Module, config: OptimConfig) -> None:
         self._config = config
         self._named = {name: p for name, p in model.named_parameters() if p.requires_grad}
         if not self._named:
             raise ValueError("nothing to train: every parameter is frozen")
+        self._masters = {name: p if p.dtype.itemsize >= 4 else _master(p) for name, p in self._named.items()}
         self._adam = torch.optim.AdamW(
-            self._named.values(),
+            self._masters.values(),
             lr=config.learning_rate,
             betas=config.betas,
             eps=config.eps,
             weight_decay=config.weight_decay,
         )
-        self.average = {name: p.detach().clone() for name, p in self._named.items()} if config.ema_decay else {}
+        self.average = {name: p.detach().clone() for name, p in self._masters.items()} if config.ema_decay else {}
 
     def update(self, step: int) -> float:
         """Applies the gradients and clears them; returns their norm before clipping.
@@ -73,9 +77,13 @@ class Optimiser:
         Raises:
             FloatingPointError: the gradients are not finite; nothing was changed.
         """
-        norm = float(whole(nn.utils.clip_grad_norm_(self._named.values(), self._config.clip_norm)))
+        for parameter, master in self._mastered().values():
+            if parameter.grad is not None:
+                master.grad, parameter.grad = parameter.grad.float(), None
+        norm = float(whole(nn.utils.clip_grad_norm_(self._masters.values(), self._config.clip_norm)))
         if not torch.isfinite(torch.tensor(norm)):
-            worst = [n for n, p in self._named.items() if p.grad is not None and not local(p.grad).isfinite().all()][:3]
+            gradients = {name: p.grad for name, p in self._masters.items() if p.grad is not None}
+            worst = [name for name, gradient in gradients.items() if not local(gradient).isfinite().all()][:3]
             raise FloatingPointError(
                 f"step {step}: gradients are not finite (first in {', '.join(worst)}). Lower learning_rate, or train "
                 "in float32; the last checkpoint is untouched."
@@ -85,9 +93,11 @@ class Optimiser:
         self._adam.step()
         self._adam.zero_grad(set_to_none=True)
         with torch.no_grad():
+            for parameter, master in self._mastered().values():
+                parameter.copy_(master)
             decay = min(self._config.ema_decay, (1 + step) / (_EMA_MEMORY + step))  # early weights are soon forgotten
             for name, average in self.average.items():
-                local(average).lerp_(local(self._named[name]), 1 - decay)
+                local(average).lerp_(local(self._masters[name]), 1 - decay)
         return norm
 
     @torch.no_grad()
@@ -99,7 +109,8 @@ class Optimiser:
     def tensors(self) -> dict[str, Tensor]:
         """Everything that the next update depends on besides the parameters."""
         found = {f"average.{name}": tensor for name, tensor in self.average.items()}
-        for name, parameter in self._named.items():
+        found |= {f"master.{name}": master.detach() for name, (_, master) in self._mastered().items()}
+        for name, parameter in self._masters.items():
             for key, value in self._adam.state[parameter].items():
                 found[f"{key}.{name}"] = torch.as_tensor(value)
         return found
@@ -107,25 +118,43 @@ class Optimiser:
     def load(self, stored: RowReader) -> None:
         """Takes back what ``tensors`` gave: the state of every parameter that had a gradient so far.
 
+        The parameters themselves must be loaded already: a checkpoint from before there were masters has none.
+
         Raises:
-            ValueError: it is another model's, or of another freeze mode.
+            ValueError: it is another model's, or of another freeze mode or dtype.
         """
+        mastered = self._mastered()
+        with torch.no_grad():
+            for rounded, master in mastered.values():
+                master.copy_(rounded)
         states: dict[str, dict[str, Tensor]] = {}
         for full_name in stored.names():
             key, name = full_name.split(".", 1)
-            parameter = self._named.get(name)
+            parameter = self._masters.get(name)
             is_step = key == "step" and stored.shape(full_name) == ()
             fits = parameter is not None and (stored.shape(full_name) == tuple(parameter.shape) or is_step)
-            if parameter is None or not fits or (key == "average" and name not in self.average):
-                raise ValueError(f"the optimiser's state is of another model or freeze mode: it has {full_name}")
+            unknown = (key == "average" and name not in self.average) or (key == "master" and name not in mastered)
+            if parameter is None or not fits or unknown:
+                raise ValueError(f"the optimiser's state is of another model, freeze mode or dtype: it has {full_name}")
             rows = stored.read(full_name, parameter)
             if is_step:
                 states.setdefault(name, {})[key] = rows
             elif key == "average":
                 local(self.average[name]).copy_(rows)
+            elif key == "master":
+                local(parameter.detach()).copy_(rows)
             else:
                 state = torch.zeros_like(parameter, requires_grad=False)
                 local(state).copy_(rows)
                 states.setdefault(name, {})[key] = state
         for name, found in states.items():
-            self._adam.state[self._named[name]] = found
+            self._adam.state[self._masters[name]] = found
+
+    def _mastered(self) -> dict[str, tuple[nn.Parameter, nn.Parameter]]:
+        """Parameters that have a master, and it."""
+        pairs = ((name, parameter, self._masters[name]) for name, parameter in self._named.items())
+        return {name: (parameter, master) for name, parameter, master in pairs if master is not parameter}
+
+
+def _master(parameter: nn.Parameter) -> nn.Parameter:
+    return nn.Parameter(parameter.detach().float())
