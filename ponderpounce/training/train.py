@@ -50,6 +50,7 @@ from ponderpounce.training.parallel import World, gather, joined, shard
 from ponderpounce.training.plot import plot_log
 from ponderpounce.training.recipe import Curriculum, Recipe, stages_of
 from ponderpounce.training.recipes import recipe
+from ponderpounce.training.recompute import recompute_layers
 from ponderpounce.training.seeing import SeeOptions, see_things
 from ponderpounce.training.trainer import CheckpointError, SaveError, StepReport, Trainer
 from ponderpounce.training.watch import LOG_FILE, Watch
@@ -110,6 +111,8 @@ class TrainOptions:
     A recipe that opens eyes has OUT/sights."""
     weights: Literal["sharded", "whole"] = "sharded"
     """Of several processes each holds its rows (FSDP2), or all: faster where they fit many times over, as on CPUs."""
+    recompute: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """PONDER's layers are run again on the way back instead of remembered: less memory for long rows, and more time."""
     device: Literal["cpu", "cuda"] = "cpu"
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Of PONDER's weights and of what POUNCE's stream runs in, when they are loaded."""
@@ -280,6 +283,8 @@ def _is_finished(out: Path) -> bool:
 def _train(run: Recipe, data: TrainingSet, options: TrainOptions, world: World) -> None:
     model, bundle = build(run, data, options)
     model.reads_together = options.device != "cpu" or (world.size > 1 and options.weights == "sharded")
+    if options.recompute:
+        recompute_layers(model.ponder)
     if options.weights == "sharded":
         shard(model, world)
     data = TrainingSet(
@@ -438,8 +443,8 @@ def _out_of_memory(options: TrainOptions, error: BaseException) -> str:
     tried = " or ".join(f"{size.batch_episodes} x {size.example.max_invocations}" for size in sizes)
     return (
         f"out of memory at {tried} (episodes a step x invocations each; {error}). Lower --max-invocations first, then "
-        "--batch-episodes; --dtype bfloat16 halves PONDER; or start more processes with torchrun. The last checkpoint "
-        "is kept: the same command with the lower number goes on."
+        "--batch-episodes; --recompute keeps less of PONDER's rows; --dtype bfloat16 halves PONDER; or start more "
+        "processes with torchrun. The last checkpoint is kept: the same command with the lower number goes on."
     )
 
 
