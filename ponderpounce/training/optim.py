@@ -8,10 +8,12 @@ bfloat16 itself an update of a thousandth is less than half of a weight's last b
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
+from torch.distributed.tensor import DTensor
 
 from ponderpounce.training.parallel import local, whole
 from ponderpounce.training.shards import RowReader
@@ -63,7 +65,7 @@ class Optimiser:
             raise ValueError("nothing to train: every parameter is frozen")
         self._masters = {name: p if p.dtype.itemsize >= 4 else _master(p) for name, p in self._named.items()}
         self._adam = torch.optim.AdamW(
-            self._masters.values(),
+            [{"params": group} for group in self._groups()],
             lr=config.learning_rate,
             betas=config.betas,
             eps=config.eps,
@@ -80,7 +82,7 @@ class Optimiser:
         for parameter, master in self._mastered().values():
             if parameter.grad is not None:
                 master.grad, parameter.grad = parameter.grad.float(), None
-        norm = float(whole(nn.utils.clip_grad_norm_(self._masters.values(), self._config.clip_norm)))
+        norm = self._clip()
         if not torch.isfinite(torch.tensor(norm)):
             gradients = {name: p.grad for name, p in self._masters.items() if p.grad is not None}
             worst = [name for name, gradient in gradients.items() if not local(gradient).isfinite().all()][:3]
@@ -149,6 +151,25 @@ class Optimiser:
                 states.setdefault(name, {})[key] = state
         for name, found in states.items():
             self._adam.state[self._masters[name]] = found
+
+    def _groups(self) -> list[list[nn.Parameter]]:
+        """Those of which a process holds its rows, and those of which it holds all: no operation takes both at once."""
+        groups: tuple[list[nn.Parameter], list[nn.Parameter]] = ([], [])
+        for each in self._masters.values():
+            groups[not isinstance(each, DTensor)].append(each)
+        return [group for group in groups if group]
+
+    def _clip(self) -> float:
+        """Shortens the gradients, all together; returns their norm before."""
+        groups = self._groups()
+        if len(groups) == 1:
+            return float(whole(nn.utils.clip_grad_norm_(groups[0], self._config.clip_norm)))
+        gradients = [[each.grad for each in group if each.grad is not None] for group in groups]
+        norm = math.hypot(*(float(whole(nn.utils.get_total_norm(group))) for group in gradients))
+        scale = min(1.0, self._config.clip_norm / (norm + 1e-6))
+        for gradient in (each for group in gradients for each in group):
+            gradient.mul_(scale)
+        return norm
 
     def _mastered(self) -> dict[str, tuple[nn.Parameter, nn.Parameter]]:
         """Parameters that have a master, and it."""

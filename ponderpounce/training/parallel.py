@@ -9,6 +9,7 @@ CPUs can train is small, and there the processes then need not wait for each oth
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 from torch.distributed.device_mesh import init_device_mesh
-from torch.distributed.fsdp import fully_shard
+from torch.distributed.fsdp import MixedPrecisionPolicy, fully_shard
 from torch.distributed.tensor import DTensor
 
 from ponderpounce.models.units import units_of
@@ -92,20 +93,30 @@ def shard(model: nn.Module, world: World) -> None:
 
     Units are gathered when they run and let go after; the rest stays gathered from the start of a step to its end.
 
-    The processes must have built the same weights.
-
-    Raises:
-        ValueError: trained parameters have several dtypes, which FSDP2 cannot reduce together.
+    The processes must have built the same weights. FSDP2 sums gradients of one dtype together: what learns and has
+    another than most of its unit (decays and norms of PONDER's recurrent layers, pi0.5's attention beside a PONDER in
+    bfloat16) stays whole on every process, and `average_gradients` is for it. Sums are in float32.
     """
     if world.size == 1:
         return
-    dtypes = {str(parameter.dtype) for parameter in model.parameters() if parameter.requires_grad}
-    if len(dtypes) > 1:
-        raise ValueError(f"several processes train in one dtype, the model has {sorted(dtypes)}; use --dtype float32")
     mesh = init_device_mesh(world.device, (world.size,))
-    for unit in units_of(model):
-        fully_shard(unit, mesh=mesh)
-    fully_shard(model, mesh=mesh)
+    left_whole: set[nn.Parameter] = set()
+    for unit in [*units_of(model), model]:
+        there = (each for each in unit.parameters() if not isinstance(each, DTensor) and each not in left_whole)
+        weights = [each for each in there if each.requires_grad]
+        dtype = _most(weights)
+        left_whole |= {each for each in weights if each.dtype != dtype}
+        is_rounded = dtype is not None and dtype.itemsize < 4
+        policy = MixedPrecisionPolicy(reduce_dtype=torch.float32) if is_rounded else MixedPrecisionPolicy()
+        fully_shard(unit, mesh=mesh, mp_policy=policy, ignored_params=left_whole)
+
+
+def _most(weights: Sequence[Tensor]) -> torch.dtype | None:
+    """The dtype of most of the numbers."""
+    counts: Counter[torch.dtype] = Counter()
+    for each in weights:
+        counts[each.dtype] += each.numel()
+    return counts.most_common(1)[0][0] if counts else None
 
 
 @torch.no_grad()

@@ -40,6 +40,7 @@ from ponderpounce.models.pounce import PounceConfig, freeze
 from ponderpounce.models.pounce_checkpoint import PounceBundle, load_bundle, random_bundle, save_bundle
 from ponderpounce.models.pounce_init import open_gates
 from ponderpounce.models.prompt import Tokenizer, tokenizer_of_instructions
+from ponderpounce.models.recompute import recompute_layers
 from ponderpounce.models.vocabulary import Vocabulary
 from ponderpounce.training.collate import collate_ponder, collate_pounce
 from ponderpounce.training.data import Sight, TrainingSet
@@ -50,7 +51,6 @@ from ponderpounce.training.parallel import World, gather, joined, shard
 from ponderpounce.training.plot import plot_log
 from ponderpounce.training.recipe import Curriculum, Recipe, stages_of
 from ponderpounce.training.recipes import recipe
-from ponderpounce.training.recompute import recompute_layers
 from ponderpounce.training.seeing import SeeOptions, see_things
 from ponderpounce.training.trainer import CheckpointError, SaveError, StepReport, Trainer
 from ponderpounce.training.watch import LOG_FILE, Watch

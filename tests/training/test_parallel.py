@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 from torch import Tensor
+from torch.distributed.tensor import DTensor
 
 from ponderpounce.models.context import Transition
 from ponderpounce.models.ponder import Ponder
@@ -31,11 +32,12 @@ STEPS = 3
 PATIENCE_S = 120
 
 
-def joint() -> JointModel:
+def joint(dtype: torch.dtype = torch.float32) -> JointModel:
+    """``dtype`` is PONDER's, as under ``pp-train --dtype``."""
     config = tiny_pounce(num_carriers=1, cognition_size=CONFIG.hidden_size, horizon=4)
     pounce = random_pounce(replace(config, max_committed_rows=2), seed=2)
     freeze(pounce, "vision")
-    return JointModel(Ponder.random(CONFIG, seed=1), pounce, w3=0.5, w4=0.5)
+    return JointModel(Ponder.random(CONFIG, seed=1, dtype=dtype), pounce, w3=0.5, w4=0.5)
 
 
 def batch_of(model: JointModel, places: range, step: int) -> tuple[PonderBatch, PounceBatch]:
@@ -77,8 +79,8 @@ def batch_of(model: JointModel, places: range, step: int) -> tuple[PonderBatch, 
 
 
 def trainer_of(world: World, weights: str = "sharded") -> Trainer:
-    model = joint()
-    if weights == "sharded":
+    model = joint(torch.bfloat16 if weights == "rounded" else torch.float32)
+    if weights != "whole":
         shard(model, world)
     else:
         model.reads_together = False
@@ -108,6 +110,23 @@ def run_as_one_of_several(folder: Path, weights: str) -> None:
             (folder / "reports.json").write_text(json.dumps(reports))
 
 
+def run_rounded_as_one_of_several(folder: Path) -> None:
+    """The same for a PONDER in bfloat16 beside a POUNCE in float32."""
+    with joined("cpu") as world:
+        trainer = trainer_of(world, "rounded")
+        reports = [asdict(report) for report in trainer.run(STEPS)]
+        trainer.save(folder / "rounded")
+        resumed = trainer_of(world, "rounded")
+        resumed.resume(folder / "rounded")
+        kinds: dict[str, int] = {}
+        for weight in trainer.model.parameters():
+            kind = f"{weight.dtype} {type(weight).__name__ if isinstance(weight, DTensor) else 'whole'}"
+            kinds[kind] = kinds.get(kind, 0) + weight.numel()
+        on, again = ([asdict(report) for report in each.run(STEPS + 2)] for each in (trainer, resumed))
+        if world.is_first:
+            (folder / "rounded.json").write_text(json.dumps([reports, on, again, kinds]))
+
+
 @pytest.fixture(scope="module")
 def one(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[dict[str, float]], Path]:
     """What one process did in three steps, and where its checkpoint is."""
@@ -118,6 +137,20 @@ def one(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[dict[str, float]
     return reports, folder
 
 
+def _run_two(folder: Path, what: str) -> None:
+    """Two of this file's processes."""
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", __file__]
+    done = subprocess.run(
+        [*command, str(folder), what],
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
 @pytest.mark.e2e
 @pytest.mark.slow
 @pytest.mark.parametrize("held", ["sharded", "whole"])
@@ -125,12 +158,7 @@ def test_two_processes_are_one(one: tuple[list[dict[str, float]], Path], held: s
     reports, folder = one
     trainer = trainer_of(World())
     assert trainer.resume(folder / "one")
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", __file__]
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [*command, str(folder), held], env=environment, capture_output=True, text=True, timeout=PATIENCE_S, check=False
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
+    _run_two(folder, held)
     theirs = json.loads((folder / "reports.json").read_text())
     weights = torch.load(folder / "weights.pt", weights_only=True)
 
@@ -155,6 +183,26 @@ def test_two_processes_are_one(one: tuple[list[dict[str, float]], Path], held: s
     assert theirs[STEPS] == pytest.approx(fourth, abs=1e-5, rel=1e-5)
 
 
+@pytest.mark.e2e
+@pytest.mark.slow
+def test_weights_of_two_dtypes_are_cut_as_well(tmp_path: Path) -> None:
+    """Two processes round at other places than one: as near as bfloat16 lets them; resumed they are the same."""
+    alone = trainer_of(World(), "rounded")
+    reports = [asdict(report) for report in alone.run(STEPS)]
+    _run_two(tmp_path, "rounded")
+    theirs, on, again, kinds = json.loads((tmp_path / "rounded.json").read_text())
+    for mine, other in zip(reports, theirs, strict=True):
+        assert other == pytest.approx(mine, rel=0.02, abs=0.02)
+    assert on == again
+    assert kinds["torch.bfloat16 DTensor"] > kinds["torch.float32 whole"] > 0
+    assert kinds["torch.float32 DTensor"] > 0
+    assert "torch.bfloat16 whole" not in kinds
+    resumed = trainer_of(World(), "rounded")
+    assert resumed.resume(tmp_path / "rounded")
+    (fourth,) = [asdict(report) for report in resumed.run(STEPS + 1)]
+    assert fourth == pytest.approx(on[0], rel=0.02, abs=0.02)
+
+
 def test_shares_are_the_batch() -> None:
     shares = [list(World(rank=rank, size=3).share(8)) for rank in range(3)]
     assert sorted(place for share in shares for place in share) == list(range(8))
@@ -172,12 +220,8 @@ def test_alone_nothing_is_sharded() -> None:
     assert [type(module) for module in model.modules()] == before
 
 
-def test_weights_of_several_dtypes_are_refused() -> None:
-    model = joint()
-    model.ponder.to(torch.bfloat16)
-    with pytest.raises(ValueError, match="--dtype float32"):
-        shard(model, World(rank=0, size=2))
-
-
 if __name__ == "__main__":
-    run_as_one_of_several(Path(sys.argv[1]), sys.argv[2])
+    if sys.argv[2] == "rounded":
+        run_rounded_as_one_of_several(Path(sys.argv[1]))
+    else:
+        run_as_one_of_several(Path(sys.argv[1]), sys.argv[2])

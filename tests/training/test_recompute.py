@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from ponderpounce.models.context import Transition
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
+from ponderpounce.models.recompute import recompute_layers
 from ponderpounce.training.joint import PonderBatch, encode_rows
-from ponderpounce.training.recompute import recompute_layers
 
 CONFIG = replace(tiny_cpu(), image_px=(32, 32), num_layers=8)
 
