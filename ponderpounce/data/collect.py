@@ -181,7 +181,7 @@ def main(argv: list[str] | None = None) -> int:
         for album in options.albums:
             if not (album.out / INFO_PATH).exists():
                 make_album(album)
-    except (DatasetError, TaskError) as error:
+    except (DatasetError, TaskError, OSError) as error:
         sys.stderr.write(f"pp-collect: {error}\n")
         return REFUSED
     except KeyboardInterrupt:

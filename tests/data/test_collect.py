@@ -284,6 +284,20 @@ def test_albums_lie_in_the_dataset_one_for_each_task(
     assert made[2:] == [(TASKS[0], 300)], "what is there is left alone"
 
 
+def test_a_disk_that_is_full_of_album_is_said_and_the_episodes_are_kept(
+    tmp_path: Path, pretend: WorkOut, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(album: AlbumOptions) -> None:
+        raise OSError(28, "No space left on device", str(album.out))
+
+    monkeypatch.setattr(module, "make_album", full)
+    monkeypatch.setattr(module, "_workers", lambda _: InOrder(pretend))
+    arguments = ["--out", str(tmp_path), "--tasks", *TASKS, "--episodes", "1", "--album", "100", "--no-progress"]
+    assert module.main(arguments) == module.REFUSED
+    assert "No space left on device" in capsys.readouterr().err
+    assert len(Dataset(tmp_path).episodes) == len(TASKS)
+
+
 def test_an_album_of_a_task_that_names_nothing_is_refused_before_anything_starts(
     tmp_path: Path, pretend: WorkOut, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
