@@ -24,6 +24,8 @@ from torch.distributed.tensor import DTensor
 
 from ponderpounce.models.units import units_of
 
+_BITS = {1: torch.int8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
+_FACTOR, _NUM_CHECKSUMS = 31, 1 << 20
 _PATIENCE = timedelta(hours=2)  # with the first process, while it opens eyes alone
 
 
@@ -89,6 +91,30 @@ def joined(device: str) -> Iterator[World]:
         yield World(rank=dist.get_rank(), size=size, device=device)
     finally:
         dist.destroy_process_group()
+
+
+def require_alike(model: nn.Module, world: World) -> None:
+    """Every process must have built or loaded the same weights; all must call it, before `shard`.
+
+    Raises:
+        ValueError: they differ. Averaged gradients would then be nobody's, and the loss would fall all the same.
+    """
+    mine = checksum(model)
+    total, squares = world.sums([mine, mine * mine])
+    if world.size * squares != total * total:  # equal only if all numbers are; exact up to some hundred processes
+        raise ValueError(
+            f"process {world.rank} of {world.size} begins with other weights than the rest (checksum {mine}); every "
+            "process and host must see the same --out, --ponder and --pounce, and nobody else may write there"
+        )
+
+
+def checksum(model: nn.Module) -> int:
+    """Of all weights' bits, below 2**20. Whole numbers, so neither the device nor the order of a sum matters."""
+    total = 0
+    for parameter in model.parameters():
+        bits = parameter.detach().view(_BITS[parameter.element_size()]).sum(dtype=torch.int64)
+        total = (total * _FACTOR + int(bits)) % _NUM_CHECKSUMS
+    return total
 
 
 def shard(model: nn.Module, world: World) -> None:

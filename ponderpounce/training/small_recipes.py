@@ -125,8 +125,8 @@ def starter() -> Curriculum:
     grounding = replace(
         grounding,
         name="starter/grounding",
-        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(900, 1800))),
-        num_steps=1800,
+        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(450, 1000))),
+        num_steps=1000,
     )
     motor = replace(
         motor, name="starter/motor", train=replace(motor.train, optim=replace(_FROM_SCRATCH, decay=(5000, 9000)))

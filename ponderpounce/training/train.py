@@ -47,7 +47,7 @@ from ponderpounce.training.data import Sight, TrainingSet
 from ponderpounce.training.example import make_example
 from ponderpounce.training.in_words import told_in_words
 from ponderpounce.training.joint import JointModel, PonderBatch, PounceBatch, Trains
-from ponderpounce.training.parallel import World, gather, joined, shard
+from ponderpounce.training.parallel import World, gather, joined, require_alike, shard
 from ponderpounce.training.plot import plot_log
 from ponderpounce.training.recipe import Curriculum, Recipe, stages_of
 from ponderpounce.training.recipes import recipe
@@ -282,6 +282,7 @@ def _is_finished(out: Path) -> bool:
 
 def _train(run: Recipe, data: TrainingSet, options: TrainOptions, world: World) -> None:
     model, bundle = build(run, data, options)
+    require_alike(model, world)
     model.reads_together = options.device != "cpu" or (world.size > 1 and options.weights == "sharded")
     if options.recompute:
         recompute_layers(model.ponder)
@@ -324,6 +325,7 @@ def _train(run: Recipe, data: TrainingSet, options: TrainOptions, world: World) 
     gather(model, None if whole is None else whole[0])
     if whole is not None:
         export(*whole, options.out, trained=run.trains)
+    world.wait()  # the next stage begins with what was written
 
 
 def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointModel, PounceBundle]:

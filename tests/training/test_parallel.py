@@ -6,11 +6,16 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor
 from torch.distributed.tensor import DTensor
 
@@ -20,9 +25,10 @@ from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
 from ponderpounce.models.pounce import freeze
 from ponderpounce.models.pounce_configs import tiny_cpu as tiny_pounce
 from ponderpounce.models.pounce_init import random_pounce
+from ponderpounce.training import parallel
 from ponderpounce.training.joint import NO_QUERY, JointModel, PonderBatch, PounceBatch
 from ponderpounce.training.optim import OptimConfig
-from ponderpounce.training.parallel import World, gather, joined, shard
+from ponderpounce.training.parallel import World, checksum, gather, joined, require_alike, shard
 from ponderpounce.training.place_lessons import place_lessons
 from ponderpounce.training.trainer import TrainConfig, Trainer
 
@@ -211,6 +217,37 @@ def test_shares_are_the_batch() -> None:
 def test_more_processes_than_episodes_are_refused() -> None:
     with pytest.raises(ValueError, match="a batch of 2 episodes for 3 processes; start at most 2"):
         World(rank=2, size=3).share(2)
+
+
+def test_a_weight_that_differs_in_one_bit_is_told() -> None:
+    model = joint()
+    before = checksum(model)
+    assert 0 <= before < 1 << 20
+    assert checksum(joint()) == before
+    weight = next(model.parameters())
+    with torch.no_grad():
+        bits = weight.view(torch.int32)
+        bits.view(-1)[0] ^= 1
+    assert checksum(model) != before
+
+
+@given(sums=st.lists(st.integers(0, (1 << 20) - 1), min_size=1, max_size=256), is_alike=st.booleans(), data=st.data())
+def test_processes_are_alike_only_if_all_are(sums: list[int], is_alike: bool, data: st.DataObject) -> None:
+    sums = [sums[0]] * len(sums) if is_alike else sums
+
+    class Pretended(World):
+        def sums(self, numbers: Sequence[float | Tensor]) -> list[float]:
+            assert [float(number) for number in numbers] == [float(sums[0]), float(sums[0] ** 2)]
+            return [float(sum(sums)), float(sum(each * each for each in sums))]
+
+    model: Any = None
+    with patch.object(parallel, "checksum", lambda _: sums[0]):
+        world = Pretended(rank=0, size=len(sums))
+        if len(set(sums)) == 1:
+            require_alike(model, world)
+        else:
+            with pytest.raises(ValueError, match="other weights than the rest"):
+                require_alike(model, world)
 
 
 def test_alone_nothing_is_sharded() -> None:

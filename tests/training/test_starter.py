@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +24,7 @@ from ponderpounce.training.recipe import Curriculum, Recipe, stages_of
 from ponderpounce.training.train import TrainOptions
 
 PX, NUM_ROWS = 64, 40
+PATIENCE_S = 120
 
 
 def _shrunk(run: Recipe) -> Recipe:
@@ -63,13 +70,16 @@ def album(folder: Path) -> Path:
     return _write(folder / ALBUM / "PickHighlight", "album", texts)
 
 
-@pytest.fixture(autouse=True)
-def stages(monkeypatch: pytest.MonkeyPatch) -> tuple[Recipe, ...]:
+def _short() -> Curriculum:
     """The recipe with stages of one step, and two steps for its eyes."""
     runs = tuple(_shrunk(run) for run in stages_of(recipes.recipe("starter")))
-    curriculum = Curriculum(name="starter", stages=runs, eyes_steps=2)
+    return Curriculum(name="starter", stages=runs, eyes_steps=2)
+
+
+@pytest.fixture(autouse=True)
+def _starter(monkeypatch: pytest.MonkeyPatch) -> None:
+    curriculum = _short()
     monkeypatch.setitem(recipes.RECIPES, "starter", lambda: curriculum)
-    return runs
 
 
 def options(folder: Path, out: Path, **changes: object) -> TrainOptions:
@@ -122,3 +132,41 @@ def test_a_ponder_that_can_see_needs_none(folder: Path, album: Path, tmp_path: P
     again = options(folder, tmp_path / "again", stage="looking", ponder=tmp_path / "run" / "eyes" / "ponder")
     train.train(replace(again, album=(tmp_path / "nowhere",)))
     assert not (tmp_path / "again" / "eyes").exists()
+
+
+def run_as_one_of_several(folder: Path, out: Path) -> None:
+    """What each process of torchrun does; whoever writes takes its time."""
+    curriculum, export = _short(), train.export
+    recipes.RECIPES["starter"] = lambda: curriculum
+
+    def slowly(*model: Any, **how: Any) -> None:
+        time.sleep(2.0)
+        export(*model, **how)
+
+    train.export = slowly
+    train.train(options(folder, out, weights="whole"))
+
+
+@pytest.mark.e2e
+@pytest.mark.slow
+def test_a_stage_of_two_processes_begins_where_the_one_before_ended(folder: Path, album: Path, tmp_path: Path) -> None:
+    """On both of them: whoever looks too early finds the eyes, or nothing, and begins with that."""
+    train.train(options(folder, tmp_path / "one"))
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", __file__]
+    done = subprocess.run(
+        [*command, str(folder), str(tmp_path / "two")],
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    for stage in ("looking", "grounding", "motor", "joint"):
+        mine, theirs = (json.loads((tmp_path / who / stage / "log.jsonl").read_text()) for who in ("one", "two"))
+        # eyes that two threads opened are not those of one, bit for bit
+        assert theirs["total"] == pytest.approx(mine["total"], rel=1e-3), stage
+
+
+if __name__ == "__main__":
+    run_as_one_of_several(Path(sys.argv[1]), Path(sys.argv[2]))
