@@ -118,27 +118,37 @@ def small() -> Curriculum:
 def starter() -> Curriculum:
     """`small` cut short, for a first pair within two hours on two cores: docs/training.md, "The starter".
 
-    Every stage is for all processes, one after the other, and nothing is played or corrected in between.
+    Every stage is for all processes, one after the other, and nothing is played or corrected in between. What `small`
+    learned late only, its PONDER has from the start: it keeps its eyes, writes plans down, and has places in mind.
     """
-    looking, _, motor, grounding, *_, joint = small().stages
+    looking, _, motor, grounding, *_, joint = (_knowing(stage) for stage in small().stages)
     looking = replace(looking, name="starter/looking", num_steps=800)
     grounding = replace(
         grounding,
         name="starter/grounding",
-        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(450, 1000))),
-        num_steps=1000,
+        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(900, 1800))),
+        num_steps=1800,
     )
     motor = replace(
-        motor, name="starter/motor", train=replace(motor.train, optim=replace(_FROM_SCRATCH, decay=(5000, 9000)))
+        motor,
+        name="starter/motor",
+        train=replace(motor.train, optim=replace(_FROM_SCRATCH, decay=(5000, 9000))),
+        num_steps=9000,
     )
-    motor = replace(motor, num_steps=9000)
     joint = replace(
         joint,
         name="starter/joint",
         train=replace(joint.train, optim=replace(joint.train.optim, warmup_steps=30, decay=(40, 150))),
         num_steps=150,
+        w4=1 / 3,
     )
     return Curriculum(name="starter", stages=(looking, grounding, motor, joint), eyes_steps=1200)
+
+
+def _knowing(stage: Recipe) -> Recipe:
+    if stage.trains == "pounce":
+        return stage
+    return replace(stage, keeps_eyes=True, w4=1.0, example=replace(stage.example, has_plans=True))
 
 
 def small_refocusing() -> Recipe:
