@@ -21,7 +21,7 @@ from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.physics import CONTROL_HZ, Physics, PhysicsState
 from ponderpounce.tasks.rendering import Cameras
 from ponderpounce.tasks.scene import FRONT, table_scene
-from ponderpounce.tasks.task import Subtask, Task, TaskError, make_task
+from ponderpounce.tasks.task import StepT, Subtask, Task, TaskError, located, make_task
 
 IMAGE_PX = 256  # upstream's; grounded texts count in these pixels
 _PUSHED_M = 0.01  # texts that follow are corrected from this distance on
@@ -74,7 +74,8 @@ def make_environment(
     """Returns an environment of a registered task. Raises TaskError for an unknown name.
 
     With ``texts_follow`` the coordinates of a grounded subgoal are corrected when its things have been pushed
-    elsewhere; upstream's stay where they were first seen. An ``order`` other than upstream's changes the list of
+    elsewhere, and there are some where upstream tells a way without its end (`located`); upstream's stay where they
+    were first seen. An ``order`` other than upstream's changes the list of
     subtasks, and with it texts and oracle; scenes and what counts as success stay the same.
     """
     return Environment(
@@ -150,7 +151,7 @@ class Environment:
         if self._order == "near-first":
             layout = self._task.near_first(layout)
         self._begin(difficulty, layout)
-        parts = self._task.demonstration(layout)
+        parts = [self._told(part) for part in self._task.demonstration(layout)]
         self._video, last_action = demonstration.perform(self._task, layout, parts, self.physics, self._look_for)
         # Upstream's reset spends one control step too: the button's cap settles on its spring.
         at_rest = np.append(panda.HOME_QPOS, self.physics.robot.rest_command)
@@ -277,12 +278,15 @@ class Environment:
 
     def _begin(self, difficulty: str, layout: Any) -> None:
         self.difficulty, self._layout = difficulty, layout
-        self._subtasks = self._task.subtasks(layout)
+        self._subtasks = tuple(self._told(subtask) for subtask in self._task.subtasks(layout))
         self._step, self._memory, self._caption, self._progress = 0, None, None, Progress()
         self._actions = []
         self.physics.reset()
         self._task.arrange(self.physics, layout)
         self.physics.refresh()
+
+    def _told(self, step: StepT) -> StepT:
+        return located(step) if self._texts_follow else step
 
     def _observe(self, *, look: bool = True) -> Snapshot:
         """Stages, remembers, judges and captions the instant the physics is at."""

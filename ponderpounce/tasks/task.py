@@ -14,7 +14,7 @@ import importlib.util
 import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Generic, TypeVar
 
 import mujoco
@@ -50,6 +50,8 @@ class Subtask:
     motion: Callable[[Motions], Iterator[NDArray[np.float32]]]  # what the oracle does for it
     failure: Callable[[Physics, Any], str | None] = never  # the reason, or None while there is none
     grounds: tuple[str, ...] = ()  # bodies whose pixels fill the template's coordinates, in order
+    way: str = ""  # what `located` adds to the text; nothing in most tasks, whose texts tell places anyway
+    way_grounds: tuple[str, ...] = ()  # bodies whose pixels fill its coordinates, in order
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,8 +61,24 @@ class Shown:
     text: str  # template, see `captions`
     motion: Callable[[Motions], Iterator[NDArray[np.float32]]]
     grounds: tuple[str, ...] = ()  # as in a subtask
+    way: str = ""  # as in a subtask
+    way_grounds: tuple[str, ...] = ()
     is_recorded: bool = True  # False: it happens, but the video leaves it out
     afterwards: Callable[[Physics], None] | None = None  # what is moved in the scene when the part is over
+
+
+StepT = TypeVar("StepT", Subtask, Shown)
+
+
+def located(step: StepT) -> StepT:
+    """Returns the step with the places of its way in its grounded text, where upstream tells none.
+
+    "move left to <102, 101>, then <83, 103>" for "move left". Which target that is can be seen; a learner from scratch
+    is told, and since it acts for a while on what it heard last, also where it goes on from there.
+    """
+    if not step.way:
+        return step
+    return replace(step, text=step.text + step.way, grounds=step.way_grounds)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -194,6 +194,7 @@ class TrainingSet:
         episode = TrainingEpisode(
             instruction=entry.instruction,
             demo=tuple((views if sights is None else sights)[:num_shown]),
+            demo_subgoals=rows.grounded_subgoal[:start:FPS],
             frames=views[num_shown:],
             sights=None if sights is None else sights[num_shown:],
             state_T8=rows.state[start:],

@@ -26,7 +26,7 @@ from ponderpounce.training.events import draw_near, event_ticks
 from ponderpounce.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses, has_moved, without_lapses
 from ponderpounce.training.nudge import NO_NUDGE, Nudge, draw_nudges
 from ponderpounce.training.place_lessons import PlaceLessons, place_lessons
-from ponderpounce.training.places import PLACE, misplaced
+from ponderpounce.training.places import PLACE, WAY, misplaced
 from ponderpounce.training.stand_in import stand_in
 
 Frame = NDArray[np.uint8]  # (height, width, 3) RGB
@@ -42,6 +42,8 @@ class TrainingEpisode:
     instruction: str
     demo: tuple[tuple[Frame, ...], ...]
     """The demonstration's views at 1 Hz; () without one."""
+    demo_subgoals: Sequence[str] = ()
+    """What is done in each of them, as grounded text; () where nobody says."""
     frames: Sequence[tuple[Frame, ...]]
     """T ticks of views, in the order of the robot's cameras; () at ticks where POUNCE has none."""
     state_T8: NDArray[np.float32]
@@ -121,23 +123,27 @@ class TrainingEpisode:
         """The same, every subgoal but the first told with the places of those that come later: ``S, <y, x>, <y, x>``.
 
         What was shown is then written down soon after, and read off from there later; without, a small network loses
-        the third of three things. When the first subgoal is told nothing has been seen. One that is tried again counts
-        once, and so does a place that was told already: where things are carried to and fro every text has one.
+        the third of three things. When the first subgoal is told nothing has been seen, but for a demonstration. One
+        that is tried again counts once, and so does a place that was told already: where things are carried to and fro
+        every text has one. Of a way (`WAY`) every stretch counts, and is told with its last word: on which side.
         """
         begins = np.flatnonzero(self.is_transition_T | (np.arange(self.num_ticks) == 0)).tolist()
+        from_the_first = even_the_first or bool(self.demo)
         planned: list[str] = []
         for begin, end in pairwise([*begins, self.num_ticks]):
             own = PLACE.sub("", self.subgoals[begin])
             later: dict[str, str] = {}
-            for text in (self.subgoals[other] for other in begins if other >= end and (begin > 0 or even_the_first)):
-                place = PLACE.search(text)
-                if place is not None and PLACE.sub("", text) != own:
+            told, stretches = [self.subgoals[begin]], []
+            for text in (self.subgoals[other] for other in begins if other >= end and (begin > 0 or from_the_first)):
+                place, stretch = PLACE.search(text), WAY.search(text)
+                if stretch is not None:
+                    stretches.append(f"{stretch[1]} {stretch[2]}")
+                elif place is not None and PLACE.sub("", text) != own:
                     later.setdefault(PLACE.sub("", text), place[0])
-            told = [self.subgoals[begin]]
             for there in later.values():
                 if all(not PLACE.search(text) or has_moved(text, there, _SAME_PX) for text in told):
                     told.append(there)
-            plan = "".join(f", {there}" for there in told[1:])
+            plan = "".join(f", {there}" for there in (*told[1:], *stretches[1:]))  # a stretch's text has the next one
             planned += [text + plan for text in self.subgoals[begin:end]]
         return replace(self, planned=planned)
 
@@ -301,13 +307,14 @@ class Example:
         """`place_lessons` of ``row``, this example's.
 
         While the first subgoal lasts more is seen than there was when it was told: what comes later is in mind then,
-        too.
+        too. What a demonstration does is in mind while it is seen.
         """
         episode = self.episode
         if episode.planned is not None and not episode.is_told:
             episode = episode.with_plans(even_the_first=True)
         texts = [self.view.text(episode.words[query.tick]) for query in self.schedule.queries]
-        return place_lessons(row, texts, self.form.vocabulary, size)
+        demonstrated = [self.view.text(text) for text in episode.demo_subgoals]
+        return place_lessons(row, texts, self.form.vocabulary, size, demonstrated)
 
 
 def make_example(

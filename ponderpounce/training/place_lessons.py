@@ -8,6 +8,10 @@ faster. So hidden states are asked for places in that form (`place_features`) wh
   numbers: what is to be said, and later read, whether or not it is said now;
 - at every token before one of a coordinate's, for the place that is being told.
 
+- at the end of every picture of a demonstration, for what is being done (`deeds`): where, where the deed before was,
+  and codes of which it is and for which time. What was done second is asked for once, a minute later; nothing else
+  teaches a network to notice it when it is seen.
+
 Only networks from scratch need it; the paper has nothing of it. Nothing reads these numbers in serving.
 """
 
@@ -21,12 +25,18 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ponderpounce.models.context import IGNORE, Row
 from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features
 from ponderpounce.models.vocabulary import Vocabulary
+from ponderpounce.training.deeds import deeds
 from ponderpounce.training.places import PLACE, TEXT_PX
+from ponderpounce.training.stand_in import text_code
+
+_Lesson = tuple[int, int, NDArray[np.float32]]
+"""Position in the row, slot, the P numbers that should be there."""
 
 _TOLD = re.compile(r"\[(\d+), (\d+)\]")  # x, y in thousandths
 _FULL = 1000
@@ -50,13 +60,21 @@ class PlaceLessons(NamedTuple):
         return PlaceLessons(*(each.to(device) for each in self))
 
 
-def place_lessons(row: Row, texts_Q: Sequence[str], vocabulary: Vocabulary, size: int) -> PlaceLessons:
+def place_lessons(
+    row: Row, texts_Q: Sequence[str], vocabulary: Vocabulary, size: int, demonstrated: Sequence[str] = ()
+) -> PlaceLessons:
     """The lessons of a row with hidden states of ``size`` numbers.
 
-    ``texts_Q``: the simulator's words in force at every query. Of more places than fit the last are left out.
+    ``texts_Q``: the simulator's words in force at every query; ``demonstrated``: those of every instant of the
+    demonstration. Of more places than fit the last are left out.
     """
-    found = [*_in_mind(row, texts_Q, size // NUM_PLACE_FEATURES), *_being_told(row, vocabulary)]
-    features = [place_features(yx_px) for _, _, yx_px in found]
+    num_slots = size // NUM_PLACE_FEATURES
+    found = [
+        *_seen_done(row, demonstrated, vocabulary, num_slots),
+        *_in_mind(row, texts_Q, num_slots),
+        *_being_told(row, vocabulary),
+    ]
+    features = [numbers for _, _, numbers in found]
     return PlaceLessons(
         index_M=torch.tensor([index for index, _, _ in found], dtype=torch.int64),
         first_M=torch.tensor([slot * NUM_PLACE_FEATURES for _, slot, _ in found], dtype=torch.int64),
@@ -64,13 +82,25 @@ def place_lessons(row: Row, texts_Q: Sequence[str], vocabulary: Vocabulary, size
     )
 
 
-def _in_mind(row: Row, texts_Q: Sequence[str], num_slots: int) -> Iterator[tuple[int, int, tuple[float, float]]]:
+def _seen_done(row: Row, texts: Sequence[str], vocabulary: Vocabulary, num_slots: int) -> Iterator[_Lesson]:
+    """Slot 0: where it is done, 1: where the deed before was, 2: which it is, and how often by now, 3: its number."""
+    ends = np.flatnonzero(np.asarray(row.ids) == vocabulary.vision_end)
+    per_instant = np.count_nonzero(ends <= row.gate_index[0]) // (len(texts) + 1)  # the first query's among them
+    for index, deed in zip(ends[per_instant - 1 :: per_instant].tolist(), deeds(texts), strict=False):
+        places = [None if place is None else place_features(place) for place in (deed.place, deed.place_before)]
+        codes = [text_code(name, NUM_PLACE_FEATURES) for name in (f"{deed.name} {deed.count}", f"deed {deed.number}")]
+        for slot, numbers in enumerate([*places, *codes][:num_slots]):
+            if numbers is not None:
+                yield index, slot, numbers
+
+
+def _in_mind(row: Row, texts_Q: Sequence[str], num_slots: int) -> Iterator[_Lesson]:
     for index, text in zip(row.gate_index.tolist(), texts_Q, strict=True):
         for slot, (y, x) in enumerate(PLACE.findall(text)[:num_slots]):
-            yield index, slot, (int(y), int(x))
+            yield index, slot, place_features((int(y), int(x)))
 
 
-def _being_told(row: Row, vocabulary: Vocabulary) -> Iterator[tuple[int, int, tuple[float, float]]]:
+def _being_told(row: Row, vocabulary: Vocabulary) -> Iterator[_Lesson]:
     """Of the words that are learned: what slipped is not to be kept in mind."""
     positions = np.flatnonzero(np.asarray(row.targets) != IGNORE)
     pieces = {id_: vocabulary.decode([id_]) for id_ in {row.targets[position] for position in positions}}
@@ -80,4 +110,4 @@ def _being_told(row: Row, vocabulary: Vocabulary) -> Iterator[tuple[int, int, tu
         for told in _TOLD.finditer("".join(spelled)):
             x, y = (int(value) * TEXT_PX / _FULL for value in told.groups())
             for position in run[(begins >= told.start(1)) & (begins < told.end(2))].tolist():
-                yield position - 1, 0, (y, x)
+                yield position - 1, 0, place_features((y, x))

@@ -9,6 +9,8 @@ import numpy as np
 from ponderpounce.models.place_code import PLACE_PX
 
 PLACE = re.compile(r"<\s*(\d+)\s*,\s*(\d+)\s*>")
+WAY = re.compile(rf"(\S+) to ({PLACE.pattern})(?:, then |$)")
+"""A stretch of a way (`tasks.task.located`): how it is gone, in the last word, and where it ends."""
 TEXT_PX = PLACE_PX
 """Side of the picture that texts speak of, whatever the size of a picture."""
 

@@ -33,13 +33,14 @@ _SKILLS = tuple(
         (r", which is \w+", ""),
         (rf"^pick up the correct cube{_AT} for the \w+ time$", rf"{_PICK}\1"),
         (rf"^pick up the (?:red|green|blue) cube{_AT} for the \w+ time$", rf"{_PICK}\1, then place it"),
-        (rf"^pick up the cube{_AT}$", rf"{_PICK}\1, then place it"),
+        (rf"^[Pp]ick up the cube{_AT}$", rf"{_PICK}\1, then place it"),
         (rf"^pick up the \w+ (?:red|green|blue) cube{_AT}$", rf"{_PICK}\1, then drop it"),
         (rf"^pick up the (?:red|green|blue) cube{_AT}$", rf"{_PICK}\1, then swing it"),
         (rf"^pick up the container{_AT} that hides the \w+ cube$", r"pick up the container\1"),
         (rf"^press the (?:first |second )?button{_AT}(?: to stop| to finish)?$", r"press the button\1"),
         (rf"^place the (?:\w+ cube onto the|cube onto the correct) target{_AT}$", r"place the cube onto the target\1"),
         (rf"^move to the top of the \w+-side target{_AT} for the \w+ time$", r"move to the top of the target\1"),
+        (r"^move (?:forward|backward|left|right)(?:-left|-right)?( to <>)?(, then <>)?$", r"point the stick\1\2"),
         (r"^put (?:the \w+ cube on the table|it down)$", "place the cube onto the table"),
     )
 )
@@ -48,6 +49,7 @@ tell its first from its second."""
 _LAST_SWING = re.compile(r"^move to the top of the left-side target.* for the (\w+) time$")
 _SWINGS = re.compile(r" repeating this back-and-forth motion (\w+) times,")
 _ORDINAL_OF = {"two": "second", "three": "third", "four": "fourth", "five": "fifth"}
+_SECOND_PLACE_SEED = 2
 _MAX_EVEN_WEIGHT = 64.0
 _NOWHERE = (PLACE_PX // 2, PLACE_PX // 2)
 
@@ -56,8 +58,9 @@ _NOWHERE = (PLACE_PX // 2, PLACE_PX // 2)
 def stand_in(subgoal: str, size: int, instruction: str = "") -> NDArray[np.float32]:
     """Returns the stand-in (size,) for a grounded subgoal, ``<y, x>`` in pixels of a 256 px picture.
 
-    Of several coordinates the first counts; a subgoal without any points at the middle. The instruction tells what
-    follows where the subgoal does not (`skill_of`).
+    The first coordinates are the place; a subgoal without any points at the middle. Second ones, where the skill leads
+    from one place to another, are within its code. The instruction tells what follows where the subgoal does not
+    (`skill_of`).
 
     Raises:
         ValueError: ``size`` leaves no room for the text's code.
@@ -67,7 +70,7 @@ def stand_in(subgoal: str, size: int, instruction: str = "") -> NDArray[np.float
         raise ValueError(f"a stand-in of {size} numbers is too small; expected at least {2 * NUM_PLACE_FEATURES}")
     place = PLACE.search(subgoal)
     yx_px = (int(place[1]), int(place[2])) if place else _NOWHERE
-    values = np.concatenate([place_features(yx_px), _code(skill_of(subgoal, instruction), num_code)])
+    values = np.concatenate([place_features(yx_px), _skill_code(subgoal, instruction, num_code)])
     values.flags.writeable = False
     return values
 
@@ -109,11 +112,32 @@ def even_weights(size: int) -> NDArray[np.float32]:
     return weights
 
 
+def _skill_code(subgoal: str, instruction: str, size: int) -> NDArray[np.float32]:
+    code = text_code(skill_of(subgoal, instruction), size)
+    places = PLACE.findall(subgoal)
+    if len(places) < 2:
+        return code
+    second = _second_place(size) @ place_features((int(places[1][0]), int(places[1][1])))
+    return _mixed(code, second)
+
+
+def _mixed(code: NDArray[np.float32], other: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The first with so much of the second in it that both can be told; rms 1 where they are."""
+    return np.sqrt(1 - _THEN_WEIGHT**2).astype(np.float32) * code + _THEN_WEIGHT * other
+
+
+@functools.lru_cache(maxsize=1 << 4)
+def _second_place(size: int) -> NDArray[np.float32]:
+    """How the numbers of a second place lie among those of a code, (size, NUM_PLACE_FEATURES)."""
+    drawn = np.random.default_rng(_SECOND_PLACE_SEED).normal(size=(size, NUM_PLACE_FEATURES))
+    return (drawn / NUM_PLACE_FEATURES**0.5).astype(np.float32)
+
+
 @functools.lru_cache(maxsize=1 << 10)
-def _code(text: str, size: int) -> NDArray[np.float32]:
+def text_code(text: str, size: int) -> NDArray[np.float32]:
     """Drawn from the text alone: nearly orthogonal to every other's, but for the same thing that goes on otherwise."""
     first, _, then = text.partition(_THEN)
     if then:
-        return np.sqrt(1 - _THEN_WEIGHT**2).astype(np.float32) * _code(first, size) + _THEN_WEIGHT * _code(then, size)
+        return _mixed(text_code(first, size), text_code(then, size))
     seed = int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "big")
     return np.random.default_rng(seed).normal(size=size).astype(np.float32)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
+from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
 
 SEED = 3
@@ -55,3 +57,35 @@ def test_what_was_pushed_is_spoken_of_where_it_is(
     assert np.sign(moved_px[np.abs(moved_px).argmax()]) == 1
     assert (before.subgoal_index, before.simple_subgoal) == (after.subgoal_index, after.simple_subgoal)
     assert worlds[True].step(after.command).grounded_subgoal == after.grounded_subgoal
+
+
+@pytest.mark.parametrize("task", ["PatternLock", "RouteStick"])
+def test_a_way_is_told_with_its_places_and_how_it_goes_on(task: str) -> None:
+    """In the video as well; upstream's texts, and what is done, are the same."""
+    found: dict[bool, tuple[list[str], list[str], list[str]]] = {}
+    for follow in (False, True):
+        with make_environment(task, render=False, texts_follow=follow) as environment:
+            snapshot = environment.reset(SEED, "hard")
+            shown = [seen.grounded_subgoal for seen in environment.demonstration(1)]
+            texts, plain = [snapshot.grounded_subgoal], [snapshot.simple_subgoal]
+            for action in environment.oracle():
+                snapshot = environment.step(action)
+                if snapshot.status is not Status.ONGOING:
+                    break
+                texts.append(snapshot.grounded_subgoal)
+                plain.append(snapshot.simple_subgoal)
+            assert snapshot.status is Status.SUCCESS
+        found[follow] = shown, texts, plain
+    assert found[False][2] == found[True][2]
+    assert not any("<" in text for text in (*found[False][0], *found[False][1]))
+    told = list(dict.fromkeys(text for text in found[True][1] if "<" in text))
+    for text, following in pairwise(told):
+        here, there = re.findall(r"<\d+, \d+>", text)
+        assert here != there
+        assert np.abs(_px(there) - _px(re.findall(r"<\d+, \d+>", following)[0])).max() <= 1
+    assert len(re.findall("<", told[-1])) == 1
+    assert all("<" in text for text in found[True][0])
+
+
+def _px(place: str) -> np.ndarray:
+    return np.array(re.findall(r"\d+", place), float)

@@ -272,6 +272,25 @@ def test_a_plan_tells_a_place_once() -> None:
     assert planned.words[1] == texts[1] + ", <80, 20>, <7, 60>"
 
 
+def test_a_plan_of_a_way_tells_every_stretch_and_how_it_is_gone() -> None:
+    """Two in a row may have the same words, and a way may come back to where it was."""
+    texts = [
+        "move left to <10, 10>, then <10, 40>",
+        "move left to <10, 40>, then <40, 40>",
+        "go round clockwise to <40, 40>, then <10, 10>",
+        "move back to <10, 10>",
+    ]
+    shown = ((np.zeros((32, 32, 3), np.uint8),) * 2,)
+    recorded = replace(episode(4, changes=(0, 1, 2, 3)), subgoals=texts, demo=shown)
+    assert [*recorded.with_plans().words] == [
+        f"{texts[0]}, clockwise <40, 40>, back <10, 10>",
+        f"{texts[1]}, back <10, 10>",
+        *texts[2:],
+    ]
+    unseen = replace(recorded, demo=()).with_plans()
+    assert unseen.words[0] == texts[0]  # nothing was shown by then
+
+
 def test_reasoning_can_be_left_unwritten() -> None:
     recorded = replace(episode(60, changes=(0,)), reasoning="the red one was under the left one")
     written, left_out = (

@@ -120,3 +120,42 @@ def test_places_that_do_not_fit_are_left_out(num_slots: int) -> None:
     example = make_example(episode(), FORM, CONFIG, np.random.default_rng(0))
     made = example.place_lessons(example.row(), num_slots * NUM_PLACE_FEATURES)
     assert int(made.first_M.max()) == (num_slots - 1) * NUM_PLACE_FEATURES
+
+
+def shown(texts: list[str]) -> TrainingEpisode:
+    views = tuple((np.zeros((32, 32, 3), np.uint8),) * 2 for _ in texts)
+    return replace(episode(), demo=views, demo_subgoals=texts)
+
+
+def test_the_end_of_every_picture_of_a_demonstration_has_what_is_done_in_mind() -> None:
+    texts = [f"put it onto a target at <{y}, {x}>" for y, x in (PLACES[0], PLACES[0], PLACES[1])] + ["press it"]
+    example = make_example(shown(texts), FORM, CONFIG, np.random.default_rng(0))
+    row = example.row()
+    lessons = example.place_lessons(row, 4 * NUM_PLACE_FEATURES)
+    seen = np.flatnonzero(np.asarray(row.ids) == FORM.vocabulary.vision_end)[1 : 2 * len(texts) : 2]  # two views each
+    by_place = {
+        (index, slot // NUM_PLACE_FEATURES): numbers
+        for index, slot, numbers in zip(
+            lessons.index_M.tolist(), lessons.first_M.tolist(), lessons.features_MP.numpy(), strict=True
+        )
+    }
+    assert sorted(slot for index, slot in by_place if index < row.gate_index[0]) == sorted(
+        [*(0, 2, 3) * 2, *range(4), 1, 2, 3]
+    )
+    here, before, which, number = range(4)
+    for index, place in zip(seen[:3], (PLACES[0], PLACES[0], PLACES[1]), strict=True):
+        np.testing.assert_array_equal(by_place[index, here], place_features(place))
+    np.testing.assert_array_equal(by_place[seen[2], before], place_features(PLACES[0]))
+    np.testing.assert_array_equal(by_place[seen[3], before], place_features(PLACES[1]))
+    for slot in (which, number):
+        codes = [by_place[index, slot] for index in seen]
+        likeness = np.corrcoef(np.stack(codes))
+        assert np.array_equal(codes[0], codes[1])
+        assert np.abs(likeness[1:, 1:] - np.eye(3)).max() < 0.7
+
+
+def test_a_demonstration_of_which_nobody_says_what_it_does_has_no_lessons() -> None:
+    recorded = replace(shown(["a", "b"]), demo_subgoals=())
+    example = make_example(recorded, FORM, CONFIG, np.random.default_rng(0))
+    row = example.row()
+    assert example.place_lessons(row, SIZE).index_M.min() >= row.gate_index[0]

@@ -73,6 +73,9 @@ def test_a_text_without_a_place_points_at_the_middle() -> None:
         ("place the green cube onto the target at <101, 127>", "place the cube onto the target at <>"),
         ("move to the top of the left-side target at <8, 7> for the first time", "move to the top of the target at <>"),
         ("put it into the bin at <102, 174>", "put it into the bin at <>"),
+        ("move forward-left to <8, 7>, then <5, 6>", "point the stick to <>, then <>"),
+        ("move right to <8, 7>", "point the stick to <>"),
+        ("Pick up the cube at <99, 126>", "pick up the first highlighted cube at <>, then place it"),
     ],
 )
 def test_one_skill_has_one_name_in_all_tasks(subgoal: str, skill: str) -> None:
@@ -105,6 +108,27 @@ def test_what_goes_on_in_another_way_is_told_by_a_like_code() -> None:
     codes = np.stack([stand_in(text, 1024)[NUM_PLACE_FEATURES:] for text in told])
     likeness = codes @ codes.T / codes.shape[1]
     np.testing.assert_allclose(likeness, [[1, 0.8, 0.8], [0.8, 1, 0.64], [0.8, 0.64, 1]], atol=0.12)
+
+
+@given(first=st.tuples(PIXELS, PIXELS), second=st.tuples(PIXELS, PIXELS), third=st.tuples(PIXELS, PIXELS))
+def test_a_second_place_lies_within_the_code(
+    first: tuple[int, int], second: tuple[int, int], third: tuple[int, int]
+) -> None:
+    """The first is where it is without, and the second can be read off by one linear map, whatever the first is."""
+    push = "push the cube at <{}, {}> to the target at <{}, {}>"
+    here, there, once = (
+        stand_in(text, 128)
+        for text in (
+            push.format(*first, *second),
+            push.format(*first, *third),
+            f"push the cube at <{first[0]}, {first[1]}>",
+        )
+    )
+    np.testing.assert_array_equal(here[:NUM_PLACE_FEATURES], once[:NUM_PLACE_FEATURES])
+    moved = there[NUM_PLACE_FEATURES:] - here[NUM_PLACE_FEATURES:]
+    origin = stand_in(push.format(0, 0, *second), 128) - stand_in(push.format(0, 0, *third), 128)
+    np.testing.assert_allclose(-moved, origin[NUM_PLACE_FEATURES:], atol=1e-5)
+    assert np.array_equal(here, there) == (second == third)
 
 
 def test_too_small_a_carrier_is_refused() -> None:

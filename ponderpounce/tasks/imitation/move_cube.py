@@ -26,7 +26,7 @@ from ponderpounce.tasks.physics import Physics
 from ponderpounce.tasks.placing import PlacedCube, Point, draw_cube, draw_disc, until_it_fits
 from ponderpounce.tasks.props import PURPLE, TARGET_RADIUS_M, TARGET_THICKNESS_M, add_target
 from ponderpounce.tasks.scene import SceneFullError, add_cube
-from ponderpounce.tasks.task import Reasoning, Shown, Subtask, Task, task
+from ponderpounce.tasks.task import Reasoning, Shown, Subtask, Task, Thing, task
 
 MANNERS = {
     "hook": "hook it with the peg",
@@ -113,6 +113,10 @@ class MoveCube(Task[Layout, None]):
     def retold(self, layout: Layout) -> tuple[Layout, ...]:
         """The cube of the same video was moved in another manner."""
         return tuple(replace(layout, manner=manner) for manner in MANNERS if manner != layout.manner)
+
+    def things(self, layout: Layout, step: int) -> tuple[Thing, ...]:
+        target = Thing(name="target", body=_TARGET, is_movable=False)
+        return (target, Thing(name=f"{layout.demonstrated.cube.color} cube", body=_CUBE), Thing(name="peg", body=_TAIL))
 
     def remember(self, memory: None, physics: Physics, layout: Layout) -> None:
         return None

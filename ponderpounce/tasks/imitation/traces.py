@@ -7,6 +7,7 @@ upstream; a dot is seen at once, upstream one observation later.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import mujoco
 
@@ -19,6 +20,8 @@ TARGET_Z_M = 0.01  # of a target's centre
 RED_STEPS = 40  # a target stays red for so long after the last touch
 TRAIL_STEPS = 41  # as long is a dot seen
 LOW_Z_M = 0.1  # a tip that is higher leaves no dots
+
+TARGET_NAME = "grey target"  # in albums, red or not
 
 _RADIUS_M, _HALF_HEIGHT_M = 0.02, 0.005
 _RED_RADIUS_M, _RED_HALF_HEIGHT_M, _RED_BELOW_M = 0.02 * 1.002, 0.02 * 1.002, 0.01
@@ -68,6 +71,12 @@ def leave_dot(physics: Physics, step: int) -> None:
         physics.place(dot, pose(x_m, y_m, _DOT_Z_M))
     else:
         physics.park(dot)
+
+
+def way(manners: Sequence[str], ends: Sequence[str], move: int) -> dict[str, Any]:
+    """The ``way`` and ``way_grounds`` of a move: where it ends, and how (in words) and where the next one does."""
+    following = f", then {manners[move + 1]}<>" if move + 1 < len(ends) else ""
+    return {"way": f"[ to <>{following}]", "way_grounds": tuple(ends[move : move + 2])}
 
 
 def _red(target: str) -> str:
