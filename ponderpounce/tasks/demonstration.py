@@ -20,7 +20,7 @@ from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.physics import Physics, PhysicsState
 from ponderpounce.tasks.task import Shown, Task
 
-Look = Callable[[Sequence[str]], list[captions.Pixel] | None]  # where the front camera sees bodies, in order
+Look = Callable[[Shown], list[captions.Pixel] | None]  # where the front camera sees what a part grounds, in order
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,7 +52,7 @@ def perform(
             task.stage(physics, layout, memory, physics.elapsed_steps() - 1)
             memory = task.remember(memory, physics, layout)
             if part.is_recorded:
-                caption = captions.follow(caption, index, part.text, partial(look, part.grounds))
+                caption = captions.follow(caption, index, part.text, partial(look, part))
                 rows.append(Row(physics=physics.save(), caption=caption))
         if part.afterwards is not None:
             part.afterwards(physics)

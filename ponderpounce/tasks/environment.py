@@ -21,7 +21,7 @@ from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.physics import CONTROL_HZ, Physics, PhysicsState
 from ponderpounce.tasks.rendering import Cameras
 from ponderpounce.tasks.scene import FRONT, table_scene
-from ponderpounce.tasks.task import StepT, Subtask, Task, TaskError, located, make_task
+from ponderpounce.tasks.task import Shown, StepT, Subtask, Task, TaskError, located, make_task
 
 IMAGE_PX = 256  # upstream's; grounded texts count in these pixels
 _PUSHED_M = 0.01  # texts that follow are corrected from this distance on
@@ -152,7 +152,7 @@ class Environment:
             layout = self._task.near_first(layout)
         self._begin(difficulty, layout)
         parts = [self._told(part) for part in self._task.demonstration(layout)]
-        self._video, last_action = demonstration.perform(self._task, layout, parts, self.physics, self._look_for)
+        self._video, last_action = demonstration.perform(self._task, layout, parts, self.physics, self._look_at)
         # Upstream's reset spends one control step too: the button's cap settles on its spring.
         at_rest = np.append(panda.HOME_QPOS, self.physics.robot.rest_command)
         self.physics.advance(at_rest if last_action is None else last_action)
@@ -304,7 +304,7 @@ class Environment:
             reason = f"not done after {self._max_steps} steps"
             self._progress = Progress(index=self._progress.index, status=Status.TIMEOUT, reason=reason)
         subtask = self._subtasks[spoken_of]
-        caption = captions.follow(self._caption, spoken_of, subtask.text, lambda: self._look_for(subtask.grounds))
+        caption = captions.follow(self._caption, spoken_of, subtask.text, lambda: self._look_at(subtask))
         if self._texts_follow:
             caption = self._following(caption, subtask)
         if self._progress.status is Status.SUCCESS:
@@ -322,11 +322,22 @@ class Environment:
         was_pushed = moved_m[:2].max() >= _PUSHED_M and moved_m[2] < _PUSHED_M
         if not caption.is_latched or not was_pushed:
             return caption
-        points = self._look_for(subtask.grounds)
+        points = self._look_at(subtask)
         if points is None:
             return caption
         self._said_of = now
         return replace(caption, grounded=captions.grounded(subtask.text, points))
+
+    def _look_at(self, step: Subtask | Shown) -> list[captions.Pixel] | None:
+        """The coordinates of its text; None if one of its things is hidden.
+
+        Those of a way are where its ends stand, hidden or not: half a target's pixels would lead beside it.
+        """
+        if not (self._texts_follow and step.way):
+            return self._look_for(step.grounds)
+        K, Rt = sight.intrinsic(self.physics, FRONT, IMAGE_PX), sight.extrinsic(self.physics, FRONT)
+        points_px = sight.project(K, Rt, np.array([self.physics.position_m(body) for body in step.grounds]))
+        return [(int(y), int(x)) for x, y in points_px.tolist()]
 
     def _look_for(self, bodies: Sequence[str]) -> list[captions.Pixel] | None:
         """Where the front camera sees bodies; None if one of them is hidden.

@@ -146,7 +146,7 @@ def test_cubes_swap_as_recorded_at_every_step(environment: EnvironmentOf) -> Non
     task = VideoRepick()
     task.arrange(env.physics, env.layout)
     acted = Shown(text="as recorded", motion=lambda motions: map(np.float32, recording["demo_actions"]))
-    rows, _ = perform(task, env.layout, (acted,), env.physics, lambda bodies: None)
+    rows, _ = perform(task, env.layout, (acted,), env.physics, lambda part: None)
     for row, theirs in zip(rows[recording["track"]["first_row"] :], recording["track"]["poses"], strict=True):
         env.physics.load(row.physics)
         ours, theirs_m = cube_poses(env), np.multiply(theirs, 1e-4)

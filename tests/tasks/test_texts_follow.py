@@ -82,10 +82,6 @@ def test_a_way_is_told_with_its_places_and_how_it_goes_on(task: str) -> None:
     for text, following in pairwise(told):
         here, there = re.findall(r"<\d+, \d+>", text)
         assert here != there
-        assert np.abs(_px(there) - _px(re.findall(r"<\d+, \d+>", following)[0])).max() <= 1
+        assert following.count(there) >= 1
     assert len(re.findall("<", told[-1])) == 1
     assert all("<" in text for text in found[True][0])
-
-
-def _px(place: str) -> np.ndarray:
-    return np.array(re.findall(r"\d+", place), float)
