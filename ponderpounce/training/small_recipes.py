@@ -354,6 +354,33 @@ def small_further() -> Curriculum:
     return Curriculum(name="small_further", stages=(hand, releasing, binding, pointing, finishing))
 
 
+def small_imitating() -> Curriculum:
+    """The pair of `small_further` learns three tasks of imitation, and to note what demonstrations do (`deeds`).
+
+    `hand` trains POUNCE and needs none of the others.
+    """
+    _, releasing, binding, _, finishing = small_further().stages
+    hand = replace(
+        releasing,
+        name="small_imitating/hand",
+        train=replace(releasing.train, seed=4, optim=replace(_FROM_SCRATCH, warmup_steps=100, decay=(2800, 5000))),
+        num_steps=5000,
+    )
+    binding = replace(
+        binding,
+        name="small_imitating/binding",
+        train=TrainConfig(seed=4, optim=replace(_FROM_SCRATCH, warmup_steps=50)),
+        num_steps=900,
+    )
+    finishing = replace(
+        finishing,
+        name="small_imitating/finishing",
+        train=TrainConfig(seed=5, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(900, 1800))),
+        num_steps=1800,
+    )
+    return Curriculum(name="small_imitating", stages=(hand, binding, finishing))
+
+
 def small_refresh(period_s: int) -> Recipe:
     """Figure 4 at small scale: the shipped pair goes on by the paper's two losses, PONDER looking every 1, 2 or 4 s."""
     *_, pointing = small_noticing().stages

@@ -7,6 +7,7 @@ drawn anew: it reads one sentence an episode, and acts by cognition. Pretrained 
 
 from __future__ import annotations
 
+import copy
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +24,7 @@ from ponderpounce.training.data import TrainingSet
 from ponderpounce.training.in_words import told_in_words
 
 DONE, REFUSED = 0, 2
+_TABLES = {"model.language_model.embed_tokens.weight", "lm_head.weight"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,6 +37,8 @@ class WidenOptions:
     """Folders that pp-collect made, of all tasks that the pair is to know."""
     out: Path
     """OUT/ponder and OUT/pounce are what `pp-train --ponder --pounce` goes on from."""
+    pieces: int = 0
+    """Rows to add to PONDER's table for words, where no id is free any more."""
     seed: int = 0
 
 
@@ -50,14 +54,42 @@ def main(argv: list[str] | None = None) -> int:
 
 def widen(options: WidenOptions) -> None:
     """Writes the pair. Raises DatasetError, OSError or ValueError if what was given does not fit."""
+    if options.pieces < 0:
+        raise ValueError(f"--pieces {options.pieces}: a number of rows, or 0 for none")
     if (options.out / "ponder").exists():
         raise ValueError(f"{options.out} holds a pair already; use another --out")
     data = TrainingSet(*options.data)
-    save_ponder(widened(load_ponder(options.ponder), data.texts()), options.out / "ponder")
+    ponder = with_more_rows(load_ponder(options.ponder), options.pieces)
+    save_ponder(widened(ponder, data.texts()), options.out / "ponder")
     bundle = load_bundle(options.pounce)
     tokenizer = tokenizer_of_instructions(data.instructions())
     wide = told_in_words(bundle, bundle.model.config, tokenizer, options.seed)
     save_bundle(replace(wide, is_random=False, has_fresh_prefix=False), options.out / "pounce")
+
+
+@torch.no_grad()
+def with_more_rows(ponder: Ponder, num_rows: int) -> Ponder:
+    """The same PONDER with so many rows more for words; what stands behind them, carriers and senses, moves up.
+
+    Nothing speaks for saying a new one.
+    """
+    form, config = ponder.format, copy.deepcopy(ponder.qwen.config)
+    first = form.first_carrier_id
+    config.text_config.vocab_size += num_rows
+    senses = form.proprioception
+    form = replace(
+        form,
+        first_carrier_id=first + num_rows,
+        proprioception=None if senses is None else replace(senses, first_id=senses.first_id + num_rows),
+    )
+    new = Ponder(config, form, image_px=ponder.image_px, device=ponder.device, dtype=ponder.dtype)
+    known = ponder.qwen.state_dict()
+    for name in _TABLES & known.keys():
+        before, after = known[name][:first], known[name][first:]
+        known[name] = torch.cat([before, before.new_zeros(num_rows, before.shape[1]), after])
+    new.qwen.load_state_dict(known)
+    new.is_random = ponder.is_random
+    return new
 
 
 @torch.no_grad()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from ponderpounce.models.pounce_checkpoint import load_bundle, random_bundle, sa
 from ponderpounce.models.prompt import stateless_prompt_text
 from ponderpounce.models.vocabulary import Vocabulary
 from ponderpounce.training.data import TrainingSet
-from ponderpounce.training.widening import REFUSED, main, widened
+from ponderpounce.training.widening import REFUSED, main, widened, with_more_rows
 
 OLD = ["press the button at [255, 470]", "pick up the first cube at [441, 430], which is blue"]
 NEW = [f"pick up the container at [{y}, {3 * y}] that hides the red cube" for y in range(100, 300, 7)]
@@ -97,6 +98,24 @@ def test_it_thinks_of_what_it_knew_the_same_and_of_new_words_what_their_spelling
     (piece,) = wide.format.vocabulary.encode(" container")
     spelt = old.embed(old.format.vocabulary.encode(" container")).mean(dim=0)
     torch.testing.assert_close(wide.embed([piece])[0], spelt)
+
+
+def test_with_more_rows_it_thinks_and_says_the_same() -> None:
+    """Carriers and senses have other ids; what they mean is the same."""
+    old, new = known(), with_more_rows(known(), 128)
+    state = np.array([0, 0.2, 0, -2.2, 0, 2.4, 0.8, 0.02], np.float32)
+    frames = torch.randint(0, 256, (1, 64, 64, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(3))
+    rows = [of.format.row([*of.format.opening(OLD[0]), *of.format.query(1, None, state)]) for of in (old, new)]
+    moved = [b - a for a, b in zip(rows[0].ids, rows[1].ids, strict=True)]
+    assert set(moved) == {0, 128}
+    thought = [of.encode_row(row, frames) for of, row in zip((old, new), rows, strict=True)]
+    torch.testing.assert_close(thought[1], thought[0], rtol=0, atol=0)
+    first = old.format.first_carrier_id
+    said = [of.logits(hidden_TH) for of, hidden_TH in zip((old, new), thought, strict=True)]
+    torch.testing.assert_close(said[1][:, :first], said[0][:, :first], rtol=0, atol=0)
+    torch.testing.assert_close(said[1][:, first + 128 :], said[0][:, first:], rtol=0, atol=0)
+    words = ["".join(letters) for letters in product("qxzjk", repeat=4)]
+    assert widened(new, words).format.vocabulary.num_tokens == new.format.first_carrier_id > first
 
 
 def test_a_widened_pair_is_read_back(tmp_path: Path, collected: Path, capsys: pytest.CaptureFixture[str]) -> None:
