@@ -22,6 +22,7 @@ from ponderpounce.models.eyes import see
 from ponderpounce.models.normalisation import Floats
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.training.augment import AS_IT_IS, NOT_AUGMENTED, Augmentation, View, draw_view
+from ponderpounce.training.countdown import counting_down, waits
 from ponderpounce.training.events import draw_near, event_ticks
 from ponderpounce.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses, has_moved, without_lapses
 from ponderpounce.training.nudge import NO_NUDGE, Nudge, draw_nudges
@@ -283,8 +284,11 @@ class Example:
         return tuple(accumulate((normalised_text(each.text) for each in self.words), lambda old, new: new or old))
 
     def stand_ins(self, size: int) -> Tensor:
-        """`stand_in` of the subgoal in force at every query, (Q, size)."""
-        texts = [self.view.text(self.episode.subgoals[query.tick]) for query in self.schedule.queries]
+        """`stand_in` of the subgoal in force at every query, (Q, size); with how long it is to wait (`countdown`)."""
+        subgoals = self.episode.subgoals
+        left = waits(subgoals)
+        ticks = [query.tick for query in self.schedule.queries]
+        texts = [counting_down(self.view.text(subgoals[tick]), left[tick]) for tick in ticks]
         return torch.from_numpy(np.stack([stand_in(text, size, self.episode.instruction) for text in texts]))
 
     def stand_in_weights(self, moved: float) -> Tensor:

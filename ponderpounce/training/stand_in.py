@@ -40,6 +40,7 @@ _SKILLS = tuple(
         (rf"^press the (?:first |second )?button{_AT}(?: to stop| to finish)?$", r"press the button\1"),
         (rf"^place the (?:\w+ cube onto the|cube onto the correct) target{_AT}$", r"place the cube onto the target\1"),
         (rf"^move to the top of the \w+-side target{_AT} for the \w+ time$", r"move to the top of the target\1"),
+        (rf"^press the button to stop the cube on the target{_AT}$", "press down"),
         (r"^move (?:forward|backward|left|right)(?:-left|-right)?( to <>)?(, then <>)?$", r"point the stick\1\2"),
         (r"^put (?:the \w+ cube on the table|it down)$", "place the cube onto the table"),
     )

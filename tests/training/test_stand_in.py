@@ -73,6 +73,8 @@ def test_a_text_without_a_place_points_at_the_middle() -> None:
         ("place the green cube onto the target at <101, 127>", "place the cube onto the target at <>"),
         ("move to the top of the left-side target at <8, 7> for the first time", "move to the top of the target at <>"),
         ("put it into the bin at <102, 174>", "put it into the bin at <>"),
+        ("press the button to stop the cube on the target at <8, 7>", "press down"),
+        ("press the button to stop the cube on the target", "press down"),
         ("move forward-left to <8, 7>, then <5, 6>", "point the stick to <>, then <>"),
         ("move right to <8, 7>", "point the stick to <>"),
         ("Pick up the cube at <99, 126>", "pick up the first highlighted cube at <>, then place it"),

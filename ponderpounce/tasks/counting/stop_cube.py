@@ -23,7 +23,7 @@ from ponderpounce.tasks.physics import CONTROL_HZ, Physics
 from ponderpounce.tasks.placing import draw_button
 from ponderpounce.tasks.props import PURPLE, add_ghost_cube, add_target
 from ponderpounce.tasks.scene import CUBE_HALF_M, add_button, display_rgba
-from ponderpounce.tasks.task import Reasoning, Subtask, Task, task
+from ponderpounce.tasks.task import Reasoning, Subtask, Task, Thing, task
 
 NUM_PASSES = 5
 
@@ -165,6 +165,10 @@ class StopCube(Task[Layout, Memory]):
         )
         text = count + f"Next, stop the cube at the target[ at <>] on visit {layout.visit}."
         return Reasoning(text=text, grounds=(_TARGET,))
+
+    def things(self, layout: Layout, step: int) -> tuple[Thing, ...]:
+        named = {"button": f"{_BUTTON}/cap", "target": _TARGET, "running cube": _CUBE}
+        return tuple(Thing(name=name, body=body, is_movable=False) for name, body in named.items())
 
     def remember(self, memory: Memory | None, physics: Physics, layout: Layout) -> Memory:
         is_near = predicates.is_near(physics, _CUBE, _TARGET, _STOPPED_M)
