@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# The pair for several tasks from the one that is shipped, on two CPU cores: see docs/training.md, "Three tasks of imitation".
+# The pair for several tasks from the one that is shipped, on two CPU cores: see docs/training.md, "Four tasks more".
 #
 #     checkpoints/several/imitate.sh [OUT]
 #
-# Two tasks with a stick and one with three manners are added. PONDER's eyes are shown what there is in them, both get words for
-# them, POUNCE learns to go along ways and to push, and PONDER to note what demonstrations do. The same command goes on after a
-# kill.
+# Two tasks with a stick, one with three manners and one to be done on the second are added. PONDER's eyes are shown what there is
+# in them, both get words for them, POUNCE learns to go along ways, to push and to wait, and PONDER to note what demonstrations do.
+# The same command goes on after a kill.
 set -euo pipefail
 
 out=${1:-out/imitate}
@@ -24,14 +24,15 @@ collect "$out/shown" --tasks "${shown[@]}" --episodes 130 "${noisy[@]}"
 collect "$out/old" --tasks "${old[@]}" --episodes 100 "${noisy[@]}"
 collect "$out/swaps" --tasks "${swapped[@]}" --episodes 40 "${noisy[@]}"
 collect "$out/highlight" --tasks PickHighlight --episodes 150 --recovery-share 0.4 --shove-share 0.7
-data=("$out/imitated" "$out/shown" "$out/old" "$out/swaps" "$out/highlight")
+collect "$out/timed" --tasks StopCube --episodes 150 --invocation-hz 20  # waits are counted in single steps
+data=("$out/imitated" "$out/timed" "$out/shown" "$out/old" "$out/swaps" "$out/highlight")
 
 look() {  # at so many PICTURES of a TASK
     [ -d "$out/album/$2/meta" ] || "$bin/pp-album" --task "$2" --pictures "$1" --out "$out/album/$2"
 }
 
 for task in PickHighlight ButtonUnmask PickXtimes BinFill SwingXtimes; do look 600 $task; done
-for task in "${imitated[@]}"; do look 1200 $task; done
+for task in StopCube "${imitated[@]}"; do look 1200 $task; done
 [ -d "$out/eyes/ponder" ] || OMP_NUM_THREADS=2 "$bin/pp-see" --recipe small_imitating --data "$out/imitated" --album "$out"/album/* \
     --ponder "$here/ponder" --steps 800 --learning-rate 5e-4 --out "$out/eyes"
 [ -d "$out/wide/ponder" ] || "$bin/pp-widen" --ponder "$out/eyes/ponder" --pounce "$here/pounce" --data "${data[@]}" \
@@ -48,7 +49,7 @@ pair="$out/pair"
 [ -d "$pair/ponder" ] || halve "$out/run/ponder" "$pair/ponder"
 [ -d "$pair/pounce" ] || halve "$out/run/hand/pounce" "$pair/pounce"
 for cognition in real null; do
-    "$bin/pp-eval" --tasks PickHighlight "${imitated[@]}" "${shown[@]}" "${old[@]}" "${swapped[@]}" --episodes 50 --runs 1 \
+    "$bin/pp-eval" --tasks PickHighlight StopCube "${imitated[@]}" "${shown[@]}" "${old[@]}" "${swapped[@]}" --episodes 50 --runs 1 \
         --seed 1000 --workers 2 --cognition $cognition --ponder-checkpoint "$pair/ponder" --pounce-checkpoint "$pair/pounce" \
         --out "$out/$cognition"
 done

@@ -303,7 +303,7 @@ def test_an_album_of_a_task_that_names_nothing_is_refused_before_anything_starts
 ) -> None:
     idle = InOrder(pretend)
     monkeypatch.setattr(module, "_workers", lambda _: idle)
-    arguments = ["--out", str(tmp_path), "--tasks", "PickHighlight", "StopCube", "--episodes", "1"]
+    arguments = ["--out", str(tmp_path), "--tasks", "PickHighlight", "InsertPeg", "--episodes", "1"]
     assert module.main([*arguments, "--album", "100", "--no-progress"]) == module.REFUSED
-    assert "'StopCube' does not name its things" in capsys.readouterr().err
+    assert "'InsertPeg' does not name its things" in capsys.readouterr().err
     assert idle.done == []

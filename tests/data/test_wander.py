@@ -95,5 +95,5 @@ def test_it_is_a_dataset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
 
 
 def test_a_task_that_names_nothing_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--out", str(tmp_path), "--task", "StopCube"]) == REFUSED
+    assert main(["--out", str(tmp_path), "--task", "InsertPeg"]) == REFUSED
     assert "does not name its things" in capsys.readouterr().err
