@@ -89,6 +89,8 @@ class EvalOptions:
     pushed elsewhere, its coordinates follow."""
     stand_in_noise_px: float = 0.0
     """With --cognition stand-in: how wrong the told places are (standard deviation); a PONDER's are by some pixels."""
+    stand_in_onward: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """With --cognition stand-in: also told where the next subgoal will be, as recipe small_imitating learned it."""
     donors: Path | None = None
     """With --cognition other-episode: the --out of a recorded evaluation with real cognition, of the same scenes."""
     subgoal_text: Literal["ponder", "oracle"] | None = None
@@ -135,6 +137,8 @@ class EvalOptions:
             raise EvaluationError("--cognition other-episode and --donors go together: record the real one first")
         if self.cognition in _PUPPETS and (self.servers, self.policy) != ("in-process", "servers"):
             raise EvaluationError(f"--cognition {self.cognition} replaces PONDER: use --servers in-process")
+        if self.stand_in_onward and self.cognition != "stand-in":
+            raise EvaluationError("--stand-in-onward is of --cognition stand-in; leave it out")
         if self.stand_in_noise_px < 0 or (self.stand_in_noise_px and self.cognition != "stand-in"):
             raise EvaluationError("--stand-in-noise-px is for --cognition stand-in, and at least 0")
         if self.cognition == "stand-in" and self.pounce_checkpoint is None:
@@ -200,6 +204,8 @@ class EvalOptions:
             own["subgoal_text"] = self.subgoal_text
         if self.stand_in_noise_px:
             own["stand_in_noise_px"] = self.stand_in_noise_px
+        if self.stand_in_onward:
+            own["stand_in_onward"] = True
         if self.order != "drawn":
             own["order"] = self.order
         return config | {name: as_json(value) for name, value in own.items()}
@@ -362,7 +368,11 @@ class EvaluationStation:
             shape = cognition_shape(pounce)
         except ValueError as error:
             raise EvaluationError(str(error)) from None
-        return ToldPonder(Link(bus, robot=robot, proc="ponder"), *shape, self._options.stand_in_noise_px).step
+        link, noise_px = Link(bus, robot=robot, proc="ponder"), self._options.stand_in_noise_px
+        return ToldPonder(link, *shape, noise_px, self._onward if self._options.stand_in_onward else None).step
+
+    def _onward(self) -> str:
+        return "" if self._environment is None else self._environment.onward()
 
 
 def _workers(options: EvalOptions) -> Workers[Job, Line]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -29,9 +30,18 @@ class ToldPonder(PuppetPonder):
     Args:
         num_carriers, hidden_size: K and H of what POUNCE reads.
         noise_px: standard deviation of the error of every told coordinate; it stays for `HELD_QUERIES` queries.
+        onward: says where the next subgoal will be (`Environment.onward`); None: POUNCE is not told.
     """
 
-    def __init__(self, link: Link, num_carriers: int, hidden_size: int, noise_px: float = 0.0) -> None:
+    def __init__(
+        self,
+        link: Link,
+        num_carriers: int,
+        hidden_size: int,
+        noise_px: float = 0.0,
+        onward: Callable[[], str] | None = None,
+    ) -> None:
+        self._onward = onward
         self._noise_px = noise_px
         self._shape = num_carriers, hidden_size
         self._subgoals = link.subscribe(topics.SUBGOAL)
@@ -47,9 +57,12 @@ class ToldPonder(PuppetPonder):
             else:
                 self._is_new = True  # the plain text is said when a subgoal begins, and at no other time
         is_new, self._is_new = self._is_new, False
-        text = self._text if not self._noise_px else mistold(self._text, self._noise_px, query.query // HELD_QUERIES)
+        texts = [self._text, "" if self._onward is None else self._onward()]
+        if self._noise_px:
+            texts = [mistold(text, self._noise_px, query.query // HELD_QUERIES) for text in texts]
+        text, onward = texts
         num_carriers, size = self._shape
-        vector = np.repeat(stand_in(text, size, self.instruction)[None], num_carriers, axis=0)
+        vector = np.repeat(stand_in(text, size, self.instruction, onward)[None], num_carriers, axis=0)
         return Answer(vector=vector, is_transition=is_new, norm=float(np.linalg.norm(vector)))
 
     def shape(self) -> tuple[int, int]:

@@ -226,6 +226,13 @@ class Environment:
         for subtask in self._subtasks[self._progress.index :]:
             yield from subtask.motion(motions)
 
+    def onward(self) -> str:
+        """Returns where the next subgoal will be, ``<y, x>``: the first of its things as it stands; empty if none."""
+        self._require_episode()
+        assert self._caption is not None
+        following = self._subtasks[self._caption.index + 1 :][:1]
+        return "".join("<{}, {}>".format(*self._project(step.grounds[:1])[0]) for step in following if step.grounds)
+
     def save(self) -> EpisodeState:
         """Returns a copy of the whole episode as it stands."""
         self._require_episode()
@@ -335,8 +342,12 @@ class Environment:
         """
         if not (self._texts_follow and step.way):
             return self._look_for(step.grounds)
+        return self._project(step.grounds)
+
+    def _project(self, bodies: Sequence[str]) -> list[captions.Pixel]:
+        """Where bodies stand in the front camera's picture, hidden or not."""
         K, Rt = sight.intrinsic(self.physics, FRONT, IMAGE_PX), sight.extrinsic(self.physics, FRONT)
-        points_px = sight.project(K, Rt, np.array([self.physics.position_m(body) for body in step.grounds]))
+        points_px = sight.project(K, Rt, np.array([self.physics.position_m(body) for body in bodies]))
         return [(int(y), int(x)) for x, y in points_px.tolist()]
 
     def _look_for(self, bodies: Sequence[str]) -> list[captions.Pixel] | None:

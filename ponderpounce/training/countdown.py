@@ -30,9 +30,6 @@ def waits(subgoals: Sequence[str]) -> list[int | None]:
     return found[::-1]
 
 
-def counting_down(text: str, wait: int | None) -> str:
-    """The text with its wait: as its second place, and if it has none as its first, too."""
-    if wait is None:
-        return text
-    until = f"<0, {min(wait, _LONGEST)}>"
-    return f"{text} until {until}" if "<" in text else f"{text} until {until} until {until}"
+def as_place(wait: int) -> str:
+    """The wait as a place."""
+    return f"<0, {min(wait, _LONGEST)}>"

@@ -22,7 +22,7 @@ from ponderpounce.models.eyes import see
 from ponderpounce.models.normalisation import Floats
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.training.augment import AS_IT_IS, NOT_AUGMENTED, Augmentation, View, draw_view
-from ponderpounce.training.countdown import counting_down, waits
+from ponderpounce.training.countdown import as_place, waits
 from ponderpounce.training.events import draw_near, event_ticks
 from ponderpounce.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses, has_moved, without_lapses
 from ponderpounce.training.nudge import NO_NUDGE, Nudge, draw_nudges
@@ -148,6 +148,15 @@ class TrainingEpisode:
             planned += [text + plan for text in self.subgoals[begin:end]]
         return replace(self, planned=planned)
 
+    def next_places(self) -> list[str]:
+        """Per tick, the place of the subgoal after the one in force, ``<y, x>``; empty where it has none."""
+        begins = [*np.flatnonzero(self.is_transition_T | (np.arange(self.num_ticks) == 0)).tolist(), self.num_ticks]
+        found: list[str] = []
+        for begin, end in pairwise(begins):
+            place = PLACE.search(self.subgoals[end]) if end < self.num_ticks else None
+            found += ["" if place is None else place[0]] * (end - begin)
+        return found
+
     @property
     def words(self) -> Sequence[str]:
         """What is to be said at each tick."""
@@ -214,6 +223,10 @@ class ExampleConfig:
     episodes may be seen otherwise."""
     augments: Literal["all", "watched"] = "all"
     """Which episodes are seen in other views."""
+    tells_onward: float = 0.0
+    """Share of queries whose stand-in tells where the next subgoal will be (`TrainingEpisode.next_places`). The hand
+    acts for up to 2.3 s on what it heard last: one that has lifted a cube and does not know where to lets go of it
+    anywhere."""
     nudge: Nudge = NO_NUDGE
     """Displaced starts of POUNCE's invocations."""
     max_queries: int | None = None
@@ -234,7 +247,7 @@ class ExampleConfig:
                 f"retold_px {self.retold_px} must be above 0, and slips 0, came {self.slips}: a row whose words all "
                 "slip never puts them right; let them slip in `Lapses.slipped`"
             )
-        for name in ("text_dropout", "slips"):
+        for name in ("text_dropout", "slips", "tells_onward"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be in [0, 1], came {getattr(self, name)}")
 
@@ -253,6 +266,8 @@ class Example:
     slip: Slip | None = None
     words: tuple[Words, ...] | None = None
     """Of every query; None: those of the recording."""
+    onward: tuple[str, ...] | None = None
+    """Of every query, the place that its stand-in tells besides (`TrainingEpisode.next_places`); None: of none."""
     nudge: Nudge = NO_NUDGE
     nudges_I2: Floats | None = None
     """Of each invocation's tool [m]; None: starts are as recorded."""
@@ -284,12 +299,16 @@ class Example:
         return tuple(accumulate((normalised_text(each.text) for each in self.words), lambda old, new: new or old))
 
     def stand_ins(self, size: int) -> Tensor:
-        """`stand_in` of the subgoal in force at every query, (Q, size); with how long it is to wait (`countdown`)."""
-        subgoals = self.episode.subgoals
-        left = waits(subgoals)
-        ticks = [query.tick for query in self.schedule.queries]
-        texts = [counting_down(self.view.text(subgoals[tick]), left[tick]) for tick in ticks]
-        return torch.from_numpy(np.stack([stand_in(text, size, self.episode.instruction) for text in texts]))
+        """`stand_in` of the subgoal in force at every query, (Q, size)."""
+        episode, made = self.episode, []
+        left, onward = waits(episode.subgoals), self.onward or ("",) * len(self.schedule.queries)
+        for query, following in zip(self.schedule.queries, onward, strict=True):
+            text, after = (self.view.text(each) for each in (episode.subgoals[query.tick], following))
+            if (wait := left[query.tick]) is not None:
+                after = as_place(wait)
+                text = text if PLACE.search(text) else f"{text} until {after}"
+            made.append(stand_in(text, size, episode.instruction, after))
+        return torch.from_numpy(np.stack(made))
 
     def stand_in_weights(self, moved: float) -> Tensor:
         """How much each query's stand-in counts, (Q,): ``moved`` where the words said last tell another place, else 1.
@@ -350,6 +369,11 @@ def make_example(
             words = drawn_lapses(lapses, *_subgoals(episode, schedule), rng, config.retold_px)
     is_moved = config.augments == "all" or episode.is_watched
     view = draw_view(config.augmentation if is_moved else NOT_AUGMENTED, form, set(episode.subgoals), rng)
+    onward = None
+    if config.tells_onward:
+        heard_Q = rng.random(len(schedule.queries)) < config.tells_onward
+        places, ticks = episode.next_places(), [query.tick for query in schedule.queries]
+        onward = tuple(places[tick] if is_heard else "" for tick, is_heard in zip(ticks, heard_Q, strict=True))
     nudges_I2 = None
     if config.nudge != NO_NUDGE:
         first_I = np.array([each.tick for each in invocations], np.intp)
@@ -364,6 +388,7 @@ def make_example(
         view=view,
         slip=slip,
         words=words,
+        onward=onward,
         nudge=config.nudge,
         nudges_I2=nudges_I2,
     )

@@ -363,18 +363,21 @@ def small_imitating() -> Curriculum:
     hand = replace(
         releasing,
         name="small_imitating/hand",
+        example=replace(releasing.example, tells_onward=0.85),  # what a PONDER cannot know it does not tell
         train=replace(releasing.train, seed=4, optim=replace(_FROM_SCRATCH, warmup_steps=100, decay=(2800, 5000))),
         num_steps=5000,
     )
     binding = replace(
         binding,
         name="small_imitating/binding",
+        example=replace(binding.example, tells_onward=1.0),
         train=TrainConfig(seed=4, optim=replace(_FROM_SCRATCH, warmup_steps=50)),
         num_steps=900,
     )
     finishing = replace(
         finishing,
         name="small_imitating/finishing",
+        example=replace(finishing.example, tells_onward=1.0),
         train=TrainConfig(seed=5, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(900, 1800))),
         num_steps=1800,
     )

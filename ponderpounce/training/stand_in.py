@@ -56,12 +56,12 @@ _NOWHERE = (PLACE_PX // 2, PLACE_PX // 2)
 
 
 @functools.lru_cache(maxsize=1 << 16)
-def stand_in(subgoal: str, size: int, instruction: str = "") -> NDArray[np.float32]:
+def stand_in(subgoal: str, size: int, instruction: str = "", onward: str = "") -> NDArray[np.float32]:
     """Returns the stand-in (size,) for a grounded subgoal, ``<y, x>`` in pixels of a 256 px picture.
 
     The first coordinates are the place; a subgoal without any points at the middle. Second ones, where the skill leads
-    from one place to another, are within its code. The instruction tells what follows where the subgoal does not
-    (`skill_of`).
+    from one place to another, are within its code; without, those of ``onward`` are, where it goes on afterwards. The
+    instruction tells what follows where the subgoal does not (`skill_of`).
 
     Raises:
         ValueError: ``size`` leaves no room for the text's code.
@@ -71,7 +71,7 @@ def stand_in(subgoal: str, size: int, instruction: str = "") -> NDArray[np.float
         raise ValueError(f"a stand-in of {size} numbers is too small; expected at least {2 * NUM_PLACE_FEATURES}")
     place = PLACE.search(subgoal)
     yx_px = (int(place[1]), int(place[2])) if place else _NOWHERE
-    values = np.concatenate([place_features(yx_px), _skill_code(subgoal, instruction, num_code)])
+    values = np.concatenate([place_features(yx_px), _skill_code(subgoal, instruction, onward, num_code)])
     values.flags.writeable = False
     return values
 
@@ -113,12 +113,12 @@ def even_weights(size: int) -> NDArray[np.float32]:
     return weights
 
 
-def _skill_code(subgoal: str, instruction: str, size: int) -> NDArray[np.float32]:
+def _skill_code(subgoal: str, instruction: str, onward: str, size: int) -> NDArray[np.float32]:
     code = text_code(skill_of(subgoal, instruction), size)
-    places = PLACE.findall(subgoal)
-    if len(places) < 2:
+    places = [*PLACE.findall(subgoal)[1:], *PLACE.findall(onward)]
+    if not places:
         return code
-    second = _second_place(size) @ place_features((int(places[1][0]), int(places[1][1])))
+    second = _second_place(size) @ place_features((int(places[0][0]), int(places[0][1])))
     return _mixed(code, second)
 
 

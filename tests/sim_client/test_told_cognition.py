@@ -31,9 +31,14 @@ def told(
 
     class WithTold(new_rig):  # type: ignore[misc, valid-type]
         def start_ponder(self, link: Link, engine: Any) -> Any:
-            return ToldPonder(link, K, H)
+            return ToldPonder(link, K, H, onward=onward.pop() if onward else None)
 
-    def play(subgoals: list[tuple[int, str]], instruction: str = NO_SWINGS) -> list[m.Cognition]:
+    onward: list[Callable[[], str]] = []
+
+    def play(
+        subgoals: list[tuple[int, str]], instruction: str = NO_SWINGS, after: Callable[[], str] | None = None
+    ) -> list[m.Cognition]:
+        onward[:] = [] if after is None else [after]
         rig = WithTold(pounce_engine=fake_pounce)
         take, left = rig.listen(COGNITION), list(subgoals)
 
@@ -68,3 +73,10 @@ def test_the_last_swing_is_told_by_the_episode_s_instruction(told: Told) -> None
         vectors[instruction] = said[-1].vector
         np.testing.assert_array_equal(said[-1].vector, np.tile(stand_in(SWING, H, instruction), (K, 1)))
     assert not np.array_equal(vectors[TWO_SWINGS], vectors[NO_SWINGS])
+
+
+def test_where_it_goes_on_is_told_besides_if_somebody_knows(told: Told) -> None:
+    text = "pick up the container at <30, 40>"
+    for place in ("<80, 90>", ""):
+        for each in told([(0, text)], after=lambda place=place: place):
+            np.testing.assert_array_equal(each.vector, np.tile(stand_in(text, H, onward=place), (K, 1)))

@@ -85,3 +85,20 @@ def test_a_way_is_told_with_its_places_and_how_it_goes_on(task: str) -> None:
         assert following.count(there) >= 1
     assert len(re.findall("<", told[-1])) == 1
     assert all("<" in text for text in found[True][0])
+
+
+def test_where_the_next_subgoal_will_be_is_where_its_thing_stands(worlds: dict[bool, Environment]) -> None:
+    environment = worlds[True]
+    environment.reset(SEED, "easy")
+    places = [re.findall(r"<(\d+), (\d+)>", environment.onward())]
+    for action in environment.oracle():
+        snapshot = environment.step(action)
+        if snapshot.status is not Status.ONGOING:
+            break
+        places.append(re.findall(r"<(\d+), (\d+)>", environment.onward()))
+        if snapshot.subgoal_index == 1:
+            (told,) = re.findall(r"<(\d+), (\d+)>", snapshot.grounded_subgoal)
+            (foretold,) = places[0]
+            assert np.abs(np.array(told, float) - np.array(foretold, float)).max() <= 2
+    assert snapshot.status is Status.SUCCESS
+    assert places[-1] == []  # nothing comes after the last

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from clock.sampling import EVALUATION
 from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features
-from ponderpounce.training.countdown import counting_down, waits
-from ponderpounce.training.stand_in import skill_of, stand_in
+from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.ponder_configs import tiny_cpu
+from ponderpounce.training.countdown import as_place, waits
+from ponderpounce.training.example import ExampleConfig, TrainingEpisode, make_example
+from ponderpounce.training.stand_in import stand_in
 
 HOVER, STILL, PRESS = (
     "move to the top of the button at <60, 90> to prepare",
@@ -27,15 +33,37 @@ def test_a_wait_ends_where_it_no_longer_waits(hover: int, still: int, press: int
 
 def test_texts_that_do_not_wait_are_left() -> None:
     assert waits(["pick it up", "place it"]) == [None, None]
-    assert counting_down(PRESS, None) == PRESS
 
 
-@given(wait=st.integers(1, 600))
-def test_a_stand_in_tells_the_wait(wait: int) -> None:
+FORM = Ponder.random(replace(tiny_cpu(), image_px=(32, 32), num_layers=4), seed=1).format
+
+
+def test_every_query_is_told_its_own_wait() -> None:
     """Where nothing else is told as the place itself; beside the place where the tool is to be all the same."""
-    still, hover = (stand_in(counting_down(text, wait), 128) for text in (STILL, HOVER))
-    np.testing.assert_array_equal(still[:NUM_PLACE_FEATURES], place_features((0, min(wait, 255))))
-    np.testing.assert_array_equal(hover[:NUM_PLACE_FEATURES], place_features((60, 90)))
-    sooner = stand_in(counting_down(HOVER, max(1, wait - 1)), 128)
-    assert np.array_equal(sooner, hover) == (wait == 1 or wait > 255)
-    assert skill_of(counting_down(STILL, wait)) == skill_of(counting_down(STILL, 1))
+    texts = [HOVER] * 40 + [STILL] * 300 + [PRESS] * 30
+    num_ticks = len(texts)
+    recorded = TrainingEpisode(
+        instruction="stop it",
+        demo=(),
+        frames=[(np.zeros((32, 32, 3), np.uint8),) * 2] * num_ticks,
+        state_T8=np.zeros((num_ticks, 8), np.float32),
+        action_T8=np.zeros((num_ticks, 8), np.float32),
+        subgoals=texts,
+        is_transition_T=np.isin(np.arange(num_ticks), (0, 40, 340)),
+    )
+    example = make_example(recorded, FORM, ExampleConfig(clocks=EVALUATION), np.random.default_rng(0))
+    made = example.stand_ins(128).numpy()
+    for query, vector in zip(example.schedule.queries, made, strict=True):
+        wait = 340 - query.tick
+        place = vector[:NUM_PLACE_FEATURES]
+        if texts[query.tick] == STILL:
+            np.testing.assert_array_equal(place, place_features((0, min(wait, 255))))
+        elif texts[query.tick] == HOVER:
+            np.testing.assert_array_equal(place, place_features((60, 90)))
+            np.testing.assert_array_equal(vector, stand_in(HOVER, 128, onward=as_place(wait)))
+        else:
+            np.testing.assert_array_equal(vector, stand_in(PRESS, 128))
+
+
+def test_the_longest_wait_is_as_long_as_a_picture_is_wide() -> None:
+    assert [as_place(wait) for wait in (1, 255, 256, 900)] == ["<0, 1>", *["<0, 255>"] * 3]

@@ -31,6 +31,7 @@ from ponderpounce.training.example import (
     target_rows,
 )
 from ponderpounce.training.places import misplaced
+from ponderpounce.training.stand_in import stand_in
 from pounce_server.contract import Request
 
 PONDER = Ponder.random(replace(tiny_ponder(), image_px=(64, 64), num_layers=4), seed=1)
@@ -289,6 +290,28 @@ def test_a_plan_of_a_way_tells_every_stretch_and_how_it_is_gone() -> None:
     ]
     unseen = replace(recorded, demo=()).with_plans()
     assert unseen.words[0] == texts[0]  # nothing was shown by then
+
+
+def test_a_stand_in_can_tell_where_it_goes_on() -> None:
+    """Of the share of queries that are to be told, and where the next subgoal has a place."""
+    texts = ["pick at <1, 1>"] * 60 + ["put at <100, 40>"] * 60 + ["press"] * 60
+    recorded = replace(episode(180, changes=(0, 60, 120)), subgoals=texts)
+    after = ["<100, 40>"] * 60 + [""] * 120
+    assert recorded.next_places() == after
+    for share in (0.0, 0.5, 1.0):
+        config = ExampleConfig(clocks=EVALUATION, tells_onward=share)
+        told = total = 0
+        for seed in range(20):
+            example = make_example(recorded, FORM, config, np.random.default_rng(seed))
+            for query, vector in zip(example.schedule.queries, example.stand_ins(64).numpy(), strict=True):
+                plain, onward = (stand_in(texts[query.tick], 64, onward=each) for each in ("", after[query.tick]))
+                is_told = np.array_equal(vector, onward)
+                assert is_told or np.array_equal(vector, plain)
+                if after[query.tick]:
+                    told, total = told + is_told, total + 1
+        assert abs(told / total - share) < (0.15 if share == 0.5 else 1e-9)
+    with pytest.raises(ValueError, match="tells_onward"):
+        ExampleConfig(clocks=EVALUATION, tells_onward=1.5)
 
 
 def test_reasoning_can_be_left_unwritten() -> None:
