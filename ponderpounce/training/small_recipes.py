@@ -355,31 +355,32 @@ def small_further() -> Curriculum:
 
 
 def small_imitating() -> Curriculum:
-    """The pair of `small_further` learns three tasks of imitation, and to note what demonstrations do (`deeds`).
+    """The pair of `small_further` learns four tasks more, where to go on, and to note what demonstrations do (`deeds`).
 
-    `hand` trains POUNCE and needs none of the others.
+    `hand` trains POUNCE and needs none of the others; `finishing` is for what the hand has played (`pp-train --watch`).
     """
     _, releasing, binding, _, finishing = small_further().stages
     hand = replace(
         releasing,
         name="small_imitating/hand",
         example=replace(releasing.example, tells_onward=0.85),  # what a PONDER cannot know it does not tell
-        train=replace(releasing.train, seed=4, optim=replace(_FROM_SCRATCH, warmup_steps=100, decay=(2800, 5000))),
-        num_steps=5000,
+        train=replace(releasing.train, seed=4, optim=replace(_FROM_SCRATCH, warmup_steps=100, decay=(4200, 7000))),
+        num_steps=7000,
     )
     binding = replace(
         binding,
         name="small_imitating/binding",
         example=replace(binding.example, tells_onward=1.0),
         train=TrainConfig(seed=4, optim=replace(_FROM_SCRATCH, warmup_steps=50)),
-        num_steps=900,
+        num_steps=700,
     )
     finishing = replace(
         finishing,
         name="small_imitating/finishing",
         example=replace(finishing.example, tells_onward=1.0),
-        train=TrainConfig(seed=5, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(900, 1800))),
-        num_steps=1800,
+        train=TrainConfig(seed=5, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(700, 1500))),
+        num_steps=1500,
+        batch_episodes=12,
     )
     return Curriculum(name="small_imitating", stages=(hand, binding, finishing))
 

@@ -115,8 +115,9 @@ class MoveCube(Task[Layout, None]):
         return tuple(replace(layout, manner=manner) for manner in MANNERS if manner != layout.manner)
 
     def things(self, layout: Layout, step: int) -> tuple[Thing, ...]:
-        target = Thing(name="target", body=_TARGET, is_movable=False)
-        return (target, Thing(name=f"{layout.demonstrated.cube.color} cube", body=_CUBE), Thing(name="peg", body=_TAIL))
+        fixed = {"target": _TARGET, "peg": _TAIL}  # half a peg cannot be put anywhere by itself
+        cube = Thing(name=f"{layout.demonstrated.cube.color} cube", body=_CUBE)
+        return (*(Thing(name=name, body=body, is_movable=False) for name, body in fixed.items()), cube)
 
     def remember(self, memory: None, physics: Physics, layout: Layout) -> None:
         return None
