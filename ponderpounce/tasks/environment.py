@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ponderpounce.tasks import captions, demonstration, engine, forks, panda, sight
+from ponderpounce.tasks import captions, demonstration, engine, forks, panda, predicates, sight
 from ponderpounce.tasks.captions import Caption
 from ponderpounce.tasks.demonstration import Row
 from ponderpounce.tasks.difficulty import DIFFICULTIES, Order
@@ -74,9 +74,9 @@ def make_environment(
     """Returns an environment of a registered task. Raises TaskError for an unknown name.
 
     With ``texts_follow`` the coordinates of a grounded subgoal are corrected when its things have been pushed
-    elsewhere, and there are some where upstream tells a way without its end (`located`); upstream's stay where they
-    were first seen. An ``order`` other than upstream's changes the list of
-    subtasks, and with it texts and oracle; scenes and what counts as success stay the same.
+    elsewhere, there are some where upstream tells a way without its end (`located`), and what was dropped on its way is
+    to be picked up again; upstream's stay where they were first seen, and go on. An ``order`` other than upstream's
+    changes the list of subtasks, and with it texts and oracle; scenes and what counts as success stay the same.
     """
     return Environment(
         make_task(name), image_px=image_px, render=render, max_steps=max_steps, texts_follow=texts_follow, order=order
@@ -223,6 +223,8 @@ class Environment:
         """
         self._require_episode()
         motions = Motions(self.physics) if motions is None else motions
+        if (again := self._to_pick_up_again()) is not None:
+            yield from self._subtasks[again].motion(motions)
         for subtask in self._subtasks[self._progress.index :]:
             yield from subtask.motion(motions)
 
@@ -230,7 +232,8 @@ class Environment:
         """Returns where the next subgoal will be, ``<y, x>``: the first of its things as it stands; empty if none."""
         self._require_episode()
         assert self._caption is not None
-        following = self._subtasks[self._caption.index + 1 :][:1]
+        is_lost = self._to_pick_up_again() is not None
+        following = self._subtasks[self._progress.index if is_lost else self._caption.index + 1 :][:1]
         return "".join("<{}, {}>".format(*self._project(step.grounds[:1])[0]) for step in following if step.grounds)
 
     def save(self) -> EpisodeState:
@@ -310,6 +313,8 @@ class Environment:
         if self._progress.status is Status.ONGOING and self._step >= self._max_steps:
             reason = f"not done after {self._max_steps} steps"
             self._progress = Progress(index=self._progress.index, status=Status.TIMEOUT, reason=reason)
+        if self._progress.index == spoken_of and (again := self._to_pick_up_again()) is not None:
+            spoken_of = again
         subtask = self._subtasks[spoken_of]
         caption = captions.follow(self._caption, spoken_of, subtask.text, lambda: self._look_at(subtask))
         if self._texts_follow:
@@ -318,6 +323,22 @@ class Environment:
             caption = captions.completed(caption)
         self._caption = caption
         return self._snapshot(look=look)
+
+    def _to_pick_up_again(self) -> int | None:
+        """With ``texts_follow``: the subtask that picked up what has to be carried now and was dropped on the way.
+
+        From when it lies on the table until it is picked up again. The engine's subtask stays the one it is.
+        """
+        index, physics = self._progress.index, self.physics
+        cubes = self._subtasks[index].carries if self._texts_follow else ()
+        if not cubes:
+            return None
+        before = max(at for at in range(index) if self._subtasks[at].grounds == cubes[:1])
+        if self._caption is not None and self._caption.index == before:  # it has not been in the hand since
+            is_lost = predicates.first_picked(physics, cubes) is None
+        else:
+            is_lost = predicates.is_dropped(physics, cubes[0]) and not any(map(physics.is_grasped, cubes))
+        return before if is_lost else None
 
     def _following(self, caption: captions.Caption, subtask: Subtask) -> captions.Caption:
         """The caption with new coordinates, if its things were pushed elsewhere (not lifted) and can be seen."""

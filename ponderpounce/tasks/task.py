@@ -50,6 +50,7 @@ class Subtask:
     motion: Callable[[Motions], Iterator[NDArray[np.float32]]]  # what the oracle does for it
     failure: Callable[[Physics, Any], str | None] = never  # the reason, or None while there is none
     grounds: tuple[str, ...] = ()  # bodies whose pixels fill the template's coordinates, in order
+    carries: tuple[str, ...] = ()  # the cube that must be in the hand for it, and others that will do
     way: str = ""  # what `located` adds to the text; nothing in most tasks, whose texts tell places anyway
     way_grounds: tuple[str, ...] = ()  # bodies whose pixels fill its coordinates, in order
 

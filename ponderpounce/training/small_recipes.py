@@ -357,7 +357,8 @@ def small_further() -> Curriculum:
 def small_imitating() -> Curriculum:
     """The pair of `small_further` learns four tasks more, where to go on, and to note what demonstrations do (`deeds`).
 
-    `hand` trains POUNCE and needs none of the others; `finishing` is for what the hand has played (`pp-train --watch`).
+    `hand` and `carrying` train POUNCE and need none of the others; `finishing` is for what the hand has played
+    (`pp-train --watch`).
     """
     _, releasing, binding, _, finishing = small_further().stages
     hand = replace(
@@ -366,6 +367,13 @@ def small_imitating() -> Curriculum:
         example=replace(releasing.example, tells_onward=0.85),  # what a PONDER cannot know it does not tell
         train=replace(releasing.train, seed=4, optim=replace(_FROM_SCRATCH, warmup_steps=100, decay=(4200, 7000))),
         num_steps=7000,
+    )
+    carrying = replace(  # it let go a few centimetres before the target
+        hand,
+        name="small_imitating/carrying",
+        example=replace(hand.example, event_weight=2.0),
+        train=replace(hand.train, seed=6, optim=replace(_FROM_SCRATCH, warmup_steps=100, decay=(3000, 6000))),
+        num_steps=6000,
     )
     binding = replace(
         binding,
@@ -382,7 +390,7 @@ def small_imitating() -> Curriculum:
         num_steps=1500,
         batch_episodes=12,
     )
-    return Curriculum(name="small_imitating", stages=(hand, binding, finishing))
+    return Curriculum(name="small_imitating", stages=(hand, carrying, binding, finishing))
 
 
 def small_refresh(period_s: int) -> Recipe:

@@ -102,3 +102,36 @@ def test_where_the_next_subgoal_will_be_is_where_its_thing_stands(worlds: dict[b
             assert np.abs(np.array(told, float) - np.array(foretold, float)).max() <= 2
     assert snapshot.status is Status.SUCCESS
     assert places[-1] == []  # nothing comes after the last
+
+
+@pytest.mark.parametrize("follow", [False, True])
+def test_what_was_dropped_on_its_way_is_to_be_picked_up_again(worlds: dict[bool, Environment], follow: bool) -> None:
+    """Upstream's words go on as if it were in the hand; the oracle that knows of it solves the task all the same."""
+    environment = worlds[follow]
+    environment.reset(SEED, "easy")
+    picked, placing = (subtask.grounds[0] for subtask in environment.subtasks[:2])
+    script = environment.oracle()
+    for action in script:
+        snapshot = environment.step(action)
+        if snapshot.subgoal_index == 1:
+            break
+    assert placing != picked
+    opened = snapshot.command.copy()
+    opened[-1] = 1.0
+    spoken_of = [environment.step(opened).subgoal_index for _ in range(30)]
+    assert spoken_of[0] == 1  # it is falling
+    assert spoken_of[-1] == (0 if follow else 1)
+    assert environment.save().progress.index == 1
+    if not follow:
+        return
+    here, onward = environment.step(opened).grounded_subgoal, environment.onward()
+    assert here.startswith(environment.subtasks[0].text[:10])
+    found = [snapshot.subgoal_index]
+    for action in environment.oracle():
+        snapshot = environment.step(action)
+        found.append(snapshot.subgoal_index)
+        if snapshot.status is not Status.ONGOING:
+            break
+    assert snapshot.status is Status.SUCCESS
+    assert list(dict.fromkeys(found[1:]))[:2] == [0, 1]
+    assert onward == "".join(f"<{y}, {x}>" for y, x in [environment._project([placing])[0]])

@@ -126,6 +126,7 @@ class BinFill(Task[Layout, Memory]):
                         is_done=_has_binned(num_binned),
                         failure=_pressed_early,
                         motion=lambda motions: motions.drop_into(_BIN),
+                        carries=(name, *_CUBES[: len(layout.cubes)]),
                     ),
                 ]
         steps.append(

@@ -86,6 +86,7 @@ class PickXtimes(Task[Layout, None]):
                     is_done=lambda physics, memory: predicates.is_dropped_onto(physics, cube, _TARGET),
                     failure=early,
                     motion=lambda motions: motions.place(_TARGET),
+                    carries=(cube,),
                 ),
             ]
         steps.append(

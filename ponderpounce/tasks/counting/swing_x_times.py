@@ -123,6 +123,7 @@ class SwingXtimes(Task[Layout, Memory]):
                 is_done=_is_over(cube, side),
                 failure=failure,
                 motion=_swing_over(side),
+                carries=(cube,),
             )
             for nth in captions.ORDINALS[: layout.repeats]
             for side in _SIDES

@@ -215,6 +215,7 @@ _SUBTASKS: dict[str, tuple[Subtask, ...]] = {
             grounds=(_TARGET,),
             is_done=lambda physics, memory: predicates.is_dropped_onto(physics, _CUBE, _TARGET),
             motion=lambda motions: motions.place(_TARGET),
+            carries=(_CUBE,),
         ),
     ),
 }

@@ -151,6 +151,7 @@ class VideoPlace(Task[Layout, Rest | None]):
                 is_done=lambda physics, memory: predicates.is_dropped_onto(physics, cube, target),
                 failure=_wrong_target(layout),
                 motion=_place(target),
+                carries=(cube,),
             ),
         )
 
