@@ -17,6 +17,7 @@ from ponderpounce.tasks.difficulty import DIFFICULTIES, Order
 from ponderpounce.tasks.engine import Progress, Status
 from ponderpounce.tasks.forks import Fork
 from ponderpounce.tasks.geometry import Array, pose_of
+from ponderpounce.tasks.kinematics import UnreachableError
 from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.physics import CONTROL_HZ, Physics, PhysicsState
 from ponderpounce.tasks.rendering import Cameras
@@ -24,6 +25,7 @@ from ponderpounce.tasks.scene import FRONT, table_scene
 from ponderpounce.tasks.task import Shown, StepT, Subtask, Task, TaskError, located, make_task
 
 IMAGE_PX = 256  # upstream's; grounded texts count in these pixels
+_MAX_DRAWS = 20
 _PUSHED_M = 0.01  # texts that follow are corrected from this distance on
 MAX_STEPS = 1300  # the paper's limit; upstream's own default is 10000
 
@@ -140,19 +142,25 @@ class Environment:
         """Starts an episode and returns its first snapshot; a demonstration, if there is one, has been given by then.
 
         The seed alone decides the scene. Without a difficulty it is the seed's remainder by three: easy, medium,
-        hard, as upstream. A ``layout`` takes the place of the drawn one. Raises TaskError for an unknown
-        difficulty.
+        hard, as upstream. A scene in which the arm cannot act out the demonstration is drawn again, as upstream's are
+        until its planner solves one; a ``layout`` takes the place of the drawn ones. Raises TaskError for an unknown
+        difficulty, and UnreachableError if there is no such scene.
         """
         difficulty = DIFFICULTIES[seed % 3] if difficulty is None else difficulty
         if difficulty not in DIFFICULTIES:
             raise TaskError(f"unknown difficulty {difficulty!r}; expected one of {', '.join(DIFFICULTIES)}")
-        if layout is None:
-            layout = self._task.sample(np.random.default_rng(seed), difficulty)
-        if self._order == "near-first":
-            layout = self._task.near_first(layout)
-        self._begin(difficulty, layout)
-        parts = [self._told(part) for part in self._task.demonstration(layout)]
-        self._video, last_action = demonstration.perform(self._task, layout, parts, self.physics, self._look_at)
+        rng, is_given = np.random.default_rng(seed), layout is not None
+        for tries_left in reversed(range(_MAX_DRAWS)):
+            layout = layout if is_given else self._task.sample(rng, difficulty)
+            layout = self._task.near_first(layout) if self._order == "near-first" else layout
+            self._begin(difficulty, layout)
+            parts = [self._told(part) for part in self._task.demonstration(layout)]
+            try:
+                self._video, last_action = demonstration.perform(self._task, layout, parts, self.physics, self._look_at)
+                break
+            except UnreachableError:
+                if is_given or tries_left == 0:
+                    raise
         # Upstream's reset spends one control step too: the button's cap settles on its spring.
         at_rest = np.append(panda.HOME_QPOS, self.physics.robot.rest_command)
         self.physics.advance(at_rest if last_action is None else last_action)

@@ -13,6 +13,7 @@ from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import Environment, Snapshot
 from ponderpounce.tasks.geometry import is_clear
 from ponderpounce.tasks.imitation.move_cube import MANNERS, MoveCube, Scene
+from ponderpounce.tasks.kinematics import UnreachableError
 from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.pegs import peg_footprint
 
@@ -142,3 +143,15 @@ def test_the_oracle_solves_98_of_100_seeds_in_upstreams_time(env: Environment, p
             steps.append(len(env.save().video) + snapshot.step)
     assert len(steps) >= 98
     assert np.mean(steps) == pytest.approx(394, rel=0.12)
+
+
+def test_a_scene_whose_video_the_arm_cannot_act_out_is_drawn_again(env: Environment) -> None:
+    seed = 710_001
+    first = MoveCube().sample(np.random.default_rng(seed), "hard")
+    with pytest.raises(UnreachableError):
+        env.reset(seed, "hard", layout=first)
+    env.reset(seed, "hard")
+    drawn = env.layout
+    assert drawn != first
+    env.reset(seed, "hard")
+    assert env.layout == drawn
