@@ -132,10 +132,10 @@ class Studio:
         """One scene, what there is to say of it, and both cameras' pictures; equal seeds give equal ones."""
         rng, physics = np.random.default_rng([seed, _POSES]), self.physics
         layout, _ = self.arranged(seed)
-        step = int(rng.choice(_STEPS))
+        step, memory = int(rng.choice(_STEPS)), self.task.imagined(rng, layout)
         for now in range(step + 1):  # scripts move things at their own steps only
-            self.task.stage(physics, layout, None, now)
-        things = self.task.things(layout, step)
+            self.task.stage(physics, layout, memory, now)
+        things = self.task.things(layout, step, memory)
         # what is highlighted lies where it lies
         self.pose_tool(rng, [thing.body for thing in things if thing.is_movable] if step == 0 else [])
         row = Row(

@@ -164,9 +164,16 @@ class Task(ABC, Generic[LayoutT, MemoryT]):
         """
         return layout
 
-    def things(self, layout: LayoutT, step: int) -> tuple[Thing, ...]:
+    def things(self, layout: LayoutT, step: int, memory: MemoryT | None = None) -> tuple[Thing, ...]:
         """Returns all that is to be named in the observation of ``step`` (`data.album`). The default names nothing."""
         return ()
+
+    def imagined(self, rng: np.random.Generator, layout: LayoutT) -> MemoryT | None:
+        """Draws what may have happened, where a scene that stands still shows traces of it (`data.album`).
+
+        The default is None: nothing has.
+        """
+        return None
 
     @classmethod
     def can_be_forked(cls) -> bool:

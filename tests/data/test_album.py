@@ -53,8 +53,8 @@ NAMED = {
     "SwingXtimes": {*CUBES, "target", "button"},
     "StopCube": {"button", "target", "running cube"},
     "MoveCube": {"red cube", "target", "peg"},
-    "PatternLock": {"grey target"},
-    "RouteStick": {"grey target", "post"},
+    "PatternLock": {"grey target", "red target"},
+    "RouteStick": {"grey target", "red target", "post"},
 }
 
 

@@ -164,7 +164,7 @@ class BinFill(Task[Layout, Memory]):
                 cubes[index] = cube
         return replace(layout, cubes=tuple(cubes))
 
-    def things(self, layout: Layout, step: int) -> tuple[Thing, ...]:
+    def things(self, layout: Layout, step: int, memory: object = None) -> tuple[Thing, ...]:
         shown = [(n, c) for n, c in zip(_CUBES, layout.cubes, strict=False) if layout.appears_at_step(n) <= step]
         cubes = (Thing(name=f"{cube.color} cube", body=name) for name, cube in shown)
         fixed = {"button": f"{_BUTTON}/cap", "bin": _BIN}

@@ -108,7 +108,7 @@ class PickXtimes(Task[Layout, None]):
         text = count + f"Next, move the {color} cube[ at <>] to the target[ at <>]."
         return Reasoning(text=text, grounds=(_CUBES[layout.asked], _TARGET))
 
-    def things(self, layout: Layout, step: int) -> tuple[Thing, ...]:
+    def things(self, layout: Layout, step: int, memory: object = None) -> tuple[Thing, ...]:
         fixed = {"button": f"{_BUTTON}/cap", "target": _TARGET}
         cubes = (Thing(name=f"{c.color} cube", body=name) for name, c in zip(_CUBES, layout.cubes, strict=False))
         return (*(Thing(name=name, body=body, is_movable=False) for name, body in fixed.items()), *cubes)

@@ -166,7 +166,7 @@ class StopCube(Task[Layout, Memory]):
         text = count + f"Next, stop the cube at the target[ at <>] on visit {layout.visit}."
         return Reasoning(text=text, grounds=(_TARGET,))
 
-    def things(self, layout: Layout, step: int) -> tuple[Thing, ...]:
+    def things(self, layout: Layout, step: int, memory: object = None) -> tuple[Thing, ...]:
         named = {"button": f"{_BUTTON}/cap", "target": _TARGET, "running cube": _CUBE}
         return tuple(Thing(name=name, body=body, is_movable=False) for name, body in named.items())
 

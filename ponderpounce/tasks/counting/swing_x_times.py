@@ -168,7 +168,7 @@ class SwingXtimes(Task[Layout, Memory]):
         text = count + f"Next, move the {color} cube[ at <>] to the {side}-side target[ at <>]."
         return Reasoning(text=text, grounds=(_CUBES[layout.asked], _target(side)))
 
-    def things(self, layout: Layout, step: int) -> tuple[Thing, ...]:
+    def things(self, layout: Layout, step: int, memory: object = None) -> tuple[Thing, ...]:
         cubes = (Thing(name=f"{c.color} cube", body=name) for name, c in zip(_CUBES, layout.cubes, strict=False))
         targets = (Thing(name="target", body=_target(side), is_movable=False) for side in _SIDES)
         return (Thing(name="button", body=f"{_BUTTON}/cap", is_movable=False), *targets, *cubes)

@@ -114,7 +114,7 @@ class MoveCube(Task[Layout, None]):
         """The cube of the same video was moved in another manner."""
         return tuple(replace(layout, manner=manner) for manner in MANNERS if manner != layout.manner)
 
-    def things(self, layout: Layout, step: int) -> tuple[Thing, ...]:
+    def things(self, layout: Layout, step: int, memory: object = None) -> tuple[Thing, ...]:
         fixed = {"target": _TARGET, "peg": _TAIL}  # half a peg cannot be put anywhere by itself
         cube = Thing(name=f"{layout.demonstrated.cube.color} cube", body=_CUBE)
         return (*(Thing(name=name, body=body, is_movable=False) for name, body in fixed.items()), cube)

@@ -141,9 +141,13 @@ class PatternLock(Task[Layout, Touches]):
             for other in _turned_away(layout.side, layout.pattern, shared)
         )
 
-    def things(self, layout: Layout, step: int) -> tuple[Thing, ...]:
-        buttons = _BUTTONS[: layout.side**2]
-        return tuple(Thing(name=traces.TARGET_NAME, body=button, is_movable=False) for button in buttons)
+    def things(self, layout: Layout, step: int, memory: Touches | None = None) -> tuple[Thing, ...]:
+        touches = dict(zip(layout.pattern, memory, strict=True)) if memory else {}
+        buttons = range(layout.side**2)
+        return traces.named([_BUTTONS[at] for at in buttons], tuple(touches.get(at) for at in buttons))
+
+    def imagined(self, rng: np.random.Generator, layout: Layout) -> Touches:
+        return traces.imagined(rng, len(layout.pattern))
 
     def remember(self, memory: Touches | None, physics: Physics, layout: Layout) -> Touches:
         return traces.followed(memory, [_is_touched(physics, button) for button in layout.pattern])

@@ -168,9 +168,13 @@ class RouteStick(Task[Layout, Memory]):
             for move, side in enumerate(layout.sides)
         )
 
-    def things(self, layout: Layout, step: int) -> tuple[Thing, ...]:
-        named = ((traces.TARGET_NAME, _TARGETS), ("post", _POSTS))
-        return tuple(Thing(name=name, body=body, is_movable=False) for name, bodies in named for body in bodies)
+    def things(self, layout: Layout, step: int, memory: Memory | None = None) -> tuple[Thing, ...]:
+        posts = (Thing(name="post", body=post, is_movable=False) for post in _POSTS)
+        return (*traces.named(_TARGETS, memory.touches if memory else (None,) * len(_TARGETS)), *posts)
+
+    def imagined(self, rng: np.random.Generator, layout: Layout) -> Memory:
+        touches = traces.imagined(rng, len(_TARGETS))
+        return Memory(move=0, has_arrived=False, num_points=1, sum_xy_m=(0.0, 0.0), touches=touches)
 
     def remember(self, memory: Memory | None, physics: Physics, layout: Layout) -> Memory:
         x_m, y_m, _ = physics.tcp_transform()[:3, 3].tolist()

@@ -10,18 +10,19 @@ from collections.abc import Sequence
 from typing import Any
 
 import mujoco
+import numpy as np
 
 from ponderpounce.tasks.geometry import pose
 from ponderpounce.tasks.physics import Physics
 from ponderpounce.tasks.props import GRAY, NUM_RINGS, RED, add_dot, add_rings, add_target
 from ponderpounce.tasks.scene import RGBA, WHITE
+from ponderpounce.tasks.task import Thing
 
 TARGET_Z_M = 0.01  # of a target's centre
 RED_STEPS = 40  # a target stays red for so long after the last touch
 TRAIL_STEPS = 41  # as long is a dot seen
 LOW_Z_M = 0.1  # a tip that is higher leaves no dots
 
-TARGET_NAME = "grey target"  # in albums, red or not
 
 _RADIUS_M, _HALF_HEIGHT_M = 0.02, 0.005
 _RED_RADIUS_M, _RED_HALF_HEIGHT_M, _RED_BELOW_M = 0.02 * 1.002, 0.02 * 1.002, 0.01
@@ -54,10 +55,26 @@ def followed(before: Touches | None, is_touched: Sequence[bool]) -> Touches:
     return tuple(0 if now else None if then is None else then + 1 for now, then in zip(is_touched, since, strict=True))
 
 
+def imagined(rng: np.random.Generator, count: int) -> Touches:
+    """Touches of so many targets as they may be at some time: of up to three, most of them not long ago."""
+    touched = rng.permutation(count)[: rng.integers(4)].tolist()
+    since = rng.integers(2 * TRAIL_STEPS, size=count).tolist()
+    return tuple(since[index] if index in touched else None for index in range(count))
+
+
+def named(targets: Sequence[str], touches: Touches) -> tuple[Thing, ...]:
+    """The targets as things, by the colour that they show."""
+    colors = ("red" if _is_red(since) else "grey" for since in touches)
+    return tuple(
+        Thing(name=f"{color} target", body=target, is_movable=False)
+        for color, target in zip(colors, targets, strict=True)
+    )
+
+
 def show_touches(physics: Physics, targets: Sequence[str], touches: Touches) -> None:
     """Paints the targets that were touched red, and the others grey."""
     for target, since in zip(targets, touches, strict=True):
-        is_red = since is not None and since <= RED_STEPS
+        is_red = _is_red(since)
         for ring in range(NUM_RINGS):
             shown = WHITE if ring % 2 else RED
             physics.paint(f"{_red(target)}/{ring}", shown if is_red else _UNSEEN)
@@ -71,6 +88,10 @@ def leave_dot(physics: Physics, step: int) -> None:
         physics.place(dot, pose(x_m, y_m, _DOT_Z_M))
     else:
         physics.park(dot)
+
+
+def _is_red(since: int | None) -> bool:
+    return since is not None and since <= RED_STEPS
 
 
 def way(manners: Sequence[str], ends: Sequence[str], move: int) -> dict[str, Any]:

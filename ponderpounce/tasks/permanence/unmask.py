@@ -78,7 +78,7 @@ class Unmask(Task[Layout, Pressed]):
             return
         physics.refresh()
 
-    def things(self, layout: Layout, step: int) -> tuple[Thing, ...]:
+    def things(self, layout: Layout, step: int, memory: object = None) -> tuple[Thing, ...]:
         """Cubes as long as they lie bare, then containers."""
         caps = [f"{name}/cap" for name in button_names(self.num_buttons)]
         buttons = [Thing(name="button", body=cap, is_movable=False) for cap in caps]

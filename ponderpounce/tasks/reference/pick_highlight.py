@@ -134,7 +134,7 @@ class PickHighlight(Task[Layout, Memory]):
         nearest = sorted(layout.targets, key=lambda target: -layout.cubes[target].x_m)
         return replace(layout, targets=tuple(nearest))
 
-    def things(self, layout: Layout, step: int) -> tuple[Thing, ...]:
+    def things(self, layout: Layout, step: int, memory: object = None) -> tuple[Thing, ...]:
         lit = layout.targets if step in HIGHLIGHT_STEPS else ()
         names = [f"{'highlighted ' * (i in lit)}{cube.color} cube" for i, cube in enumerate(layout.cubes)]
         cubes = [Thing(name=name, body=body) for name, body in zip(names, _CUBES, strict=False)]
