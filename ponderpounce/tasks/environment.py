@@ -27,6 +27,7 @@ from ponderpounce.tasks.task import Shown, StepT, Subtask, Task, TaskError, loca
 IMAGE_PX = 256  # upstream's; grounded texts count in these pixels
 _MAX_DRAWS = 20
 _PUSHED_M = 0.01  # texts that follow are corrected from this distance on
+_NUM_WATCHED = 2
 MAX_STEPS = 1300  # the paper's limit; upstream's own default is 10000
 
 
@@ -409,9 +410,20 @@ class Environment:
         """A frame of the video, seen through a world that is put back as it was."""
         now = self.physics.save()
         self.physics.load(row.physics)
-        snapshot = self._seen(step, Progress(), row.caption, look=look, is_demonstration=True)
+        snapshot = self._seen(step, Progress(), self._watching(row.caption), look=look, is_demonstration=True)
         self.physics.load(now)
         return snapshot
+
+    def _watching(self, caption: Caption) -> Caption:
+        """With ``texts_follow``: the caption of a frame that names no place, with where the first two things are that
+        the robot will be asked for. What changes places meanwhile is to be followed; nothing else says where to.
+        """
+        if not self._texts_follow or "<" in caption.grounded:
+            return caption
+        bodies = [*dict.fromkeys(body for subtask in self._subtasks for body in subtask.grounds[:1])][:_NUM_WATCHED]
+        points = [] if any(map(self.physics.is_parked, bodies)) else self._project(bodies)
+        there = ", ".join(f"<{y}, {x}>" for y, x in points)
+        return replace(caption, grounded=f"{caption.grounded} at {there}") if points else caption
 
     def _snapshot(self, *, look: bool = True) -> Snapshot:
         assert self._caption is not None

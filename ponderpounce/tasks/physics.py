@@ -103,6 +103,10 @@ class Physics:
             # An upward push equal to its weight; unlike model.body_gravcomp it is part of the saved state.
             self.data.xfrc_applied[body.id, :3] = -self.model.body_subtreemass[body.id] * self.model.opt.gravity
 
+    def is_parked(self, name: str) -> bool:
+        """Whether a prop is out of sight where `park` puts it."""
+        return bool(np.array_equal(self.position_m(name)[1:], _PARK_XYZ_M[1:]))
+
     def paint(self, geom: str, rgba: RGBA) -> None:
         """Colours a geom until the next `reset`."""
         self.model.geom(geom).rgba[:] = rgba

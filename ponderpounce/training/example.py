@@ -23,6 +23,7 @@ from ponderpounce.models.normalisation import Floats
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.training.augment import AS_IT_IS, NOT_AUGMENTED, Augmentation, View, draw_view
 from ponderpounce.training.countdown import as_place, waits
+from ponderpounce.training.deeds import narration
 from ponderpounce.training.events import draw_near, event_ticks
 from ponderpounce.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses, has_moved, without_lapses
 from ponderpounce.training.nudge import NO_NUDGE, Nudge, draw_nudges
@@ -202,6 +203,9 @@ class ExampleConfig:
     has_reasoning: bool = True
     """False: nothing is written after a demonstration but the subgoal. The paper's PONDER can write; one from scratch
     would learn little else."""
+    narrates: bool = False
+    """After a demonstration `narration` is written. Deeds are then looked up in words, in which a number or a neighbour
+    leads to a place; what was done a minute ago is read off pictures in one order, which all rows teach alike."""
     has_plans: bool = False
     """See `TrainingEpisode.with_plans`."""
     slips: float = 0.0
@@ -347,6 +351,7 @@ def make_example(
     episode = episode.with_foresight() if config.has_foresight else episode
     episode = episode.with_plans() if config.has_plans else episode
     episode = episode if config.has_reasoning else replace(episode, reasoning="")
+    episode = replace(episode, reasoning=narration(episode.demo_subgoals)) if config.narrates else episode
     schedule = sample_schedule(rng, config.clocks, episode.num_ticks, transition_ticks=episode.transition_ticks)
     schedule = _shortened(schedule, config.max_queries)
     imitated = [i for i, each in enumerate(schedule.invocations) if each.tick >= episode.imitated_from]

@@ -390,7 +390,25 @@ def small_imitating() -> Curriculum:
         num_steps=1500,
         batch_episodes=12,
     )
-    return Curriculum(name="small_imitating", stages=(hand, carrying, binding, finishing))
+    recalling = (
+        replace(  # what a demonstration did is looked up when the first word comes: the rest of the row is left out
+            finishing,
+            name="small_imitating/recalling",
+            example=replace(
+                finishing.example, narrates=True, max_queries=2, text_dropout=0.0, slips=0.0, lapses=NO_LAPSES
+            ),
+            train=TrainConfig(seed=7, optim=replace(_FROM_SCRATCH, warmup_steps=50)),
+            num_steps=1000,
+            batch_episodes=16,
+        )
+    )
+    settling = replace(
+        finishing,
+        name="small_imitating/settling",
+        example=replace(finishing.example, narrates=True),
+        train=TrainConfig(seed=8, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(700, 1500))),
+    )
+    return Curriculum(name="small_imitating", stages=(hand, carrying, binding, finishing, recalling, settling))
 
 
 def small_refresh(period_s: int) -> Recipe:

@@ -135,3 +135,24 @@ def test_what_was_dropped_on_its_way_is_to_be_picked_up_again(worlds: dict[bool,
     assert snapshot.status is Status.SUCCESS
     assert list(dict.fromkeys(found[1:]))[:2] == [0, 1]
     assert onward == "".join(f"<{y}, {x}>" for y, x in [environment._project([placing])[0]])
+
+
+def test_a_video_that_names_no_place_tells_where_to_look() -> None:
+    """Swapped containers: their place is told as they move, and at its end it is that of the first subgoal."""
+    for follow in (False, True):
+        environment = make_environment("VideoUnmaskSwap", render=False, texts_follow=follow)
+        try:
+            first = environment.reset(SEED, "easy")
+            texts = [snapshot.grounded_subgoal for snapshot in environment.demonstration()]
+        finally:
+            environment.close()
+        if not follow:
+            assert set(texts) == {"static"}
+            continue
+        hidden = texts.index(next(text for text in texts if text != "static"))
+        assert hidden > 0  # containers that are not there yet are not told
+        told = np.array([[int(v) for v in re.findall(r"\d+", text)[:2]] for text in texts[hidden:]], float)
+        assert len(told) == len(texts) - hidden
+        assert np.hypot(*np.diff(told, axis=0).T).max() < 12  # it runs, and does not jump
+        assert np.hypot(*(told[0] - told[-1])) > 10  # this one is swapped
+        assert np.hypot(*(told[-1] - yx_px(first))) < 10

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ponderpounce.training.deeds import deeds
+from ponderpounce.training.deeds import deeds, narration
 
 DONE = st.lists(st.tuples(st.sampled_from(["pick at", "put onto a target at", "move left to"]), st.integers(0, 3)))
 
@@ -34,3 +34,45 @@ def test_a_text_that_gets_its_place_later_is_the_same_deed() -> None:
 def test_how_a_way_goes_on_is_no_part_of_a_deed() -> None:
     (deed,) = deeds(["move left to <9, 9>, then <8, 8>"])
     assert (deed.name, deed.place) == ("move left", (9, 9))
+
+
+def test_what_is_only_watched_is_one_deed_wherever_it_moves() -> None:
+    found = deeds(
+        [
+            "pick up the cube at <9, 9>",
+            "static at <30, 9>, <80, 80>",
+            "static at <60, 9>, <81, 80>",
+            "static at <90, 9>",
+        ]
+    )
+    assert [deed.number for deed in found] == [1, 2, 2, 2]
+    assert [deed.place for deed in found] == [(9, 9), (30, 9), (60, 9), (90, 9)]
+    assert [deed.place_before for deed in found] == [None, (80, 80), (81, 80), None]
+
+
+PUTS = st.lists(st.one_of(st.just("button"), st.tuples(st.integers(0, 9), st.integers(0, 9))), min_size=1, max_size=5)
+
+
+@given(PUTS, st.integers(1, 3))
+def test_a_narration_tells_every_place_in_order_and_when_the_button_was_pressed(
+    done: list[str | tuple[int, int]], seen: int
+) -> None:
+    texts: list[str] = []
+    for nth, each in enumerate(done):
+        what = "press the button" if isinstance(each, str) else "drop the cube onto target"
+        place = (7 + nth, 7) if isinstance(each, str) else (20 * each[0], 20 * each[1])
+        pick = [f"pick up the cube at <{nth}, 200>"] * seen
+        texts += [*pick, *[f"{what} at <{place[0]}, {place[1]}>"] * seen]
+    texts.append("static at <1, 1>, <2, 2>")
+    puts = [each for each in done if not isinstance(each, str)]
+    told = narration(texts).split(", ") if puts else []
+    numbers = iter(["first", "second", "third", "fourth", "fifth"])
+    expected = [each if isinstance(each, str) else f"{next(numbers)} <{20 * each[0]}, {20 * each[1]}>" for each in done]
+    assert told == (", ".join(expected).split(", ") if puts else [])
+    assert puts or narration(texts) == ", ".join(f"<{nth}, 200>" for nth in range(len(done)))
+
+
+def test_a_picked_block_is_told_and_a_way_is_not() -> None:
+    assert narration(["pick up the cube at <9, 8>", "drop the cube on the table at <9, 8>, <1, 2>"]) == "<9, 8>"
+    assert narration(["move left to <9, 9>, then <8, 8>", "move right to <8, 8>"]) == ""
+    assert narration([]) == ""

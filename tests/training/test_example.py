@@ -16,6 +16,7 @@ from ponderpounce.models.groot_prompt import tiny_eagle_tokenizer_for_random_wei
 from ponderpounce.models.normalisation import ROBOMME as STATISTICS
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
+from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.models.pounce_configs import tiny_cpu as tiny_pounce
 from ponderpounce.models.pounce_configs import tiny_groot
 from ponderpounce.models.pounce_groot import GrootInputs
@@ -325,6 +326,26 @@ def test_reasoning_can_be_left_unwritten() -> None:
         replace(recorded, reasoning=""), FORM, ExampleConfig(clocks=EVALUATION), np.random.default_rng(0)
     )
     assert left_out.row().ids == expected.row().ids
+
+
+def test_what_was_demonstrated_is_narrated_before_the_first_subgoal() -> None:
+    shown = ["pick up the cube at <9, 9>", "drop the cube onto target at <100, 40>", "static at <1, 1>, <2, 2>"]
+    recorded = replace(episode(60, num_demo=3, changes=(0,)), demo_subgoals=shown)
+    rows = {
+        narrates: make_example(
+            recorded,
+            FORM,
+            ExampleConfig(clocks=EVALUATION, has_reasoning=False, narrates=narrates),
+            np.random.default_rng(0),
+        )
+        for narrates in (True, False)
+    }
+    v = FORM.vocabulary
+    said = {narrates: [t for t in each.row().targets if t >= 0] for narrates, each in rows.items()}
+    told = v.encode(normalised_text("first <100, 40>"))
+    begin = said[True].index(v.t_yes) + 1
+    assert tuple(said[True][begin : begin + len(told)]) == tuple(told)
+    assert said[True][begin + len(told) :] == said[False][said[False].index(v.t_yes) :]
 
 
 def test_a_plan_is_said_and_cognition_is_of_the_subgoal() -> None:
