@@ -22,7 +22,7 @@ from ponderpounce.models.eyes import see
 from ponderpounce.models.normalisation import Floats
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.training.augment import AS_IT_IS, NOT_AUGMENTED, Augmentation, View, draw_view
-from ponderpounce.training.countdown import as_place, waits
+from ponderpounce.training.countdown import as_place, counted, stood_at, waits
 from ponderpounce.training.deeds import narration
 from ponderpounce.training.events import draw_near, event_ticks
 from ponderpounce.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses, has_moved, without_lapses
@@ -219,6 +219,8 @@ class ExampleConfig:
 
     lapses: Lapses = NO_LAPSES
     """Words that come late or are wrong, and are put right."""
+    counts_down: bool = False
+    """Waits are told with their number of steps, at every query anew (`countdown`)."""
     retold_px: float | None = None
     """Words are said again once the place that they told is farther than that from its thing; None: never."""
 
@@ -306,11 +308,15 @@ class Example:
         """`stand_in` of the subgoal in force at every query, (Q, size)."""
         episode, made = self.episode, []
         left, onward = waits(episode.subgoals), self.onward or ("",) * len(self.schedule.queries)
+        stood = stood_at(episode.subgoals)  # a hand that sees nothing and hears only how long would drift away
         for query, following in zip(self.schedule.queries, onward, strict=True):
-            text, after = (self.view.text(each) for each in (episode.subgoals[query.tick], following))
+            text, after = (
+                self.view.text(each) for each in (episode.subgoals[query.tick], following or stood[query.tick])
+            )
             if (wait := left[query.tick]) is not None:
-                after = as_place(wait)
-                text = text if PLACE.search(text) else f"{text} until {after}"
+                is_at_place = PLACE.search(text) is not None
+                text = text if is_at_place else f"{text} until {as_place(wait)}"
+                after = as_place(wait) if is_at_place else after
             made.append(stand_in(text, size, episode.instruction, after))
         return torch.from_numpy(np.stack(made))
 
@@ -372,6 +378,11 @@ def make_example(
         lapses = config.lapses if config.lapses.rows and rng.random() < config.lapses.rows else NO_LAPSES
         if lapses != NO_LAPSES or config.retold_px is not None:
             words = drawn_lapses(lapses, *_subgoals(episode, schedule), rng, config.retold_px)
+        if config.counts_down and any(left := waits(episode.subgoals)):
+            subgoals, is_change = _subgoals(episode, schedule)
+            words = without_lapses(subgoals, is_change) if words is None else words
+            told = [episode.subgoals[query.tick] for query in schedule.queries]
+            words = counted(words, told, [left[query.tick] for query in schedule.queries])
     is_moved = config.augments == "all" or episode.is_watched
     view = draw_view(config.augmentation if is_moved else NOT_AUGMENTED, form, set(episode.subgoals), rng)
     onward = None

@@ -375,6 +375,12 @@ def small_imitating() -> Curriculum:
         train=replace(hand.train, seed=6, optim=replace(_FROM_SCRATCH, warmup_steps=100, decay=(3000, 6000))),
         num_steps=6000,
     )
+    waiting = replace(  # told how long, it has to be told where, too
+        hand,
+        name="small_imitating/waiting",
+        train=replace(hand.train, seed=9, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(500, 1500))),
+        num_steps=1500,
+    )
     binding = replace(
         binding,
         name="small_imitating/binding",
@@ -405,10 +411,10 @@ def small_imitating() -> Curriculum:
     settling = replace(
         finishing,
         name="small_imitating/settling",
-        example=replace(finishing.example, narrates=True),
+        example=replace(finishing.example, narrates=True, counts_down=True),
         train=TrainConfig(seed=8, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(700, 1500))),
     )
-    return Curriculum(name="small_imitating", stages=(hand, carrying, binding, finishing, recalling, settling))
+    return Curriculum(name="small_imitating", stages=(hand, carrying, waiting, binding, finishing, recalling, settling))
 
 
 def small_refresh(period_s: int) -> Recipe:
