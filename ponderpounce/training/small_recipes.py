@@ -411,8 +411,9 @@ def small_imitating() -> Curriculum:
     settling = replace(
         finishing,
         name="small_imitating/settling",
-        example=replace(finishing.example, narrates=True, counts_down=True),
-        train=TrainConfig(seed=8, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(700, 1500))),
+        example=replace(finishing.example, narrates=True, counts_down=True, text_dropout=0.2, slips=0.25),
+        train=TrainConfig(seed=8, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(1000, 2000))),
+        num_steps=2000,
     )
     return Curriculum(name="small_imitating", stages=(hand, carrying, waiting, binding, finishing, recalling, settling))
 
