@@ -52,11 +52,14 @@ wait $acting
     --stand-in-onward --workers 2 --pounce-checkpoint "$more/run/carrying/pounce" --out "$more/played"
 mapfile -t found < <(logs "$more/played")
 [ -d "$more/watched/meta" ] || "$bin/pp-export" "${found[@]}" --out "$more/watched"
-[ -d "$more/run/ponder" ] || train_on_both_cores --stage finishing --watch "$more/watched" --watch-share 0.17
+[ -d "$more/run/finishing/ponder" ] || train_on_both_cores --stage finishing --watch "$more/watched" --watch-share 0.17
+[ -d "$more/run/recalling/ponder" ] || train_on_both_cores --stage recalling --tasks "${imitated[@]}" "${shown[@]}" VideoUnmask VideoUnmaskSwap
+[ -d "$more/run/waiting/pounce" ] || train_on_both_cores --stage waiting
+[ -d "$more/run/settling/ponder" ] || train_on_both_cores --stage settling --watch "$more/watched" --watch-share 0.17
 
 pair="$more/pair"
-[ -d "$pair/ponder" ] || halve "$more/run/ponder" "$pair/ponder"
-[ -d "$pair/pounce" ] || halve "$more/run/carrying/pounce" "$pair/pounce"
+[ -d "$pair/ponder" ] || halve "$more/run/settling/ponder" "$pair/ponder"
+[ -d "$pair/pounce" ] || halve "$more/run/waiting/pounce" "$pair/pounce"
 for cognition in real null; do
     "$bin/pp-eval" --tasks PickHighlight StopCube "${imitated[@]}" "${shown[@]}" "${old[@]}" "${swapped[@]}" --episodes 50 --runs 1 \
         --seed 1000 --workers 2 --cognition $cognition --ponder-checkpoint "$pair/ponder" --pounce-checkpoint "$pair/pounce" \
