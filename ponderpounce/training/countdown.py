@@ -46,6 +46,15 @@ def stood_at(subgoals: Sequence[str]) -> list[str]:
     return found
 
 
+def waits_unplaced(subgoals: Sequence[str]) -> list[bool]:
+    """Per tick, whether the hand waits, or does what it has waited for, without being told where it stands."""
+    stood = stood_at(subgoals)
+    return [
+        bool(place) and not (_WAITING.search(text) and PLACE.search(text))
+        for text, place in zip(subgoals, stood, strict=True)
+    ]
+
+
 def counted(words: Sequence[Words], subgoals: Sequence[str], left: Sequence[int | None]) -> tuple[Words, ...]:
     """The words of Q queries, with the steps that are ``left`` wherever a subgoal without a place is waited out."""
     return tuple(

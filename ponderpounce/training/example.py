@@ -22,7 +22,7 @@ from ponderpounce.models.eyes import see
 from ponderpounce.models.normalisation import Floats
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.training.augment import AS_IT_IS, NOT_AUGMENTED, Augmentation, View, draw_view
-from ponderpounce.training.countdown import as_place, counted, stood_at, waits
+from ponderpounce.training.countdown import as_place, counted, stood_at, waits, waits_unplaced
 from ponderpounce.training.deeds import narration
 from ponderpounce.training.events import draw_near, event_ticks
 from ponderpounce.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses, has_moved, without_lapses
@@ -395,6 +395,8 @@ def make_example(
         first_I = np.array([each.tick for each in invocations], np.intp)
         chunks_IN8 = episode.action_T8[chunk_ticks(first_I, config.nudge.return_rows + 1, episode.num_ticks)]
         nudges_I2 = draw_nudges(config.nudge, episode.state_T8[first_I], chunks_IN8, rng)
+        # how long there is to wait takes the place of where: nothing would tell the way back, and it would be guessed
+        nudges_I2[np.array(waits_unplaced(episode.subgoals), np.bool_)[first_I]] = 0.0
     return Example(
         episode=episode,
         form=form,

@@ -8,13 +8,14 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from clock.sampling import EVALUATION
+from clock.sampling import EVALUATION, ROBOMME
 from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
-from ponderpounce.training.countdown import as_place, counted, stood_at, waits
+from ponderpounce.training.countdown import as_place, counted, stood_at, waits, waits_unplaced
 from ponderpounce.training.example import ExampleConfig, TrainingEpisode, make_example
 from ponderpounce.training.lapses import Words
+from ponderpounce.training.nudge import Nudge
 from ponderpounce.training.stand_in import stand_in
 
 HOVER, STILL, PRESS = (
@@ -88,6 +89,17 @@ def test_a_wait_is_counted_down_at_every_query(left: list[int | None], seed: int
             assert new == Words(text=f"remain static {wait}", is_due=True)
         elif text == HOVER or wait is None:
             assert new == old
+
+
+def test_a_start_that_nothing_leads_back_from_is_not_moved_aside() -> None:
+    texts = [HOVER] * 40 + [STILL] * 120 + [PRESS] * 30
+    assert waits_unplaced(texts) == [False] * 40 + [True] * 150
+    assert waits_unplaced(["pick it up at <1, 1>", "put it down"]) == [False, False]
+    config = ExampleConfig(clocks=ROBOMME, max_invocations=1 << 30, nudge=Nudge(std_m=0.04, return_rows=8))
+    example = make_example(waiting_episode(texts, (0, 40, 160)), FORM, config, np.random.default_rng(0))
+    assert example.nudges_I2 is not None
+    for invocation, nudge_2 in zip(example.invocations, example.nudges_I2, strict=True):
+        assert np.any(nudge_2) == (texts[invocation.tick] == HOVER)
 
 
 def test_a_row_says_its_counts() -> None:
