@@ -378,8 +378,8 @@ def small_imitating() -> Curriculum:
     waiting = replace(  # told how long, it has to be told where, too
         hand,
         name="small_imitating/waiting",
-        train=replace(hand.train, seed=9, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(500, 1500))),
-        num_steps=1500,
+        train=replace(hand.train, seed=9, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(300, 1000))),
+        num_steps=1000,
     )
     binding = replace(
         binding,
