@@ -27,7 +27,7 @@ from ponderpounce.tasks.task import Shown, StepT, Subtask, Task, TaskError, loca
 IMAGE_PX = 256  # upstream's; grounded texts count in these pixels
 _MAX_DRAWS = 20
 _PUSHED_M = 0.01  # texts that follow are corrected from this distance on
-_NUM_WATCHED = 2
+_NUM_WATCHED = 2  # as many as PONDER is taught to have in mind at a picture (`place_lessons`)
 MAX_STEPS = 1300  # the paper's limit; upstream's own default is 10000
 
 
@@ -77,9 +77,10 @@ def make_environment(
     """Returns an environment of a registered task. Raises TaskError for an unknown name.
 
     With ``texts_follow`` the coordinates of a grounded subgoal are corrected when its things have been pushed
-    elsewhere, there are some where upstream tells a way without its end (`located`), and what was dropped on its way is
-    to be picked up again; upstream's stay where they were first seen, and go on. An ``order`` other than upstream's
-    changes the list of subtasks, and with it texts and oracle; scenes and what counts as success stay the same.
+    elsewhere, there are some where upstream tells a way without its end (`located`) or a demonstration's text names no
+    place, and what was dropped on its way is to be picked up again; upstream's stay where they were first seen, and go
+    on. An ``order`` other than upstream's changes the list of subtasks, and with it texts and oracle; scenes and what
+    counts as success stay the same.
     """
     return Environment(
         make_task(name), image_px=image_px, render=render, max_steps=max_steps, texts_follow=texts_follow, order=order

@@ -18,9 +18,8 @@ from ponderpounce.training.places import PLACE
 _OTHER_PX = 6.0  # of a 256 px picture: less than any two things lie apart
 
 _AT = re.compile(rf" (?:at|to) {PLACE.pattern}(?:, then .*|, {PLACE.pattern})?")
-_WATCHED = re.compile(
-    rf"[^<]* at {PLACE.pattern}, {PLACE.pattern}|static at {PLACE.pattern}"
-)  # `Environment._watching`
+# what `Environment._watching` makes of a text without a place
+_WATCHED = re.compile(rf"[^<]* at {PLACE.pattern}, {PLACE.pattern}|static at {PLACE.pattern}")
 _PUT, _PRESS, _PICK = "drop the cube onto target", "press the button", "pick up the"
 
 Place = tuple[int, int]

@@ -310,10 +310,9 @@ class Example:
         left, onward = waits(episode.subgoals), self.onward or ("",) * len(self.schedule.queries)
         stood = stood_at(episode.subgoals)  # a hand that sees nothing and hears only how long would drift away
         for query, following in zip(self.schedule.queries, onward, strict=True):
-            text, after = (
-                self.view.text(each) for each in (episode.subgoals[query.tick], following or stood[query.tick])
-            )
-            if (wait := left[query.tick]) is not None:
+            tick = query.tick
+            text, after = (self.view.text(each) for each in (episode.subgoals[tick], stood[tick] or following))
+            if (wait := left[tick]) is not None:
                 is_at_place = PLACE.search(text) is not None
                 text = text if is_at_place else f"{text} until {as_place(wait)}"
                 after = as_place(wait) if is_at_place else after

@@ -355,10 +355,10 @@ def small_further() -> Curriculum:
 
 
 def small_imitating() -> Curriculum:
-    """The pair of `small_further` learns four tasks more, where to go on, and to note what demonstrations do (`deeds`).
+    """The pair of `small_further` learns four tasks more, where to go on, and to write down what demonstrations do.
 
-    `hand` and `carrying` train POUNCE and need none of the others; `finishing` is for what the hand has played
-    (`pp-train --watch`).
+    `hand`, `carrying` and `waiting` train POUNCE and need none of the others; `finishing` and `settling` are for what
+    the hand has played (`pp-train --watch`).
     """
     _, releasing, binding, _, finishing = small_further().stages
     hand = replace(
@@ -375,7 +375,7 @@ def small_imitating() -> Curriculum:
         train=replace(hand.train, seed=6, optim=replace(_FROM_SCRATCH, warmup_steps=100, decay=(3000, 6000))),
         num_steps=6000,
     )
-    waiting = replace(  # told how long, it has to be told where, too
+    waiting = replace(  # the button was missed: a hand that waits strolls away from it
         hand,
         name="small_imitating/waiting",
         train=replace(hand.train, seed=9, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(300, 1000))),
@@ -396,17 +396,15 @@ def small_imitating() -> Curriculum:
         num_steps=1500,
         batch_episodes=12,
     )
-    recalling = (
-        replace(  # what a demonstration did is looked up when the first word comes: the rest of the row is left out
-            finishing,
-            name="small_imitating/recalling",
-            example=replace(
-                finishing.example, narrates=True, max_queries=2, text_dropout=0.0, slips=0.0, lapses=NO_LAPSES
-            ),
-            train=TrainConfig(seed=7, optim=replace(_FROM_SCRATCH, warmup_steps=50)),
-            num_steps=1000,
-            batch_episodes=16,
-        )
+    # what a demonstration did is looked up when the first word comes: the rest of the row is left out
+    at_first = replace(finishing.example, narrates=True, max_queries=2, text_dropout=0.0, slips=0.0, lapses=NO_LAPSES)
+    recalling = replace(
+        finishing,
+        name="small_imitating/recalling",
+        example=at_first,
+        train=TrainConfig(seed=7, optim=replace(_FROM_SCRATCH, warmup_steps=50)),
+        num_steps=1000,
+        batch_episodes=16,
     )
     settling = replace(
         finishing,

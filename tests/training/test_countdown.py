@@ -12,6 +12,7 @@ from clock.sampling import EVALUATION, ROBOMME
 from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
+from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.training.countdown import as_place, counted, stood_at, waits, waits_unplaced
 from ponderpounce.training.example import ExampleConfig, TrainingEpisode, make_example
 from ponderpounce.training.lapses import Words
@@ -21,7 +22,7 @@ from ponderpounce.training.stand_in import stand_in
 HOVER, STILL, PRESS = (
     "move to the top of the button at <60, 90> to prepare",
     "remain static",
-    "press the button to stop",
+    "press the button to stop the cube on the target at <20, 30>",
 )
 
 
@@ -57,7 +58,8 @@ def test_every_query_is_told_its_own_wait() -> None:
     """Where nothing else is told as the place itself; beside the place where the tool is to be all the same."""
     texts = [HOVER] * 40 + [STILL] * 300 + [PRESS] * 30
     recorded = waiting_episode(texts, (0, 40, 340))
-    example = make_example(recorded, FORM, ExampleConfig(clocks=EVALUATION), np.random.default_rng(0))
+    config = ExampleConfig(clocks=EVALUATION, tells_onward=1.0)  # the text after the wait names a place, too
+    example = make_example(recorded, FORM, config, np.random.default_rng(0))
     made = example.stand_ins(128).numpy()
     for query, vector in zip(example.schedule.queries, made, strict=True):
         wait = 340 - query.tick
@@ -109,7 +111,7 @@ def test_a_row_says_its_counts() -> None:
     for query, said in zip(example.schedule.queries, example.said, strict=True):
         if texts[query.tick] == STILL:
             assert said == f"remain static {160 - query.tick}"
-    assert example.said[-1] == PRESS
+    assert example.said[-1] == normalised_text(PRESS)
 
 
 def test_the_longest_wait_is_as_long_as_a_picture_is_wide() -> None:
