@@ -21,7 +21,9 @@ from ponderpounce.models.images import resized
 from ponderpounce.models.normalisation import Quantiles, RobotStatistics
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.models.prompt import with_subgoal
+from ponderpounce.tasks.front_view import front_pixels
 from ponderpounce.training.example import Frame, TrainingEpisode, chunk_ticks
+from ponderpounce.training.places import TEXT_PX
 from ponderpounce.training.sight_store import SightStore, Views
 
 _QUANTILES = (0.01, 0.99)
@@ -195,6 +197,7 @@ class TrainingSet:
             instruction=entry.instruction,
             demo=tuple((views if sights is None else sights)[:num_shown]),
             demo_subgoals=rows.grounded_subgoal[:start:FPS],
+            demo_tools=_seen_at(rows.tcp_pose[:start:FPS]),
             frames=views[num_shown:],
             sights=None if sights is None else sights[num_shown:],
             state_T8=rows.state[start:],
@@ -269,6 +272,12 @@ def _sources(dataset: Dataset, tasks: Sequence[str], *, is_watched: bool) -> lis
         kind = "" if is_watched else "successful "
         raise ValueError(f"{dataset.root} has no {kind}episode of {', '.join(tasks) or 'any task'}; it has {there}")
     return [_Source(dataset=dataset, entry=entry, is_watched=is_watched) for entry in entries]
+
+
+def _seen_at(poses_T7: NDArray[np.float32]) -> list[str]:
+    """Where the front camera sees the tool, as a text tells a place, at its edge where it would leave the picture."""
+    pixels_T2 = front_pixels(poses_T7[:, :3], TEXT_PX).round().clip(0, TEXT_PX).astype(int)
+    return [f"<{y}, {x}>" for y, x in pixels_T2.tolist()]
 
 
 def _reach(moves_MND: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -23,8 +23,9 @@ from ponderpounce.models.normalisation import Floats
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.training.augment import AS_IT_IS, NOT_AUGMENTED, Augmentation, View, draw_view
 from ponderpounce.training.countdown import as_place, counted, stood_at, waits, waits_unplaced
+from ponderpounce.training.cut_short import Cut, cuts
 from ponderpounce.training.deeds import narration
-from ponderpounce.training.events import draw_near, event_ticks
+from ponderpounce.training.events import EVENT_ROWS, draw_near, event_ticks
 from ponderpounce.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses, has_moved, without_lapses
 from ponderpounce.training.nudge import NO_NUDGE, Nudge, draw_nudges
 from ponderpounce.training.place_lessons import PlaceLessons, place_lessons
@@ -34,6 +35,7 @@ from ponderpounce.training.stand_in import stand_in
 Frame = NDArray[np.uint8]  # (height, width, 3) RGB
 _SILENCE = repeat(Words())
 _SAME_PX = 6.0  # of a 256 px picture: less than any two things lie apart
+_RECALLING = 2  # queries
 _MOVED_PX = 3.0  # of a 256 px picture: farther than PONDER errs where nothing moves
 
 
@@ -46,6 +48,8 @@ class TrainingEpisode:
     """The demonstration's views at 1 Hz; () without one."""
     demo_subgoals: Sequence[str] = ()
     """What is done in each of them, as grounded text; () where nobody says."""
+    demo_tools: Sequence[str] = ()
+    """Where the tool is then, ``<y, x>``; () where nobody says."""
     frames: Sequence[tuple[Frame, ...]]
     """T ticks of views, in the order of the robot's cameras; () at ticks where POUNCE has none."""
     state_T8: NDArray[np.float32]
@@ -120,6 +124,21 @@ class TrainingEpisode:
             placed = next((text for text in texts if PLACE.search(text)), "")
             subgoals += [text if PLACE.search(text) else placed or text for text in texts]
         return replace(self, subgoals=subgoals)
+
+    def cut_short(self, cut: Cut) -> TrainingEpisode:
+        """The same, told to end sooner (`cuts`). Its last ticks are not to be seen."""
+        ticks = cut.ticks_U.tolist()
+        return replace(
+            self,
+            instruction=cut.instruction,
+            frames=[self.frames[tick] for tick in ticks],
+            sights=None if self.sights is None else [self.sights[tick] for tick in ticks],
+            state_T8=self.state_T8[ticks],
+            action_T8=self.action_T8[ticks],
+            subgoals=cut.subgoals,
+            is_transition_T=cut.is_transition_U,
+            seen_at_T=None if self.seen_at_T is None else self.seen_at_T[ticks],
+        )
 
     def with_plans(self, *, even_the_first: bool = False) -> TrainingEpisode:
         """The same, every subgoal but the first told with the places of those that come later: ``S, <y, x>, <y, x>``.
@@ -208,6 +227,8 @@ class ExampleConfig:
     leads to a place; what was done a minute ago is read off pictures in one order, which all rows teach alike."""
     has_plans: bool = False
     """See `TrainingEpisode.with_plans`."""
+    cuts_short: float = 0.0
+    """Share of episodes that count, of two rounds and more, that are told to end sooner (`cuts`)."""
     slips: float = 0.0
     """Share of grounded rows in which all said places are wrong by ``slip_px`` and not to be learned. Cognition must
     then come from what is seen; from flawless words alone it would learn to copy them, and PONDER's own are not."""
@@ -238,6 +259,9 @@ class ExampleConfig:
     max_queries: int | None = None
     """The row ends after so many queries, and with it the invocations; None: with the episode. Most of what is to be
     seen is seen early."""
+    recalls: float = 0.0
+    """Share of demonstrated episodes whose row ends with the second query: what a demonstration did is looked up when
+    the first words come, and that costs a fraction of a whole row."""
 
     def __post_init__(self) -> None:
         if self.max_queries is not None and self.max_queries < 1:
@@ -253,7 +277,7 @@ class ExampleConfig:
                 f"retold_px {self.retold_px} must be above 0, and slips 0, came {self.slips}: a row whose words all "
                 "slip never puts them right; let them slip in `Lapses.slipped`"
             )
-        for name in ("text_dropout", "slips", "tells_onward"):
+        for name in ("text_dropout", "slips", "tells_onward", "cuts_short", "recalls"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be in [0, 1], came {getattr(self, name)}")
 
@@ -346,7 +370,8 @@ class Example:
             episode = episode.with_plans(even_the_first=True)
         texts = [self.view.text(episode.words[query.tick]) for query in self.schedule.queries]
         demonstrated = [self.view.text(text) for text in episode.demo_subgoals]
-        return place_lessons(row, texts, self.form.vocabulary, size, demonstrated)
+        tools = [self.view.text(text) for text in episode.demo_tools]
+        return place_lessons(row, texts, self.form.vocabulary, size, demonstrated, tools)
 
 
 def make_example(
@@ -354,11 +379,24 @@ def make_example(
 ) -> Example:
     """Draws a schedule and lays the episode out under it."""
     episode = episode.with_foresight() if config.has_foresight else episode
+    cut: Cut | None = None
+    if config.cuts_short and rng.random() < config.cuts_short:
+        there = cuts(episode.instruction, episode.subgoals, episode.is_transition_T)
+        sooner = [each for each in there if each.end > episode.imitated_from]
+        cut = sooner[rng.integers(len(sooner))] if sooner else None
+    episode = episode if cut is None else episode.cut_short(cut)
     episode = episode.with_plans() if config.has_plans else episode
     episode = episode if config.has_reasoning else replace(episode, reasoning="")
     episode = replace(episode, reasoning=narration(episode.demo_subgoals)) if config.narrates else episode
     schedule = sample_schedule(rng, config.clocks, episode.num_ticks, transition_ticks=episode.transition_ticks)
     schedule = _shortened(schedule, config.max_queries)
+    if config.recalls and episode.demo and rng.random() < config.recalls:
+        schedule = _shortened(schedule, _RECALLING)
+    if cut is not None:
+        schedule = SampledSchedule(
+            queries=tuple(each for each in schedule.queries if each.tick < cut.shown),
+            invocations=tuple(each for each in schedule.invocations if each.tick + EVENT_ROWS <= cut.end),
+        )
     imitated = [i for i, each in enumerate(schedule.invocations) if each.tick >= episode.imitated_from]
     count = 0 if episode.is_watched else min(config.max_invocations, len(imitated))
     events = event_ticks(episode.action_T8, episode.transition_ticks)

@@ -2,6 +2,9 @@
 
 Networks that learn from scratch may end with a falling rate, which the paper's do not need.
 
+Networks that learn from scratch may also have their matrices turned by Muon (K. Jordan et al., 2024; scaled as in
+arXiv:2502.16982, so that AdamW's rates serve), which the paper's do not need either.
+
 Weights of fewer than 32 bits have float32 masters that are updated in their place, and are rounded from them: in
 bfloat16 itself an update of a thousandth is less than half of a weight's last bit, and nothing would ever move.
 """
@@ -10,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -19,6 +23,8 @@ from ponderpounce.training.parallel import local, whole
 from ponderpounce.training.shards import RowReader
 
 _LEAST_RATE = 0.02
+_LEAST_RANK = 8  # a matrix of fewer rows is a few vectors: there is little to turn
+_LOOKED_UP = ("embed", "lm_head")  # one row a token or a place: rows are learned apart, seldom ones seldom
 _EMA_MEMORY = 10  # the average of n steps goes back n / 10 of them at most
 
 
@@ -36,6 +42,8 @@ class OptimConfig:
     clip_norm: float = 1.0
     ema_decay: float = 0.0
     """0: no average is kept."""
+    matrices: Literal["adamw", "muon"] = "adamw"
+    """What updates hidden layers' matrices; AdamW updates all else. Muon needs them whole (not sharded)."""
 
     def __post_init__(self) -> None:
         if self.learning_rate <= 0 or self.clip_norm <= 0 or self.warmup_steps < 0:
@@ -64,13 +72,22 @@ class Optimiser:
         if not self._named:
             raise ValueError("nothing to train: every parameter is frozen")
         self._masters = {name: p if p.dtype.itemsize >= 4 else _master(p) for name, p in self._named.items()}
-        self._adam = torch.optim.AdamW(
-            [{"params": group} for group in self._groups()],
+        turned = [p for name, p in self._masters.items() if config.matrices == "muon" and _is_turned(name, p)]
+        if any(isinstance(each, DTensor) for each in turned):
+            raise ValueError("Muon needs whole matrices, these are sharded: give --weights whole, or matrices='adamw'")
+        apart = {id(each) for each in turned}
+        groups = [[each for each in group if id(each) not in apart] for group in self._groups()]
+        adam = torch.optim.AdamW(
+            [{"params": group} for group in groups if group] or [{"params": []}],
             lr=config.learning_rate,
             betas=config.betas,
             eps=config.eps,
             weight_decay=config.weight_decay,
         )
+        self._parts: list[torch.optim.Optimizer] = [adam]
+        if turned:
+            muon = torch.optim.Muon(turned, weight_decay=config.weight_decay, adjust_lr_fn="match_rms_adamw")
+            self._parts.append(muon)
         self.average = {name: p.detach().clone() for name, p in self._masters.items()} if config.ema_decay else {}
 
     def update(self, step: int) -> float:
@@ -90,10 +107,11 @@ class Optimiser:
                 f"step {step}: gradients are not finite (first in {', '.join(worst)}). Lower learning_rate, or train "
                 "in float32; the last checkpoint is untouched."
             )
-        for group in self._adam.param_groups:
-            group["lr"] = learning_rate(self._config, step)
-        self._adam.step()
-        self._adam.zero_grad(set_to_none=True)
+        for part in self._parts:
+            for group in part.param_groups:
+                group["lr"] = learning_rate(self._config, step)
+            part.step()
+            part.zero_grad(set_to_none=True)
         with torch.no_grad():
             for parameter, master in self._mastered().values():
                 parameter.copy_(master)
@@ -113,7 +131,7 @@ class Optimiser:
         found = {f"average.{name}": tensor for name, tensor in self.average.items()}
         found |= {f"master.{name}": master.detach() for name, (_, master) in self._mastered().items()}
         for name, parameter in self._masters.items():
-            for key, value in self._adam.state[parameter].items():
+            for key, value in self._state(parameter).items():
                 found[f"{key}.{name}"] = torch.as_tensor(value)
         return found
 
@@ -135,9 +153,12 @@ class Optimiser:
             parameter = self._masters.get(name)
             is_step = key == "step" and stored.shape(full_name) == ()
             fits = parameter is not None and (stored.shape(full_name) == tuple(parameter.shape) or is_step)
+            is_own = key in ("average", "master")
             unknown = (key == "average" and name not in self.average) or (key == "master" and name not in mastered)
-            if parameter is None or not fits or unknown:
-                raise ValueError(f"the optimiser's state is of another model, freeze mode or dtype: it has {full_name}")
+            if parameter is None or not fits or unknown or (not is_own and key not in self._remembers(parameter)):
+                raise ValueError(
+                    f"the optimiser's state is of another model, freeze mode, dtype or optimiser: it has {full_name}"
+                )
             rows = stored.read(full_name, parameter)
             if is_step:
                 states.setdefault(name, {})[key] = rows
@@ -150,7 +171,20 @@ class Optimiser:
                 local(state).copy_(rows)
                 states.setdefault(name, {})[key] = state
         for name, found in states.items():
-            self._adam.state[self._masters[name]] = found
+            self._state(self._masters[name]).update(found)
+
+    def _remembers(self, parameter: nn.Parameter) -> tuple[str, ...]:
+        """What the part that updates a parameter remembers of it."""
+        is_turned = any(parameter is each for part in self._parts[1:] for each in part.param_groups[0]["params"])
+        return ("momentum_buffer",) if is_turned else ("step", "exp_avg", "exp_avg_sq")
+
+    def _state(self, parameter: nn.Parameter) -> dict[str, Any]:
+        """What is remembered of a parameter by the part that updates it."""
+        for part in self._parts:
+            if any(parameter is each for group in part.param_groups for each in group["params"]):
+                state: dict[str, Any] = part.state[parameter]
+                return state
+        raise KeyError("a parameter of no part")
 
     def _groups(self) -> list[list[nn.Parameter]]:
         """Those of which a process holds its rows, and those of which it holds all: no operation takes both at once."""
@@ -175,6 +209,12 @@ class Optimiser:
         """Parameters that have a master, and it."""
         pairs = ((name, parameter, self._masters[name]) for name, parameter in self._named.items())
         return {name: (parameter, master) for name, parameter, master in pairs if master is not parameter}
+
+
+def _is_turned(name: str, parameter: nn.Parameter) -> bool:
+    """True for the matrix of a hidden layer."""
+    is_matrix = parameter.ndim == 2 and min(parameter.shape) >= _LEAST_RANK
+    return is_matrix and not any(each in name for each in _LOOKED_UP)
 
 
 def _master(parameter: nn.Parameter) -> nn.Parameter:

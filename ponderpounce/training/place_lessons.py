@@ -10,7 +10,8 @@ faster. So hidden states are asked for places in that form (`place_features`) wh
 
 - at the end of every picture of a demonstration, for what is being done (`deeds`): where, where the deed before was,
   and codes of which it is and for which time. What was done second is asked for once, a minute later; nothing else
-  teaches a network to notice it when it is seen.
+  teaches a network to notice it when it is seen. Where a way is shown, at the last of its image tokens, too, for where
+  the tool is: on which side of a thing it passes is seen on the way alone.
 
 Only networks from scratch need it; the paper has nothing of it. Nothing reads these numbers in serving.
 """
@@ -32,7 +33,7 @@ from ponderpounce.models.context import IGNORE, Row
 from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features
 from ponderpounce.models.vocabulary import Vocabulary
 from ponderpounce.training.deeds import deeds
-from ponderpounce.training.places import PLACE, TEXT_PX
+from ponderpounce.training.places import PLACE, TEXT_PX, WAY
 from ponderpounce.training.stand_in import text_code
 
 _Lesson = tuple[int, int, NDArray[np.float32]]
@@ -61,16 +62,22 @@ class PlaceLessons(NamedTuple):
 
 
 def place_lessons(
-    row: Row, texts_Q: Sequence[str], vocabulary: Vocabulary, size: int, demonstrated: Sequence[str] = ()
+    row: Row,
+    texts_Q: Sequence[str],
+    vocabulary: Vocabulary,
+    size: int,
+    demonstrated: Sequence[str] = (),
+    tools: Sequence[str] = (),
 ) -> PlaceLessons:
     """The lessons of a row with hidden states of ``size`` numbers.
 
     ``texts_Q``: the simulator's words in force at every query; ``demonstrated``: those of every instant of the
-    demonstration. Of more places than fit the last are left out.
+    demonstration, ``tools``: where the tool is then. Of more places than fit the last are left out.
     """
     num_slots = size // NUM_PLACE_FEATURES
     found = [
         *_seen_done(row, demonstrated, vocabulary, num_slots),
+        *_seen_going(row, demonstrated, tools, vocabulary),
         *_in_mind(row, texts_Q, num_slots),
         *_being_told(row, vocabulary),
     ]
@@ -84,14 +91,28 @@ def place_lessons(
 
 def _seen_done(row: Row, texts: Sequence[str], vocabulary: Vocabulary, num_slots: int) -> Iterator[_Lesson]:
     """Slot 0: where it is done, 1: where the deed before was, 2: which it is, and how often by now, 3: its number."""
-    ends = np.flatnonzero(np.asarray(row.ids) == vocabulary.vision_end)
-    per_instant = np.count_nonzero(ends <= row.gate_index[0]) // (len(texts) + 1)  # the first query's among them
-    for index, deed in zip(ends[per_instant - 1 :: per_instant].tolist(), deeds(texts), strict=False):
+    for index, deed in zip(_picture_ends(row, len(texts), vocabulary), deeds(texts), strict=False):
         places = [None if place is None else place_features(place) for place in (deed.place, deed.place_before)]
         codes = [text_code(name, NUM_PLACE_FEATURES) for name in (f"{deed.name} {deed.count}", f"deed {deed.number}")]
         for slot, numbers in enumerate([*places, *codes][:num_slots]):
             if numbers is not None:
                 yield index, slot, numbers
+
+
+def _seen_going(row: Row, texts: Sequence[str], tools: Sequence[str], vocabulary: Vocabulary) -> Iterator[_Lesson]:
+    """Slot 0: where the tool is."""
+    for index, text, tool in zip(_picture_ends(row, len(texts), vocabulary), texts, tools, strict=False):
+        place = PLACE.search(tool)
+        if WAY.search(text) is not None and place is not None:
+            yield index - 1, 0, place_features((int(place[1]), int(place[2])))
+
+
+def _picture_ends(row: Row, num_instants: int, vocabulary: Vocabulary) -> list[int]:
+    """Where the last picture of every instant of a demonstration ends, and further ones."""
+    ends = np.flatnonzero(np.asarray(row.ids) == vocabulary.vision_end)
+    per_instant = np.count_nonzero(ends <= row.gate_index[0]) // (num_instants + 1)  # the first query's among them
+    found: list[int] = ends[per_instant - 1 :: per_instant].tolist()
+    return found
 
 
 def _in_mind(row: Row, texts_Q: Sequence[str], num_slots: int) -> Iterator[_Lesson]:

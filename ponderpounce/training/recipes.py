@@ -99,6 +99,7 @@ RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
     "small_several": small.small_several,
     "small_further": small.small_further,
     "small_imitating": small.small_imitating,
+    "small_mastering": small.small_mastering,
     "small_refresh_1s": partial(small.small_refresh, 1),
     "small_refresh_2s": partial(small.small_refresh, 2),
     "small_refresh_4s": partial(small.small_refresh, 4),

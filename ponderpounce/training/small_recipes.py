@@ -17,6 +17,7 @@ from ponderpounce.training.recipe import Curriculum, Recipe
 from ponderpounce.training.trainer import TrainConfig
 
 _FROM_SCRATCH = OptimConfig(learning_rate=1e-3, warmup_steps=200, betas=(0.9, 0.95), weight_decay=1e-4, ema_decay=0.998)
+_TURNING = replace(_FROM_SCRATCH, matrices="muon")
 
 _BESIDE_THE_WAY = Nudge(std_m=0.04)
 _MOVED_WEIGHT = 4.0
@@ -414,6 +415,31 @@ def small_imitating() -> Curriculum:
         num_steps=2000,
     )
     return Curriculum(name="small_imitating", stages=(hand, carrying, waiting, binding, finishing, recalling, settling))
+
+
+def small_mastering() -> Curriculum:
+    """The pair of `small_imitating` goes on: by another optimiser, and with counts told otherwise.
+
+    `waiting` trains POUNCE and does not need the other; `settling` is for what the pair has played, too
+    (`pp-train --watch`).
+    """
+    _, _, waiting, *_, settling = small_imitating().stages
+    settling = replace(
+        settling,
+        name="small_mastering/settling",
+        example=replace(settling.example, cuts_short=0.5, recalls=0.5),
+        train=TrainConfig(seed=10, optim=replace(_TURNING, warmup_steps=100, decay=(1500, 3300))),
+        num_steps=3300,
+        batch_episodes=16,
+    )
+    waiting = replace(
+        waiting,
+        name="small_mastering/waiting",
+        example=replace(waiting.example, event_weight=2.0),
+        train=replace(waiting.train, seed=11, optim=replace(_TURNING, warmup_steps=50, decay=(600, 2000))),
+        num_steps=2000,
+    )
+    return Curriculum(name="small_mastering", stages=(waiting, settling))
 
 
 def small_refresh(period_s: int) -> Recipe:

@@ -421,3 +421,13 @@ def test_a_prompt_that_is_too_long_is_refused() -> None:
     example = make_example(episode(5), FORM, ExampleConfig(clocks=EVALUATION), np.random.default_rng(0))
     with pytest.raises(ValueError, match="expected at most 3"):
         collate_pounce([example], replace(POUNCE, max_prompt_tokens=3), TOKENIZER, STATISTICS)
+
+
+def test_what_a_demonstration_did_can_be_asked_for_in_short_rows() -> None:
+    config = ExampleConfig(clocks=EVALUATION, recalls=1.0)
+    shown, unshown = episode(200, num_demo=3, changes=(0,)), episode(200, changes=(0,))
+    short, whole = (make_example(each, FORM, config, np.random.default_rng(0)) for each in (shown, unshown))
+    as_before = make_example(shown, FORM, replace(config, recalls=0.0), np.random.default_rng(0))
+    assert len(short.schedule.queries) == 2 < len(whole.schedule.queries) == len(as_before.schedule.queries)
+    assert short.schedule.queries == as_before.schedule.queries[:2]
+    assert all(each.tick < as_before.schedule.queries[2].tick for each in short.schedule.invocations)

@@ -159,3 +159,22 @@ def test_a_demonstration_of_which_nobody_says_what_it_does_has_no_lessons() -> N
     example = make_example(recorded, FORM, CONFIG, np.random.default_rng(0))
     row = example.row()
     assert example.place_lessons(row, SIZE).index_M.min() >= row.gate_index[0]
+
+
+def test_where_a_way_is_shown_the_last_image_token_has_the_tool_in_mind() -> None:
+    (y, x), (v, u) = PLACES[:2]
+    way = f"circle around it clockwise to <{y}, {x}>, then clockwise to <{v}, {u}>"
+    tools = ["<5, 6>", "<50, 60>", "<200, 210>"]
+    going = replace(shown([way, way, "wait there"]), demo_tools=tools)
+    example = make_example(going, FORM, CONFIG, np.random.default_rng(0))
+    row = example.row()
+    lessons = example.place_lessons(row, 4 * NUM_PLACE_FEATURES)
+    ends = np.flatnonzero(np.asarray(row.ids) == FORM.vocabulary.vision_end)[1:6:2]
+    by_place = dict(zip(lessons.index_M.tolist(), lessons.features_MP.numpy(), strict=True))
+    assert {row.ids[end - 1] for end in ends} == {FORM.vocabulary.image_pad}
+    np.testing.assert_array_equal(by_place[ends[0] - 1], place_features((5, 6)))
+    np.testing.assert_array_equal(by_place[ends[1] - 1], place_features((50, 60)))
+    assert ends[2] - 1 not in by_place  # no way is gone there
+    assert len(make_example(replace(going, demo_tools=()), FORM, CONFIG, np.random.default_rng(0)).row().ids) == len(
+        row.ids
+    )  # the row is the same: only what is asked of it differs
