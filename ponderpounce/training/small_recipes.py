@@ -436,8 +436,8 @@ def small_mastering() -> Curriculum:
         waiting,
         name="small_mastering/waiting",
         example=replace(waiting.example, event_weight=2.0),
-        train=replace(waiting.train, seed=11, optim=replace(_TURNING, warmup_steps=50, decay=(600, 2000))),
-        num_steps=2000,
+        train=replace(waiting.train, seed=11, optim=replace(_TURNING, warmup_steps=50, decay=(400, 1500))),
+        num_steps=1500,
     )
     return Curriculum(name="small_mastering", stages=(waiting, settling))
 

@@ -1,0 +1,48 @@
+#!/usr/bin/env bash
+# The shipped pair for several tasks from the one that imitate.sh has left, on two CPU cores: see docs/training.md,
+# "Counts told otherwise".
+#
+#     checkpoints/several/master.sh [OUT]    (the OUT of train.sh, further.sh and imitate.sh)
+#
+# The pair plays, and PONDER goes on with what it has played, with instructions that ask for fewer rounds than were done, and with
+# another optimiser; POUNCE learns StopCube's wait anew. The same command goes on after a kill. It was run by its parts and by hand.
+set -euo pipefail
+
+out=${1:-out/several}
+more=$out/imitate
+next=$out/master
+bin=${BIN:-.venv/bin}
+source "$(dirname "$0")/../small/common.sh"
+export OMP_NUM_THREADS=1 MUJOCO_GL=${MUJOCO_GL:-egl}
+data=("$more/imitated" "$more/timed" "$more/shown" "$more/old" "$more/swaps" "$more/highlight")
+
+play() {  # EPISODES each from SEED on, into FOLDER, of TASKS; and what was played becomes a dataset
+    local folder=$3 found
+    "$bin/pp-eval" --tasks "${@:4}" --episodes "$1" --runs 1 --seed "$2" --max-steps 900 --order near-first --record --record-hz 5 \
+        --workers 2 --ponder-checkpoint "$more/pair/ponder" --pounce-checkpoint "$more/pair/pounce" --out "$folder-played"
+    mapfile -t found < <(logs "$folder-played")
+    [ -d "$folder/meta" ] || "$bin/pp-export" "${found[@]}" --out "$folder"
+}
+
+play 36 1950000 "$next/counted" PickXtimes SwingXtimes BinFill
+play 16 1960000 "$next/driven" ButtonUnmask VideoUnmask VideoPlaceButton VideoPlaceOrder PickHighlight
+
+train() {  # on both cores
+    "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --weights whole --recipe small_mastering \
+        --ponder "$more/run/settling/ponder" --pounce "$more/run/waiting/pounce" --sights "$more/sights" --out "$next/run" "$@"
+}
+
+[ -d "$next/run/settling/ponder" ] || train --stage settling --data "${data[@]}" \
+    --watch "$more/watched" "$next/counted" "$next/driven" --watch-share 0.26
+# StopCube four times as often as the rest
+[ -d "$next/run/waiting/pounce" ] || train --stage waiting --data "${data[@]}" "$more/timed" "$more/timed" "$more/timed"
+
+pair="$next/pair"
+[ -d "$pair/ponder" ] || halve "$next/run/settling/ponder" "$pair/ponder"
+[ -d "$pair/pounce" ] || halve "$next/run/waiting/pounce" "$pair/pounce"
+for cognition in real null; do
+    "$bin/pp-eval" --tasks PickHighlight StopCube MoveCube PatternLock RouteStick VideoPlaceButton VideoPlaceOrder VideoRepick \
+        ButtonUnmask VideoUnmask PickXtimes SwingXtimes BinFill ButtonUnmaskSwap VideoUnmaskSwap --episodes 50 --runs 1 --seed 1000 \
+        --workers 2 --cognition $cognition --ponder-checkpoint "$pair/ponder" --pounce-checkpoint "$pair/pounce" --out "$next/$cognition"
+done
+"$bin/pp-tables" "$next/real" "$next/null" --out "$next/tables"
