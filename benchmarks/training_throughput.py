@@ -30,11 +30,12 @@ from ponderpounce.models.pounce_checkpoint import PounceBundle, random_bundle
 from ponderpounce.models.pounce_configs import in_space
 from ponderpounce.models.pounce_family import action_loss, sample_times
 from ponderpounce.training.collate import collate_ponder, collate_pounce
-from ponderpounce.training.example import TrainingEpisode, make_example
+from ponderpounce.training.example import make_example
 from ponderpounce.training.joint import Draws, JointModel, PonderBatch, PounceBatch, encode_rows
 from ponderpounce.training.recipe import Recipe, stages_of
 from ponderpounce.training.recipes import recipe
 from ponderpounce.training.trainer import Trainer
+from ponderpounce.training.training_episode import TrainingEpisode
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

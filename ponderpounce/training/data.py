@@ -22,9 +22,10 @@ from ponderpounce.models.normalisation import Quantiles, RobotStatistics
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.models.prompt import with_subgoal
 from ponderpounce.tasks.front_view import front_pixels
-from ponderpounce.training.example import Frame, TrainingEpisode, chunk_ticks
+from ponderpounce.training.example import chunk_ticks
 from ponderpounce.training.places import TEXT_PX
 from ponderpounce.training.sight_store import SightStore, Views
+from ponderpounce.training.training_episode import Frame, TrainingEpisode
 
 _QUANTILES = (0.01, 0.99)
 _SYSTEMS = ("pounce", "ponder")

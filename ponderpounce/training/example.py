@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate, pairwise, repeat
+from itertools import accumulate, repeat
 from typing import Literal
 
 import numpy as np
@@ -29,163 +29,13 @@ from ponderpounce.training.events import EVENT_ROWS, draw_near, event_ticks
 from ponderpounce.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses, has_moved, without_lapses
 from ponderpounce.training.nudge import NO_NUDGE, Nudge, draw_nudges
 from ponderpounce.training.place_lessons import PlaceLessons, place_lessons
-from ponderpounce.training.places import PLACE, WAY, misplaced
+from ponderpounce.training.places import PLACE, misplaced
 from ponderpounce.training.stand_in import stand_in
+from ponderpounce.training.training_episode import Frame, TrainingEpisode
 
-Frame = NDArray[np.uint8]  # (height, width, 3) RGB
 _SILENCE = repeat(Words())
-_SAME_PX = 6.0  # of a 256 px picture: less than any two things lie apart
 _RECALLING = 2  # queries
 _MOVED_PX = 3.0  # of a 256 px picture: farther than PONDER errs where nothing moves
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class TrainingEpisode:
-    """What training reads of an episode of T ticks. Row k is the world before action k."""
-
-    instruction: str
-    demo: tuple[tuple[Frame, ...], ...]
-    """The demonstration's views at 1 Hz; () without one."""
-    demo_subgoals: Sequence[str] = ()
-    """What is done in each of them, as grounded text; () where nobody says."""
-    demo_tools: Sequence[str] = ()
-    """Where the tool is then, ``<y, x>``; () where nobody says."""
-    frames: Sequence[tuple[Frame, ...]]
-    """T ticks of views, in the order of the robot's cameras; () at ticks where POUNCE has none."""
-    state_T8: NDArray[np.float32]
-    action_T8: NDArray[np.float32]
-    """Absolute joint targets and the gripper's command."""
-    subgoals: Sequence[str]
-    """T grounded texts; empty texts for data without annotations."""
-    is_transition_T: NDArray[np.bool_]
-    """Where another subgoal begins. Texts do not tell: two in a row may be the same, and one changes when its object
-    comes into sight."""
-    reasoning: str = ""
-    """What PONDER writes at the first transition after a demonstration; empty without one."""
-    imitated_from: int = 0
-    """The tick from which POUNCE imitates; before it somebody else acted (`pp-correct`)."""
-    is_watched: bool = False
-    """Somebody else's doing, good or bad: PONDER learns to follow it, POUNCE does not imitate it."""
-    is_told: bool = False
-    """PONDER cannot know what is to be said, or when (`pp-wander`): it learns to follow what texts point at, only."""
-    planned: Sequence[str] | None = None
-    """T texts that PONDER says instead of the subgoals (`with_plans`); None: the subgoals."""
-    sights: Sequence[tuple[Frame, ...]] | None = None
-    """T ticks of what PONDER's eyes make of the views, where ``frames`` are not the cameras' own; ``demo`` then is what
-    they make of it, too."""
-    seen_at_T: NDArray[np.intp] | None = None
-    """The tick that PONDER's view of each tick is of (`as_seen`); None: itself."""
-
-    def __post_init__(self) -> None:
-        rows = (self.frames, self.state_T8, self.action_T8, self.subgoals, self.is_transition_T)
-        sizes = {len(column) for column in rows}
-        if not 0 <= self.imitated_from < len(self.subgoals):
-            raise ValueError(f"imitated_from {self.imitated_from} is none of the {len(self.subgoals)} ticks")
-        if len(sizes) != 1 or 0 in sizes:
-            raise ValueError(
-                "an episode needs one frame, state, action, text and transition flag per tick; it has "
-                f"{', '.join(str(len(column)) for column in rows)}"
-            )
-
-    @property
-    def num_ticks(self) -> int:
-        return len(self.subgoals)
-
-    def as_seen(self, seen_at_T: NDArray[np.intp]) -> TrainingEpisode:
-        """The same where pictures were taken now and then only: what is shown at tick t was taken at ``seen_at_T[t]``.
-
-        What PONDER is told and is to say must be of that instant, too. A thing that is being pushed lies elsewhere a
-        second later; a PONDER whose pictures lag behind its words learns not to look. POUNCE's state and commands stay.
-        Changes that no picture shows apart are seen as one.
-        """
-        count_T = np.cumsum(self.is_transition_T)[seen_at_T]
-        return replace(
-            self,
-            subgoals=[self.subgoals[tick] for tick in seen_at_T],
-            is_transition_T=np.diff(count_T, prepend=0) > 0,
-            seen_at_T=seen_at_T,
-        )
-
-    def ponder_state(self, tick: int) -> NDArray[np.float32]:
-        """The robot's state (8,) as it was when the picture of this tick was taken."""
-        state_8: NDArray[np.float32] = self.state_T8[tick if self.seen_at_T is None else self.seen_at_T[tick]]
-        return state_8
-
-    def with_foresight(self) -> TrainingEpisode:
-        """The same with a place in every text that gets one later, while its subgoal lasts.
-
-        Upstream's texts have none as long as the arm hides the thing. Nothing in the picture tells where it is then,
-        but what was seen before may, and a PONDER that learns to say such a text points nowhere.
-        """
-        begins = np.flatnonzero(self.is_transition_T | (np.arange(self.num_ticks) == 0)).tolist()
-        subgoals: list[str] = []
-        for begin, end in pairwise([*begins, self.num_ticks]):
-            texts = self.subgoals[begin:end]
-            placed = next((text for text in texts if PLACE.search(text)), "")
-            subgoals += [text if PLACE.search(text) else placed or text for text in texts]
-        return replace(self, subgoals=subgoals)
-
-    def cut_short(self, cut: Cut) -> TrainingEpisode:
-        """The same, told to end sooner (`cuts`). Its last ticks are not to be seen."""
-        ticks = cut.ticks_U.tolist()
-        return replace(
-            self,
-            instruction=cut.instruction,
-            frames=[self.frames[tick] for tick in ticks],
-            sights=None if self.sights is None else [self.sights[tick] for tick in ticks],
-            state_T8=self.state_T8[ticks],
-            action_T8=self.action_T8[ticks],
-            subgoals=cut.subgoals,
-            is_transition_T=cut.is_transition_U,
-            seen_at_T=None if self.seen_at_T is None else self.seen_at_T[ticks],
-        )
-
-    def with_plans(self, *, even_the_first: bool = False) -> TrainingEpisode:
-        """The same, every subgoal but the first told with the places of those that come later: ``S, <y, x>, <y, x>``.
-
-        What was shown is then written down soon after, and read off from there later; without, a small network loses
-        the third of three things. When the first subgoal is told nothing has been seen, but for a demonstration. One
-        that is tried again counts once, and so does a place that was told already: where things are carried to and fro
-        every text has one. Of a way (`WAY`) every stretch counts, and is told with its last word: on which side.
-        """
-        begins = np.flatnonzero(self.is_transition_T | (np.arange(self.num_ticks) == 0)).tolist()
-        from_the_first = even_the_first or bool(self.demo)
-        planned: list[str] = []
-        for begin, end in pairwise([*begins, self.num_ticks]):
-            own = PLACE.sub("", self.subgoals[begin])
-            later: dict[str, str] = {}
-            told, stretches = [self.subgoals[begin]], []
-            for text in (self.subgoals[other] for other in begins if other >= end and (begin > 0 or from_the_first)):
-                place, stretch = PLACE.search(text), WAY.search(text)
-                if stretch is not None:
-                    stretches.append(f"{stretch[1]} {stretch[2]}")
-                elif place is not None and PLACE.sub("", text) != own:
-                    later.setdefault(PLACE.sub("", text), place[0])
-            for there in later.values():
-                if all(not PLACE.search(text) or has_moved(text, there, _SAME_PX) for text in told):
-                    told.append(there)
-            plan = "".join(f", {there}" for there in (*told[1:], *stretches[1:]))  # a stretch's text has the next one
-            planned += [text + plan for text in self.subgoals[begin:end]]
-        return replace(self, planned=planned)
-
-    def next_places(self) -> list[str]:
-        """Per tick, the place of the subgoal after the one in force, ``<y, x>``; empty where it has none."""
-        begins = [*np.flatnonzero(self.is_transition_T | (np.arange(self.num_ticks) == 0)).tolist(), self.num_ticks]
-        found: list[str] = []
-        for begin, end in pairwise(begins):
-            place = PLACE.search(self.subgoals[end]) if end < self.num_ticks else None
-            found += ["" if place is None else place[0]] * (end - begin)
-        return found
-
-    @property
-    def words(self) -> Sequence[str]:
-        """What is to be said at each tick."""
-        return self.subgoals if self.planned is None else self.planned
-
-    @property
-    def transition_ticks(self) -> frozenset[int]:
-        """Ticks at which another subgoal begins."""
-        return frozenset(np.flatnonzero(self.is_transition_T).tolist())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

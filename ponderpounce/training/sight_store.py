@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ponderpounce.training.example import Frame
+from ponderpounce.training.training_episode import Frame
 
 Views = list[tuple[Frame, ...]]
 """Of every instant, one picture per view; () where none are read."""

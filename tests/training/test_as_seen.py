@@ -18,8 +18,9 @@ from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
 from ponderpounce.models.proprioception import Proprioception
 from ponderpounce.training.data import Sight, TrainingSet
-from ponderpounce.training.example import ExampleConfig, TrainingEpisode, episode_row, make_example
+from ponderpounce.training.example import ExampleConfig, episode_row, make_example
 from ponderpounce.training.stand_in import stand_in
+from ponderpounce.training.training_episode import TrainingEpisode
 
 FORM = Ponder.random(
     replace(tiny_cpu(), image_px=(32, 32), num_layers=4, proprioception=Proprioception(first_id=460)), seed=1

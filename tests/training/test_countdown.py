@@ -14,10 +14,11 @@ from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.training.countdown import as_place, counted, stood_at, waits, waits_unplaced
-from ponderpounce.training.example import ExampleConfig, TrainingEpisode, make_example
+from ponderpounce.training.example import ExampleConfig, make_example
 from ponderpounce.training.lapses import Words
 from ponderpounce.training.nudge import Nudge
 from ponderpounce.training.stand_in import stand_in
+from ponderpounce.training.training_episode import TrainingEpisode
 
 HOVER, STILL, PRESS = (
     "move to the top of the button at <60, 90> to prepare",

@@ -16,7 +16,8 @@ from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.tasks.environment import make_environment
 from ponderpounce.training.cut_short import Cut, cuts
 from ponderpounce.training.events import EVENT_ROWS
-from ponderpounce.training.example import ExampleConfig, TrainingEpisode, make_example
+from ponderpounce.training.example import ExampleConfig, make_example
+from ponderpounce.training.training_episode import TrainingEpisode
 
 FORM = Ponder.random(replace(tiny_cpu(), image_px=(32, 32)), seed=1).format
 STINT = 40  # ticks of each subgoal

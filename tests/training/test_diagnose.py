@@ -33,7 +33,8 @@ from ponderpounce.training.diagnose import (
     next_alike,
     stale,
 )
-from ponderpounce.training.example import Example, TrainingEpisode, make_example
+from ponderpounce.training.example import Example, make_example
+from ponderpounce.training.training_episode import TrainingEpisode
 
 PX, NUM_TICKS = 64, 150
 PONDER = Ponder.random(replace(tiny_ponder(), image_px=(PX, PX), num_layers=4), seed=1)

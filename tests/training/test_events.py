@@ -16,8 +16,9 @@ from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
 from ponderpounce.training import recipes, train
 from ponderpounce.training.events import EVENT_ROWS, draw_near, event_ticks
-from ponderpounce.training.example import ExampleConfig, TrainingEpisode, make_example
+from ponderpounce.training.example import ExampleConfig, make_example
 from ponderpounce.training.train import TrainOptions
+from ponderpounce.training.training_episode import TrainingEpisode
 
 ticks_of = st.lists(st.integers(0, 300), min_size=1, unique=True).map(sorted)
 

@@ -23,16 +23,10 @@ from ponderpounce.models.pounce_groot import GrootInputs
 from ponderpounce.models.pounce_reading import groot_inputs, pi05_inputs
 from ponderpounce.models.prompt import tiny_tokenizer_for_random_weights
 from ponderpounce.training.collate import collate_ponder, collate_pounce
-from ponderpounce.training.example import (
-    ExampleConfig,
-    TrainingEpisode,
-    episode_row,
-    make_example,
-    row_frames,
-    target_rows,
-)
+from ponderpounce.training.example import ExampleConfig, episode_row, make_example, row_frames, target_rows
 from ponderpounce.training.places import misplaced
 from ponderpounce.training.stand_in import stand_in
+from ponderpounce.training.training_episode import TrainingEpisode
 from pounce_server.contract import Request
 
 PONDER = Ponder.random(replace(tiny_ponder(), image_px=(64, 64), num_layers=4), seed=1)

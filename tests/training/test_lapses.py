@@ -14,9 +14,10 @@ from ponderpounce.models.context import IGNORE
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
 from ponderpounce.models.ponder_coordinates import normalised_text
-from ponderpounce.training.example import ExampleConfig, TrainingEpisode, make_example
+from ponderpounce.training.example import ExampleConfig, make_example
 from ponderpounce.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses, without_lapses
 from ponderpounce.training.places import PLACE
+from ponderpounce.training.training_episode import TrainingEpisode
 
 FORM = Ponder.random(replace(tiny_cpu(), image_px=(32, 32), num_layers=4), seed=1).format
 OFTEN = Lapses(rows=1.0, missed=0.5, wrong=0.3, longest=3)

@@ -16,10 +16,11 @@ from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
 from ponderpounce.models.pounce_configs import tiny_cpu as tiny_pounce
 from ponderpounce.models.pounce_init import random_pounce
 from ponderpounce.training.collate import collate_ponder
-from ponderpounce.training.example import Example, ExampleConfig, TrainingEpisode, make_example
+from ponderpounce.training.example import Example, ExampleConfig, make_example
 from ponderpounce.training.joint import Draws, JointModel, PounceBatch, encode_rows
 from ponderpounce.training.places import PLACE
 from ponderpounce.training.stand_in import even_weights
+from ponderpounce.training.training_episode import TrainingEpisode
 
 PONDER = Ponder.random(replace(tiny_ponder(), image_px=(32, 32), num_layers=4), seed=1)
 FORM, SIZE = PONDER.format, PONDER.hidden_size

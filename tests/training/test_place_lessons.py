@@ -15,10 +15,11 @@ from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.training.collate import collate_ponder
-from ponderpounce.training.example import Example, ExampleConfig, TrainingEpisode, make_example
+from ponderpounce.training.example import Example, ExampleConfig, make_example
 from ponderpounce.training.joint import encode_rows
 from ponderpounce.training.lapses import Lapses
 from ponderpounce.training.place_lessons import PlaceLessons
+from ponderpounce.training.training_episode import TrainingEpisode
 
 PONDER = Ponder.random(replace(tiny_cpu(), image_px=(32, 32), num_layers=4), seed=1)
 FORM, SIZE = PONDER.format, PONDER.hidden_size

@@ -15,7 +15,8 @@ from ponderpounce.models.eyes import Eye, see
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
 from ponderpounce.models.proprioception import Proprioception
-from ponderpounce.training.example import TrainingEpisode, episode_row, row_frames
+from ponderpounce.training.example import episode_row, row_frames
+from ponderpounce.training.training_episode import TrainingEpisode
 
 EYES = (Eye(camera=1), Eye(camera=0, box=(0.25, 0.5, 0.75, 1.0)))
 PONDER = Ponder.random(

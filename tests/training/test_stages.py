@@ -22,12 +22,13 @@ from ponderpounce.models.pounce_checkpoint import load_bundle
 from ponderpounce.training import recipes, train
 from ponderpounce.training.augment import AS_IT_IS, Augmentation
 from ponderpounce.training.data import Sight, TrainingSet
-from ponderpounce.training.example import ExampleConfig, TrainingEpisode, make_example, row_frames
+from ponderpounce.training.example import ExampleConfig, make_example, row_frames
 from ponderpounce.training.joint import Draws, JointModel
 from ponderpounce.training.parallel import World
 from ponderpounce.training.recipe import Curriculum, Recipe, stages_of
 from ponderpounce.training.train import Batches, TrainOptions, build
 from ponderpounce.training.trainer import Trainer
+from ponderpounce.training.training_episode import TrainingEpisode
 
 PX, NUM_EPISODES, NUM_ROWS = 64, 2, 50
 

@@ -20,8 +20,9 @@ from ponderpounce.models.pounce_configs import tiny_cpu, tiny_groot
 from ponderpounce.models.pounce_init import random_pounce
 from ponderpounce.models.pounce_reading import groot_inputs, pi05_inputs
 from ponderpounce.training.collate import collate_ponder, collate_pounce
-from ponderpounce.training.example import Example, ExampleConfig, TrainingEpisode, make_example, said_by_query
+from ponderpounce.training.example import Example, ExampleConfig, make_example, said_by_query
 from ponderpounce.training.joint import Draws, JointModel
+from ponderpounce.training.training_episode import TrainingEpisode
 from pounce_server.contract import Request, example_request
 from pounce_server.engine import EagerEngine
 from protocol import messages as m
