@@ -8,7 +8,7 @@ typos included.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 ALL_DONE = "All tasks completed"
@@ -21,6 +21,12 @@ Pixel = tuple[int, int]  # row, column
 def simple(template: str) -> str:
     """Returns the template without its bracketed parts."""
     return re.sub(r"\[[^]]*\]", "", template)
+
+
+def counted_cubes(counts: Mapping[str, int]) -> str:
+    """How many cubes of which color, in this order: "two red cubes, one green cube and three blue cubes"."""
+    parts = [f"{COUNTS[count - 1]} {color} cube{'s' * (count > 1)}" for color, count in counts.items()]
+    return " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
 
 
 def num_coordinates(template: str) -> int:

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ponderpounce.tasks.front_view import AIM_M, EYE_M, FOV_DEG, RIGHT
+from ponderpounce.tasks.front_view import EYE_M, FOV_DEG, camera_axes
 from ponderpounce.tasks.geometry import Footprint, is_clear
 from ponderpounce.tasks.panda import (
     PANDA_WRISTCAM,
@@ -235,9 +235,8 @@ def _add_lights(spec: mujoco.MjSpec) -> None:
 
 
 def _add_cameras(spec: mujoco.MjSpec) -> None:
-    eye = np.array(EYE_M)
-    back = (eye - np.array(AIM_M)) / np.linalg.norm(eye - np.array(AIM_M))
-    spec.worldbody.add_camera(name=FRONT, pos=eye, xyaxes=[*RIGHT, *np.cross(back, RIGHT)], fovy=FOV_DEG)
+    right, up, _ = camera_axes()
+    spec.worldbody.add_camera(name=FRONT, pos=EYE_M, xyaxes=[*right, *up], fovy=FOV_DEG)
     # In the hand's frame +z leaves the palm and the fingers open along y. Image right is +y, image up is +x.
     spec.body("right_hand").add_camera(
         name=WRIST, pos=[0.0465, -0.02, 0.036], xyaxes=[0.0, 1.0, 0.0, 1.0, 0.0, 0.0], fovy=90.0

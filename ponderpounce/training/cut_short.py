@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ponderpounce.tasks.captions import COUNTS
+from ponderpounce.tasks.captions import COUNTS, counted_cubes
 
 _MORE_TICKS = 25  # a query a second: one at least sees that a round has ended
 
@@ -85,9 +85,7 @@ def _asking_for(rounds: Sequence[tuple[str, str]], instruction: str) -> str:
     if (whole := _BIN.search(instruction)) is not None:
         counts = Counter(color for _, color in rounds)
         said = [color for _, color in _BINNED.findall(whole[0]) if counts[color]]
-        parts = [f"{COUNTS[counts[color] - 1]} {color} cube{'s' * (counts[color] > 1)}" for color in said]
-        listed = " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
-        return _BIN.sub(listed, instruction)
+        return _BIN.sub(counted_cubes({color: counts[color] for color in said}), instruction)
     count = COUNTS[len(rounds) - 1]
     if len(rounds) == 1:
         return _REPEATS.sub("", _SWINGS.sub(r"put it down on the \1 target", instruction))

@@ -229,11 +229,7 @@ def make_example(
 ) -> Example:
     """Draws a schedule and lays the episode out under it."""
     episode = episode.with_foresight() if config.has_foresight else episode
-    cut: Cut | None = None
-    if config.cuts_short and rng.random() < config.cuts_short:
-        there = cuts(episode.instruction, episode.subgoals, episode.is_transition_T)
-        sooner = [each for each in there if each.end > episode.imitated_from]
-        cut = sooner[rng.integers(len(sooner))] if sooner else None
+    cut = _drawn_cut(episode, rng) if config.cuts_short and rng.random() < config.cuts_short else None
     episode = episode if cut is None else episode.cut_short(cut)
     episode = episode.with_plans() if config.has_plans else episode
     episode = episode if config.has_reasoning else replace(episode, reasoning="")
@@ -297,6 +293,13 @@ def make_example(
         nudge=config.nudge,
         nudges_I2=nudges_I2,
     )
+
+
+def _drawn_cut(episode: TrainingEpisode, rng: np.random.Generator) -> Cut | None:
+    """One way to end sooner, of those that leave something to imitate; None where there is none."""
+    there = cuts(episode.instruction, episode.subgoals, episode.is_transition_T)
+    sooner = [each for each in there if each.end > episode.imitated_from]
+    return sooner[rng.integers(len(sooner))] if sooner else None
 
 
 def _shortened(schedule: SampledSchedule, max_queries: int | None) -> SampledSchedule:

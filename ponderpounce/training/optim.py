@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -75,8 +75,8 @@ class Optimiser:
         turned = [p for name, p in self._masters.items() if config.matrices == "muon" and _is_turned(name, p)]
         if any(isinstance(each, DTensor) for each in turned):
             raise ValueError("Muon needs whole matrices, these are sharded: give --weights whole, or matrices='adamw'")
-        apart = {id(each) for each in turned}
-        groups = [[each for each in group if id(each) not in apart] for group in self._groups()]
+        self._turned = {id(each) for each in turned}
+        groups = [[each for each in group if id(each) not in self._turned] for group in self._groups()]
         adam = torch.optim.AdamW(
             [{"params": group} for group in groups if group] or [{"params": []}],
             lr=config.learning_rate,
@@ -84,10 +84,11 @@ class Optimiser:
             eps=config.eps,
             weight_decay=config.weight_decay,
         )
-        self._parts: list[torch.optim.Optimizer] = [adam]
+        self._parts: list[tuple[torch.optim.Optimizer, tuple[str, ...]]] = [(adam, ("step", "exp_avg", "exp_avg_sq"))]
+        """And what each remembers of a parameter."""
         if turned:
             muon = torch.optim.Muon(turned, weight_decay=config.weight_decay, adjust_lr_fn="match_rms_adamw")
-            self._parts.append(muon)
+            self._parts.append((muon, ("momentum_buffer",)))
         self.average = {name: p.detach().clone() for name, p in self._masters.items()} if config.ema_decay else {}
 
     def update(self, step: int) -> float:
@@ -107,7 +108,7 @@ class Optimiser:
                 f"step {step}: gradients are not finite (first in {', '.join(worst)}). Lower learning_rate, or train "
                 "in float32; the last checkpoint is untouched."
             )
-        for part in self._parts:
+        for part, _ in self._parts:
             for group in part.param_groups:
                 group["lr"] = learning_rate(self._config, step)
             part.step()
@@ -131,7 +132,8 @@ class Optimiser:
         found = {f"average.{name}": tensor for name, tensor in self.average.items()}
         found |= {f"master.{name}": master.detach() for name, (_, master) in self._mastered().items()}
         for name, parameter in self._masters.items():
-            for key, value in self._state(parameter).items():
+            part, _ = self._part_of(parameter)
+            for key, value in part.state[parameter].items():
                 found[f"{key}.{name}"] = torch.as_tensor(value)
         return found
 
@@ -155,7 +157,7 @@ class Optimiser:
             fits = parameter is not None and (stored.shape(full_name) == tuple(parameter.shape) or is_step)
             is_own = key in ("average", "master")
             unknown = (key == "average" and name not in self.average) or (key == "master" and name not in mastered)
-            if parameter is None or not fits or unknown or (not is_own and key not in self._remembers(parameter)):
+            if parameter is None or not fits or unknown or not (is_own or key in self._part_of(parameter)[1]):
                 raise ValueError(
                     f"the optimiser's state is of another model, freeze mode, dtype or optimiser: it has {full_name}"
                 )
@@ -171,20 +173,12 @@ class Optimiser:
                 local(state).copy_(rows)
                 states.setdefault(name, {})[key] = state
         for name, found in states.items():
-            self._state(self._masters[name]).update(found)
+            part, _ = self._part_of(self._masters[name])
+            part.state[self._masters[name]] = found
 
-    def _remembers(self, parameter: nn.Parameter) -> tuple[str, ...]:
-        """What the part that updates a parameter remembers of it."""
-        is_turned = any(parameter is each for part in self._parts[1:] for each in part.param_groups[0]["params"])
-        return ("momentum_buffer",) if is_turned else ("step", "exp_avg", "exp_avg_sq")
-
-    def _state(self, parameter: nn.Parameter) -> dict[str, Any]:
-        """What is remembered of a parameter by the part that updates it."""
-        for part in self._parts:
-            if any(parameter is each for group in part.param_groups for each in group["params"]):
-                state: dict[str, Any] = part.state[parameter]
-                return state
-        raise KeyError("a parameter of no part")
+    def _part_of(self, parameter: nn.Parameter) -> tuple[torch.optim.Optimizer, tuple[str, ...]]:
+        """What updates a parameter, and what it remembers of it."""
+        return self._parts[id(parameter) in self._turned]
 
     def _groups(self) -> list[list[nn.Parameter]]:
         """Those of which a process holds its rows, and those of which it holds all: no operation takes both at once."""

@@ -102,10 +102,8 @@ class BinFill(Task[Layout, Memory]):
             physics.refresh()
 
     def instruction(self, layout: Layout) -> str:
-        counts = dict(layout.wanted)
-        parts = [f"{captions.COUNTS[n - 1]} {color} cube{'s' * (n > 1)}" for color, n in _in_order_of_speech(counts)]
-        listed = " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
-        return f"put {listed} into the bin, then press the button to stop"
+        cubes = captions.counted_cubes(dict(_in_order_of_speech(dict(layout.wanted))))
+        return f"put {cubes} into the bin, then press the button to stop"
 
     def subtasks(self, layout: Layout) -> tuple[Subtask, ...]:
         steps: list[Subtask] = []
