@@ -25,7 +25,9 @@ from ponderpounce.data.video import FPS, Frame, VideoWriter
 CAMERAS = ("front", "wrist")
 ROWS, ABOUT = "rows.parquet", "episode.json"
 WANDERING = "wandering things"  # the origin of what pp-wander made
-EXECUTED = "executed_action"  # the one column that only some datasets have
+EXECUTED, SAID = "executed_action", "said"
+OPTIONAL = (EXECUTED, SAID)
+"""Columns that only some datasets have: those collected under noise, those of a policy's own play."""
 
 Package = dict[str, bytes]  # file name -> content
 Recovery = Literal["none", "z", "xy"]
@@ -44,6 +46,7 @@ class Row:
     is_transition: bool = False  # the first row of a new subgoal that the robot itself is to reach
     demonstration_reasoning: str = ""  # only in the first row after a demonstration
     executed_action: NDArray[np.float32] | None = None  # (8,): what was carried out in place of `action`, under noise
+    said: str | None = None  # the policy's own new words about this row, "" for none; None: nobody was listened to
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,6 +73,7 @@ class About:
     rejected: tuple[Rejection, ...] = ()
     noise_rad: float = 0.0  # standard deviation of the joint targets' noise, far from everything; see `dart`
     corrected_from: int = 0  # the first row after the demonstration that POUNCE imitates; see `correct`
+    unreached: tuple[str, ...] = ()  # grounded subgoals that were still to come when it ended; see `export`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -86,6 +90,7 @@ class Rows:
     grounded_subgoal: tuple[str, ...]
     demonstration_reasoning: tuple[str, ...]
     executed_action: NDArray[np.float32] | None = None  # (N, 8); None: every action was carried out as it is
+    said: tuple[str, ...] | None = None  # as the policy told places, [x, y] in thousandths; None: not recorded
 
     def __len__(self) -> int:
         return len(self.state)
@@ -124,6 +129,7 @@ class EpisodeWriter:
             grounded_subgoal=tuple(row.grounded_subgoal for row in rows),
             demonstration_reasoning=tuple(row.demonstration_reasoning for row in rows),
             executed_action=_executed(rows),
+            said=None if all(row.said is None for row in rows) else tuple(row.said or "" for row in rows),
         )
         pixels = {camera: [each.num_frames, each.counts.tolist()] for camera, each in self._pixels.items()}
         sink = io.BytesIO()
@@ -153,6 +159,7 @@ def unpack(package: Package) -> Episode:
         for camera, (num_frames, counts) in values.pop("pixels").items()
     }
     values["rejected"] = tuple(Rejection(**each) for each in values["rejected"])
+    values["unreached"] = tuple(values["unreached"])
     return Episode(
         about=About(**values),
         rows=from_table(pq.read_table(io.BytesIO(package[ROWS]))),
@@ -168,8 +175,8 @@ def to_table(rows: Rows) -> pa.Table:
 
 
 def from_table(table: pa.Table) -> Rows:
-    """The columns of an Arrow table; those it has besides are left aside. Without noise it has no executed actions."""
-    names = [each.name for each in fields(Rows) if each.name != EXECUTED or EXECUTED in table.column_names]
+    """The columns of an Arrow table; those it has besides are left aside, and it may lack what is optional."""
+    names = [each.name for each in fields(Rows) if each.name not in OPTIONAL or each.name in table.column_names]
     return Rows(**{name: _from_arrow(table.column(name).combine_chunks()) for name in names})
 
 

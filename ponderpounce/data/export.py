@@ -1,8 +1,8 @@
 """``pp-export``: recorded episodes as a dataset of the same format, every row an exact join by tick.
 
-Row k is the observation of tick k, the texts that were in force then, and the action that was commanded for tick k. A
-log holds no demonstration; since a seed decides the scene, it is acted out again and put before the rows, and the first
-state of the log must then be the very one that follows it.
+Row k is the observation of tick k, the texts that were in force then, what the policy said of it, and the action
+that was commanded for tick k. A log holds no demonstration; since a seed decides the scene, it is acted out again and
+put before the rows, and the first state of the log must then be the very one that follows it.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
@@ -22,7 +22,9 @@ from ponderpounce.data.errors import DatasetError
 from ponderpounce.data.lerobot_v3 import INFO_PATH, DatasetWriter
 from ponderpounce.data.rollout import Narrator
 from ponderpounce.data.video import FPS, Frame
-from ponderpounce.tasks.environment import Environment, make_environment
+from ponderpounce.tasks.difficulty import Order
+from ponderpounce.tasks.engine import Status
+from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
 from ponderpounce.tasks.task import TaskError
 from protocol import images
 from protocol import messages as m
@@ -40,6 +42,12 @@ class ExportOptions:
     """MCAP logs of sim-client."""
     out: Path
     """Folder of the new dataset."""
+    texts: Literal["logged", "follow"] = "logged"
+    """"follow": every action is played again, and told is what is to be done as things then stand. What was dropped is
+    to be picked up again, what was pushed lies elsewhere, of cubes that will all do the next is one that is left, and
+    what is still to come at the end is told, too. For a PONDER that learns from what it played."""
+    order: Order = "drawn"
+    """The one that was played in; for "follow"."""
     only_success: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Leave out episodes that did not succeed."""
     progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
@@ -73,7 +81,7 @@ def export(options: ExportOptions) -> int:
         record = read_log(path)
         if options.only_success and not (record.result and record.result.is_success):
             continue
-        writer.add(read_episode(path, record))
+        writer.add(read_episode(path, record, texts=options.texts, order=options.order))
         num_episodes += 1
     if not num_episodes:
         raise DatasetError("none of the logs is of an episode that succeeded; leave out --only-success")
@@ -81,7 +89,9 @@ def export(options: ExportOptions) -> int:
     return num_episodes
 
 
-def read_episode(path: Path, record: EpisodeRecord) -> Episode:
+def read_episode(
+    path: Path, record: EpisodeRecord, *, texts: Literal["logged", "follow"] = "logged", order: Order = "drawn"
+) -> Episode:
     """Joins a log's messages, and acts its demonstration out again.
 
     Raises:
@@ -94,14 +104,22 @@ def read_episode(path: Path, record: EpisodeRecord) -> Episode:
     if height_px != width_px:
         raise DatasetError(f"{path}: pictures of {height_px} x {width_px} px; datasets here have square ones")
     writer = EpisodeWriter(height_px)
-    with make_environment(info.task, image_px=height_px) as environment:
-        narrator = _again(path, environment, info, observations[0])
+    follows = texts == "follow"
+    max_steps = len(actions) + 1  # it ended as it did
+    with make_environment(
+        info.task, image_px=height_px, max_steps=max_steps, texts_follow=follows, order=order
+    ) as environment:
+        narrator, first = _again(path, environment, info, observations[0])
         for row, frames in narrator.demonstration(FPS):
             writer.add(row, frames)
-        said = texts_by_tick(record.subgoals, len(actions))
         reasoning = narrator.reasoning()
-        for observation, action, (plain, grounded, is_new), seen in zip(
-            observations, actions, said, _pictures(path, observations), strict=True
+        if follows:
+            told, unreached = _played_again(path, environment, first, observations, actions)
+        else:
+            told, unreached = texts_by_tick(record.subgoals, len(actions)), ()
+        said = said_by_tick(record.subgoals, len(actions))
+        for observation, action, (plain, grounded, is_new), own, seen in zip(
+            observations, actions, told, said, _pictures(path, observations), strict=True
         ):
             is_first = observation is observations[0]
             row = Row(
@@ -112,6 +130,7 @@ def read_episode(path: Path, record: EpisodeRecord) -> Episode:
                 grounded_subgoal=grounded,
                 is_transition=is_new,
                 demonstration_reasoning=reasoning if is_first else "",
+                said=own,
             )
             writer.add(row, seen)
     about = About(
@@ -122,19 +141,47 @@ def read_episode(path: Path, record: EpisodeRecord) -> Episode:
         origin=info.policy,
         is_success=record.result is not None and record.result.is_success,
         image_px=height_px,
+        unreached=unreached,
     )
     return unpack(writer.pack(about))
 
 
-def _again(path: Path, environment: Environment, info: m.EpisodeInfo, first: m.Observation) -> Narrator:
+def _played_again(
+    path: Path,
+    environment: Environment,
+    snapshot: Snapshot,
+    observations: Sequence[m.Observation],
+    actions: Sequence[m.Floats],
+) -> tuple[list[tuple[str, str, bool]], tuple[str, ...]]:
+    """What is told at every tick, as `texts_by_tick` has it, and what is still to come at the end.
+
+    Raises DatasetError where the robot comes to stand elsewhere than in the log.
+    """
+    told, index = [], -1
+    for observation, action in zip(observations, actions, strict=True):
+        if not np.array_equal(snapshot.state, observation.proprio):
+            raise DatasetError(
+                f"{path}: at tick {observation.tick} the robot stands at {snapshot.state.tolist()} here and at "
+                f"{observation.proprio.tolist()} in the log; export it with the versions that made it, or as logged"
+            )
+        told.append((snapshot.simple_subgoal, snapshot.grounded_subgoal, snapshot.subgoal_index != index))
+        index = snapshot.subgoal_index
+        snapshot = environment.step(action, look=False)
+    return told, () if snapshot.status is Status.SUCCESS else environment.to_come()
+
+
+def _again(
+    path: Path, environment: Environment, info: m.EpisodeInfo, first: m.Observation
+) -> tuple[Narrator, Snapshot]:
     """Resets the log's scene. Raises DatasetError unless the robot stands there as the log says."""
-    state = environment.reset(info.seed, info.difficulty).state
+    snapshot = environment.reset(info.seed, info.difficulty)
+    state = snapshot.state
     if not np.array_equal(state, first.proprio):
         raise DatasetError(
             f"{path}: seed {info.seed} of {info.task} begins at {state.tolist()} here and at {first.proprio.tolist()} "
             f"in the log, which was made with {info.versions}; export it with those versions"
         )
-    return Narrator(environment)
+    return Narrator(environment), snapshot
 
 
 def _joined(path: Path, record: EpisodeRecord) -> tuple[list[m.Observation], list[m.Floats]]:
@@ -163,6 +210,12 @@ def texts_by_tick(subgoals: Sequence[m.Subgoal], num_ticks: int) -> list[tuple[s
         now = (plain.get(tick, now[0]), grounded.get(tick, now[1]))
         said.append((*now, tick in plain))
     return said
+
+
+def said_by_tick(subgoals: Sequence[m.Subgoal], num_ticks: int) -> list[str]:
+    """What the policy itself said about each tick's observation, as it told it; empty where it said nothing."""
+    own = {each.tick: each.text for each in subgoals if each.kind == m.SubgoalKind.SUBGOAL}
+    return [own.get(tick, "") for tick in range(num_ticks)]
 
 
 def _pictures(path: Path, observations: Sequence[m.Observation]) -> Iterator[dict[str, Frame]]:

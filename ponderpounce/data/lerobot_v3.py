@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ponderpounce.data.episode import CAMERAS, EXECUTED, Episode, to_table
+from ponderpounce.data.episode import CAMERAS, EXECUTED, OPTIONAL, SAID, Episode, to_table
 from ponderpounce.data.statistics import PixelHistogram, Statistics, of_vectors
 from ponderpounce.data.video import CODEC, FPS, PIXEL_FORMAT, VideoJoiner
 
@@ -50,8 +50,8 @@ _COLUMNS: dict[str, dict[str, Any]] = {
     "index": {"dtype": "int64", "shape": [1], "names": None},
     "task_index": {"dtype": "int64", "shape": [1], "names": None},
 }
-_EXECUTED_COLUMN = {EXECUTED: _COLUMNS["action"]}
-"""Only in datasets that were collected under noise."""
+_OPTIONAL_COLUMNS = {EXECUTED: _COLUMNS["action"], SAID: _COLUMNS["subgoal"]}
+"""Only in some datasets (`episode.OPTIONAL`)."""
 _POLICY = ("observation.state", "action", "tcp_pose", EXECUTED)
 """Statistics of these are over the robot's own rows: they normalise a policy, and nobody acts in a demonstration."""
 
@@ -74,7 +74,7 @@ class DatasetWriter:
         self._episodes: list[dict[str, Any]] = []
         self._image_px = 0
         self._num_rows = 0
-        self._has_executed: bool | None = None
+        self._optional: tuple[str, ...] | None = None
 
     def add(self, episode: Episode) -> None:
         """Appends an episode."""
@@ -84,12 +84,11 @@ class DatasetWriter:
             raise ValueError(
                 f"episode of {about.image_px} px after ones of {self._image_px} px; a dataset has one size"
             )
-        has_executed = episode.rows.executed_action is not None
-        if self._has_executed not in (None, has_executed):
-            raise ValueError(
-                f"a dataset's episodes all have {EXECUTED}, or none has; {about.task} {about.seed} differs"
-            )
-        self._has_executed = has_executed
+        optional = tuple(name for name in OPTIONAL if getattr(episode.rows, name) is not None)
+        if self._optional not in (None, optional):
+            (differs, *_) = {*self._optional} ^ {*optional}
+            raise ValueError(f"a dataset's episodes all have {differs}, or none has; {about.task} {about.seed} differs")
+        self._optional = optional
         table = self._numbered(episode)
         placed: dict[str, Any] = {
             "episode_index": len(self._episodes),
@@ -106,8 +105,9 @@ class DatasetWriter:
             "num_rejected": len(about.rejected),
             "num_demonstration_rows": int(episode.rows.is_demonstration.sum()),
             "corrected_from": about.corrected_from,
+            "unreached": list(about.unreached),
         }
-        if has_executed:
+        if EXECUTED in optional:
             placed["noise_rad"] = about.noise_rad
         placed |= self._data.append(table)
         for camera, videos in self._videos.items():
@@ -127,7 +127,10 @@ class DatasetWriter:
         self._data.close()
         for videos in self._videos.values():
             videos.close()
-        pq.write_table(pa.Table.from_pylist(self._episodes), _made(self._root / EPISODES_PATH))
+        listed = pa.Table.from_pylist(self._episodes)
+        at = listed.schema.get_field_index("unreached")  # all may be empty, and Arrow then knows no type
+        listed = listed.set_column(at, "unreached", listed["unreached"].cast(pa.list_(pa.string())))
+        pq.write_table(listed, _made(self._root / EPISODES_PATH))
         pq.write_table(_tasks(self._instructions), self._root / TASKS_PATH)
         statistics = self._data.statistics()
         statistics |= {video_key(camera): pixels.statistics() for camera, pixels in self._pixels.items()}
@@ -148,7 +151,7 @@ class DatasetWriter:
         return pa.table(columns)
 
     def _columns(self) -> dict[str, dict[str, Any]]:
-        return {**_COLUMNS, **_EXECUTED_COLUMN} if self._has_executed else _COLUMNS
+        return _COLUMNS | {name: _OPTIONAL_COLUMNS[name] for name in self._optional or ()}
 
     def _described(self) -> dict[str, Any]:
         video = {

@@ -78,9 +78,9 @@ def make_environment(
 
     With ``texts_follow`` the coordinates of a grounded subgoal are corrected when its things have been pushed
     elsewhere, there are some where upstream tells a way without its end (`located`) or a demonstration's text names no
-    place, and what was dropped on its way is to be picked up again; upstream's stay where they were first seen, and go
-    on. An ``order`` other than upstream's changes the list of subtasks, and with it texts and oracle; scenes and what
-    counts as success stay the same.
+    place, what was dropped on its way is to be picked up again, and of things that will all do the next is one that is
+    left (`Task.subtasks_after`); upstream's stay where they were first seen, and go on. An ``order`` other than
+    upstream's changes the list of subtasks, and with it texts and oracle; scenes and what counts as success stay.
     """
     return Environment(
         make_task(name), image_px=image_px, render=render, max_steps=max_steps, texts_follow=texts_follow, order=order
@@ -246,6 +246,20 @@ class Environment:
         following = self._subtasks[self._progress.index if is_lost else self._caption.index + 1 :][:1]
         return "".join("<{}, {}>".format(*self._project(step.grounds[:1])[0]) for step in following if step.grounds)
 
+    def to_come(self) -> tuple[str, ...]:
+        """Returns the grounded texts of the subtasks after the one that is spoken of, with where their things stand.
+
+        What is not in the scene yet has no place.
+        """
+        self._require_episode()
+        assert self._caption is not None
+        texts = []
+        for step in self._subtasks[self._caption.index + 1 :]:
+            is_there = not any(map(self.physics.is_parked, step.grounds))
+            points = self._project(step.grounds) if is_there and step.grounds else []
+            texts.append(captions.grounded(step.text, points) if is_there else captions.simple(step.text))
+        return tuple(texts)
+
     def save(self) -> EpisodeState:
         """Returns a copy of the whole episode as it stands."""
         self._require_episode()
@@ -272,6 +286,7 @@ class Environment:
         self._step, self._memory = state.step, state.memory
         self._progress, self._caption, self._video = state.progress, state.caption, state.video
         self._actions = list(state.actions)
+        self._read_on()
         return self._snapshot(look=look)
 
     def fork(self, variant: int = 0) -> Fork:
@@ -305,6 +320,12 @@ class Environment:
         self._task.arrange(self.physics, layout)
         self.physics.refresh()
 
+    def _read_on(self) -> None:
+        """With ``texts_follow``: the list goes on from what has been done, in whatever order."""
+        if self._texts_follow:
+            done = self._task.subtasks_after(self._layout, self._memory)
+            self._subtasks = tuple(self._told(subtask) for subtask in done)
+
     def _told(self, step: StepT) -> StepT:
         return located(step) if self._texts_follow else step
 
@@ -312,7 +333,9 @@ class Environment:
         """Stages, remembers, judges and captions the instant the physics is at."""
         self._task.stage(self.physics, self._layout, self._memory, self.physics.elapsed_steps() - 1)
         spoken_of = self._progress.index  # texts change one step after the engine does
-        self._memory = self._task.remember(self._memory, self.physics, self._layout)
+        before, self._memory = self._memory, self._task.remember(self._memory, self.physics, self._layout)
+        if self._memory != before:
+            self._read_on()
         self._progress = engine.judge(
             self._progress,
             self._subtasks,

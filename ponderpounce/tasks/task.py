@@ -132,6 +132,15 @@ class Task(ABC, Generic[LayoutT, MemoryT]):
     def subtasks(self, layout: LayoutT) -> tuple[Subtask, ...]:
         """Returns the ordered list of subtasks."""
 
+    def subtasks_after(self, layout: LayoutT, memory: MemoryT) -> tuple[Subtask, ...]:
+        """Returns the list as it should read after what has been done, where the list leaves open what comes first.
+
+        As long, and entry by entry with the same completion and failure: success is what it was. Of two cubes that are
+        both wanted either may come first; who followed the list from here on would otherwise be sent to the one that is
+        in the bin. The default is `subtasks`.
+        """
+        return self.subtasks(layout)
+
     def demonstration(self, layout: LayoutT) -> tuple[Shown, ...]:
         """Returns what happens before the robot is asked to act. The default is nothing.
 

@@ -18,9 +18,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ponderpounce.models.context import ContextFormat
-from ponderpounce.training.places import PLACE, TEXT_PX
+from ponderpounce.training.places import PLACE, TEXT_PX, WAY
 
 _SIDED = re.compile(r"left|right|clockwise", re.IGNORECASE)
+_SIDE = re.compile(r"\b(?:left|right|clockwise|counterclockwise)\b")
+_MIRRORED = {"left": "right", "right": "left", "clockwise": "counterclockwise", "counterclockwise": "clockwise"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,7 +32,8 @@ class Augmentation:
     max_shift_px: int = 0
     """Of PONDER's picture, either way in both directions; edges are repeated."""
     mirror: bool = False
-    """Half of the episodes are mirrored, unless their texts speak of sides."""
+    """Half of the episodes are mirrored, unless their texts speak of sides. Those of ways (`places.WAY`) may: with
+    "left" for "right" it is the way that the picture then shows."""
     max_gain: float = 0.0
     """Pictures are brighter or darker, at most 1 + that times or 1 / (1 + that); every factor is as likely."""
 
@@ -78,9 +81,11 @@ class View:
         return wide[:, :, top : top + height, left : left + width].permute(0, 2, 3, 1)
 
     def text(self, text: str) -> str:
-        """Its coordinates as they are in this view; at the picture's edge where they would leave it."""
+        """Its coordinates and sides as they are in this view; at the picture's edge where they would leave it."""
         if not (self.down_px or self.right_px or self.is_mirrored):
             return text
+        if self.is_mirrored:
+            text = _SIDE.sub(lambda side: _MIRRORED[side[0]], text)
         return PLACE.sub(self._moved, text)
 
     def _moved(self, place: re.Match[str]) -> str:
@@ -109,6 +114,7 @@ def draw_view(config: Augmentation, form: ContextFormat, texts: set[str], rng: n
     if config.mirror and abs(left + right - 1) > 1e-9:
         raise ValueError(f"an eye from {left} to {right} is not symmetric about the middle and cannot be mirrored")
     down_px, right_px = rng.integers(-config.max_shift_px, config.max_shift_px + 1, size=2).tolist()
-    is_mirrored = config.mirror and bool(rng.integers(2)) and not any(_SIDED.search(text) for text in texts)
+    is_sided = any(_SIDED.search(text) and not WAY.search(text) for text in texts)
+    is_mirrored = config.mirror and bool(rng.integers(2)) and not is_sided
     text_px = (bottom - top) * TEXT_PX / form.image_px[0]
     return View(down_px=down_px, right_px=right_px, is_mirrored=is_mirrored, text_px=text_px, gain=gain)

@@ -23,6 +23,7 @@ from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.models.prompt import with_subgoal
 from ponderpounce.tasks.front_view import front_pixels
 from ponderpounce.training.example import chunk_ticks
+from ponderpounce.training.own_words import as_recorded
 from ponderpounce.training.places import TEXT_PX
 from ponderpounce.training.sight_store import SightStore, Views
 from ponderpounce.training.training_episode import Frame, TrainingEpisode
@@ -209,6 +210,8 @@ class TrainingSet:
             imitated_from=entry.corrected_from,
             is_watched=source.is_watched,
             is_told=entry.origin == WANDERING,
+            unreached=entry.unreached,
+            said=[as_recorded(text) for text in (rows.said or ())[start:]],
         )
         sees = self._sight is None or self._sight.form is not None
         return episode.as_seen((own[start:] - start).clip(min=0)) if sees else episode

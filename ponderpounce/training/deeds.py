@@ -13,13 +13,14 @@ from dataclasses import dataclass
 
 from ponderpounce.tasks.captions import ORDINALS
 from ponderpounce.training.lapses import has_moved
-from ponderpounce.training.places import PLACE
+from ponderpounce.training.places import PLACE, WAY
 
 _OTHER_PX = 6.0  # of a 256 px picture: less than any two things lie apart
 
 _AT = re.compile(rf" (?:at|to) {PLACE.pattern}(?:, then .*|, {PLACE.pattern})?")
 # what `Environment._watching` makes of a text without a place
 _WATCHED = re.compile(rf"[^<]* at {PLACE.pattern}, {PLACE.pattern}|static at {PLACE.pattern}")
+_AROUND = re.compile(r"(left|right) target by circling around the stick (clockwise|counterclockwise)")
 _PUT, _PRESS, _PICK = "drop the cube onto target", "press the button", "pick up the"
 
 Place = tuple[int, int]
@@ -67,8 +68,11 @@ def narration(texts: Sequence[str]) -> str:
     """What was done where, in order: ``first <y, x>, second <y, x>, button, third <y, x>``; empty where that is little.
 
     Things are put onto one place after the other, or one is picked up. Written down it can be looked up by number, or
-    by what it stands beside, as often as one likes; ways are told by their plan (`TrainingEpisode.with_plans`).
+    by what it stands beside, as often as one likes. Of a way around things every stretch is told with the side on which
+    it passes (`passing_side`); other ways are told by their plan (`TrainingEpisode.with_plans`).
     """
+    if around := [f"{side} {place}" for side, place in _around(texts)]:
+        return ", ".join(around)
     told: dict[int, str] = {}
     picked: dict[int, str] = {}
     for deed in deeds(texts):
@@ -82,6 +86,28 @@ def narration(texts: Sequence[str]) -> str:
     if not any(PLACE.search(text) for text in told.values()):
         told = picked
     return ", ".join(told[number] for number in sorted(told))
+
+
+def passing_side(text: str) -> str:
+    """Whether the stretch of a way that the text tells passes its thing "backward", nearer to the robot, or "forward".
+
+    That is where the tool is seen half-way. Which way round follows from it and from where the stretch leads, and was
+    not learned without. Empty for other texts.
+    """
+    found = _AROUND.search(text)
+    if found is None:
+        return ""
+    return "backward" if (found[1] == "left") == (found[2] == "clockwise") else "forward"
+
+
+def _around(texts: Sequence[str]) -> list[tuple[str, str]]:
+    """Side and end, ``<y, x>``, of every stretch of a way around things."""
+    found: list[tuple[str, str]] = []
+    for text in texts:
+        stretch = WAY.search(text)
+        if (side := passing_side(text)) and stretch is not None and (side, stretch[2]) not in found[-1:]:
+            found.append((side, stretch[2]))
+    return found
 
 
 def _name(text: str) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate, repeat
+from itertools import accumulate, pairwise, repeat
 from typing import Literal
 
 import numpy as np
@@ -28,6 +28,7 @@ from ponderpounce.training.deeds import narration
 from ponderpounce.training.events import EVENT_ROWS, draw_near, event_ticks
 from ponderpounce.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses, has_moved, without_lapses
 from ponderpounce.training.nudge import NO_NUDGE, Nudge, draw_nudges
+from ponderpounce.training.own_words import own_words
 from ponderpounce.training.place_lessons import PlaceLessons, place_lessons
 from ponderpounce.training.places import PLACE, misplaced
 from ponderpounce.training.stand_in import stand_in
@@ -35,6 +36,7 @@ from ponderpounce.training.training_episode import Frame, TrainingEpisode
 
 _SILENCE = repeat(Words())
 _RECALLING = 2  # queries
+_CORRECTED = 0.3  # of own words, at every query
 _MOVED_PX = 3.0  # of a 256 px picture: farther than PONDER errs where nothing moves
 
 
@@ -90,6 +92,8 @@ class ExampleConfig:
 
     lapses: Lapses = NO_LAPSES
     """Words that come late or are wrong, and are put right."""
+    own_words: float = 0.0
+    """Of grounded rows whose recording holds what its PONDER said, the share in which that stands (`own_words`)."""
     counts_down: bool = False
     """Waits are told with their number of steps, at every query anew (`countdown`)."""
     retold_px: float | None = None
@@ -127,7 +131,7 @@ class ExampleConfig:
                 f"retold_px {self.retold_px} must be above 0, and slips 0, came {self.slips}: a row whose words all "
                 "slip never puts them right; let them slip in `Lapses.slipped`"
             )
-        for name in ("text_dropout", "slips", "tells_onward", "cuts_short", "recalls"):
+        for name in ("text_dropout", "slips", "tells_onward", "cuts_short", "recalls", "own_words"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be in [0, 1], came {getattr(self, name)}")
 
@@ -250,8 +254,9 @@ def make_example(
     chosen = draw_near(ticks, events, count, config.event_weight, rng)
     invocations = tuple(schedule.invocations[imitated[index]] for index in chosen)
     is_grounded = config.is_grounded and (rng.random() >= config.text_dropout or episode.is_told)
+    is_own = is_grounded and bool(config.own_words and episode.said) and rng.random() < config.own_words
     slip = None
-    if is_grounded and config.slips and not episode.is_told and rng.random() < config.slips:
+    if is_grounded and not is_own and config.slips and not episode.is_told and rng.random() < config.slips:
         std_px = float(np.exp(rng.uniform(*np.log(config.slip_px))))
         slip = Slip(std_px=std_px, seed=int(rng.integers(1 << 62)))
     elif is_grounded and config.tremble_px:
@@ -259,7 +264,9 @@ def make_example(
     words = None
     if is_grounded and not episode.is_told:
         lapses = config.lapses if config.lapses.rows and rng.random() < config.lapses.rows else NO_LAPSES
-        if lapses != NO_LAPSES or config.retold_px is not None:
+        if is_own:
+            words = own_words(_newly_said(episode, schedule), *_subgoals(episode, schedule), rng, _CORRECTED)
+        elif lapses != NO_LAPSES or config.retold_px is not None:
             words = drawn_lapses(lapses, *_subgoals(episode, schedule), rng, config.retold_px)
         if config.counts_down and any(left := waits(episode.subgoals)):
             subgoals, is_change = _subgoals(episode, schedule)
@@ -351,6 +358,17 @@ def _subgoals(episode: TrainingEpisode, schedule: SampledSchedule) -> tuple[list
     """What is to be said at every query, and whether it is the first to see a change."""
     queries = schedule.queries
     return [episode.words[query.tick] for query in queries], [query.stamp.is_transition for query in queries]
+
+
+def _newly_said(episode: TrainingEpisode, schedule: SampledSchedule) -> list[str]:
+    """The last words of the recorded PONDER since the query before. After a demonstration the first ones are left out:
+    they followed from what it wrote about it, which no row holds."""
+    ticks = [query.tick for query in schedule.queries]
+    newest = [
+        next((text for text in reversed(episode.said[before + 1 : tick + 1]) if text), "")
+        for before, tick in pairwise([-1, *ticks])
+    ]
+    return ["", *newest[1:]] if episode.demo else newest
 
 
 def said_by_query(episode: TrainingEpisode, schedule: SampledSchedule) -> tuple[str, ...]:

@@ -32,7 +32,7 @@ from torch import Tensor
 from ponderpounce.models.context import IGNORE, Row
 from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features
 from ponderpounce.models.vocabulary import Vocabulary
-from ponderpounce.training.deeds import deeds
+from ponderpounce.training.deeds import deeds, passing_side
 from ponderpounce.training.places import PLACE, TEXT_PX, WAY
 from ponderpounce.training.stand_in import text_code
 
@@ -77,7 +77,7 @@ def place_lessons(
     num_slots = size // NUM_PLACE_FEATURES
     found = [
         *_seen_done(row, demonstrated, vocabulary, num_slots),
-        *_seen_going(row, demonstrated, tools, vocabulary),
+        *_seen_going(row, demonstrated, tools, vocabulary, num_slots),
         *_in_mind(row, texts_Q, num_slots),
         *_being_told(row, vocabulary),
     ]
@@ -99,12 +99,16 @@ def _seen_done(row: Row, texts: Sequence[str], vocabulary: Vocabulary, num_slots
                 yield index, slot, numbers
 
 
-def _seen_going(row: Row, texts: Sequence[str], tools: Sequence[str], vocabulary: Vocabulary) -> Iterator[_Lesson]:
-    """Slot 0: where the tool is."""
+def _seen_going(
+    row: Row, texts: Sequence[str], tools: Sequence[str], vocabulary: Vocabulary, num_slots: int
+) -> Iterator[_Lesson]:
+    """Slot 0: where the tool is, 1: on which side of the thing that it is led around this stretch passes."""
     for index, text, tool in zip(_picture_ends(row, len(texts), vocabulary), texts, tools, strict=False):
         place = PLACE.search(tool)
         if WAY.search(text) is not None and place is not None:
             yield index - 1, 0, place_features((int(place[1]), int(place[2])))
+            if (side := passing_side(text)) and num_slots > 1:
+                yield index - 1, 1, text_code(side, NUM_PLACE_FEATURES)
 
 
 def _picture_ends(row: Row, num_instants: int, vocabulary: Vocabulary) -> list[int]:

@@ -9,6 +9,7 @@ from functools import partial
 
 from clock import sampling
 from ponderpounce.models import ponder_configs, pounce_configs
+from ponderpounce.training import several_recipes as several
 from ponderpounce.training import small_recipes as small
 from ponderpounce.training.example import ExampleConfig
 from ponderpounce.training.optim import OptimConfig
@@ -96,10 +97,11 @@ RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
     "small_retelling": small.small_retelling,
     "small_keeping_up": small.small_keeping_up,
     "small_noticing": small.small_noticing,
-    "small_several": small.small_several,
-    "small_further": small.small_further,
-    "small_imitating": small.small_imitating,
-    "small_mastering": small.small_mastering,
+    "small_several": several.small_several,
+    "small_further": several.small_further,
+    "small_imitating": several.small_imitating,
+    "small_mastering": several.small_mastering,
+    "small_recovering": several.small_recovering,
     "small_refresh_1s": partial(small.small_refresh, 1),
     "small_refresh_2s": partial(small.small_refresh, 2),
     "small_refresh_4s": partial(small.small_refresh, 4),

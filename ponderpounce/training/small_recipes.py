@@ -16,10 +16,9 @@ from ponderpounce.training.optim import OptimConfig
 from ponderpounce.training.recipe import Curriculum, Recipe
 from ponderpounce.training.trainer import TrainConfig
 
-_FROM_SCRATCH = OptimConfig(learning_rate=1e-3, warmup_steps=200, betas=(0.9, 0.95), weight_decay=1e-4, ema_decay=0.998)
-_TURNING = replace(_FROM_SCRATCH, matrices="muon")
+FROM_SCRATCH = OptimConfig(learning_rate=1e-3, warmup_steps=200, betas=(0.9, 0.95), weight_decay=1e-4, ema_decay=0.998)
 
-_BESIDE_THE_WAY = Nudge(std_m=0.04)
+BESIDE_THE_WAY = Nudge(std_m=0.04)
 _MOVED_WEIGHT = 4.0
 _RETOLD_PX = 4.0  # of a 256 px picture: what cognition follows well, and more than PONDER's own error
 
@@ -44,7 +43,7 @@ def small() -> Curriculum:
             has_foresight=True,
             augmentation=Augmentation(max_shift_px=4, mirror=True),
         ),
-        train=TrainConfig(seed=0, optim=_FROM_SCRATCH),
+        train=TrainConfig(seed=0, optim=FROM_SCRATCH),
         num_steps=900,
         batch_episodes=16,
         w2=1.0,
@@ -61,7 +60,7 @@ def small() -> Curriculum:
         example=replace(
             looking.example, text_dropout=0.2, slips=0.4, slip_px=(3.0, 24.0), tremble_px=1.0, max_queries=None
         ),
-        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, decay=(1400, 3200))),
+        train=TrainConfig(seed=0, optim=replace(FROM_SCRATCH, decay=(1400, 3200))),
         num_steps=3200,
         batch_episodes=8,
         w3=3.0,
@@ -69,14 +68,14 @@ def small() -> Curriculum:
     refining = replace(  # once more at the full rate: it was still learning
         grounding,
         name="small/refining",
-        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, decay=(900, 2000))),
+        train=TrainConfig(seed=0, optim=replace(FROM_SCRATCH, decay=(900, 2000))),
         num_steps=2000,
     )
     reaching = replace(
         looking,
         name="small/reaching",
-        example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=16, nudge=_BESIDE_THE_WAY, has_foresight=True),
-        train=TrainConfig(seed=0, dropout=0.1, flow_samples=2, optim=_FROM_SCRATCH),
+        example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=16, nudge=BESIDE_THE_WAY, has_foresight=True),
+        train=TrainConfig(seed=0, dropout=0.1, flow_samples=2, optim=FROM_SCRATCH),
         num_steps=6000,
         batch_episodes=8,
         w3=0.0,
@@ -85,13 +84,13 @@ def small() -> Curriculum:
     motor = replace(
         reaching,
         name="small/motor",
-        train=replace(reaching.train, optim=replace(_FROM_SCRATCH, decay=(6000, 11000))),
+        train=replace(reaching.train, optim=replace(FROM_SCRATCH, decay=(6000, 11000))),
         num_steps=11000,
     )
     mending = replace(  # from what went wrong (`pp-correct`)
         motor,
         name="small/mending",
-        train=replace(reaching.train, optim=replace(_FROM_SCRATCH, learning_rate=5e-4, decay=(400, 2000))),
+        train=replace(reaching.train, optim=replace(FROM_SCRATCH, learning_rate=5e-4, decay=(400, 2000))),
         num_steps=2000,
     )
     joint = replace(
@@ -107,7 +106,7 @@ def small() -> Curriculum:
             augments="watched",
         ),
         train=replace(
-            reaching.train, optim=replace(_FROM_SCRATCH, learning_rate=2e-4, warmup_steps=50, decay=(50, 200))
+            reaching.train, optim=replace(FROM_SCRATCH, learning_rate=2e-4, warmup_steps=50, decay=(50, 200))
         ),
         num_steps=200,
         w3=1.0,
@@ -127,13 +126,13 @@ def starter() -> Curriculum:
     grounding = replace(
         grounding,
         name="starter/grounding",
-        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(900, 1800))),
+        train=TrainConfig(seed=0, optim=replace(FROM_SCRATCH, warmup_steps=50, decay=(900, 1800))),
         num_steps=1800,
     )
     motor = replace(
         motor,
         name="starter/motor",
-        train=replace(motor.train, optim=replace(_FROM_SCRATCH, decay=(5000, 9000))),
+        train=replace(motor.train, optim=replace(FROM_SCRATCH, decay=(5000, 9000))),
         num_steps=9000,
     )
     joint = replace(
@@ -159,7 +158,7 @@ def small_refocusing() -> Recipe:
         refining,
         name="small_refocusing",
         example=replace(refining.example, max_queries=12),
-        train=TrainConfig(seed=0, optim=_FROM_SCRATCH),
+        train=TrainConfig(seed=0, optim=FROM_SCRATCH),
         num_steps=400,
         keeps_eyes=True,
     )
@@ -175,7 +174,7 @@ def small_following() -> Curriculum:
         refining,
         name="small_following/refining",
         example=replace(refining.example, lapses=Lapses(rows=0.5)),
-        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, decay=(1150, 2300))),
+        train=TrainConfig(seed=0, optim=replace(FROM_SCRATCH, decay=(1150, 2300))),
         num_steps=2300,
         keeps_eyes=True,
     )
@@ -192,7 +191,7 @@ def small_planning() -> Recipe:
         refining,
         name="small_planning",
         example=replace(refining.example, has_plans=True),
-        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(500, 1050))),
+        train=TrainConfig(seed=0, optim=replace(FROM_SCRATCH, warmup_steps=50, decay=(500, 1050))),
         num_steps=1050,
     )
 
@@ -210,7 +209,7 @@ def small_retelling() -> Curriculum:
         name="small_retelling/refining",
         example=replace(planning.example, text_dropout=0.4, slips=0.0, retold_px=_RETOLD_PX, lapses=lapses),
         w4=1.0,
-        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(1400, 2700))),
+        train=TrainConfig(seed=0, optim=replace(FROM_SCRATCH, warmup_steps=50, decay=(1400, 2700))),
         num_steps=2700,
     )
     joint = replace(
@@ -224,7 +223,7 @@ def small_retelling() -> Curriculum:
         name="small_retelling/following",
         example=replace(planning.example, text_dropout=0.3),
         w4=1.0,
-        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, learning_rate=7e-4, warmup_steps=50, decay=(200, 500))),
+        train=TrainConfig(seed=0, optim=replace(FROM_SCRATCH, learning_rate=7e-4, warmup_steps=50, decay=(200, 500))),
         num_steps=500,
     )
     return Curriculum(name="small_retelling", stages=(refining, joint, following))
@@ -236,14 +235,14 @@ def small_keeping_up() -> Curriculum:
     following = replace(
         following,
         name="small_keeping_up/following",
-        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, learning_rate=7e-4, warmup_steps=50, decay=(800, 1700))),
+        train=TrainConfig(seed=0, optim=replace(FROM_SCRATCH, learning_rate=7e-4, warmup_steps=50, decay=(800, 1700))),
         num_steps=1700,
         moved_weight=_MOVED_WEIGHT,
     )
     pointing = replace(  # C's fast numbers had followed, and the slow ones, which POUNCE reads, only half-way
         following,
         name="small_keeping_up/pointing",
-        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, learning_rate=7e-4, warmup_steps=50, decay=(300, 800))),
+        train=TrainConfig(seed=0, optim=replace(FROM_SCRATCH, learning_rate=7e-4, warmup_steps=50, decay=(300, 800))),
         num_steps=800,
         aligns_evenly=True,
     )
@@ -258,188 +257,17 @@ def small_noticing() -> Curriculum:
         pointing,
         name="small_noticing/noticing",
         example=replace(pointing.example, max_queries=8, text_dropout=0.15, slips=0.15, lapses=NO_LAPSES),
-        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(500, 1000))),
+        train=TrainConfig(seed=0, optim=replace(FROM_SCRATCH, warmup_steps=50, decay=(500, 1000))),
         num_steps=1000,
         batch_episodes=24,
     )
     pointing = replace(
         pointing,
         name="small_noticing/pointing",
-        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, learning_rate=7e-4, warmup_steps=50, decay=(350, 900))),
+        train=TrainConfig(seed=0, optim=replace(FROM_SCRATCH, learning_rate=7e-4, warmup_steps=50, decay=(350, 900))),
         num_steps=900,
     )
     return Curriculum(name="small_noticing", stages=(noticing, pointing))
-
-
-def small_several() -> Curriculum:
-    """The shipped pair learns further tasks: docs/training.md, "Several tasks". `pp-widen` gives it their words first.
-
-    `hand` trains POUNCE and needs none of the others.
-    """
-    _, _, motor, *_ = small().stages
-    noticing, pointing = small_noticing().stages
-    hand = replace(
-        motor,
-        name="small_several/hand",
-        train=replace(motor.train, optim=replace(_FROM_SCRATCH, decay=(2500, 4000))),
-        num_steps=4000,
-    )
-    noticing = replace(
-        noticing,
-        name="small_several/noticing",
-        example=replace(noticing.example, max_queries=10, has_reasoning=False),
-        train=TrainConfig(seed=0, optim=_FROM_SCRATCH),
-        num_steps=500,
-    )
-    pointing = replace(
-        pointing,
-        name="small_several/pointing",
-        example=replace(pointing.example, has_reasoning=False),
-        train=TrainConfig(seed=0, optim=replace(_FROM_SCRATCH, warmup_steps=50)),
-        num_steps=800,
-    )
-    binding = replace(  # which of the things the instruction means is mostly asked early: short rows once more
-        noticing,
-        name="small_several/binding",
-        example=replace(noticing.example, text_dropout=0.4),
-        train=TrainConfig(seed=1, optim=replace(_FROM_SCRATCH, warmup_steps=50)),
-        num_steps=1100,
-    )
-    finishing = replace(
-        pointing,
-        name="small_several/finishing",
-        train=TrainConfig(seed=1, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(600, 1600))),
-        num_steps=1600,
-    )
-    return Curriculum(name="small_several", stages=(hand, noticing, pointing, binding, finishing))
-
-
-def small_further() -> Curriculum:
-    """The pair of `small_several` learns three tasks more, what things are picked up for, and from the hand's misses.
-
-    `hand` and `releasing` train POUNCE and need none of the others; `finishing` is for what the hand has played
-    (`pp-train --watch`).
-    """
-    hand, _, _, binding, finishing = small_several().stages
-    hand = replace(
-        hand,
-        name="small_further/hand",
-        train=replace(hand.train, seed=1, optim=replace(_FROM_SCRATCH, warmup_steps=100, decay=(1900, 3100))),
-        num_steps=3100,
-    )
-    releasing = replace(  # cubes fell beside the bin
-        hand,
-        name="small_further/releasing",
-        example=replace(hand.example, nudge=replace(_BESIDE_THE_WAY, spares_release=True)),
-        train=replace(hand.train, seed=2, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(400, 1200))),
-        num_steps=1200,
-    )
-    binding = replace(
-        binding,
-        name="small_further/binding",
-        train=TrainConfig(seed=2, optim=replace(_FROM_SCRATCH, warmup_steps=50)),
-        num_steps=300,
-    )
-    pointing = replace(  # of a short row with a long demonstration little is learned for what it costs
-        finishing,
-        name="small_further/pointing",
-        train=TrainConfig(seed=2, optim=replace(_FROM_SCRATCH, warmup_steps=50)),
-        num_steps=450,
-    )
-    finishing = replace(
-        finishing,
-        name="small_further/finishing",
-        train=TrainConfig(seed=3, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(300, 750))),
-        num_steps=750,
-    )
-    return Curriculum(name="small_further", stages=(hand, releasing, binding, pointing, finishing))
-
-
-def small_imitating() -> Curriculum:
-    """The pair of `small_further` learns four tasks more, where to go on, and to write down what demonstrations do.
-
-    `hand`, `carrying` and `waiting` train POUNCE and need none of the others; `finishing` and `settling` are for what
-    the hand has played (`pp-train --watch`).
-    """
-    _, releasing, binding, _, finishing = small_further().stages
-    hand = replace(
-        releasing,
-        name="small_imitating/hand",
-        example=replace(releasing.example, tells_onward=0.85),  # what a PONDER cannot know it does not tell
-        train=replace(releasing.train, seed=4, optim=replace(_FROM_SCRATCH, warmup_steps=100, decay=(4200, 7000))),
-        num_steps=7000,
-    )
-    carrying = replace(  # it let go a few centimetres before the target
-        hand,
-        name="small_imitating/carrying",
-        example=replace(hand.example, event_weight=2.0),
-        train=replace(hand.train, seed=6, optim=replace(_FROM_SCRATCH, warmup_steps=100, decay=(3000, 6000))),
-        num_steps=6000,
-    )
-    waiting = replace(  # the button was missed: a hand that waits strolls away from it
-        hand,
-        name="small_imitating/waiting",
-        train=replace(hand.train, seed=9, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(300, 1000))),
-        num_steps=1000,
-    )
-    binding = replace(
-        binding,
-        name="small_imitating/binding",
-        example=replace(binding.example, tells_onward=1.0),
-        train=TrainConfig(seed=4, optim=replace(_FROM_SCRATCH, warmup_steps=50)),
-        num_steps=700,
-    )
-    finishing = replace(
-        finishing,
-        name="small_imitating/finishing",
-        example=replace(finishing.example, tells_onward=1.0),
-        train=TrainConfig(seed=5, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(700, 1500))),
-        num_steps=1500,
-        batch_episodes=12,
-    )
-    # what a demonstration did is looked up when the first word comes: the rest of the row is left out
-    at_first = replace(finishing.example, narrates=True, max_queries=2, text_dropout=0.0, slips=0.0, lapses=NO_LAPSES)
-    recalling = replace(
-        finishing,
-        name="small_imitating/recalling",
-        example=at_first,
-        train=TrainConfig(seed=7, optim=replace(_FROM_SCRATCH, warmup_steps=50)),
-        num_steps=1000,
-        batch_episodes=16,
-    )
-    settling = replace(
-        finishing,
-        name="small_imitating/settling",
-        example=replace(finishing.example, narrates=True, counts_down=True, text_dropout=0.2, slips=0.25),
-        train=TrainConfig(seed=8, optim=replace(_FROM_SCRATCH, warmup_steps=50, decay=(1000, 2000))),
-        num_steps=2000,
-    )
-    return Curriculum(name="small_imitating", stages=(hand, carrying, waiting, binding, finishing, recalling, settling))
-
-
-def small_mastering() -> Curriculum:
-    """The pair of `small_imitating` goes on: by another optimiser, and with counts told otherwise.
-
-    `waiting` trains POUNCE and does not need the other; `settling` is for what the pair has played, too
-    (`pp-train --watch`).
-    """
-    _, _, waiting, *_, settling = small_imitating().stages
-    settling = replace(
-        settling,
-        name="small_mastering/settling",
-        example=replace(settling.example, cuts_short=0.5, recalls=0.5),
-        train=TrainConfig(seed=10, optim=replace(_TURNING, warmup_steps=100, decay=(1500, 3300))),
-        num_steps=3300,
-        batch_episodes=16,
-    )
-    waiting = replace(
-        waiting,
-        name="small_mastering/waiting",
-        example=replace(waiting.example, event_weight=2.0),
-        train=replace(waiting.train, seed=11, optim=replace(_TURNING, warmup_steps=50, decay=(400, 1500))),
-        num_steps=1500,
-    )
-    return Curriculum(name="small_mastering", stages=(waiting, settling))
 
 
 def small_refresh(period_s: int) -> Recipe:
@@ -452,14 +280,14 @@ def small_refresh(period_s: int) -> Recipe:
             pointing.example,
             clocks=replace(sampling.ROBOMME, query=LogNormal(mean_ns=period_s * NS_PER_S, sigma=0.05)),
             max_invocations=16,
-            nudge=_BESIDE_THE_WAY,
+            nudge=BESIDE_THE_WAY,
             augments="watched",
         ),
         train=TrainConfig(
             seed=0,
             dropout=0.1,
             flow_samples=2,
-            optim=replace(_FROM_SCRATCH, learning_rate=5e-4, warmup_steps=50, decay=(150, 300)),
+            optim=replace(FROM_SCRATCH, learning_rate=5e-4, warmup_steps=50, decay=(150, 300)),
         ),
         num_steps=300,
         w3=0.0,
@@ -487,6 +315,6 @@ def small_subgoal_text() -> Recipe:
         name="small_subgoal_text",
         pounce=replace(silent, cognition=replace(silent.cognition, rounds_places=False), reads_subgoal=True),
         example=replace(motor.example, has_plans=True),
-        train=replace(motor.train, optim=replace(_FROM_SCRATCH, decay=(1000, 2000))),
+        train=replace(motor.train, optim=replace(FROM_SCRATCH, decay=(1000, 2000))),
         num_steps=2000,
     )

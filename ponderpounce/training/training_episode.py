@@ -50,6 +50,10 @@ class TrainingEpisode:
     """PONDER cannot know what is to be said, or when (`pp-wander`): it learns to follow what texts point at, only."""
     planned: Sequence[str] | None = None
     """T texts that PONDER says instead of the subgoals (`with_plans`); None: the subgoals."""
+    unreached: Sequence[str] = ()
+    """Texts of what was still to come at the end, of an episode that failed: plans have it, too."""
+    said: Sequence[str] = ()
+    """What the recorded PONDER newly said at each of T ticks, ``""`` for nothing; () where nobody was listened to."""
     sights: Sequence[tuple[Frame, ...]] | None = None
     """T ticks of what PONDER's eyes make of the views, where ``frames`` are not the cameras' own; ``demo`` then is what
     they make of it, too."""
@@ -118,6 +122,8 @@ class TrainingEpisode:
             subgoals=cut.subgoals,
             is_transition_T=cut.is_transition_U,
             seen_at_T=None if self.seen_at_T is None else self.seen_at_T[ticks],
+            said=(),  # of the longer task, as this is
+            unreached=(),
         )
 
     def with_plans(self, *, even_the_first: bool = False) -> TrainingEpisode:
@@ -135,7 +141,8 @@ class TrainingEpisode:
             own = PLACE.sub("", self.subgoals[begin])
             later: dict[str, str] = {}
             told, stretches = [self.subgoals[begin]], []
-            for text in (self.subgoals[other] for other in begins if other >= end and (begin > 0 or from_the_first)):
+            coming = [*(self.subgoals[other] for other in begins if other >= end), *self.unreached]
+            for text in coming if begin > 0 or from_the_first else ():
                 place, stretch = PLACE.search(text), WAY.search(text)
                 if stretch is not None:
                     stretches.append(f"{stretch[1]} {stretch[2]}")

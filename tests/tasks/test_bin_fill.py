@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from ponderpounce.tasks import panda
-from ponderpounce.tasks.counting.bin_fill import BinFill, Layout
+from ponderpounce.tasks.captions import ORDINALS
+from ponderpounce.tasks.counting.bin_fill import BinFill, Layout, Memory
 from ponderpounce.tasks.difficulty import DIFFICULTIES
 from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import Environment, Snapshot
@@ -176,15 +177,52 @@ def test_near_first_is_another_order_of_the_same_cubes(difficulty: str) -> None:
     for seed in range(12):
         layout = BinFill().sample(np.random.default_rng(seed), difficulty)
         sorted_ = BinFill().near_first(layout)
+        assert BinFill().instruction(sorted_) == BinFill().instruction(layout)
+        assert dict(sorted_.wanted) == dict(layout.wanted)
+        spoken = [color for color in CUBE_COLORS if color in dict(layout.wanted)]
+        assert [color for color, _ in sorted_.wanted] == spoken
         if layout.is_filling_up:
-            assert sorted_ == layout
+            assert sorted_.cubes == layout.cubes
             continue
-        assert replace(sorted_, cubes=layout.cubes) == layout
+        assert replace(sorted_, cubes=layout.cubes, wanted=layout.wanted) == layout
         assert sorted(sorted_.cubes, key=repr) == sorted(layout.cubes, key=repr)
         assert [cube.color for cube in sorted_.cubes] == [cube.color for cube in layout.cubes]
         for color, _ in layout.wanted:
             towards_camera = [cube.x_m for cube in sorted_.cubes if cube.color == color]
             assert towards_camera == sorted(towards_camera, reverse=True)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_list_goes_on_from_whatever_is_in_the_bin(seed: int) -> None:
+    """Cubes go in by chance: the list stays as long, tells what was done, and sends nobody to a cube that is in."""
+    rng = np.random.default_rng(seed)
+    layout = BinFill().near_first(BinFill().sample(rng, "hard"))
+    drawn = BinFill().subtasks(layout)
+    assert [step.text for step in BinFill().subtasks_after(layout, Memory())] == [step.text for step in drawn]
+    left = Counter(dict(layout.wanted))
+    binned: list[str] = []
+    while left.total():
+        name = str(rng.choice([n for color in left if left[color] for n in layout.of_color(color) if n not in binned]))
+        binned.append(name)
+        left -= layout.colors_of([name])
+        steps = BinFill().subtasks_after(layout, Memory(binned=tuple(binned)))
+        assert len(steps) == len(drawn)
+        picked = [step.grounds[0] for step in steps[:-1:2]]
+        assert picked[: len(binned)] == binned
+        assert layout.colors_of(picked) == dict(layout.wanted)
+        assert len(set(picked)) == len(picked)
+        for color, count in layout.wanted:
+            said = [step.text.split()[3] for step in steps[:-1:2] if step.text.split()[4] == color]
+            assert said == list(ORDINALS[:count])
+        assert [step.carries[0] for step in steps[1:-1:2]] == picked
+
+
+def test_one_too_many_leaves_the_list_as_long() -> None:
+    layout = BinFill().sample(np.random.default_rng(2), "medium")
+    others = [f"cube_{i}" for i, cube in enumerate(layout.cubes) if cube.color not in dict(layout.wanted)]
+    names = others or layout.of_color(layout.wanted[0][0])
+    steps = BinFill().subtasks_after(layout, Memory(binned=tuple(names)))
+    assert len(steps) == len(BinFill().subtasks(layout))
 
 
 @pytest.mark.parametrize("step", [0, 60])

@@ -71,6 +71,33 @@ def test_who_speaks_of_sides_is_not_mirrored() -> None:
         assert views == ({False, True} if may_be else {False})
 
 
+WAYS = (
+    "move to the nearest left target by circling clockwise to <80, 130>, then counterclockwise to <9, 60>",
+    "move forward-right to <80, 130>, then <9, 60>",
+    "move left to <80, 130>",
+)
+
+
+@pytest.mark.parametrize("text", WAYS)
+def test_a_way_may_be_mirrored_and_then_leads_to_the_other_side(text: str) -> None:
+    config = Augmentation(mirror=True)
+    views = [draw_view(config, FORM, {text}, np.random.default_rng(seed)) for seed in range(20)]
+    assert {view.is_mirrored for view in views} == {False, True}
+    assert not any(
+        draw_view(config, FORM, {text, "the left one"}, np.random.default_rng(s)).is_mirrored for s in range(20)
+    )
+    mirrored = View(is_mirrored=True)
+    told = mirrored.text(text)
+    assert told != text
+    assert mirrored.text(told) == text, "mirrored twice it is what it was"
+    assert ("left" in told, "right" in told) == ("right" in text, "left" in text)
+    words = [word.strip(",") for word in text.split()]
+    other = {"clockwise": "counterclockwise", "counterclockwise": "clockwise"}
+    turned = [word.strip(",") for word in told.split()]
+    assert [other[word] for word in words if word in other] == [word for word in turned if word in other]
+    assert View(down_px=1, right_px=1, text_px=4.0).text(text).split(" to ")[0] == text.split(" to ")[0], "not mirrored"
+
+
 @given(seed=st.integers(0, 10_000), max_gain=st.floats(0.05, 2.0))
 def test_light_is_one_for_a_row_and_keeps_what_is_brighter_and_of_which_colour(seed: int, max_gain: float) -> None:
     rng = np.random.default_rng(seed)

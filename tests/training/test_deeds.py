@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ponderpounce.training.deeds import deeds, narration
+from ponderpounce.training.augment import View
+from ponderpounce.training.deeds import deeds, narration, passing_side
 
 DONE = st.lists(st.tuples(st.sampled_from(["pick at", "put onto a target at", "move left to"]), st.integers(0, 3)))
 
@@ -70,6 +72,31 @@ def test_a_narration_tells_every_place_in_order_and_when_the_button_was_pressed(
     expected = [each if isinstance(each, str) else f"{next(numbers)} <{20 * each[0]}, {20 * each[1]}>" for each in done]
     assert told == (", ".join(expected).split(", ") if puts else [])
     assert puts or narration(texts) == ", ".join(f"<{nth}, 200>" for nth in range(len(done)))
+
+
+def around(towards: str, turn: str, y: int, x: int, then: str = "") -> str:
+    return f"move to the nearest {towards} target by circling around the stick {turn} to <{y}, {x}>{then}"
+
+
+def test_of_a_way_around_things_the_side_is_told() -> None:
+    """As the front camera sees it: its left is the picture's right, and clockwise is seen from above."""
+    texts = [
+        *[around("left", "clockwise", 89, 167, ", then clockwise to <96, 203>")] * 3,
+        *[around("left", "clockwise", 96, 203, ", then clockwise to <89, 167>")] * 2,
+        *[around("right", "clockwise", 89, 167)] * 3,
+    ]
+    assert narration(texts) == "backward <89, 167>, backward <96, 203>, forward <89, 167>"
+    assert narration(texts[2:4]) == "backward <89, 167>, backward <96, 203>"
+
+
+@pytest.mark.parametrize("towards", ["left", "right"])
+@pytest.mark.parametrize("turn", ["clockwise", "counterclockwise"])
+def test_nearer_to_the_robot_is_so_in_a_mirror_too(towards: str, turn: str) -> None:
+    text = around(towards, turn, 89, 167)
+    mirrored = View(is_mirrored=True).text(text)
+    assert mirrored != text
+    assert passing_side(mirrored) == passing_side(text) != ""
+    assert passing_side("move left to <9, 9>") == passing_side("press the button") == ""
 
 
 def test_a_picked_block_is_told_and_a_way_is_not() -> None:

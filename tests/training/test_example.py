@@ -259,6 +259,16 @@ def test_a_plan_tells_the_places_of_what_comes_later(stints: list[tuple[str, boo
         assert later == ([f"<{10 * m}; 9>" for m in once] if n else [])
 
 
+def test_a_plan_tells_what_was_not_reached_as_if_it_had_been() -> None:
+    """Else one that failed after two of five would teach plans of two."""
+    texts = ["press at <7, 7>", *(f"pick cube {n} at <{30 * n}, 20>" for n in range(1, 6))]
+    whole = replace(episode(6, changes=tuple(range(6))), subgoals=texts).with_plans()
+    for reached in range(1, 6):
+        begun = replace(episode(reached, changes=tuple(range(reached))), subgoals=texts[:reached])
+        assert [*replace(begun, unreached=texts[reached:]).with_plans().words] == [*whole.words[:reached]]
+        assert reached == 1 or [*begun.with_plans().words] != [*whole.words[:reached]]
+
+
 def test_a_plan_tells_a_place_once() -> None:
     """Where things are carried to and fro every text has one, and most are the same."""
     places = ["<9, 9>", "<40, 90>", "<80, 20>", "<42, 91>", "<80, 24>", "<7, 60>"]

@@ -19,6 +19,7 @@ from ponderpounce.training.example import Example, ExampleConfig, make_example
 from ponderpounce.training.joint import encode_rows
 from ponderpounce.training.lapses import Lapses
 from ponderpounce.training.place_lessons import PlaceLessons
+from ponderpounce.training.stand_in import text_code
 from ponderpounce.training.training_episode import TrainingEpisode
 
 PONDER = Ponder.random(replace(tiny_cpu(), image_px=(32, 32), num_layers=4), seed=1)
@@ -176,6 +177,17 @@ def test_where_a_way_is_shown_the_last_image_token_has_the_tool_in_mind() -> Non
     np.testing.assert_array_equal(by_place[ends[0] - 1], place_features((5, 6)))
     np.testing.assert_array_equal(by_place[ends[1] - 1], place_features((50, 60)))
     assert ends[2] - 1 not in by_place  # no way is gone there
+    assert lessons.index_M.tolist().count(ends[0] - 1) == 1
+    led = f"move to the nearest left target by circling around the stick clockwise to <{y}, {x}>"
+    example = make_example(replace(going, demo_subgoals=(led, led, led)), FORM, CONFIG, np.random.default_rng(0))
+    row = example.row()
+    for num_slots in (4, 1):  # beside where the tool is, on which side it passes, if there is room
+        lessons = example.place_lessons(row, num_slots * NUM_PLACE_FEATURES)
+        at = (lessons.index_M == int(ends[0]) - 1).nonzero().flatten().tolist()
+        assert len(at) == min(num_slots, 2)
+    lessons = example.place_lessons(row, 4 * NUM_PLACE_FEATURES)
+    (side,) = ((lessons.index_M == int(ends[0]) - 1) & (lessons.first_M == NUM_PLACE_FEATURES)).nonzero().tolist()
+    np.testing.assert_array_equal(lessons.features_MP[side[0]], text_code("backward", NUM_PLACE_FEATURES))
     assert len(make_example(replace(going, demo_tools=()), FORM, CONFIG, np.random.default_rng(0)).row().ids) == len(
         row.ids
     )  # the row is the same: only what is asked of it differs

@@ -106,40 +106,15 @@ class BinFill(Task[Layout, Memory]):
         return f"put {cubes} into the bin, then press the button to stop"
 
     def subtasks(self, layout: Layout) -> tuple[Subtask, ...]:
-        steps: list[Subtask] = []
-        for color, count in layout.wanted:
-            for nth, name in zip(captions.ORDINALS, layout.of_color(color)[:count], strict=False):
-                num_binned = len(steps) // 2 + 1
-                steps += [
-                    Subtask(
-                        text=f"pick up the {nth} {color} cube[ at <>]",
-                        grounds=(name,),
-                        is_done=partial(_is_any_picked, layout),
-                        failure=_pressed_early,
-                        motion=partial(_pick, name),
-                    ),
-                    Subtask(
-                        text="put it into the bin[ at <>]",
-                        grounds=(_BIN,),
-                        is_done=_has_binned(num_binned),
-                        failure=_pressed_early,
-                        motion=lambda motions: motions.drop_into(_BIN),
-                        carries=(name, *_CUBES[: len(layout.cubes)]),
-                    ),
-                ]
-        steps.append(
-            Subtask(
-                text="press the button[ at <>]",
-                grounds=(f"{_BUTTON}/cap",),
-                is_done=lambda physics, memory: predicates.is_pressed(physics, _BUTTON),
-                failure=partial(_miscounted, layout),
-                motion=lambda motions: motions.press(_BUTTON),
-            )
-        )
-        return tuple(steps)
+        return _steps(layout, _left(layout, ()))
+
+    def subtasks_after(self, layout: Layout, memory: Memory) -> tuple[Subtask, ...]:
+        """Those in the bin first, as they came; one too many or of another color takes the place of the last."""
+        num_wanted = sum(count for _, count in layout.wanted)
+        return _steps(layout, [*memory.binned, *_left(layout, memory.binned)][:num_wanted])
 
     def reasoning(self, layout: Layout, index: int) -> Reasoning:
-        order = [name for color, count in layout.wanted for name in layout.of_color(color)[:count]]
+        order = _left(layout, ())
         done, left = order[: index // 2], order[index // 2 :]
         count = "; ".join(
             f"{what}: {_listed(layout.colors_of(names)) or 'none'}"
@@ -151,7 +126,8 @@ class BinFill(Task[Layout, Memory]):
         return Reasoning(text=text, grounds=(left[0], _BIN))
 
     def near_first(self, layout: Layout) -> Layout:
-        """Cubes of one color change their numbers, and nothing else does. Where they appear one by one, none does."""
+        """Colors come as they are spoken of; cubes of one color change their numbers, unless they appear one by one."""
+        layout = replace(layout, wanted=tuple(_in_order_of_speech(dict(layout.wanted))))
         if layout.is_filling_up:
             return layout
         cubes = list(layout.cubes)
@@ -190,6 +166,46 @@ class BinFill(Task[Layout, Memory]):
             if name not in binned and _fell_in(physics, name):
                 return Memory(binned=(*binned, name))  # one per step, as upstream counts
         return Memory(binned=binned)
+
+
+def _left(layout: Layout, binned: Sequence[str]) -> list[str]:
+    """The cubes that the list still wants after these, in its order."""
+    had = layout.colors_of(binned)
+    wanted = ((color, max(count - had[color], 0)) for color, count in layout.wanted)
+    return [name for color, count in wanted for name in [n for n in layout.of_color(color) if n not in binned][:count]]
+
+
+def _steps(layout: Layout, order: Sequence[str]) -> tuple[Subtask, ...]:
+    """These cubes one after the other, then the button."""
+    steps: list[Subtask] = []
+    for num_binned, name in enumerate(order, start=1):
+        color = layout.cubes[_CUBES.index(name)].color
+        nth = captions.ORDINALS[layout.colors_of(order[:num_binned])[color] - 1]
+        steps += [
+            Subtask(
+                text=f"pick up the {nth} {color} cube[ at <>]",
+                grounds=(name,),
+                is_done=partial(_is_any_picked, layout),
+                failure=_pressed_early,
+                motion=partial(_pick, name),
+            ),
+            Subtask(
+                text="put it into the bin[ at <>]",
+                grounds=(_BIN,),
+                is_done=_has_binned(num_binned),
+                failure=_pressed_early,
+                motion=lambda motions: motions.drop_into(_BIN),
+                carries=(name, *_CUBES[: len(layout.cubes)]),
+            ),
+        ]
+    button = Subtask(
+        text="press the button[ at <>]",
+        grounds=(f"{_BUTTON}/cap",),
+        is_done=lambda physics, memory: predicates.is_pressed(physics, _BUTTON),
+        failure=partial(_miscounted, layout),
+        motion=lambda motions: motions.press(_BUTTON),
+    )
+    return (*steps, button)
 
 
 def _draw(rng: np.random.Generator, difficulty: str) -> Layout:

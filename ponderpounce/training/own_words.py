@@ -1,0 +1,93 @@
+"""Rows in which a recorded PONDER's own words stand, right and wrong, and are put right.
+
+What was played is followed with the simulator's words elsewhere (`pp-train --watch`): PONDER sees where its errors lead
+and not the words that led there. In serving they stand in its context: "put it into the bin" where nothing was picked
+up, and a plan of three cubes where four are asked for; it reads them and goes on from them. Here the recording's own
+words stand where they were said, and are not learned; where others are in force those are owed, and after a while they
+come and are learned. `lapses` draws such errors, these were made.
+
+That is DAgger (Ross et al. 2011) for words; the paper has nothing of it.
+"""
+
+# Q queries
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ponderpounce.models.ponder_coordinates import pixel_text
+from ponderpounce.training.lapses import Words
+from ponderpounce.training.places import PLACE
+
+_APART_PX = 16.0  # of a 256 px picture: the same thing, seen a little beside or pushed
+
+
+def as_recorded(said: str) -> str:
+    """A PONDER's words, with places as the simulator's texts tell them; empty if one lies outside of the picture."""
+    try:
+        return pixel_text(said)
+    except ValueError:
+        return ""
+
+
+def own_words(
+    said: Sequence[str], subgoals: Sequence[str], is_change: Sequence[bool], rng: np.random.Generator, corrected: float
+) -> tuple[Words, ...]:
+    """Words of Q queries: those that were said, until they are put right.
+
+    Words are owed where those that were said last speak of another subgoal than the one in force, and where it begins
+    anew. What is owed comes at a query with a chance of ``corrected``; until then the recording's words stand, or its
+    silence. Right ones come as they are to be; those whose plan alone is another may stand, too.
+
+    Args:
+        said: what the recorded PONDER newly said at each query, places in pixels; ``""`` for nothing.
+        subgoals: what is to be said there.
+        is_change: whether the query is the first to see a change.
+        rng: one number is drawn for each query.
+        corrected: above 0, at most 1. With 1 every word is right, as without errors.
+    """
+    words: list[Words] = []
+    last, before, is_anew = "", "", False
+    for index, (own, text, changes) in enumerate(zip(said, subgoals, is_change, strict=True)):
+        is_anew |= changes and speaks_of(before, text)
+        before = text
+        is_due = bool(text) and (is_anew or not speaks_of(last, text))
+        is_put_right = rng.random() < corrected or (index == 0 and not own)  # nothing is late at the first query
+        if is_due and (is_put_right or _agree(own, text)):
+            words.append(Words(text=text, is_due=True))
+        elif is_put_right or not own:
+            words.append(Words(is_due=is_due))
+        else:
+            words.append(Words(text=own, is_due=is_due, is_learned=False))
+        if words[-1].text:
+            last, is_anew = words[-1].text, False
+    return tuple(words)
+
+
+def speaks_of(said: str, text: str) -> bool:
+    """Whether both tell one subgoal, whatever they plan after it: the same words, and a place that is the same."""
+    if _subgoal(said) != _subgoal(text):
+        return False
+    return all(_is_near(*both) for both in zip(PLACE.findall(said)[:1], PLACE.findall(text)[:1], strict=True))
+
+
+def _agree(said: str, text: str) -> bool:
+    """Whether they plan the same, too."""
+    first, second = PLACE.findall(said), PLACE.findall(text)
+    return (
+        PLACE.sub("<>", said) == PLACE.sub("<>", text)
+        and len(first) == len(second)
+        and all(_is_near(*both) for both in zip(first, second, strict=True))
+    )
+
+
+def _subgoal(text: str) -> str:
+    """The text without its plan and its places."""
+    subgoal, *_ = PLACE.sub("<>", text).split(", ")
+    return subgoal
+
+
+def _is_near(first: tuple[str, str], second: tuple[str, str]) -> bool:
+    return float(np.hypot(int(first[0]) - int(second[0]), int(first[1]) - int(second[1]))) <= _APART_PX

@@ -1,0 +1,196 @@
+"""Recipes of the pair that knows several tasks: it goes on from `small_noticing`, and each from the one before it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from ponderpounce.training.lapses import NO_LAPSES
+from ponderpounce.training.recipe import Curriculum
+from ponderpounce.training.small_recipes import BESIDE_THE_WAY, FROM_SCRATCH, small, small_noticing
+from ponderpounce.training.trainer import TrainConfig
+
+_TURNING = replace(FROM_SCRATCH, matrices="muon")
+
+
+def small_several() -> Curriculum:
+    """The shipped pair learns further tasks: docs/training.md, "Several tasks". `pp-widen` gives it their words first.
+
+    `hand` trains POUNCE and needs none of the others.
+    """
+    _, _, motor, *_ = small().stages
+    noticing, pointing = small_noticing().stages
+    hand = replace(
+        motor,
+        name="small_several/hand",
+        train=replace(motor.train, optim=replace(FROM_SCRATCH, decay=(2500, 4000))),
+        num_steps=4000,
+    )
+    noticing = replace(
+        noticing,
+        name="small_several/noticing",
+        example=replace(noticing.example, max_queries=10, has_reasoning=False),
+        train=TrainConfig(seed=0, optim=FROM_SCRATCH),
+        num_steps=500,
+    )
+    pointing = replace(
+        pointing,
+        name="small_several/pointing",
+        example=replace(pointing.example, has_reasoning=False),
+        train=TrainConfig(seed=0, optim=replace(FROM_SCRATCH, warmup_steps=50)),
+        num_steps=800,
+    )
+    binding = replace(  # which of the things the instruction means is mostly asked early: short rows once more
+        noticing,
+        name="small_several/binding",
+        example=replace(noticing.example, text_dropout=0.4),
+        train=TrainConfig(seed=1, optim=replace(FROM_SCRATCH, warmup_steps=50)),
+        num_steps=1100,
+    )
+    finishing = replace(
+        pointing,
+        name="small_several/finishing",
+        train=TrainConfig(seed=1, optim=replace(FROM_SCRATCH, warmup_steps=50, decay=(600, 1600))),
+        num_steps=1600,
+    )
+    return Curriculum(name="small_several", stages=(hand, noticing, pointing, binding, finishing))
+
+
+def small_further() -> Curriculum:
+    """The pair of `small_several` learns three tasks more, what things are picked up for, and from the hand's misses.
+
+    `hand` and `releasing` train POUNCE and need none of the others; `finishing` is for what the hand has played
+    (`pp-train --watch`).
+    """
+    hand, _, _, binding, finishing = small_several().stages
+    hand = replace(
+        hand,
+        name="small_further/hand",
+        train=replace(hand.train, seed=1, optim=replace(FROM_SCRATCH, warmup_steps=100, decay=(1900, 3100))),
+        num_steps=3100,
+    )
+    releasing = replace(  # cubes fell beside the bin
+        hand,
+        name="small_further/releasing",
+        example=replace(hand.example, nudge=replace(BESIDE_THE_WAY, spares_release=True)),
+        train=replace(hand.train, seed=2, optim=replace(FROM_SCRATCH, warmup_steps=50, decay=(400, 1200))),
+        num_steps=1200,
+    )
+    binding = replace(
+        binding,
+        name="small_further/binding",
+        train=TrainConfig(seed=2, optim=replace(FROM_SCRATCH, warmup_steps=50)),
+        num_steps=300,
+    )
+    pointing = replace(  # of a short row with a long demonstration little is learned for what it costs
+        finishing,
+        name="small_further/pointing",
+        train=TrainConfig(seed=2, optim=replace(FROM_SCRATCH, warmup_steps=50)),
+        num_steps=450,
+    )
+    finishing = replace(
+        finishing,
+        name="small_further/finishing",
+        train=TrainConfig(seed=3, optim=replace(FROM_SCRATCH, warmup_steps=50, decay=(300, 750))),
+        num_steps=750,
+    )
+    return Curriculum(name="small_further", stages=(hand, releasing, binding, pointing, finishing))
+
+
+def small_imitating() -> Curriculum:
+    """The pair of `small_further` learns four tasks more, where to go on, and to write down what demonstrations do.
+
+    `hand`, `carrying` and `waiting` train POUNCE and need none of the others; `finishing` and `settling` are for what
+    the hand has played (`pp-train --watch`).
+    """
+    _, releasing, binding, _, finishing = small_further().stages
+    hand = replace(
+        releasing,
+        name="small_imitating/hand",
+        example=replace(releasing.example, tells_onward=0.85),  # what a PONDER cannot know it does not tell
+        train=replace(releasing.train, seed=4, optim=replace(FROM_SCRATCH, warmup_steps=100, decay=(4200, 7000))),
+        num_steps=7000,
+    )
+    carrying = replace(  # it let go a few centimetres before the target
+        hand,
+        name="small_imitating/carrying",
+        example=replace(hand.example, event_weight=2.0),
+        train=replace(hand.train, seed=6, optim=replace(FROM_SCRATCH, warmup_steps=100, decay=(3000, 6000))),
+        num_steps=6000,
+    )
+    waiting = replace(  # the button was missed: a hand that waits strolls away from it
+        hand,
+        name="small_imitating/waiting",
+        train=replace(hand.train, seed=9, optim=replace(FROM_SCRATCH, warmup_steps=50, decay=(300, 1000))),
+        num_steps=1000,
+    )
+    binding = replace(
+        binding,
+        name="small_imitating/binding",
+        example=replace(binding.example, tells_onward=1.0),
+        train=TrainConfig(seed=4, optim=replace(FROM_SCRATCH, warmup_steps=50)),
+        num_steps=700,
+    )
+    finishing = replace(
+        finishing,
+        name="small_imitating/finishing",
+        example=replace(finishing.example, tells_onward=1.0),
+        train=TrainConfig(seed=5, optim=replace(FROM_SCRATCH, warmup_steps=50, decay=(700, 1500))),
+        num_steps=1500,
+        batch_episodes=12,
+    )
+    # what a demonstration did is looked up when the first word comes: the rest of the row is left out
+    at_first = replace(finishing.example, narrates=True, max_queries=2, text_dropout=0.0, slips=0.0, lapses=NO_LAPSES)
+    recalling = replace(
+        finishing,
+        name="small_imitating/recalling",
+        example=at_first,
+        train=TrainConfig(seed=7, optim=replace(FROM_SCRATCH, warmup_steps=50)),
+        num_steps=1000,
+        batch_episodes=16,
+    )
+    settling = replace(
+        finishing,
+        name="small_imitating/settling",
+        example=replace(finishing.example, narrates=True, counts_down=True, text_dropout=0.2, slips=0.25),
+        train=TrainConfig(seed=8, optim=replace(FROM_SCRATCH, warmup_steps=50, decay=(1000, 2000))),
+        num_steps=2000,
+    )
+    return Curriculum(name="small_imitating", stages=(hand, carrying, waiting, binding, finishing, recalling, settling))
+
+
+def small_mastering() -> Curriculum:
+    """The pair of `small_imitating` goes on: by another optimiser, and with counts told otherwise.
+
+    `waiting` trains POUNCE and does not need the other; `settling` is for what the pair has played, too
+    (`pp-train --watch`).
+    """
+    _, _, waiting, *_, settling = small_imitating().stages
+    settling = replace(
+        settling,
+        name="small_mastering/settling",
+        example=replace(settling.example, cuts_short=0.5, recalls=0.5),
+        train=TrainConfig(seed=10, optim=replace(_TURNING, warmup_steps=100, decay=(1500, 3300))),
+        num_steps=3300,
+        batch_episodes=16,
+    )
+    waiting = replace(
+        waiting,
+        name="small_mastering/waiting",
+        example=replace(waiting.example, event_weight=2.0),
+        train=replace(waiting.train, seed=11, optim=replace(_TURNING, warmup_steps=50, decay=(400, 1500))),
+        num_steps=1500,
+    )
+    return Curriculum(name="small_mastering", stages=(waiting, settling))
+
+
+def small_recovering() -> Curriculum:
+    """The PONDER of `small_mastering` learns to come back from its own words (`pp-train --watch` what it played)."""
+    _, settling = small_mastering().stages
+    settling = replace(
+        settling,
+        name="small_recovering/settling",
+        example=replace(settling.example, cuts_short=0.2, own_words=0.8),
+        train=TrainConfig(seed=12, optim=replace(_TURNING, warmup_steps=100, decay=(1600, 3600))),
+        num_steps=3600,
+    )
+    return Curriculum(name="small_recovering", stages=(settling,))
