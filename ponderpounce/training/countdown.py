@@ -5,7 +5,9 @@ cognition is looked at for up to 2.3 s after its picture was taken, and the hand
 long there was still to wait then. Told in control steps, as the second coordinate of a place.
 
 PONDER says the number, too, once a second: the next one is the last one less 20, which is learned sooner than what is
-to be waited for.
+to be waited for. Too soon: where the last one is always right nothing else is learned, and a first guess is counted
+down to its end. So in some rows the first numbers are those of a rhythm half, or twice as fast, and are put right later
+(`misjudged`); and which rhythm it is is a lesson of its own (`rhythm`).
 """
 
 from __future__ import annotations
@@ -13,12 +15,19 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
+import numpy as np
+
 from ponderpounce.models.place_code import PLACE_PX
+from ponderpounce.tasks.captions import ORDINALS
 from ponderpounce.training.lapses import Words
 from ponderpounce.training.places import PLACE
 
 _WAITING = re.compile(r"^remain static$| to prepare$")
 _LONGEST = PLACE_PX - 1
+_PASSES = re.compile(r"just as it reaches the target for the (\w+) time")
+_PRESS_TICKS = 30  # the press begins so long before the instant
+_RHYTHM_TICKS = 20  # no two rhythms are nearer to each other
+_MISJUDGED = (0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0)
 
 
 def waits(subgoals: Sequence[str]) -> list[int | None]:
@@ -55,12 +64,63 @@ def waits_unplaced(subgoals: Sequence[str]) -> list[bool]:
     ]
 
 
-def counted(words: Sequence[Words], subgoals: Sequence[str], left: Sequence[int | None]) -> tuple[Words, ...]:
-    """The words of Q queries, with the steps that are ``left`` wherever a subgoal without a place is waited out."""
-    return tuple(
-        each if wait is None or PLACE.search(text) else Words(text=f"{text} {wait}", is_due=True)
-        for each, text, wait in zip(words, subgoals, left, strict=True)
-    )
+def counted(
+    words: Sequence[Words],
+    subgoals: Sequence[str],
+    left: Sequence[int | None],
+    wrong: Sequence[int | None] | None = None,
+) -> tuple[Words, ...]:
+    """The words of Q queries, with the steps that are ``left`` wherever a subgoal without a place is waited out.
+
+    Where ``wrong`` has a number it stands in the other's stead, not to be learned (`misjudged`).
+    """
+    told = []
+    for each, text, wait, other in zip(words, subgoals, left, wrong or [None] * len(words), strict=True):
+        if not _is_counted(text, wait):
+            told.append(each)
+        elif other is None:
+            told.append(Words(text=f"{text} {wait}", is_due=True))
+        else:
+            told.append(Words(text=f"{text} {other}", is_due=True, is_learned=False))
+    return tuple(told)
+
+
+def misjudged(
+    ticks: Sequence[int], subgoals: Sequence[str], left: Sequence[int | None], rng: np.random.Generator
+) -> list[int | None]:
+    """Per query, the wrong number of steps that is told there; None: the right one.
+
+    The first ones of those that are counted, at least one, as if all went so many times as fast.
+    """
+    counted_at = [n for n, (text, wait) in enumerate(zip(subgoals, left, strict=True)) if _is_counted(text, wait)]
+    found: list[int | None] = [None] * len(ticks)
+    if not counted_at:
+        return found
+    until = int(rng.integers(1, len(counted_at) + 1))
+    at = [(n, ticks[n], ticks[n] + (left[n] or 0)) for n in counted_at[:until]]
+    possible = [share for share in _MISJUDGED if all(share * due > tick for _, tick, due in at)]
+    share = float(rng.choice(possible))
+    for n, tick, due in at:
+        found[n] = round(share * due) - tick
+    return found
+
+
+def _is_counted(text: str, wait: int | None) -> bool:
+    return wait is not None and PLACE.search(text) is None
+
+
+def rhythm(instruction: str, subgoals: Sequence[str]) -> int | None:
+    """How many steps each pass takes of the thing that is to be stopped when it comes by for the n-th time.
+
+    It starts at the end of a pass, and is where it is to be stopped after half of one and every one that follows. None
+    where nothing comes by, or it is never stopped.
+    """
+    asked = _PASSES.search(instruction)
+    left = waits(subgoals)
+    if asked is None or left[0] is None:
+        return None
+    steps = (left[0] + _PRESS_TICKS) / (ORDINALS.index(asked[1]) + 0.5)
+    return round(steps / _RHYTHM_TICKS) * _RHYTHM_TICKS
 
 
 def as_place(wait: int) -> str:

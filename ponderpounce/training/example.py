@@ -22,7 +22,7 @@ from ponderpounce.models.eyes import see
 from ponderpounce.models.normalisation import Floats
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.training.augment import AS_IT_IS, NOT_AUGMENTED, Augmentation, View, draw_view
-from ponderpounce.training.countdown import as_place, counted, stood_at, waits, waits_unplaced
+from ponderpounce.training.countdown import as_place, counted, misjudged, rhythm, stood_at, waits, waits_unplaced
 from ponderpounce.training.cut_short import Cut, cuts
 from ponderpounce.training.deeds import narration
 from ponderpounce.training.events import EVENT_ROWS, draw_near, event_ticks
@@ -96,6 +96,8 @@ class ExampleConfig:
     """Of grounded rows whose recording holds what its PONDER said, the share in which that stands (`own_words`)."""
     counts_down: bool = False
     """Waits are told with their number of steps, at every query anew (`countdown`)."""
+    misjudges: float = 0.0
+    """Share of rows with waits counted down in which the first numbers are wrong (`countdown.misjudged`)."""
     retold_px: float | None = None
     """Words are said again once the place that they told is farther than that from its thing; None: never."""
 
@@ -131,7 +133,7 @@ class ExampleConfig:
                 f"retold_px {self.retold_px} must be above 0, and slips 0, came {self.slips}: a row whose words all "
                 "slip never puts them right; let them slip in `Lapses.slipped`"
             )
-        for name in ("text_dropout", "slips", "tells_onward", "cuts_short", "recalls", "own_words"):
+        for name in ("text_dropout", "slips", "tells_onward", "cuts_short", "recalls", "own_words", "misjudges"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be in [0, 1], came {getattr(self, name)}")
 
@@ -225,7 +227,12 @@ class Example:
         texts = [self.view.text(episode.words[query.tick]) for query in self.schedule.queries]
         demonstrated = [self.view.text(text) for text in episode.demo_subgoals]
         tools = [self.view.text(text) for text in episode.demo_tools]
-        return place_lessons(row, texts, self.form.vocabulary, size, demonstrated, tools)
+        steps = rhythm(episode.instruction, episode.subgoals)
+        rhythms = [
+            "" if steps is None or 2 * query.tick < steps else f"comes by every {steps} steps"
+            for query in self.schedule.queries
+        ]
+        return place_lessons(row, texts, self.form.vocabulary, size, demonstrated, tools, rhythms)
 
 
 def make_example(
@@ -272,7 +279,10 @@ def make_example(
             subgoals, is_change = _subgoals(episode, schedule)
             words = without_lapses(subgoals, is_change) if words is None else words
             told = [episode.subgoals[query.tick] for query in schedule.queries]
-            words = counted(words, told, [left[query.tick] for query in schedule.queries])
+            ticks = [query.tick for query in schedule.queries]
+            left_Q = [left[tick] for tick in ticks]
+            is_wrong = config.misjudges and rng.random() < config.misjudges
+            words = counted(words, told, left_Q, misjudged(ticks, told, left_Q, rng) if is_wrong else None)
     is_moved = config.augments == "all" or episode.is_watched
     view = draw_view(config.augmentation if is_moved else NOT_AUGMENTED, form, set(episode.subgoals), rng)
     onward = None

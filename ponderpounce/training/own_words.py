@@ -13,6 +13,7 @@ That is DAgger (Ross et al. 2011) for words; the paper has nothing of it.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -21,6 +22,7 @@ from ponderpounce.models.ponder_coordinates import pixel_text
 from ponderpounce.training.lapses import Words
 from ponderpounce.training.places import PLACE
 
+_PLAN = re.compile(r", (?![^<]*>)")  # the first comma that is in no place
 _APART_PX = 16.0  # of a 256 px picture: the same thing, seen a little beside or pushed
 
 
@@ -55,7 +57,7 @@ def own_words(
         before = text
         is_due = bool(text) and (is_anew or not speaks_of(last, text))
         is_put_right = rng.random() < corrected or (index == 0 and not own)  # nothing is late at the first query
-        if is_due and (is_put_right or _agree(own, text)):
+        if is_due and (is_put_right or _says_the_same(own, text)):
             words.append(Words(text=text, is_due=True))
         elif is_put_right or not own:
             words.append(Words(is_due=is_due))
@@ -67,27 +69,20 @@ def own_words(
 
 
 def speaks_of(said: str, text: str) -> bool:
-    """Whether both tell one subgoal, whatever they plan after it: the same words, and a place that is the same."""
-    if _subgoal(said) != _subgoal(text):
-        return False
-    return all(_is_near(*both) for both in zip(PLACE.findall(said)[:1], PLACE.findall(text)[:1], strict=True))
-
-
-def _agree(said: str, text: str) -> bool:
-    """Whether they plan the same, too."""
-    first, second = PLACE.findall(said), PLACE.findall(text)
-    return (
-        PLACE.sub("<>", said) == PLACE.sub("<>", text)
-        and len(first) == len(second)
-        and all(_is_near(*both) for both in zip(first, second, strict=True))
-    )
+    """Whether both tell one subgoal, whatever they plan after it: the same words, and places that are the same."""
+    return _says_the_same(_subgoal(said), _subgoal(text))
 
 
 def _subgoal(text: str) -> str:
-    """The text without its plan and its places."""
-    subgoal, *_ = PLACE.sub("<>", text).split(", ")
-    return subgoal
+    """The text without its plan."""
+    end = _PLAN.search(text)
+    return text if end is None else text[: end.start()]
 
 
-def _is_near(first: tuple[str, str], second: tuple[str, str]) -> bool:
-    return float(np.hypot(int(first[0]) - int(second[0]), int(first[1]) - int(second[1]))) <= _APART_PX
+def _says_the_same(first: str, second: str) -> bool:
+    if PLACE.sub("<>", first) != PLACE.sub("<>", second):
+        return False
+    return all(
+        np.hypot(int(y) - int(v), int(x) - int(u)) <= _APART_PX
+        for (y, x), (v, u) in zip(PLACE.findall(first), PLACE.findall(second), strict=True)
+    )

@@ -6,7 +6,8 @@ faster. So hidden states are asked for places in that form (`place_features`) wh
 
 - at the end of every observation, for all places that the words in force name, one after the other in the first
   numbers: what is to be said, and later read, whether or not it is said now;
-- at every token before one of a coordinate's, for the place that is being told.
+- at every token before one of a coordinate's, for the place that is being told;
+- at the end of every observation, for the rhythm in which something comes by (`countdown.rhythm`).
 
 - at the end of every picture of a demonstration, for what is being done (`deeds`): where, where the deed before was,
   and codes of which it is and for which time. What was done second is asked for once, a minute later; nothing else
@@ -68,17 +69,20 @@ def place_lessons(
     size: int,
     demonstrated: Sequence[str] = (),
     tools: Sequence[str] = (),
+    rhythms_Q: Sequence[str] = (),
 ) -> PlaceLessons:
     """The lessons of a row with hidden states of ``size`` numbers.
 
     ``texts_Q``: the simulator's words in force at every query; ``demonstrated``: those of every instant of the
-    demonstration, ``tools``: where the tool is then. Of more places than fit the last are left out.
+    demonstration, ``tools``: where the tool is then; ``rhythms_Q``: how often something comes by, as far as that was to
+    be seen by then. Of more places than fit the last are left out.
     """
     num_slots = size // NUM_PLACE_FEATURES
     found = [
         *_seen_done(row, demonstrated, vocabulary, num_slots),
         *_seen_going(row, demonstrated, tools, vocabulary, num_slots),
         *_in_mind(row, texts_Q, num_slots),
+        *_coming_by(row, rhythms_Q, num_slots),
         *_being_told(row, vocabulary),
     ]
     features = [numbers for _, _, numbers in found]
@@ -123,6 +127,13 @@ def _in_mind(row: Row, texts_Q: Sequence[str], num_slots: int) -> Iterator[_Less
     for index, text in zip(row.gate_index.tolist(), texts_Q, strict=True):
         for slot, (y, x) in enumerate(PLACE.findall(text)[:num_slots]):
             yield index, slot, place_features((int(y), int(x)))
+
+
+def _coming_by(row: Row, rhythms_Q: Sequence[str], num_slots: int) -> Iterator[_Lesson]:
+    """The last slot, where there is more than one."""
+    for index, text in zip(row.gate_index.tolist(), rhythms_Q, strict=False):
+        if text and num_slots > 1:
+            yield index, num_slots - 1, text_code(text, NUM_PLACE_FEATURES)
 
 
 def _being_told(row: Row, vocabulary: Vocabulary) -> Iterator[_Lesson]:

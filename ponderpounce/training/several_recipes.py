@@ -189,8 +189,8 @@ def small_recovering() -> Curriculum:
     settling = replace(
         settling,
         name="small_recovering/settling",
-        example=replace(settling.example, cuts_short=0.2, own_words=0.8),
-        train=TrainConfig(seed=12, optim=replace(_TURNING, warmup_steps=100, decay=(1600, 3600))),
-        num_steps=3600,
+        example=replace(settling.example, cuts_short=0.2, own_words=0.8, misjudges=0.6),
+        train=TrainConfig(seed=12, optim=replace(_TURNING, warmup_steps=100, decay=(1000, 2400))),
+        num_steps=2400,
     )
     return Curriculum(name="small_recovering", stages=(settling,))

@@ -9,11 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from clock.sampling import EVALUATION, ROBOMME
+from ponderpounce.models.context import IGNORE
 from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
 from ponderpounce.models.ponder_coordinates import normalised_text
-from ponderpounce.training.countdown import as_place, counted, stood_at, waits, waits_unplaced
+from ponderpounce.tasks.captions import ORDINALS
+from ponderpounce.tasks.counting.stop_cube import StopCube
+from ponderpounce.training.countdown import as_place, counted, misjudged, rhythm, stood_at, waits, waits_unplaced
 from ponderpounce.training.example import ExampleConfig, make_example
 from ponderpounce.training.lapses import Words
 from ponderpounce.training.nudge import Nudge
@@ -117,3 +120,73 @@ def test_a_row_says_its_counts() -> None:
 
 def test_the_longest_wait_is_as_long_as_a_picture_is_wide() -> None:
     assert [as_place(wait) for wait in (1, 255, 256, 900)] == ["<0, 1>", *["<0, 255>"] * 3]
+
+
+@given(first=st.integers(0, 60), count=st.integers(0, 14), every=st.integers(15, 25), rest=st.integers(0, 40))
+def test_a_misjudged_wait_is_that_of_another_rhythm_and_is_put_right(
+    first: int, count: int, every: int, rest: int
+) -> None:
+    ticks = [0, *(first + every * n for n in range(1, count + 1)), first + every * (count + 1) + rest]
+    due = ticks[-1]
+    texts = [HOVER, *[STILL] * count, PRESS]
+    left = [due, *(due - tick for tick in ticks[1:-1]), None]
+    seen = set()
+    for seed in range(30):
+        wrong = misjudged(ticks, texts, left, np.random.default_rng(seed))
+        assert wrong[0] is None, "where a place is told no number is"
+        assert wrong[-1] is None
+        at = [n for n, each in enumerate(wrong) if each is not None]
+        assert at == [*range(1, len(at) + 1)], "the first ones"
+        assert bool(at) == bool(count)
+        told = [each + ticks[n] for n, each in enumerate(wrong) if each is not None]
+        assert len(set(told)) <= 1, "one instant, the same at every query"
+        assert all(each >= 0 for each in wrong if each is not None)
+        assert due not in told or due < 3
+        seen.add(len(at))
+    assert count < 2 or len(seen) > 1
+
+
+def test_a_misjudged_wait_is_not_learned_and_c_knows_better() -> None:
+    recorded = waiting_episode([HOVER] * 40 + [STILL] * 200 + [PRESS] * 30, (0, 40, 240))
+    config = ExampleConfig(clocks=EVALUATION, counts_down=True)
+    right, wrong = (
+        make_example(recorded, FORM, replace(config, misjudges=share), np.random.default_rng(5)) for share in (0.0, 1.0)
+    )
+    assert right.words is not None
+    assert wrong.words is not None
+    assert [each.is_due for each in wrong.words] == [each.is_due for each in right.words]
+    others = [new for old, new in zip(right.words, wrong.words, strict=True) if old != new]
+    assert others
+    assert not any(each.is_learned for each in others)
+    assert all(each.text.startswith(STILL) for each in others)
+    np.testing.assert_array_equal(right.stand_ins(128), wrong.stand_ins(128))
+    learned = FORM.vocabulary.decode([id_ for id_ in wrong.row().targets if id_ != IGNORE])
+    assert learned.count(STILL) == sum(each.text.startswith(STILL) for each in wrong.words) - len(others)
+
+
+def test_the_rhythm_is_that_of_the_scene() -> None:
+    for seed in range(40):
+        layout = StopCube().sample(np.random.default_rng(seed), "easy")
+        texts = [HOVER] * 30 + [STILL] * (layout.press_step - 30) + [PRESS] * 30
+        assert rhythm(StopCube().instruction(layout), texts) == layout.pass_steps
+    assert rhythm("pick it up", texts) is None
+    assert rhythm(StopCube().instruction(layout), [HOVER] * 30) is None, "it is never stopped"
+
+
+def test_the_rhythm_is_a_lesson_once_it_has_been_seen() -> None:
+    asked = f"press the button to stop the cube just as it reaches the target for the {ORDINALS[2]} time"
+    texts = [HOVER] * 30 + [STILL] * 240 + [PRESS] * 30  # stopped after 300, in the third pass: 120 each
+    recorded = replace(waiting_episode(texts, (0, 30, 270)), instruction=asked)
+    example = make_example(recorded, FORM, ExampleConfig(clocks=EVALUATION), np.random.default_rng(0))
+    row = example.row()
+    lessons = example.place_lessons(row, 4 * NUM_PLACE_FEATURES)
+    at = lessons.index_M[lessons.first_M == 3 * NUM_PLACE_FEATURES].tolist()
+    seen = [query.tick >= 60 for query in example.schedule.queries]
+    assert at == [index for index, is_seen in zip(row.gate_index.tolist(), seen, strict=True) if is_seen]
+    assert 0 < len(at) < len(seen)
+    codes = lessons.features_MP[lessons.first_M == 3 * NUM_PLACE_FEATURES]
+    assert (codes == codes[0]).all()
+    slower = replace(recorded, instruction=asked.replace("third", "second"))  # as late, in an earlier pass
+    other = make_example(slower, FORM, ExampleConfig(clocks=EVALUATION), np.random.default_rng(0))
+    again = other.place_lessons(other.row(), 4 * NUM_PLACE_FEATURES)
+    assert not (again.features_MP[again.first_M == 3 * NUM_PLACE_FEATURES][0] == codes[0]).all()
