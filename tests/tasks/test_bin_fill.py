@@ -14,7 +14,7 @@ from ponderpounce.tasks.captions import ORDINALS
 from ponderpounce.tasks.counting.bin_fill import BinFill, Layout, Memory
 from ponderpounce.tasks.difficulty import DIFFICULTIES
 from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot
+from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
 from ponderpounce.tasks.geometry import Footprint, is_clear
 from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.scene import BUTTON_HALF_M, CUBE_COLORS
@@ -215,6 +215,26 @@ def test_the_list_goes_on_from_whatever_is_in_the_bin(seed: int) -> None:
             said = [step.text.split()[3] for step in steps[:-1:2] if step.text.split()[4] == color]
             assert said == list(ORDINALS[:count])
         assert [step.carries[0] for step in steps[1:-1:2]] == picked
+
+
+@pytest.mark.parametrize("follows", [False, True])
+def test_who_begins_with_another_cube_is_sent_to_one_that_is_left(follows: bool) -> None:
+    """Upstream's texts go on with the list, and then speak of a cube that is in the bin."""
+    with make_environment("BinFill", render=False, texts_follow=follows) as env:
+        env.reset(4, "medium")
+        color = env.layout.cubes[0].color
+        first, second = env.layout.of_color(color)[:2]
+        env.reset(4, "medium", layout=replace(env.layout, wanted=((color, 2),), is_filling_up=False))
+        motions = Motions(env.physics)
+        for motion in (motions.pick(second), motions.drop_into("bin")):
+            for action in motion:
+                env.step(action)
+        snapshot = env.step(action)
+        assert snapshot.simple_subgoal == f"pick up the second {color} cube"
+        left = env.subtasks[2].grounds
+        assert left == ((first,) if follows else (second,))
+        assert ("<" in snapshot.grounded_subgoal) == follows, "what is in the bin has vanished and is seen nowhere"
+        assert [text.split(" at ")[0] for text in env.to_come()] == ["put it into the bin", "press the button"]
 
 
 def test_one_too_many_leaves_the_list_as_long() -> None:
