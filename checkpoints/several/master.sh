@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # A trial to go on from the pair that imitate.sh has left, on two CPU cores: see docs/training.md, "A lower loss, and no more
-# scenes solved". The shipped pair is imitate.sh's.
+# scenes solved". recover.sh goes on from it.
 #
 #     checkpoints/several/master.sh [OUT]    (the OUT of train.sh, further.sh and imitate.sh)
 #

@@ -17,7 +17,7 @@ export OMP_NUM_THREADS=1 MUJOCO_GL=${MUJOCO_GL:-egl}
 
 noisy=(--recovery-share 0.2 --shove-share 0.3)
 collect "$next/old" --tasks ButtonUnmask VideoUnmask PickXtimes SwingXtimes --episodes 100 "${noisy[@]}"  # as they were
-collect "$next/filled" --tasks BinFill --episodes 220 "${noisy[@]}"  # its colors in the order that is spoken
+collect "$next/filled" --tasks BinFill --episodes 140 "${noisy[@]}"  # its colors in the order that is spoken
 data=("$more/imitated" "$more/timed" "$more/timed" "$more/shown" "$next/old" "$next/filled" "$more/swaps" "$more/highlight")
 
 play() {  # EPISODES each from SEED on, into FOLDER, of TASKS
