@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 
-from ponderpounce.data.episode import Package, Rejection, Rows, unpack
+from ponderpounce.data.episode import OPTIONAL, Package, Rejection, Rows, from_table, to_table, unpack
 
 
 def test_what_is_packed_is_unpacked(package: Callable[..., Package]) -> None:
@@ -30,5 +30,9 @@ def test_equal_episodes_are_equal_bytes(package: Callable[..., Package]) -> None
 
 
 def test_every_column_has_a_value_for_every_row(package: Callable[..., Package]) -> None:
-    rows = unpack(package(4, num_rows=6, nudge_rad=0.1)).rows
+    rows = replace(unpack(package(4, num_rows=6, nudge_rad=0.1)).rows, said=("", "press", *[""] * 4))
     assert {len(getattr(rows, each.name)) for each in fields(Rows)} == {6}
+    read = from_table(to_table(rows))
+    assert read.said == rows.said
+    missing = {each.name for each in fields(Rows) if getattr(unpack(package(4)).rows, each.name) is None}
+    assert missing == set(OPTIONAL)
