@@ -11,7 +11,7 @@ set -euo pipefail
 out=${1:-out/several}
 more=$out/imitate
 bin=${BIN:-.venv/bin}
-source "$(dirname "$0")/../small/common.sh"
+source "$(dirname "$0")/common.sh"
 export OMP_NUM_THREADS=1 MUJOCO_GL=${MUJOCO_GL:-egl}
 imitated=(MoveCube PatternLock RouteStick)
 shown=(VideoPlaceButton VideoPlaceOrder VideoRepick)
@@ -60,9 +60,4 @@ mapfile -t found < <(logs "$more/played")
 pair="$more/pair"
 [ -d "$pair/ponder" ] || halve "$more/run/settling/ponder" "$pair/ponder"
 [ -d "$pair/pounce" ] || halve "$more/run/waiting/pounce" "$pair/pounce"
-for cognition in real null; do
-    "$bin/pp-eval" --tasks PickHighlight StopCube "${imitated[@]}" "${shown[@]}" "${old[@]}" "${swapped[@]}" --episodes 50 --runs 1 \
-        --seed 1000 --workers 2 --cognition $cognition --ponder-checkpoint "$pair/ponder" --pounce-checkpoint "$pair/pounce" \
-        --out "$more/$cognition"
-done
-"$bin/pp-tables" "$more/real" "$more/null" --out "$more/tables"
+evaluate "$pair" "$more"

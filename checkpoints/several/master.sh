@@ -12,20 +12,19 @@ out=${1:-out/several}
 more=$out/imitate
 next=$out/master
 bin=${BIN:-.venv/bin}
-source "$(dirname "$0")/../small/common.sh"
+source "$(dirname "$0")/common.sh"
 export OMP_NUM_THREADS=1 MUJOCO_GL=${MUJOCO_GL:-egl}
 data=("$more/imitated" "$more/timed" "$more/shown" "$more/old" "$more/swaps" "$more/highlight")
 
-play() {  # EPISODES each from SEED on, into FOLDER, of TASKS; and what was played becomes a dataset
+watch() {  # what the pair plays becomes a dataset: EPISODES each from SEED on, FOLDER, TASKS
     local folder=$3 found
-    "$bin/pp-eval" --tasks "${@:4}" --episodes "$1" --runs 1 --seed "$2" --max-steps 900 --order near-first --record --record-hz 5 \
-        --workers 2 --ponder-checkpoint "$more/pair/ponder" --pounce-checkpoint "$more/pair/pounce" --out "$folder-played"
+    play "$more/pair" "$1" "$2" "$folder-played" "${@:4}"
     mapfile -t found < <(logs "$folder-played")
     [ -d "$folder/meta" ] || "$bin/pp-export" "${found[@]}" --out "$folder"
 }
 
-play 36 1950000 "$next/counted" PickXtimes SwingXtimes BinFill
-play 16 1960000 "$next/driven" ButtonUnmask VideoUnmask VideoPlaceButton VideoPlaceOrder PickHighlight
+watch 36 1950000 "$next/counted" PickXtimes SwingXtimes BinFill
+watch 16 1960000 "$next/driven" ButtonUnmask VideoUnmask VideoPlaceButton VideoPlaceOrder PickHighlight
 
 train() {  # on both cores
     "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --weights whole --recipe small_mastering \
@@ -40,9 +39,4 @@ train() {  # on both cores
 pair="$next/pair"
 [ -d "$pair/ponder" ] || halve "$next/run/settling/ponder" "$pair/ponder"
 [ -d "$pair/pounce" ] || halve "$next/run/waiting/pounce" "$pair/pounce"
-for cognition in real null; do
-    "$bin/pp-eval" --tasks PickHighlight StopCube MoveCube PatternLock RouteStick VideoPlaceButton VideoPlaceOrder VideoRepick \
-        ButtonUnmask VideoUnmask PickXtimes SwingXtimes BinFill ButtonUnmaskSwap VideoUnmaskSwap --episodes 50 --runs 1 --seed 1000 \
-        --workers 2 --cognition $cognition --ponder-checkpoint "$pair/ponder" --pounce-checkpoint "$pair/pounce" --out "$next/$cognition"
-done
-"$bin/pp-tables" "$next/real" "$next/null" --out "$next/tables"
+evaluate "$pair" "$next"

@@ -12,7 +12,7 @@ more=$out/imitate
 trial=$out/master
 next=$out/recover
 bin=${BIN:-.venv/bin}
-source "$(dirname "$0")/../small/common.sh"
+source "$(dirname "$0")/common.sh"
 export OMP_NUM_THREADS=1 MUJOCO_GL=${MUJOCO_GL:-egl}
 
 noisy=(--recovery-share 0.2 --shove-share 0.3)
@@ -20,14 +20,8 @@ collect "$next/old" --tasks ButtonUnmask VideoUnmask PickXtimes SwingXtimes --ep
 collect "$next/filled" --tasks BinFill --episodes 140 "${noisy[@]}"  # its colors in the order that is spoken
 data=("$more/imitated" "$more/timed" "$more/timed" "$more/shown" "$next/old" "$next/filled" "$more/swaps" "$more/highlight")
 
-play() {  # EPISODES each from SEED on, into FOLDER, of TASKS
-    [ -f "$3/results.json" ] || "$bin/pp-eval" --tasks "${@:4}" --episodes "$1" --runs 1 --seed "$2" --max-steps 900 \
-        --order near-first --record --record-hz 5 --workers 2 --out "$3" \
-        --ponder-checkpoint "$trial/pair/ponder" --pounce-checkpoint "$trial/pair/pounce"
-}
-
-play 52 1970000 "$next/counted-played" PickXtimes SwingXtimes BinFill
-play 16 1980000 "$next/driven-played" VideoPlaceButton VideoPlaceOrder ButtonUnmask VideoUnmask
+play "$trial/pair" 52 1970000 "$next/counted-played" PickXtimes SwingXtimes BinFill
+play "$trial/pair" 16 1980000 "$next/driven-played" VideoPlaceButton VideoPlaceOrder ButtonUnmask VideoUnmask
 
 told() {  # what was played into these FOLDERS, but PickHighlight, told as things then stood
     local found=() folder into=$1
@@ -45,9 +39,4 @@ pair="$next/pair"
     --ponder "$trial/run/settling/ponder" --pounce "$trial/run/waiting/pounce" --sights "$more/sights" --out "$next/run"
 [ -d "$pair/ponder" ] || halve "$next/run/settling/ponder" "$pair/ponder"
 [ -d "$pair/pounce" ] || halve "$trial/run/waiting/pounce" "$pair/pounce"
-for cognition in real null; do
-    "$bin/pp-eval" --tasks PickHighlight StopCube MoveCube PatternLock RouteStick VideoPlaceButton VideoPlaceOrder VideoRepick \
-        ButtonUnmask VideoUnmask PickXtimes SwingXtimes BinFill ButtonUnmaskSwap VideoUnmaskSwap --episodes 50 --runs 1 --seed 1000 \
-        --workers 2 --cognition $cognition --ponder-checkpoint "$pair/ponder" --pounce-checkpoint "$pair/pounce" --out "$next/$cognition"
-done
-"$bin/pp-tables" "$next/real" "$next/null" --out "$next/tables"
+evaluate "$pair" "$next"

@@ -256,7 +256,7 @@ class Environment:
         texts = []
         for step in self._subtasks[self._caption.index + 1 :]:
             is_there = not any(map(self.physics.is_parked, step.grounds))
-            points = self._project(step.grounds) if is_there and step.grounds else []
+            points = self._project(step.grounds) if is_there else []
             texts.append(captions.grounded(step.text, points) if is_there else captions.simple(step.text))
         return tuple(texts)
 
@@ -401,7 +401,7 @@ class Environment:
     def _project(self, bodies: Sequence[str]) -> list[captions.Pixel]:
         """Where bodies stand in the front camera's picture, hidden or not."""
         K, Rt = sight.intrinsic(self.physics, FRONT, IMAGE_PX), sight.extrinsic(self.physics, FRONT)
-        points_px = sight.project(K, Rt, np.array([self.physics.position_m(body) for body in bodies]))
+        points_px = sight.project(K, Rt, np.array([self.physics.position_m(body) for body in bodies]).reshape(-1, 3))
         return [(int(y), int(x)) for x, y in points_px.tolist()]
 
     def _look_for(self, bodies: Sequence[str]) -> list[captions.Pixel] | None:

@@ -19,14 +19,13 @@ import numpy as np
 
 from ponderpounce.models.place_code import PLACE_PX
 from ponderpounce.tasks.captions import ORDINALS
+from ponderpounce.tasks.counting.stop_cube import PASS_STEPS, PRESS_STEPS
 from ponderpounce.training.lapses import Words
 from ponderpounce.training.places import PLACE
 
 _WAITING = re.compile(r"^remain static$| to prepare$")
 _LONGEST = PLACE_PX - 1
 _PASSES = re.compile(r"just as it reaches the target for the (\w+) time")
-_PRESS_TICKS = 30  # the press begins so long before the instant
-_RHYTHM_TICKS = 20  # no two rhythms are nearer to each other
 _MISJUDGED = (0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0)
 
 
@@ -119,8 +118,8 @@ def rhythm(instruction: str, subgoals: Sequence[str]) -> int | None:
     left = waits(subgoals)
     if asked is None or left[0] is None:
         return None
-    steps = (left[0] + _PRESS_TICKS) / (ORDINALS.index(asked[1]) + 0.5)
-    return round(steps / _RHYTHM_TICKS) * _RHYTHM_TICKS
+    steps = (left[0] + PRESS_STEPS) / (ORDINALS.index(asked[1]) + 0.5)  # the press begins before the instant
+    return min(PASS_STEPS, key=lambda each: abs(each - steps))
 
 
 def as_place(wait: int) -> str:

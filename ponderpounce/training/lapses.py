@@ -96,8 +96,8 @@ def drawn_lapses(
     mistaken = ""
     last = ""  # of all words that stand there
     for index, (text, changes) in enumerate(zip(subgoals, is_change, strict=True)):
-        others = [other for other in known if _is_other(other, text)]
-        if changes and mistaken and not _is_other(mistaken, text):
+        others = [other for other in known if is_other(other, text)]
+        if changes and mistaken and not is_other(mistaken, text):
             wait = None
         elif changes or (wait is None and retold_px is not None and has_moved(last, text, retold_px)):
             is_late = index > 0 and rng.random() < lapses.missed
@@ -137,9 +137,9 @@ def has_moved(told: str, now: str, by_px: float) -> bool:
     return float(np.hypot(int(first[1]) - int(second[1]), int(first[2]) - int(second[2]))) > by_px
 
 
-def _is_other(text: str, than: str) -> bool:
+def is_other(text: str, than: str) -> bool:
     """Whether it is of another subgoal: other words, or places that are further apart than things are pushed."""
-    if PLACE.sub("", text) != PLACE.sub("", than):
+    if PLACE.sub("<>", text) != PLACE.sub("<>", than):
         return True
-    pairs = zip(PLACE.findall(text), PLACE.findall(than), strict=False)
+    pairs = zip(PLACE.findall(text), PLACE.findall(than), strict=True)
     return any(np.hypot(int(y) - int(v), int(x) - int(u)) > _APART_PX for (y, x), (v, u) in pairs)

@@ -19,11 +19,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from ponderpounce.models.ponder_coordinates import pixel_text
-from ponderpounce.training.lapses import Words
-from ponderpounce.training.places import PLACE
+from ponderpounce.training.lapses import Words, is_other
 
 _PLAN = re.compile(r", (?![^<]*>)")  # the first comma that is in no place
-_APART_PX = 16.0  # of a 256 px picture: the same thing, seen a little beside or pushed
 
 
 def as_recorded(said: str) -> str:
@@ -48,7 +46,7 @@ def own_words(
         subgoals: what is to be said there.
         is_change: whether the query is the first to see a change.
         rng: one number is drawn for each query.
-        corrected: above 0, at most 1. With 1 every word is right, as without errors.
+        corrected: from 0 to 1. With 1 every word is right, as without errors; with 0 nothing is put right.
     """
     words: list[Words] = []
     last, before, is_anew = "", "", False
@@ -57,7 +55,7 @@ def own_words(
         before = text
         is_due = bool(text) and (is_anew or not speaks_of(last, text))
         is_put_right = rng.random() < corrected or (index == 0 and not own)  # nothing is late at the first query
-        if is_due and (is_put_right or _says_the_same(own, text)):
+        if is_due and (is_put_right or not is_other(own, text)):
             words.append(Words(text=text, is_due=True))
         elif is_put_right or not own:
             words.append(Words(is_due=is_due))
@@ -70,19 +68,10 @@ def own_words(
 
 def speaks_of(said: str, text: str) -> bool:
     """Whether both tell one subgoal, whatever they plan after it: the same words, and places that are the same."""
-    return _says_the_same(_subgoal(said), _subgoal(text))
+    return not is_other(_subgoal(said), _subgoal(text))
 
 
 def _subgoal(text: str) -> str:
     """The text without its plan."""
     end = _PLAN.search(text)
     return text if end is None else text[: end.start()]
-
-
-def _says_the_same(first: str, second: str) -> bool:
-    if PLACE.sub("<>", first) != PLACE.sub("<>", second):
-        return False
-    return all(
-        np.hypot(int(y) - int(v), int(x) - int(u)) <= _APART_PX
-        for (y, x), (v, u) in zip(PLACE.findall(first), PLACE.findall(second), strict=True)
-    )

@@ -83,23 +83,32 @@ def test_what_a_policy_said_is_of_the_tick_that_it_had_seen() -> None:
     assert said_by_tick(log, 5) == ["pick at [500, 20]", "", "", "press", ""]
 
 
-def test_played_again_its_texts_are_those_that_collecting_tells(log: Path, record: EpisodeRecord) -> None:
+@pytest.fixture(scope="module")
+def rounds(recorded: Callable[..., Path]) -> Path:
+    """Of a task with several subgoals."""
+    return recorded("PickXtimes", SEED, pixels="exact")
+
+
+@pytest.mark.parametrize("name", ["log", "rounds"])
+def test_played_again_its_texts_are_those_that_collecting_tells(name: str, request: pytest.FixtureRequest) -> None:
+    path: Path = request.getfixturevalue(name)
+    record = read_log(path)
     rows: list[Row] = []
-    with make_environment(TASK, render=False, texts_follow=True) as environment:
-        play(environment, JOB, SEED, take=lambda row, frames: rows.append(row))
-    again = read_episode(log, record, texts="follow")
+    with make_environment(record.info.task, render=False, texts_follow=True) as environment:
+        job = dataclasses.replace(JOB, task=record.info.task)
+        play(environment, job, SEED, take=lambda row, frames: rows.append(row))
+    again = read_episode(path, record, texts="follow")
     assert again.rows.grounded_subgoal == tuple(row.grounded_subgoal for row in rows)
     assert again.rows.subgoal == tuple(row.subgoal for row in rows)
     assert again.rows.is_transition.tolist() == [row.is_transition for row in rows]
     assert again.about.unreached == ()
 
 
-def test_of_an_episode_that_ends_early_the_rest_is_told(recorded: Callable[..., Path]) -> None:
+def test_of_an_episode_that_ends_early_the_rest_is_told(rounds: Path) -> None:
     """As if it had failed there."""
-    log = recorded("PickXtimes", SEED, pixels="exact")
-    record, at = read_log(log), 40
+    record, at = read_log(rounds), 40
     begun = dataclasses.replace(record, ticks=record.ticks[:at], result=None)
-    cut = read_episode(log, begun, texts="follow")
+    cut = read_episode(rounds, begun, texts="follow")
     assert not cut.about.is_success
     assert len(cut.rows) == at
     told = dict.fromkeys(each.text for each in record.subgoals if each.kind == m.SubgoalKind.TASK_SIMPLE)

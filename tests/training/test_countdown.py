@@ -186,7 +186,8 @@ def test_the_rhythm_is_a_lesson_once_it_has_been_seen() -> None:
     assert 0 < len(at) < len(seen)
     codes = lessons.features_MP[lessons.first_M == 3 * NUM_PLACE_FEATURES]
     assert (codes == codes[0]).all()
-    slower = replace(recorded, instruction=asked.replace("third", "second"))  # as late, in an earlier pass
-    other = make_example(slower, FORM, ExampleConfig(clocks=EVALUATION), np.random.default_rng(0))
+    texts = [HOVER] * 30 + [STILL] * 60 + [PRESS] * 30  # stopped after 120, in the second pass: 80 each
+    faster = replace(waiting_episode(texts, (0, 30, 90)), instruction=asked.replace("third", "second"))
+    other = make_example(faster, FORM, ExampleConfig(clocks=EVALUATION), np.random.default_rng(0))
     again = other.place_lessons(other.row(), 4 * NUM_PLACE_FEATURES)
     assert not (again.features_MP[again.first_M == 3 * NUM_PLACE_FEATURES][0] == codes[0]).all()

@@ -30,11 +30,11 @@ NUM_PASSES = 5
 _TARGET_REACH_M, _TARGET_RADIUS_M, _TARGET_HALF_HEIGHT_M = 0.1, 0.036, 0.005
 _LINE_HALF_M, _LINE_TURN_RAD = 0.3, np.deg2rad(30.0)
 _Z_M = 0.01  # of the cube's and the target's centre: the cube is half sunk into the table
-_PASS_STEPS = (60, 80, 120)
+PASS_STEPS = (60, 80, 120)  # of one pass, whichever is drawn
 _VISITS = (2, 3, 4, 5)
 _STOPPED_M = 0.06
 _CHECKPOINT_STEPS = 100
-_PRESS_STEPS = 30  # the oracle begins to press so long before the cube is on the target
+PRESS_STEPS = 30  # the oracle begins to press so long before the cube is on the target
 _BUTTON, _TARGET, _CUBE = "button", "target", "shuttle"
 
 
@@ -74,7 +74,7 @@ class Layout:
     @property
     def press_step(self) -> int:
         """When the oracle begins to press."""
-        return self.last_step - self.pass_steps // 2 - _PRESS_STEPS
+        return self.last_step - self.pass_steps // 2 - PRESS_STEPS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,7 +106,7 @@ class StopCube(Task[Layout, Memory]):
             target_xy_m=(target_x_m, target_y_m),
             heading_rad=float(rng.uniform(-_LINE_TURN_RAD, _LINE_TURN_RAD)),
             color_linear=(red, green, blue),
-            pass_steps=int(rng.choice(_PASS_STEPS)),
+            pass_steps=int(rng.choice(PASS_STEPS)),
             visit=int(rng.choice(_VISITS)),
         )
 
@@ -165,6 +165,10 @@ class StopCube(Task[Layout, Memory]):
         )
         text = count + f"Next, stop the cube at the target[ at <>] on visit {layout.visit}."
         return Reasoning(text=text, grounds=(_TARGET,))
+
+    def moving(self, layout: Layout, step: int) -> tuple[tuple[float, float, float], ...]:
+        x_m, y_m, z_m = layout.cube_pose(step + 1)[:3].tolist()  # reset spends a control step
+        return ((x_m, y_m, z_m),)
 
     def things(self, layout: Layout, step: int, memory: object = None) -> tuple[Thing, ...]:
         named = {"button": f"{_BUTTON}/cap", "target": _TARGET, "running cube": _CUBE}

@@ -1,0 +1,21 @@
+# What the scripts beside it have in common; each sets $bin.
+
+source "$(dirname "${BASH_SOURCE[0]}")/../small/common.sh"
+
+play() {  # a PAIR plays EPISODES each from SEED on, recorded INTO a folder, of TASKS
+    local pair=$1 into=$4
+    "$bin/pp-eval" --tasks "${@:5}" --episodes "$2" --runs 1 --seed "$3" --max-steps 900 \
+        --order near-first --record --record-hz 5 --workers 2 --out "$into" \
+        --ponder-checkpoint "$pair/ponder" --pounce-checkpoint "$pair/pounce"
+}
+
+evaluate() {  # a PAIR on the test scenes of fifteen tasks, with cognition and without: OUT/real, OUT/null, OUT/tables
+    local pair=$1 out=$2 cognition
+    for cognition in real null; do
+        "$bin/pp-eval" --tasks PickHighlight StopCube MoveCube PatternLock RouteStick VideoPlaceButton VideoPlaceOrder VideoRepick \
+            ButtonUnmask VideoUnmask PickXtimes SwingXtimes BinFill ButtonUnmaskSwap VideoUnmaskSwap --episodes 50 --runs 1 \
+            --seed 1000 --workers 2 --cognition "$cognition" --ponder-checkpoint "$pair/ponder" --pounce-checkpoint "$pair/pounce" \
+            --out "$out/$cognition"
+    done
+    "$bin/pp-tables" "$out/real" "$out/null" --out "$out/tables"
+}
