@@ -39,12 +39,12 @@ from ponder_server.contract import (
 )
 from ponder_server.draft import Draft, NoDraft
 from ponder_server.narrow import check_weights, quantise
-from ponder_server.prefixes import Prefixes
+from ponder_server.opening import Opener
 from ponder_server.runner import BUCKETS, NUM_SAVED_STATES, Append, Runner, Session
 from ponder_server.slots import slot_size
 from ponder_server.threads import Threads
 from ponder_server.writer import MAX_CHECKED_TOKENS, Steps, TransitionWriter
-from ponderpounce.models.context import Segment, SegmentKind, in_groups
+from ponderpounce.models.context import SegmentKind
 from ponderpounce.models.eyes import Pictures, check_cameras, readable_sizes, see
 from ponderpounce.models.graphs import Capture, graphs_for
 from ponderpounce.models.ponder import Ponder
@@ -176,7 +176,13 @@ class QwenEngine:
         self._parts = [*(layer.mlp for layer in (*model.visual.blocks, *model.language_model.layers)), *draft.parts]
         self._writer = TransitionWriter(ponder, draft, max_text_tokens=config.max_text_tokens)
         self._num_query_ids = len(self._query_ids(WARM_UP_PROPRIO))
-        self._prefixes = Prefixes(config.max_prefixes)
+        self._opener = Opener(
+            ponder,
+            self._writer,
+            self._embed,
+            max_prefixes=config.max_prefixes,
+            chunk_tokens=config.prefill_chunk_tokens,
+        )
         self._begun: dict[str, _Query] = {}
         self._batch: Batch[Fire] = Batch(self._runner, max_rows=config.max_batch_rows)
         if config.weights != "float":
@@ -217,7 +223,8 @@ class QwenEngine:
         context = self._runner.open(session)
         try:
             with audible(self._parts, progress):
-                self._encode(context, opening, segments, demo, progress)
+                pictures = [picture for instant in demo for picture in instant]
+                spans = self._opener.encode(context, opening, segments, pictures, progress)
         except BaseException as error:
             self._runner.close(context)
             if isinstance(error, torch.OutOfMemoryError):
@@ -225,34 +232,10 @@ class QwenEngine:
             raise
         self._episodes[session] = _Episode(
             context=context,
-            spans=[Span(segment.kind, len(segment)) for segment in segments],
+            spans=spans,
             owes_reasoning=opening.has_demo,
         )
         return context.num_tokens
-
-    def _encode(
-        self,
-        context: Session,
-        opening: Opening,
-        segments: tuple[Segment, ...],
-        demo: list[Pictures],
-        progress: Progress,
-    ) -> None:
-        """Fills an empty context: from an equal opening of before, or in a few large forwards."""
-        prefix = self._prefixes.find(opening) if opening.has_demo else None
-        if prefix is not None:
-            context.start_from(prefix)
-            progress()
-            return
-        pictures = [picture for instant in demo for picture in instant]
-        for chunk in in_groups(segments, self._config.prefill_chunk_tokens):
-            ids = [token for segment in chunk for token in segment.ids]
-            num_images = sum(segment.num_images for segment in chunk)
-            context.append(ids, self._embed(ids, pictures[:num_images]), num_wanted=0)
-            del pictures[:num_images]
-            progress()
-        if opening.has_demo:
-            self._prefixes.keep(opening, context)
 
     def fire(
         self,
@@ -334,7 +317,7 @@ class QwenEngine:
             if not is_transition:
                 wanted = 1 + self._format.num_carriers
                 hidden_NH = yield Append(session=context, ids=query.ids, embeds_TH=embeds_TH, num_wanted=wanted)
-                is_transition = self._format.speaks and self._gate(hidden_NH[0]) == self._format.vocabulary.t_yes
+                is_transition = self._format.speaks and self._writer.wants_to_write(hidden_NH[:1])
                 hidden_KH = hidden_NH[1:]
             if is_transition:
                 context.restore(before)
@@ -434,7 +417,7 @@ class QwenEngine:
         embeds_TH = self._embed(ids, [*self._see(self._warm_up_frames(), "warm-up")])
         context.save(context.before_fire)
         hidden_NH = context.append(ids, embeds_TH, num_wanted=1 + self._format.num_carriers)
-        self._gate(hidden_NH[0])
+        self._writer.wants_to_write(hidden_NH[:1])
         return hidden_NH[1:].float()
 
     def _episode(self, session: str) -> _Episode:
@@ -479,10 +462,6 @@ class QwenEngine:
             ]
         )
         episode.spans = [span for span, stay in zip(episode.spans, stays, strict=True) if stay]
-
-    def _gate(self, hidden_H: Tensor) -> int:
-        """The most likely next token, of all tokens: only exact T_yes is a transition."""
-        return int(self._ponder.logits(hidden_H[None])[0].argmax())
 
     def _answer(self, context: Session, hidden_KH: Tensor, texts: tuple[Text, ...]) -> Fire:
         # a copy: a view would keep the hidden states of the whole observation alive

@@ -2,9 +2,11 @@
 
 import hashlib
 from collections import OrderedDict
+from collections.abc import Sequence
 
 import torch
 
+from ponder_server.context_policy import Span
 from ponder_server.contract import Opening
 from ponder_server.runner import Prefix, Session
 
@@ -17,22 +19,23 @@ class Prefixes:
 
     def __init__(self, max_prefixes: int) -> None:
         self._max_prefixes = max_prefixes
-        self._prefixes: OrderedDict[bytes, Prefix] = OrderedDict()
+        self._prefixes: OrderedDict[bytes, tuple[Prefix, tuple[Span, ...]]] = OrderedDict()
 
-    def find(self, opening: Opening) -> Prefix | None:
+    def find(self, opening: Opening) -> tuple[Prefix, tuple[Span, ...]] | None:
+        """An equal opening's context, and what its tokens are."""
         key = _digest(opening)
-        prefix = self._prefixes.get(key)
-        if prefix is not None:
+        found = self._prefixes.get(key)
+        if found is not None:
             self._prefixes.move_to_end(key)
-        return prefix
+        return found
 
-    def keep(self, opening: Opening, context: Session) -> None:
+    def keep(self, opening: Opening, context: Session, spans: Sequence[Span]) -> None:
         """Copies a context that holds exactly ``opening``; does without if the device has no memory for it."""
         while self._prefixes and len(self._prefixes) >= self._max_prefixes:
             self._prefixes.popitem(last=False)
         if self._max_prefixes:
             try:
-                self._prefixes[_digest(opening)] = context.copy()
+                self._prefixes[_digest(opening)] = (context.copy(), tuple(spans))
             except torch.OutOfMemoryError:
                 self._prefixes.clear()
 

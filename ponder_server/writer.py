@@ -57,6 +57,10 @@ class TransitionWriter:
         self._ends = ends_of_text(ponder.format.vocabulary)
         self._is_text_V, self._may_end_V = sayable(ponder, ends=False), sayable(ponder, ends=True)
 
+    def wants_to_write(self, hidden_1H: Tensor) -> bool:
+        """Whether T_yes is the most likely next token, of all tokens."""
+        return int(self._ponder.logits(hidden_1H)[0].argmax()) == self._t_yes
+
     def write(
         self,
         context: Session,

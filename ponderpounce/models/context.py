@@ -8,7 +8,8 @@ One episode is
     O_t  [ T_yes S_t | T_yes DR T_yes S_t ]  K carriers                               per query t
 
 where a frame is ``<|vision_start|> <|image_pad|> * n <|vision_end|>`` (n = 64 at 256 px), one per view or, where a
-PONDER has ``eyes``, one per eye; where it has ``proprioception``, O_t ends with tokens of the robot's state.
+PONDER has ``eyes``, one per eye; where it has ``proprioception``, O_t ends with tokens of the robot's state. One that
+``takes_notes`` may write ``T_yes`` and words after every frame of the demonstration, too.
 **T_no is never in the row.** It is only the LM *target* at the first carrier position (paper, appendix A.2), so T_t is
 always decided by the logits of the token before: the last one of O_t, or the last one of the text. Carriers are rows
 of the embedding table that no real token uses; their ids are ordinary ids.
@@ -20,7 +21,7 @@ Pure: integers in, integers out. # T tokens of a row, K carriers, Q queries
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -104,6 +105,9 @@ class ContextFormat:
     """What is told of the robot's state besides; None: nothing, as in the paper."""
     speaks: bool = True
     """False: trained without words (RoboCasa-DC), its LM head on nothing. Serving then asks it for none."""
+    takes_notes: bool = False
+    """True: after every instant of a demonstration it may write, as at a query, and ``T_yes`` and its words stay in
+    the row. The paper's only watches."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.num_carriers <= 16:
@@ -180,9 +184,29 @@ class ContextFormat:
         targets = (label, *(IGNORE,) * (self.num_carriers - 1))
         return Segment(kind=SegmentKind.CARRIERS, ids=self.carrier_ids, targets=targets)
 
-    def opening(self, instruction: str, demo_views: Sequence[int] = ()) -> tuple[Segment, ...]:
-        """Everything before the first query; ``demo_views``: the number of views at each demo instant."""
-        return (self.instruction(instruction), *(self.demo(n) for n in demo_views), self.execution())
+    def opening(
+        self,
+        instruction: str,
+        demo_views: Sequence[int] = (),
+        notes: Sequence[Transition | None] | None = None,
+    ) -> tuple[Segment, ...]:
+        """Everything before the first query; ``demo_views``: the number of views at each demo instant.
+
+        ``notes``: what is written after each of these, None where nothing is; whatever comes next is then labelled
+        T_no, as carriers are. None for a row without words. Serving writes its own (``ponder_server``).
+
+        Raises ValueError if there are not as many notes as instants.
+        """
+        demo = [self.demo(n) for n in demo_views]
+        if notes is None:
+            return (self.instruction(instruction), *demo, self.execution())
+        segments = [self.instruction(instruction)]
+        for nth, (seen, note) in enumerate(zip(demo, notes, strict=True)):
+            segments.append(self._after_a_look(seen) if nth else seen)
+            if note is not None:
+                segments.append(self.text(note))
+        segments.append(self._after_a_look(self.execution()) if demo else self.execution())
+        return tuple(segments)
 
     def query(
         self,
@@ -253,6 +277,10 @@ class ContextFormat:
             positions_4T[3, index:end] = position + offset_w
             index, position = end, position + max(rows, columns)
         return positions_4T, position
+
+    def _after_a_look(self, segment: Segment) -> Segment:
+        """What follows an instant of a demonstration, and its note if there is one: no more is to be written."""
+        return replace(segment, targets=(self.vocabulary.t_no, *segment.targets[1:]))
 
     def _seen(self, kind: SegmentKind, num_views: int) -> Segment:
         v = self.vocabulary

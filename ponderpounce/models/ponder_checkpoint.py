@@ -46,9 +46,9 @@ class CheckpointError(ValueError):
 class StoredPonder:
     """Contents of ponder.json. The defaults are for a public Qwen3.5, which has none; a file has every field."""
 
-    format: Literal["ponderpounce.ponder/4"] = "ponderpounce.ponder/4"
-    """/3 is the same without ``speaks``, /2 without ``proprioception`` as well, /1 without ``eyes``: such a PONDER
-    speaks and has none of the others."""
+    format: Literal["ponderpounce.ponder/5"] = "ponderpounce.ponder/5"
+    """/4 is the same without ``takes_notes``, /3 without ``speaks`` as well, /2 without ``proprioception``, /1 without
+    ``eyes``: such a PONDER speaks and has none of the others."""
     num_carriers: int = 1
     first_carrier_id: int | None = None
     """None: the first row after the tokenizer's last id."""
@@ -56,6 +56,7 @@ class StoredPonder:
     eyes: Eyes = None
     proprioception: Proprioception | None = None
     speaks: bool = True
+    takes_notes: bool = False
     is_random: bool = True
     """The carriers were never trained."""
 
@@ -88,6 +89,7 @@ def load_ponder(directory: Path, *, device: torch.device | str = "cpu", dtype: t
         eyes=stored.eyes,
         proprioception=stored.proprioception,
         speaks=stored.speaks,
+        takes_notes=stored.takes_notes,
     )
     if qwen_config.image_token_id != vocabulary.image_pad:
         raise CheckpointError(
@@ -122,6 +124,7 @@ def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_S
         eyes=ponder.format.eyes,
         proprioception=ponder.format.proprioception,
         speaks=ponder.format.speaks,
+        takes_notes=ponder.format.takes_notes,
         is_random=ponder.is_random,
     )
     (directory / OWN_NAME).write_text(json.dumps(asdict(stored), indent=2) + "\n")
@@ -212,6 +215,8 @@ def _read_stored(directory: Path) -> StoredPonder:
         values |= {"format": "ponderpounce.ponder/3", "proprioception": None}
     if isinstance(values, dict) and values.get("format") == "ponderpounce.ponder/3":
         values |= {"format": "ponderpounce.ponder/4", "speaks": True}
+    if isinstance(values, dict) and values.get("format") == "ponderpounce.ponder/4":
+        values |= {"format": "ponderpounce.ponder/5", "takes_notes": False}
     return from_json(StoredPonder, values, str(path))
 
 

@@ -173,6 +173,15 @@ class Task(ABC, Generic[LayoutT, MemoryT]):
         """
         return layout
 
+    def moving(self, layout: LayoutT, step: int) -> tuple[tuple[float, float, float], ...]:
+        """Returns where things are [m] that move by the step clock alone and must be followed, in the observation of
+        ``step``; those that have not begun to move count, too.
+
+        Empty when nothing moves any more. ``step`` counts from reset, a demonstration included. The default follows
+        nothing.
+        """
+        return ()
+
     def things(self, layout: LayoutT, step: int, memory: MemoryT | None = None) -> tuple[Thing, ...]:
         """Returns all that is to be named in the observation of ``step`` (`data.album`). The default names nothing."""
         return ()

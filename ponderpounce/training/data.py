@@ -23,6 +23,7 @@ from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.models.prompt import with_subgoal
 from ponderpounce.tasks.front_view import front_pixels
 from ponderpounce.training.example import chunk_ticks
+from ponderpounce.training.notes import demo_notes, moving_places
 from ponderpounce.training.own_words import as_recorded
 from ponderpounce.training.places import TEXT_PX
 from ponderpounce.training.sight_store import SightStore, Views
@@ -195,11 +196,14 @@ class TrainingSet:
         num_shown = len(range(0, start, FPS))
         own = np.maximum.accumulate(np.where(rows.is_rendered, np.arange(len(rows.is_rendered)), 0))
         views, sights = self._pictures(source, own, shown)
+        moving = moving_places(entry.task, entry.seed, entry.difficulty, entry.num_rows)
+        tools = _seen_at(rows.tcp_pose[:start:FPS])
         episode = TrainingEpisode(
             instruction=entry.instruction,
             demo=tuple((views if sights is None else sights)[:num_shown]),
             demo_subgoals=rows.grounded_subgoal[:start:FPS],
-            demo_tools=_seen_at(rows.tcp_pose[:start:FPS]),
+            demo_tools=tools,
+            demo_notes=demo_notes(rows.grounded_subgoal[:start:FPS], tools, moving[:start:FPS]),
             frames=views[num_shown:],
             sights=None if sights is None else sights[num_shown:],
             state_T8=rows.state[start:],
@@ -211,6 +215,7 @@ class TrainingSet:
             is_watched=source.is_watched,
             is_told=entry.origin == WANDERING,
             unreached=entry.unreached,
+            moving=() if start else moving,  # what a demonstration showed is at rest by then
             said=[as_recorded(text) for text in (rows.said or ())[start:]],
         )
         sees = self._sight is None or self._sight.form is not None

@@ -27,6 +27,7 @@ from ponderpounce.training.cut_short import Cut, cuts
 from ponderpounce.training.deeds import narration
 from ponderpounce.training.events import EVENT_ROWS, draw_near, event_ticks
 from ponderpounce.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses, has_moved, without_lapses
+from ponderpounce.training.notes import in_sight, misnoted, noted, with_notes
 from ponderpounce.training.nudge import NO_NUDGE, Nudge, draw_nudges
 from ponderpounce.training.own_words import own_words
 from ponderpounce.training.place_lessons import PlaceLessons, place_lessons
@@ -98,6 +99,9 @@ class ExampleConfig:
     """Waits are told with their number of steps, at every query anew (`countdown`)."""
     misjudges: float = 0.0
     """Share of rows with waits counted down in which the first numbers are wrong (`countdown.misjudged`)."""
+    takes_notes: bool = False
+    """What moves by itself is written down at every look (`notes`); a PONDER that learns it is served so. Waits are
+    then told among the notes, and ``counts_down`` tells no others."""
     retold_px: float | None = None
     """Words are said again once the place that they told is farther than that from its thing; None: never."""
 
@@ -152,6 +156,8 @@ class Example:
     slip: Slip | None = None
     words: tuple[Words, ...] | None = None
     """Of every query; None: those of the recording."""
+    notes: tuple[str, ...] = ()
+    """Of every query, subgoal and notes (`notes.noted`), ``""`` for none; () where none are taken."""
     onward: tuple[str, ...] | None = None
     """Of every query, the place that its stand-in tells besides (`TrainingEpisode.next_places`); None: of none."""
     nudge: Nudge = NO_NUDGE
@@ -224,7 +230,9 @@ class Example:
         episode = self.episode
         if episode.planned is not None and not episode.is_told:
             episode = episode.with_plans(even_the_first=True)
-        texts = [self.view.text(episode.words[query.tick]) for query in self.schedule.queries]
+        notes = self.notes or ("",) * len(self.schedule.queries)
+        words = [note or episode.words[query.tick] for note, query in zip(notes, self.schedule.queries, strict=True)]
+        texts = [self.view.text(text) for text in words]
         demonstrated = [self.view.text(text) for text in episode.demo_subgoals]
         tools = [self.view.text(text) for text in episode.demo_tools]
         steps = rhythm(episode.instruction, episode.subgoals)
@@ -268,14 +276,25 @@ def make_example(
         slip = Slip(std_px=std_px, seed=int(rng.integers(1 << 62)))
     elif is_grounded and config.tremble_px:
         slip = Slip(std_px=config.tremble_px, seed=int(rng.integers(1 << 62)), is_learned=True)
-    words = None
+    words: tuple[Words, ...] | None = None
+    notes: tuple[str, ...] = ()
     if is_grounded and not episode.is_told:
         lapses = config.lapses if config.lapses.rows and rng.random() < config.lapses.rows else NO_LAPSES
         if is_own:
             words = own_words(_newly_said(episode, schedule), *_subgoals(episode, schedule), rng, _CORRECTED)
         elif lapses != NO_LAPSES or config.retold_px is not None:
             words = drawn_lapses(lapses, *_subgoals(episode, schedule), rng, config.retold_px)
-        if config.counts_down and any(left := waits(episode.subgoals)):
+        if config.takes_notes and episode.moving:
+            ticks = [query.tick for query in schedule.queries]
+            seen = [in_sight(places, form.eyes) for places in episode.moving]
+            told = noted(episode.instruction, episode.subgoals, seen)
+            notes = tuple(told[tick] for tick in ticks)
+            wrong_Q = [""] * len(ticks)
+            if config.misjudges and rng.random() < config.misjudges:
+                wrong_Q = misnoted(episode.instruction, episode.subgoals, seen, ticks, rng)
+            words = without_lapses(*_subgoals(episode, schedule)) if words is None else words
+            words = with_notes(words, notes, wrong_Q)
+        elif config.counts_down and any(left := waits(episode.subgoals)):
             subgoals, is_change = _subgoals(episode, schedule)
             words = without_lapses(subgoals, is_change) if words is None else words
             told = [episode.subgoals[query.tick] for query in schedule.queries]
@@ -306,6 +325,7 @@ def make_example(
         view=view,
         slip=slip,
         words=words,
+        notes=notes,
         onward=onward,
         nudge=config.nudge,
         nudges_I2=nudges_I2,
@@ -347,11 +367,19 @@ def episode_row(
     if words is None:
         words = without_lapses(*_subgoals(episode, schedule))
     say = view.text if slip is None else slip.saying(view)
+    eyes = form.eyes
     views, form = _before_ponder(episode, form)
-    segments = list(form.opening(episode.instruction, [len(views) for views in episode.demo]))
     encode = form.vocabulary.encode
-    reasoning = encode(normalised_text(say(episode.reasoning))) if episode.reasoning else None
     is_learned = slip is None or slip.is_learned
+    notes: list[Transition | None] | None = None
+    if form.takes_notes and is_grounded:
+        written = [in_sight(note, eyes) for note in episode.demo_notes or ("",) * len(episode.demo)]
+        notes = [
+            Transition(subgoal=encode(normalised_text(say(note))), is_learned=is_learned) if note else None
+            for note in written
+        ]
+    segments = list(form.opening(episode.instruction, [len(views) for views in episode.demo], notes))
+    reasoning = encode(normalised_text(say(episode.reasoning))) if episode.reasoning else None
     for query, said in zip(schedule.queries, words if is_grounded else _SILENCE, strict=is_grounded):
         transition = None
         if said.text:

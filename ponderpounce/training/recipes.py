@@ -102,6 +102,7 @@ RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
     "small_imitating": several.small_imitating,
     "small_mastering": several.small_mastering,
     "small_recovering": several.small_recovering,
+    "small_noting": several.small_noting,
     "small_refresh_1s": partial(small.small_refresh, 1),
     "small_refresh_2s": partial(small.small_refresh, 2),
     "small_refresh_4s": partial(small.small_refresh, 4),

@@ -194,3 +194,16 @@ def small_recovering() -> Curriculum:
         num_steps=2400,
     )
     return Curriculum(name="small_recovering", stages=(settling,))
+
+
+def small_noting() -> Curriculum:
+    """The PONDER of `small_recovering` learns to take notes of what moves (`pp-train --watch` what the pair played)."""
+    (settling,) = small_recovering().stages
+    settling = replace(
+        settling,
+        name="small_noting/settling",
+        example=replace(settling.example, takes_notes=True),
+        train=TrainConfig(seed=13, optim=replace(_TURNING, warmup_steps=100, decay=(900, 1900))),
+        num_steps=1900,
+    )
+    return Curriculum(name="small_noting", stages=(settling,))

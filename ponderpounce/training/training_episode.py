@@ -30,6 +30,9 @@ class TrainingEpisode:
     """What is done in each of them, as grounded text; () where nobody says."""
     demo_tools: Sequence[str] = ()
     """Where the tool is then, ``<y, x>``; () where nobody says."""
+    demo_notes: Sequence[str] = ()
+    """What a PONDER that takes notes writes down in each of them (`notes.demo_notes`), ``""`` for nothing; () for
+    nothing in all of them."""
     frames: Sequence[tuple[Frame, ...]]
     """T ticks of views, in the order of the robot's cameras; () at ticks where POUNCE has none."""
     state_T8: NDArray[np.float32]
@@ -52,6 +55,9 @@ class TrainingEpisode:
     """T texts that PONDER says instead of the subgoals (`with_plans`); None: the subgoals."""
     unreached: Sequence[str] = ()
     """Texts of what was still to come at the end, of an episode that failed: plans have it, too."""
+    moving: Sequence[str] = ()
+    """Per tick where things are that move by themselves, ``<y, x>, <y, x>`` (`notes.moving_places`), ``""`` for none;
+    () where nobody says."""
     said: Sequence[str] = ()
     """What the recorded PONDER newly said at each of T ticks, ``""`` for nothing; () where nobody was listened to."""
     sights: Sequence[tuple[Frame, ...]] | None = None
@@ -87,6 +93,7 @@ class TrainingEpisode:
             self,
             subgoals=[self.subgoals[tick] for tick in seen_at_T],
             is_transition_T=np.diff(count_T, prepend=0) > 0,
+            moving=[self.moving[tick] for tick in seen_at_T] if self.moving else (),
             seen_at_T=seen_at_T,
         )
 
@@ -122,6 +129,7 @@ class TrainingEpisode:
             subgoals=cut.subgoals,
             is_transition_T=cut.is_transition_U,
             seen_at_T=None if self.seen_at_T is None else self.seen_at_T[ticks],
+            moving=[self.moving[tick] for tick in ticks] if self.moving else (),
             said=(),  # of the longer task, as this is
             unreached=(),
         )

@@ -1,6 +1,7 @@
 """Laws of the episode row: append-stable, T_no only as a target, positions that move by an image's side."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -47,6 +48,37 @@ def test_a_shorter_episode_is_a_prefix_of_a_longer_one(episode: Episode, cut: in
     part, whole = FORMAT.row(segments[:cut]), FORMAT.row(segments)
     assert whole.ids[: len(part.ids)] == part.ids
     assert whole.targets[: len(part.targets)] == part.targets
+
+
+@given(episodes, st.lists(st.none() | transitions, min_size=3, max_size=3))
+def test_notes_stand_after_their_look_and_nothing_else_changes(
+    episode: Episode, notes: list[Transition | None]
+) -> None:
+    """Without them, and the labels that there are no more, the row is what it was."""
+    instruction, demo_views, _ = episode
+    bare = FORMAT.opening(instruction, demo_views)
+    noted = FORMAT.opening(instruction, demo_views, notes[: len(demo_views)])
+    assert [segment.ids for segment in noted if segment.kind is not SegmentKind.TEXT] == [each.ids for each in bare]
+    v, looks = VOCABULARY, 0
+    for segment, following in pairwise(noted):
+        if segment.kind is SegmentKind.DEMO:
+            note, looks = notes[looks], looks + 1
+            assert (following.kind is SegmentKind.TEXT) == (note is not None)
+            if note is None:
+                assert following.targets[0] == v.t_no
+            else:
+                assert following == FORMAT.text(note)
+        elif segment.kind is SegmentKind.TEXT:
+            assert following.targets[0] == v.t_no
+    assert looks == len(demo_views)
+    assert FORMAT.opening(instruction, demo_views, None) == bare
+    if not demo_views:
+        assert noted == bare
+
+
+def test_there_is_a_note_or_none_for_every_look() -> None:
+    with pytest.raises(ValueError, match="shorter"):
+        FORMAT.opening("watch", [1, 1], [None])
 
 
 @given(episodes)

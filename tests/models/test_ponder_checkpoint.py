@@ -242,19 +242,24 @@ def test_a_checkpoint_remembers_that_it_has_no_words(tmp_path: Path) -> None:
     assert not load_ponder(tmp_path).format.speaks
 
 
-@pytest.mark.parametrize(
-    ("version", "unknown"),
-    [(1, ["speaks", "eyes", "proprioception"]), (2, ["speaks", "proprioception"]), (3, ["speaks"])],
-)
-def test_a_folder_from_before_there_were_eyes_or_proprioception_has_none_and_speaks(
-    ponder: Ponder, folder: Path, version: int, unknown: list[str]
+def test_a_checkpoint_remembers_that_it_takes_notes(tmp_path: Path) -> None:
+    noting = Ponder.random(CONFIG, VOCABULARY, seed=1)
+    noting.format = replace(noting.format, takes_notes=True)
+    save_ponder(noting, tmp_path)
+    assert load_ponder(tmp_path).format.takes_notes
+
+
+@pytest.mark.parametrize("version", [1, 2, 3, 4])
+def test_a_folder_from_before_there_were_eyes_proprioception_or_notes_has_none_and_speaks(
+    ponder: Ponder, folder: Path, version: int
 ) -> None:
     stored = json.loads((folder / "ponder.json").read_text())
-    for name in unknown:
+    for name in ("eyes", "proprioception", "speaks", "takes_notes")[version - 1 :]:
         del stored[name]
     (folder / "ponder.json").write_text(json.dumps({**stored, "format": f"ponderpounce.ponder/{version}"}))
     loaded = load_ponder(folder)
     assert (loaded.format.eyes, loaded.format.proprioception, loaded.format.speaks) == (None, None, True)
+    assert not loaded.format.takes_notes
     assert loaded.image_px == (64, 64)
     assert weights_hash(loaded) == weights_hash(ponder)
 

@@ -24,7 +24,7 @@ from ponder_server.contract import Fire, Opening, Outcome
 from ponder_server.draft import Draft, FirstOf, NoDraft, TrieDraft
 from ponder_server.engine import EngineConfig, QwenEngine
 from ponder_server.mtp import MAX_DRAFT_TOKENS, WINDOW, MtpDraft
-from ponder_server.writer import sayable
+from ponder_server.writer import TransitionWriter, sayable
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import load_ponder, mtp_shapes, save_ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
@@ -233,7 +233,7 @@ def test_the_end_is_foreseen_and_not_guessed(monkeypatch: pytest.MonkeyPatch) ->
     with torch.no_grad():  # after that token, T_no is by far the most likely
         towards_H = rms(ponder.embed([last]), ponder.qwen.model.language_model.norm.weight)[0]
         ponder.qwen.lm_head.weight[VOCABULARY.t_no] = towards_H / towards_H.norm()
-    monkeypatch.setattr(QwenEngine, "_gate", lambda *_: VOCABULARY.t_yes)
+    monkeypatch.setattr(TransitionWriter, "wants_to_write", lambda *_: True)
     (greedy,), _ = written_by(QwenEngine(ponder, CONFIG, NoDraft()), ["7"], exactly=None)
     (guessed,), num_forwards = written_by(
         QwenEngine(ponder, CONFIG, MtpDraft(ponder, num_tokens=9)), ["7"], exactly=None

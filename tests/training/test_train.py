@@ -21,6 +21,7 @@ from ponderpounce.models.prompt import with_subgoal
 from ponderpounce.training import recipes, train
 from ponderpounce.training.data import TrainingSet
 from ponderpounce.training.example import chunk_ticks, make_example
+from ponderpounce.training.notes import moving_places
 from ponderpounce.training.parallel import World
 from ponderpounce.training.recipe import Recipe, stages_of
 from ponderpounce.training.train import TrainOptions
@@ -96,6 +97,27 @@ def test_an_episode_is_read_as_it_was_written(folder: Path) -> None:
     brightness = [int(views[0].mean()) for views in (*episode.demo, episode.frames[0], episode.frames[44])]
     assert brightness == pytest.approx([20, 40, 60, 20 + NUM_DEMO_ROWS, 64 + NUM_DEMO_ROWS], abs=2)  # H.264 rounds
     assert int(episode.frames[0][1].mean()) == pytest.approx(255 - 20 - NUM_DEMO_ROWS, abs=2)
+
+
+def test_what_was_still_to_come_what_was_said_and_what_moves_are_read(tmp_path: Path) -> None:
+    packed = unpack(_episode(11, 0))
+    said = ["" for _ in packed.rows.state]
+    said[3], said[20] = "look at [500, 20]", "look at [5000, 20]"
+    about = replace(packed.about, task="StopCube", is_success=False, unreached=("press it at <3, 4>",))
+    writer = DatasetWriter(tmp_path / "set")
+    writer.add(replace(packed, about=about, rows=replace(packed.rows, said=tuple(said))))
+    writer.finish()
+    plain = tmp_path / "plain"
+    writer = DatasetWriter(plain)
+    writer.add(unpack(_episode(11, 0)))
+    writer.finish()
+    episode = TrainingSet(plain, watched=[tmp_path / "set"])[1]
+    assert episode.unreached == ("press it at <3, 4>",)
+    heard = {tick: text for tick, text in enumerate(episode.said) if text}
+    assert heard == {3: "look at <5, 128>"}, "a place outside of the picture is no place"
+    assert list(episode.moving) == moving_places("StopCube", 11, "easy", 45)
+    assert not any(TrainingSet(plain)[0].moving)
+    assert not any(TrainingSet(plain)[0].said)
 
 
 def test_a_small_cache_reads_the_same(folder: Path) -> None:

@@ -32,6 +32,7 @@ from ponderpounce.tasks.task import Reasoning, Shown, Subtask, Task, Thing
 COVER_STEP = 32  # the first observation that shows the containers
 
 _RELEASE_Z_M = 0.07
+_MIDDLE_Z_M = 0.038  # of what the front camera sees of a container
 
 Pressed = frozenset[str]
 
@@ -77,6 +78,15 @@ class Unmask(Task[Layout, Pressed]):
         else:
             return
         physics.refresh()
+
+    def moving(self, layout: Layout, step: int) -> tuple[tuple[float, float, float], ...]:
+        """The containers asked for, and their cubes before they are covered."""
+        if step > layout.last_event_step:
+            return ()
+        spots = swaps.spots_after(layout.containers, layout.swaps, step - SWAP_STEP, LANE_M)
+        wanted = (spots[cube.container] for cube in layout.hidden[: layout.num_picks])
+        z_m = HIDDEN_HALF_M if step < COVER_STEP else _MIDDLE_Z_M
+        return tuple((spot.x_m, spot.y_m, z_m) for spot in wanted)
 
     def things(self, layout: Layout, step: int, memory: object = None) -> tuple[Thing, ...]:
         """Cubes as long as they lie bare, then containers."""

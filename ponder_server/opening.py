@@ -1,0 +1,106 @@
+"""Fills an empty context with an episode's opening: in a few large forwards, or look by look where notes are taken.
+
+# T tokens, N wanted ones, H hidden
+"""
+
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+from torch import Tensor
+
+from ponder_server.context_policy import Span
+from ponder_server.contract import Opening, Progress
+from ponder_server.prefixes import Prefixes
+from ponder_server.runner import Session
+from ponder_server.writer import Steps, TransitionWriter
+from ponderpounce.models.context import Segment, SegmentKind, in_groups
+from ponderpounce.models.eyes import Pictures
+from ponderpounce.models.ponder import Ponder
+
+Result = TypeVar("Result")
+
+
+class Opener:
+    """Encodes openings for one engine."""
+
+    def __init__(
+        self,
+        ponder: Ponder,
+        writer: TransitionWriter,
+        embed: Callable[[Sequence[int], Sequence[Pictures]], Tensor],
+        *,
+        max_prefixes: int,
+        chunk_tokens: int,
+    ) -> None:
+        """``embed``: tokens and the pictures among them, (T, H); the rest as in ``EngineConfig``."""
+        self._ponder = ponder
+        self._writer = writer
+        self._embed = embed
+        self._prefixes = Prefixes(max_prefixes)
+        self._chunk_tokens = chunk_tokens
+
+    def encode(
+        self,
+        context: Session,
+        opening: Opening,
+        segments: Sequence[Segment],
+        pictures: Sequence[Pictures],
+        progress: Progress,
+    ) -> list[Span]:
+        """Fills the context and tells what its tokens are; from an equal opening of before, if there was one.
+
+        Raises ContextFull if notes do not fit; the caller closes the context.
+        """
+        if opening.has_demo and (found := self._prefixes.find(opening)) is not None:
+            context.start_from(found[0])
+            progress()
+            return [*found[1]]
+        takes_notes = self._ponder.format.takes_notes and self._ponder.format.speaks
+        fill = self._look_by_look if takes_notes and opening.has_demo else self._at_once
+        spans = fill(context, segments, [*pictures], progress)
+        if opening.has_demo:
+            self._prefixes.keep(opening, context, spans)
+        return spans
+
+    def _at_once(
+        self, context: Session, segments: Sequence[Segment], pictures: list[Pictures], progress: Progress
+    ) -> list[Span]:
+        for chunk in in_groups(segments, self._chunk_tokens):
+            ids = [token for segment in chunk for token in segment.ids]
+            num_images = sum(segment.num_images for segment in chunk)
+            context.append(ids, self._embed(ids, pictures[:num_images]), num_wanted=0)
+            del pictures[:num_images]
+            progress()
+        return [Span(segment.kind, len(segment)) for segment in segments]
+
+    def _look_by_look(
+        self, context: Session, segments: Sequence[Segment], pictures: list[Pictures], progress: Progress
+    ) -> list[Span]:
+        """Notes belong to the demonstration: no policy forgets them before it."""
+        spans = []
+        for segment in segments:
+            num_before = context.num_tokens
+            embeds_TH = self._embed(segment.ids, pictures[: segment.num_images])
+            del pictures[: segment.num_images]
+            is_look = segment.kind is SegmentKind.DEMO
+            hidden_NH = context.append(segment.ids, embeds_TH, num_wanted=int(is_look))
+            if is_look and self._writer.wants_to_write(hidden_NH):
+                before = context.save(context.before_fire)
+                nothing_0H = embeds_TH[:0]
+                steps = self._writer.write(context, before, (), nothing_0H, with_reasoning=False, exactly=None)
+                _alone(context, steps)
+            spans.append(Span(segment.kind, context.num_tokens - num_before))
+            progress()
+        return spans
+
+
+def _alone(context: Session, steps: Steps[Result]) -> Result:
+    """Carries out what would share forwards with others in serving."""
+    request = next(steps)
+    while True:
+        hidden_NH = context.append(request.ids, request.embeds_TH, num_wanted=request.num_wanted)
+        try:
+            request = steps.send(hidden_NH)
+        except StopIteration as stop:
+            result: Result = stop.value
+            return result

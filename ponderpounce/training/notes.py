@@ -1,0 +1,158 @@
+"""Notes: what is followed is written down at every look, so that each one builds on the words of the one before.
+
+A thing that changes places with another is where it was a second ago, and a bit further. In one pass over a video each
+second's place would follow from the last one's, one layer above it, and a small network has few layers. What is written
+down begins at the first layer again. So PONDER notes, as long as anything moves by itself:
+
+- at every instant of a demonstration, where what will be asked for is then: "<99, 120>";
+- at every query, where it is now, behind the subgoal: "press the first button at <60, 90>, <99, 120>";
+- of a thing that comes by and is to be stopped, also how often it does and how long there is to wait (`countdown`):
+  "remain static, <110, 77>, 80, 137". The pace is read off two places, and the wait off pace and place.
+
+The paper has nothing of it; its PONDER is pretrained on video.
+"""
+
+# T ticks of an episode, D instants of its demonstration, Q queries
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from ponderpounce.models.eyes import Eyes
+from ponderpounce.tasks.counting.stop_cube import PASS_STEPS, PRESS_STEPS
+from ponderpounce.tasks.front_view import front_pixels
+from ponderpounce.tasks.task import make_task, task_names
+from ponderpounce.training.countdown import rhythm, waits
+from ponderpounce.training.lapses import Words
+from ponderpounce.training.places import PLACE, TEXT_PX
+
+_STILL = re.compile(rf"static at ({PLACE.pattern}).*|(?:drop|put) the cube on the table at ({PLACE.pattern}).*")
+_SHOWN = re.compile(rf"pick up the cube at ({PLACE.pattern})")
+_TOUCHED_PX = 14.0  # of a 256 px picture: the tool is at the thing, so it is seen which one is meant
+_LOOK_STEPS = 25  # a query a second: one at least sees where everything has come to rest
+_PACE_STEPS = 30  # two looks; before, nobody can tell how fast it runs
+
+
+def moving_places(task: str, seed: int, difficulty: str, num_steps: int) -> list[str]:
+    """Per observation of an episode from reset on, its demonstration's first, where things are that move by themselves.
+
+    ``<y, x>, <y, x>`` as texts tell places, nothing of those outside of the picture, up to a look after the last has
+    come to rest; empty where nothing moves. Needs no physics: what the seed draws tells it (`Task.moving`).
+    """
+    if task not in task_names():  # somebody else's data
+        return [""] * num_steps
+    found_task = make_task(task)
+    layout = found_task.sample(np.random.default_rng(seed), difficulty)
+    found: list[str] = []
+    for step in range(num_steps):
+        points_m = found_task.moving(layout, step)
+        if not points_m:
+            found += found[-1:] * _LOOK_STEPS
+            return [*found, *[""] * num_steps][:num_steps]
+        pixels = front_pixels(np.array(points_m), TEXT_PX).round().astype(int).tolist()
+        found.append(", ".join(f"<{y}, {x}>" for y, x in pixels if min(y, x) >= 0 and max(y, x) <= TEXT_PX))
+    return found
+
+
+def in_sight(places: str, eyes: Eyes) -> str:
+    """Those of the ``places`` that PONDER's ``eyes`` on the first camera show; all where it sees whole pictures."""
+    if eyes is None:
+        return places
+    boxes = [eye.box for eye in eyes if eye.camera == 0]
+    told = (place[0] for place in PLACE.finditer(places) if any(_is_in(box, place) for box in boxes))
+    return ", ".join(told)
+
+
+def _is_in(box: tuple[float, float, float, float], place: re.Match[str]) -> bool:
+    top, left, bottom, right = (TEXT_PX * side for side in box)
+    return top <= int(place[1]) < bottom and left <= int(place[2]) < right
+
+
+def demo_notes(texts: Sequence[str], tools: Sequence[str], moving: Sequence[str]) -> list[str]:
+    """What is noted at every instant of a demonstration, places as texts tell them; ``""`` for nothing.
+
+    Where things move by the clock alone, ``moving`` says it. Else it is noted where the cube is that was picked up and
+    may change places once it is put down, from when the tool is at it.
+
+    Args:
+        texts: what is done in each of D instants, grounded; its places followed (`pp-collect --texts follow`).
+        tools: where the tool is then, ``<y, x>``.
+        moving: `moving_places` of these instants.
+    """
+    if any(moving) or not any(_STILL.fullmatch(text) for text in texts) or len(tools) != len(texts):
+        return list(moving)
+    found, is_known = [], False
+    for text, tool in zip(texts, tools, strict=True):
+        still, shown = _STILL.fullmatch(text), _SHOWN.fullmatch(text)
+        is_known |= shown is not None and _is_at(tool, shown[1])
+        place = ""
+        if is_known and shown is not None:
+            place = shown[1]
+        elif is_known and still is not None:
+            place = next(each for each in (still[1], still[4]) if each)
+        found.append(place)
+    return found
+
+
+def _is_at(tool: str, place: str) -> bool:
+    first, second = PLACE.search(tool), PLACE.search(place)
+    if first is None or second is None:
+        return False
+    return float(np.hypot(int(first[1]) - int(second[1]), int(first[2]) - int(second[2]))) <= _TOUCHED_PX
+
+
+def noted(instruction: str, subgoals: Sequence[str], moving: Sequence[str]) -> list[str]:
+    """What is said at each of T ticks while anything moves by itself: subgoal and notes; ``""`` where nothing does.
+
+    ``subgoals``: T texts without plans; ``moving``: what PONDER sees of it. What is to be stopped is followed while the
+    hand waits for it.
+    """
+    pace = rhythm(instruction, subgoals)
+    if pace is None:
+        return [f"{text}, {places}" if text and places else "" for text, places in zip(subgoals, moving, strict=True)]
+    return [
+        "" if wait is None else _paced(text, places, pace, wait, tick)
+        for tick, (text, places, wait) in enumerate(zip(subgoals, moving, waits(subgoals), strict=True))
+    ]
+
+
+def _paced(text: str, places: str, pace: int, wait: int, tick: int) -> str:
+    told = [text, places] if places else [text]
+    if tick >= _PACE_STEPS:
+        told += [str(pace), str(wait)]
+    return ", ".join(told) if len(told) > 1 else ""
+
+
+def misnoted(
+    instruction: str,
+    subgoals: Sequence[str],
+    moving: Sequence[str],
+    ticks: Sequence[int],
+    rng: np.random.Generator,
+) -> list[str]:
+    """Per query, at these ticks of T, notes of another pace: at the first ones that tell any; ``""`` elsewhere.
+
+    A pace that is always right is copied from the last words and not looked for; so some are wrong, and put right.
+    """
+    found, pace, left = [""] * len(ticks), rhythm(instruction, subgoals), waits(subgoals)
+    paced_at = [n for n, tick in enumerate(ticks) if left[tick] is not None and tick >= _PACE_STEPS]
+    if pace is None or not paced_at:
+        return found
+    other = int(rng.choice([each for each in PASS_STEPS if each != pace]))
+    for n in paced_at[: int(rng.integers(1, len(paced_at) + 1))]:
+        tick = ticks[n]
+        due = round((tick + (left[tick] or 0) + PRESS_STEPS) * other / pace) - PRESS_STEPS
+        if due > tick:
+            found[n] = _paced(subgoals[tick], moving[tick], other, due - tick, tick)
+    return found
+
+
+def with_notes(words: Sequence[Words], notes_Q: Sequence[str], wrong_Q: Sequence[str]) -> tuple[Words, ...]:
+    """The words of Q queries, with a note wherever there is one; where there is a wrong one it is not to be learned."""
+    return tuple(
+        Words(text=wrong, is_due=True, is_learned=False) if wrong else Words(text=note, is_due=True) if note else each
+        for each, note, wrong in zip(words, notes_Q, wrong_Q, strict=True)
+    )

@@ -1,0 +1,226 @@
+"""Notes: where what moves by itself is at every look; told of one instant, put right, and as serving writes them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from clock.sampling import EVALUATION
+from ponderpounce.models.context import IGNORE, Row
+from ponderpounce.models.eyes import Eye
+from ponderpounce.models.place_code import place_features
+from ponderpounce.models.ponder_coordinates import normalised_text
+from ponderpounce.tasks.counting.stop_cube import PASS_STEPS, StopCube
+from ponderpounce.tasks.environment import make_environment
+from ponderpounce.tasks.front_view import front_pixels
+from ponderpounce.training.example import ExampleConfig, Slip, make_example
+from ponderpounce.training.notes import demo_notes, in_sight, misnoted, moving_places, noted
+from ponderpounce.training.places import PLACE, TEXT_PX
+from ponderpounce.training.training_episode import TrainingEpisode
+from tests.training.test_countdown import FORM, HOVER, PRESS, STILL, waiting_episode
+
+ASKED = "press the button to stop the cube just as it reaches the target for the third time"
+TEXTS = [HOVER] * 30 + [STILL] * 240 + [PRESS] * 30  # it comes by every 120 steps
+MOVING = [f"<{50 + tick // 5}, 100>" for tick in range(len(TEXTS))]
+
+
+def running_episode() -> TrainingEpisode:
+    return replace(waiting_episode(TEXTS, (0, 30, 270)), instruction=ASKED, moving=MOVING)
+
+
+@pytest.mark.parametrize(
+    ("task", "bodies"), [("StopCube", ["shuttle"]), ("ButtonUnmaskSwap", [f"container_{n}" for n in range(4)])]
+)
+def test_places_are_where_the_simulator_shows_things(task: str, bodies: list[str]) -> None:
+    """Told of the seed alone; containers once they have come down."""
+    for seed in (11, 13):
+        environment = make_environment(task, render=False)
+        hold = environment.reset(seed).command
+        told = moving_places(task, seed, environment.difficulty, 130)
+        assert all(told[:64])
+        for step in range(130):
+            if step >= 32 and told[step]:
+                points_m = np.array([environment.physics.position_m(body) for body in bodies])
+                points_m[:, 2] = points_m[:, 2].clip(max=0.038)  # texts tell the middle of what is seen of a container
+                seen_N2 = front_pixels(points_m, TEXT_PX)
+                for place in PLACE.finditer(told[step]):
+                    away_px = np.hypot(*(seen_N2 - [int(place[1]), int(place[2])]).T).min()
+                    assert away_px < 1.5
+            environment.step(hold, look=False)
+        environment.close()
+
+
+def test_what_has_come_to_rest_is_told_for_one_more_look() -> None:
+    told = moving_places("ButtonUnmask", 3, "easy", 200)
+    assert all(told[:90])
+    assert len(set(told[:32])) == len(set(told[32:90])) == 1, "the cube, then its container, which is higher"
+    assert not any(told[90:])
+
+
+def test_nothing_is_told_of_a_task_that_nobody_knows_or_where_nothing_moves() -> None:
+    assert moving_places("SomebodyElses", 0, "easy", 3) == ["", "", ""]
+    assert moving_places("PickHighlight", 0, "easy", 3) == ["", "", ""]
+
+
+def test_what_is_out_of_sight_is_not_noted() -> None:
+    eyes = (Eye(camera=0, box=(0.0, 0.25, 0.5, 0.75)), Eye(camera=1))
+    assert in_sight("<127, 64>, <128, 64>, <0, 191>, <0, 192>, <3, 63>", eyes) == "<127, 64>, <0, 191>"
+    assert in_sight("<200, 200>", None) == "<200, 200>"
+    assert in_sight("", eyes) == ""
+
+
+def test_the_cube_that_was_shown_is_noted_from_when_the_tool_is_at_it() -> None:
+    texts = ["pick up the cube at <90, 120>"] * 3 + ["drop the cube on the table at <80, 121>, <60, 60>"]
+    texts += ["static at <90, 120>, <60, 60>", "static at <99, 110>, <60, 60>"]
+    tools = ["<20, 128>", "<85, 122>", "<70, 122>", "<70, 122>", "<20, 128>", "<20, 128>"]
+    expected = ["", "<90, 120>", "<90, 120>", "<80, 121>", "<90, 120>", "<99, 110>"]
+    assert demo_notes(texts, tools, [""] * 6) == expected
+    assert demo_notes(texts[:3], tools[:3], [""] * 3) == [""] * 3, "nothing was put down to change places"
+    assert demo_notes(texts, tools, ["<1, 2>"] * 6) == ["<1, 2>"] * 6, "the clock alone tells it"
+    assert demo_notes(texts, (), [""] * 6) == [""] * 6, "nobody says where the tool is"
+
+
+def numbers(text: str) -> list[int]:
+    """The pace and the wait of a note."""
+    return [int(each) for each in PLACE.sub("", text).split(", ") if each.isdecimal()]
+
+
+def test_notes_tell_place_pace_and_wait_of_their_own_instant() -> None:
+    told = noted(ASKED, TEXTS, MOVING)
+    assert told[0] == f"{HOVER}, <50, 100>", "how fast it runs nobody can tell yet"
+    assert told[30] == f"{STILL}, <56, 100>, 120, 240"
+    assert {tick + numbers(told[tick])[1] for tick in range(30, 270)} == {270}
+    assert not any(told[270:]), "who has waited is told no more"
+    assert noted(ASKED, TEXTS, [""] * 300)[29:31] == ["", f"{STILL}, 120, 240"], "out of sight it runs on"
+
+
+def test_what_changes_places_is_noted_behind_the_subgoal() -> None:
+    assert noted("press it", ["press", "press", ""], ["<1, 2>, <3, 4>", "", "<1, 2>"]) == [
+        "press, <1, 2>, <3, 4>",
+        "",
+        "",
+    ]
+
+
+@given(seed=st.integers(0, 1000), ticks=st.lists(st.integers(0, 299), min_size=1, unique=True).map(sorted))
+def test_a_wrong_pace_is_that_of_another_scene_and_is_put_right(seed: int, ticks: list[int]) -> None:
+    wrong = misnoted(ASKED, TEXTS, MOVING, ticks, np.random.default_rng(seed))
+    paced = [bool(30 <= tick < 270) for tick in ticks]
+    assert all(is_paced for text, is_paced in zip(wrong, paced, strict=True) if text)
+    found = [(tick, *numbers(text)) for tick, text in zip(ticks, wrong, strict=True) if text]
+    assert len({pace for _, pace, _ in found}) <= 1
+    for tick, pace, wait in found:
+        assert pace in set(PASS_STEPS) - {120}
+        assert tick + wait == 2.5 * pace - 30, "the instant that a cube of this pace would be stopped at"
+        assert wait > 0
+    places = [text.split(", 100>")[0] for text in wrong if text]
+    right = [noted(ASKED, TEXTS, MOVING)[tick].split(", 100>")[0] for tick, *_ in found]
+    assert places == right, "where it is is told rightly all the same"
+
+
+def test_the_row_tells_notes_at_every_look_and_c_what_is_right() -> None:
+    config = ExampleConfig(clocks=EVALUATION, takes_notes=True)
+    example = make_example(running_episode(), FORM, config, np.random.default_rng(0))
+    assert example.words is not None
+    told = noted(ASKED, TEXTS, MOVING)
+    for query, words in zip(example.schedule.queries, example.words, strict=True):
+        if told[query.tick]:
+            assert (words.text, words.is_due, words.is_learned) == (told[query.tick], True, True)
+    assert sum(bool(words.text) for words in example.words) > 10
+    misled = make_example(running_episode(), FORM, replace(config, misjudges=1.0), np.random.default_rng(0))
+    assert misled.words is not None
+    unlearned = [words.text for words in misled.words if not words.is_learned]
+    assert 0 < len(unlearned) < len(misled.words)
+    assert all(numbers(text)[0] != 120 for text in unlearned)
+    row = misled.row()
+    gates = np.asarray(row.targets)[row.gate_index + 1]
+    assert (gates == FORM.vocabulary.t_yes).sum() == sum(bool(words.text) for words in misled.words)
+    np.testing.assert_array_equal(misled.stand_ins(128), example.stand_ins(128))
+
+
+def test_places_in_mind_are_those_that_notes_tell() -> None:
+    config = ExampleConfig(clocks=EVALUATION, takes_notes=True)
+    example = make_example(running_episode(), FORM, config, np.random.default_rng(0))
+    row = example.row()
+    lessons = example.place_lessons(row, 128)
+    query = next(n for n, query in enumerate(example.schedule.queries) if TEXTS[query.tick] == STILL)
+    is_there = (lessons.index_M == row.gate_index[query]) & (lessons.first_M == 0)
+    y, x = PLACE.search(MOVING[example.schedule.queries[query].tick]).groups()  # type: ignore[union-attr]
+    np.testing.assert_array_equal(lessons.features_MP[is_there][0], place_features((int(y), int(x))))
+
+
+def test_without_the_setting_nothing_is_noted() -> None:
+    config = ExampleConfig(clocks=EVALUATION)
+    with_moving = make_example(running_episode(), FORM, config, np.random.default_rng(0))
+    without = make_example(replace(running_episode(), moving=()), FORM, config, np.random.default_rng(0))
+    assert with_moving.row().ids == without.row().ids
+
+
+NOTES = ["<10, 20>", "", "<12, 22>"]
+TAKING = replace(FORM, takes_notes=True)
+
+
+def shown_episode() -> TrainingEpisode:
+    picture = (np.zeros((32, 32, 3), np.uint8),) * 2
+    return replace(waiting_episode(["pick it up at <12, 22>"] * 60, (0,)), demo=(picture,) * 3, demo_notes=NOTES)
+
+
+def shown_row(*, slip: Slip | None = None, is_grounded: bool = True) -> Row:
+    example = make_example(shown_episode(), TAKING, ExampleConfig(clocks=EVALUATION), np.random.default_rng(0))
+    return replace(example, slip=slip, is_grounded=is_grounded).row()
+
+
+def between_looks(row: Row) -> list[tuple[str, list[int]]]:
+    """What is written after each look of the demonstration, and the targets of that and of the next token."""
+    v = FORM.vocabulary
+    ends = [index for index, each in enumerate(row.ids) if each == v.vision_end][: 2 * 3 + 1][1::2]  # two views a look
+    found = []
+    for end in ends:
+        stop = next(i for i in range(end + 1, len(row.ids)) if row.ids[i] in (v.vision_start, v.im_end))
+        ids = row.ids[end + 1 : stop]
+        text = v.decode(list(ids[1:])) if ids else ""
+        found.append((text, list(row.targets[end + 1 : stop + 1])))
+    return found
+
+
+def test_a_demonstration_is_noted_look_by_look() -> None:
+    v = FORM.vocabulary
+    for (text, targets), note in zip(between_looks(shown_row()), NOTES, strict=True):
+        assert text == normalised_text(note)
+        assert targets == [*([v.t_yes, *v.encode(text)] if note else []), v.t_no]
+
+
+def test_notes_that_slip_are_read_and_not_learned_and_rows_without_words_have_none() -> None:
+    v = FORM.vocabulary
+    slipped = between_looks(shown_row(slip=Slip(std_px=20.0, seed=1)))
+    assert [bool(text) for text, _ in slipped] == [True, False, True]
+    for (text, targets), note in zip(slipped, NOTES, strict=True):
+        assert not note or text != normalised_text(note)
+        assert targets[-1] == v.t_no
+        assert set(targets[:-1]) <= {v.t_yes, IGNORE}
+    assert [text for text, _ in between_looks(shown_row(is_grounded=False))] == ["", "", ""]
+    assert all(set(targets) == {IGNORE} for _, targets in between_looks(shown_row(is_grounded=False)))
+
+
+def test_who_takes_no_notes_reads_the_row_as_it_was() -> None:
+    example = make_example(shown_episode(), FORM, ExampleConfig(clocks=EVALUATION), np.random.default_rng(0))
+    bare = make_example(
+        replace(shown_episode(), demo_notes=()), FORM, ExampleConfig(clocks=EVALUATION), np.random.default_rng(0)
+    )
+    assert example.row().ids == bare.row().ids
+    assert FORM.vocabulary.t_no not in [target for _, targets in between_looks(example.row()) for target in targets]
+
+
+def test_the_cube_of_a_scene_comes_back_at_its_pace() -> None:
+    """A whole pass there and back: the same place again."""
+    seed = 5
+    layout = StopCube().sample(np.random.default_rng(seed), "easy")
+    told = moving_places("StopCube", seed, "easy", 4 * layout.pass_steps)
+    both_ways = 2 * layout.pass_steps
+    assert told[both_ways : both_ways + 20] == told[:20]
+    assert any(first != second for first, second in pairwise(told))
