@@ -16,6 +16,7 @@ import re
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ponderpounce.models.place_code import PLACE_PX
 from ponderpounce.tasks.captions import ORDINALS
@@ -41,6 +42,23 @@ def waits(subgoals: Sequence[str]) -> list[int | None]:
         left = None if left is None else left + 1
         found.append(left)
     return found[::-1]
+
+
+def waiting_longer(
+    subgoals: Sequence[str], is_transition_T: NDArray[np.bool_], ticks: int
+) -> tuple[list[str], NDArray[np.bool_]]:
+    """Texts and transitions of an episode whose waits all end so many ticks later, or with it.
+
+    Who hears "press" presses at once, as if it had been pressing since the last query; and so comes too early.
+    """
+    texts, begins_T = [*subgoals], is_transition_T.copy()
+    left = waits(subgoals)
+    for tick in range(1, len(texts)):
+        if left[tick - 1] == 1:
+            until = min(tick + ticks, len(texts) - 1)
+            texts[tick:until] = [texts[tick - 1]] * (until - tick)
+            begins_T[tick:until], begins_T[until] = False, True
+    return texts, begins_T
 
 
 def stood_at(subgoals: Sequence[str]) -> list[str]:

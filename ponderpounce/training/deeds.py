@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ponderpounce.tasks.captions import ORDINALS
 from ponderpounce.training.lapses import has_moved
@@ -64,28 +64,53 @@ def deeds(texts: Sequence[str]) -> list[Deed]:
     return found
 
 
+@dataclass(frozen=True, slots=True)
+class Told:
+    """One thing that a narration tells, and the instants of a demonstration in which it is done."""
+
+    words: str
+    """``second <y, x>``."""
+    place: str
+    """``<y, x>``; empty where the text tells none."""
+    first: int
+    last: int
+
+
+def told_deeds(texts: Sequence[str]) -> list[Told]:
+    """What was done where, in order; nothing where that is little.
+
+    Things are put onto one place after the other, or one is picked up. Of a way every stretch counts: around things
+    with the side on which it passes (`passing_side`), others with their last word, as plans tell them
+    (`TrainingEpisode.with_plans`).
+    """
+    if stretches := _stretches(texts):
+        return stretches
+    puts: dict[int, Told] = {}
+    picks: dict[int, Told] = {}
+    for instant, deed in enumerate(deeds(texts)):
+        place = "" if deed.place is None else "<{}, {}>".format(*deed.place)
+        if deed.name.startswith(_PUT) and place and deed.count <= len(ORDINALS):
+            there, words = puts, f"{ORDINALS[deed.count - 1]} {place}"
+        elif deed.name.startswith(_PRESS):
+            there, words = puts, "button"
+        elif deed.name.startswith(_PICK) and place:
+            there, words = picks, place
+        else:
+            continue
+        first = there[deed.number].first if deed.number in there else instant
+        there[deed.number] = Told(words, place, first, instant)
+    told = puts if any(PLACE.search(each.words) for each in puts.values()) else picks
+    return [told[number] for number in sorted(told)]
+
+
 def narration(texts: Sequence[str]) -> str:
     """What was done where, in order: ``first <y, x>, second <y, x>, button, third <y, x>``; empty where that is little.
 
-    Things are put onto one place after the other, or one is picked up. Written down it can be looked up by number, or
-    by what it stands beside, as often as one likes. Of a way around things every stretch is told with the side on which
-    it passes (`passing_side`); other ways are told by their plan (`TrainingEpisode.with_plans`).
+    Written down it can be looked up by number, or by what it stands beside, as often as one likes. A way that leads
+    around nothing is told by its plan.
     """
-    if around := [f"{side} {place}" for side, place in _around(texts)]:
-        return ", ".join(around)
-    told: dict[int, str] = {}
-    picked: dict[int, str] = {}
-    for deed in deeds(texts):
-        place = None if deed.place is None else "<{}, {}>".format(*deed.place)
-        if deed.name.startswith(_PUT) and place and deed.count <= len(ORDINALS):
-            told[deed.number] = f"{ORDINALS[deed.count - 1]} {place}"
-        elif deed.name.startswith(_PRESS):
-            told[deed.number] = "button"
-        elif deed.name.startswith(_PICK) and place:
-            picked[deed.number] = place
-    if not any(PLACE.search(text) for text in told.values()):
-        told = picked
-    return ", ".join(told[number] for number in sorted(told))
+    is_told_by_its_plan = any(WAY.search(text) and not passing_side(text) for text in texts)
+    return "" if is_told_by_its_plan else ", ".join(told.words for told in told_deeds(texts))
 
 
 def passing_side(text: str) -> str:
@@ -100,13 +125,18 @@ def passing_side(text: str) -> str:
     return "backward" if (found[1] == "left") == (found[2] == "clockwise") else "forward"
 
 
-def _around(texts: Sequence[str]) -> list[tuple[str, str]]:
-    """Side and end, ``<y, x>``, of every stretch of a way around things."""
-    found: list[tuple[str, str]] = []
-    for text in texts:
+def _stretches(texts: Sequence[str]) -> list[Told]:
+    """Every stretch of a way, with its side or its last word and its end."""
+    found: list[Told] = []
+    for instant, text in enumerate(texts):
         stretch = WAY.search(text)
-        if (side := passing_side(text)) and stretch is not None and (side, stretch[2]) not in found[-1:]:
-            found.append((side, stretch[2]))
+        if stretch is None:
+            continue
+        words = f"{passing_side(text) or stretch[1]} {stretch[2]}"
+        if found and found[-1].words == words:
+            found[-1] = replace(found[-1], last=instant)
+        else:
+            found.append(Told(words, stretch[2], instant, instant))
     return found
 
 

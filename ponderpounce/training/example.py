@@ -22,7 +22,16 @@ from ponderpounce.models.eyes import see
 from ponderpounce.models.normalisation import Floats
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.training.augment import AS_IT_IS, NOT_AUGMENTED, Augmentation, View, draw_view
-from ponderpounce.training.countdown import as_place, counted, misjudged, rhythm, stood_at, waits, waits_unplaced
+from ponderpounce.training.countdown import (
+    as_place,
+    counted,
+    misjudged,
+    rhythm,
+    stood_at,
+    waiting_longer,
+    waits,
+    waits_unplaced,
+)
 from ponderpounce.training.cut_short import Cut, cuts
 from ponderpounce.training.deeds import narration
 from ponderpounce.training.events import EVENT_ROWS, draw_near, event_ticks
@@ -99,6 +108,8 @@ class ExampleConfig:
     """Waits are told with their number of steps, at every query anew (`countdown`)."""
     misjudges: float = 0.0
     """Share of rows with waits counted down in which the first numbers are wrong (`countdown.misjudged`)."""
+    waits_longer: int = 0
+    """Waits are told to end so many control steps later than they did: a hand that comes too early is told so."""
     takes_notes: bool = False
     """What moves by itself is written down at every look (`notes`); a PONDER that learns it is served so. Waits are
     then told among the notes, and ``counts_down`` tells no others."""
@@ -248,6 +259,9 @@ def make_example(
 ) -> Example:
     """Draws a schedule and lays the episode out under it."""
     episode = episode.with_foresight() if config.has_foresight else episode
+    if config.waits_longer:
+        texts, is_transition_T = waiting_longer(episode.subgoals, episode.is_transition_T, config.waits_longer)
+        episode = replace(episode, subgoals=texts, is_transition_T=is_transition_T)
     cut = _drawn_cut(episode, rng) if config.cuts_short and rng.random() < config.cuts_short else None
     episode = episode if cut is None else episode.cut_short(cut)
     episode = episode.with_plans() if config.has_plans else episode

@@ -26,12 +26,13 @@ from ponderpounce.tasks.counting.stop_cube import PASS_STEPS, PRESS_STEPS
 from ponderpounce.tasks.front_view import front_pixels
 from ponderpounce.tasks.task import make_task, task_names
 from ponderpounce.training.countdown import rhythm, waits
+from ponderpounce.training.deeds import told_deeds
 from ponderpounce.training.lapses import Words
-from ponderpounce.training.places import PLACE, TEXT_PX
+from ponderpounce.training.places import PLACE, TEXT_PX, WAY
 
-_STILL = re.compile(rf"static at ({PLACE.pattern}).*|(?:drop|put) the cube on the table at ({PLACE.pattern}).*")
-_SHOWN = re.compile(rf"pick up the cube at ({PLACE.pattern})")
-_TOUCHED_PX = 14.0  # of a 256 px picture: the tool is at the thing, so it is seen which one is meant
+_ONE = PLACE.pattern.replace("(", "").replace(")", "")
+_STILL = re.compile(rf"drop the cube on the table at ({_ONE})(?:, {_ONE})?|static at ({_ONE})(?:, ({_ONE}))?")
+_PARTS = re.compile(r", (?![^<]*>)")  # the commas that are in no place
 _LOOK_STEPS = 25  # a query a second: one at least sees where everything has come to rest
 _PACE_STEPS = 30  # two looks; before, nobody can tell how fast it runs
 
@@ -57,13 +58,16 @@ def moving_places(task: str, seed: int, difficulty: str, num_steps: int) -> list
     return found
 
 
-def in_sight(places: str, eyes: Eyes) -> str:
-    """Those of the ``places`` that PONDER's ``eyes`` on the first camera show; all where it sees whole pictures."""
+def in_sight(note: str, eyes: Eyes) -> str:
+    """The note without the places that PONDER's ``eyes`` on the first camera do not show."""
     if eyes is None:
-        return places
+        return note
     boxes = [eye.box for eye in eyes if eye.camera == 0]
-    told = (place[0] for place in PLACE.finditer(places) if any(_is_in(box, place) for box in boxes))
-    return ", ".join(told)
+    told = (
+        PLACE.sub(lambda place: place[0] if any(_is_in(box, place) for box in boxes) else "", part).strip()
+        for part in _PARTS.split(note)
+    )
+    return ", ".join(part for part in told if part)
 
 
 def _is_in(box: tuple[float, float, float, float], place: re.Match[str]) -> bool:
@@ -74,34 +78,44 @@ def _is_in(box: tuple[float, float, float, float], place: re.Match[str]) -> bool
 def demo_notes(texts: Sequence[str], tools: Sequence[str], moving: Sequence[str]) -> list[str]:
     """What is noted at every instant of a demonstration, places as texts tell them; ``""`` for nothing.
 
-    Where things move by the clock alone, ``moving`` says it. Else it is noted where the cube is that was picked up and
-    may change places once it is put down, from when the tool is at it.
+    Where things move by the clock alone, where they are. Else every deed that a narration tells (`told_deeds`), with
+    its number, when the tool is nearest to its place; and where a thing that will be asked for may
+    change places afterwards, its place from then on.
 
     Args:
         texts: what is done in each of D instants, grounded; its places followed (`pp-collect --texts follow`).
         tools: where the tool is then, ``<y, x>``.
         moving: `moving_places` of these instants.
     """
-    if any(moving) or not any(_STILL.fullmatch(text) for text in texts) or len(tools) != len(texts):
+    if any(moving) or len(tools) != len(texts):
         return list(moving)
-    found, is_known = [], False
-    for text, tool in zip(texts, tools, strict=True):
-        still, shown = _STILL.fullmatch(text), _SHOWN.fullmatch(text)
-        is_known |= shown is not None and _is_at(tool, shown[1])
-        place = ""
-        if is_known and shown is not None:
-            place = shown[1]
-        elif is_known and still is not None:
-            place = next(each for each in (still[1], still[4]) if each)
-        found.append(place)
+    found, done = [""] * len(texts), -1
+    for told in told_deeds(texts):
+        # the end of a stretch is where the next one begins
+        last = min(told.last + int(WAY.search(texts[told.last]) is not None), len(texts) - 1)
+        instants = range(min(max(told.first, done + 1), last), last + 1)
+        done = min(instants, key=lambda instant: _away_px(tools[instant], told.place))
+        found[done] = f"{found[done]}, {told.words}" if found[done] else told.words
+        if told.words == told.place:  # the one that was picked up: it stays in view, and may move
+            found[done : told.last + 1] = [told.place] * (told.last + 1 - done)
+    is_picked_alone = any(PLACE.fullmatch(note) for note in found)
+    for instant, text in enumerate(texts):
+        still = _STILL.fullmatch(text)
+        if still is None or not any(found[:instant]):
+            continue
+        put_back, at_rest, second = still.groups()
+        if is_picked_alone:
+            found[instant] = put_back or at_rest
+        elif second:  # of the cube, and of where it will have to be put, this is the one that may move
+            found[instant] = second
     return found
 
 
-def _is_at(tool: str, place: str) -> bool:
+def _away_px(tool: str, place: str) -> float:
     first, second = PLACE.search(tool), PLACE.search(place)
-    if first is None or second is None:
-        return False
-    return float(np.hypot(int(first[1]) - int(second[1]), int(first[2]) - int(second[2]))) <= _TOUCHED_PX
+    if first is None or second is None:  # the text tells none: as good as any
+        return 0.0
+    return float(np.hypot(int(first[1]) - int(second[1]), int(first[2]) - int(second[2])))
 
 
 def noted(instruction: str, subgoals: Sequence[str], moving: Sequence[str]) -> list[str]:

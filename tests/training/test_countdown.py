@@ -16,7 +16,16 @@ from ponderpounce.models.ponder_configs import tiny_cpu
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.tasks.captions import ORDINALS
 from ponderpounce.tasks.counting.stop_cube import StopCube
-from ponderpounce.training.countdown import as_place, counted, misjudged, rhythm, stood_at, waits, waits_unplaced
+from ponderpounce.training.countdown import (
+    as_place,
+    counted,
+    misjudged,
+    rhythm,
+    stood_at,
+    waiting_longer,
+    waits,
+    waits_unplaced,
+)
 from ponderpounce.training.example import ExampleConfig, make_example
 from ponderpounce.training.lapses import Words
 from ponderpounce.training.nudge import Nudge
@@ -162,6 +171,37 @@ def test_a_misjudged_wait_is_not_learned_and_c_knows_better() -> None:
     np.testing.assert_array_equal(right.stand_ins(128), wrong.stand_ins(128))
     learned = FORM.vocabulary.decode([id_ for id_ in wrong.row().targets if id_ != IGNORE])
     assert learned.count(STILL) == sum(each.text.startswith(STILL) for each in wrong.words) - len(others)
+
+
+@given(hover=st.integers(0, 40), still=st.integers(1, 300), press=st.integers(1, 30), longer=st.integers(0, 12))
+def test_a_wait_told_longer_ends_so_much_later_or_with_the_episode(
+    hover: int, still: int, press: int, longer: int
+) -> None:
+    texts = [HOVER] * hover + [STILL] * still + [PRESS] * press
+    begins_T = np.isin(np.arange(len(texts)), [0, hover, hover + still])
+    told, told_begins_T = waiting_longer(texts, begins_T, longer)
+    more = min(longer, press - 1)
+    assert told == [HOVER] * hover + [STILL] * (still + more) + [PRESS] * (press - more)
+    assert np.flatnonzero(told_begins_T).tolist() == sorted({0, hover, hover + still + more})
+    assert waiting_longer(told, told_begins_T, 0)[0] == told
+    assert waits(told)[0] == hover + still + more
+
+
+def test_who_never_waits_is_told_as_ever() -> None:
+    texts, begins_T = ["pick it up"] * 3, np.array([True, False, False])
+    assert waiting_longer(texts, begins_T, 5)[0] == texts
+    assert waiting_longer([STILL] * 3, begins_T, 5)[0] == [STILL] * 3, "it never ends"
+
+
+def test_c_and_words_are_told_the_longer_wait() -> None:
+    recorded = waiting_episode([HOVER] * 40 + [STILL] * 100 + [PRESS] * 30, (0, 40, 140))
+    config = ExampleConfig(clocks=EVALUATION, counts_down=True, waits_longer=5)
+    example = make_example(recorded, FORM, config, np.random.default_rng(0))
+    assert example.words is not None
+    at = next(n for n, query in enumerate(example.schedule.queries) if query.tick >= 60)
+    wait = 145 - example.schedule.queries[at].tick
+    assert example.words[at].text == f"{STILL} {wait}"
+    np.testing.assert_array_equal(example.stand_ins(128)[at][:NUM_PLACE_FEATURES], place_features((0, wait)))
 
 
 def test_the_rhythm_is_that_of_the_scene() -> None:

@@ -72,6 +72,8 @@ def test_what_is_out_of_sight_is_not_noted() -> None:
     assert in_sight("<127, 64>, <128, 64>, <0, 191>, <0, 192>, <3, 63>", eyes) == "<127, 64>, <0, 191>"
     assert in_sight("<200, 200>", None) == "<200, 200>"
     assert in_sight("", eyes) == ""
+    assert in_sight("second <3, 63>", eyes) == "second", "it happened all the same"
+    assert in_sight("second <3, 64>", eyes) == "second <3, 64>"
 
 
 def test_the_cube_that_was_shown_is_noted_from_when_the_tool_is_at_it() -> None:
@@ -80,9 +82,33 @@ def test_the_cube_that_was_shown_is_noted_from_when_the_tool_is_at_it() -> None:
     tools = ["<20, 128>", "<85, 122>", "<70, 122>", "<70, 122>", "<20, 128>", "<20, 128>"]
     expected = ["", "<90, 120>", "<90, 120>", "<80, 121>", "<90, 120>", "<99, 110>"]
     assert demo_notes(texts, tools, [""] * 6) == expected
-    assert demo_notes(texts[:3], tools[:3], [""] * 3) == [""] * 3, "nothing was put down to change places"
+    assert demo_notes(texts[:1], tools[:1], [""]) == ["<90, 120>"], "no later than it is done"
     assert demo_notes(texts, tools, ["<1, 2>"] * 6) == ["<1, 2>"] * 6, "the clock alone tells it"
     assert demo_notes(texts, (), [""] * 6) == [""] * 6, "nobody says where the tool is"
+
+
+def test_deeds_are_noted_when_the_tool_is_there_and_a_target_from_then_on() -> None:
+    texts = ["pick up the cube at <90, 120>", *["drop the cube onto target at <100, 60>"] * 3]
+    texts += ["press the button at <120, 128>", "pick up the cube at <98, 60>"]
+    texts += ["drop the cube onto target at <80, 170>", "drop the cube onto table at <60, 128>, <80, 170>"]
+    texts += ["static at <82, 128>, <80, 170>", "static at <82, 128>, <90, 150>"]
+    tools = ["<85, 120>", "<70, 90>", "<95, 62>", "<90, 60>", "<50, 90>", "<95, 60>"]
+    tools += ["<40, 140>", "<50, 128>", "<20, 128>", "<20, 128>"]
+    expected = ["", "", "first <100, 60>", "", "button", "", "second <80, 170>", "", "<80, 170>", "<90, 150>"]
+    assert demo_notes(texts, tools, [""] * 10) == expected
+
+
+def test_stretches_of_a_way_are_noted_where_they_end() -> None:
+    texts = [*["move backward to <66, 172>, then <52, 148>"] * 3, *["move backward-right to <52, 148>"] * 2]
+    tools = ["<95, 172>", "<85, 172>", "<76, 172>", "<64, 170>", "<56, 158>"]
+    expected = ["", "", "", "backward <66, 172>", "backward-right <52, 148>"]
+    assert demo_notes(texts, tools, [""] * 5) == expected, (
+        "the first ends between two looks, and is nearer to the second"
+    )
+    tools[2] = "<68, 172>"
+    assert demo_notes(texts, tools, [""] * 5) == ["", "", expected[3], "", expected[4]]
+    both = demo_notes([texts[0], texts[3]], [tools[0], "<60, 160>"], ["", ""])
+    assert both == ["", f"{expected[3]}, {expected[4]}"], "what fell between the same two looks is told at once"
 
 
 def numbers(text: str) -> list[int]:
