@@ -203,7 +203,7 @@ def small_noting() -> Curriculum:
         settling,
         name="small_noting/settling",
         example=replace(settling.example, takes_notes=True, waits_longer=5),
-        train=TrainConfig(seed=13, optim=replace(_TURNING, warmup_steps=100, decay=(900, 1900))),
-        num_steps=1900,
+        train=TrainConfig(seed=13, optim=replace(_TURNING, warmup_steps=100, decay=(900, 2000))),
+        num_steps=2000,
     )
     return Curriculum(name="small_noting", stages=(settling,))
