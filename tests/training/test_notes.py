@@ -111,6 +111,26 @@ def test_stretches_of_a_way_are_noted_where_they_end() -> None:
     assert both == ["", f"{expected[3]}, {expected[4]}"], "what fell between the same two looks is told at once"
 
 
+def test_a_stretch_that_ends_where_it_began_is_not_over_at_once() -> None:
+    texts = [*["move left to <50, 50>, then <52, 52>"] * 2, *["move right to <52, 52>"] * 2]
+    tools = ["<90, 90>", "<70, 70>", "<51, 51>", "<60, 60>"]
+    assert demo_notes(texts, tools, [""] * 4) == ["", "", "left <50, 50>", "right <52, 52>"]
+
+
+def test_where_nothing_was_put_or_picked_up_to_be_asked_for_nothing_is_noted() -> None:
+    texts = [
+        "Pick up the cube at <84, 129>",
+        "place the cube onto the target at <113, 108>",
+        "static at <9, 9>, <8, 8>",
+    ]
+    assert demo_notes(texts, ["<84, 129>", "<113, 108>", "<9, 9>"], [""] * 3) == [""] * 3
+
+
+def test_what_is_told_to_move_is_of_the_picture_that_is_shown() -> None:
+    shown_at_T = np.arange(300) // 20 * 20
+    assert running_episode().as_seen(shown_at_T).moving == [MOVING[tick] for tick in shown_at_T]
+
+
 def numbers(text: str) -> list[int]:
     """The pace and the wait of a note."""
     return [int(each) for each in PLACE.sub("", text).split(", ") if each.isdecimal()]
