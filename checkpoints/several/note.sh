@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Goes on from the pair that recover.sh has left, on two CPU cores: see docs/training.md, "Notes".
+# A trial to go on from the pair that recover.sh has left, on two CPU cores: see docs/training.md, "Notes".
 #
 #     checkpoints/several/note.sh [OUT]    (the OUT of the other scripts)
 #

@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Goes on from the trial that master.sh has left, on two CPU cores: see docs/training.md, "Its own words". note.sh goes on.
+# Goes on from the trial that master.sh has left, on two CPU cores: see docs/training.md, "Its own words". note.sh is a trial to go
+# on.
 #
 #     checkpoints/several/recover.sh [OUT]    (the OUT of train.sh, further.sh, imitate.sh and master.sh)
 #

@@ -197,7 +197,10 @@ def small_recovering() -> Curriculum:
 
 
 def small_noting() -> Curriculum:
-    """The PONDER of `small_recovering` learns to take notes of what moves (`pp-train --watch` what the pair played)."""
+    """The PONDER of `small_recovering` learns to take notes of what moves (`pp-train --watch` what the pair played).
+
+    A trial: docs/training.md, "Notes".
+    """
     (settling,) = small_recovering().stages
     settling = replace(
         settling,
