@@ -1,6 +1,5 @@
 #!/usr/bin/env bash
-# Goes on from the trial that master.sh has left, on two CPU cores: see docs/training.md, "Its own words". note.sh is a trial to go
-# on.
+# Goes on from the trial that master.sh has left, on two CPU cores: see docs/training.md, "Its own words". note.sh: a trial.
 #
 #     checkpoints/several/recover.sh [OUT]    (the OUT of train.sh, further.sh, imitate.sh and master.sh)
 #
