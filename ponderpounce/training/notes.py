@@ -23,6 +23,7 @@ import numpy as np
 
 from ponderpounce.models.eyes import Eyes
 from ponderpounce.tasks.counting.stop_cube import PASS_STEPS, PRESS_STEPS
+from ponderpounce.tasks.difficulty import DIFFICULTIES
 from ponderpounce.tasks.front_view import front_pixels
 from ponderpounce.tasks.task import make_task, task_names
 from ponderpounce.training.countdown import rhythm, waits
@@ -43,7 +44,7 @@ def moving_places(task: str, seed: int, difficulty: str, num_steps: int) -> list
     ``<y, x>, <y, x>`` as texts tell places, nothing of those outside of the picture, up to a look after the last has
     come to rest; empty where nothing moves. Needs no physics: what the seed draws tells it (`Task.moving`).
     """
-    if task not in task_names():  # somebody else's data
+    if task not in task_names() or difficulty not in DIFFICULTIES:  # somebody else's data, or pictures of many scenes
         return [""] * num_steps
     found_task = make_task(task)
     layout = found_task.sample(np.random.default_rng(seed), difficulty)

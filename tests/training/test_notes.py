@@ -65,6 +65,7 @@ def test_what_has_come_to_rest_is_told_for_one_more_look() -> None:
 def test_nothing_is_told_of_a_task_that_nobody_knows_or_where_nothing_moves() -> None:
     assert moving_places("SomebodyElses", 0, "easy", 3) == ["", "", ""]
     assert moving_places("PickHighlight", 0, "easy", 3) == ["", "", ""]
+    assert moving_places("StopCube", 0, "mixed", 3) == ["", "", ""], "an album: a scene for every picture"
 
 
 def test_what_is_out_of_sight_is_not_noted() -> None:

@@ -11,6 +11,7 @@ import torch
 from clock.sampling import EVALUATION, sample_schedule
 from ponder_server.contract import Opening
 from ponder_server.engine import EngineConfig, QwenEngine
+from ponder_server.writer import TransitionWriter
 from ponderpounce.models.eyes import Eye, see
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
@@ -76,7 +77,7 @@ def test_training_and_serving_see_the_same(monkeypatch: pytest.MonkeyPatch, pond
         hidden = ponder.encode_row(row, frames)
     engine = engine_of(ponder)
     monkeypatch.setattr(Ponder, "embed", listened)
-    monkeypatch.setattr(engine, "_gate", lambda _: form.vocabulary.t_no)  # the episode has no texts
+    monkeypatch.setattr(TransitionWriter, "wants_to_write", lambda *_: False)  # the episode has no texts
     engine.open("a", Opening(instruction=INSTRUCTION, demo_frames=recorded.demo))
     for query, index_K in zip(schedule.queries, row.carrier_index, strict=True):
         fire = engine.fire("a", recorded.frames[query.tick], proprio=recorded.state_T8[query.tick])
