@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ponderpounce.models.place_code import PLACE_PX
 from ponderpounce.tasks.captions import ORDINALS
-from ponderpounce.tasks.counting.stop_cube import PASS_STEPS, PRESS_STEPS
+from ponderpounce.tasks.paces import PASS_STEPS, PRESS_STEPS
 from ponderpounce.training.lapses import Words
 from ponderpounce.training.places import PLACE
 

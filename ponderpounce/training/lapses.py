@@ -23,7 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ponderpounce.training.places import PLACE, misplaced
+from ponderpounce.training.places import PLACE, apart_px, misplaced
 
 _APART_PX = 16.0  # texts that differ by their places alone: less than that is the same thing, pushed
 
@@ -131,10 +131,8 @@ def _said(text: str, lapses: Lapses, rng: np.random.Generator) -> tuple[str, boo
 
 def has_moved(told: str, now: str, by_px: float) -> bool:
     """Whether the first place of both is farther away than that."""
-    first, second = PLACE.search(told), PLACE.search(now)
-    if first is None or second is None:
-        return False
-    return float(np.hypot(int(first[1]) - int(second[1]), int(first[2]) - int(second[2]))) > by_px
+    found_px = apart_px(told, now)
+    return found_px is not None and found_px > by_px
 
 
 def is_other(text: str, than: str) -> bool:

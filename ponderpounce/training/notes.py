@@ -18,32 +18,41 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from importlib.util import find_spec
 
 import numpy as np
 
 from ponderpounce.models.eyes import Eyes
-from ponderpounce.tasks.counting.stop_cube import PASS_STEPS, PRESS_STEPS
 from ponderpounce.tasks.difficulty import DIFFICULTIES
 from ponderpounce.tasks.front_view import front_pixels
-from ponderpounce.tasks.task import make_task, task_names
+from ponderpounce.tasks.paces import PASS_STEPS, PRESS_STEPS
 from ponderpounce.training.countdown import rhythm, waits
 from ponderpounce.training.deeds import told_deeds
 from ponderpounce.training.lapses import Words
-from ponderpounce.training.places import PLACE, TEXT_PX, WAY
+from ponderpounce.training.places import PARTS, PLACE, TEXT_PX, WAY, apart_px
 
 _ONE = PLACE.pattern.replace("(", "").replace(")", "")
 _STILL = re.compile(rf"drop the cube on the table at ({_ONE})(?:, {_ONE})?|static at ({_ONE})(?:, ({_ONE}))?")
-_PARTS = re.compile(r", (?![^<]*>)")  # the commas that are in no place
 _LOOK_STEPS = 25  # a query a second: one at least sees where everything has come to rest
 _PACE_STEPS = 30  # two looks; before, nobody can tell how fast it runs
+
+
+def can_follow() -> bool:
+    """Whether scenes can be drawn here: tasks need MuJoCo, which a machine that only trains may not have."""
+    return find_spec("mujoco") is not None
 
 
 def moving_places(task: str, seed: int, difficulty: str, num_steps: int) -> list[str]:
     """Per observation of an episode from reset on, its demonstration's first, where things are that move by themselves.
 
     ``<y, x>, <y, x>`` as texts tell places, nothing of those outside of the picture, up to a look after the last has
-    come to rest; empty where nothing moves. Needs no physics: what the seed draws tells it (`Task.moving`).
+    come to rest; empty where nothing moves. Needs no physics: what the seed draws tells it (`Task.moving`). Empty, too,
+    where nothing can be drawn (`can_follow`).
     """
+    if not can_follow():
+        return [""] * num_steps
+    from ponderpounce.tasks.task import make_task, task_names  # here alone: it imports MuJoCo
+
     if task not in task_names() or difficulty not in DIFFICULTIES:  # somebody else's data, or pictures of many scenes
         return [""] * num_steps
     found_task = make_task(task)
@@ -66,7 +75,7 @@ def in_sight(note: str, eyes: Eyes) -> str:
     boxes = [eye.box for eye in eyes if eye.camera == 0]
     told = (
         PLACE.sub(lambda place: place[0] if any(_is_in(box, place) for box in boxes) else "", part).strip()
-        for part in _PARTS.split(note)
+        for part in PARTS.split(note)
     )
     return ", ".join(part for part in told if part)
 
@@ -95,7 +104,7 @@ def demo_notes(texts: Sequence[str], tools: Sequence[str], moving: Sequence[str]
         # the end of a stretch is where the next one begins
         last = min(told.last + int(WAY.search(texts[told.last]) is not None), len(texts) - 1)
         instants = range(min(max(told.first, done + 1), last), last + 1)
-        done = min(instants, key=lambda instant: _away_px(tools[instant], told.place))
+        done = min(instants, key=lambda instant: apart_px(tools[instant], told.place) or 0.0)  # 0: the text tells none
         found[done] = f"{found[done]}, {told.words}" if found[done] else told.words
         if told.words == told.place:  # the one that was picked up: it stays in view, and may move
             found[done : told.last + 1] = [told.place] * (told.last + 1 - done)
@@ -110,13 +119,6 @@ def demo_notes(texts: Sequence[str], tools: Sequence[str], moving: Sequence[str]
         elif second:  # of the cube, and of where it will have to be put, this is the one that may move
             found[instant] = second
     return found
-
-
-def _away_px(tool: str, place: str) -> float:
-    first, second = PLACE.search(tool), PLACE.search(place)
-    if first is None or second is None:  # the text tells none: as good as any
-        return 0.0
-    return float(np.hypot(int(first[1]) - int(second[1]), int(first[2]) - int(second[2])))
 
 
 def noted(instruction: str, subgoals: Sequence[str], moving: Sequence[str]) -> list[str]:

@@ -13,15 +13,13 @@ That is DAgger (Ross et al. 2011) for words; the paper has nothing of it.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 
 import numpy as np
 
 from ponderpounce.models.ponder_coordinates import pixel_text
 from ponderpounce.training.lapses import Words, is_other
-
-_PLAN = re.compile(r", (?![^<]*>)")  # the first comma that is in no place
+from ponderpounce.training.places import PARTS
 
 
 def as_recorded(said: str) -> str:
@@ -73,5 +71,5 @@ def speaks_of(said: str, text: str) -> bool:
 
 def _subgoal(text: str) -> str:
     """The text without its plan."""
-    end = _PLAN.search(text)
+    end = PARTS.search(text)
     return text if end is None else text[: end.start()]

@@ -11,6 +11,8 @@ from ponderpounce.models.place_code import PLACE_PX
 PLACE = re.compile(r"<\s*(\d+)\s*,\s*(\d+)\s*>")
 WAY = re.compile(rf"(\S+) to ({PLACE.pattern})(?:, then |$)")
 """A stretch of a way (`tasks.task.located`): how it is gone, in the last word, and where it ends."""
+PARTS = re.compile(r", (?![^<]*>)")
+"""Commas between the parts of a text, not those within places."""
 TEXT_PX = PLACE_PX
 """Side of the picture that texts speak of, whatever the size of a picture."""
 
@@ -23,3 +25,11 @@ def misplaced(text: str, std_px: float, rng: np.random.Generator, count: int = 0
         return f"<{y}, {x}>"
 
     return PLACE.sub(slipped, text, count=count)
+
+
+def apart_px(text: str, other: str) -> float | None:
+    """How far apart the first places of two texts are; None where one of them tells none."""
+    first, second = PLACE.search(text), PLACE.search(other)
+    if first is None or second is None:
+        return None
+    return float(np.hypot(int(first[1]) - int(second[1]), int(first[2]) - int(second[2])))

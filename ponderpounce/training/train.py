@@ -47,6 +47,7 @@ from ponderpounce.training.data import Sight, TrainingSet
 from ponderpounce.training.example import make_example
 from ponderpounce.training.in_words import told_in_words
 from ponderpounce.training.joint import JointModel, PonderBatch, PounceBatch, Trains
+from ponderpounce.training.notes import can_follow
 from ponderpounce.training.parallel import World, gather, joined, require_alike, shard
 from ponderpounce.training.plot import plot_log
 from ponderpounce.training.recipe import Curriculum, Recipe, stages_of
@@ -335,6 +336,8 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
         ValueError: pretrained weights are missing, or the pictures have another size than PONDER reads.
         FileNotFoundError: a given folder holds no checkpoint.
     """
+    if run.example.takes_notes and not can_follow():
+        raise ValueError(f"recipe {run.name} takes notes of what moves, and draws scenes for it: pip install mujoco")
     dtype = {"float32": torch.float32, "bfloat16": torch.bfloat16}[options.dtype]
     seed = run.train.seed
     if not run.from_scratch and (options.ponder is None or options.pounce is None):

@@ -15,7 +15,7 @@ from ponder_server.contract import ContextFull, Frame, Opening, SessionError
 from ponder_server.engine import EngineConfig, QwenEngine
 from ponder_server.runner import Session
 from ponderpounce.models import ponder_configs
-from ponderpounce.models.context import Row, SegmentKind, Transition
+from ponderpounce.models.context import Row, Transition
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
 from ponderpounce.models.vocabulary import Vocabulary
@@ -141,47 +141,6 @@ def test_serving_regenerates_the_row_of_a_ponder_that_learned_without_words() ->
     expected = encode(ponder, row)[torch.from_numpy(row.carrier_index)]
     for answer, C_t in zip(answers, expected, strict=True):
         assert np.abs(answer.cognition - C_t.numpy()).max() < TOLERANCE
-
-
-NOTES: Script = (None, Transition(subgoal=VOCABULARY.encode("at <1, 2>")), Transition(subgoal=VOCABULARY.encode("<3>")))
-NOTING_SCRIPT: Script = (None, Transition(subgoal=SUBGOAL))
-
-
-@pytest.mark.parametrize("prefill_chunk_tokens", [1, 4096])
-def test_serving_regenerates_the_row_of_a_ponder_that_takes_notes(prefill_chunk_tokens: int) -> None:
-    """Also from an equal demonstration of before; and where a context is to forget, notes stay as their pictures do."""
-    ponder = taught(NOTING_SCRIPT, notes=NOTES)
-    row = training_row(ponder, NOTING_SCRIPT, notes=NOTES)
-    engine = QwenEngine(ponder, replace(CONFIG, prefill_chunk_tokens=prefill_chunk_tokens))
-    expected = encode(ponder, row)[torch.from_numpy(row.carrier_index)]
-    num_opened = len(ponder.format.row(ponder.format.opening(INSTRUCTION, [1, 1, 1], NOTES)).ids)
-    for session in ("a", "b"):
-        assert engine.open(session, WITH_DEMO) == num_opened
-        spans = engine._episode(session).spans
-        assert sum(span.num_tokens for span in spans) == num_opened
-        assert {span.kind for span in spans} == {SegmentKind.INSTRUCTION, SegmentKind.DEMO, SegmentKind.EXECUTION}
-        answers = [engine.fire(session, observation(query)) for query in range(len(NOTING_SCRIPT))]
-        assert context_of(engine, session).ids == list(row.ids)
-        assert context_of(engine, session).next_position == ponder.format.positions(row.ids)[1]
-        for answer, C_t in zip(answers, expected, strict=True):
-            assert np.abs(answer.cognition - C_t.numpy()).max() < TOLERANCE
-
-
-def test_notes_that_do_not_fit_refuse_the_session_and_leave_its_place_free() -> None:
-    ponder = taught(NOTING_SCRIPT, notes=NOTES)
-    num_opened = len(ponder.format.row(ponder.format.opening(INSTRUCTION, [1, 1, 1], NOTES)).ids)
-    engine = QwenEngine(ponder, replace(CONFIG, max_context_tokens=num_opened - 1, max_sessions=1))
-    with pytest.raises(ContextFull):
-        engine.open("a", WITH_DEMO)
-    engine.open("a", WITHOUT_DEMO)
-
-
-def test_a_ponder_without_words_takes_no_notes() -> None:
-    ponder = taught(NOTING_SCRIPT, notes=NOTES)
-    ponder.format = replace(ponder.format, speaks=False)
-    engine = QwenEngine(ponder, CONFIG)
-    engine.open("a", WITH_DEMO)
-    assert context_of(engine, "a").ids == list(training_row(ponder, ()).ids)
 
 
 def test_a_transition_has_forgotten_its_speculative_carriers_to_the_last_bit(engine: QwenEngine) -> None:

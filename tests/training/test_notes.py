@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 from itertools import pairwise
 
@@ -15,9 +17,10 @@ from ponderpounce.models.context import IGNORE, Row
 from ponderpounce.models.eyes import Eye
 from ponderpounce.models.place_code import place_features
 from ponderpounce.models.ponder_coordinates import normalised_text
-from ponderpounce.tasks.counting.stop_cube import PASS_STEPS, StopCube
+from ponderpounce.tasks.counting.stop_cube import StopCube
 from ponderpounce.tasks.environment import make_environment
 from ponderpounce.tasks.front_view import front_pixels
+from ponderpounce.tasks.paces import PASS_STEPS
 from ponderpounce.training.example import ExampleConfig, Slip, make_example
 from ponderpounce.training.notes import demo_notes, in_sight, misnoted, moving_places, noted
 from ponderpounce.training.places import PLACE, TEXT_PX
@@ -66,6 +69,24 @@ def test_nothing_is_told_of_a_task_that_nobody_knows_or_where_nothing_moves() ->
     assert moving_places("SomebodyElses", 0, "easy", 3) == ["", "", ""]
     assert moving_places("PickHighlight", 0, "easy", 3) == ["", "", ""]
     assert moving_places("StopCube", 0, "mixed", 3) == ["", "", ""], "an album: a scene for every picture"
+
+
+def test_a_machine_without_mujoco_trains_and_follows_nothing() -> None:
+    """And a recipe that takes notes says what it needs."""
+    program = """
+import sys
+sys.modules["mujoco"] = None
+from ponderpounce.training import recipes, train
+from ponderpounce.training.notes import moving_places
+assert moving_places("StopCube", 3, "easy", 2) == ["", ""]
+try:
+    train.build(recipes.recipe("small_noting").stages[-1], None, None)
+except ValueError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert "takes notes" in done.stdout, done.stderr
+    assert "pip install mujoco" in done.stdout
 
 
 def test_what_is_out_of_sight_is_not_noted() -> None:

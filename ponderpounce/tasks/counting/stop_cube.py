@@ -19,6 +19,7 @@ import numpy as np
 from ponderpounce.tasks import captions, predicates
 from ponderpounce.tasks.geometry import Array, pose, smoothstep
 from ponderpounce.tasks.oracle import Actions, Motions
+from ponderpounce.tasks.paces import PASS_STEPS, PRESS_STEPS
 from ponderpounce.tasks.physics import CONTROL_HZ, Physics
 from ponderpounce.tasks.placing import draw_button
 from ponderpounce.tasks.props import PURPLE, add_ghost_cube, add_target
@@ -30,11 +31,9 @@ NUM_PASSES = 5
 _TARGET_REACH_M, _TARGET_RADIUS_M, _TARGET_HALF_HEIGHT_M = 0.1, 0.036, 0.005
 _LINE_HALF_M, _LINE_TURN_RAD = 0.3, np.deg2rad(30.0)
 _Z_M = 0.01  # of the cube's and the target's centre: the cube is half sunk into the table
-PASS_STEPS = (60, 80, 120)  # of one pass, whichever is drawn
 _VISITS = (2, 3, 4, 5)
 _STOPPED_M = 0.06
 _CHECKPOINT_STEPS = 100
-PRESS_STEPS = 30  # the oracle begins to press so long before the cube is on the target
 _BUTTON, _TARGET, _CUBE = "button", "target", "shuttle"
 
 
