@@ -176,6 +176,10 @@ class TrainingSet:
             found |= {source.entry.instruction, *(normalised_text(text) for text in said)}
         return sorted(found)
 
+    def tools(self, number: int) -> list[str]:
+        """Where the front camera sees the tool in every row of an episode, ``<y, x>``."""
+        return _seen_at(self._sources[number].rows().tcp_pose)
+
     def __getitem__(self, number: int) -> TrainingEpisode:
         if number in self._cache:
             self._cache.move_to_end(number)

@@ -135,10 +135,10 @@ def samples_of(
             _, is_image_T = _encoded(ponder, example)
             tokens_NSH = read()[is_image_T].unflatten(0, (-1, ponder.format.num_image_tokens))
             texts = [example.view.text(example.episode.subgoals[query.tick]) for query in example.schedule.queries]
-            answers = answers_of(texts, names, ponder.format)
-            things.append(tokens_NSH[answers.is_thing_NS])
-            places.append(answers.told_NSP[answers.is_thing_NS])
-            others += [tokens_NSH[~answers.is_thing_NS], read()[~is_image_T]]
+            spots = answers_of(texts, [""] * len(texts), names, ponder.format).things
+            things.append(tokens_NSH[spots.is_here_NS])
+            places.append(spots.told_NSP[spots.is_here_NS])
+            others += [tokens_NSH[~spots.is_here_NS], read()[~is_image_T]]
         config = ExampleConfig(clocks=sampling.ROBOMME, max_invocations=1, has_foresight=True)
         for data in folders:
             for number in range(min(num_episodes, len(data))):

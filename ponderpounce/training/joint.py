@@ -19,7 +19,6 @@ from dataclasses import dataclass, fields, replace
 from itertools import accumulate
 from typing import Any, Literal, NamedTuple
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -31,7 +30,7 @@ from ponderpounce.models.pounce import PounceInputs
 from ponderpounce.models.pounce_family import AnyPounce, action_loss
 from ponderpounce.models.pounce_groot import GrootInputs
 from ponderpounce.training.place_lessons import PlaceLessons
-from ponderpounce.training.stand_in import even_weights
+from ponderpounce.training.stand_in import number_weights
 
 Trains = Literal["both", "ponder", "pounce"]
 """Which systems a stage trains. The other one is not even run."""
@@ -202,7 +201,7 @@ class JointModel(nn.Module):
         reads_together: bool = True,
     ) -> None:
         """With ``keeps_eyes`` PONDER's vision tower stays as it is; ``reads_together`` is `encode_rows`'s ``together``;
-        ``aligns_evenly``: numbers of C count as `even_weights` says.
+        ``aligns_evenly``: numbers of C count as `number_weights` says.
 
         Raises ValueError if POUNCE was built for another cognition than PONDER gives.
         """
@@ -214,8 +213,7 @@ class JointModel(nn.Module):
         self.ponder = ponder
         self.pounce = pounce
         self.w1, self.w2, self.w3, self.w4 = w1, w2, w3, w4
-        weights_H = even_weights(ponder.hidden_size) if aligns_evenly else np.ones(ponder.hidden_size, np.float32)
-        self._column_weights_H = torch.from_numpy(weights_H)
+        self._column_weights_H = torch.from_numpy(number_weights(ponder.hidden_size, evenly=aligns_evenly))
         self.trains = trains
         self.reads_together = reads_together
         for name, system in (("ponder", ponder), ("pounce", pounce)):

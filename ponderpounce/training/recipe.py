@@ -33,7 +33,7 @@ class Recipe:
     moved_weight: float = 1.0
     """How much alignment counts at queries whose words tell another place than the stand-in (`stand_in_weights`)."""
     aligns_evenly: bool = False
-    """Numbers of C that tell a place slowly count for more (`even_weights`)."""
+    """Numbers of C that tell a place slowly count for more (`number_weights`)."""
     w4: float = 0.0
     """Of the auxiliary lessons in places to have in mind (`place_lessons`); the paper has no such loss."""
     trains: Trains = "both"

@@ -4,9 +4,10 @@ A pretrained PONDER brings eyes along. One from scratch would have to learn to s
 to say, through a language model that is as new: slow, and never precise. Here every image token is asked directly: does
 a thing's middle lie in your square, which one is it, and where is it, in the square and in the picture? The place in
 the picture is asked for in the form that cognition will have (`stand_in`), for attention passes on what a token holds
-and not where it stood. The answers come from one linear layer that is thrown away afterwards, so that a token carries
-them plainly. No other recipe needs this, the paper has nothing of it, and no word is learned: the rest of PONDER stays
-as it was drawn.
+and not where it stood. The robot's tool is asked for apart, since it is where things are: in a demonstration nothing
+else tells what is being done. The answers come from one linear layer that is thrown away afterwards, so that a token
+carries them plainly. No other recipe needs this, the paper has nothing of it, and no word is learned: the rest of
+PONDER stays as it was drawn.
 """
 
 # N pictures, S image tokens of a picture, W names, P numbers that tell a place
@@ -38,7 +39,7 @@ from ponderpounce.models.vocabulary import Vocabulary
 from ponderpounce.training.augment import Augmentation, draw_view
 from ponderpounce.training.data import Sight, TrainingSet
 from ponderpounce.training.optim import OptimConfig, Optimiser
-from ponderpounce.training.places import TEXT_PX
+from ponderpounce.training.places import PLACE, TEXT_PX
 from ponderpounce.training.recipe import stages_of
 from ponderpounce.training.recipes import recipe
 
@@ -47,8 +48,11 @@ DONE, REFUSED = 0, 2
 _THING = re.compile(r"([^,<>]+?) at <(\d+), (\d+)>")
 _WAYS = Augmentation(max_shift_px=4, mirror=True)
 _HELD_OUT_SHARE = 0.05
+_EXAMINED_TOGETHER = 200
 _PLACE_WEIGHT, _TOLD_WEIGHT, _NAME_WEIGHT = 16.0, 0.5, 0.3
-_NUM_ASKED = 3 + NUM_PLACE_FEATURES  # beside names
+_NUM_ASKED = 3 + NUM_PLACE_FEATURES  # of a thing, and of the tool: is it here, and where in two ways
+_NUM_ANSWERS = 2 * _NUM_ASKED  # beside names
+_SETTLING_RATE = 1e-2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,6 +70,9 @@ class SeeOptions:
     out: Path
     """OUT/ponder is what `pp-train --ponder` goes on from."""
     steps: int = 2000
+    settling: int = 0
+    """Before these so many steps in which the questions are learned and not the eyes. With --ponder: what it can read
+    already then stays near what it was."""
     pictures: int = 128
     """Of one step."""
     learning_rate: float = 2e-3
@@ -80,22 +87,32 @@ class Album:
     pictures: NDArray[np.uint8]
     """(N, height, width, 3)"""
     texts: tuple[str, ...]
+    tools: tuple[str, ...]
+    """Where the tool is, ``<y, x>``."""
     names: tuple[str, ...]
     """Of all things, sorted."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Spots:
+    """Where the image tokens of pictures should say that something is."""
+
+    is_here_NS: Tensor
+    """bool"""
+    place_NS2: Tensor
+    """Down and right in a token's square, -1/2 to 1/2."""
+    told_NSP: Tensor
+    """The place in the picture, as `place_features`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Answers:
     """What the image tokens of pictures should say."""
 
-    is_thing_NS: Tensor
-    """bool"""
+    things: Spots
     name_NS: Tensor
     """int64, where there is a thing."""
-    place_NS2: Tensor
-    """Down and right in a token's square, -1/2 to 1/2."""
-    told_NSP: Tensor
-    """The place in the picture, as `place_features`."""
+    tool: Spots
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -125,26 +142,33 @@ def see_things(options: SeeOptions) -> None:
         folders = ", ".join(map(str, options.album))
         raise ValueError(f"{folders}: {len(album.texts)} pictures; some hundreds at least are needed")
     torch.manual_seed(options.seed)
-    answering = nn.Linear(ponder.hidden_size, _NUM_ASKED + len(album.names))
-    optim = OptimConfig(
-        learning_rate=options.learning_rate,
-        weight_decay=1e-4,
-        decay=(options.steps // 2, options.steps),
-    )
-    optimiser = Optimiser(nn.ModuleList([ponder.qwen.model.visual, answering]), optim)
+    answering = nn.Linear(ponder.hidden_size, _NUM_ANSWERS + len(album.names))
     options.out.mkdir(parents=True, exist_ok=True)
     with (options.out / "log.jsonl").open("w") as log:
-        for step in tqdm(range(options.steps), unit="step", disable=not options.progress):
-            rng = np.random.default_rng([options.seed, step])
-            chosen = rng.integers(num_learned, size=options.pictures)
-            frames_NHW3, answers = draw(album, chosen, ponder.format, rng)
-            loss = loss_of(answering(ponder.image_features(frames_NHW3)), answers)
-            loss.backward()  # type: ignore[no-untyped-call]
-            optimiser.update(step)
-            log.write(json.dumps({"step": step, "loss": loss.item()}) + "\n")
+        settling = _phase(answering, options.settling, _SETTLING_RATE)
+        opening = _phase(nn.ModuleList([ponder.qwen.model.visual, answering]), options.steps, options.learning_rate)
+        bar = tqdm(total=options.settling + options.steps, unit="step", disable=not options.progress)
+        with bar:
+            for phase, (optimiser, num_steps) in enumerate((settling, opening)):
+                for step in range(num_steps):
+                    rng = np.random.default_rng([options.seed, step] if phase else [options.seed, step, phase])
+                    chosen = rng.integers(num_learned, size=options.pictures)
+                    frames_NHW3, answers = draw(album, chosen, ponder.format, rng)
+                    with torch.set_grad_enabled(bool(phase)):
+                        tokens = ponder.image_features(frames_NHW3)
+                    loss = loss_of(answering(tokens), answers)
+                    loss.backward()  # type: ignore[no-untyped-call]
+                    optimiser.update(step)
+                    log.write(json.dumps({"step": bar.n - options.settling, "loss": loss.item()}) + "\n")
+                    bar.update()
     held_out = np.arange(num_learned, len(album.texts))
     sys.stdout.write(f"{num_held_out} pictures held out: {examine(ponder, answering, album, held_out)}\n")
     save_ponder(ponder, options.out / "ponder")
+
+
+def _phase(learning: nn.Module, num_steps: int, rate: float) -> tuple[Optimiser, int]:
+    decay = (num_steps // 2, max(num_steps, 1))
+    return Optimiser(learning, OptimConfig(learning_rate=rate, weight_decay=1e-4, decay=decay)), num_steps
 
 
 def _newborn(options: SeeOptions) -> Ponder:
@@ -164,17 +188,24 @@ def read_album(form: ContextFormat, *folders: Path) -> Album:
     pages = TrainingSet(*folders, sight=Sight(form=form, pounce_px=None))
     pictures: list[NDArray[np.uint8]] = []
     texts: list[str] = []
+    tools: list[str] = []
     for number in range(len(pages)):
         page = pages[number]
         pictures += [sight[0] for sight in page.sights or ()]
         texts += page.subgoals
+        tools += pages.tools(number)
     try:
         names = names_in(texts)
     except ValueError as error:
         raise ValueError(f"{', '.join(map(str, folders))}: {error}; make it with pp-album") from None
     # one album's pictures stay as they lie, of several each has its share of what is held out, at the end
     order = np.arange(len(texts)) if len(folders) == 1 else np.random.default_rng(0).permutation(len(texts))
-    return Album(pictures=np.stack([pictures[i] for i in order]), texts=tuple(texts[i] for i in order), names=names)
+    return Album(
+        pictures=np.stack([pictures[i] for i in order]),
+        texts=tuple(texts[i] for i in order),
+        tools=tuple(tools[i] for i in order),
+        names=names,
+    )
 
 
 def names_in(texts: Iterable[str]) -> tuple[str, ...]:
@@ -189,63 +220,108 @@ def draw(
     album: Album, chosen: NDArray[np.integer], form: ContextFormat, rng: np.random.Generator, ways: Augmentation = _WAYS
 ) -> tuple[Tensor, Answers]:
     """Pictures by number, each moved and mirrored in its own way: (N, height, width, 3) uint8, and the answers."""
-    frames, told = [], []
+    frames, told, tools = [], [], []
     for number in chosen:
         view = draw_view(ways, form, set(), rng)
         frames.append(view.pictures(torch.from_numpy(album.pictures[number])[None]))
         told.append(view.text(album.texts[number]))
-    return torch.cat(frames), answers_of(told, album.names, form)
+        tools.append(view.text(album.tools[number]))
+    return torch.cat(frames), answers_of(told, tools, album.names, form)
 
 
-def answers_of(texts: Sequence[str], names: Sequence[str], form: ContextFormat) -> Answers:
-    """Which token's square holds which thing's middle; of several in one square, the last. Others are not asked for."""
+def answers_of(texts: Sequence[str], tools: Sequence[str], names: Sequence[str], form: ContextFormat) -> Answers:
+    """Which token's square holds which thing's middle; of several in one square, the last. Others are not asked for.
+
+    ``tools``: where the tool is in each picture, ``<y, x>``; empty where nobody asks.
+    """
+    found: list[list[tuple[float, float]]] = []
+    name_NS = torch.zeros(len(texts), form.image_grid[0] * form.image_grid[1], dtype=torch.int64)
+    for number, text in enumerate(texts):
+        found.append([])
+        for name, y, x in _THING.findall(text):
+            found[-1].append((int(y), int(x)))
+            if (at := _square(found[-1][-1], form)) is not None:
+                name_NS[number, at[0]] = names.index(name.strip())
+    tool = [[(int(y), int(x)) for y, x in PLACE.findall(text)] for text in tools]
+    return Answers(things=_spots(found, form), name_NS=name_NS, tool=_spots(tool, form))
+
+
+def _square(yx_px: tuple[float, float], form: ContextFormat) -> tuple[int, float, float] | None:
+    """The token in whose square a place lies, and how far down and right of its middle; None if PONDER sees it not."""
     assert form.eyes is not None
     top, left, bottom, right = form.eyes[0].box
     num_rows, num_columns = form.image_grid
-    is_thing_NS = torch.zeros(len(texts), num_rows * num_columns, dtype=torch.bool)
-    name_NS = torch.zeros(is_thing_NS.shape, dtype=torch.int64)
-    place_NS2 = torch.zeros(*is_thing_NS.shape, 2)
-    told_NSP = torch.zeros(*is_thing_NS.shape, NUM_PLACE_FEATURES)
-    for number, text in enumerate(texts):
-        for name, y, x in _THING.findall(text):
-            down = (int(y) / TEXT_PX - top) / (bottom - top) * num_rows
-            along = (int(x) / TEXT_PX - left) / (right - left) * num_columns
-            if not (0 <= down < num_rows and 0 <= along < num_columns):
-                continue
-            token = int(down) * num_columns + int(along)
-            is_thing_NS[number, token] = True
-            name_NS[number, token] = names.index(name.strip())
-            place_NS2[number, token] = torch.tensor([down % 1 - 0.5, along % 1 - 0.5])
-            told_NSP[number, token] = torch.from_numpy(place_features((int(y), int(x))))
-    return Answers(is_thing_NS=is_thing_NS, name_NS=name_NS, place_NS2=place_NS2, told_NSP=told_NSP)
+    down = (yx_px[0] / TEXT_PX - top) / (bottom - top) * num_rows
+    along = (yx_px[1] / TEXT_PX - left) / (right - left) * num_columns
+    if not (0 <= down < num_rows and 0 <= along < num_columns):
+        return None
+    return int(down) * num_columns + int(along), down % 1 - 0.5, along % 1 - 0.5
+
+
+def _spots(places_N: Sequence[Sequence[tuple[float, float]]], form: ContextFormat) -> Spots:
+    shape = (len(places_N), form.image_grid[0] * form.image_grid[1])
+    is_here_NS = torch.zeros(shape, dtype=torch.bool)
+    place_NS2, told_NSP = torch.zeros(*shape, 2), torch.zeros(*shape, NUM_PLACE_FEATURES)
+    for number, places in enumerate(places_N):
+        for place in places:
+            if (at := _square(place, form)) is not None:
+                token, *offset = at
+                is_here_NS[number, token] = True
+                place_NS2[number, token] = torch.tensor(offset)
+                told_NSP[number, token] = torch.from_numpy(place_features(place))
+    return Spots(is_here_NS=is_here_NS, place_NS2=place_NS2, told_NSP=told_NSP)
 
 
 def loss_of(said: Tensor, answers: Answers) -> Tensor:
-    """Of the answers (N * S, 3 + P + W): is it a thing, and where it is one, its place in both ways and its name."""
-    is_thing = answers.is_thing_NS.flatten()
-    named = F.cross_entropy(said[is_thing, _NUM_ASKED:], answers.name_NS.flatten()[is_thing])
-    placed = F.mse_loss(said[is_thing, 1:3], answers.place_NS2.flatten(0, 1)[is_thing])
-    found = F.binary_cross_entropy_with_logits(said[:, 0], is_thing.float())
-    told = F.mse_loss(said[is_thing, 3:_NUM_ASKED], answers.told_NSP.flatten(0, 1)[is_thing])
-    return found + _PLACE_WEIGHT * placed + _TOLD_WEIGHT * told + _NAME_WEIGHT * named
+    """Of the answers (N * S, 2 * (3 + P) + W): is there a thing, and where there is, its place in both ways and its
+    name; is the tool there, and where."""
+    is_thing = answers.things.is_here_NS.flatten()
+    named = F.cross_entropy(said[is_thing, _NUM_ANSWERS:], answers.name_NS.flatten()[is_thing])
+    loss = _located(said[:, :_NUM_ASKED], answers.things) + _NAME_WEIGHT * named
+    # where it is in no picture nobody asks for it
+    has_tool = bool(answers.tool.is_here_NS.any())
+    return loss + _located(said[:, _NUM_ASKED:_NUM_ANSWERS], answers.tool) if has_tool else loss
+
+
+def _located(said: Tensor, spots: Spots) -> Tensor:
+    is_here = spots.is_here_NS.flatten()
+    found = F.binary_cross_entropy_with_logits(said[:, 0], is_here.float())
+    placed = F.mse_loss(said[is_here, 1:3], spots.place_NS2.flatten(0, 1)[is_here])
+    told = F.mse_loss(said[is_here, 3:], spots.told_NSP.flatten(0, 1)[is_here])
+    return found + _PLACE_WEIGHT * placed + _TOLD_WEIGHT * told
 
 
 @torch.inference_mode()
 def examine(ponder: Ponder, answering: nn.Linear, album: Album, chosen: NDArray[np.integer]) -> str:
     """How well these pictures are seen as they are, in words; places in pixels of the 256 px picture."""
-    assert ponder.format.eyes is not None
     rng = np.random.default_rng(0)
-    frames_NHW3, answers = draw(album, chosen, ponder.format, rng, Augmentation())
-    said = answering(ponder.image_features(frames_NHW3))
-    is_thing = answers.is_thing_NS.flatten()
-    found = (said[is_thing, 0] > 0).float().mean().item()
-    named = (said[is_thing, _NUM_ASKED:].argmax(-1) == answers.name_NS.flatten()[is_thing]).float().mean().item()
-    top, left, bottom, right = ponder.format.eyes[0].box
-    num_rows, num_columns = ponder.format.image_grid
+    said, there = [], []
+    for some in np.array_split(chosen, -(-len(chosen) // _EXAMINED_TOGETHER)):
+        frames_NHW3, answers = draw(album, some, ponder.format, rng, Augmentation())
+        said.append(answering(ponder.image_features(frames_NHW3)))
+        there.append(answers)
+    is_thing = torch.cat([each.things.is_here_NS.flatten() for each in there])
+    names = torch.cat([each.name_NS.flatten() for each in there])[is_thing]
+    named = (torch.cat(said)[is_thing, _NUM_ANSWERS:].argmax(-1) == names).float().mean().item()
+    things = _how_well([each[:, :_NUM_ASKED] for each in said], [each.things for each in there], ponder.format)
+    tool = _how_well([each[:, _NUM_ASKED:] for each in said], [each.tool for each in there], ponder.format)
+    return f"of their things {things}, {named:.1%} named rightly; of their tools {tool}"
+
+
+def _how_well(said: Sequence[Tensor], spots: Sequence[Spots], form: ContextFormat) -> str:
+    assert form.eyes is not None
+    is_here = torch.cat([each.is_here_NS.flatten() for each in spots])
+    if not is_here.any():
+        return "none"
+    answers = torch.cat(list(said))[is_here]
+    top, left, bottom, right = form.eyes[0].box
+    num_rows, num_columns = form.image_grid
     token_px = torch.tensor([(bottom - top) / num_rows, (right - left) / num_columns]) * TEXT_PX
-    off_px = ((said[:, 1:3] - answers.place_NS2.flatten(0, 1)) * token_px)[is_thing].norm(dim=-1)
+    places = torch.cat([each.place_NS2.flatten(0, 1) for each in spots])[is_here]
+    off_px = ((answers[:, 1:3] - places) * token_px).norm(dim=-1)
     p50, p95 = off_px.quantile(torch.tensor([0.5, 0.95])).tolist()
-    return f"{found:.1%} of their things found, {named:.1%} named rightly, places {p50:.2f} px off (p95 {p95:.2f})"
+    found = (answers[:, 0] > 0).float().mean().item()
+    return f"{found:.1%} found, {p50:.2f} px off (p95 {p95:.2f})"
 
 
 if __name__ == "__main__":

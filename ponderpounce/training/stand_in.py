@@ -7,6 +7,8 @@ here is learned, so the two first stages need not wait for each other. Serving n
 
 Layout of one carrier's H numbers, rms 1: sines, cosines and the value itself of both coordinates, the rest a fixed
 random code of the skill that it asks for: the text without its coordinates, and without what the hand need not know.
+Of more than `MOST_NUMBERS` the others are zero and not asked for: a PONDER may grow, and what POUNCE has learned to
+read stays where it was.
 """
 
 # H hidden size, K carriers
@@ -22,6 +24,9 @@ from numpy.typing import NDArray
 
 from ponderpounce.models.place_code import NUM_PLACE_FEATURES, PLACE_PX, VALUE_SCALE, WAVE_PX, place_features
 from ponderpounce.training.places import PLACE
+
+MOST_NUMBERS = 128
+"""That a stand-in tells anything in."""
 
 _AT = r"( at <>)?"
 _PICK = "pick up the first highlighted cube"
@@ -66,12 +71,13 @@ def stand_in(subgoal: str, size: int, instruction: str = "", onward: str = "") -
     Raises:
         ValueError: ``size`` leaves no room for the text's code.
     """
-    num_code = size - NUM_PLACE_FEATURES
+    num_code = min(size, MOST_NUMBERS) - NUM_PLACE_FEATURES
     if num_code < NUM_PLACE_FEATURES:
         raise ValueError(f"a stand-in of {size} numbers is too small; expected at least {2 * NUM_PLACE_FEATURES}")
     place = PLACE.search(subgoal)
     yx_px = (int(place[1]), int(place[2])) if place else _NOWHERE
-    values = np.concatenate([place_features(yx_px), _skill_code(subgoal, instruction, onward, num_code)])
+    rest = np.zeros(size - NUM_PLACE_FEATURES - num_code, np.float32)
+    values = np.concatenate([place_features(yx_px), _skill_code(subgoal, instruction, onward, num_code), rest])
     values.flags.writeable = False
     return values
 
@@ -99,18 +105,22 @@ def _is_last_swing(text: str, instruction: str) -> bool:
     return swing[1] == (_ORDINAL_OF.get(swings[1]) if swings else "first")
 
 
-def even_weights(size: int) -> NDArray[np.float32]:
-    """How much each number's squared error should count so that a place counts alike in all that tell it, (size,).
+def number_weights(size: int, *, evenly: bool) -> NDArray[np.float32]:
+    """How much each number's squared error counts, (size,); a mean over all is one over those of a stand-in.
 
-    A place 5 px off changes a wave of 16 px by all that it can change, and the plain coordinate by a fifteenth of its
-    spread: left alone, the slow numbers may say another place than the fast ones at next to no loss. What turns once in
-    64 px or less counts once, and nothing more than 64 times.
+    ``evenly``: so that a place counts alike in all that tell it. A place 5 px off changes a wave of 16 px by all that
+    it can change, and the plain coordinate by a fifteenth of its spread: left alone, the slow numbers may say another
+    place than the fast ones at next to no loss. What turns once in 64 px or less counts once, and nothing more than 64
+    times.
     """
-    slopes = 2**0.5 * 2 * np.pi / np.repeat(WAVE_PX, 2)
-    place = np.concatenate([slopes, slopes, np.full(2, VALUE_SCALE / PLACE_PX)])
-    weights = np.ones(size, np.float32)
-    weights[:NUM_PLACE_FEATURES] = np.clip((slopes[WAVE_PX.index(64) * 2] / place) ** 2, 1.0, _MAX_EVEN_WEIGHT)
-    return weights
+    weights = np.zeros(size, np.float32)
+    weights[:MOST_NUMBERS] = 1.0
+    if evenly:
+        slopes = 2**0.5 * 2 * np.pi / np.repeat(WAVE_PX, 2)
+        place = np.concatenate([slopes, slopes, np.full(2, VALUE_SCALE / PLACE_PX)])
+        even = np.clip((slopes[WAVE_PX.index(64) * 2] / place) ** 2, 1.0, _MAX_EVEN_WEIGHT)
+        weights[:NUM_PLACE_FEATURES] = even[:size]
+    return weights * np.float32(size / min(size, MOST_NUMBERS))
 
 
 def _skill_code(subgoal: str, instruction: str, onward: str, size: int) -> NDArray[np.float32]:

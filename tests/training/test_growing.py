@@ -1,4 +1,4 @@
-"""A grown PONDER is the old one, until it learns; and it can."""
+"""A larger PONDER is the old one, until it learns; and it can. POUNCE reads of it what it read before."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from ponderpounce.models import pounce_configs
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
-from ponderpounce.training.growing import grown
+from ponderpounce.models.pounce_checkpoint import random_bundle
+from ponderpounce.training.growing import broadened, grown, reading_more
 
 IDS = [5, 17, 200, 31, 8, 90, 44]
 
@@ -19,8 +21,12 @@ def ponder(num_layers: int = 4) -> Ponder:
 
 
 def hidden(of: Ponder) -> torch.Tensor:
-    positions, _ = of.format.positions(IDS)
-    return of(of.embed(IDS)[None], torch.from_numpy(positions)[:, None])
+    """Of a row with a picture in it."""
+    form = of.format
+    ids = [*IDS, *form.demo(1).ids, *IDS]
+    frames = torch.randint(0, 256, (1, *form.image_px, 3), generator=torch.Generator().manual_seed(1)).byte()
+    positions, _ = form.positions(ids)
+    return of(of.embed(ids, frames)[None], torch.from_numpy(positions)[:, None])
 
 
 @pytest.mark.parametrize("num_new", [1, 2, 4])
@@ -50,3 +56,67 @@ def test_what_is_new_can_learn() -> None:
 def test_there_must_be_layers_to_copy(num_new: int) -> None:
     with pytest.raises(ValueError, match="1 to 4 more"):
         grown(ponder(), num_new)
+
+
+@pytest.mark.parametrize(("times", "ffn_size"), [(1.5, 288), (2.0, 192), (2.0, 500)])
+def test_a_broader_one_thinks_the_same_in_its_first_numbers_and_nothing_in_the_others(
+    times: float, ffn_size: int
+) -> None:
+    old = ponder()
+    size = old.hidden_size
+    new = broadened(old, round(times * size), ffn_size)
+    text = new.qwen.config.text_config
+    assert (text.hidden_size, text.intermediate_size) == (new.hidden_size, ffn_size) == (round(times * size), ffn_size)
+    assert text.num_attention_heads == times * old.qwen.config.text_config.num_attention_heads
+    with torch.no_grad():
+        before, after = hidden(old), hidden(new)
+        torch.testing.assert_close(after[..., :size], before, rtol=1e-3, atol=1e-3)
+        assert not after[..., size:].any()
+        torch.testing.assert_close(new.logits(after), old.logits(before), rtol=1e-3, atol=1e-2)
+    assert old.hidden_size == size
+
+
+def test_new_numbers_heads_and_neurons_learn_from_the_first_step_on() -> None:
+    """Whatever writes into them, or from them: what only reads has nothing to read yet."""
+    old = ponder()
+    new = broadened(old, 2 * old.hidden_size, 2 * old.qwen.config.text_config.intermediate_size)
+    hidden(new)[..., : old.hidden_size].square().sum().backward()
+    writing = [
+        (name, parameter.grad)
+        for name, parameter in new.qwen.named_parameters()
+        if name.endswith(("out_proj.weight", "o_proj.weight", "down_proj.weight"))
+    ]
+    last = f"layers.{new.qwen.config.text_config.num_hidden_layers - 1}."
+    for name, grad in writing:
+        rows, columns = (size // 2 for size in grad.shape)
+        assert grad[:rows, columns:].abs().max() > 0, name  # new heads and neurons, into old numbers
+        if last not in name:
+            assert grad[rows:].abs().max() > 0, name  # into new numbers, which later layers read
+
+
+@pytest.mark.parametrize(
+    ("hidden_size", "ffn_size", "message"),
+    [(48, 192, "at least the 96 numbers"), (96, 100, "192 neurons"), (120, 192, "do not come out even at 120")],
+)
+def test_what_is_smaller_or_uneven_is_refused(hidden_size: int, ffn_size: int, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        broadened(ponder(), hidden_size, ffn_size)
+
+
+def test_pounce_reads_of_a_larger_cognition_what_it_read() -> None:
+    bundle = random_bundle(pounce_configs.tiny_cpu(cognition_size=96), seed=4)
+    more = reading_more(bundle, 144)
+    assert more.model.config.cognition.cognition_size == 144
+    known, other = torch.randn(2, 1, 96), torch.randn(2, 1, 48)
+    ages, is_null = torch.tensor([0, 10**9]), torch.tensor([False, True])
+    prefixes = [
+        each.model.cognition_prefix(cognition, ages, is_null)  # type: ignore[union-attr, operator]
+        for each, cognition in ((bundle, known), (more, torch.cat([known, other], dim=-1)))
+    ]
+    torch.testing.assert_close(*prefixes)
+    rest = {name for name in bundle.model.state_dict() if "cognition_prefix" not in name}
+    assert all(torch.equal(more.model.state_dict()[name], bundle.model.state_dict()[name]) for name in rest)
+    with pytest.raises(ValueError, match="64 would be fewer"):
+        reading_more(bundle, 64)
+    with pytest.raises(ValueError, match="GR00T"):
+        reading_more(random_bundle(pounce_configs.tiny_groot(cognition_size=96), seed=0), 144)

@@ -19,7 +19,7 @@ from ponderpounce.training.collate import collate_ponder
 from ponderpounce.training.example import Example, ExampleConfig, make_example
 from ponderpounce.training.joint import Draws, JointModel, PounceBatch, encode_rows
 from ponderpounce.training.places import PLACE
-from ponderpounce.training.stand_in import even_weights
+from ponderpounce.training.stand_in import number_weights
 from ponderpounce.training.training_episode import TrainingEpisode
 
 PONDER = Ponder.random(replace(tiny_ponder(), image_px=(32, 32), num_layers=4), seed=1)
@@ -109,6 +109,6 @@ def test_evenly_aligned_every_number_counts_with_its_weight() -> None:
     with torch.no_grad():
         (hidden_TH,) = encode_rows(PONDER, batch)
     errors_QH = (hidden_TH[torch.from_numpy(batch.rows[0].carrier_index[:, 0])] - batch.stand_ins[0]).square()
-    expected = (errors_QH * torch.from_numpy(even_weights(SIZE))).mean().item()
+    expected = (errors_QH * torch.from_numpy(number_weights(SIZE, evenly=True))).mean().item()
     assert alignment([example], 1.0, aligns_evenly=True) == pytest.approx(expected, rel=1e-4)
     assert expected > 1.5 * alignment([example], 1.0)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features, wave_columns
-from ponderpounce.training.stand_in import even_weights, skill_of, stand_in
+from ponderpounce.training.stand_in import MOST_NUMBERS, number_weights, skill_of, stand_in, text_code
 
 PIXELS = st.integers(0, 255)
 PICK = "pick up the {nth} highlighted cube at <{y}, {x}>, which is {colour}"
@@ -34,13 +34,25 @@ def test_nearer_places_look_more_alike_and_texts_do_not_move(a: tuple[int, int],
     assert np.array_equal(here, there) == (a == b)
 
 
+@given(y=PIXELS, x=PIXELS, size=st.integers(MOST_NUMBERS, 300))
+def test_a_larger_one_tells_the_same_where_it_did_and_asks_for_no_more(y: int, x: int, size: int) -> None:
+    text = PICK.format(nth="first", y=y, x=x, colour="red")
+    known, larger = stand_in(text, MOST_NUMBERS), stand_in(text, size)
+    np.testing.assert_array_equal(larger[:MOST_NUMBERS], known)
+    assert not larger[MOST_NUMBERS:].any()
+    errors = np.random.default_rng(size).normal(size=size)
+    for evenly in (False, True):
+        meant = (errors[:MOST_NUMBERS] * number_weights(MOST_NUMBERS, evenly=evenly)).mean()
+        assert (errors * number_weights(size, evenly=evenly)).mean() == pytest.approx(meant, rel=1e-5)
+
+
 def test_other_texts_are_nearly_orthogonal() -> None:
     texts = (
         "press the button at <60, 80>",
         "place the cube onto the table",
         PICK.format(nth="first", y=1, x=2, colour=""),
     )
-    codes = np.stack([stand_in(text, 512)[NUM_PLACE_FEATURES:] for text in texts])
+    codes = np.stack([text_code(skill_of(text), 512) for text in texts])
     cosines = np.corrcoef(codes)
     assert np.abs(cosines - np.eye(3)).max() < 0.2
 
@@ -107,7 +119,7 @@ def test_the_swing_after_which_the_cube_is_put_down_is_another_skill(
 def test_what_goes_on_in_another_way_is_told_by_a_like_code() -> None:
     first = "pick up the first highlighted cube at <9, 9>"
     told = (first, "pick up the cube at <9, 9>", "pick up the red cube at <9, 9>")
-    codes = np.stack([stand_in(text, 1024)[NUM_PLACE_FEATURES:] for text in told])
+    codes = np.stack([text_code(skill_of(text), 1024) for text in told])
     likeness = codes @ codes.T / codes.shape[1]
     np.testing.assert_allclose(likeness, [[1, 0.8, 0.8], [0.8, 1, 0.64], [0.8, 0.64, 1]], atol=0.12)
 
@@ -140,7 +152,7 @@ def test_too_small_a_carrier_is_refused() -> None:
 
 @pytest.mark.parametrize(("period_px", "weight"), [(16, 1), (32, 1), (64, 1), (128, 4), (256, 16)])
 def test_evenly_weighed_waves_that_turn_slowly_say_as_much_of_a_small_step(period_px: int, weight: float) -> None:
-    weights = even_weights(40)
+    weights = number_weights(40, evenly=True)
     columns, known = wave_columns(period_px), wave_columns(64)
     assert weights[columns] == pytest.approx(weight, rel=1e-6)
     steps = np.array([place_features((y + 1, x)) - place_features((y, x)) for y in range(0, 256, 5) for x in (0, 99)])
@@ -150,7 +162,7 @@ def test_evenly_weighed_waves_that_turn_slowly_say_as_much_of_a_small_step(perio
 
 
 def test_nothing_counts_more_than_64_times_and_what_tells_no_place_once() -> None:
-    weights = even_weights(40)
+    weights = number_weights(40, evenly=True)
     assert weights.max() == 64
     assert weights[wave_columns(512)].tolist() == [64] * 4
     assert set(weights[NUM_PLACE_FEATURES:]) == {1}
