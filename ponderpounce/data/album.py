@@ -9,7 +9,7 @@ of the dataset is a page of such rows, so it is read, stored and looked at like 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +25,7 @@ from ponderpounce.data.episode import About, EpisodeWriter, Row, unpack
 from ponderpounce.data.errors import DatasetError
 from ponderpounce.data.lerobot_v3 import INFO_PATH, DatasetWriter
 from ponderpounce.data.video import Frame
+from ponderpounce.tasks import demonstration
 from ponderpounce.tasks.captions import Pixel
 from ponderpounce.tasks.difficulty import DIFFICULTIES, Difficulty
 from ponderpounce.tasks.environment import IMAGE_PX
@@ -42,6 +43,7 @@ INSTRUCTION = "tell what you see, and where"
 SEPARATOR = ", "
 
 _PAGE = 100
+_OF_ONE_DEMONSTRATION = 10
 _POSES = 1  # a seed's stream of random numbers, beside the layout's
 _STEPS = (0, 50)  # of an episode: some things are only shown for a while
 _MIN_PIXELS = 8  # less of a thing is not seen
@@ -49,6 +51,7 @@ _TOOL_LOW_M, _TOOL_HIGH_M = (-0.32, -0.3, 0.02), (0.12, 0.3, 0.3)
 _HELD_SHARE, _HOME_SHARE = 0.25, 0.15
 _LIFTED_M = 0.06
 _TRIES = 20
+_NEXT_DRAW = 1_000_003  # of a scene that cannot be acted out
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,6 +65,8 @@ class AlbumOptions:
     """Rounded up to whole pages of 100."""
     seed: int = 3_000_000
     """The first scene's; episodes of these seeds should not be evaluated."""
+    demonstrated: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Instants of demonstrations in place of scenes that stand still."""
     image_px: int = IMAGE_PX
     progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
     """Show a progress bar."""
@@ -83,7 +88,7 @@ def make_album(options: AlbumOptions) -> None:
 
     Raises:
         DatasetError: there is a dataset already.
-        TaskError: no such task, or one that does not name its things.
+        TaskError: no such task, or one that does not name its things, or demonstrates nothing.
         OSError: a full disk.
     """
     if (options.out / INFO_PATH).exists():
@@ -94,7 +99,11 @@ def make_album(options: AlbumOptions) -> None:
             first_seed = options.seed + page * _PAGE
             rows = EpisodeWriter(options.image_px)
             for seed in range(first_seed, first_seed + _PAGE):
-                rows.add(*studio.picture(seed))
+                if not options.demonstrated:
+                    rows.add(*studio.picture(seed))
+                elif seed % _OF_ONE_DEMONSTRATION == 0:
+                    for row, frames in studio.demonstrated(seed, _OF_ONE_DEMONSTRATION):
+                        rows.add(row, frames)
             about = About(
                 task=options.task,
                 instruction=INSTRUCTION,
@@ -138,7 +147,31 @@ class Studio:
         things = self.task.things(layout, step, memory)
         # what is highlighted lies where it lies
         self.pose_tool(rng, [thing.body for thing in things if thing.is_movable] if step == 0 else [])
-        row = Row(
+        return self._row(things), self.frames()
+
+    def demonstrated(self, seed: int, count: int) -> Iterator[tuple[Row, dict[str, Frame]]]:
+        """So many instants of the demonstration of one scene, in order; equal seeds give equal ones.
+
+        Raises TaskError if the task demonstrates nothing.
+        """
+        rng, task, physics = np.random.default_rng([seed, _POSES]), self.task, self.physics
+        for tries_left in reversed(range(_TRIES)):
+            layout, _ = self.arranged(seed + _NEXT_DRAW * (_TRIES - 1 - tries_left))
+            try:
+                video, _ = demonstration.perform(task, layout, task.demonstration(layout), physics, lambda part: None)
+                break
+            except UnreachableError:  # as an environment, which draws again
+                if tries_left == 0:
+                    raise
+        if not video:
+            raise TaskError(f"task {task.name!r} demonstrates nothing; leave --demonstrated out")
+        for step in np.sort(rng.permutation(len(video))[:count]).tolist():
+            physics.load(video[step].physics)
+            yield self._row(task.things(layout, step, video[step].memory)), self.frames()
+
+    def _row(self, things: Sequence[Thing]) -> Row:
+        physics = self.physics
+        return Row(
             state=physics.state().astype(np.float32),
             action=physics.command().astype(np.float32),
             tcp_pose=self.tcp_pose(),
@@ -146,7 +179,6 @@ class Studio:
             grounded_subgoal=told(physics, things),
             is_transition=True,
         )
-        return row, self.frames()
 
     def arranged(self, seed: int) -> tuple[Any, Difficulty]:
         """Puts up the scene of a seed; returns its layout and how difficult it is."""

@@ -29,6 +29,8 @@ class Row:
 
     physics: PhysicsState
     caption: Caption
+    memory: Any
+    """The task's, of what has happened by then."""
 
 
 def perform(
@@ -53,7 +55,7 @@ def perform(
             memory = task.remember(memory, physics, layout)
             if part.is_recorded:
                 caption = captions.follow(caption, index, part.text, partial(look, part))
-                rows.append(Row(physics=physics.save(), caption=caption))
+                rows.append(Row(physics=physics.save(), caption=caption, memory=memory))
         if part.afterwards is not None:
             part.afterwards(physics)
             physics.refresh()

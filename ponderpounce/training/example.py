@@ -47,6 +47,9 @@ from ponderpounce.training.training_episode import Frame, TrainingEpisode
 _SILENCE = repeat(Words())
 _RECALLING = 2  # queries
 _CORRECTED = 0.3  # of own words, at every query
+_SHARES = (
+    "text_dropout", "slips", "tells_onward", "cuts_short", "recalls", "own_words", "misjudges", "even_clocks",
+)  # fmt: skip
 _MOVED_PX = 3.0  # of a 256 px picture: farther than PONDER errs where nothing moves
 
 
@@ -70,6 +73,9 @@ class ExampleConfig:
     """How an episode becomes a training example."""
 
     clocks: Clocks
+    even_clocks: float = 0.0
+    """Share of rows whose clocks run without spread, as in evaluation: where a second look tells a speed, all that
+    follows is then told by counting looks."""
     max_invocations: int = 16
     """Of those that the schedule has, so many are drawn: they cost most."""
     event_weight: float = 1.0
@@ -148,7 +154,7 @@ class ExampleConfig:
                 f"retold_px {self.retold_px} must be above 0, and slips 0, came {self.slips}: a row whose words all "
                 "slip never puts them right; let them slip in `Lapses.slipped`"
             )
-        for name in ("text_dropout", "slips", "tells_onward", "cuts_short", "recalls", "own_words", "misjudges"):
+        for name in _SHARES:
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be in [0, 1], came {getattr(self, name)}")
 
@@ -267,7 +273,9 @@ def make_example(
     episode = episode.with_plans() if config.has_plans else episode
     episode = episode if config.has_reasoning else replace(episode, reasoning="")
     episode = replace(episode, reasoning=narration(episode.demo_subgoals)) if config.narrates else episode
-    schedule = sample_schedule(rng, config.clocks, episode.num_ticks, transition_ticks=episode.transition_ticks)
+    is_even = config.even_clocks and rng.random() < config.even_clocks
+    clocks = config.clocks.without_spread() if is_even else config.clocks
+    schedule = sample_schedule(rng, clocks, episode.num_ticks, transition_ticks=episode.transition_ticks)
     schedule = _shortened(schedule, config.max_queries)
     if config.recalls and episode.demo and rng.random() < config.recalls:
         schedule = _shortened(schedule, _RECALLING)

@@ -53,6 +53,7 @@ _PLACE_WEIGHT, _TOLD_WEIGHT, _NAME_WEIGHT = 16.0, 0.5, 0.3
 _NUM_ASKED = 3 + NUM_PLACE_FEATURES  # of a thing, and of the tool: is it here, and where in two ways
 _NUM_ANSWERS = 2 * _NUM_ASKED  # beside names
 _SETTLING_RATE = 1e-2
+_SETTLING_STREAM = 1  # of a step's random numbers
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -147,28 +148,26 @@ def see_things(options: SeeOptions) -> None:
     with (options.out / "log.jsonl").open("w") as log:
         settling = _phase(answering, options.settling, _SETTLING_RATE)
         opening = _phase(nn.ModuleList([ponder.qwen.model.visual, answering]), options.steps, options.learning_rate)
-        bar = tqdm(total=options.settling + options.steps, unit="step", disable=not options.progress)
-        with bar:
-            for phase, (optimiser, num_steps) in enumerate((settling, opening)):
-                for step in range(num_steps):
-                    rng = np.random.default_rng([options.seed, step] if phase else [options.seed, step, phase])
-                    chosen = rng.integers(num_learned, size=options.pictures)
-                    frames_NHW3, answers = draw(album, chosen, ponder.format, rng)
-                    with torch.set_grad_enabled(bool(phase)):
-                        tokens = ponder.image_features(frames_NHW3)
-                    loss = loss_of(answering(tokens), answers)
-                    loss.backward()  # type: ignore[no-untyped-call]
-                    optimiser.update(step)
-                    log.write(json.dumps({"step": bar.n - options.settling, "loss": loss.item()}) + "\n")
-                    bar.update()
+        for step in tqdm(range(-options.settling, options.steps), unit="step", disable=not options.progress):
+            is_opening = step >= 0
+            rng = np.random.default_rng([options.seed, step] if is_opening else [options.seed, -step, _SETTLING_STREAM])
+            chosen = rng.integers(num_learned, size=options.pictures)
+            frames_NHW3, answers = draw(album, chosen, ponder.format, rng)
+            with torch.set_grad_enabled(is_opening):
+                tokens = ponder.image_features(frames_NHW3)
+            loss = loss_of(answering(tokens), answers)
+            loss.backward()  # type: ignore[no-untyped-call]
+            optimiser, done = (opening, step) if is_opening else (settling, step + options.settling)
+            optimiser.update(done)
+            log.write(json.dumps({"step": step, "loss": loss.item()}) + "\n")
     held_out = np.arange(num_learned, len(album.texts))
     sys.stdout.write(f"{num_held_out} pictures held out: {examine(ponder, answering, album, held_out)}\n")
     save_ponder(ponder, options.out / "ponder")
 
 
-def _phase(learning: nn.Module, num_steps: int, rate: float) -> tuple[Optimiser, int]:
+def _phase(learning: nn.Module, num_steps: int, rate: float) -> Optimiser:
     decay = (num_steps // 2, max(num_steps, 1))
-    return Optimiser(learning, OptimConfig(learning_rate=rate, weight_decay=1e-4, decay=decay)), num_steps
+    return Optimiser(learning, OptimConfig(learning_rate=rate, weight_decay=1e-4, decay=decay))
 
 
 def _newborn(options: SeeOptions) -> Ponder:

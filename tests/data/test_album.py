@@ -79,6 +79,20 @@ def test_other_tasks_name_their_things(task: str) -> None:
     assert names == NAMED[task]
 
 
+def test_demonstrations_are_pictured_while_they_last(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With what they leave behind: a target turns red where the stick is, and the stick is told of by its pose."""
+    with closing(Studio("PatternLock", 256)) as studio:
+        rows = [row for row, _ in studio.demonstrated(20, 10)]
+        again = [row.grounded_subgoal for row, _ in studio.demonstrated(20, 10)]
+        assert [row.grounded_subgoal for row in rows] == again
+        reds = {place for row in rows for place in re.findall(r"red target at <(\d+, \d+)>", row.grounded_subgoal)}
+        assert len(reds) > 1
+        assert len({tuple(row.tcp_pose.tolist()) for row in rows}) == len(rows)
+    arguments = ["--out", str(tmp_path / "album"), "--image-px", "128", "--no-progress", "--demonstrated"]
+    assert main([*arguments, "--task", "PickXtimes", "--pictures", "1"]) == REFUSED
+    assert "demonstrates nothing" in capsys.readouterr().err
+
+
 def test_equal_seeds_are_equal_pictures_whatever_was_drawn_before(studio: Studio) -> None:
     row, frames = studio.picture(5)
     studio.picture(8)

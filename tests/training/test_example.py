@@ -319,6 +319,16 @@ def test_a_stand_in_can_tell_where_it_goes_on() -> None:
         ExampleConfig(clocks=EVALUATION, tells_onward=1.5)
 
 
+def test_of_a_share_of_rows_clocks_run_evenly() -> None:
+    recorded = episode(300)
+    served = [q.tick for q in sample_schedule(np.random.default_rng(0), EVALUATION, 300).queries]
+    for share in (0.0, 0.5, 1.0):
+        config = ExampleConfig(clocks=ROBOMME, even_clocks=share)
+        drawn = [make_example(recorded, FORM, config, np.random.default_rng(seed)) for seed in range(40)]
+        even = [[query.tick for query in each.schedule.queries] == served for each in drawn]
+        assert abs(np.mean(even) - share) < (0.2 if share == 0.5 else 1e-9)
+
+
 def test_reasoning_can_be_left_unwritten() -> None:
     recorded = replace(episode(60, changes=(0,)), reasoning="the red one was under the left one")
     written, left_out = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -31,25 +32,31 @@ TOP_PX, LEFT_PX, SIDE_PX, TOKEN_PX = 8, 64, 128, 32
     name=st.sampled_from(NAMES),
 )
 def test_the_answer_says_the_place_again(y: int, x: int, name: str) -> None:
-    answers = answers_of([f"{name} at <{y}, {x}>", ""], NAMES, FORM)
+    place = f"<{y}, {x}>"
+    answers = answers_of([f"{name} at {place}", ""], ["", place], NAMES, FORM)
     is_in_sight = TOP_PX <= y < TOP_PX + SIDE_PX and LEFT_PX <= x < LEFT_PX + SIDE_PX
-    assert answers.is_thing_NS.sum(dim=1).tolist() == [is_in_sight, 0]
-    if is_in_sight:
-        (token,) = answers.is_thing_NS[0].nonzero().flatten().tolist()
-        down, along = answers.place_NS2[0, token].tolist()
+    assert answers.things.is_here_NS.sum(dim=1).tolist() == [is_in_sight, 0]
+    assert answers.tool.is_here_NS.sum(dim=1).tolist() == [0, is_in_sight]
+    for picture, spots in enumerate((answers.things, answers.tool)) if is_in_sight else ():
+        (token,) = spots.is_here_NS[picture].nonzero().flatten().tolist()
+        down, along = spots.place_NS2[picture, token].tolist()
         assert y == pytest.approx(TOP_PX + (token // 4 + 0.5 + down) * TOKEN_PX, abs=1e-3)
         assert x == pytest.approx(LEFT_PX + (token % 4 + 0.5 + along) * TOKEN_PX, abs=1e-3)
         assert NAMES[int(answers.name_NS[0, token])] == name
-        assert answers.told_NSP[0, token].tolist() == place_features((y, x)).tolist()
+        assert spots.told_NSP[picture, token].tolist() == place_features((y, x)).tolist()
 
 
 def test_pictures_and_answers_move_together() -> None:
     picture = np.zeros((1, 64, 64, 3), np.uint8)
     picture[0, 30, 20] = 255
-    seen = Album(pictures=picture, texts=(f"red cube at <{TOP_PX + 61}, {LEFT_PX + 41}>",), names=NAMES)
+    place = f"<{TOP_PX + 61}, {LEFT_PX + 41}>"
+    seen = Album(pictures=picture, texts=(f"red cube at {place}",), tools=(place,), names=NAMES)
     frames, answers = draw(seen, np.zeros(40, np.int64), FORM, np.random.default_rng(0))
+    things = answers.things
+    assert torch.equal(things.is_here_NS, answers.tool.is_here_NS)
+    assert torch.equal(things.place_NS2, answers.tool.place_NS2)
     assert len({tuple(place.tolist()) for place in frames[..., 0].nonzero()[:, 1:]}) > 20
-    for frame, is_thing_S, place_S2 in zip(frames, answers.is_thing_NS, answers.place_NS2, strict=True):
+    for frame, is_thing_S, place_S2 in zip(frames, things.is_here_NS, things.place_NS2, strict=True):
         ((down, along),) = frame[..., 0].nonzero().tolist()
         (token,) = is_thing_S.nonzero().flatten().tolist()
         told = [(token // 4 + 0.5 + place_S2[token, 0]) * 16, (token % 4 + 0.5 + place_S2[token, 1]) * 16]
@@ -57,18 +64,25 @@ def test_pictures_and_answers_move_together() -> None:
 
 
 def test_the_loss_is_least_where_everything_is_answered_rightly() -> None:
-    answers = answers_of(["red cube at <40, 90>, button at <70, 120>"], NAMES, FORM)
-    said = torch.full((16, 3 + NUM_PLACE_FEATURES + len(NAMES)), -20.0)
-    for token in answers.is_thing_NS[0].nonzero().flatten().tolist():
-        said[token, 0] = 20
-        said[token, 1:3] = answers.place_NS2[0, token]
-        said[token, 3 : 3 + NUM_PLACE_FEATURES] = answers.told_NSP[0, token]
-        said[token, 3 + NUM_PLACE_FEATURES + int(answers.name_NS[0, token])] = 20
+    answers = answers_of(["red cube at <40, 90>, button at <70, 120>"], ["<41, 150>"], NAMES, FORM)
+    one = 3 + NUM_PLACE_FEATURES
+    said = torch.full((16, 2 * one + len(NAMES)), -20.0)
+    for first, spots in ((0, answers.things), (one, answers.tool)):
+        for token in spots.is_here_NS[0].nonzero().flatten().tolist():
+            said[token, first] = 20
+            said[token, first + 1 : first + 3] = spots.place_NS2[0, token]
+            said[token, first + 3 : first + one] = spots.told_NSP[0, token]
+    for token in answers.things.is_here_NS[0].nonzero().flatten().tolist():
+        said[token, 2 * one + int(answers.name_NS[0, token])] = 20
     assert loss_of(said, answers) < 1e-6
-    for column in (0, 1, 2, 3, 2 + NUM_PLACE_FEATURES):
-        worse = said.clone()
-        worse[answers.is_thing_NS[0], column] -= 30
-        assert loss_of(worse, answers) > 1
+    for first, spots in ((0, answers.things), (one, answers.tool)):
+        for column in (0, 1, 2, 3, 2 + NUM_PLACE_FEATURES):
+            worse = said.clone()
+            worse[spots.is_here_NS[0], first + column] -= 30
+            assert loss_of(worse, answers) > 0.5
+    nobody_asks = answers_of(["red cube at <40, 90>, button at <70, 120>"], [""], NAMES, FORM)
+    said[:, one : 2 * one] = 30.0
+    assert loss_of(said, nobody_asks) < 1e-6
 
 
 def test_the_tower_learns_and_nothing_else_moves(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -88,7 +102,13 @@ def test_the_tower_learns_and_nothing_else_moves(tmp_path: Path, capsys: pytest.
     assert main(arguments) == REFUSED
     assert "another --out" in capsys.readouterr().err
     again = [*arguments[:-1], str(tmp_path / "again"), "--ponder", str(out / "ponder"), "--steps", "3"]
-    assert main([*again, "--pictures", "32", "--no-progress"]) == 0
+    assert main([*again, "--settling", "5", "--pictures", "32", "--no-progress"]) == 0
+    steps = [json.loads(line)["step"] for line in (tmp_path / "again" / "log.jsonl").read_text().splitlines()]
+    assert steps == [*range(-5, 3)]
+    only = [*arguments[:-1], str(tmp_path / "only"), "--ponder", str(out / "ponder"), "--steps", "0"]
+    assert main([*only, "--settling", "4", "--pictures", "32", "--no-progress"]) == 0
+    untouched = load_ponder(tmp_path / "only" / "ponder").qwen.state_dict()
+    assert all(torch.equal(untouched[name], weight) for name, weight in seeing.qwen.state_dict().items())
     reopened = load_ponder(tmp_path / "again" / "ponder")
     once = dict(seeing.qwen.named_parameters())
     moved = {name for name, weight in reopened.qwen.named_parameters() if not torch.equal(weight, once[name])}
