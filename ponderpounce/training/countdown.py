@@ -25,7 +25,8 @@ from ponderpounce.training.lapses import Words
 from ponderpounce.training.places import PLACE
 
 _WAITING = re.compile(r"^remain static$| to prepare$")
-_LONGEST = PLACE_PX - 1
+LONGEST = PLACE_PX - 1
+"""Wait that can be told as a place, in control steps."""
 _PASSES = re.compile(r"just as it reaches the target for the (\w+) time")
 _MISJUDGED = (0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0)
 
@@ -142,4 +143,4 @@ def rhythm(instruction: str, subgoals: Sequence[str]) -> int | None:
 
 def as_place(wait: int) -> str:
     """The wait as a place."""
-    return f"<0, {min(wait, _LONGEST)}>"
+    return f"<0, {min(wait, LONGEST)}>"

@@ -36,10 +36,10 @@ from ponderpounce.training.cut_short import Cut, cuts
 from ponderpounce.training.deeds import narration
 from ponderpounce.training.events import EVENT_ROWS, draw_near, event_ticks
 from ponderpounce.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses, has_moved, without_lapses
-from ponderpounce.training.notes import in_sight, misnoted, noted, with_notes
+from ponderpounce.training.notes import heeded, in_sight, misnoted, noted, with_notes
 from ponderpounce.training.nudge import NO_NUDGE, Nudge, draw_nudges
 from ponderpounce.training.own_words import own_words
-from ponderpounce.training.place_lessons import PlaceLessons, place_lessons
+from ponderpounce.training.place_lessons import PlaceLessons, comes_by, place_lessons
 from ponderpounce.training.places import PLACE, misplaced
 from ponderpounce.training.stand_in import stand_in
 from ponderpounce.training.training_episode import Frame, TrainingEpisode
@@ -49,6 +49,7 @@ _RECALLING = 2  # queries
 _CORRECTED = 0.3  # of own words, at every query
 _SHARES = (
     "text_dropout", "slips", "tells_onward", "cuts_short", "recalls", "own_words", "misjudges", "even_clocks",
+    "learned_repeats",
 )  # fmt: skip
 _MOVED_PX = 3.0  # of a 256 px picture: farther than PONDER errs where nothing moves
 
@@ -119,6 +120,8 @@ class ExampleConfig:
     takes_notes: bool = False
     """What moves by itself is written down at every look (`notes`); a PONDER that learns it is served so. Waits are
     then told among the notes, and ``counts_down`` tells no others."""
+    learned_repeats: float = 1.0
+    """Of notes that repeat the one before, the share that is learned (`notes.heeded`)."""
     retold_px: float | None = None
     """Words are said again once the place that they told is farther than that from its thing; None: never."""
 
@@ -175,6 +178,8 @@ class Example:
     """Of every query; None: those of the recording."""
     notes: tuple[str, ...] = ()
     """Of every query, subgoal and notes (`notes.noted`), ``""`` for none; () where none are taken."""
+    heeded_demo: tuple[bool, ...] | None = None
+    """Which notes of the demonstration are learned (`notes.heeded`); None: all."""
     onward: tuple[str, ...] | None = None
     """Of every query, the place that its stand-in tells besides (`TrainingEpisode.next_places`); None: of none."""
     nudge: Nudge = NO_NUDGE
@@ -191,6 +196,7 @@ class Example:
             view=self.view,
             slip=self.slip,
             words=self.words,
+            heeded_demo=self.heeded_demo,
         )
         return replace(row, targets=(IGNORE,) * len(row.targets)) if self.episode.is_told else row
 
@@ -254,8 +260,7 @@ class Example:
         tools = [self.view.text(text) for text in episode.demo_tools]
         steps = rhythm(episode.instruction, episode.subgoals)
         rhythms = [
-            "" if steps is None or 2 * query.tick < steps else f"comes by every {steps} steps"
-            for query in self.schedule.queries
+            "" if steps is None or 2 * query.tick < steps else comes_by(steps) for query in self.schedule.queries
         ]
         return place_lessons(row, texts, self.form.vocabulary, size, demonstrated, tools, rhythms)
 
@@ -315,7 +320,7 @@ def make_example(
             if config.misjudges and rng.random() < config.misjudges:
                 wrong_Q = misnoted(episode.instruction, episode.subgoals, seen, ticks, rng)
             words = without_lapses(*_subgoals(episode, schedule)) if words is None else words
-            words = with_notes(words, notes, wrong_Q)
+            words = with_notes(words, notes, wrong_Q, heeded(notes, config.learned_repeats, rng))
         elif config.counts_down and any(left := waits(episode.subgoals)):
             subgoals, is_change = _subgoals(episode, schedule)
             words = without_lapses(subgoals, is_change) if words is None else words
@@ -324,6 +329,10 @@ def make_example(
             left_Q = [left[tick] for tick in ticks]
             is_wrong = config.misjudges and rng.random() < config.misjudges
             words = counted(words, told, left_Q, misjudged(ticks, told, left_Q, rng) if is_wrong else None)
+    heeded_demo = None
+    if config.learned_repeats < 1 and form.takes_notes and episode.demo_notes:
+        seen = [in_sight(note, form.eyes) for note in episode.demo_notes]
+        heeded_demo = tuple(heeded(seen, config.learned_repeats, rng))
     is_moved = config.augments == "all" or episode.is_watched
     view = draw_view(config.augmentation if is_moved else NOT_AUGMENTED, form, set(episode.subgoals), rng)
     onward = None
@@ -348,6 +357,7 @@ def make_example(
         slip=slip,
         words=words,
         notes=notes,
+        heeded_demo=heeded_demo,
         onward=onward,
         nudge=config.nudge,
         nudges_I2=nudges_I2,
@@ -381,10 +391,12 @@ def episode_row(
     view: View = AS_IT_IS,
     slip: Slip | None = None,
     words: Sequence[Words] | None = None,
+    heeded_demo: Sequence[bool] | None = None,
 ) -> Row:
     """The tokens of the episode. The first transition of a demonstration episode begins with its reasoning.
 
-    ``words`` are those of every query, if not those of the recording.
+    ``words`` are those of every query, if not those of the recording; ``heeded_demo``: which of the demonstration's
+    notes are learned, if not all.
     """
     if words is None:
         words = without_lapses(*_subgoals(episode, schedule))
@@ -396,9 +408,10 @@ def episode_row(
     notes: list[Transition | None] | None = None
     if form.takes_notes and is_grounded:
         written = [in_sight(note, eyes) for note in episode.demo_notes or ("",) * len(episode.demo)]
+        heeded_D = [True] * len(written) if heeded_demo is None else heeded_demo
         notes = [
-            Transition(subgoal=encode(normalised_text(say(note))), is_learned=is_learned) if note else None
-            for note in written
+            Transition(subgoal=encode(normalised_text(say(note))), is_learned=is_learned and learns) if note else None
+            for note, learns in zip(written, heeded_D, strict=True)
         ]
     segments = list(form.opening(episode.instruction, [len(views) for views in episode.demo], notes))
     reasoning = encode(normalised_text(say(episode.reasoning))) if episode.reasoning else None

@@ -19,6 +19,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from importlib.util import find_spec
+from itertools import pairwise
 
 import numpy as np
 
@@ -167,9 +168,23 @@ def misnoted(
     return found
 
 
-def with_notes(words: Sequence[Words], notes_Q: Sequence[str], wrong_Q: Sequence[str]) -> tuple[Words, ...]:
-    """The words of Q queries, with a note wherever there is one; where there is a wrong one it is not to be learned."""
-    return tuple(
-        Words(text=wrong, is_due=True, is_learned=False) if wrong else Words(text=note, is_due=True) if note else each
-        for each, note, wrong in zip(words, notes_Q, wrong_Q, strict=True)
-    )
+def heeded(notes: Sequence[str], share: float, rng: np.random.Generator) -> list[bool]:
+    """Whether each note is learned: all that tell anything new, and a ``share`` of those that repeat the one before.
+
+    Most notes repeat it, are nearly always right and outweigh the ones in which something moved.
+    """
+    drawn = (rng.random(len(notes)) < share).tolist()
+    return [now != before or is_drawn for (before, now), is_drawn in zip(pairwise(["", *notes]), drawn, strict=True)]
+
+
+def with_notes(
+    words: Sequence[Words], notes_Q: Sequence[str], wrong_Q: Sequence[str], heeded_Q: Sequence[bool]
+) -> tuple[Words, ...]:
+    """The words of Q queries, with a note wherever there is one; where there is a wrong one it is not to be learned,
+    nor where it is not `heeded`."""
+    found = []
+    for each, note, wrong, is_heeded in zip(words, notes_Q, wrong_Q, heeded_Q, strict=True):
+        if wrong or note:
+            each = Words(text=wrong or note, is_due=True, is_learned=is_heeded and not wrong)
+        found.append(each)
+    return tuple(found)

@@ -7,7 +7,8 @@ faster. So hidden states are asked for places in that form (`place_features`) wh
 - at the end of every observation, for all places that the words in force name, one after the other in the first
   numbers: what is to be said, and later read, whether or not it is said now;
 - at every token before one of a coordinate's, for the place that is being told;
-- at the end of every observation, for the rhythm in which something comes by (`countdown.rhythm`).
+- at the end of every observation, for the rhythm in which something comes by (`countdown.rhythm`), and at every token
+  before one of its number's, or of the number of steps that are left (`notes`), for that.
 
 - at the end of every picture of a demonstration, for what is being done (`deeds`): where, where the deed before was,
   and codes of which it is and for which time. What was done second is asked for once, a minute later; nothing else
@@ -33,6 +34,7 @@ from torch import Tensor
 from ponderpounce.models.context import IGNORE, Row
 from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features
 from ponderpounce.models.vocabulary import Vocabulary
+from ponderpounce.training.countdown import LONGEST
 from ponderpounce.training.deeds import deeds, passing_side
 from ponderpounce.training.places import PLACE, TEXT_PX, WAY
 from ponderpounce.training.stand_in import text_code
@@ -41,6 +43,7 @@ _Lesson = tuple[int, int, NDArray[np.float32]]
 """Position in the row, slot, the P numbers that should be there."""
 
 _TOLD = re.compile(r"\[(\d+), (\d+)\]")  # x, y in thousandths
+_PACED = re.compile(r"(?<=[\]a-z]), (\d+), (\d+)")  # the rhythm, and the steps that are left
 _FULL = 1000
 
 
@@ -83,7 +86,7 @@ def place_lessons(
         *_seen_going(row, demonstrated, tools, vocabulary, num_slots),
         *_in_mind(row, texts_Q, num_slots),
         *_coming_by(row, rhythms_Q, num_slots),
-        *_being_told(row, vocabulary),
+        *_being_told(row, vocabulary, num_slots),
     ]
     features = [numbers for _, _, numbers in found]
     return PlaceLessons(
@@ -130,20 +133,37 @@ def _in_mind(row: Row, texts_Q: Sequence[str], num_slots: int) -> Iterator[_Less
 
 
 def _coming_by(row: Row, rhythms_Q: Sequence[str], num_slots: int) -> Iterator[_Lesson]:
-    """The last slot, where there is more than one."""
     for index, text in zip(row.gate_index.tolist(), rhythms_Q, strict=False):
-        if text and num_slots > 1:
-            yield index, num_slots - 1, text_code(text, NUM_PLACE_FEATURES)
+        if text:
+            yield from _rhythm(index, text, num_slots)
 
 
-def _being_told(row: Row, vocabulary: Vocabulary) -> Iterator[_Lesson]:
+def comes_by(steps: int) -> str:
+    """A rhythm in words that stand nowhere else."""
+    return f"comes by every {steps} steps"
+
+
+def _rhythm(index: int, text: str, num_slots: int) -> Iterator[_Lesson]:
+    """The last slot, where there is more than one."""
+    if num_slots > 1:
+        yield index, num_slots - 1, text_code(text, NUM_PLACE_FEATURES)
+
+
+def _being_told(row: Row, vocabulary: Vocabulary, num_slots: int) -> Iterator[_Lesson]:
     """Of the words that are learned: what slipped is not to be kept in mind."""
     positions = np.flatnonzero(np.asarray(row.targets) != IGNORE)
     pieces = {id_: vocabulary.decode([id_]) for id_ in {row.targets[position] for position in positions}}
     for run in np.split(positions, np.flatnonzero(np.diff(positions) > 1) + 1):
         spelled = [pieces[row.targets[position]] for position in run]
         begins = np.cumsum([0, *map(len, spelled)])[:-1]
-        for told in _TOLD.finditer("".join(spelled)):
+        said = "".join(spelled)
+        for told in _TOLD.finditer(said):
             x, y = (int(value) * TEXT_PX / _FULL for value in told.groups())
             for position in run[(begins >= told.start(1)) & (begins < told.end(2))].tolist():
                 yield position - 1, 0, place_features((y, x))
+        for told in _PACED.finditer(said):
+            for position in run[(begins >= told.start(1)) & (begins < told.end(1))].tolist():
+                yield from _rhythm(position - 1, comes_by(int(told[1])), num_slots)
+            for position in run[(begins >= told.start(2)) & (begins < told.end(2))].tolist():
+                wait = int(told[2])  # as cognition tells it, and coarsely, for longer ones
+                yield position - 1, 0, place_features((min(wait / 4, LONGEST), min(wait, LONGEST)))

@@ -210,3 +210,20 @@ def small_noting() -> Curriculum:
         num_steps=2000,
     )
     return Curriculum(name="small_noting", stages=(settling,))
+
+
+def small_counting() -> Curriculum:
+    """The PONDER of `small_noting` is asked for pace and count, mostly under the clocks that it will be served with.
+
+    A trial: docs/training.md, "Counts".
+    """
+    (settling,) = small_noting().stages
+    settling = replace(
+        settling,
+        name="small_counting/settling",
+        example=replace(settling.example, even_clocks=0.6, misjudges=0.3, learned_repeats=0.3),
+        train=TrainConfig(seed=14, optim=replace(_TURNING, warmup_steps=100, decay=(400, 1000))),
+        num_steps=1000,
+        batch_episodes=8,
+    )
+    return Curriculum(name="small_counting", stages=(settling,))

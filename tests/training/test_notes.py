@@ -15,21 +15,26 @@ from hypothesis import strategies as st
 from clock.sampling import EVALUATION
 from ponderpounce.models.context import IGNORE, Row
 from ponderpounce.models.eyes import Eye
-from ponderpounce.models.place_code import place_features
+from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.tasks.counting.stop_cube import StopCube
 from ponderpounce.tasks.environment import make_environment
 from ponderpounce.tasks.front_view import front_pixels
 from ponderpounce.tasks.paces import PASS_STEPS
 from ponderpounce.training.example import ExampleConfig, Slip, make_example
-from ponderpounce.training.notes import demo_notes, in_sight, misnoted, moving_places, noted
+from ponderpounce.training.notes import demo_notes, heeded, in_sight, misnoted, moving_places, noted
 from ponderpounce.training.places import PLACE, TEXT_PX
+from ponderpounce.training.stand_in import text_code
 from ponderpounce.training.training_episode import TrainingEpisode
 from tests.training.test_countdown import FORM, HOVER, PRESS, STILL, waiting_episode
 
 ASKED = "press the button to stop the cube just as it reaches the target for the third time"
 TEXTS = [HOVER] * 30 + [STILL] * 240 + [PRESS] * 30  # it comes by every 120 steps
 MOVING = [f"<{50 + tick // 5}, 100>" for tick in range(len(TEXTS))]
+
+
+def _rng() -> np.random.Generator:
+    return np.random.default_rng(0)
 
 
 def running_episode() -> TrainingEpisode:
@@ -222,6 +227,63 @@ def test_places_in_mind_are_those_that_notes_tell() -> None:
     np.testing.assert_array_equal(lessons.features_MP[is_there][0], place_features((int(y), int(x))))
 
 
+def test_while_pace_and_count_are_told_they_are_in_mind() -> None:
+    example = make_example(running_episode(), FORM, ExampleConfig(clocks=EVALUATION, takes_notes=True), _rng())
+    row = example.row()
+    lessons = example.place_lessons(row, 4 * NUM_PLACE_FEATURES)
+    told = {
+        (index, first): features
+        for index, first, features in zip(
+            lessons.index_M.tolist(), lessons.first_M.tolist(), lessons.features_MP.numpy(), strict=True
+        )
+    }
+    last = 3 * NUM_PLACE_FEATURES
+    found = 0
+    for gate, note in zip(row.gate_index.tolist(), example.notes, strict=True):
+        if len(numbers(note)) < 2:
+            continue
+        pace, wait = numbers(note)[-2:]
+        end = gate + 1 + len(FORM.vocabulary.encode(normalised_text(note)))  # its last digit; T_yes stands before
+        digits = len(FORM.vocabulary.encode(str(wait)))
+        for index in range(end - digits, end):
+            as_told = place_features((min(wait / 4, 255), min(wait, 255)))
+            np.testing.assert_array_equal(told[index, 0], as_told)
+        assert (end - digits - 1, 0) not in told, "the comma leads to no number"
+        before = end - digits - 2  # the last digit of the pace is said there
+        np.testing.assert_array_equal(told[before - 1, last], text_code(f"comes by every {pace} steps", 26))
+        found += 1
+    assert found > 5
+
+
+def test_notes_that_repeat_the_one_before_are_learned_now_and_then() -> None:
+    notes = ["<1, 2>", "<1, 2>", "", "<1, 2>", "<3, 4>", *["<3, 4>"] * 1000]
+    told = heeded(notes, 0.3, _rng())
+    assert [told[at] for at in (0, 3, 4)] == [True] * 3
+    assert 200 < sum(told[5:]) < 400
+    assert all(heeded(notes, 1.0, _rng()))
+    assert heeded(notes[:5], 0.0, _rng()) == [True, False, True, True, True]
+
+
+def test_what_is_not_heeded_stands_in_the_row_all_the_same() -> None:
+    still = [f"<{80 + tick // 150}, 100>" for tick in range(len(TEXTS))]
+    asked = replace(running_episode(), instruction="press it", moving=still)
+    shown = replace(asked, demo=shown_episode().demo, demo_notes=("<10, 20>", "<10, 20>", "<12, 22>"))
+    config = ExampleConfig(clocks=EVALUATION, takes_notes=True, learned_repeats=0.0)
+    thinned = make_example(shown, TAKING, config, _rng())
+    whole = make_example(shown, TAKING, replace(config, learned_repeats=1.0), _rng())
+    assert thinned.heeded_demo == (True, False, True)
+    assert thinned.row().ids == whole.row().ids
+    assert [learned for _, learned in between_looks_learned(thinned.row())] == [True, False, True]
+    assert all(learned for _, learned in between_looks_learned(whole.row()))
+    words = [each for each in thinned.words or () if each.text]
+    repeats = [now.text == before.text for before, now in pairwise(words)]
+    assert any(repeats)
+    assert not all(repeats)
+    assert [each.is_learned for each in words[1:]] == [not repeats_it for repeats_it in repeats]
+    gates = [np.asarray(each.row().targets)[each.row().gate_index + 1] for each in (thinned, whole)]
+    np.testing.assert_array_equal(*gates)  # that something is said is learned
+
+
 def test_without_the_setting_nothing_is_noted() -> None:
     config = ExampleConfig(clocks=EVALUATION)
     with_moving = make_example(running_episode(), FORM, config, np.random.default_rng(0))
@@ -254,6 +316,11 @@ def between_looks(row: Row) -> list[tuple[str, list[int]]]:
         text = v.decode(list(ids[1:])) if ids else ""
         found.append((text, list(row.targets[end + 1 : stop + 1])))
     return found
+
+
+def between_looks_learned(row: Row) -> list[tuple[str, bool]]:
+    """What is written after each look, and whether its words, and not just that there are any, are targets."""
+    return [(text, targets[1] != IGNORE) for text, targets in between_looks(row) if text]
 
 
 def test_a_demonstration_is_noted_look_by_look() -> None:

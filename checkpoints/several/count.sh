@@ -1,0 +1,26 @@
+#!/usr/bin/env bash
+# A trial to go on from the PONDER of note.sh, on two CPU cores: see docs/training.md, "Counts".
+#
+#     checkpoints/several/count.sh [OUT]    (the OUT of the other scripts)
+#
+# PONDER is asked for pace and count of what it is to stop. Of what note.sh has collected, the oracle's episodes. The same
+# command goes on after a kill.
+set -euo pipefail
+
+out=${1:-out/several}
+before=$out/note
+next=$out/count
+bin=${BIN:-.venv/bin}
+source "$(dirname "$0")/common.sh"
+export OMP_NUM_THREADS=1 MUJOCO_GL=${MUJOCO_GL:-egl}
+
+data=("$before/timed" "$before/timed" "$before/swaps" "$before/swaps" "$before/repick" "$before/shown" "$before/old" "$before/filled"
+    "$before/imitated" "$before/highlight")
+
+pair="$next/pair"
+[ -d "$next/run/settling/ponder" ] || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --weights whole \
+    --recipe small_counting --stage settling --data "${data[@]}" --sights "$before/sights" --out "$next/run" \
+    --ponder "$before/pair/ponder" --pounce "$before/pair/pounce"
+[ -d "$pair/ponder" ] || halve "$next/run/settling/ponder" "$pair/ponder"
+[ -d "$pair/pounce" ] || cp -r "$before/pair/pounce" "$pair/pounce"
+evaluate "$pair" "$next"
