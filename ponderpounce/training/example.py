@@ -39,7 +39,7 @@ from ponderpounce.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses,
 from ponderpounce.training.notes import heeded, in_sight, misnoted, noted, with_notes
 from ponderpounce.training.nudge import NO_NUDGE, Nudge, draw_nudges
 from ponderpounce.training.own_words import own_words
-from ponderpounce.training.place_lessons import PlaceLessons, comes_by, place_lessons
+from ponderpounce.training.place_lessons import PlaceLessons, place_lessons
 from ponderpounce.training.places import PLACE, misplaced
 from ponderpounce.training.stand_in import stand_in
 from ponderpounce.training.training_episode import Frame, TrainingEpisode
@@ -259,9 +259,7 @@ class Example:
         demonstrated = [self.view.text(text) for text in episode.demo_subgoals]
         tools = [self.view.text(text) for text in episode.demo_tools]
         steps = rhythm(episode.instruction, episode.subgoals)
-        rhythms = [
-            "" if steps is None or 2 * query.tick < steps else comes_by(steps) for query in self.schedule.queries
-        ]
+        rhythms = [None if steps is None or 2 * query.tick < steps else steps for query in self.schedule.queries]
         return place_lessons(row, texts, self.form.vocabulary, size, demonstrated, tools, rhythms)
 
 

@@ -72,13 +72,13 @@ def place_lessons(
     size: int,
     demonstrated: Sequence[str] = (),
     tools: Sequence[str] = (),
-    rhythms_Q: Sequence[str] = (),
+    rhythms_Q: Sequence[int | None] = (),
 ) -> PlaceLessons:
     """The lessons of a row with hidden states of ``size`` numbers.
 
     ``texts_Q``: the simulator's words in force at every query; ``demonstrated``: those of every instant of the
-    demonstration, ``tools``: where the tool is then; ``rhythms_Q``: how often something comes by, as far as that was to
-    be seen by then. Of more places than fit the last are left out.
+    demonstration, ``tools``: where the tool is then; ``rhythms_Q``: every how many steps something comes by, None
+    before that was to be seen. Of more places than fit the last are left out.
     """
     num_slots = size // NUM_PLACE_FEATURES
     found = [
@@ -132,21 +132,16 @@ def _in_mind(row: Row, texts_Q: Sequence[str], num_slots: int) -> Iterator[_Less
             yield index, slot, place_features((int(y), int(x)))
 
 
-def _coming_by(row: Row, rhythms_Q: Sequence[str], num_slots: int) -> Iterator[_Lesson]:
-    for index, text in zip(row.gate_index.tolist(), rhythms_Q, strict=False):
-        if text:
-            yield from _rhythm(index, text, num_slots)
+def _coming_by(row: Row, rhythms_Q: Sequence[int | None], num_slots: int) -> Iterator[_Lesson]:
+    for index, steps in zip(row.gate_index.tolist(), rhythms_Q, strict=False):
+        if steps is not None:
+            yield from _rhythm(index, steps, num_slots)
 
 
-def comes_by(steps: int) -> str:
-    """A rhythm in words that stand nowhere else."""
-    return f"comes by every {steps} steps"
-
-
-def _rhythm(index: int, text: str, num_slots: int) -> Iterator[_Lesson]:
+def _rhythm(index: int, steps: int, num_slots: int) -> Iterator[_Lesson]:
     """The last slot, where there is more than one."""
     if num_slots > 1:
-        yield index, num_slots - 1, text_code(text, NUM_PLACE_FEATURES)
+        yield index, num_slots - 1, text_code(f"comes by every {steps} steps", NUM_PLACE_FEATURES)
 
 
 def _being_told(row: Row, vocabulary: Vocabulary, num_slots: int) -> Iterator[_Lesson]:
@@ -163,7 +158,7 @@ def _being_told(row: Row, vocabulary: Vocabulary, num_slots: int) -> Iterator[_L
                 yield position - 1, 0, place_features((y, x))
         for told in _PACED.finditer(said):
             for position in run[(begins >= told.start(1)) & (begins < told.end(1))].tolist():
-                yield from _rhythm(position - 1, comes_by(int(told[1])), num_slots)
+                yield from _rhythm(position - 1, int(told[1]), num_slots)
             for position in run[(begins >= told.start(2)) & (begins < told.end(2))].tolist():
                 wait = int(told[2])  # as cognition tells it, and coarsely, for longer ones
                 yield position - 1, 0, place_features((min(wait / 4, LONGEST), min(wait, LONGEST)))

@@ -248,9 +248,12 @@ def test_while_pace_and_count_are_told_they_are_in_mind() -> None:
         for index in range(end - digits, end):
             as_told = place_features((min(wait / 4, 255), min(wait, 255)))
             np.testing.assert_array_equal(told[index, 0], as_told)
-        assert (end - digits - 1, 0) not in told, "the comma leads to no number"
-        before = end - digits - 2  # the last digit of the pace is said there
-        np.testing.assert_array_equal(told[before - 1, last], text_code(f"comes by every {pace} steps", 26))
+        assert (end - digits - 1, 0) not in told, "before the comma no number is due"
+        comma = end - digits - 1  # and before it is the last digit of the pace
+        of_pace = [*range(comma - 1 - len(FORM.vocabulary.encode(str(pace))), comma - 1)]
+        assert [index for index in range(gate + 1, end) if (index, last) in told] == of_pace
+        code = text_code(f"comes by every {pace} steps", NUM_PLACE_FEATURES)
+        assert all(np.array_equal(told[index, last], code) for index in of_pace)
         found += 1
     assert found > 5
 
