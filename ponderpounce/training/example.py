@@ -36,7 +36,7 @@ from ponderpounce.training.cut_short import Cut, cuts
 from ponderpounce.training.deeds import narration
 from ponderpounce.training.events import EVENT_ROWS, draw_near, event_ticks
 from ponderpounce.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses, has_moved, without_lapses
-from ponderpounce.training.notes import heeded, in_sight, misnoted, noted, with_notes
+from ponderpounce.training.notes import heeded, in_sight, misnoted, noted, told_wait, with_notes
 from ponderpounce.training.nudge import NO_NUDGE, Nudge, draw_nudges
 from ponderpounce.training.own_words import own_words
 from ponderpounce.training.place_lessons import PlaceLessons, place_lessons
@@ -115,6 +115,9 @@ class ExampleConfig:
     """Waits are told with their number of steps, at every query anew (`countdown`)."""
     misjudges: float = 0.0
     """Share of rows with waits counted down in which the first numbers are wrong (`countdown.misjudged`)."""
+    trusts_counts: bool = False
+    """C tells the wait that words tell, be they wrong; else always the true one. A PONDER whose words are mostly right
+    hedges between them and what it sees, and tells neither; the wait is then best put right in words."""
     waits_longer: int = 0
     """Waits are told to end so many control steps later than they did: a hand that comes too early is told so."""
     takes_notes: bool = False
@@ -180,6 +183,8 @@ class Example:
     """Of every query, subgoal and notes (`notes.noted`), ``""`` for none; () where none are taken."""
     heeded_demo: tuple[bool, ...] | None = None
     """Which notes of the demonstration are learned (`notes.heeded`); None: all."""
+    trusted: tuple[int | None, ...] | None = None
+    """Of every query, the wrong wait that C is to tell as words do, None: the right one; None: all are."""
     onward: tuple[str, ...] | None = None
     """Of every query, the place that its stand-in tells besides (`TrainingEpisode.next_places`); None: of none."""
     nudge: Nudge = NO_NUDGE
@@ -218,10 +223,12 @@ class Example:
         episode, made = self.episode, []
         left, onward = waits(episode.subgoals), self.onward or ("",) * len(self.schedule.queries)
         stood = stood_at(episode.subgoals)  # a hand that sees nothing and hears only how long would drift away
-        for query, following in zip(self.schedule.queries, onward, strict=True):
+        trusted = self.trusted or (None,) * len(self.schedule.queries)
+        for query, following, other in zip(self.schedule.queries, onward, trusted, strict=True):
             tick = query.tick
             text, after = (self.view.text(each) for each in (episode.subgoals[tick], stood[tick] or following))
             if (wait := left[tick]) is not None:
+                wait = wait if other is None else other
                 is_at_place = PLACE.search(text) is not None
                 text = text if is_at_place else f"{text} until {as_place(wait)}"
                 after = as_place(wait) if is_at_place else after
@@ -303,6 +310,7 @@ def make_example(
         slip = Slip(std_px=config.tremble_px, seed=int(rng.integers(1 << 62)), is_learned=True)
     words: tuple[Words, ...] | None = None
     notes: tuple[str, ...] = ()
+    wrong_waits_Q: list[int | None] | None = None
     if is_grounded and not episode.is_told:
         lapses = config.lapses if config.lapses.rows and rng.random() < config.lapses.rows else NO_LAPSES
         if is_own:
@@ -317,6 +325,7 @@ def make_example(
             wrong_Q = [""] * len(ticks)
             if config.misjudges and rng.random() < config.misjudges:
                 wrong_Q = misnoted(episode.instruction, episode.subgoals, seen, ticks, rng)
+                wrong_waits_Q = [told_wait(note) for note in wrong_Q]
             words = without_lapses(*_subgoals(episode, schedule)) if words is None else words
             words = with_notes(words, notes, wrong_Q, heeded(notes, config.learned_repeats, rng))
         elif config.counts_down and any(left := waits(episode.subgoals)):
@@ -325,8 +334,9 @@ def make_example(
             told = [episode.subgoals[query.tick] for query in schedule.queries]
             ticks = [query.tick for query in schedule.queries]
             left_Q = [left[tick] for tick in ticks]
-            is_wrong = config.misjudges and rng.random() < config.misjudges
-            words = counted(words, told, left_Q, misjudged(ticks, told, left_Q, rng) if is_wrong else None)
+            if config.misjudges and rng.random() < config.misjudges:
+                wrong_waits_Q = misjudged(ticks, told, left_Q, rng)
+            words = counted(words, told, left_Q, wrong_waits_Q)
     heeded_demo = None
     if config.learned_repeats < 1 and form.takes_notes and episode.demo_notes:
         seen = [in_sight(note, form.eyes) for note in episode.demo_notes]
@@ -356,6 +366,7 @@ def make_example(
         words=words,
         notes=notes,
         heeded_demo=heeded_demo,
+        trusted=tuple(wrong_waits_Q) if config.trusts_counts and wrong_waits_Q else None,
         onward=onward,
         nudge=config.nudge,
         nudges_I2=nudges_I2,

@@ -34,6 +34,7 @@ from ponderpounce.training.places import PARTS, PLACE, TEXT_PX, WAY, apart_px
 
 _ONE = PLACE.pattern.replace("(", "").replace(")", "")
 _STILL = re.compile(rf"drop the cube on the table at ({_ONE})(?:, {_ONE})?|static at ({_ONE})(?:, ({_ONE}))?")
+_WAIT = re.compile(r", \d+, (\d+)$")
 _LOOK_STEPS = 25  # a query a second: one at least sees where everything has come to rest
 _PACE_STEPS = 30  # two looks; before, nobody can tell how fast it runs
 
@@ -142,6 +143,12 @@ def _paced(text: str, places: str, pace: int, wait: int, tick: int) -> str:
     if tick >= _PACE_STEPS:
         told += [str(pace), str(wait)]
     return ", ".join(told) if len(told) > 1 else ""
+
+
+def told_wait(note: str) -> int | None:
+    """The number of steps that a note ends with, behind a pace; None where it tells none."""
+    told = _WAIT.search(note)
+    return None if told is None else int(told[1])
 
 
 def misnoted(

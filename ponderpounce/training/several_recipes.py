@@ -227,3 +227,19 @@ def small_counting() -> Curriculum:
         batch_episodes=8,
     )
     return Curriculum(name="small_counting", stages=(settling,))
+
+
+def small_pacing() -> Curriculum:
+    """The PONDER of `small_counting` goes on with more of what is to be stopped in time; C believes its words.
+
+    A trial: docs/training.md, "Counts".
+    """
+    (settling,) = small_counting().stages
+    settling = replace(
+        settling,
+        name="small_pacing/settling",
+        example=replace(settling.example, even_clocks=0.7, trusts_counts=True),
+        train=TrainConfig(seed=15, optim=replace(_TURNING, warmup_steps=100, decay=(400, 1100))),
+        num_steps=1100,
+    )
+    return Curriculum(name="small_pacing", stages=(settling,))

@@ -21,10 +21,11 @@ from ponderpounce.tasks.counting.stop_cube import StopCube
 from ponderpounce.tasks.environment import make_environment
 from ponderpounce.tasks.front_view import front_pixels
 from ponderpounce.tasks.paces import PASS_STEPS
+from ponderpounce.training.countdown import as_place, stood_at, waits
 from ponderpounce.training.example import ExampleConfig, Slip, make_example
-from ponderpounce.training.notes import demo_notes, heeded, in_sight, misnoted, moving_places, noted
+from ponderpounce.training.notes import demo_notes, heeded, in_sight, misnoted, moving_places, noted, told_wait
 from ponderpounce.training.places import PLACE, TEXT_PX
-from ponderpounce.training.stand_in import text_code
+from ponderpounce.training.stand_in import stand_in, text_code
 from ponderpounce.training.training_episode import TrainingEpisode
 from tests.training.test_countdown import FORM, HOVER, PRESS, STILL, waiting_episode
 
@@ -214,6 +215,24 @@ def test_the_row_tells_notes_at_every_look_and_c_what_is_right() -> None:
     gates = np.asarray(row.targets)[row.gate_index + 1]
     assert (gates == FORM.vocabulary.t_yes).sum() == sum(bool(words.text) for words in misled.words)
     np.testing.assert_array_equal(misled.stand_ins(128), example.stand_ins(128))
+
+
+def test_c_that_trusts_counts_tells_the_wait_of_the_words_right_or_wrong() -> None:
+    config = ExampleConfig(clocks=EVALUATION, takes_notes=True, misjudges=1.0, trusts_counts=True)
+    example = make_example(running_episode(), FORM, config, np.random.default_rng(0))
+    assert example.words is not None
+    left, found = waits(TEXTS), {True: 0, False: 0}
+    for query, words, told in zip(example.schedule.queries, example.words, example.stand_ins(128), strict=True):
+        wait = left[query.tick]
+        if wait is None or TEXTS[query.tick] != STILL:
+            continue
+        said = told_wait(words.text)
+        assert said is not None
+        assert said == (wait if words.is_learned else numbers(words.text)[1])
+        believed = f"{STILL} until {as_place(said)}"
+        np.testing.assert_array_equal(told, stand_in(believed, 128, ASKED, stood_at(TEXTS)[query.tick]))
+        found[words.is_learned] += 1
+    assert all(found.values()), "right ones and wrong ones"
 
 
 def test_places_in_mind_are_those_that_notes_tell() -> None:
