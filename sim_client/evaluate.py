@@ -91,6 +91,8 @@ class EvalOptions:
     """With --cognition stand-in: how wrong the told places are (standard deviation); a PONDER's are by some pixels."""
     stand_in_onward: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """With --cognition stand-in: also told where the next subgoal will be, as recipe small_imitating learned it."""
+    stand_in_waits_longer: int = 0
+    """With --cognition stand-in: control steps that are added to a wait which it is told (StopCube)."""
     donors: Path | None = None
     """With --cognition other-episode: the --out of a recorded evaluation with real cognition, of the same scenes."""
     subgoal_text: Literal["ponder", "oracle"] | None = None
@@ -139,6 +141,8 @@ class EvalOptions:
             raise EvaluationError(f"--cognition {self.cognition} replaces PONDER: use --servers in-process")
         if self.stand_in_onward and self.cognition != "stand-in":
             raise EvaluationError("--stand-in-onward is of --cognition stand-in; leave it out")
+        if self.stand_in_waits_longer and self.cognition != "stand-in":
+            raise EvaluationError("--stand-in-waits-longer is of --cognition stand-in; leave it out")
         if self.stand_in_noise_px < 0 or (self.stand_in_noise_px and self.cognition != "stand-in"):
             raise EvaluationError("--stand-in-noise-px is for --cognition stand-in, and at least 0")
         if self.cognition == "stand-in" and self.pounce_checkpoint is None:
@@ -206,6 +210,8 @@ class EvalOptions:
             own["stand_in_noise_px"] = self.stand_in_noise_px
         if self.stand_in_onward:
             own["stand_in_onward"] = True
+        if self.stand_in_waits_longer:
+            own["stand_in_waits_longer"] = self.stand_in_waits_longer
         if self.order != "drawn":
             own["order"] = self.order
         return config | {name: as_json(value) for name, value in own.items()}
@@ -369,10 +375,14 @@ class EvaluationStation:
         except ValueError as error:
             raise EvaluationError(str(error)) from None
         link, noise_px = Link(bus, robot=robot, proc="ponder"), self._options.stand_in_noise_px
-        return ToldPonder(link, *shape, noise_px, self._onward if self._options.stand_in_onward else None).step
+        onward = self._onward if self._options.stand_in_onward else None
+        return ToldPonder(link, *shape, noise_px, onward, self._due_step, self._options.stand_in_waits_longer).step
 
     def _onward(self) -> str:
         return "" if self._environment is None else self._environment.onward()
+
+    def _due_step(self) -> int | None:
+        return None if self._environment is None else self._environment.due_step()
 
 
 def _workers(options: EvalOptions) -> Workers[Job, Line]:

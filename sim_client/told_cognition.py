@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ponderpounce.training.countdown import is_waiting, stood_at, told_until
 from ponderpounce.training.places import misplaced
 from ponderpounce.training.stand_in import stand_in
 from protocol import messages as m
@@ -31,6 +32,9 @@ class ToldPonder(PuppetPonder):
         num_carriers, hidden_size: K and H of what POUNCE reads.
         noise_px: standard deviation of the error of every told coordinate; it stays for `HELD_QUERIES` queries.
         onward: says where the next subgoal will be (`Environment.onward`); None: POUNCE is not told.
+        due_step: says when what is waited for is to begin (`Environment.due_step`); it is then told how long there is
+            to wait, and where it stands, as examples tell it (`countdown`).
+        waits_longer: control steps that are added to it.
     """
 
     def __init__(
@@ -40,12 +44,16 @@ class ToldPonder(PuppetPonder):
         hidden_size: int,
         noise_px: float = 0.0,
         onward: Callable[[], str] | None = None,
+        due_step: Callable[[], int | None] | None = None,
+        waits_longer: int = 0,
     ) -> None:
         self._onward = onward
+        self._due_step = due_step
+        self._waits_longer = waits_longer
         self._noise_px = noise_px
         self._shape = num_carriers, hidden_size
         self._subgoals = link.subscribe(topics.SUBGOAL)
-        self._text, self._is_new = "", False
+        self.end()
         super().__init__(link)
 
     def answer(self, query: m.Query) -> Answer:
@@ -53,23 +61,36 @@ class ToldPonder(PuppetPonder):
             if not is_of_episode(self.link, subgoal.header):
                 continue
             if subgoal.kind == m.SubgoalKind.TASK_GROUNDED:
-                self._text = subgoal.text
+                self._heard.append(subgoal.text)
             else:
                 self._is_new = True  # the plain text is said when a subgoal begins, and at no other time
         is_new, self._is_new = self._is_new, False
-        texts = [self._text, "" if self._onward is None else self._onward()]
-        if self._noise_px:
-            texts = [mistold(text, self._noise_px, query.query // HELD_QUERIES) for text in texts]
-        text, onward = texts
+        text, onward = self._told(query)
         num_carriers, size = self._shape
         vector = np.repeat(stand_in(text, size, self.instruction, onward)[None], num_carriers, axis=0)
         return Answer(vector=vector, is_transition=is_new, norm=float(np.linalg.norm(vector)))
+
+    def _told(self, query: m.Query) -> tuple[str, str]:
+        """The subgoal in force, and a second place."""
+        due = None if self._due_step is None else self._due_step()
+        left = 0 if due is None else due + self._waits_longer - query.tick
+        heard = self._heard if left <= 0 else [each for each in self._heard if is_waiting(each)]
+        text = heard[-1] if heard else ""
+        if due is not None:
+            second = stood_at(heard)[-1] if heard else ""
+        else:
+            second = "" if self._onward is None else self._onward()
+        if self._noise_px:
+            draw = query.query // HELD_QUERIES
+            text, second = (mistold(each, self._noise_px, draw) for each in (text, second))
+        return told_until(text, second, left) if left > 0 else (text, second)
 
     def shape(self) -> tuple[int, int]:
         return self._shape
 
     def end(self) -> None:
-        self._text, self._is_new = "", False
+        self._heard: list[str] = []
+        self._is_new = False
 
     @property
     def model_hash(self) -> str:

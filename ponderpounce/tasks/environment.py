@@ -246,6 +246,12 @@ class Environment:
         following = self._subtasks[self._progress.index if is_lost else self._caption.index + 1 :][:1]
         return "".join("<{}, {}>".format(*self._project(step.grounds[:1])[0]) for step in following if step.grounds)
 
+    def due_step(self) -> int | None:
+        """Returns when what must happen at one instant is to begin (`Task.due_step`), in steps from reset on."""
+        self._require_episode()
+        due: int | None = self._task.due_step(self._layout)
+        return due
+
     def to_come(self) -> tuple[str, ...]:
         """Returns the grounded texts of the subtasks after the one that is spoken of, with where their things stand.
 

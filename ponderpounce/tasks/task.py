@@ -182,6 +182,13 @@ class Task(ABC, Generic[LayoutT, MemoryT]):
         """
         return ()
 
+    def due_step(self, layout: LayoutT) -> int | None:
+        """Returns when the arm is to begin with what must happen at one instant, in steps from reset on.
+
+        None, and that is the default, where nothing must.
+        """
+        return None
+
     def things(self, layout: LayoutT, step: int, memory: MemoryT | None = None) -> tuple[Thing, ...]:
         """Returns all that is to be named in the observation of ``step`` (`data.album`). The default names nothing."""
         return ()

@@ -31,12 +31,17 @@ _PASSES = re.compile(r"just as it reaches the target for the (\w+) time")
 _MISJUDGED = (0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0)
 
 
+def is_waiting(text: str) -> bool:
+    """Whether it is a subgoal that is waited out."""
+    return _WAITING.search(text) is not None
+
+
 def waits(subgoals: Sequence[str]) -> list[int | None]:
     """Per tick of an episode, how many there are until it no longer waits; None where it does not, or never ends."""
     found: list[int | None] = []
     left: int | None = None
     for text in reversed(subgoals):
-        if not _WAITING.search(text):
+        if not is_waiting(text):
             left = 0
             found.append(None)
             continue
@@ -67,7 +72,7 @@ def stood_at(subgoals: Sequence[str]) -> list[str]:
     found: list[str] = []
     place = ""
     for text in subgoals:
-        if _WAITING.search(text) and (told := PLACE.search(text)) is not None:
+        if is_waiting(text) and (told := PLACE.search(text)) is not None:
             place = told[0]
         found.append(place)
     return found
@@ -77,7 +82,7 @@ def waits_unplaced(subgoals: Sequence[str]) -> list[bool]:
     """Per tick, whether the hand waits, or does what it has waited for, without being told where it stands."""
     stood = stood_at(subgoals)
     return [
-        bool(place) and not (_WAITING.search(text) and PLACE.search(text))
+        bool(place) and not (is_waiting(text) and PLACE.search(text))
         for text, place in zip(subgoals, stood, strict=True)
     ]
 
@@ -139,6 +144,11 @@ def rhythm(instruction: str, subgoals: Sequence[str]) -> int | None:
         return None
     steps = (left[0] + PRESS_STEPS) / (ORDINALS.index(asked[1]) + 0.5)  # the press begins before the instant
     return min(PASS_STEPS, key=lambda each: abs(each - steps))
+
+
+def told_until(text: str, after: str, wait: int) -> tuple[str, str]:
+    """A subgoal that is waited out and the place after it; how long is told as its place, or after it if it has one."""
+    return (text, as_place(wait)) if PLACE.search(text) else (f"{text} until {as_place(wait)}", after)
 
 
 def as_place(wait: int) -> str:

@@ -23,11 +23,11 @@ from ponderpounce.models.normalisation import Floats
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.training.augment import AS_IT_IS, NOT_AUGMENTED, Augmentation, View, draw_view
 from ponderpounce.training.countdown import (
-    as_place,
     counted,
     misjudged,
     rhythm,
     stood_at,
+    told_until,
     waiting_longer,
     waits,
     waits_unplaced,
@@ -40,7 +40,7 @@ from ponderpounce.training.notes import heeded, in_sight, misnoted, noted, told_
 from ponderpounce.training.nudge import NO_NUDGE, Nudge, draw_nudges
 from ponderpounce.training.own_words import own_words
 from ponderpounce.training.place_lessons import PlaceLessons, place_lessons
-from ponderpounce.training.places import PLACE, misplaced
+from ponderpounce.training.places import misplaced
 from ponderpounce.training.stand_in import stand_in
 from ponderpounce.training.training_episode import Frame, TrainingEpisode
 
@@ -228,10 +228,7 @@ class Example:
             tick = query.tick
             text, after = (self.view.text(each) for each in (episode.subgoals[tick], stood[tick] or following))
             if (wait := left[tick]) is not None:
-                wait = wait if other is None else other
-                is_at_place = PLACE.search(text) is not None
-                text = text if is_at_place else f"{text} until {as_place(wait)}"
-                after = as_place(wait) if is_at_place else after
+                text, after = told_until(text, after, wait if other is None else other)
             made.append(stand_in(text, size, episode.instruction, after))
         return torch.from_numpy(np.stack(made))
 

@@ -31,14 +31,20 @@ def told(
 
     class WithTold(new_rig):  # type: ignore[misc, valid-type]
         def start_ponder(self, link: Link, engine: Any) -> Any:
-            return ToldPonder(link, K, H, onward=onward.pop() if onward else None)
+            return ToldPonder(link, K, H, 0.0, onward.pop() if onward else None, lambda: due[0], waits_longer=longer[0])
 
     onward: list[Callable[[], str]] = []
+    due: list[int | None] = [None]
+    longer = [0]
 
     def play(
-        subgoals: list[tuple[int, str]], instruction: str = NO_SWINGS, after: Callable[[], str] | None = None
+        subgoals: list[tuple[int, str]],
+        instruction: str = NO_SWINGS,
+        after: Callable[[], str] | None = None,
+        due_step: int | None = None,
+        waits_longer: int = 0,
     ) -> list[m.Cognition]:
-        onward[:] = [] if after is None else [after]
+        onward[:], due[:], longer[:] = [] if after is None else [after], [due_step], [waits_longer]
         rig = WithTold(pounce_engine=fake_pounce)
         take, left = rig.listen(COGNITION), list(subgoals)
 
@@ -80,3 +86,18 @@ def test_where_it_goes_on_is_told_besides_if_somebody_knows(told: Told) -> None:
     for place in ("<80, 90>", ""):
         for each in told([(0, text)], after=lambda place=place: place):
             np.testing.assert_array_equal(each.vector, np.tile(stand_in(text, H, onward=place), (K, 1)))
+
+
+def test_how_long_there_is_to_wait_is_told_and_where_it_stands_and_then_no_more(told: Told) -> None:
+    hover, still, press = "move to the top of the button at <10, 20> to prepare", "remain static", "press at <30, 40>"
+    subgoals = [(0, hover), (1, still), (3, press)]
+    said = told(subgoals, due_step=40)
+    first, second, third, last = said
+    assert [each.tick for each in said] == [0, 14, 34, 54]
+    np.testing.assert_array_equal(first.vector[0], stand_in(hover, H, onward="<0, 40>"))
+    np.testing.assert_array_equal(second.vector[0], stand_in(f"{still} until <0, 26>", H, onward="<10, 20>"))
+    np.testing.assert_array_equal(third.vector[0], stand_in(f"{still} until <0, 6>", H, onward="<10, 20>"))
+    np.testing.assert_array_equal(last.vector[0], stand_in(press, H, onward="<10, 20>"))
+
+    later = told(subgoals, due_step=40, waits_longer=15)[-1]
+    np.testing.assert_array_equal(later.vector[0], stand_in(f"{still} until <0, 1>", H, onward="<10, 20>"))

@@ -74,6 +74,16 @@ def test_the_cube_is_where_its_clock_says_whatever_the_arm_does(env: Environment
         play(env, [HOME] * 8)
 
 
+def test_the_press_is_asked_for_in_the_observation_in_which_it_is_due(env: Environment) -> None:
+    layout = start(env, pass_steps=60, visit=3)
+    asked_at = 0
+    for step, action in enumerate(press_at(env, layout.press_step), start=1):  # reset has given an observation, too
+        if env.step(action, look=False).grounded_subgoal.startswith("press"):
+            asked_at = step
+            break
+    assert env.due_step() == asked_at == layout.press_step
+
+
 def test_checkpoints_come_every_100_steps_until_the_press(env: Environment) -> None:
     for pass_steps, visit, num_checkpoints in ((60, 2, 1), (60, 4, 2), (80, 5, 4), (120, 5, 6)):
         start(env, pass_steps=pass_steps, visit=visit)

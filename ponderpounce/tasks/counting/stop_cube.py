@@ -169,6 +169,9 @@ class StopCube(Task[Layout, Memory]):
         x_m, y_m, z_m = layout.cube_pose(step + 1)[:3].tolist()  # reset spends a control step
         return ((x_m, y_m, z_m),)
 
+    def due_step(self, layout: Layout) -> int:
+        return layout.press_step
+
     def things(self, layout: Layout, step: int, memory: object = None) -> tuple[Thing, ...]:
         named = {"button": f"{_BUTTON}/cap", "target": _TARGET, "running cube": _CUBE}
         return tuple(Thing(name=name, body=body, is_movable=False) for name, body in named.items())
