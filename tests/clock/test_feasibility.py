@@ -6,7 +6,7 @@ import dataclasses
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from clock import schedules
@@ -19,7 +19,7 @@ TICK_MS = 50
 
 def starved_by_simulation(horizon: int, invoke_ticks: int, delay_ticks: int) -> int:
     """Ticks without a row between the first playable rows of two late invocations."""
-    first = 40 * invoke_ticks
+    first = 61 * invoke_ticks  # after the longest delay: before the first playable row nothing is starved
     covered = {
         tick
         for j in range(80)
@@ -29,6 +29,7 @@ def starved_by_simulation(horizon: int, invoke_ticks: int, delay_ticks: int) -> 
 
 
 @given(horizon=st.integers(1, 50), invoke_ticks=st.integers(1, 60), delay=st.integers(0, 60))
+@example(horizon=42, invoke_ticks=1, delay=41)
 def test_starved_ticks_per_chunk_are_those_of_a_simulation(horizon: int, invoke_ticks: int, delay: int) -> None:
     found = Feasibility(horizon=horizon, invoke_ticks=invoke_ticks, delay_ticks=delay)
     expected = starved_by_simulation(horizon, invoke_ticks, delay)
