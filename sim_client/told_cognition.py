@@ -26,14 +26,14 @@ HELD_QUERIES = 4
 
 
 class ToldPonder(PuppetPonder):
-    """Answers with the stand-in of the task's newest grounded subgoal.
+    """Answers with the stand-in of the task's grounded subgoal in the observation that is asked about.
 
     Args:
         num_carriers, hidden_size: K and H of what POUNCE reads.
         noise_px: standard deviation of the error of every told coordinate; it stays for `HELD_QUERIES` queries.
         onward: says where the next subgoal will be (`Environment.onward`); None: POUNCE is not told.
         due_step: says when what is waited for is to begin (`Environment.due_step`); it is then told how long there is
-            to wait, and where it stands, as examples tell it (`countdown`).
+            to wait, as examples tell it (`countdown`).
         waits_longer: control steps that are added to it.
     """
 
@@ -61,10 +61,12 @@ class ToldPonder(PuppetPonder):
             if not is_of_episode(self.link, subgoal.header):
                 continue
             if subgoal.kind == m.SubgoalKind.TASK_GROUNDED:
-                self._heard.append(subgoal.text)
+                self._heard.append((subgoal.tick, subgoal.text))
             else:
-                self._is_new = True  # the plain text is said when a subgoal begins, and at no other time
-        is_new, self._is_new = self._is_new, False
+                self._begun.append(subgoal.tick)  # the plain text is said when a subgoal begins, and at no other time
+        # it answers when a cognition is due, and has heard by then what the picture that is asked about does not show
+        is_new = any(tick <= query.tick for tick in self._begun)
+        self._begun = [tick for tick in self._begun if tick > query.tick]
         text, onward = self._told(query)
         num_carriers, size = self._shape
         vector = np.repeat(stand_in(text, size, self.instruction, onward)[None], num_carriers, axis=0)
@@ -74,12 +76,10 @@ class ToldPonder(PuppetPonder):
         """The subgoal in force, and a second place."""
         due = None if self._due_step is None else self._due_step()
         left = 0 if due is None else due + self._waits_longer - query.tick
-        heard = self._heard if left <= 0 else [each for each in self._heard if is_waiting(each)]
+        heard = [text for tick, text in self._heard if tick <= query.tick and (left <= 0 or is_waiting(text))]
         text = heard[-1] if heard else ""
-        if due is not None:
-            second = stood_at(heard)[-1] if heard else ""
-        else:
-            second = "" if self._onward is None else self._onward()
+        stood = stood_at(heard)[-1] if heard else ""
+        second = stood or ("" if self._onward is None else self._onward())
         if self._noise_px:
             draw = query.query // HELD_QUERIES
             text, second = (mistold(each, self._noise_px, draw) for each in (text, second))
@@ -89,8 +89,8 @@ class ToldPonder(PuppetPonder):
         return self._shape
 
     def end(self) -> None:
-        self._heard: list[str] = []
-        self._is_new = False
+        self._heard: list[tuple[int, str]] = []
+        self._begun: list[int] = []
 
     @property
     def model_hash(self) -> str:

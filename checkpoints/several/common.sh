@@ -9,6 +9,14 @@ play() {  # a PAIR plays EPISODES each from SEED on, recorded INTO a folder, of 
         --ponder-checkpoint "$pair/ponder" --pounce-checkpoint "$pair/pounce"
 }
 
+settle() {  # a PONDER goes on by RECIPE's `settling` INTO a folder, and makes a pair there with POUNCE; the rest is pp-train's
+    local recipe=$1 ponder=$2 pounce=$3 into=$4; shift 4
+    [ -d "$into/run/settling/ponder" ] || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --weights whole \
+        --recipe "$recipe" --stage settling --ponder "$ponder" --pounce "$pounce" --out "$into/run" "$@"
+    [ -d "$into/pair/ponder" ] || halve "$into/run/settling/ponder" "$into/pair/ponder"
+    [ -d "$into/pair/pounce" ] || cp -r "$pounce" "$into/pair/pounce"
+}
+
 evaluate() {  # a PAIR on the test scenes of fifteen tasks, with cognition and without: OUT/real, OUT/null, OUT/tables
     local pair=$1 out=$2 cognition
     for cognition in real null; do

@@ -17,10 +17,5 @@ export OMP_NUM_THREADS=1 MUJOCO_GL=${MUJOCO_GL:-egl}
 data=("$before/timed" "$before/timed" "$before/swaps" "$before/swaps" "$before/repick" "$before/shown" "$before/old" "$before/filled"
     "$before/imitated" "$before/highlight")
 
-pair="$next/pair"
-[ -d "$next/run/settling/ponder" ] || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --weights whole \
-    --recipe small_counting --stage settling --data "${data[@]}" --sights "$before/sights" --out "$next/run" \
-    --ponder "$before/pair/ponder" --pounce "$before/pair/pounce"
-[ -d "$pair/ponder" ] || halve "$next/run/settling/ponder" "$pair/ponder"
-[ -d "$pair/pounce" ] || cp -r "$before/pair/pounce" "$pair/pounce"
-evaluate "$pair" "$next"
+settle small_counting "$before/pair/ponder" "$before/pair/pounce" "$next" --data "${data[@]}" --sights "$before/sights"
+evaluate "$next/pair" "$next"

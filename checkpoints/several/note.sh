@@ -33,10 +33,6 @@ for played in counted driven; do
     [ -d "$next/$played/meta" ] || "$bin/pp-export" "${found[@]}" --texts follow --order near-first --out "$next/$played"
 done
 
-pair="$next/pair"
-[ -d "$next/run/settling/ponder" ] || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --weights whole \
-    --recipe small_noting --stage settling --data "${data[@]}" --watch "$next/counted" "$next/driven" --watch-share 0.25 \
-    --ponder "$before/pair/ponder" --pounce "$before/pair/pounce" --sights "$next/sights" --out "$next/run"
-[ -d "$pair/ponder" ] || halve "$next/run/settling/ponder" "$pair/ponder"
-[ -d "$pair/pounce" ] || cp -r "$before/pair/pounce" "$pair/pounce"
-evaluate "$pair" "$next"
+settle small_noting "$before/pair/ponder" "$before/pair/pounce" "$next" --data "${data[@]}" --sights "$next/sights" \
+    --watch "$next/counted" "$next/driven" --watch-share 0.25
+evaluate "$next/pair" "$next"

@@ -19,10 +19,5 @@ collect "$next/timed" --tasks StopCube --episodes 300 --invocation-hz 20
 data=("$next/timed" "$next/timed" "$noted/swaps" "$noted/repick" "$noted/shown" "$noted/old" "$noted/filled" "$noted/imitated"
     "$noted/highlight")
 
-pair="$next/pair"
-[ -d "$next/run/settling/ponder" ] || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --weights whole \
-    --recipe small_pacing --stage settling --data "${data[@]}" --sights "$noted/sights" --out "$next/run" \
-    --ponder "$before/pair/ponder" --pounce "$before/pair/pounce"
-[ -d "$pair/ponder" ] || halve "$next/run/settling/ponder" "$pair/ponder"
-[ -d "$pair/pounce" ] || cp -r "$before/pair/pounce" "$pair/pounce"
-evaluate "$pair" "$next"
+settle small_pacing "$before/pair/ponder" "$before/pair/pounce" "$next" --data "${data[@]}" --sights "$noted/sights"
+evaluate "$next/pair" "$next"

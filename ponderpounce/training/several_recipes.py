@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 from ponderpounce.training.lapses import NO_LAPSES
 from ponderpounce.training.recipe import Curriculum
@@ -185,15 +186,9 @@ def small_mastering() -> Curriculum:
 
 def small_recovering() -> Curriculum:
     """The PONDER of `small_mastering` learns to come back from its own words (`pp-train --watch` what it played)."""
-    _, settling = small_mastering().stages
-    settling = replace(
-        settling,
-        name="small_recovering/settling",
-        example=replace(settling.example, cuts_short=0.2, own_words=0.8, misjudges=0.6),
-        train=TrainConfig(seed=12, optim=replace(_TURNING, warmup_steps=100, decay=(1000, 2400))),
-        num_steps=2400,
+    return _settling_on(
+        small_mastering(), "small_recovering", 12, (1000, 2400), cuts_short=0.2, own_words=0.8, misjudges=0.6
     )
-    return Curriculum(name="small_recovering", stages=(settling,))
 
 
 def small_noting() -> Curriculum:
@@ -201,15 +196,7 @@ def small_noting() -> Curriculum:
 
     A trial: docs/training.md, "Notes".
     """
-    (settling,) = small_recovering().stages
-    settling = replace(
-        settling,
-        name="small_noting/settling",
-        example=replace(settling.example, takes_notes=True, waits_longer=5),
-        train=TrainConfig(seed=13, optim=replace(_TURNING, warmup_steps=100, decay=(900, 2000))),
-        num_steps=2000,
-    )
-    return Curriculum(name="small_noting", stages=(settling,))
+    return _settling_on(small_recovering(), "small_noting", 13, (900, 2000), takes_notes=True, waits_longer=5)
 
 
 def small_counting() -> Curriculum:
@@ -217,16 +204,8 @@ def small_counting() -> Curriculum:
 
     A trial: docs/training.md, "Counts".
     """
-    (settling,) = small_noting().stages
-    settling = replace(
-        settling,
-        name="small_counting/settling",
-        example=replace(settling.example, even_clocks=0.6, misjudges=0.3, learned_repeats=0.3),
-        train=TrainConfig(seed=14, optim=replace(_TURNING, warmup_steps=100, decay=(400, 1000))),
-        num_steps=1000,
-        batch_episodes=8,
-    )
-    return Curriculum(name="small_counting", stages=(settling,))
+    told = {"even_clocks": 0.6, "misjudges": 0.3, "learned_repeats": 0.3}
+    return _settling_on(small_noting(), "small_counting", 14, (400, 1000), batch_episodes=8, **told)
 
 
 def small_pacing() -> Curriculum:
@@ -234,12 +213,21 @@ def small_pacing() -> Curriculum:
 
     A trial: docs/training.md, "Counts".
     """
-    (settling,) = small_counting().stages
+    told = {"even_clocks": 0.7, "trusts_counts": True}
+    return _settling_on(small_counting(), "small_pacing", 15, (400, 1100), batch_episodes=8, **told)
+
+
+def _settling_on(
+    before: Curriculum, name: str, seed: int, decay: tuple[int, int], *, batch_episodes: int = 16, **example: Any
+) -> Curriculum:
+    """The last stage of ``before`` once more, until the rate has fallen, with other examples."""
+    *_, settling = before.stages
     settling = replace(
         settling,
-        name="small_pacing/settling",
-        example=replace(settling.example, even_clocks=0.7, trusts_counts=True),
-        train=TrainConfig(seed=15, optim=replace(_TURNING, warmup_steps=100, decay=(400, 1100))),
-        num_steps=1100,
+        name=f"{name}/settling",
+        example=replace(settling.example, **example),
+        train=TrainConfig(seed=seed, optim=replace(_TURNING, warmup_steps=100, decay=decay)),
+        num_steps=decay[1],
+        batch_episodes=batch_episodes,
     )
-    return Curriculum(name="small_pacing", stages=(settling,))
+    return Curriculum(name=name, stages=(settling,))

@@ -347,6 +347,7 @@ def test_sums_are_rounded_alike_whichever_server_a_process_has() -> None:
         ({"pounce_checkpoint": Path("nowhere"), "servers": "local"}, "use --servers in-process"),
         ({"pounce_checkpoint": Path("nowhere"), "stand_in_noise_px": -1.0}, "and at least 0"),
         ({"cognition": "null", "stand_in_noise_px": 1.0}, "is for --cognition stand-in"),
+        ({"cognition": "null", "stand_in_waits_longer": 1}, "is of --cognition stand-in"),
     ],
 )
 def test_stand_ins_where_they_mean_nothing_are_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:

@@ -43,6 +43,7 @@ def told(
         after: Callable[[], str] | None = None,
         due_step: int | None = None,
         waits_longer: int = 0,
+        tick: int = 0,
     ) -> list[m.Cognition]:
         onward[:], due[:], longer[:] = [] if after is None else [after], [due_step], [waits_longer]
         rig = WithTold(pounce_engine=fake_pounce)
@@ -53,7 +54,8 @@ def told(
             while left and left[0][0] <= len(rig.said[m.Cognition]):
                 _, text = left.pop(0)
                 for kind in (m.SubgoalKind.TASK_SIMPLE, m.SubgoalKind.TASK_GROUNDED):
-                    rig.links["sim"].publish(SUBGOAL, m.Subgoal(kind=kind, text=text), at_ns=0, clock_id="sim")
+                    subgoal = m.Subgoal(kind=kind, text=text, tick=tick)
+                    rig.links["sim"].publish(SUBGOAL, subgoal, at_ns=0, clock_id="sim")
 
         rig.meanwhile = speak
         rig.run(episode_info(paper, instruction=instruction), 65)
@@ -101,3 +103,12 @@ def test_how_long_there_is_to_wait_is_told_and_where_it_stands_and_then_no_more(
 
     later = told(subgoals, due_step=40, waits_longer=15)[-1]
     np.testing.assert_array_equal(later.vector[0], stand_in(f"{still} until <0, 1>", H, onward="<10, 20>"))
+
+
+def test_what_the_picture_that_is_asked_about_does_not_show_yet_is_told_to_the_next(told: Told) -> None:
+    text = "press the button at <10, 20>"
+    said = told([(0, text)], tick=20)
+    assert [each.tick for each in said] == [0, 14, 34, 54]
+    assert [each.is_transition for each in said] == [True, False, True, False], "the rig's own of tick 0, and this one"
+    for each, heard in zip(said, ("", "", text, text), strict=True):
+        np.testing.assert_array_equal(each.vector[0], stand_in(heard, H))

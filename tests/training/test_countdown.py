@@ -169,6 +169,12 @@ def test_a_misjudged_wait_is_not_learned_and_c_knows_better() -> None:
     assert not any(each.is_learned for each in others)
     assert all(each.text.startswith(STILL) for each in others)
     np.testing.assert_array_equal(right.stand_ins(128), wrong.stand_ins(128))
+    config = replace(config, misjudges=1.0, trusts_counts=True)
+    trusting = make_example(recorded, FORM, config, np.random.default_rng(5))
+    assert trusting.words == wrong.words
+    is_other = [old != new for old, new in zip(right.words, wrong.words, strict=True)]
+    tells_other = (trusting.stand_ins(128) != right.stand_ins(128)).any(dim=1).tolist()
+    assert tells_other == is_other, "unless it trusts them"
     learned = FORM.vocabulary.decode([id_ for id_ in wrong.row().targets if id_ != IGNORE])
     assert learned.count(STILL) == sum(each.text.startswith(STILL) for each in wrong.words) - len(others)
 
