@@ -53,7 +53,8 @@ class ToldPonder(PuppetPonder):
         self._noise_px = noise_px
         self._shape = num_carriers, hidden_size
         self._subgoals = link.subscribe(topics.SUBGOAL)
-        self.end()
+        self._heard: list[tuple[int, str]] = []
+        self._begun: list[int] = []
         super().__init__(link)
 
     def answer(self, query: m.Query) -> Answer:
@@ -89,8 +90,8 @@ class ToldPonder(PuppetPonder):
         return self._shape
 
     def end(self) -> None:
-        self._heard: list[tuple[int, str]] = []
-        self._begun: list[int] = []
+        self._heard.clear()
+        self._begun.clear()
 
     @property
     def model_hash(self) -> str:
