@@ -7,6 +7,10 @@ another subgoal of the same episode are said when nothing changed, or a place is
 themselves are not learned: where PONDER should have spoken, or should have been silent, that is its label, and the
 words that put it right are learned.
 
+A place can also be another thing's, or have one number of it (``elsewhere``): copied from a plan that was wrong from
+the start, it is where a hand tries in vain until the episode's time is over. Said of the subgoal in force it is put
+right like other wrong words; in what is planned it stands, and when its turn comes the right one is learned.
+
 A place can be wrong without an error: the thing was pushed. With ``retold_px`` words are owed again as soon as the
 place that they tell lies that far from where the thing is, for whichever reason. Cognition then never has to follow
 farther than that.
@@ -42,11 +46,14 @@ class Lapses:
     """Of all that is said, the share whose own place is wrong by ``slip_px``; put right only with a ``retold_px``."""
     slip_px: tuple[float, float] = (3.0, 24.0)
     """Standard deviation of each coordinate, of a 256 px picture: from the first to the second, log-uniform."""
+    elsewhere: float = 0.0
+    """Of all that is said, the share in which one place, its own or a planned one, is another thing's of the episode,
+    or has one number of that."""
     longest: int = 3
     """Queries until it is put right: from 1 up to so many, each as likely."""
 
     def __post_init__(self) -> None:
-        for name in ("rows", "missed", "wrong", "slipped"):
+        for name in ("rows", "missed", "wrong", "slipped", "elsewhere"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be in [0, 1], came {getattr(self, name)}")
         if self.longest < 1:
@@ -67,7 +74,7 @@ class Words:
     is_due: bool = False
     """Whether anything should be."""
     is_learned: bool = True
-    """False: the place slipped; that something is said is learned, what is said is not."""
+    """False: a place is wrong; that something is said is learned, what is said is not."""
 
 
 def without_lapses(subgoals: Sequence[str], is_change: Sequence[bool]) -> tuple[Words, ...]:
@@ -91,6 +98,7 @@ def drawn_lapses(
     also owed where the first place that was told last is farther than that from the subgoal's; None: never.
     """
     known = [text for text, changes in zip(subgoals, is_change, strict=True) if changes and text]
+    places = [match[0] for text in known for match in PLACE.finditer(text)]
     words: list[Words] = []
     wait: int | None = None  # queries until the words that are owed come; None: none are
     mistaken = ""
@@ -110,7 +118,15 @@ def drawn_lapses(
             wait = int(rng.integers(1, lapses.longest + 1))
             continue
         is_owed = wait is not None and bool(text)
-        if wait == 0:
+        if wait == 0 and is_owed and lapses.elsewhere and rng.random() < lapses.elsewhere:
+            last = _elsewhere(text, places, rng)
+            words.append(Words(text=last, is_due=True, is_learned=last == text))
+            wait = None
+            if is_other(_own(last), _own(text)):
+                mistaken = last
+                wait = int(rng.integers(1, lapses.longest + 1))
+                continue
+        elif wait == 0:
             last, is_right = _said(text, lapses, rng)
             words.append(Words(text=last, is_due=is_owed, is_learned=is_right))
             wait = None
@@ -127,6 +143,27 @@ def _said(text: str, lapses: Lapses, rng: np.random.Generator) -> tuple[str, boo
         return text, True
     said = misplaced(text, float(np.exp(rng.uniform(*np.log(lapses.slip_px)))), rng, count=1)
     return said, said == text  # at the edge of the picture, or by chance, it may be right all the same
+
+
+def _elsewhere(text: str, places: Sequence[str], rng: np.random.Generator) -> str:
+    """The text with one of its places as another of ``places``, or with the one or the other number of that."""
+    told = list(PLACE.finditer(text))
+    if not told:
+        return text
+    # as often the subgoal's own as any of the plan
+    place = told[0] if rng.random() < 0.5 else told[int(rng.integers(len(told)))]
+    others = [other for other in places if has_moved(other, place[0], _APART_PX)]
+    if not others:
+        return text
+    (v, u), (y, x) = PLACE.findall(str(rng.choice(others)))[0], place.groups()
+    wrong = str(rng.choice([f"<{v}, {u}>", f"<{v}, {u}>", f"<{v}, {x}>", f"<{y}, {u}>"]))
+    return f"{text[: place.start()]}{wrong}{text[place.end() :]}"
+
+
+def _own(text: str) -> str:
+    """The text up to its first place: what is planned comes later."""
+    place = PLACE.search(text)
+    return text if place is None else text[: place.end()]
 
 
 def has_moved(told: str, now: str, by_px: float) -> bool:

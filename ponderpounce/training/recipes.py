@@ -105,6 +105,7 @@ RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
     "small_noting": several.small_noting,
     "small_counting": several.small_counting,
     "small_pacing": several.small_pacing,
+    "small_watching": several.small_watching,
     "small_refresh_1s": partial(small.small_refresh, 1),
     "small_refresh_2s": partial(small.small_refresh, 2),
     "small_refresh_4s": partial(small.small_refresh, 4),

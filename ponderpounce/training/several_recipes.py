@@ -217,6 +217,18 @@ def small_pacing() -> Curriculum:
     return _settling_on(small_counting(), "small_pacing", 15, (400, 1100), batch_episodes=8, **told)
 
 
+def small_watching() -> Curriculum:
+    """The PONDER of `small_pacing` tells waits as they are, and puts right what is told where another thing is.
+
+    It is shown again what the pair plays (`pp-train --watch`). A trial: docs/training.md, "Places put right".
+    """
+    before = small_pacing()
+    lapses = replace(before.stages[-1].example.lapses, elsewhere=0.15)
+    # a row whose every place has slipped teaches to leave that as it is: not where it is another thing's
+    told = {"waits_longer": 0, "lapses": lapses, "slip_px": (3.0, 12.0)}
+    return _settling_on(before, "small_watching", 16, (400, 1100), batch_episodes=8, **told)
+
+
 def _settling_on(
     before: Curriculum, name: str, seed: int, decay: tuple[int, int], *, batch_episodes: int = 16, **example: Any
 ) -> Curriculum:

@@ -145,6 +145,38 @@ def test_a_slip_is_not_learned_and_is_put_right(stints: list[tuple[str, int]], s
         last = said.text or last
 
 
+@given(stints=STINTS, seed=st.integers(0, 2**32 - 1))
+def test_a_place_told_elsewhere_is_not_learned_and_is_put_right(stints: list[tuple[str, int]], seed: int) -> None:
+    texts, is_change = told(stints)
+    plans = [*texts[1:], texts[0]]  # each tells a place of the plan besides
+    texts = [text + plan[plan.index(" at ") :].replace(" at", ",") for text, plan in zip(texts, plans, strict=True)]
+    astray = Lapses(rows=1.0, missed=0.0, wrong=0.0, elsewhere=0.6)
+    words = drawn_lapses(astray, texts, is_change, np.random.default_rng(seed))
+    last, waited = "", 0
+    for text, changes, said in zip(texts, is_change, words, strict=True):
+        is_wrong = bool(last) and far_px(last, text) > 16.0
+        assert said.is_due >= is_wrong
+        assert said.is_due <= (changes or is_wrong)  # a change may make true what was wrong
+        assert said.is_learned == (said.text in ("", text))
+        if said.text:
+            assert PLACE.sub("", said.text) == PLACE.sub("", text)
+            there = {place[n] for each in texts for place in PLACE.findall(each) for n in (0, 1)}
+            assert all({*place} <= there for place in PLACE.findall(said.text))
+        waited = 0 if changes or said.text else waited + said.is_due
+        assert waited < astray.longest
+        last = said.text or last
+
+
+def test_about_as_many_places_are_told_elsewhere_as_asked_for() -> None:
+    texts = [f"pick at <{n}, {x}>, <{m}, 20>" for n, m, x in ((20, 80, 20), (80, 140, 60), (140, 20, 90))]
+    astray = Lapses(rows=1.0, missed=0.0, wrong=0.0, elsewhere=0.5, longest=1)
+    rng = np.random.default_rng(0)
+    firsts = [drawn_lapses(astray, texts, [True] * 3, rng)[1] for _ in range(400)]
+    assert 0.4 < np.mean([not said.is_learned for said in firsts]) < 0.6
+    own = np.mean([far_px(said.text, texts[1]) > 0 for said in firsts])
+    assert 0.3 < own < 0.45  # three of four of these, the others in the plan
+
+
 def far_px(one: str, other: str) -> float:
     first, second = (np.array([int(v) for v in PLACE.findall(text)[0]]) for text in (one, other))
     return float(np.hypot(*(first - second)))
