@@ -3,8 +3,9 @@
 #
 #     checkpoints/several/watch.sh [OUT]    (the OUT of the other scripts)
 #
-# Waits are told as they are, and a quarter of the rows are of what the pair before has played. All else as note.sh and pace.sh
-# have collected it. The same command goes on after a kill.
+# Waits are told as they are, places told where another thing is are put right, sides are noted when they are seen, and some rows
+# are of what the pair before has played. All else as note.sh and pace.sh have collected it. The same command goes on after a
+# kill.
 set -euo pipefail
 
 out=${1:-out/several}
@@ -16,14 +17,11 @@ source "$(dirname "$0")/common.sh"
 export OMP_NUM_THREADS=1 MUJOCO_GL=${MUJOCO_GL:-egl}
 
 play "$paced/pair" 12 1996000 "$next/counted-played" PickXtimes SwingXtimes BinFill
-play "$paced/pair" 9 1997000 "$next/driven-played" VideoPlaceButton VideoPlaceOrder ButtonUnmask VideoUnmask MoveCube
-for played in counted driven; do
-    mapfile -t found < <(logs "$next/$played-played")
-    [ -d "$next/$played/meta" ] || "$bin/pp-export" "${found[@]}" --texts follow --order near-first --out "$next/$played"
-done
+mapfile -t found < <(logs "$next/counted-played")
+[ -d "$next/counted/meta" ] || "$bin/pp-export" "${found[@]}" --texts follow --order near-first --out "$next/counted"
 data=("$paced/timed" "$noted/swaps" "$noted/swaps" "$noted/repick" "$noted/shown" "$noted/shown" "$noted/old" "$noted/filled"
     "$noted/imitated" "$noted/highlight")
 
 settle small_watching "$paced/pair/ponder" "$paced/pair/pounce" "$next" --data "${data[@]}" --sights "$noted/sights" \
-    --watch "$next/counted" "$next/driven" --watch-share 0.25
+    --watch "$next/counted" --watch-share 0.15
 evaluate "$next/pair" "$next"

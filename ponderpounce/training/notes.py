@@ -28,7 +28,7 @@ from ponderpounce.tasks.difficulty import DIFFICULTIES
 from ponderpounce.tasks.front_view import front_pixels
 from ponderpounce.tasks.paces import PASS_STEPS, PRESS_STEPS
 from ponderpounce.training.countdown import rhythm, waits
-from ponderpounce.training.deeds import told_deeds
+from ponderpounce.training.deeds import passing_side, told_deeds
 from ponderpounce.training.lapses import Words
 from ponderpounce.training.places import PARTS, PLACE, TEXT_PX, WAY, apart_px
 
@@ -91,8 +91,9 @@ def demo_notes(texts: Sequence[str], tools: Sequence[str], moving: Sequence[str]
     """What is noted at every instant of a demonstration, places as texts tell them; ``""`` for nothing.
 
     Where things move by the clock alone, where they are. Else every deed that a narration tells (`told_deeds`), with
-    its number, when the tool is nearest to its place; and where a thing that will be asked for may
-    change places afterwards, its place from then on.
+    its number, when the tool is nearest to its place; of a way around things also the side on which it passes one, when
+    the tool is there: that is seen then, and told at the end of the stretch. And where a thing that will be asked for
+    may change places afterwards, its place from then on.
 
     Args:
         texts: what is done in each of D instants, grounded; its places followed (`pp-collect --texts follow`).
@@ -107,6 +108,9 @@ def demo_notes(texts: Sequence[str], tools: Sequence[str], moving: Sequence[str]
         last = min(told.last + int(WAY.search(texts[told.last]) is not None), len(texts) - 1)
         instants = range(min(max(told.first, done + 1), last), last + 1)
         done = min(instants, key=lambda instant: apart_px(tools[instant], told.place) or 0.0)  # 0: the text tells none
+        side = passing_side(texts[told.last])
+        if side and (way := range(instants.start, done)):
+            found[_half_way(way, tools, told.place)] = side
         found[done] = f"{found[done]}, {told.words}" if found[done] else told.words
         if told.words == told.place:  # the one that was picked up: it stays in view, and may move
             found[done : told.last + 1] = [told.place] * (told.last + 1 - done)
@@ -121,6 +125,18 @@ def demo_notes(texts: Sequence[str], tools: Sequence[str], moving: Sequence[str]
         elif second:  # of the cube, and of where it will have to be put, this is the one that may move
             found[instant] = second
     return found
+
+
+def _half_way(way: range, tools: Sequence[str], end: str) -> int:
+    """Of these instants the one in which the tool is half-way, in columns, from where it is in the first to ``end``:
+    rows are what it leaves its line in."""
+    start, stop = _column(tools[way.start]), _column(end)
+    return min(way, key=lambda instant: abs(_column(tools[instant]) - (start + stop) / 2))
+
+
+def _column(place: str) -> int:
+    found = PLACE.search(place)
+    return 0 if found is None else int(found[2])
 
 
 def noted(instruction: str, subgoals: Sequence[str], moving: Sequence[str]) -> list[str]:

@@ -226,7 +226,7 @@ def small_watching() -> Curriculum:
     lapses = replace(before.stages[-1].example.lapses, elsewhere=0.15)
     # a row whose every place has slipped teaches to leave that as it is: not where it is another thing's
     told = {"waits_longer": 0, "lapses": lapses, "slip_px": (3.0, 12.0)}
-    return _settling_on(before, "small_watching", 16, (400, 1100), batch_episodes=8, **told)
+    return _settling_on(before, "small_watching", 16, (350, 1000), batch_episodes=8, **told)
 
 
 def _settling_on(

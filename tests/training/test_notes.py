@@ -139,6 +139,20 @@ def test_stretches_of_a_way_are_noted_where_they_end() -> None:
     assert both == ["", f"{expected[3]}, {expected[4]}"], "what fell between the same two looks is told at once"
 
 
+def test_the_side_on_which_a_way_passes_is_noted_when_it_is_seen() -> None:
+    left = "move to the nearest left target by circling around the stick {} to {}"
+    there, back = "<89, 167>, then clockwise to <89, 130>", "<89, 130>"
+    texts = [left.format("clockwise", there)] * 4
+    texts += ["move to the nearest right target by circling around the stick clockwise to <89, 130>"] * 2
+    tools = ["<85, 132>", "<58, 140>", "<56, 151>", "<80, 165>", "<103, 148>", "<88, 133>"]
+    expected = ["", "", "backward", "backward <89, 167>", "forward", f"forward {back}"]
+    assert demo_notes(texts, tools, [""] * 6) == expected
+    at_once = demo_notes(texts[3:], tools[3:], [""] * 3)
+    assert at_once == ["backward <89, 167>", *expected[4:]], "no instant is left for the side alone"
+    straight = ["move left to <89, 167>"] * 3
+    assert demo_notes(straight, tools[1:4], [""] * 3) == ["", "", "left <89, 167>"], "it goes around nothing"
+
+
 def test_a_stretch_that_ends_where_it_began_is_not_over_at_once() -> None:
     texts = [*["move left to <50, 50>, then <52, 52>"] * 2, *["move right to <52, 52>"] * 2]
     tools = ["<90, 90>", "<70, 70>", "<51, 51>", "<60, 60>"]
