@@ -9,6 +9,12 @@ play() {  # a PAIR plays EPISODES each from SEED on, recorded INTO a folder, of 
         --ponder-checkpoint "$pair/ponder" --pounce-checkpoint "$pair/pounce"
 }
 
+retell() {  # what was played in the folder FROM, told as things then stood, becomes the dataset INTO
+    local from=$1 into=$2 found
+    mapfile -t found < <(logs "$from")
+    [ -d "$into/meta" ] || "$bin/pp-export" "${found[@]}" --texts follow --order near-first --out "$into"
+}
+
 settle() {  # a PONDER goes on by RECIPE's `settling` INTO a folder, and makes a pair there with POUNCE; the rest is pp-train's
     local recipe=$1 ponder=$2 pounce=$3 into=$4; shift 4
     [ -d "$into/run/settling/ponder" ] || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --weights whole \

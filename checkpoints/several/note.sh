@@ -28,10 +28,7 @@ data=("$next/timed" "$next/timed" "$next/swaps" "$next/swaps" "$next/repick" "$n
 
 play "$before/pair" 28 1990000 "$next/counted-played" PickXtimes SwingXtimes BinFill
 play "$before/pair" 12 1995000 "$next/driven-played" VideoPlaceButton VideoPlaceOrder ButtonUnmask VideoUnmask
-for played in counted driven; do
-    mapfile -t found < <(logs "$next/$played-played")
-    [ -d "$next/$played/meta" ] || "$bin/pp-export" "${found[@]}" --texts follow --order near-first --out "$next/$played"
-done
+for played in counted driven; do retell "$next/$played-played" "$next/$played"; done
 
 settle small_noting "$before/pair/ponder" "$before/pair/pounce" "$next" --data "${data[@]}" --sights "$next/sights" \
     --watch "$next/counted" "$next/driven" --watch-share 0.25

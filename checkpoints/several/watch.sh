@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# A trial to go on from the PONDER of pace.sh, on two CPU cores: see docs/training.md, "Places put right".
+# Goes on from the PONDER of pace.sh, on two CPU cores, and leaves the shipped pair: see docs/training.md, "Places put right".
 #
 #     checkpoints/several/watch.sh [OUT]    (the OUT of the other scripts)
 #
-# Waits are told as they are, places told where another thing is are put right, sides are noted when they are seen, and some rows
-# are of what the pair before has played. All else as note.sh and pace.sh have collected it. The same command goes on after a
-# kill.
+# Waits are told as they are, places told where another thing is are to be put right, sides noted when they are seen, and some
+# rows are of what the pair before has played. All else as note.sh and pace.sh have collected it. The same command goes on after
+# a kill. It was run by its parts.
 set -euo pipefail
 
 out=${1:-out/several}
@@ -17,8 +17,7 @@ source "$(dirname "$0")/common.sh"
 export OMP_NUM_THREADS=1 MUJOCO_GL=${MUJOCO_GL:-egl}
 
 play "$paced/pair" 12 1996000 "$next/counted-played" PickXtimes SwingXtimes BinFill
-mapfile -t found < <(logs "$next/counted-played")
-[ -d "$next/counted/meta" ] || "$bin/pp-export" "${found[@]}" --texts follow --order near-first --out "$next/counted"
+retell "$next/counted-played" "$next/counted"
 data=("$paced/timed" "$noted/swaps" "$noted/swaps" "$noted/repick" "$noted/shown" "$noted/shown" "$noted/old" "$noted/filled"
     "$noted/imitated" "$noted/highlight")
 

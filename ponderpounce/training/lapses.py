@@ -118,18 +118,13 @@ def drawn_lapses(
             wait = int(rng.integers(1, lapses.longest + 1))
             continue
         is_owed = wait is not None and bool(text)
-        if wait == 0 and is_owed and lapses.elsewhere and rng.random() < lapses.elsewhere:
-            last = _elsewhere(text, places, rng)
-            words.append(Words(text=last, is_due=True, is_learned=last == text))
-            wait = None
-            if is_other(_own(last), _own(text)):
-                mistaken = last
-                wait = int(rng.integers(1, lapses.longest + 1))
-                continue
-        elif wait == 0:
-            last, is_right = _said(text, lapses, rng)
+        if wait == 0:
+            last, is_right = _said(text, places, lapses, rng)
             words.append(Words(text=last, is_due=is_owed, is_learned=is_right))
             wait = None
+            if lapses.elsewhere and is_other(_own(last), _own(text)):
+                mistaken = last
+                wait = int(rng.integers(1, lapses.longest + 1))
         else:
             words.append(Words(is_due=is_owed))
         if wait is None:
@@ -137,8 +132,11 @@ def drawn_lapses(
     return tuple(words)
 
 
-def _said(text: str, lapses: Lapses, rng: np.random.Generator) -> tuple[str, bool]:
-    """The words, and whether they are right."""
+def _said(text: str, places: Sequence[str], lapses: Lapses, rng: np.random.Generator) -> tuple[str, bool]:
+    """The words, and whether they are right. ``places``: all of the episode."""
+    if text and lapses.elsewhere and rng.random() < lapses.elsewhere:
+        said = _elsewhere(text, places, rng)
+        return said, said == text
     if not lapses.slipped or rng.random() >= lapses.slipped or PLACE.search(text) is None:
         return text, True
     said = misplaced(text, float(np.exp(rng.uniform(*np.log(lapses.slip_px)))), rng, count=1)

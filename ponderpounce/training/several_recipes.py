@@ -218,9 +218,10 @@ def small_pacing() -> Curriculum:
 
 
 def small_watching() -> Curriculum:
-    """The PONDER of `small_pacing` tells waits as they are, and puts right what is told where another thing is.
+    """The PONDER of `small_pacing` is taught to tell waits as they are, and to put places right (`Lapses.elsewhere`).
 
-    It is shown again what the pair plays (`pp-train --watch`). A trial: docs/training.md, "Places put right".
+    It is shown again what the pair plays (`pp-train --watch`). What it leaves is shipped: docs/training.md, "Places put
+    right", and what it did not learn.
     """
     before = small_pacing()
     lapses = replace(before.stages[-1].example.lapses, elsewhere=0.15)
