@@ -182,6 +182,14 @@ class Task(ABC, Generic[LayoutT, MemoryT]):
         """
         return ()
 
+    def underway(self, layout: LayoutT, step: int) -> tuple[int, int]:
+        """Returns when what is on its way (`moving`) in the observation of ``step`` left, and when it will be at rest,
+        were it for a moment.
+
+        ``step`` twice, and that is the default, where nothing is, or where it never rests.
+        """
+        return step, step
+
     def due_step(self, layout: LayoutT) -> int | None:
         """Returns when the arm is to begin with what must happen at one instant, in steps from reset on.
 

@@ -23,7 +23,7 @@ from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.models.prompt import with_subgoal
 from ponderpounce.tasks.front_view import front_pixels
 from ponderpounce.training.example import chunk_ticks
-from ponderpounce.training.notes import demo_notes, moving_places
+from ponderpounce.training.notes import demo_notes, ends_of_moves, moving_places
 from ponderpounce.training.own_words import as_recorded
 from ponderpounce.training.places import TEXT_PX
 from ponderpounce.training.sight_store import SightStore, Views
@@ -202,12 +202,14 @@ class TrainingSet:
         views, sights = self._pictures(source, own, shown)
         moving = moving_places(entry.task, entry.seed, entry.difficulty, entry.num_rows)
         tools = _seen_at(rows.tcp_pose[:start:FPS])
+        shown_texts = rows.grounded_subgoal[:start]
+        whence, rests = ends_of_moves(shown_texts)
         episode = TrainingEpisode(
             instruction=entry.instruction,
             demo=tuple((views if sights is None else sights)[:num_shown]),
-            demo_subgoals=rows.grounded_subgoal[:start:FPS],
+            demo_subgoals=shown_texts[::FPS],
             demo_tools=tools,
-            demo_notes=demo_notes(rows.grounded_subgoal[:start:FPS], tools, moving[:start:FPS]),
+            demo_notes=demo_notes(shown_texts[::FPS], tools, moving[:start:FPS], (whence[::FPS], rests[::FPS])),
             frames=views[num_shown:],
             sights=None if sights is None else sights[num_shown:],
             state_T8=rows.state[start:],

@@ -6,6 +6,9 @@ down begins at the first layer again. So PONDER notes, as long as anything moves
 
 - at every instant of a demonstration, where what will be asked for is then: "<99, 120>";
 - at every query, where it is now, behind the subgoal: "press the first button at <60, 90>, <99, 120>";
+- of a thing that is changing places, also where it will come to rest: "<99, 120> to <80, 66>". Half-way through a swap
+  the other one is nearer to where it was last seen, and was taken for it. Who knows where it is going is not misled,
+  and what is noted last is the place to go to though the swap is not over;
 - of a thing that comes by and is to be stopped, also how often it does and how long there is to wait (`countdown`):
   "remain static, <110, 77>, 80, 137". The pace is read off two places, and the wait off pace and place.
 
@@ -19,7 +22,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from importlib.util import find_spec
-from itertools import pairwise
+from itertools import groupby, pairwise
 
 import numpy as np
 
@@ -29,11 +32,14 @@ from ponderpounce.tasks.front_view import front_pixels
 from ponderpounce.tasks.paces import PASS_STEPS, PRESS_STEPS
 from ponderpounce.training.countdown import rhythm, waits
 from ponderpounce.training.deeds import passing_side, told_deeds
-from ponderpounce.training.lapses import Words
+from ponderpounce.training.lapses import Words, has_moved
 from ponderpounce.training.places import PARTS, PLACE, TEXT_PX, WAY, apart_px
 
 _ONE = PLACE.pattern.replace("(", "").replace(")", "")
-_STILL = re.compile(rf"drop the cube on the table at ({_ONE})(?:, {_ONE})?|static at ({_ONE})(?:, ({_ONE}))?")
+_WATCHED = "static at "
+_STILL = re.compile(rf"drop the cube on the table at ({_ONE})(?:, {_ONE})?|{_WATCHED}({_ONE})(?:, ({_ONE}))?")
+_TO = " to "
+_UNDERWAY_PX = 3.0
 _WAIT = re.compile(r", \d+, (\d+)$")
 _LOOK_STEPS = 25  # a query a second: one at least sees where everything has come to rest
 _PACE_STEPS = 30  # two looks; before, nobody can tell how fast it runs
@@ -48,8 +54,9 @@ def moving_places(task: str, seed: int, difficulty: str, num_steps: int) -> list
     """Per observation of an episode from reset on, its demonstration's first, where things are that move by themselves.
 
     ``<y, x>, <y, x>`` as texts tell places, nothing of those outside of the picture, up to a look after the last has
-    come to rest; empty where nothing moves. Needs no physics: what the seed draws tells it (`Task.moving`). Empty, too,
-    where nothing can be drawn (`can_follow`).
+    come to rest; ``<y, x> to <v, u>`` for one that is on its way to a place. Empty where nothing moves. Needs no
+    physics: what the seed draws tells it (`Task.moving`, `Task.underway`). Empty, too, where nothing can be drawn
+    (`can_follow`).
     """
     if not can_follow():
         return [""] * num_steps
@@ -65,9 +72,51 @@ def moving_places(task: str, seed: int, difficulty: str, num_steps: int) -> list
         if not points_m:
             found += found[-1:] * _LOOK_STEPS
             return [*found, *[""] * num_steps][:num_steps]
-        pixels = front_pixels(np.array(points_m), TEXT_PX).round().astype(int).tolist()
-        found.append(", ".join(f"<{y}, {x}>" for y, x in pixels if min(y, x) >= 0 and max(y, x) <= TEXT_PX))
+        ends_m = (found_task.moving(layout, at) for at in found_task.underway(layout, step))
+        places = zip(*map(_in_picture, (points_m, *ends_m)), strict=True)
+        found.append(", ".join(_onward(now, whence, rest) for now, whence, rest in places if now))
     return found
+
+
+def _in_picture(points_m: Sequence[tuple[float, float, float]]) -> list[str]:
+    """``<y, x>`` of each; empty outside of the picture."""
+    pixels = front_pixels(np.array(points_m), TEXT_PX).round().astype(int).tolist()
+    return [f"<{y}, {x}>" if min(y, x) >= 0 and max(y, x) <= TEXT_PX else "" for y, x in pixels]
+
+
+def _onward(now: str, whence: str, rest: str) -> str:
+    """The place, and where it will come to rest if that is another one and it can be seen to have left."""
+    is_underway = has_moved(now, rest, _UNDERWAY_PX) and has_moved(now, whence, _UNDERWAY_PX)
+    return f"{now}{_TO}{rest}" if is_underway else now
+
+
+def ends_of_moves(texts: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The captions of a demonstration, one a control step, with things that are watched where they last were at rest,
+    and where they next will be.
+
+    They are while they move by a pixel at most in five steps; between two swaps that is a moment.
+    """
+    last, coming = [], []
+    for is_watched, run in groupby(texts, key=lambda text: text.startswith(_WATCHED)):
+        captions = [*run]
+        last += _at_rest(captions[::-1])[::-1] if is_watched else captions
+        coming += _at_rest(captions) if is_watched else captions
+    return last, coming
+
+
+def _at_rest(texts: Sequence[str]) -> Sequence[str]:
+    told = [[(int(y), int(x)) for y, x in PLACE.findall(text)] for text in texts]
+    if len({len(each) for each in told}) > 1 or not told[0]:  # something comes into sight, or nothing is
+        return texts
+    places_TK2 = np.array(told)
+    last = len(texts) - 1
+    before, after = (np.arange(last + 1) + shift for shift in (-2, 2))
+    moves_TK2 = places_TK2[after.clip(max=last)] - places_TK2[before.clip(min=0)]
+    moves_TK = np.abs(moves_TK2).max(axis=-1) > 1
+    for tick in range(last - 1, -1, -1):
+        moves_K = moves_TK[tick]
+        places_TK2[tick, moves_K] = places_TK2[tick + 1, moves_K]
+    return [_WATCHED + ", ".join(f"<{y}, {x}>" for y, x in places_K2) for places_K2 in places_TK2.tolist()]
 
 
 def in_sight(note: str, eyes: Eyes) -> str:
@@ -76,9 +125,11 @@ def in_sight(note: str, eyes: Eyes) -> str:
         return note
     boxes = [eye.box for eye in eyes if eye.camera == 0]
     told = (
-        PLACE.sub(lambda place: place[0] if any(_is_in(box, place) for box in boxes) else "", part).strip()
+        PLACE.sub(lambda place: place[0] if any(_is_in(box, place) for box in boxes) else "", part)
         for part in PARTS.split(note)
     )
+    # of two places that "to" joins one may be left
+    told = (part.removeprefix(_TO).removesuffix(_TO).strip() for part in told)
     return ", ".join(part for part in told if part)
 
 
@@ -87,7 +138,12 @@ def _is_in(box: tuple[float, float, float, float], place: re.Match[str]) -> bool
     return top <= int(place[1]) < bottom and left <= int(place[2]) < right
 
 
-def demo_notes(texts: Sequence[str], tools: Sequence[str], moving: Sequence[str]) -> list[str]:
+def demo_notes(
+    texts: Sequence[str],
+    tools: Sequence[str],
+    moving: Sequence[str],
+    moves: tuple[Sequence[str], Sequence[str]] | None = None,
+) -> list[str]:
     """What is noted at every instant of a demonstration, places as texts tell them; ``""`` for nothing.
 
     Where things move by the clock alone, where they are. Else every deed that a narration tells (`told_deeds`), with
@@ -99,6 +155,7 @@ def demo_notes(texts: Sequence[str], tools: Sequence[str], moving: Sequence[str]
         texts: what is done in each of D instants, grounded; its places followed (`pp-collect --texts follow`).
         tools: where the tool is then, ``<y, x>``.
         moving: `moving_places` of these instants.
+        moves: `ends_of_moves` at these instants; None: nothing changes places.
     """
     if any(moving) or len(tools) != len(texts):
         return list(moving)
@@ -115,15 +172,14 @@ def demo_notes(texts: Sequence[str], tools: Sequence[str], moving: Sequence[str]
         if told.words == told.place:  # the one that was picked up: it stays in view, and may move
             found[done : told.last + 1] = [told.place] * (told.last + 1 - done)
     is_picked_alone = any(PLACE.fullmatch(note) for note in found)
-    for instant, text in enumerate(texts):
-        still = _STILL.fullmatch(text)
-        if still is None or not any(found[:instant]):
+    for instant, captions in enumerate(zip(texts, *(moves or (texts, texts)), strict=True)):
+        still = [match for match in map(_STILL.fullmatch, captions) if match is not None]
+        if len(still) < len(captions) or not any(found[:instant]):
             continue
-        put_back, at_rest, second = still.groups()
         if is_picked_alone:
-            found[instant] = put_back or at_rest
-        elif second:  # of the cube, and of where it will have to be put, this is the one that may move
-            found[instant] = second
+            found[instant] = _onward(*(match[1] or match[2] for match in still))
+        elif still[0][3]:  # of the cube, and of where it will have to be put, this is the one that may move
+            found[instant] = _onward(*(match[3] for match in still))
     return found
 
 

@@ -230,6 +230,32 @@ def small_watching() -> Curriculum:
     return _settling_on(before, "small_watching", 16, (350, 1000), batch_episodes=8, **told)
 
 
+def small_foreseeing() -> Curriculum:
+    """The PONDER of `small_watching` learns to tell where things that change places will come to rest (`notes`).
+
+    `following` is for episodes in which things change places, and for their beginnings alone; `settling` for all.
+    """
+    *_, settling = small_watching().stages
+    following = replace(
+        settling,
+        name="small_foreseeing/following",
+        example=replace(
+            settling.example,
+            max_queries=11,  # by then everything is at rest
+            recalls=1.0,
+            even_clocks=0.9,
+            text_dropout=0.0,
+            lapses=NO_LAPSES,
+            slips=0.0,
+        ),
+        train=TrainConfig(seed=17, optim=replace(_TURNING, warmup_steps=50)),
+        num_steps=700,
+        batch_episodes=16,
+    )
+    last = _settling_on(small_watching(), "small_foreseeing", 18, (250, 700), batch_episodes=8)
+    return Curriculum(name="small_foreseeing", stages=(following, *last.stages))
+
+
 def _settling_on(
     before: Curriculum, name: str, seed: int, decay: tuple[int, int], *, batch_episodes: int = 16, **example: Any
 ) -> Curriculum:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -21,10 +22,20 @@ from ponderpounce.tasks.counting.stop_cube import StopCube
 from ponderpounce.tasks.environment import make_environment
 from ponderpounce.tasks.front_view import front_pixels
 from ponderpounce.tasks.paces import PASS_STEPS
+from ponderpounce.tasks.swaps import SWAP_STEPS
 from ponderpounce.training.countdown import as_place, stood_at, waits
 from ponderpounce.training.example import ExampleConfig, Slip, make_example
-from ponderpounce.training.notes import demo_notes, heeded, in_sight, misnoted, moving_places, noted, told_wait
-from ponderpounce.training.places import PLACE, TEXT_PX
+from ponderpounce.training.notes import (
+    demo_notes,
+    ends_of_moves,
+    heeded,
+    in_sight,
+    misnoted,
+    moving_places,
+    noted,
+    told_wait,
+)
+from ponderpounce.training.places import PARTS, PLACE, TEXT_PX, apart_px
 from ponderpounce.training.stand_in import stand_in, text_code
 from ponderpounce.training.training_episode import TrainingEpisode
 from tests.training.test_countdown import FORM, HOVER, PRESS, STILL, waiting_episode
@@ -57,11 +68,52 @@ def test_places_are_where_the_simulator_shows_things(task: str, bodies: list[str
                 points_m = np.array([environment.physics.position_m(body) for body in bodies])
                 points_m[:, 2] = points_m[:, 2].clip(max=0.038)  # texts tell the middle of what is seen of a container
                 seen_N2 = front_pixels(points_m, TEXT_PX)
-                for place in PLACE.finditer(told[step]):
+                for place in re.finditer(rf"(?<! to ){PLACE.pattern}", told[step]):
                     away_px = np.hypot(*(seen_N2 - [int(place[1]), int(place[2])]).T).min()
                     assert away_px < 1.5
             environment.step(hold, look=False)
         environment.close()
+
+
+@pytest.mark.parametrize("difficulty", ["easy", "medium", "hard"])
+@pytest.mark.parametrize("seed", [3, 5, 8])
+def test_who_is_on_its_way_is_told_to_where_the_swap_leaves_it(seed: int, difficulty: str) -> None:
+    """Law: what stands behind "to" is where the thing is when the swap that is going on is over; it is never a guess of
+    what comes after, and nobody at rest has any."""
+    told = moving_places("VideoUnmaskSwap", seed, difficulty, 400)
+    end = max(step for step, note in enumerate(told) if note)
+    num_underway = 0
+    for step, note in enumerate(told[:end]):
+        over = min(64 + -(-(step - 64) // SWAP_STEPS) * SWAP_STEPS, end)
+        for nth, part in enumerate(PARTS.split(note) if note else ()):
+            _, _, rest = part.partition(" to ")
+            if rest:
+                num_underway += 1
+                assert 64 < step < over
+                assert rest == PARTS.split(told[over])[nth]
+            else:
+                left_px = apart_px(part, PARTS.split(told[over])[nth])
+                has_just_left = step <= 64 or (step - 64) % SWAP_STEPS < SWAP_STEPS // 2
+                assert has_just_left or left_px is None or left_px <= 3
+    assert num_underway or all(len(PARTS.split(note)) == 1 for note in told if note)
+
+
+def test_where_watched_things_rest_before_and_after_is_read_off_the_captions() -> None:
+    """They move for a while, rest for a moment, and move on; what is not watched stays as it was."""
+    ways = [*range(50, 80, 2), 80, 80, 80, 80, 80, *range(80, 101, 2)]
+    texts = ["pick up the cube at <1, 2>", *(f"static at <{y}, 9>, <5, 6>" for y in (50, 50, 50, *ways, 100, 100, 100))]
+    last, coming = ends_of_moves(texts)
+    assert last[0] == coming[0] == texts[0]
+    middle = texts.index("static at <66, 9>, <5, 6>")
+    assert last[middle].startswith("static at <50, 9>, <5, 6>")
+    assert coming[middle] == "static at <80, 9>, <5, 6>"
+    onward = texts.index("static at <90, 9>, <5, 6>")
+    assert last[onward] == "static at <80, 9>, <5, 6>"
+    assert coming[onward] == "static at <100, 9>, <5, 6>"
+    assert coming[1] == texts[1]
+    seen_late = ["static at <1, 2>", "static at <1, 2>, <3, 4>"]
+    assert ends_of_moves(seen_late) == (seen_late, seen_late), "something comes into sight"
+    assert ends_of_moves(["static at "]) == (["static at "],) * 2
 
 
 def test_what_has_come_to_rest_is_told_for_one_more_look() -> None:
@@ -102,6 +154,9 @@ def test_what_is_out_of_sight_is_not_noted() -> None:
     assert in_sight("", eyes) == ""
     assert in_sight("second <3, 63>", eyes) == "second", "it happened all the same"
     assert in_sight("second <3, 64>", eyes) == "second <3, 64>"
+    assert in_sight("<3, 64> to <3, 65>, <4, 64> to <3, 1>, <3, 1> to <5, 64>, <3, 1> to <3, 2>", eyes) == (
+        "<3, 64> to <3, 65>, <4, 64>, <5, 64>"
+    )
 
 
 def test_the_cube_that_was_shown_is_noted_from_when_the_tool_is_at_it() -> None:
@@ -113,6 +168,8 @@ def test_the_cube_that_was_shown_is_noted_from_when_the_tool_is_at_it() -> None:
     assert demo_notes(texts[:1], tools[:1], [""]) == ["<90, 120>"], "no later than it is done"
     assert demo_notes(texts, tools, ["<1, 2>"] * 6) == ["<1, 2>"] * 6, "the clock alone tells it"
     assert demo_notes(texts, (), [""] * 6) == [""] * 6, "nobody says where the tool is"
+    moves = ([*texts[:5], texts[4]], [*texts[:5], "static at <130, 100>, <60, 60>"])
+    assert demo_notes(texts, tools, [""] * 6, moves) == [*expected[:5], "<99, 110> to <130, 100>"], "on its way"
 
 
 def test_deeds_are_noted_when_the_tool_is_there_and_a_target_from_then_on() -> None:

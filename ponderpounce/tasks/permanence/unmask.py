@@ -27,6 +27,7 @@ from ponderpounce.tasks.oracle import Actions, Motions
 from ponderpounce.tasks.permanence.scenes import LANE_M, SWAP_STEP, Hidden, Layout
 from ponderpounce.tasks.physics import Physics
 from ponderpounce.tasks.scene import CUBE_COLORS, add_button, add_cube
+from ponderpounce.tasks.swaps import SWAP_STEPS
 from ponderpounce.tasks.task import Reasoning, Shown, Subtask, Task, Thing
 
 COVER_STEP = 32  # the first observation that shows the containers
@@ -87,6 +88,13 @@ class Unmask(Task[Layout, Pressed]):
         wanted = (spots[cube.container] for cube in layout.hidden[: layout.num_picks])
         z_m = HIDDEN_HALF_M if step < COVER_STEP else _MIDDLE_Z_M
         return tuple((spot.x_m, spot.y_m, z_m) for spot in wanted)
+
+    def underway(self, layout: Layout, step: int) -> tuple[int, int]:
+        """When the swap that is going on began, and when it ends."""
+        if not SWAP_STEP < step < layout.last_event_step:
+            return step, step
+        began = step - (step - SWAP_STEP) % SWAP_STEPS
+        return (step, step) if began == step else (began, began + SWAP_STEPS)
 
     def things(self, layout: Layout, step: int, memory: object = None) -> tuple[Thing, ...]:
         """Cubes as long as they lie bare, then containers."""
