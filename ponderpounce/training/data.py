@@ -25,7 +25,7 @@ from ponderpounce.tasks.front_view import front_pixels
 from ponderpounce.training.example import chunk_ticks
 from ponderpounce.training.notes import demo_notes, ends_of_moves, moving_places
 from ponderpounce.training.own_words import as_recorded
-from ponderpounce.training.places import TEXT_PX
+from ponderpounce.training.places import TEXT_PX, WAY
 from ponderpounce.training.sight_store import SightStore, Views
 from ponderpounce.training.training_episode import Frame, TrainingEpisode
 
@@ -34,6 +34,9 @@ _SYSTEMS = ("pounce", "ponder")
 _MIN_REACH = 1e-3
 _MIN_SPAN = 1e-3
 """A dimension that hardly moves is not blown up to fill [-1, 1]."""
+_OVER_A_WAY_M = 0.06
+"""How high a stick's tip is led over the places that a way leads to, about. It is seen some ten pixels behind them:
+without this the end of a stretch was looked for up to a second late, and the next one's side where none was seen."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -201,8 +204,9 @@ class TrainingSet:
         own = np.maximum.accumulate(np.where(rows.is_rendered, np.arange(len(rows.is_rendered)), 0))
         views, sights = self._pictures(source, own, shown)
         moving = moving_places(entry.task, entry.seed, entry.difficulty, entry.num_rows)
-        tools = _seen_at(rows.tcp_pose[:start:FPS])
         shown_texts = rows.grounded_subgoal[:start]
+        is_way = any(WAY.search(text) for text in shown_texts[::FPS])
+        tools = _seen_at(rows.tcp_pose[:start:FPS], below_m=_OVER_A_WAY_M if is_way else 0.0)
         whence, rests = ends_of_moves(shown_texts)
         episode = TrainingEpisode(
             instruction=entry.instruction,
@@ -289,9 +293,11 @@ def _sources(dataset: Dataset, tasks: Sequence[str], *, is_watched: bool) -> lis
     return [_Source(dataset=dataset, entry=entry, is_watched=is_watched) for entry in entries]
 
 
-def _seen_at(poses_T7: NDArray[np.float32]) -> list[str]:
-    """Where the front camera sees the tool, as a text tells a place, at its edge where it would leave the picture."""
-    pixels_T2 = front_pixels(poses_T7[:, :3], TEXT_PX).round().clip(0, TEXT_PX).astype(int)
+def _seen_at(poses_T7: NDArray[np.float32], below_m: float = 0.0) -> list[str]:
+    """Where the front camera sees what is so far below the tool, as a text tells a place; at the picture's edge where
+    it would leave it."""
+    points_T3 = poses_T7[:, :3] - np.array([0.0, 0.0, below_m])
+    pixels_T2 = front_pixels(points_T3, TEXT_PX).round().clip(0, TEXT_PX).astype(int)
     return [f"<{y}, {x}>" for y, x in pixels_T2.tolist()]
 
 
