@@ -249,10 +249,10 @@ def small_foreseeing() -> Curriculum:
             slips=0.0,
         ),
         train=TrainConfig(seed=17, optim=replace(_TURNING, warmup_steps=50)),
-        num_steps=700,
+        num_steps=400,
         batch_episodes=16,
     )
-    last = _settling_on(small_watching(), "small_foreseeing", 18, (250, 700), batch_episodes=8)
+    last = _settling_on(small_watching(), "small_foreseeing", 18, (220, 620), batch_episodes=8)
     return Curriculum(name="small_foreseeing", stages=(following, *last.stages))
 
 
