@@ -15,10 +15,15 @@ retell() {  # what was played in the folder FROM, told as things then stood, bec
     [ -d "$into/meta" ] || "$bin/pp-export" "${found[@]}" --texts follow --order near-first --out "$into"
 }
 
+learn() {  # a PONDER goes on by a STAGE of RECIPE INTO a folder, beside POUNCE; the rest is pp-train's
+    local recipe=$1 stage=$2 ponder=$3 pounce=$4 into=$5; shift 5
+    [ -d "$into/run/$stage/ponder" ] || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --weights whole \
+        --recipe "$recipe" --stage "$stage" --ponder "$ponder" --pounce "$pounce" --out "$into/run" "$@"
+}
+
 settle() {  # a PONDER goes on by RECIPE's `settling` INTO a folder, and makes a pair there with POUNCE; the rest is pp-train's
     local recipe=$1 ponder=$2 pounce=$3 into=$4; shift 4
-    [ -d "$into/run/settling/ponder" ] || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --weights whole \
-        --recipe "$recipe" --stage settling --ponder "$ponder" --pounce "$pounce" --out "$into/run" "$@"
+    learn "$recipe" settling "$ponder" "$pounce" "$into" "$@"
     [ -d "$into/pair/ponder" ] || halve "$into/run/settling/ponder" "$into/pair/ponder"
     [ -d "$into/pair/pounce" ] || cp -r "$pounce" "$into/pair/pounce"
 }
