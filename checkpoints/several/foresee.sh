@@ -25,8 +25,8 @@ collect "$next/repick" --tasks VideoRepick --episodes 61 "${noisy[@]}" --difficu
 ponder=$watched/pair/ponder pounce=$watched/pair/pounce
 swaps=("$next/video-swaps" "$next/button-swaps" "$noted/repick")
 learn small_foreseeing following "$ponder" "$pounce" "$next" --data "${swaps[@]}" --sights "$noted/sights"
-data=("$paced/timed" "${swaps[@]}" "$next/repick" "$noted/shown" "$noted/shown" "$noted/old" "$noted/filled" "$noted/imitated"
-    "$noted/highlight")
+data=("$paced/timed" "${swaps[@]}" "$next/video-swaps" "$next/button-swaps" "$next/repick" "$noted/shown" "$noted/shown"
+    "$noted/old" "$noted/filled" "$noted/imitated" "$noted/highlight")
 settle small_foreseeing "$next/run/following/ponder" "$pounce" "$next" --data "${data[@]}" --sights "$noted/sights" \
     --watch "$watched/counted" --watch-share 0.15
 evaluate "$next/pair" "$next"
