@@ -102,6 +102,14 @@ class Text:
     """True if it was cut at the token limit and closed as it was."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Note:
+    """What PONDER wrote after an instant of a demonstration, counted from 0."""
+
+    instant: int
+    text: Text
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Fire:
     """The answer to one query."""
@@ -113,6 +121,8 @@ class Fire:
     texts: tuple[Text, ...]
     context_tokens: int
     """Tokens in the session after this fire."""
+    notes: tuple[Note, ...] = ()
+    """Of the demonstration, with the first answer of an episode; () with all others."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

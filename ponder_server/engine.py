@@ -28,6 +28,7 @@ from ponder_server.contract import (
     EngineSpec,
     Fire,
     Frame,
+    Note,
     Opening,
     Outcome,
     Progress,
@@ -107,6 +108,8 @@ class _Episode:
     """What the cached tokens are."""
     owes_reasoning: bool
     """A demonstration was shown and its reasoning (DR) not yet written; the first transition writes it."""
+    notes: tuple[Note, ...]
+    """Of the demonstration, not yet told: the first answer tells them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -224,7 +227,7 @@ class QwenEngine:
         try:
             with audible(self._parts, progress):
                 pictures = [picture for instant in demo for picture in instant]
-                spans = self._opener.encode(context, opening, segments, pictures, progress)
+                opened = self._opener.encode(context, opening, segments, pictures, progress)
         except BaseException as error:
             self._runner.close(context)
             if isinstance(error, torch.OutOfMemoryError):
@@ -232,8 +235,9 @@ class QwenEngine:
             raise
         self._episodes[session] = _Episode(
             context=context,
-            spans=spans,
+            spans=[*opened.spans],
             owes_reasoning=opening.has_demo,
+            notes=opened.notes,
         )
         return context.num_tokens
 
@@ -330,7 +334,7 @@ class QwenEngine:
                     exactly=exactly,
                 )
                 hidden_KH = yield Append(session=context, ids=self._format.carrier_ids, embeds_TH=carriers_KH)
-            answer = self._answer(context, hidden_KH, texts)
+            answer = self._answer(context, hidden_KH, texts, episode.notes)
             num_written = len(context.ids) - before.num_ids - len(query.ids)
             episode.spans += [
                 Span(SegmentKind.OBSERVATION, num_observed),
@@ -338,6 +342,7 @@ class QwenEngine:
                 Span(SegmentKind.CARRIERS, self._format.num_carriers),
             ]
             episode.owes_reasoning &= not is_transition
+            episode.notes = ()
             is_answered = True
             return answer
         finally:
@@ -463,7 +468,7 @@ class QwenEngine:
         )
         episode.spans = [span for span, stay in zip(episode.spans, stays, strict=True) if stay]
 
-    def _answer(self, context: Session, hidden_KH: Tensor, texts: tuple[Text, ...]) -> Fire:
+    def _answer(self, context: Session, hidden_KH: Tensor, texts: tuple[Text, ...], notes: tuple[Note, ...]) -> Fire:
         # a copy: a view would keep the hidden states of the whole observation alive
         cognition = hidden_KH.to("cpu", torch.float32, copy=True).numpy()
         if not np.isfinite(cognition).all():
@@ -476,4 +481,5 @@ class QwenEngine:
             is_transition=bool(texts),
             texts=texts,
             context_tokens=context.num_tokens,
+            notes=notes,
         )

@@ -82,7 +82,10 @@ class PonderNode:
         return list(self._rendezvous.give_up())
 
     def answer(self, work: Work, fire: Fire, *, ready_ns: int, infer_ns: int) -> tuple[m.Cognition, list[m.Subgoal]]:
-        """What is published: the cognition, and for the log alone the texts that PONDER wrote to itself."""
+        """What is published: the cognition, and for the log alone the texts that PONDER wrote to itself.
+
+        A note of the demonstration has its instant in place of the tick, and no query.
+        """
         query = work.query
         self.next_query = query.query + 1
         vector = np.ascontiguousarray(fire.cognition, np.float32)
@@ -99,6 +102,16 @@ class PonderNode:
             model_hash=self._spec.model_hash,
             is_fake=self._spec.is_random,
         )
+        notes = [
+            m.Subgoal(
+                kind=m.SubgoalKind.DEMO_NOTE,
+                text=note.text.text,
+                tick=note.instant,
+                token_ids=note.text.token_ids,
+                is_truncated=note.text.truncated,
+            )
+            for note in fire.notes
+        ]
         texts = [
             m.Subgoal(
                 kind=_KINDS[text.kind],
@@ -110,7 +123,7 @@ class PonderNode:
             )
             for text in fire.texts
         ]
-        return cognition, texts
+        return cognition, [*notes, *texts]
 
 
 def _work(query: m.Query, observation: m.Observation) -> Work:

@@ -9,8 +9,8 @@ from typing import TypeVar
 from torch import Tensor
 
 from ponder_server.context_policy import Span
-from ponder_server.contract import Opening, Progress
-from ponder_server.prefixes import Prefixes
+from ponder_server.contract import Note, Opening, Progress
+from ponder_server.prefixes import Opened, Prefixes
 from ponder_server.runner import Session
 from ponder_server.writer import Steps, TransitionWriter
 from ponderpounce.models.context import Segment, SegmentKind, in_groups
@@ -46,7 +46,7 @@ class Opener:
         segments: Sequence[Segment],
         pictures: Sequence[Pictures],
         progress: Progress,
-    ) -> list[Span]:
+    ) -> Opened:
         """Fills the context and tells what its tokens are; from an equal opening of before, if there was one.
 
         Raises ContextFull if notes do not fit; the caller closes the context.
@@ -54,30 +54,32 @@ class Opener:
         if opening.has_demo and (found := self._prefixes.find(opening)) is not None:
             context.start_from(found[0])
             progress()
-            return [*found[1]]
+            return found[1]
         takes_notes = self._ponder.format.takes_notes and self._ponder.format.speaks
         fill = self._look_by_look if takes_notes and opening.has_demo else self._at_once
-        spans = fill(context, segments, [*pictures], progress)
+        opened = fill(context, segments, [*pictures], progress)
         if opening.has_demo:
-            self._prefixes.keep(opening, context, spans)
-        return spans
+            self._prefixes.keep(opening, context, opened)
+        return opened
 
     def _at_once(
         self, context: Session, segments: Sequence[Segment], pictures: list[Pictures], progress: Progress
-    ) -> list[Span]:
+    ) -> Opened:
         for chunk in in_groups(segments, self._chunk_tokens):
             ids = [token for segment in chunk for token in segment.ids]
             num_images = sum(segment.num_images for segment in chunk)
             context.append(ids, self._embed(ids, pictures[:num_images]), num_wanted=0)
             del pictures[:num_images]
             progress()
-        return [Span(segment.kind, len(segment)) for segment in segments]
+        return Opened(spans=tuple(Span(segment.kind, len(segment)) for segment in segments))
 
     def _look_by_look(
         self, context: Session, segments: Sequence[Segment], pictures: list[Pictures], progress: Progress
-    ) -> list[Span]:
+    ) -> Opened:
         """Notes belong to the demonstration: no policy forgets them before it."""
-        spans = []
+        spans: list[Span] = []
+        notes: list[Note] = []
+        num_looks = 0
         for segment in segments:
             num_before = context.num_tokens
             embeds_TH = self._embed(segment.ids, pictures[: segment.num_images])
@@ -88,10 +90,11 @@ class Opener:
                 before = context.save(context.before_fire)
                 nothing_0H = embeds_TH[:0]
                 steps = self._writer.write(context, before, (), nothing_0H, with_reasoning=False, exactly=None)
-                _alone(context, steps)
+                notes += [Note(instant=num_looks, text=text) for text in _alone(context, steps)]
+            num_looks += is_look
             spans.append(Span(segment.kind, context.num_tokens - num_before))
             progress()
-        return spans
+        return Opened(spans=tuple(spans), notes=tuple(notes))
 
 
 def _alone(context: Session, steps: Steps[Result]) -> Result:

@@ -2,13 +2,21 @@
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 
 from ponder_server.context_policy import Span
-from ponder_server.contract import Opening
+from ponder_server.contract import Note, Opening
 from ponder_server.runner import Prefix, Session
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Opened:
+    """What fills a context that was just opened, and what PONDER wrote meanwhile."""
+
+    spans: tuple[Span, ...]
+    notes: tuple[Note, ...] = ()
 
 
 class Prefixes:
@@ -19,9 +27,9 @@ class Prefixes:
 
     def __init__(self, max_prefixes: int) -> None:
         self._max_prefixes = max_prefixes
-        self._prefixes: OrderedDict[bytes, tuple[Prefix, tuple[Span, ...]]] = OrderedDict()
+        self._prefixes: OrderedDict[bytes, tuple[Prefix, Opened]] = OrderedDict()
 
-    def find(self, opening: Opening) -> tuple[Prefix, tuple[Span, ...]] | None:
+    def find(self, opening: Opening) -> tuple[Prefix, Opened] | None:
         """An equal opening's context, and what its tokens are."""
         key = _digest(opening)
         found = self._prefixes.get(key)
@@ -29,13 +37,13 @@ class Prefixes:
             self._prefixes.move_to_end(key)
         return found
 
-    def keep(self, opening: Opening, context: Session, spans: Sequence[Span]) -> None:
+    def keep(self, opening: Opening, context: Session, opened: Opened) -> None:
         """Copies a context that holds exactly ``opening``; does without if the device has no memory for it."""
         while self._prefixes and len(self._prefixes) >= self._max_prefixes:
             self._prefixes.popitem(last=False)
         if self._max_prefixes:
             try:
-                self._prefixes[_digest(opening)] = (context.copy(), tuple(spans))
+                self._prefixes[_digest(opening)] = (context.copy(), opened)
             except torch.OutOfMemoryError:
                 self._prefixes.clear()
 

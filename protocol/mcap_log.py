@@ -248,7 +248,8 @@ class _Writer:
         if isinstance(message, m.Event):
             self._say(header.proc, _LEVELS[message.severity], f"{message.name}: {message.text}", wall_ns)
         elif isinstance(message, m.Subgoal):
-            self._say(header.proc, Log.INFO, f"{message.kind.name.lower()}: {message.text}", wall_ns)
+            when = f" at {message.tick} s" if message.kind is m.SubgoalKind.DEMO_NOTE else ""
+            self._say(header.proc, Log.INFO, f"{message.kind.name.lower()}{when}: {message.text}", wall_ns)
         if self._log_ns - self._flushed_ns >= FLUSH_NS:
             self.flush()
 

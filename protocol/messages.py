@@ -65,6 +65,7 @@ class SubgoalKind(IntEnum):
     DEMO_REASONING = 2
     TASK_SIMPLE = 3
     TASK_GROUNDED = 4
+    DEMO_NOTE = 5
 
 
 class Severity(IntEnum):

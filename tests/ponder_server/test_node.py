@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ponder_server.contract import EngineSpec, Fire, Text
+from ponder_server.contract import EngineSpec, Fire, Note, Text
 from ponder_server.node import KEEP_QUERIES, PonderNode, check_robot
 from ponderpounce.models.eyes import Eye
 from protocol import images
@@ -200,6 +200,16 @@ def test_texts_are_for_the_log(node: PonderNode) -> None:
     assert [(s.kind, s.text, s.token_ids, s.is_truncated, s.query, s.tick) for s in subgoals] == [
         (m.SubgoalKind.SUBGOAL, "pick the red cube", (4, 5), False, 5, 3),
         (m.SubgoalKind.DEMO_REASONING, "first", (6,), True, 5, 3),
+    ]
+
+
+def test_notes_of_the_demonstration_are_for_the_log_with_the_instant_that_they_are_of(node: PonderNode) -> None:
+    note = Text(kind="subgoal", text="at <1, 2>", token_ids=(4, 5), truncated=False)
+    subgoal = dataclasses.replace(note, text="pick")
+    _, subgoals = answered(node, texts=(subgoal,), notes=(Note(instant=2, text=note),))
+    assert [(s.kind, s.text, s.token_ids, s.query, s.tick) for s in subgoals] == [
+        (m.SubgoalKind.DEMO_NOTE, "at <1, 2>", (4, 5), None, 2),
+        (m.SubgoalKind.SUBGOAL, "pick", (4, 5), 5, 3),
     ]
 
 

@@ -47,6 +47,20 @@ def test_serving_regenerates_the_row_of_a_ponder_that_takes_notes(prefill_chunk_
         assert context_of(engine, session).next_position == ponder.format.positions(row.ids)[1]
         for answer, C_t in zip(answers, expected, strict=True):
             assert np.abs(answer.cognition - C_t.numpy()).max() < TOLERANCE
+        told = [(note.instant, note.text.text) for note in answers[0].notes]
+        assert told == [(1, "at <1, 2>"), (2, "<3>")], "each with the instant that it is of, and with the first answer"
+        assert not any(answer.notes for answer in answers[1:])
+
+
+def test_a_query_that_fails_leaves_notes_to_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    engine = QwenEngine(taught(NOTING_SCRIPT, notes=NOTES), CONFIG)
+    engine.open("a", WITH_DEMO)
+    with monkeypatch.context() as broken:
+        broken.setattr(np, "isfinite", lambda values: np.zeros(values.shape, np.bool_))
+        with pytest.raises(FloatingPointError, match="cognition is not finite"):
+            engine.fire("a", observation(0))
+    assert len(engine.fire("a", observation(0)).notes) == 2
+    assert not engine.fire("a", observation(1)).notes
 
 
 def test_notes_that_do_not_fit_refuse_the_session_and_leave_its_place_free() -> None:
