@@ -96,7 +96,8 @@ def ends_of_moves(texts: Sequence[str]) -> tuple[list[str], list[str]]:
 
     They are while they move by a pixel at most in five steps; between two swaps that is a moment.
     """
-    last, coming = [], []
+    last: list[str] = []
+    coming: list[str] = []
     for is_watched, run in groupby(texts, key=lambda text: text.startswith(_WATCHED)):
         captions = [*run]
         last += _at_rest(captions[::-1])[::-1] if is_watched else captions
