@@ -31,7 +31,7 @@ from ponderpounce.tasks.difficulty import DIFFICULTIES
 from ponderpounce.tasks.front_view import front_pixels
 from ponderpounce.tasks.paces import PASS_STEPS, PRESS_STEPS
 from ponderpounce.training.countdown import rhythm, waits
-from ponderpounce.training.deeds import passing_side, told_deeds
+from ponderpounce.training.deeds import Told, passing_side, told_deeds
 from ponderpounce.training.lapses import Words, has_moved
 from ponderpounce.training.places import PARTS, PLACE, TEXT_PX, WAY, apart_px
 
@@ -40,6 +40,7 @@ _WATCHED = "static at "
 _STILL = re.compile(rf"drop the cube on the table at ({_ONE})(?:, {_ONE})?|{_WATCHED}({_ONE})(?:, ({_ONE}))?")
 _TO = " to "
 _UNDERWAY_PX = 3.0
+_SAME_PX = 8.0  # less than any two targets lie apart
 _WAIT = re.compile(r", \d+, (\d+)$")
 _LOOK_STEPS = 25  # a query a second: one at least sees where everything has come to rest
 _PACE_STEPS = 30  # two looks; before, nobody can tell how fast it runs
@@ -130,7 +131,7 @@ def in_sight(note: str, eyes: Eyes) -> str:
         for part in PARTS.split(note)
     )
     # of two places that "to" joins one may be left
-    told = (part.removeprefix(_TO).removesuffix(_TO).strip() for part in told)
+    told = (" ".join(part.removeprefix(_TO).removesuffix(_TO).split()) for part in told)
     return ", ".join(part for part in told if part)
 
 
@@ -150,7 +151,8 @@ def demo_notes(
     Where things move by the clock alone, where they are. Else every deed that a narration tells (`told_deeds`), with
     its number, when the tool is nearest to its place; of a way around things also the side on which it passes one, when
     the tool is there: that is seen then, and told at the end of the stretch. And where a thing that will be asked for
-    may change places afterwards, its place from then on.
+    may change places afterwards, its place from then on: "second <y, x>". Which of the deeds was asked for is then one
+    thing to find out, and where it was done another, to be looked up by that word.
 
     Args:
         texts: what is done in each of D instants, grounded; its places followed (`pp-collect --texts follow`).
@@ -160,18 +162,19 @@ def demo_notes(
     """
     if any(moving) or len(tools) != len(texts):
         return list(moving)
-    found, done = [""] * len(texts), -1
-    for told in told_deeds(texts):
+    found, done, told = [""] * len(texts), -1, told_deeds(texts)
+    for deed in told:
         # the end of a stretch is where the next one begins
-        last = min(told.last + int(WAY.search(texts[told.last]) is not None), len(texts) - 1)
-        instants = range(min(max(told.first, done + 1), last), last + 1)
-        done = min(instants, key=lambda instant: apart_px(tools[instant], told.place) or 0.0)  # 0: the text tells none
-        side = passing_side(texts[told.last])
+        last = min(deed.last + int(WAY.search(texts[deed.last]) is not None), len(texts) - 1)
+        instants = range(min(max(deed.first, done + 1), last), last + 1)
+        done = min(instants, key=lambda instant: apart_px(tools[instant], deed.place) or 0.0)  # 0: the text tells none
+        side = passing_side(texts[deed.last])
         if side and (way := range(instants.start, done)):
-            found[_half_way(way, tools, told.place)] = side
-        found[done] = f"{found[done]}, {told.words}" if found[done] else told.words
-        if told.words == told.place:  # the one that was picked up: it stays in view, and may move
-            found[done : told.last + 1] = [told.place] * (told.last + 1 - done)
+            found[_half_way(way, tools, deed.place)] = side
+        found[done] = f"{found[done]}, {deed.words}" if found[done] else deed.words
+        if deed.words == deed.place:  # the one that was picked up: it stays in view, and may move
+            found[done : deed.last + 1] = [deed.place] * (deed.last + 1 - done)
+    which: str | None = None
     is_picked_alone = any(PLACE.fullmatch(note) for note in found)
     for instant, captions in enumerate(zip(texts, *(moves or (texts, texts)), strict=True)):
         still = [match for match in map(_STILL.fullmatch, captions) if match is not None]
@@ -180,8 +183,19 @@ def demo_notes(
         if is_picked_alone:
             found[instant] = _onward(*(match[1] or match[2] for match in still))
         elif still[0][3]:  # of the cube, and of where it will have to be put, this is the one that may move
-            found[instant] = _onward(*(match[3] for match in still))
+            which = _which(told, still[0][3]) if which is None else which
+            found[instant] = f"{which} {_onward(*(match[3] for match in still))}".lstrip()
     return found
+
+
+def _which(told: Sequence[Told], place: str) -> str:
+    """By which word the deed that was done there was told, as in "second"; empty where none was."""
+    there = {
+        away_px: each.words.removesuffix(f" {each.place}")
+        for each in told
+        if each.words.endswith(each.place) and (away_px := apart_px(each.place, place)) is not None
+    }
+    return there[min(there)] if there and min(there) <= _SAME_PX else ""
 
 
 def _half_way(way: range, tools: Sequence[str], end: str) -> int:

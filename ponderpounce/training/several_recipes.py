@@ -252,7 +252,7 @@ def small_foreseeing() -> Curriculum:
         num_steps=400,
         batch_episodes=16,
     )
-    last = _settling_on(small_watching(), "small_foreseeing", 18, (220, 620), batch_episodes=8)
+    last = _settling_on(small_watching(), "small_foreseeing", 18, (220, 520), batch_episodes=8)
     return Curriculum(name="small_foreseeing", stages=(following, *last.stages))
 
 

@@ -154,6 +154,7 @@ def test_what_is_out_of_sight_is_not_noted() -> None:
     assert in_sight("", eyes) == ""
     assert in_sight("second <3, 63>", eyes) == "second", "it happened all the same"
     assert in_sight("second <3, 64>", eyes) == "second <3, 64>"
+    assert in_sight("second <3, 63> to <3, 64>, second <3, 64> to <3, 63>", eyes) == "second to <3, 64>, second <3, 64>"
     assert in_sight("<3, 64> to <3, 65>, <4, 64> to <3, 1>, <3, 1> to <5, 64>, <3, 1> to <3, 2>", eyes) == (
         "<3, 64> to <3, 65>, <4, 64>, <5, 64>"
     )
@@ -179,8 +180,18 @@ def test_deeds_are_noted_when_the_tool_is_there_and_a_target_from_then_on() -> N
     texts += ["static at <82, 128>, <80, 170>", "static at <82, 128>, <90, 150>"]
     tools = ["<85, 120>", "<70, 90>", "<95, 62>", "<90, 60>", "<50, 90>", "<95, 60>"]
     tools += ["<40, 140>", "<50, 128>", "<20, 128>", "<20, 128>"]
-    expected = ["", "", "first <100, 60>", "", "button", "", "second <80, 170>", "", "<80, 170>", "<90, 150>"]
-    assert demo_notes(texts, tools, [""] * 10) == expected
+    expected = ["", "", "first <100, 60>", "", "button", "", "second <80, 170>", ""]
+    then = ["second <80, 170>", "second <90, 150>"]
+    assert demo_notes(texts, tools, [""] * 10) == [*expected, *then], "which of them was asked for, wherever it moves"
+    moves = (texts, [*texts[:9], "static at <82, 128>, <110, 90>"])
+    underway = demo_notes([*texts[:9], "static at <82, 128>, <90, 150>"], tools, [""] * 10, moves)
+    assert underway[8:] == [then[0], "second <90, 150>"], "it cannot be seen to have left"
+    moves = ([*texts[:9], texts[8]], [*texts[:9], "static at <82, 128>, <110, 90>"])
+    assert demo_notes(texts, tools, [""] * 10, moves)[8:] == [then[0], "second <90, 150> to <110, 90>"]
+    first = [*texts[:8], "static at <82, 128>, <101, 61>", "static at <82, 128>, <101, 61>"]
+    assert demo_notes(first, tools, [""] * 10)[8:] == ["first <101, 61>"] * 2
+    nobody = [*texts[:8], "static at <82, 128>, <30, 30>", "static at <82, 128>, <30, 30>"]
+    assert demo_notes(nobody, tools, [""] * 10)[8:] == ["<30, 30>"] * 2, "nothing was put there"
 
 
 def test_stretches_of_a_way_are_noted_where_they_end() -> None:
