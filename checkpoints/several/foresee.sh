@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Goes on from the pair that watch.sh has left, on two CPU cores: see docs/training.md, "Where it will come to rest".
+# A trial to go on from the pair that watch.sh has left, on two CPU cores: see docs/training.md, "Where it will come to rest".
 #
 #     checkpoints/several/foresee.sh [OUT]    (the OUT of the other scripts)
 #

@@ -233,7 +233,8 @@ def small_watching() -> Curriculum:
 def small_foreseeing() -> Curriculum:
     """The PONDER of `small_watching` learns to tell where things that change places will come to rest (`notes`).
 
-    `following` is for episodes in which things change places, and for their beginnings alone; `settling` for all.
+    `following` is for episodes in which things change places, and for their beginnings alone; `settling` for all. A
+    trial: docs/training.md, "Where it will come to rest".
     """
     *_, settling = small_watching().stages
     following = replace(
