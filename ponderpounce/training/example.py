@@ -45,10 +45,11 @@ from ponderpounce.training.stand_in import stand_in
 from ponderpounce.training.training_episode import Frame, TrainingEpisode
 
 _SILENCE = repeat(Words())
+_BEGINNING = 8  # queries
 _RECALLING = 2  # queries
 _CORRECTED = 0.3  # of own words, at every query
 _SHARES = (
-    "text_dropout", "slips", "tells_onward", "cuts_short", "recalls", "own_words", "misjudges", "even_clocks",
+    "text_dropout", "slips", "tells_onward", "cuts_short", "begins", "recalls", "own_words", "misjudges", "even_clocks",
     "learned_repeats",
 )  # fmt: skip
 _MOVED_PX = 3.0  # of a 256 px picture: farther than PONDER errs where nothing moves
@@ -123,6 +124,8 @@ class ExampleConfig:
     takes_notes: bool = False
     """What moves by itself is written down at every look (`notes`); a PONDER that learns it is served so. Waits are
     then told among the notes, and ``counts_down`` tells no others."""
+    tells_ends: bool = False
+    """Notes of what is on its way to a place tell that, too (`notes.ends_of_moves`)."""
     learned_repeats: float = 1.0
     """Of notes that repeat the one before, the share that is learned (`notes.heeded`)."""
     retold_px: float | None = None
@@ -142,6 +145,9 @@ class ExampleConfig:
     max_queries: int | None = None
     """The row ends after so many queries, and with it the invocations; None: with the episode. Most of what is to be
     seen is seen early."""
+    begins: float = 0.0
+    """Share of rows that end after eight queries: what stands where is told in the first few, and is what most errors
+    begin with, while the rest of a row mostly repeats it."""
     recalls: float = 0.0
     """Share of demonstrated episodes whose row ends with the second query: what a demonstration did is looked up when
     the first words come, and that costs a fraction of a whole row."""
@@ -280,10 +286,13 @@ def make_example(
     episode = episode.with_plans() if config.has_plans else episode
     episode = episode if config.has_reasoning else replace(episode, reasoning="")
     episode = replace(episode, reasoning=narration(episode.demo_subgoals)) if config.narrates else episode
+    episode = episode if config.tells_ends else episode.without_ends()
     is_even = config.even_clocks and rng.random() < config.even_clocks
     clocks = config.clocks.without_spread() if is_even else config.clocks
     schedule = sample_schedule(rng, clocks, episode.num_ticks, transition_ticks=episode.transition_ticks)
     schedule = _shortened(schedule, config.max_queries)
+    if config.begins and rng.random() < config.begins:
+        schedule = _shortened(schedule, _BEGINNING)
     if config.recalls and episode.demo and rng.random() < config.recalls:
         schedule = _shortened(schedule, _RECALLING)
     if cut is not None:

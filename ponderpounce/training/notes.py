@@ -39,6 +39,7 @@ _ONE = PLACE.pattern.replace("(", "").replace(")", "")
 _WATCHED = "static at "
 _STILL = re.compile(rf"drop the cube on the table at ({_ONE})(?:, {_ONE})?|{_WATCHED}({_ONE})(?:, ({_ONE}))?")
 _TO = " to "
+_END = re.compile(rf"{_TO}{_ONE}")
 _UNDERWAY_PX = 3.0
 _SAME_PX = 8.0  # less than any two targets lie apart
 _WAIT = re.compile(r", \d+, (\d+)$")
@@ -89,6 +90,11 @@ def _onward(now: str, whence: str, rest: str) -> str:
     """The place, and where it will come to rest if that is another one and it can be seen to have left."""
     is_underway = has_moved(now, rest, _UNDERWAY_PX) and has_moved(now, whence, _UNDERWAY_PX)
     return f"{now}{_TO}{rest}" if is_underway else now
+
+
+def without_end(note: str) -> str:
+    """The note without the places where things will come to rest."""
+    return _END.sub("", note)
 
 
 def ends_of_moves(texts: Sequence[str]) -> tuple[list[str], list[str]]:

@@ -243,6 +243,7 @@ def small_foreseeing() -> Curriculum:
         example=replace(
             settling.example,
             max_queries=11,  # by then everything is at rest
+            tells_ends=True,
             recalls=1.0,
             even_clocks=0.9,
             text_dropout=0.0,
@@ -253,8 +254,18 @@ def small_foreseeing() -> Curriculum:
         num_steps=400,
         batch_episodes=16,
     )
-    last = _settling_on(small_watching(), "small_foreseeing", 18, (220, 520), batch_episodes=8)
+    last = _settling_on(small_watching(), "small_foreseeing", 18, (220, 520), batch_episodes=8, tells_ends=True)
     return Curriculum(name="small_foreseeing", stages=(following, *last.stages))
+
+
+def small_beginnings() -> Curriculum:
+    """The PONDER of `small_watching` goes on, with more of what stands where and fewer rows that do not teach words.
+
+    docs/training.md, "Beginnings".
+    """
+    # what slips teaches C to look for itself, and rows without texts as well: learned by now
+    told = {"begins": 0.4, "text_dropout": 0.05, "slips": 0.1}
+    return _settling_on(small_watching(), "small_beginnings", 19, (350, 1100), batch_episodes=8, **told)
 
 
 def _settling_on(

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ponderpounce.training.cut_short import Cut
 from ponderpounce.training.lapses import has_moved
+from ponderpounce.training.notes import without_end
 from ponderpounce.training.places import PLACE, WAY
 
 Frame = NDArray[np.uint8]  # (height, width, 3) RGB
@@ -133,6 +134,11 @@ class TrainingEpisode:
             said=(),  # of the longer task, as this is
             unreached=(),
         )
+
+    def without_ends(self) -> TrainingEpisode:
+        """The same, its notes telling where things are and not where they will come to rest."""
+        notes, moving = ([without_end(note) for note in told] for told in (self.demo_notes, self.moving))
+        return replace(self, demo_notes=notes, moving=moving)
 
     def with_plans(self, *, even_the_first: bool = False) -> TrainingEpisode:
         """The same, every subgoal but the first told with the places of those that come later: ``S, <y, x>, <y, x>``.

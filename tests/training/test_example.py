@@ -445,3 +445,28 @@ def test_what_a_demonstration_did_can_be_asked_for_in_short_rows() -> None:
     assert len(short.schedule.queries) == 2 < len(whole.schedule.queries) == len(as_before.schedule.queries)
     assert short.schedule.queries == as_before.schedule.queries[:2]
     assert all(each.tick < as_before.schedule.queries[2].tick for each in short.schedule.invocations)
+
+
+def test_rows_may_be_beginnings() -> None:
+    config = ExampleConfig(clocks=EVALUATION, begins=1.0)
+    recorded = episode(300, changes=(0, 40, 180))
+    short = make_example(recorded, FORM, config, np.random.default_rng(0))
+    whole = make_example(recorded, FORM, replace(config, begins=0.0), np.random.default_rng(0))
+    assert short.schedule.queries == whole.schedule.queries[:8] != whole.schedule.queries
+    assert all(each.tick < whole.schedule.queries[8].tick for each in short.schedule.invocations)
+    assert short.episode.subgoals == whole.episode.subgoals, "nothing else of it is cut"
+
+
+def test_where_things_will_come_to_rest_is_noted_only_if_asked_for() -> None:
+    recorded = replace(
+        episode(60, num_demo=2),
+        demo_notes=["<3, 4> to <80, 66>, second <9, 9>", "<5, 6>"],
+        moving=["<1, 2>, <7, 8> to <80, 66>"] * 60,
+    )
+    told, untold = (
+        make_example(recorded, FORM, ExampleConfig(clocks=EVALUATION, tells_ends=tells), np.random.default_rng(0)).episode
+        for tells in (True, False)
+    )
+    assert (told.demo_notes, told.moving) == (recorded.demo_notes, recorded.moving)
+    assert untold.demo_notes == ["<3, 4>, second <9, 9>", "<5, 6>"]
+    assert set(untold.moving) == {"<1, 2>, <7, 8>"}
