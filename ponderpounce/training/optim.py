@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 
+from ponderpounce.training.muon import Muon
 from ponderpounce.training.parallel import local, whole
 from ponderpounce.training.shards import RowReader
 
@@ -72,7 +73,7 @@ class Optimiser:
         if not self._named:
             raise ValueError("nothing to train: every parameter is frozen")
         self._masters = {name: p if p.dtype.itemsize >= 4 else _master(p) for name, p in self._named.items()}
-        turned = [p for name, p in self._masters.items() if config.matrices == "muon" and _is_turned(name, p)]
+        turned = [p for name, p in self._masters.items() if config.matrices == "muon" and is_turned(name, p)]
         if any(isinstance(each, DTensor) for each in turned):
             raise ValueError("Muon needs whole matrices, these are sharded: give --weights whole, or matrices='adamw'")
         self._turned = {id(each) for each in turned}
@@ -87,7 +88,7 @@ class Optimiser:
         self._parts: list[tuple[torch.optim.Optimizer, tuple[str, ...]]] = [(adam, ("step", "exp_avg", "exp_avg_sq"))]
         """And what each remembers of a parameter."""
         if turned:
-            muon = torch.optim.Muon(turned, weight_decay=config.weight_decay, adjust_lr_fn="match_rms_adamw")
+            muon = Muon(turned, lr=config.learning_rate, weight_decay=config.weight_decay)
             self._parts.append((muon, ("momentum_buffer",)))
         self.average = {name: p.detach().clone() for name, p in self._masters.items()} if config.ema_decay else {}
 
@@ -205,7 +206,7 @@ class Optimiser:
         return {name: (parameter, master) for name, parameter, master in pairs if master is not parameter}
 
 
-def _is_turned(name: str, parameter: nn.Parameter) -> bool:
+def is_turned(name: str, parameter: nn.Parameter) -> bool:
     """True for the matrix of a hidden layer."""
     is_matrix = parameter.ndim == 2 and min(parameter.shape) >= _LEAST_RANK
     return is_matrix and not any(each in name for each in _LOOKED_UP)

@@ -265,7 +265,7 @@ def small_beginnings() -> Curriculum:
     """
     # what slips teaches C to look for itself, and rows without texts as well: learned by now
     told = {"begins": 0.4, "text_dropout": 0.05, "slips": 0.1}
-    return _settling_on(small_watching(), "small_beginnings", 19, (350, 1100), batch_episodes=8, **told)
+    return _settling_on(small_watching(), "small_beginnings", 19, (500, 1600), batch_episodes=8, **told)
 
 
 def _settling_on(

@@ -464,7 +464,9 @@ def test_where_things_will_come_to_rest_is_noted_only_if_asked_for() -> None:
         moving=["<1, 2>, <7, 8> to <80, 66>"] * 60,
     )
     told, untold = (
-        make_example(recorded, FORM, ExampleConfig(clocks=EVALUATION, tells_ends=tells), np.random.default_rng(0)).episode
+        make_example(
+            recorded, FORM, ExampleConfig(clocks=EVALUATION, tells_ends=tells), np.random.default_rng(0)
+        ).episode
         for tells in (True, False)
     )
     assert (told.demo_notes, told.moving) == (recorded.demo_notes, recorded.moving)

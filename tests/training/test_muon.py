@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 
 from ponderpounce.training import optim
+from ponderpounce.training.muon import Muon
 from ponderpounce.training.optim import OptimConfig, Optimiser
 from ponderpounce.training.parallel import World
 from ponderpounce.training.shards import RowReader, write_rows
@@ -101,3 +102,27 @@ def test_matrices_of_which_a_process_has_some_rows_are_refused(monkeypatch: pyte
     monkeypatch.setattr(optim, "DTensor", nn.Parameter)  # as if every one was sharded
     with pytest.raises(ValueError, match="--weights whole"):
         Optimiser(Network(), CONFIG)
+
+
+def test_it_is_torchs_own_but_for_what_bfloat16_rounds() -> None:
+    shapes = [(24, 16), (16, 24), (24, 16), (8, 8)]
+    generator = torch.Generator().manual_seed(3)
+    ours, theirs = ([nn.Parameter(torch.ones(shape)) for shape in shapes] for _ in range(2))
+    mine = Muon(ours, lr=1e-2, weight_decay=0.1)
+    peer = torch.optim.Muon(theirs, lr=1e-2, weight_decay=0.1, adjust_lr_fn="match_rms_adamw")
+    for step in range(3):
+        for one, other in zip(ours, theirs, strict=True):
+            one.grad = torch.randn(one.shape, generator=generator)
+            other.grad = one.grad.clone()
+        if step == 1:
+            ours[3].grad = theirs[3].grad = None
+        mine.step()
+        peer.step()
+    for one, other in zip(ours, theirs, strict=True):
+        assert torch.equal(mine.state[one]["momentum_buffer"], peer.state[other]["momentum_buffer"])
+        assert (one - other).norm() < 0.02 * (1 - other).norm()
+
+
+def test_a_vector_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"matrices, came a parameter of shape \(3,\)"):
+        Muon([nn.Parameter(torch.zeros(3))])
