@@ -51,6 +51,7 @@ from ponderpounce.models.graphs import Capture, graphs_for
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import weights_hash
 from ponderpounce.models.proprioception import NUM_PROPRIO
+from ponderpounce.models.second_look import Standing
 
 WARM_UP_SESSION = "warm-up"
 WARM_UP_OPENING = Opening(instruction="warm up")
@@ -110,6 +111,10 @@ class _Episode:
     """A demonstration was shown and its reasoning (DR) not yet written; the first transition writes it."""
     notes: tuple[Note, ...]
     """Of the demonstration, not yet told: the first answer tells them."""
+    alone: tuple[int, ...]
+    """The opening without its demonstration: what a second look begins with."""
+    standing: Standing | None
+    """None: it never looks again."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -146,11 +151,14 @@ class QwenEngine:
         self._frame_px = readable_sizes(self._format.eyes, ponder.image_px)[0]
         check_cameras([self._frame_px] * config.num_cameras, self._format.eyes, ponder.image_px)
         size = slot_size(ponder.qwen.config.text_config, ponder.dtype)
-        session_bytes = size.slot_bytes(config.max_context_tokens) + NUM_SAVED_STATES * size.state_bytes
+        self._second_look = self._format.second_look if self._format.speaks else None
+        contexts_each = 1 if self._second_look is None else 2  # a second look has one of its own
+        slot_bytes = size.slot_bytes(config.max_context_tokens) + NUM_SAVED_STATES * size.state_bytes
+        session_bytes = slot_bytes * contexts_each
         try:
             self._runner = Runner(
                 ponder,
-                num_slots=config.max_sessions,
+                num_slots=config.max_sessions * contexts_each,
                 max_tokens=config.max_context_tokens,
                 buckets=config.buckets,
                 threads=Threads(config.attention_threads),
@@ -238,6 +246,8 @@ class QwenEngine:
             spans=[*opened.spans],
             owes_reasoning=opening.has_demo,
             notes=opened.notes,
+            alone=tuple(token for each in self._format.opening(opening.instruction) for token in each.ids),
+            standing=None if self._second_look is None else Standing(self._second_look),
         )
         return context.num_tokens
 
@@ -323,7 +333,16 @@ class QwenEngine:
                 hidden_NH = yield Append(session=context, ids=query.ids, embeds_TH=embeds_TH, num_wanted=wanted)
                 is_transition = self._format.speaks and self._writer.wants_to_write(hidden_NH[:1])
                 hidden_KH = hidden_NH[1:]
-            if is_transition:
+            standing = episode.standing
+            looks_again = standing is not None and standing.is_due and not is_transition
+            words = (yield from self._look_again(query, observation_TH)) if looks_again else ()
+            if words:
+                is_transition = True
+                context.restore(before)
+                text = yield from self._writer.say(context, before, query.ids[:num_observed], observation_TH, words)
+                texts = (text,)
+                hidden_KH = yield Append(session=context, ids=self._format.carrier_ids, embeds_TH=carriers_KH)
+            elif is_transition:
                 context.restore(before)
                 texts = yield from self._writer.write(
                     context,
@@ -343,11 +362,27 @@ class QwenEngine:
             ]
             episode.owes_reasoning &= not is_transition
             episode.notes = ()
+            if standing is not None:
+                standing.answered([(text.text, text.token_ids) for text in texts], looked_again=looks_again)
             is_answered = True
             return answer
         finally:
             if not is_answered:
                 context.restore(before)
+
+    def _look_again(self, query: _Query, observation_TH: Tensor) -> Steps[tuple[int, ...]]:
+        """What is to be said of a silent query after all: the words in force with another place; () for nothing."""
+        episode, standing = query.episode, query.episode.standing
+        assert standing is not None
+        ids = (*episode.alone, *query.ids[: len(observation_TH)])
+        embeds_TH = torch.cat([self._ponder.embed(episode.alone), observation_TH])
+        context = self._runner.open(f"{episode.context.name}, looked at again")
+        try:
+            words = yield from self._writer.complete_place(context, ids, embeds_TH, standing.token_ids)
+        finally:
+            self._runner.close(context)
+        anew = self._format.vocabulary.decode(words)
+        return words if standing.is_another(anew) else ()
 
     @torch.inference_mode()
     def close(self, session: str) -> None:

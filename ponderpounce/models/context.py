@@ -30,6 +30,7 @@ from numpy.typing import ArrayLike
 
 from ponderpounce.models.eyes import Eyes, num_seen
 from ponderpounce.models.proprioception import Proprioception, check_rows
+from ponderpounce.models.second_look import SecondLook
 from ponderpounce.models.vocabulary import Vocabulary
 
 IGNORE = -100
@@ -108,6 +109,8 @@ class ContextFormat:
     takes_notes: bool = False
     """True: after every instant of a demonstration it may write, as at a query, and ``T_yes`` and its words stay in
     the row. The paper's only watches."""
+    second_look: SecondLook | None = None
+    """When serving looks again for what it has said (`second_look`); None: never, as in the paper."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.num_carriers <= 16:

@@ -27,6 +27,7 @@ from ponderpounce.models.context import ContextFormat
 from ponderpounce.models.eyes import Eyes, check_eyes
 from ponderpounce.models.ponder import Ponder, image_grid, skeleton, token_px
 from ponderpounce.models.proprioception import Proprioception
+from ponderpounce.models.second_look import SecondLook
 from ponderpounce.models.vocabulary import Vocabulary
 
 CONFIG_NAME = "config.json"
@@ -46,9 +47,9 @@ class CheckpointError(ValueError):
 class StoredPonder:
     """Contents of ponder.json. The defaults are for a public Qwen3.5, which has none; a file has every field."""
 
-    format: Literal["ponderpounce.ponder/5"] = "ponderpounce.ponder/5"
-    """/4 is the same without ``takes_notes``, /3 without ``speaks`` as well, /2 without ``proprioception``, /1 without
-    ``eyes``: such a PONDER speaks and has none of the others."""
+    format: Literal["ponderpounce.ponder/6"] = "ponderpounce.ponder/6"
+    """Each is the one before and a field more: /5 has no ``second_look``, /4 no ``takes_notes``, /3 no ``speaks``, /2
+    no ``proprioception``, /1 no ``eyes``. Such a PONDER speaks and has none of the others."""
     num_carriers: int = 1
     first_carrier_id: int | None = None
     """None: the first row after the tokenizer's last id."""
@@ -57,6 +58,7 @@ class StoredPonder:
     proprioception: Proprioception | None = None
     speaks: bool = True
     takes_notes: bool = False
+    second_look: SecondLook | None = None
     is_random: bool = True
     """The carriers were never trained."""
 
@@ -90,6 +92,7 @@ def load_ponder(directory: Path, *, device: torch.device | str = "cpu", dtype: t
         proprioception=stored.proprioception,
         speaks=stored.speaks,
         takes_notes=stored.takes_notes,
+        second_look=stored.second_look,
     )
     if qwen_config.image_token_id != vocabulary.image_pad:
         raise CheckpointError(
@@ -125,6 +128,7 @@ def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_S
         proprioception=ponder.format.proprioception,
         speaks=ponder.format.speaks,
         takes_notes=ponder.format.takes_notes,
+        second_look=ponder.format.second_look,
         is_random=ponder.is_random,
     )
     (directory / OWN_NAME).write_text(json.dumps(asdict(stored), indent=2) + "\n")
@@ -217,6 +221,8 @@ def _read_stored(directory: Path) -> StoredPonder:
         values |= {"format": "ponderpounce.ponder/4", "speaks": True}
     if isinstance(values, dict) and values.get("format") == "ponderpounce.ponder/4":
         values |= {"format": "ponderpounce.ponder/5", "takes_notes": False}
+    if isinstance(values, dict) and values.get("format") == "ponderpounce.ponder/5":
+        values |= {"format": "ponderpounce.ponder/6", "second_look": None}
     return from_json(StoredPonder, values, str(path))
 
 

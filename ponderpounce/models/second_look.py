@@ -1,0 +1,89 @@
+"""A second look: where something is, is read anew when words about it have stood for long and nothing came of them.
+
+PONDER says a place once and from then on reads it in its own words. If it was wrong, or the thing has been pushed, the
+hand tries there until the time is over: a context that holds its own error repeats it. So the words are completed once
+more in a context that holds nothing but the instruction and the newest observation, as if the episode began with it,
+and if another place comes out they are said again with that one. What only memory knows cannot be seen in one look:
+``unless`` names it.
+
+The paper has nothing of it; its 9B model is trusted to put its words right.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+_PLACE = re.compile(r"\[(\d+), (\d+)\]")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SecondLook:
+    """When a PONDER looks again; part of its checkpoint."""
+
+    after: int
+    """Queries for which words must have stood, and between two second looks."""
+    least: int
+    """Thousandths of the picture: what is nearer is the same place."""
+    unless: str = ""
+    """Regular expression of words about what cannot be seen, only remembered; empty: all can be seen."""
+
+    def __post_init__(self) -> None:
+        if self.after < 1:
+            raise ValueError(f"after must be at least 1 query, came {self.after}")
+        if self.least < 1:
+            raise ValueError(f"least must be at least 1 thousandth, came {self.least}")
+        try:
+            re.compile(self.unless)
+        except re.error as error:
+            raise ValueError(f"unless is no regular expression: {error} in {self.unless!r}") from None
+
+    def can_answer(self, text: str) -> bool:
+        """Whether one look can tell the first place of this text."""
+        return _PLACE.search(text) is not None and not (self.unless and re.search(self.unless, text))
+
+    def is_another(self, before: str, anew: str) -> bool:
+        """Whether two texts' first places are not the same one; False where one of them has none."""
+        places = [_PLACE.search(text) for text in (before, anew)]
+        if any(place is None for place in places):
+            return False
+        (x, y), (u, v) = ((int(place[1]), int(place[2])) for place in places if place is not None)
+        return (x - u) ** 2 + (y - v) ** 2 >= self.least**2
+
+
+class Standing:
+    """The words in force in one episode, and for how many queries they have been: a state machine without tensors."""
+
+    def __init__(self, config: SecondLook) -> None:
+        self._config = config
+        self.text = ""
+        """Said last; empty before anything was."""
+        self.token_ids: tuple[int, ...] = ()
+        self._count = 0
+
+    @property
+    def is_due(self) -> bool:
+        """Whether a query that would be answered without words is to look again."""
+        return self._count + 1 >= self._config.after and self._config.can_answer(self.text)
+
+    def is_another(self, anew: str) -> bool:
+        """Whether the first place of ``anew`` is not the one that was said."""
+        return self._config.is_another(self.text, anew)
+
+    def answered(self, texts: Sequence[tuple[str, tuple[int, ...]]], *, looked_again: bool) -> None:
+        """A query was: with these texts and their tokens, the subgoal last; () for silence.
+
+        Saying the same of whatever place is no news, and does not put a second look off. One that was taken does,
+        whatever came of it.
+        """
+        is_news = bool(texts) and _about(texts[-1][0]) != _about(self.text)
+        if texts:
+            self.text, self.token_ids = texts[-1]
+        self._count = 0 if is_news or looked_again else self._count + 1
+
+
+def _about(text: str) -> str:
+    """A text's words in front of its first place."""
+    place = _PLACE.search(text)
+    return text if place is None else text[: place.start()]
