@@ -22,7 +22,8 @@ from benchmarks.report import Report, Row, show, spread
 from clock.membership import percentile_ns
 from ponder_server.admission import Admission
 from ponder_server.contract import Frame, Opening, SessionError
-from ponder_server.engine import EngineConfig, QwenEngine
+from ponder_server.engine import QwenEngine
+from ponder_server.engine_config import EngineConfig
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
 

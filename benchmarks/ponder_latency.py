@@ -34,7 +34,8 @@ from benchmarks.report import Report, Row, show, spread
 from ponder_server.config import NUM_TORCH_THREADS
 from ponder_server.contract import Opening, WeightsName
 from ponder_server.draft import Draft, NoDraft, TrieDraft
-from ponder_server.engine import EngineConfig, QwenEngine
+from ponder_server.engine import QwenEngine
+from ponder_server.engine_config import EngineConfig
 from ponder_server.mtp import MtpDraft
 from ponderpounce.models import ponder_configs
 from ponderpounce.models.context import Row as EpisodeRow

@@ -27,7 +27,8 @@ from torch import Tensor
 
 from benchmarks.report import Report, Row, show, spread
 from ponder_server.config import SizeName
-from ponder_server.engine import EngineConfig, QwenEngine
+from ponder_server.engine import QwenEngine
+from ponder_server.engine_config import EngineConfig
 from ponderpounce.models import ponder_configs
 from ponderpounce.models.ponder import Ponder
 from protocol.mcap_log import read_log

@@ -27,7 +27,8 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     import torch  # here, so that --help and a mistyped option answer at once
 
     from ponder_server.draft import Draft, FirstOf, TrieDraft
-    from ponder_server.engine import EngineConfig, QwenEngine
+    from ponder_server.engine import QwenEngine
+    from ponder_server.engine_config import EngineConfig
     from ponder_server.mtp import MtpDraft
     from ponder_server.threads import num_usable_cores
     from ponderpounce.models import ponder_configs

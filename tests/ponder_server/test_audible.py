@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from ponder_server.contract import Opening
-from ponder_server.engine import EngineConfig, QwenEngine
+from ponder_server.engine import QwenEngine
+from ponder_server.engine_config import EngineConfig
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
 

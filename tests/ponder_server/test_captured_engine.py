@@ -10,7 +10,8 @@ from ponder_server.__main__ import build_engine
 from ponder_server.config import PonderOptions
 from ponder_server.contract import Fire, Frame, Opening, WeightsName
 from ponder_server.draft import TrieDraft
-from ponder_server.engine import EngineConfig, QwenEngine
+from ponder_server.engine import QwenEngine
+from ponder_server.engine_config import EngineConfig
 from ponderpounce.models.graphs import Capture, Work, directly
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu

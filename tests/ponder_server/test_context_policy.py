@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from ponder_server.context_policy import POLICIES, PolicyName, Span, carriers_only, pin_and_slide, refuse
 from ponder_server.contract import ContextFull, Frame, Opening
-from ponder_server.engine import EngineConfig, QwenEngine
+from ponder_server.engine import QwenEngine
+from ponder_server.engine_config import EngineConfig
 from ponderpounce.models.context import SegmentKind
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu

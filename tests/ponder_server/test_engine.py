@@ -12,7 +12,8 @@ import torch
 from ponder_server.__main__ import build_engine
 from ponder_server.config import PonderOptions, SizeName
 from ponder_server.contract import ContextFull, Frame, Opening, SessionError
-from ponder_server.engine import EngineConfig, QwenEngine
+from ponder_server.engine import QwenEngine
+from ponder_server.engine_config import EngineConfig
 from ponder_server.runner import Session
 from ponderpounce.models import ponder_configs
 from ponderpounce.models.context import Row, Transition

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from ponder_server import contract
-from ponder_server.engine import EngineConfig, QwenEngine
+from ponder_server.engine import QwenEngine
+from ponder_server.engine_config import EngineConfig
 from ponder_server.fleet import PonderFleet
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu

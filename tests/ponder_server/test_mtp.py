@@ -22,7 +22,8 @@ from ponder_server.__main__ import build_engine
 from ponder_server.config import PonderOptions
 from ponder_server.contract import Fire, Opening, Outcome
 from ponder_server.draft import Draft, FirstOf, NoDraft, TrieDraft
-from ponder_server.engine import EngineConfig, QwenEngine
+from ponder_server.engine import QwenEngine
+from ponder_server.engine_config import EngineConfig
 from ponder_server.mtp import MAX_DRAFT_TOKENS, WINDOW, MtpDraft
 from ponder_server.writer import TransitionWriter, sayable
 from ponderpounce.models.ponder import Ponder

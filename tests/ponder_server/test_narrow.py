@@ -14,7 +14,8 @@ import torch
 from ponder_server.__main__ import build_engine
 from ponder_server.config import PonderOptions
 from ponder_server.contract import Opening, WeightsName
-from ponder_server.engine import EngineConfig, QwenEngine
+from ponder_server.engine import QwenEngine
+from ponder_server.engine_config import EngineConfig
 from ponder_server.narrow import quantise
 from ponder_server.serve import PonderServer
 from ponderpounce.models.fp8 import Fp8Linear

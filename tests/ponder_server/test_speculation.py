@@ -8,7 +8,8 @@ import pytest
 
 from ponder_server.contract import Fire, Opening
 from ponder_server.draft import NoDraft, TrieDraft
-from ponder_server.engine import EngineConfig, QwenEngine
+from ponder_server.engine import QwenEngine
+from ponder_server.engine_config import EngineConfig
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
 from ponderpounce.models.vocabulary import Vocabulary

@@ -10,7 +10,8 @@ import torch
 
 from clock.sampling import EVALUATION, sample_schedule
 from ponder_server.contract import Opening
-from ponder_server.engine import EngineConfig, QwenEngine
+from ponder_server.engine import QwenEngine
+from ponder_server.engine_config import EngineConfig
 from ponder_server.writer import TransitionWriter
 from ponderpounce.models.eyes import Eye, see
 from ponderpounce.models.ponder import Ponder
