@@ -28,5 +28,6 @@ collect "$next/repick" --tasks VideoRepick --episodes 61 --recovery-share 0.2 --
 data=("$paced/timed" "$noted/swaps" "$noted/swaps" "$noted/repick" "$next/repick" "$noted/shown" "$noted/shown" "$noted/old"
     "$noted/old" "$noted/filled" "$noted/filled" "$noted/imitated" "$noted/highlight" "$noted/highlight")
 settle small_beginnings "$pair/ponder" "$pair/pounce" "$next" --data "${data[@]}" --sights "$noted/sights" \
-    --watch "$watched/counted" "$next/counted" "$next/driven" --watch-share 0.2
+    --watch "$watched/counted" "$next/counted" "$next/driven" --watch-share 0.2 --steps 1400
+look_again "$next/pair/ponder" 6 8 'highlight|hides|correct'
 evaluate "$next/pair" "$next"

@@ -28,6 +28,13 @@ settle() {  # a PONDER goes on by RECIPE's `settling` INTO a folder, and makes a
     [ -d "$into/pair/pounce" ] || cp -r "$pounce" "$into/pair/pounce"
 }
 
+look_again() {  # a PONDER's folder is served with a second look AFTER so many queries, of places LEAST apart, UNLESS words say so
+    "$bin/python" -c 'import json, pathlib, sys
+path, after, least, unless = pathlib.Path(sys.argv[1], "ponder.json"), *map(int, sys.argv[2:4]), sys.argv[4]
+stored = json.loads(path.read_text()) | {"second_look": {"after": after, "least": least, "unless": unless}}
+path.write_text(json.dumps(stored, indent=2) + "\n")' "$@"
+}
+
 evaluate() {  # a PAIR on the test scenes of fifteen tasks, with cognition and without: OUT/real, OUT/null, OUT/tables
     local pair=$1 out=$2 cognition
     for cognition in real null; do
