@@ -43,6 +43,7 @@ from ponder_server.narrow import check_weights, quantise
 from ponder_server.opening import Opener
 from ponder_server.runner import NUM_SAVED_STATES, Append, Runner, Session
 from ponder_server.slots import slot_size
+from ponder_server.standing import Standing
 from ponder_server.threads import Threads
 from ponder_server.writer import MAX_CHECKED_TOKENS, Steps, TransitionWriter
 from ponderpounce.models.context import SegmentKind
@@ -51,7 +52,6 @@ from ponderpounce.models.graphs import Capture, graphs_for
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import weights_hash
 from ponderpounce.models.proprioception import NUM_PROPRIO
-from ponderpounce.models.second_look import Standing
 
 WARM_UP_SESSION = "warm-up"
 WARM_UP_OPENING = Opening(instruction="warm up")

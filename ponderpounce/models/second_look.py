@@ -12,7 +12,6 @@ The paper has nothing of it; its 9B model is trusted to put its words right.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 _PLACE = re.compile(r"\[(\d+), (\d+)\]")
@@ -51,39 +50,7 @@ class SecondLook:
         (x, y), (u, v) = ((int(place[1]), int(place[2])) for place in places if place is not None)
         return (x - u) ** 2 + (y - v) ** 2 >= self.least**2
 
-
-class Standing:
-    """The words in force in one episode, and for how many queries they have been: a state machine without tensors."""
-
-    def __init__(self, config: SecondLook) -> None:
-        self._config = config
-        self.text = ""
-        """Said last; empty before anything was."""
-        self.token_ids: tuple[int, ...] = ()
-        self._count = 0
-
-    @property
-    def is_due(self) -> bool:
-        """Whether a query that would be answered without words is to look again."""
-        return self._count + 1 >= self._config.after and self._config.can_answer(self.text)
-
-    def is_another(self, anew: str) -> bool:
-        """Whether the first place of ``anew`` is not the one that was said."""
-        return self._config.is_another(self.text, anew)
-
-    def answered(self, texts: Sequence[tuple[str, tuple[int, ...]]], *, looked_again: bool) -> None:
-        """A query was: with these texts and their tokens, the subgoal last; () for silence.
-
-        Saying the same of whatever place is no news, and does not put a second look off. One that was taken does,
-        whatever came of it.
-        """
-        is_news = bool(texts) and _about(texts[-1][0]) != _about(self.text)
-        if texts:
-            self.text, self.token_ids = texts[-1]
-        self._count = 0 if is_news or looked_again else self._count + 1
-
-
-def _about(text: str) -> str:
-    """A text's words in front of its first place."""
-    place = _PLACE.search(text)
-    return text if place is None else text[: place.start()]
+    def about(self, text: str) -> str:
+        """A text's words in front of its first place."""
+        place = _PLACE.search(text)
+        return text if place is None else text[: place.start()]

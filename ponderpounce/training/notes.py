@@ -6,8 +6,9 @@ down begins at the first layer again. So PONDER notes, as long as anything moves
 
 - at every instant of a demonstration, where what will be asked for is then: "<99, 120>";
 - at every query, where it is now, behind the subgoal: "press the first button at <60, 90>, <99, 120>";
-- of a thing that is changing places, also where it will come to rest: "<99, 120> to <80, 66>". Half-way through a swap
-  the other one is nearer to where it was last seen, and was taken for it. Who knows where it is going is not misled,
+- if a recipe asks for it (`tells_ends`), of a thing that is changing places also where it will come to rest:
+  "<99, 120> to <80, 66>". Half-way through a swap the other one is nearer to where it was last seen, and
+  was taken for it. Who knows where it is going is not misled,
   and what is noted last is the place to go to though the swap is not over;
 - of a thing that comes by and is to be stopped, also how often it does and how long there is to wait (`countdown`):
   "remain static, <110, 77>, 80, 137". The pace is read off two places, and the wait off pace and place.

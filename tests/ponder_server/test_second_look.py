@@ -11,9 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ponder_server.engine import QwenEngine
+from ponder_server.standing import Standing
 from ponderpounce.models.context import Transition
 from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.second_look import SecondLook, Standing
+from ponderpounce.models.second_look import SecondLook
 from tests.ponder_server.test_engine import (
     CONFIG,
     INSTRUCTION,
