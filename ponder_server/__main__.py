@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
+from functools import partial
 
 import tyro
 
@@ -26,6 +27,7 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     """
     import torch  # here, so that --help and a mistyped option answer at once
 
+    from ponder_server.council import Council
     from ponder_server.draft import Draft, FirstOf, TrieDraft
     from ponder_server.engine import QwenEngine
     from ponder_server.engine_config import EngineConfig
@@ -51,10 +53,12 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     else:
         size = getattr(ponder_configs, options.size)()
         ponder = Ponder.random(size, seed=options.seed, device=options.device, dtype=dtype)
+    counsel, form = ponder.format.counsel, ponder.format
+    num_members = 1 if counsel is None else 1 + len(counsel.others)
     config = EngineConfig(
         max_context_tokens=options.max_context_tokens,
         when_full=options.when_full,
-        max_sessions=options.max_sessions,
+        max_sessions=options.max_sessions * num_members,
         max_text_tokens=options.max_text_tokens,
         max_batch_rows=options.max_batch_rows,
         attention_threads=min(options.attention_threads, num_cores),
@@ -71,7 +75,10 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
         log.warning(
             "--draft-tokens: these weights have no multi-token prediction (mtp.*); texts are written without it"
         )
-    return QwenEngine(ponder, config, FirstOf(drafts))
+    engine = QwenEngine(ponder, config, FirstOf(drafts))
+    if counsel is None:
+        return engine
+    return Council(engine, counsel, partial(counsel.views, form.eyes, ponder.image_px))
 
 
 def main(argv: list[str] | None = None) -> int:

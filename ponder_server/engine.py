@@ -13,7 +13,7 @@ a session.
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import accumulate
 
 import numpy as np
@@ -39,6 +39,7 @@ from ponder_server.contract import (
 )
 from ponder_server.draft import Draft, NoDraft
 from ponder_server.engine_config import EngineConfig
+from ponder_server.episode import Episode, Query
 from ponder_server.narrow import check_weights, quantise
 from ponder_server.opening import Opener
 from ponder_server.runner import NUM_SAVED_STATES, Append, Runner, Session
@@ -52,43 +53,15 @@ from ponderpounce.models.graphs import Capture, graphs_for
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import weights_hash
 from ponderpounce.models.proprioception import NUM_PROPRIO
+from ponderpounce.models.views import AS_IT_IS, View
 
 WARM_UP_SESSION = "warm-up"
 WARM_UP_OPENING = Opening(instruction="warm up")
 NUM_UNMEASURED_FIRES = 5
 NUM_MEASURED_FIRES = 30
 NUM_FULL_FIRES = 10
+_BUCKET_STEP = 16
 WARM_UP_PROPRIO = np.zeros(NUM_PROPRIO, np.float32)
-
-
-@dataclass(slots=True, kw_only=True)
-class _Episode:
-    """A session in use, and what its tokens do not say about it."""
-
-    context: Session
-    spans: list[Span]
-    """What the cached tokens are."""
-    owes_reasoning: bool
-    """A demonstration was shown and its reasoning (DR) not yet written; the first transition writes it."""
-    notes: tuple[Note, ...]
-    """Of the demonstration, not yet told: the first answer tells them."""
-    alone: tuple[int, ...]
-    """The opening without its demonstration: what a second look begins with."""
-    standing: Standing | None
-    """None: it never looks again."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Query:
-    """A query that was begun."""
-
-    episode: _Episode
-    pictures: Pictures
-    """(images, h, w, 3): what is seen of its frames."""
-    ids: tuple[int, ...]
-    """O_t and the carriers."""
-    force_text_tokens: int | None
-    turn: int
 
 
 class QwenEngine:
@@ -108,7 +81,7 @@ class QwenEngine:
         self._ponder = ponder
         self._config = config
         self._format = ponder.format
-        self._episodes: dict[str, _Episode] = {}
+        self._episodes: dict[str, Episode] = {}
         self._frame_px = readable_sizes(self._format.eyes, ponder.image_px)[0]
         check_cameras([self._frame_px] * config.num_cameras, self._format.eyes, ponder.image_px)
         size = slot_size(ponder.qwen.config.text_config, ponder.dtype)
@@ -121,7 +94,7 @@ class QwenEngine:
                 ponder,
                 num_slots=config.max_sessions * contexts_each,
                 max_tokens=config.max_context_tokens,
-                buckets=config.buckets,
+                buckets=_fitted(config.buckets, len(self._query_ids(WARM_UP_PROPRIO))),
                 threads=Threads(config.attention_threads),
             )
         except (RuntimeError, MemoryError) as error:  # torch's own on a GPU and on a CPU
@@ -155,7 +128,7 @@ class QwenEngine:
             max_prefixes=config.max_prefixes,
             chunk_tokens=config.prefill_chunk_tokens,
         )
-        self._begun: dict[str, _Query] = {}
+        self._begun: dict[str, Query] = {}
         self._batch: Batch[Fire] = Batch(self._runner, max_rows=config.max_batch_rows)
         if config.weights != "float":
             exact_KH = self._example_cognition()
@@ -173,8 +146,8 @@ class QwenEngine:
         return self._spec
 
     @torch.inference_mode()
-    def open(self, session: str, opening: Opening, progress: Progress = no_progress) -> int:
-        """Encodes instruction and demonstration; see ``PonderEngine.open``."""
+    def open(self, session: str, opening: Opening, progress: Progress = no_progress, *, view: View = AS_IT_IS) -> int:
+        """Encodes instruction and demonstration; see ``PonderEngine.open``. ``view``: how all pictures are seen."""
         if session in self._episodes:
             raise SessionError(f"session {session!r} is already open; close it first.")
         if len(self._episodes) >= self._config.max_sessions:
@@ -187,7 +160,7 @@ class QwenEngine:
         for instant, views in enumerate(opening.demo_frames):
             if not views:
                 raise ValueError(f"demo instant {instant} has no view")
-        demo = [self._see(views, f"demo instant {n}") for n, views in enumerate(opening.demo_frames)]
+        demo = [self._see(views, f"demo instant {n}", view) for n, views in enumerate(opening.demo_frames)]
         segments = self._format.opening(opening.instruction, [len(views) for views in opening.demo_frames])
         wanted = sum(len(segment) for segment in segments)
         if wanted > self._config.max_context_tokens:
@@ -196,19 +169,20 @@ class QwenEngine:
         try:
             with audible(self._parts, progress):
                 pictures = [picture for instant in demo for picture in instant]
-                opened = self._opener.encode(context, opening, segments, pictures, progress)
+                opened = self._opener.encode(context, opening, segments, pictures, progress, view)
         except BaseException as error:
             self._runner.close(context)
             if isinstance(error, torch.OutOfMemoryError):
                 raise SessionError(f"session {session!r}: the device has no memory left to encode it.") from error
             raise
-        self._episodes[session] = _Episode(
+        self._episodes[session] = Episode(
             context=context,
             spans=[*opened.spans],
             owes_reasoning=opening.has_demo,
             notes=opened.notes,
             alone=tuple(token for each in self._format.opening(opening.instruction) for token in each.ids),
             standing=None if self._second_look is None else Standing(self._second_look),
+            view=view,
         )
         return context.num_tokens
 
@@ -242,27 +216,43 @@ class QwenEngine:
         *,
         proprio: Proprio | None = None,
         force_text_tokens: int | None = None,
+        saying: tuple[str, ...] | None = None,
     ) -> None:
-        """Takes on one query, to be answered by :meth:`step`; see ``BatchingEngine.begin``."""
+        """Takes on one query, to be answered by :meth:`step`; see ``BatchingEngine.begin``.
+
+        ``saying``: the texts to answer it with, the subgoal last, whatever the model wants to say; () for silence.
+        """
         episode = self._episode(session)
         context = episode.context
         if session in (*self._begun, *self._batch.sessions):
             raise SessionError(f"session {session!r} is thinking about a query already; one at a time.")
         if len(frames) != self._config.num_cameras:
             raise ValueError(f"fire got {len(frames)} frames, this engine has num_cameras {self._config.num_cameras}")
-        pictures = self._see(frames, "observation")
+        pictures = self._see(frames, "observation", episode.view)
         ids = self._query_ids(proprio)
         if force_text_tokens is not None and force_text_tokens < 1:
             raise ValueError(f"force_text_tokens is {force_text_tokens}; at least 1, or None")
+        episode.before = None
         self._make_room(episode)
         context.check_room(len(ids))
-        self._begun[session] = _Query(
+        self._begun[session] = Query(
             episode=episode,
             pictures=pictures,
             ids=ids,
             force_text_tokens=force_text_tokens,
+            saying=saying,
             turn=self._batch.turn(),
         )
+
+    def drop(self, session: str) -> None:
+        """Forgets a query that was begun and not answered; without one it changes nothing."""
+        self._begun.pop(session, None)
+        self._batch.drop(session)
+
+    @torch.inference_mode()
+    def undo(self, session: str) -> None:
+        """The session is as it was before its last query, which was answered. Raises SessionError if none was."""
+        self._episode(session).undo()
 
     @torch.inference_mode()
     def step(self, progress: Progress = no_progress) -> list[Outcome[Fire]]:
@@ -278,7 +268,7 @@ class QwenEngine:
                     self._batch.add(session, self._think(query, query_TH), query.turn)
             return self._batch.step(progress)
 
-    def _think(self, query: _Query, embeds_TH: Tensor) -> Steps[Fire]:
+    def _think(self, query: Query, embeds_TH: Tensor) -> Steps[Fire]:
         """One query's way through the network; whatever ends it early, the context is as it was."""
         episode, exactly = query.episode, query.force_text_tokens
         context = episode.context
@@ -288,20 +278,22 @@ class QwenEngine:
         is_answered = False
         try:
             texts: tuple[Text, ...] = ()
-            is_transition = exactly is not None
+            is_transition = exactly is not None or bool(query.saying)
             if not is_transition:
                 wanted = 1 + self._format.num_carriers
                 hidden_NH = yield Append(session=context, ids=query.ids, embeds_TH=embeds_TH, num_wanted=wanted)
-                is_transition = self._format.speaks and self._writer.wants_to_write(hidden_NH[:1])
+                is_asked = self._format.speaks and query.saying is None
+                is_transition = is_asked and self._writer.wants_to_write(hidden_NH[:1])
                 hidden_KH = hidden_NH[1:]
             standing = episode.standing
             looks_again = standing is not None and standing.is_due and not is_transition
-            words = (yield from self._look_again(query, observation_TH)) if looks_again else ()
-            if words:
-                is_transition = True
+            said = [] if query.saying is None else [*map(self._format.vocabulary.encode, query.saying)]
+            if looks_again and query.saying is None:
+                words = yield from self._look_again(query, observation_TH)
+                said = [words] if words else []
+            if said:
                 context.restore(before)
-                text = yield from self._writer.say(context, before, query.ids[:num_observed], observation_TH, words)
-                texts = (text,)
+                texts = yield from self._writer.say(context, before, query.ids[:num_observed], observation_TH, said)
                 hidden_KH = yield Append(session=context, ids=self._format.carrier_ids, embeds_TH=carriers_KH)
             elif is_transition:
                 context.restore(before)
@@ -316,22 +308,19 @@ class QwenEngine:
                 hidden_KH = yield Append(session=context, ids=self._format.carrier_ids, embeds_TH=carriers_KH)
             answer = self._answer(context, hidden_KH, texts, episode.notes)
             num_written = len(context.ids) - before.num_ids - len(query.ids)
-            episode.spans += [
+            spans = [
                 Span(SegmentKind.OBSERVATION, num_observed),
                 Span(SegmentKind.TEXT, num_written),
                 Span(SegmentKind.CARRIERS, self._format.num_carriers),
             ]
-            episode.owes_reasoning &= not is_transition
-            episode.notes = ()
-            if standing is not None:
-                standing.answered([(text.text, text.token_ids) for text in texts], looked_again=looks_again)
+            episode.answered(texts, spans, before, looked_again=looks_again)
             is_answered = True
             return answer
         finally:
             if not is_answered:
                 context.restore(before)
 
-    def _look_again(self, query: _Query, observation_TH: Tensor) -> Steps[tuple[int, ...]]:
+    def _look_again(self, query: Query, observation_TH: Tensor) -> Steps[tuple[int, ...]]:
         """What is to be said of a silent query after all: the words in force with another place; () for nothing."""
         episode, standing = query.episode, query.episode.standing
         assert standing is not None
@@ -349,8 +338,7 @@ class QwenEngine:
     def close(self, session: str) -> None:
         """Keeps the memory for the next session; see ``PonderEngine.close``."""
         episode = self._episode(session)
-        self._begun.pop(session, None)
-        self._batch.drop(session)
+        self.drop(session)
         self._runner.close(episode.context)
         del self._episodes[session]
 
@@ -364,7 +352,7 @@ class QwenEngine:
         longest = max(self._num_query_ids, MAX_CHECKED_TOKENS)
         if self._runner.prepare(longest, max_rows=self._config.max_batch_rows):
             self._runner.check(self._example_cognition)
-        frames = self._warm_up_frames()
+        frames = self.example_frames()
         self.open(WARM_UP_SESSION, WARM_UP_OPENING)
         try:
             context = self._episode(WARM_UP_SESSION).context
@@ -398,7 +386,8 @@ class QwenEngine:
             self.close(WARM_UP_SESSION)
         return durations_ns[1:]
 
-    def _warm_up_frames(self) -> tuple[Frame, ...]:
+    def example_frames(self) -> tuple[Frame, ...]:
+        """Frames of one query, of noise: for measurements."""
         noise = np.random.default_rng(0)
         shape = (*self._frame_px, 3)
         return tuple(noise.integers(0, 256, shape, dtype=np.uint8) for _ in range(self._config.num_cameras))
@@ -415,13 +404,13 @@ class QwenEngine:
     def _example_query(self, context: Session) -> Tensor:
         """C (K, H) of one observation as if T_t, which is looked at, were T_no."""
         ids = self._query_ids(WARM_UP_PROPRIO)
-        embeds_TH = self._embed(ids, [*self._see(self._warm_up_frames(), "warm-up")])
+        embeds_TH = self._embed(ids, [*self._see(self.example_frames(), "warm-up")])
         context.save(context.before_fire)
         hidden_NH = context.append(ids, embeds_TH, num_wanted=1 + self._format.num_carriers)
         self._writer.wants_to_write(hidden_NH[:1])
         return hidden_NH[1:].float()
 
-    def _episode(self, session: str) -> _Episode:
+    def _episode(self, session: str) -> Episode:
         episode = self._episodes.get(session)
         if episode is None:
             raise SessionError(f"session {session!r} is not open; open are {sorted(self._episodes)}.")
@@ -432,9 +421,10 @@ class QwenEngine:
         observed = self._format.observation(self._config.num_cameras, proprio)
         return (*observed.ids, *self._format.carrier_ids)
 
-    def _see(self, frames: tuple[Frame, ...], where: str) -> Pictures:
+    def _see(self, frames: tuple[Frame, ...], where: str, view: View = AS_IT_IS) -> Pictures:
         try:
-            return see(frames, self._format.eyes, self._format.image_px)
+            pictures = see(frames, self._format.eyes, self._format.image_px)
+            return pictures if view.shows_it_as_it_is else view.pictures(torch.from_numpy(pictures)).numpy()
         except ValueError as error:
             raise ValueError(f"{where}, {error}") from None
 
@@ -444,7 +434,7 @@ class QwenEngine:
         return self._ponder.embed(ids, torch.from_numpy(np.stack(pictures)).to(self._ponder.device))
 
     @torch.inference_mode()
-    def _make_room(self, episode: _Episode) -> None:
+    def _make_room(self, episode: Episode) -> None:
         """Asks the policy, early enough that a transition with texts of full length would still fit."""
         context = episode.context
         num_wanted = self._num_query_ids + 2 * (1 + self._config.max_text_tokens)
@@ -479,3 +469,10 @@ class QwenEngine:
             context_tokens=context.num_tokens,
             notes=notes,
         )
+
+
+def _fitted(buckets: tuple[int, ...], num_query_ids: int) -> tuple[int, ...]:
+    """The buckets, and one for queries where they would be padded to twice their length."""
+    own = -(-num_query_ids // _BUCKET_STEP) * _BUCKET_STEP
+    padded = next((bucket for bucket in buckets if bucket >= num_query_ids), own)
+    return tuple(sorted({*buckets, own})) if 2 * own <= padded else buckets

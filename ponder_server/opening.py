@@ -16,6 +16,7 @@ from ponder_server.writer import Steps, TransitionWriter
 from ponderpounce.models.context import Segment, SegmentKind, in_groups
 from ponderpounce.models.eyes import Pictures
 from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.views import AS_IT_IS, View
 
 Result = TypeVar("Result")
 
@@ -46,19 +47,23 @@ class Opener:
         segments: Sequence[Segment],
         pictures: Sequence[Pictures],
         progress: Progress,
+        view: View = AS_IT_IS,
     ) -> Opened:
         """Fills the context and tells what its tokens are; from an equal opening of before, if there was one.
 
+        ``view``: how the pictures were seen; those seen otherwise than they are make no beginning for others.
+
         Raises ContextFull if notes do not fit; the caller closes the context.
         """
-        if opening.has_demo and (found := self._prefixes.find(opening)) is not None:
+        is_shared = opening.has_demo and view.shows_it_as_it_is
+        if is_shared and (found := self._prefixes.find(opening)) is not None:
             context.start_from(found[0])
             progress()
             return found[1]
         takes_notes = self._ponder.format.takes_notes and self._ponder.format.speaks
         fill = self._look_by_look if takes_notes and opening.has_demo else self._at_once
         opened = fill(context, segments, [*pictures], progress)
-        if opening.has_demo:
+        if is_shared:
             self._prefixes.keep(opening, context, opened)
         return opened
 

@@ -101,15 +101,23 @@ class TransitionWriter:
         before: SavedState,
         observation_ids: Sequence[int],
         observation_TH: Tensor,
-        text_ids: Sequence[int],
-    ) -> Steps[Text]:
-        """Writes a transition of given words, as :meth:`write` does one of its own."""
-        self._limit(context, before, self._ponder.format.num_carriers, len(text_ids))
-        ids = [self._t_yes, *text_ids]
+        texts: Sequence[Sequence[int]],
+    ) -> Steps[tuple[Text, ...]]:
+        """Writes a transition of given texts, the subgoal last, as :meth:`write` does its own."""
+        ids = [token for text in texts for token in (self._t_yes, *text)]
+        self._limit(context, before, self._ponder.format.num_carriers, len(observation_ids) + len(ids))
         embeds_TH = torch.cat([observation_TH, self._ponder.embed(ids)])
         yield Append(session=context, ids=[*observation_ids, *ids], embeds_TH=embeds_TH, num_wanted=0)
-        text = self._ponder.format.vocabulary.decode(text_ids)
-        return Text(kind="subgoal", text=text, token_ids=tuple(text_ids), truncated=False)
+        decode = self._ponder.format.vocabulary.decode
+        return tuple(
+            Text(
+                kind="subgoal" if n == len(texts) else "demo_reasoning",
+                text=decode(text),
+                token_ids=tuple(text),
+                truncated=False,
+            )
+            for n, text in enumerate(texts, 1)
+        )
 
     def complete_place(
         self, context: Session, ids: Sequence[int], embeds_TH: Tensor, text_ids: Sequence[int]

@@ -12,7 +12,7 @@ play() {  # a PAIR plays EPISODES each from SEED on, recorded INTO a folder, of 
 retell() {  # what was played in the folder FROM, told as things then stood, becomes the dataset INTO
     local from=$1 into=$2 found
     mapfile -t found < <(logs "$from")
-    [ -d "$into/meta" ] || "$bin/pp-export" "${found[@]}" --texts follow --order near-first --out "$into"
+    [ -d "$into/meta" ] || "$bin/pp-export" "${found[@]}" --texts follow --order near-first --demonstration-hz 1 --out "$into"
 }
 
 learn() {  # a PONDER goes on by a STAGE of RECIPE INTO a folder, beside POUNCE; the rest is pp-train's

@@ -54,9 +54,11 @@ class CollectOptions:
     scale: Literal["1x", "9x"] = "1x"
     """Paper: 100 episodes a task, or 900."""
     frames: Literal["all", "training"] = "all"
-    """Pictures at 20 Hz; or only those that training reads, demonstrations at 1 Hz and POUNCE's invocations."""
+    """Pictures at 20 Hz; or only those that training reads, of demonstrations and POUNCE's invocations."""
     invocation_hz: Literal[1, 2, 4, 5, 10, 20] = 10
     """With --frames training: how often POUNCE looks (paper: every 100 ms in training)."""
+    demonstration_hz: Literal[1, 2, 4, 5, 10, 20] = 1
+    """With --frames training: how often demonstrations are looked at (paper: once a second)."""
     image_px: int = 256
     """Even; the paper's and the benchmark's is 256."""
     noise: NoiseKind = "none"
@@ -115,7 +117,7 @@ class CollectOptions:
     def look(self) -> Look:
         if self.frames == "all":
             return Look()
-        return Look(demonstration_hz=1, execution_hz=self.invocation_hz)
+        return Look(demonstration_hz=self.demonstration_hz, execution_hz=self.invocation_hz)
 
     def task_names(self) -> tuple[str, ...]:
         """The tasks in alphabetical order, each once. Raises TaskError for an unknown one."""

@@ -48,6 +48,9 @@ class ExportOptions:
     what is still to come at the end is told, too. For a PONDER that learns from what it played."""
     order: Order = "drawn"
     """The one that was played in; for "follow"."""
+    demonstration_hz: Literal[1, 2, 4, 5, 10, 20] = 20
+    """How often demonstrations are looked at as they are acted out again: most of the time that one takes. Training
+    reads a picture a second."""
     only_success: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Leave out episodes that did not succeed."""
     progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
@@ -81,7 +84,10 @@ def export(options: ExportOptions) -> int:
         record = read_log(path)
         if options.only_success and not (record.result and record.result.is_success):
             continue
-        writer.add(read_episode(path, record, texts=options.texts, order=options.order))
+        episode = read_episode(
+            path, record, texts=options.texts, order=options.order, demonstration_hz=options.demonstration_hz
+        )
+        writer.add(episode)
         num_episodes += 1
     if not num_episodes:
         raise DatasetError("none of the logs is of an episode that succeeded; leave out --only-success")
@@ -90,9 +96,14 @@ def export(options: ExportOptions) -> int:
 
 
 def read_episode(
-    path: Path, record: EpisodeRecord, *, texts: Literal["logged", "follow"] = "logged", order: Order = "drawn"
+    path: Path,
+    record: EpisodeRecord,
+    *,
+    texts: Literal["logged", "follow"] = "logged",
+    order: Order = "drawn",
+    demonstration_hz: int = FPS,
 ) -> Episode:
-    """Joins a log's messages, and acts its demonstration out again.
+    """Joins a log's messages, and acts its demonstration out again, with pictures so many times a second.
 
     Raises:
         DatasetError: something is missing from the log, or the scene that its seed gives is another one here.
@@ -110,7 +121,7 @@ def read_episode(
         info.task, image_px=height_px, max_steps=max_steps, texts_follow=follows, order=order
     ) as environment:
         narrator, first = _again(path, environment, info, observations[0])
-        for row, frames in narrator.demonstration(FPS):
+        for row, frames in narrator.demonstration(demonstration_hz):
             writer.add(row, frames)
         reasoning = narrator.reasoning()
         if follows:

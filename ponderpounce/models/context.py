@@ -28,6 +28,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.typing import ArrayLike
 
+from ponderpounce.models.counsel import Counsel
 from ponderpounce.models.eyes import Eyes, num_seen
 from ponderpounce.models.proprioception import Proprioception, check_rows
 from ponderpounce.models.second_look import SecondLook
@@ -111,8 +112,12 @@ class ContextFormat:
     the row. The paper's only watches."""
     second_look: SecondLook | None = None
     """When serving looks again for what it has said (`second_look`); None: never, as in the paper."""
+    counsel: Counsel | None = None
+    """In which other views serving reads an episode as well (`counsel`); None: in none, as in the paper."""
 
     def __post_init__(self) -> None:
+        if self.counsel is not None:
+            self.counsel.check(self.eyes)
         if not 1 <= self.num_carriers <= 16:
             raise ValueError(f"num_carriers is {self.num_carriers}; K must be 1..16 (the paper uses 1).")
         if self.first_carrier_id < self.vocabulary.num_tokens:

@@ -24,6 +24,7 @@ from transformers.models.qwen3_5 import Qwen3_5Config
 
 from ponderpounce.models.config_json import from_json
 from ponderpounce.models.context import ContextFormat
+from ponderpounce.models.counsel import Counsel
 from ponderpounce.models.eyes import Eyes, check_eyes
 from ponderpounce.models.ponder import Ponder, image_grid, skeleton, token_px
 from ponderpounce.models.proprioception import Proprioception
@@ -47,9 +48,9 @@ class CheckpointError(ValueError):
 class StoredPonder:
     """Contents of ponder.json. The defaults are for a public Qwen3.5, which has none; a file has every field."""
 
-    format: Literal["ponderpounce.ponder/6"] = "ponderpounce.ponder/6"
-    """Each is the one before and a field more: /5 has no ``second_look``, /4 no ``takes_notes``, /3 no ``speaks``, /2
-    no ``proprioception``, /1 no ``eyes``. Such a PONDER speaks and has none of the others."""
+    format: Literal["ponderpounce.ponder/7"] = "ponderpounce.ponder/7"
+    """Each is the one before and a field more: /6 has no ``counsel``, /5 no ``second_look``, /4 no ``takes_notes``, /3
+    no ``speaks``, /2 no ``proprioception``, /1 no ``eyes``. Such a PONDER speaks and has none of the others."""
     num_carriers: int = 1
     first_carrier_id: int | None = None
     """None: the first row after the tokenizer's last id."""
@@ -59,6 +60,7 @@ class StoredPonder:
     speaks: bool = True
     takes_notes: bool = False
     second_look: SecondLook | None = None
+    counsel: Counsel | None = None
     is_random: bool = True
     """The carriers were never trained."""
 
@@ -93,6 +95,7 @@ def load_ponder(directory: Path, *, device: torch.device | str = "cpu", dtype: t
         speaks=stored.speaks,
         takes_notes=stored.takes_notes,
         second_look=stored.second_look,
+        counsel=stored.counsel,
     )
     if qwen_config.image_token_id != vocabulary.image_pad:
         raise CheckpointError(
@@ -129,6 +132,7 @@ def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_S
         speaks=ponder.format.speaks,
         takes_notes=ponder.format.takes_notes,
         second_look=ponder.format.second_look,
+        counsel=ponder.format.counsel,
         is_random=ponder.is_random,
     )
     (directory / OWN_NAME).write_text(json.dumps(asdict(stored), indent=2) + "\n")
@@ -223,6 +227,8 @@ def _read_stored(directory: Path) -> StoredPonder:
         values |= {"format": "ponderpounce.ponder/5", "takes_notes": False}
     if isinstance(values, dict) and values.get("format") == "ponderpounce.ponder/5":
         values |= {"format": "ponderpounce.ponder/6", "second_look": None}
+    if isinstance(values, dict) and values.get("format") == "ponderpounce.ponder/6":
+        values |= {"format": "ponderpounce.ponder/7", "counsel": None}
     return from_json(StoredPonder, values, str(path))
 
 

@@ -8,8 +8,8 @@ float decides a token. Because 1000 > 256, pixels -> normalised -> pixels is the
 
 import re
 
-_YX_PX = re.compile(r"<\s*(\d+)\s*,\s*(\d+)\s*>")
-_XY_1000 = re.compile(r"\[\s*(\d+)\s*,\s*(\d+)\s*\]")
+YX_PX = re.compile(r"<\s*(\d+)\s*,\s*(\d+)\s*>")
+XY_1000 = re.compile(r"\[\s*(\d+)\s*,\s*(\d+)\s*\]")
 
 
 def _scaled(value: int, numerator: int, denominator: int) -> int:
@@ -39,7 +39,7 @@ def normalised_text(text: str, image_px: tuple[int, int] = (256, 256)) -> str:
         x, y = xy_1000_from_yx_px((int(match[1]), int(match[2])), image_px)
         return f"[{x}, {y}]"
 
-    return _YX_PX.sub(rewrite, text)
+    return YX_PX.sub(rewrite, text)
 
 
 def pixel_text(text: str, image_px: tuple[int, int] = (256, 256)) -> str:
@@ -49,4 +49,4 @@ def pixel_text(text: str, image_px: tuple[int, int] = (256, 256)) -> str:
         y, x = yx_px_from_xy_1000((int(match[1]), int(match[2])), image_px)
         return f"<{y}, {x}>"
 
-    return _XY_1000.sub(rewrite, text)
+    return XY_1000.sub(rewrite, text)

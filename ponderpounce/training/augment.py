@@ -13,16 +13,14 @@ import re
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-import torch.nn.functional as F
-from torch import Tensor
 
 from ponderpounce.models.context import ContextFormat
-from ponderpounce.training.places import PLACE, TEXT_PX, WAY
+from ponderpounce.models.views import AS_IT_IS, View
+from ponderpounce.training.places import TEXT_PX, WAY
+
+__all__ = ["AS_IT_IS", "NOT_AUGMENTED", "Augmentation", "View", "draw_view"]
 
 _SIDED = re.compile(r"left|right|clockwise", re.IGNORECASE)
-_SIDE = re.compile(r"\b(?:left|right|clockwise|counterclockwise)\b")
-_MIRRORED = {"left": "right", "right": "left", "clockwise": "counterclockwise", "counterclockwise": "clockwise"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,52 +48,6 @@ class Augmentation:
 
 
 NOT_AUGMENTED = Augmentation()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class View:
-    """One way to look at a whole episode."""
-
-    down_px: int = 0
-    right_px: int = 0
-    """What is shown moves by so many pixels of PONDER's picture."""
-    is_mirrored: bool = False
-    """First left and right change places, then it moves."""
-    text_px: float = 1.0
-    """Pixels of a text's coordinates to one of PONDER's picture."""
-    gain: float = 1.0
-    """Of all pictures' brightness."""
-
-    def pictures(self, frames_NHW3: Tensor) -> Tensor:
-        """(N, height, width, 3) uint8"""
-        if self.gain != 1.0:
-            frames_NHW3 = (frames_NHW3.float() * self.gain).round().clamp(max=255).to(torch.uint8)
-        if self.is_mirrored:
-            frames_NHW3 = frames_NHW3.flip(2)
-        margin = max(abs(self.down_px), abs(self.right_px))
-        if margin == 0:
-            return frames_NHW3
-        height, width = frames_NHW3.shape[1:3]
-        wide = F.pad(frames_NHW3.permute(0, 3, 1, 2).float(), (margin,) * 4, mode="replicate").to(torch.uint8)
-        top, left = margin - self.down_px, margin - self.right_px
-        return wide[:, :, top : top + height, left : left + width].permute(0, 2, 3, 1)
-
-    def text(self, text: str) -> str:
-        """Its coordinates and sides as they are in this view; at the picture's edge where they would leave it."""
-        if not (self.down_px or self.right_px or self.is_mirrored):
-            return text
-        if self.is_mirrored:
-            text = _SIDE.sub(lambda side: _MIRRORED[side[0]], text)
-        return PLACE.sub(self._moved, text)
-
-    def _moved(self, place: re.Match[str]) -> str:
-        y, x = int(place[1]), int(place[2])
-        x = TEXT_PX - x if self.is_mirrored else x
-        y, x = (round(v + shift * self.text_px) for v, shift in ((y, self.down_px), (x, self.right_px)))
-        return f"<{min(max(y, 0), TEXT_PX)}, {min(max(x, 0), TEXT_PX)}>"
-
-
-AS_IT_IS = View()
 
 
 def draw_view(config: Augmentation, form: ContextFormat, texts: set[str], rng: np.random.Generator) -> View:

@@ -268,6 +268,14 @@ def small_beginnings() -> Curriculum:
     return _settling_on(small_watching(), "small_beginnings", 19, (500, 1600), batch_episodes=8, **told)
 
 
+def small_growing() -> Curriculum:
+    """The PONDER of `small_beginnings`, enlarged (`pp-enlarge`), goes on.
+
+    docs/training.md, "Half as broad again".
+    """
+    return _settling_on(small_beginnings(), "small_growing", 20, (1200, 3000), batch_episodes=8)
+
+
 def _settling_on(
     before: Curriculum, name: str, seed: int, decay: tuple[int, int], *, batch_episodes: int = 16, **example: Any
 ) -> Curriculum:

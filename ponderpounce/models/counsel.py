@@ -1,0 +1,71 @@
+"""Counsel: an episode is read in several views at once, and what most of them say is said in all.
+
+Moved by three pixels, or mirrored, a scene that a small PONDER has read wrongly is often read rightly. So each view
+has a context of its own, and after every query they agree (`ponder_server.election`). It is an ensemble of views in
+place of networks (test-time augmentation), with one addition: who was outvoted goes on from the words of the others.
+
+The paper has nothing of it.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from ponderpounce.models.eyes import Eyes
+from ponderpounce.models.place_code import PLACE_PX
+from ponderpounce.models.views import View
+
+_SIDED = re.compile(r"\b(?:left|right)\b(?! (?:after|before))|clockwise", re.IGNORECASE)
+"""Sides that an instruction names. "right after" is none."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Otherwise:
+    """One more way to look: what is shown moves by so many pixels of PONDER's picture, mirrored before or not."""
+
+    down_px: int = 0
+    right_px: int = 0
+    is_mirrored: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Counsel:
+    """In which views an episode is read besides the one as it is; part of a PONDER's checkpoint."""
+
+    others: tuple[Otherwise, ...]
+    near: int
+    """Thousandths of the picture: places nearer than that are one."""
+
+    def __post_init__(self) -> None:
+        if not self.others:
+            raise ValueError("counsel needs another view at least; leave it out for none")
+        if self.near < 1:
+            raise ValueError(f"near must be at least 1 thousandth, came {self.near}")
+
+    def check(self, eyes: Eyes) -> None:
+        """Raises ValueError unless words and pictures move together: one eye, symmetric if a view is mirrored."""
+        if eyes is None or len(eyes) != 1:
+            raise ValueError("counsel is for a PONDER with one eye: else pictures lie in texts in several ways")
+        _, left, _, right = eyes[0].box
+        if any(each.is_mirrored for each in self.others) and abs(left + right - 1) > 1e-9:
+            raise ValueError(f"an eye from {left} to {right} is not symmetric about the middle and cannot be mirrored")
+
+    def views(self, eyes: Eyes, image_px: tuple[int, int], instruction: str) -> tuple[View, ...]:
+        """The views of one episode, the first as it is. None is mirrored where the instruction names a side."""
+        assert eyes is not None
+        top, _, bottom, _ = eyes[0].box
+        text_px = (bottom - top) * PLACE_PX / image_px[0]
+        may_mirror = _SIDED.search(instruction) is None
+        return (
+            View(text_px=text_px),
+            *(
+                View(
+                    down_px=each.down_px,
+                    right_px=each.right_px,
+                    is_mirrored=each.is_mirrored and may_mirror,
+                    text_px=text_px,
+                )
+                for each in self.others
+            ),
+        )

@@ -1,0 +1,197 @@
+"""Counsel: all readings of an episode tell the same story, each in its own view, and an error leaves none of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ponder_server.contract import Fire, Opening, Outcome, SessionError, Text
+from ponder_server.council import Council
+from ponder_server.engine import QwenEngine
+from ponder_server.writer import ends_of_text
+from ponderpounce.models.counsel import Counsel, Otherwise
+from ponderpounce.models.eyes import Eye
+from ponderpounce.models.views import AS_IT_IS, View
+from tests.ponder_server.test_engine import (
+    CONFIG,
+    SCRIPT,
+    SUBGOAL,
+    TOLERANCE,
+    VOCABULARY,
+    WITH_DEMO,
+    assert_untouched,
+    context_of,
+    observation,
+    state_of,
+    taught,
+)
+
+COUNSEL = Counsel(others=(Otherwise(right_px=3), Otherwise(is_mirrored=True)), near=30)
+VIEWS = (View(text_px=2.0), View(right_px=3, text_px=2.0), View(is_mirrored=True, text_px=2.0))
+EYES = (Eye(camera=0, box=(0.25, 0.25, 0.75, 0.75)),)
+FRAMES = (np.zeros((4, 4, 3), np.uint8),)
+OPENING = Opening(instruction="do it")
+
+
+class Scripted:
+    """Stands in for a `QwenEngine`: every view says what its script has for the query, or what it is told to."""
+
+    def __init__(self, scripts: dict[View, list[tuple[str, ...]]], broken: View | None = None) -> None:
+        self.scripts, self.broken = scripts, broken
+        self.views: dict[str, View] = {}
+        self.told: dict[str, list[tuple[str, ...]]] = {}
+        self.begun: dict[str, tuple[str, ...] | None] = {}
+        self.spec = QwenEngine(taught(SCRIPT), CONFIG).spec
+
+    def open(self, session: str, opening: Opening, progress: Any, *, view: View) -> int:
+        self.views[session], self.told[session] = view, []
+        return 7
+
+    def begin(self, session: str, frames: Any, *, proprio: Any = None, saying: tuple[str, ...] | None = None) -> None:
+        assert session not in self.begun
+        self.begun[session] = saying
+
+    def drop(self, session: str) -> None:
+        self.begun.pop(session, None)
+
+    def undo(self, session: str) -> None:
+        self.told[session].pop()
+
+    def close(self, session: str) -> None:
+        del self.views[session], self.told[session]
+
+    def step(self, progress: Any) -> list[Outcome[Fire]]:
+        if not self.begun:
+            return []
+        session = next(reversed(self.begun))  # in whatever order
+        saying, view = self.begun.pop(session), self.views[session]
+        if view == self.broken:
+            return [Outcome(session, None, ValueError("broken"))]
+        said = self.scripts[view][len(self.told[session])] if saying is None else saying
+        self.told[session].append(said)
+        texts = tuple(Text(kind="subgoal", text=text, token_ids=(), truncated=False) for text in said)
+        cognition = np.full((1, 2), VIEWS.index(view), np.float32)
+        return [Outcome(session, Fire(cognition=cognition, is_transition=bool(said), texts=texts, context_tokens=9))]
+
+
+def council_of(engine: Any, views: tuple[View, ...] = VIEWS) -> Council:
+    return Council(engine, COUNSEL, lambda instruction: views)
+
+
+def test_who_is_outvoted_says_what_was_elected_in_his_own_view() -> None:
+    away = [("go to [100, 100]",), ()]
+    engine = Scripted(
+        {
+            VIEWS[0]: away,
+            VIEWS[1]: [("go to [523, 600]",), ("go to [1, 1]",)],
+            VIEWS[2]: [("go to [500, 600]",), ("go to [1, 1]",)],
+        }
+    )
+    council = council_of(engine)
+    council.open("a", OPENING)
+    first = council.fire("a", FRAMES)
+    assert [text.text for text in first.texts] == ["go to [500, 600]"]
+    assert first.cognition.tolist() == [[0.0, 0.0]], "of the view as it is"
+    second = council.fire("a", FRAMES)
+    assert len(second.texts) == 1
+    for view, told in zip(VIEWS, engine.told.values(), strict=True):
+        assert [tuple(map(view.meant, said)) for said in told] == [
+            tuple(text.text for text in answer.texts) for answer in (first, second)
+        ]
+
+
+def test_an_error_in_one_reading_leaves_no_trace_in_any() -> None:
+    engine = Scripted({view: [("go",), ("stop",)] for view in VIEWS}, broken=VIEWS[0])
+    council = council_of(engine)
+    council.open("a", OPENING)
+    with pytest.raises(ValueError, match="broken"):
+        council.fire("a", FRAMES)
+    assert not engine.begun
+    assert [*engine.told.values()] == [[], [], []]
+    engine.broken = None
+    assert [text.text for text in council.fire("a", FRAMES).texts] == ["go"]
+    council.close("a")
+    assert not engine.views
+    with pytest.raises(SessionError, match="is not open"):
+        council.begin("a", FRAMES)
+
+
+def test_readings_in_one_view_are_what_one_is() -> None:
+    ponder = taught(SCRIPT)
+    alone, council = QwenEngine(ponder, CONFIG), council_of(QwenEngine(ponder, CONFIG), (AS_IT_IS,) * 2)
+    for engine in (alone, council):
+        assert engine.open("a", WITH_DEMO) > 0
+    for query in range(len(SCRIPT)):
+        expected, answer = (engine.fire("a", observation(query)) for engine in (alone, council))
+        assert answer.texts == expected.texts
+        assert answer.context_tokens == expected.context_tokens
+        assert np.abs(answer.cognition - expected.cognition).max() < TOLERANCE
+    council.close("a")
+    council.open("a", WITH_DEMO)  # and there is room again
+
+
+def test_an_answer_taken_back_leaves_the_session_as_it_was_and_can_be_given_otherwise() -> None:
+    engine = QwenEngine(taught(SCRIPT), CONFIG)
+    engine.open("a", WITH_DEMO)
+    engine.fire("a", observation(0))
+    before = state_of(context_of(engine, "a"))
+    spoken = engine.fire("a", observation(1))
+    assert len(spoken.texts) == 2, "reasoning, and a subgoal"
+    engine.undo("a")
+    assert_untouched(context_of(engine, "a"), before)
+    with pytest.raises(SessionError, match="no answer that could be taken back"):
+        engine.undo("a")
+    engine.begin("a", observation(1), saying=())
+    (outcome,) = engine.step()
+    assert outcome.unwrap().texts == ()
+    engine.undo("a")
+    engine.begin("a", observation(1), saying=tuple(text.text for text in spoken.texts))
+    while not (outcomes := engine.step()):
+        pass
+    again = outcomes[0].unwrap()
+    assert [(text.kind, text.text) for text in again.texts] == [(text.kind, text.text) for text in spoken.texts]
+    assert np.abs(again.cognition - spoken.cognition).max() < TOLERANCE
+    assert again.texts[-1].token_ids == SUBGOAL
+    assert not ends_of_text(VOCABULARY) & {*again.texts[-1].token_ids}
+
+
+@given(st.integers(-4, 4), st.integers(-4, 4), st.booleans(), st.integers(100, 900), st.integers(100, 900))
+def test_what_is_meant_is_what_is_seen_undone(down_px: int, right_px: int, is_mirrored: bool, x: int, y: int) -> None:
+    view = View(down_px=down_px, right_px=right_px, is_mirrored=is_mirrored, text_px=2.0)
+    text = f"move left to [{x}, {y}], then [{y}, {x}]"
+    back = view.meant(view.seen(text))
+    numbers = [
+        [int(n) for n in each.replace("]", "").replace("[", ",").split(",") if n.strip().isdigit()]
+        for each in (back, text)
+    ]
+    assert np.abs(np.subtract(*numbers)).max() <= 1
+    assert back.split()[:2] == ["move", "left"]
+    assert ("right" in view.seen(text)) == is_mirrored
+
+
+def test_nothing_is_mirrored_where_the_instruction_names_a_side() -> None:
+    for instruction, may_mirror in (
+        ("put it on the left-side target", False),
+        ("place it right after the button was pressed", True),
+        ("pick up the cube", True),
+    ):
+        views = COUNSEL.views(EYES, (64, 64), instruction)
+        assert [view.is_mirrored for view in views] == [False, False, may_mirror]
+        assert {view.text_px for view in views} == {2.0}
+
+
+def test_counsel_is_refused_where_words_and_pictures_would_not_move_together() -> None:
+    COUNSEL.check(EYES)
+    with pytest.raises(ValueError, match="one eye"):
+        COUNSEL.check(None)
+    with pytest.raises(ValueError, match="not symmetric"):
+        COUNSEL.check((replace(EYES[0], box=(0.0, 0.0, 0.5, 0.5)),))
+    with pytest.raises(ValueError, match="another view"):
+        Counsel(others=(), near=30)
+    with pytest.raises(ValueError, match="at least 1"):
+        replace(COUNSEL, near=0)
