@@ -57,6 +57,8 @@ class Batch(Generic[Result]):
         assert session not in self.sessions, f"{session!r} is thinking already"
         try:
             request = next(steps)
+        except StopIteration as stop:  # it wants nothing appended
+            self._ended.append(Outcome(session, stop.value))
         except Exception as error:
             self._ended.append(Outcome(session, None, error))
         else:

@@ -123,6 +123,8 @@ class Fire:
     """Tokens in the session after this fire."""
     notes: tuple[Note, ...] = ()
     """Of the demonstration, with the first answer of an episode; () with all others."""
+    is_second_look: bool = False
+    """Its words are those in force, with a place that a second look has found."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

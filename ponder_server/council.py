@@ -23,7 +23,7 @@ from ponder_server.contract import (
     SessionError,
     no_progress,
 )
-from ponder_server.election import Said, elected
+from ponder_server.election import Said, elected, elected_place
 from ponder_server.engine import (
     NUM_MEASURED_FIRES,
     NUM_UNMEASURED_FIRES,
@@ -76,20 +76,9 @@ class Council:
         views = self._views_of(opening.instruction)
         members = {session: views[0]}
         members |= {f"{session}, seen otherwise {n}": view for n, view in enumerate(views[1:], 1)}
-        opened: list[str] = []
-        try:
-            num_tokens = [self._open(member, opening, progress, view, opened) for member, view in members.items()]
-        except BaseException:
-            for member in opened:
-                self._engine.close(member)
-            raise
+        num_tokens = self._engine.open_views(members, opening, progress)
         self._sessions[session] = _Session(members=members)
         self._owner |= dict.fromkeys(members, session)
-        return num_tokens[0]
-
-    def _open(self, member: str, opening: Opening, progress: Progress, view: View, opened: list[str]) -> int:
-        num_tokens = self._engine.open(member, opening, progress, view=view)
-        opened.append(member)
         return num_tokens
 
     def fire(
@@ -150,8 +139,13 @@ class Council:
     def _agree(self, own: _Session) -> bool:
         """Holds the election; whether everybody has said so already. The others begin anew."""
         said = {member: _said(own.answers[member]) for member in own.members}
-        meant = [tuple(map(view.meant, said[member])) for member, view in own.members.items()]
-        own.elected = elected(meant, self._near)
+        meant = {member: tuple(map(view.meant, said[member])) for member, view in own.members.items()}
+        found = {member for member, answer in own.answers.items() if answer.is_second_look}
+        own.elected = elected([() if member in found else meant[member] for member in own.members], self._near)
+        if not own.elected:
+            own.elected = elected_place(
+                [meant[member] for member in own.members if member in found], self._near, len(said)
+            )
         outvoted = []
         for member, view in own.members.items():
             words = tuple(map(view.seen, own.elected))

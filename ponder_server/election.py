@@ -17,6 +17,7 @@ Said: TypeAlias = tuple[str, ...]
 _PLACE = re.compile(r"\[(\d+), (\d+)\]")
 _NUMBER = re.compile(r"\d+")
 _NEAR_WAIT = 10  # control steps
+_MOST_ALIKE = 2.0
 
 
 def elected(said: Sequence[Said], near: int) -> Said:
@@ -33,6 +34,13 @@ def elected(said: Sequence[Said], near: int) -> Said:
     chosen = speaking[support.index(max(support))]
     alike = [texts for texts in speaking if len(texts) == len(chosen)]
     return tuple(_centred(text, [texts[n] for texts in alike], near) for n, text in enumerate(chosen))
+
+
+def elected_place(found: Sequence[Said], near: int, num_readings: int) -> Said:
+    """What second looks have found, where more than half of all readings found it; else ()."""
+    place = elected(found, near) if found else ()
+    agreeing = sum(_likeness(place, other, near) == _MOST_ALIKE for other in found)
+    return place if 2 * agreeing > num_readings else ()
 
 
 def _likeness(texts: Said, other: Said, near: int) -> float:

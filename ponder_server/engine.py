@@ -12,7 +12,7 @@ a session.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import accumulate
 
@@ -42,7 +42,8 @@ from ponder_server.engine_config import EngineConfig
 from ponder_server.episode import Episode, Query
 from ponder_server.narrow import check_weights, quantise
 from ponder_server.opening import Opener
-from ponder_server.runner import NUM_SAVED_STATES, Append, Runner, Session
+from ponder_server.prefixes import Opened
+from ponder_server.runner import NUM_SAVED_STATES, Append, Runner, Session, fitted
 from ponder_server.slots import slot_size
 from ponder_server.standing import Standing
 from ponder_server.threads import Threads
@@ -60,7 +61,6 @@ WARM_UP_OPENING = Opening(instruction="warm up")
 NUM_UNMEASURED_FIRES = 5
 NUM_MEASURED_FIRES = 30
 NUM_FULL_FIRES = 10
-_BUCKET_STEP = 16
 WARM_UP_PROPRIO = np.zeros(NUM_PROPRIO, np.float32)
 
 
@@ -94,7 +94,7 @@ class QwenEngine:
                 ponder,
                 num_slots=config.max_sessions * contexts_each,
                 max_tokens=config.max_context_tokens,
-                buckets=_fitted(config.buckets, len(self._query_ids(WARM_UP_PROPRIO))),
+                buckets=fitted(config.buckets, len(self._query_ids(WARM_UP_PROPRIO))),
                 threads=Threads(config.attention_threads),
             )
         except (RuntimeError, MemoryError) as error:  # torch's own on a GPU and on a CPU
@@ -145,46 +145,63 @@ class QwenEngine:
     def spec(self) -> EngineSpec:
         return self._spec
 
+    def open(self, session: str, opening: Opening, progress: Progress = no_progress) -> int:
+        """Encodes instruction and demonstration; see ``PonderEngine.open``."""
+        return self.open_views({session: AS_IT_IS}, opening, progress)
+
     @torch.inference_mode()
-    def open(self, session: str, opening: Opening, progress: Progress = no_progress, *, view: View = AS_IT_IS) -> int:
-        """Encodes instruction and demonstration; see ``PonderEngine.open``. ``view``: how all pictures are seen."""
-        if session in self._episodes:
-            raise SessionError(f"session {session!r} is already open; close it first.")
-        if len(self._episodes) >= self._config.max_sessions:
+    def open_views(self, views: Mapping[str, View], opening: Opening, progress: Progress = no_progress) -> int:
+        """Opens several sessions on one opening, whose pictures each of them sees in its own way; the forwards are
+        shared. All or none of them; otherwise as ``PonderEngine.open``. Returns the first one's tokens."""
+        for session in views:
+            if session in self._episodes:
+                raise SessionError(f"session {session!r} is already open; close it first.")
+        first = next(iter(views))
+        if len(self._episodes) + len(views) > self._config.max_sessions:
             raise SessionError(
-                f"session {session!r} does not fit: {sorted(self._episodes)} are open and max_sessions is "
+                f"session {first!r} does not fit: {sorted(self._episodes)} are open and max_sessions is "
                 f"{self._config.max_sessions}. Close one, or raise max_sessions."
             )
         if not opening.instruction.strip():
-            raise ValueError(f"session {session!r}: the instruction is empty; PONDER needs the task's text")
-        for instant, views in enumerate(opening.demo_frames):
-            if not views:
+            raise ValueError(f"session {first!r}: the instruction is empty; PONDER needs the task's text")
+        for instant, cameras in enumerate(opening.demo_frames):
+            if not cameras:
                 raise ValueError(f"demo instant {instant} has no view")
-        demo = [self._see(views, f"demo instant {n}", view) for n, views in enumerate(opening.demo_frames)]
-        segments = self._format.opening(opening.instruction, [len(views) for views in opening.demo_frames])
+        segments = self._format.opening(opening.instruction, [len(cameras) for cameras in opening.demo_frames])
         wanted = sum(len(segment) for segment in segments)
         if wanted > self._config.max_context_tokens:
-            raise ContextFull(session=session, used=0, wanted=wanted, limit=self._config.max_context_tokens)
-        context = self._runner.open(session)
+            raise ContextFull(session=first, used=0, wanted=wanted, limit=self._config.max_context_tokens)
+        alone = tuple(token for each in self._format.opening(opening.instruction) for token in each.ids)
+        thoughts: Batch[Opened] = Batch(self._runner, max_rows=self._config.max_batch_rows)
+        contexts: dict[str, Session] = {}
+        opened: dict[str, Opened] = {}
         try:
             with audible(self._parts, progress):
-                pictures = [picture for instant in demo for picture in instant]
-                opened = self._opener.encode(context, opening, segments, pictures, progress, view)
+                for session, view in views.items():
+                    demo = [self._see(each, f"demo instant {n}", view) for n, each in enumerate(opening.demo_frames)]
+                    pictures = [picture for instant in demo for picture in instant]
+                    contexts[session] = context = self._runner.open(session)
+                    steps = self._opener.encode(context, opening, segments, pictures, view)
+                    thoughts.add(session, steps, thoughts.turn())
+                while len(opened) < len(views):
+                    opened |= {outcome.session: outcome.unwrap() for outcome in thoughts.step(progress)}
         except BaseException as error:
-            self._runner.close(context)
-            if isinstance(error, torch.OutOfMemoryError):
-                raise SessionError(f"session {session!r}: the device has no memory left to encode it.") from error
+            for context in contexts.values():
+                self._runner.close(context)
+            if isinstance(error, SessionError):  # a forward's, which knows no names
+                raise SessionError(f"session {first!r}: {error}") from error
             raise
-        self._episodes[session] = Episode(
-            context=context,
-            spans=[*opened.spans],
-            owes_reasoning=opening.has_demo,
-            notes=opened.notes,
-            alone=tuple(token for each in self._format.opening(opening.instruction) for token in each.ids),
-            standing=None if self._second_look is None else Standing(self._second_look),
-            view=view,
-        )
-        return context.num_tokens
+        for session, view in views.items():
+            self._episodes[session] = Episode(
+                context=contexts[session],
+                spans=[*opened[session].spans],
+                owes_reasoning=opening.has_demo,
+                notes=opened[session].notes,
+                alone=alone,
+                standing=None if self._second_look is None else Standing(self._second_look),
+                view=view,
+            )
+        return contexts[first].num_tokens
 
     def fire(
         self,
@@ -286,7 +303,9 @@ class QwenEngine:
                 is_transition = is_asked and self._writer.wants_to_write(hidden_NH[:1])
                 hidden_KH = hidden_NH[1:]
             standing = episode.standing
-            looks_again = standing is not None and standing.is_due and not is_transition
+            # who is told what to say has looked, if it was time: what was found is in what he is told
+            may_look = query.saying is not None or not is_transition
+            looks_again = standing is not None and standing.is_due and may_look
             said = [] if query.saying is None else [*map(self._format.vocabulary.encode, query.saying)]
             if looks_again and query.saying is None:
                 words = yield from self._look_again(query, observation_TH)
@@ -306,7 +325,8 @@ class QwenEngine:
                     exactly=exactly,
                 )
                 hidden_KH = yield Append(session=context, ids=self._format.carrier_ids, embeds_TH=carriers_KH)
-            answer = self._answer(context, hidden_KH, texts, episode.notes)
+            found = bool(said) and query.saying is None
+            answer = self._answer(context, hidden_KH, texts, episode.notes, is_second_look=found)
             num_written = len(context.ids) - before.num_ids - len(query.ids)
             spans = [
                 Span(SegmentKind.OBSERVATION, num_observed),
@@ -454,7 +474,15 @@ class QwenEngine:
         )
         episode.spans = [span for span, stay in zip(episode.spans, stays, strict=True) if stay]
 
-    def _answer(self, context: Session, hidden_KH: Tensor, texts: tuple[Text, ...], notes: tuple[Note, ...]) -> Fire:
+    def _answer(
+        self,
+        context: Session,
+        hidden_KH: Tensor,
+        texts: tuple[Text, ...],
+        notes: tuple[Note, ...],
+        *,
+        is_second_look: bool,
+    ) -> Fire:
         # a copy: a view would keep the hidden states of the whole observation alive
         cognition = hidden_KH.to("cpu", torch.float32, copy=True).numpy()
         if not np.isfinite(cognition).all():
@@ -468,11 +496,5 @@ class QwenEngine:
             texts=texts,
             context_tokens=context.num_tokens,
             notes=notes,
+            is_second_look=is_second_look,
         )
-
-
-def _fitted(buckets: tuple[int, ...], num_query_ids: int) -> tuple[int, ...]:
-    """The buckets, and one for queries where they would be padded to twice their length."""
-    own = -(-num_query_ids // _BUCKET_STEP) * _BUCKET_STEP
-    padded = next((bucket for bucket in buckets if bucket >= num_query_ids), own)
-    return tuple(sorted({*buckets, own})) if 2 * own <= padded else buckets

@@ -4,21 +4,18 @@
 """
 
 from collections.abc import Callable, Sequence
-from typing import TypeVar
 
 from torch import Tensor
 
 from ponder_server.context_policy import Span
-from ponder_server.contract import Note, Opening, Progress
+from ponder_server.contract import Note, Opening
 from ponder_server.prefixes import Opened, Prefixes
-from ponder_server.runner import Session
+from ponder_server.runner import Append, Session
 from ponder_server.writer import Steps, TransitionWriter
 from ponderpounce.models.context import Segment, SegmentKind, in_groups
 from ponderpounce.models.eyes import Pictures
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.views import AS_IT_IS, View
-
-Result = TypeVar("Result")
 
 
 class Opener:
@@ -46,9 +43,8 @@ class Opener:
         opening: Opening,
         segments: Sequence[Segment],
         pictures: Sequence[Pictures],
-        progress: Progress,
         view: View = AS_IT_IS,
-    ) -> Opened:
+    ) -> Steps[Opened]:
         """Fills the context and tells what its tokens are; from an equal opening of before, if there was one.
 
         ``view``: how the pictures were seen; those seen otherwise than they are make no beginning for others.
@@ -58,29 +54,23 @@ class Opener:
         is_shared = opening.has_demo and view.shows_it_as_it_is
         if is_shared and (found := self._prefixes.find(opening)) is not None:
             context.start_from(found[0])
-            progress()
             return found[1]
         takes_notes = self._ponder.format.takes_notes and self._ponder.format.speaks
         fill = self._look_by_look if takes_notes and opening.has_demo else self._at_once
-        opened = fill(context, segments, [*pictures], progress)
+        opened = yield from fill(context, segments, [*pictures])
         if is_shared:
             self._prefixes.keep(opening, context, opened)
         return opened
 
-    def _at_once(
-        self, context: Session, segments: Sequence[Segment], pictures: list[Pictures], progress: Progress
-    ) -> Opened:
+    def _at_once(self, context: Session, segments: Sequence[Segment], pictures: list[Pictures]) -> Steps[Opened]:
         for chunk in in_groups(segments, self._chunk_tokens):
             ids = [token for segment in chunk for token in segment.ids]
             num_images = sum(segment.num_images for segment in chunk)
-            context.append(ids, self._embed(ids, pictures[:num_images]), num_wanted=0)
+            yield Append(session=context, ids=ids, embeds_TH=self._embed(ids, pictures[:num_images]), num_wanted=0)
             del pictures[:num_images]
-            progress()
         return Opened(spans=tuple(Span(segment.kind, len(segment)) for segment in segments))
 
-    def _look_by_look(
-        self, context: Session, segments: Sequence[Segment], pictures: list[Pictures], progress: Progress
-    ) -> Opened:
+    def _look_by_look(self, context: Session, segments: Sequence[Segment], pictures: list[Pictures]) -> Steps[Opened]:
         """Notes belong to the demonstration: no policy forgets them before it."""
         spans: list[Span] = []
         notes: list[Note] = []
@@ -90,25 +80,14 @@ class Opener:
             embeds_TH = self._embed(segment.ids, pictures[: segment.num_images])
             del pictures[: segment.num_images]
             is_look = segment.kind is SegmentKind.DEMO
-            hidden_NH = context.append(segment.ids, embeds_TH, num_wanted=int(is_look))
+            hidden_NH = yield Append(session=context, ids=segment.ids, embeds_TH=embeds_TH, num_wanted=int(is_look))
             if is_look and self._writer.wants_to_write(hidden_NH):
                 before = context.save(context.before_fire)
                 nothing_0H = embeds_TH[:0]
-                steps = self._writer.write(context, before, (), nothing_0H, with_reasoning=False, exactly=None)
-                notes += [Note(instant=num_looks, text=text) for text in _alone(context, steps)]
+                texts = yield from self._writer.write(
+                    context, before, (), nothing_0H, with_reasoning=False, exactly=None
+                )
+                notes += [Note(instant=num_looks, text=text) for text in texts]
             num_looks += is_look
             spans.append(Span(segment.kind, context.num_tokens - num_before))
-            progress()
         return Opened(spans=tuple(spans), notes=tuple(notes))
-
-
-def _alone(context: Session, steps: Steps[Result]) -> Result:
-    """Carries out what would share forwards with others in serving."""
-    request = next(steps)
-    while True:
-        hidden_NH = context.append(request.ids, request.embeds_TH, num_wanted=request.num_wanted)
-        try:
-            request = steps.send(hidden_NH)
-        except StopIteration as stop:
-            result: Result = stop.value
-            return result

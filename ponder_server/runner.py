@@ -32,6 +32,14 @@ NUM_SAVED_STATES = 2
 
 BUCKETS = (1, 16, 160, 512, 2048)
 """Tokens of a row: a decoded token, a verified draft, a fire of two 256 px cameras, pieces of a demonstration."""
+_BUCKET_STEP = 16
+
+
+def fitted(buckets: tuple[int, ...], num_query_ids: int) -> tuple[int, ...]:
+    """The buckets, and one for queries where they would be padded to twice their length."""
+    own = -(-num_query_ids // _BUCKET_STEP) * _BUCKET_STEP
+    padded = next((bucket for bucket in buckets if bucket >= num_query_ids), own)
+    return tuple(sorted({*buckets, own})) if 2 * own <= padded else buckets
 
 
 @dataclass(slots=True, kw_only=True, eq=False)

@@ -35,6 +35,14 @@ stored = json.loads(path.read_text()) | {"second_look": {"after": after, "least"
 path.write_text(json.dumps(stored, indent=2) + "\n")' "$@"
 }
 
+take_counsel() {  # a PONDER's folder is served in OTHER views too, each of them DOWN,RIGHT or DOWN,RIGHT,mirrored
+    "$bin/python" -c 'import json, pathlib, sys
+path, others = pathlib.Path(sys.argv[1], "ponder.json"), [each.split(",") for each in sys.argv[2:]]
+views = [{"down_px": int(down), "right_px": int(right), "is_mirrored": bool(mirrored)} for down, right, *mirrored in others]
+stored = json.loads(path.read_text()) | {"counsel": {"others": views, "near": 30}}
+path.write_text(json.dumps(stored, indent=2) + "\n")' "$@"
+}
+
 evaluate() {  # a PAIR on the test scenes of fifteen tasks, with cognition and without: OUT/real, OUT/null, OUT/tables
     local pair=$1 out=$2 cognition
     for cognition in real null; do

@@ -273,7 +273,7 @@ def small_growing() -> Curriculum:
 
     docs/training.md, "Half as broad again".
     """
-    return _settling_on(small_beginnings(), "small_growing", 20, (1200, 3000), batch_episodes=8)
+    return _settling_on(small_beginnings(), "small_growing", 20, (700, 1600), batch_episodes=8)
 
 
 def _settling_on(

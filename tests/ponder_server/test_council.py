@@ -47,9 +47,12 @@ class Scripted:
         self.told: dict[str, list[tuple[str, ...]]] = {}
         self.begun: dict[str, tuple[str, ...] | None] = {}
         self.spec = QwenEngine(taught(SCRIPT), CONFIG).spec
+        self.looking: set[View] = set()
+        """Who says by a second look what it says."""
 
-    def open(self, session: str, opening: Opening, progress: Any, *, view: View) -> int:
-        self.views[session], self.told[session] = view, []
+    def open_views(self, views: dict[str, View], opening: Opening, progress: Any) -> int:
+        self.views |= views
+        self.told |= {session: [] for session in views}
         return 7
 
     def begin(self, session: str, frames: Any, *, proprio: Any = None, saying: tuple[str, ...] | None = None) -> None:
@@ -76,7 +79,14 @@ class Scripted:
         self.told[session].append(said)
         texts = tuple(Text(kind="subgoal", text=text, token_ids=(), truncated=False) for text in said)
         cognition = np.full((1, 2), VIEWS.index(view), np.float32)
-        return [Outcome(session, Fire(cognition=cognition, is_transition=bool(said), texts=texts, context_tokens=9))]
+        fire = Fire(
+            cognition=cognition,
+            is_transition=bool(said),
+            texts=texts,
+            context_tokens=9,
+            is_second_look=bool(said) and saying is None and view in self.looking,
+        )
+        return [Outcome(session, fire)]
 
 
 def council_of(engine: Any, views: tuple[View, ...] = VIEWS) -> Council:
@@ -103,6 +113,18 @@ def test_who_is_outvoted_says_what_was_elected_in_his_own_view() -> None:
         assert [tuple(map(view.meant, said)) for said in told] == [
             tuple(text.text for text in answer.texts) for answer in (first, second)
         ]
+
+
+def test_what_a_second_look_has_found_gives_way_to_words_of_ones_own() -> None:
+    looked, spoken = ("go to [100, 100]",), ("stop",)
+    for others, expected in (((spoken, spoken), spoken), ((), looked), ((spoken, ()), ())):
+        said = [looked, *others]
+        said += [tuple(map(view.seen, looked)) for view in VIEWS[len(said) :]]
+        engine = Scripted({view: [each] for view, each in zip(VIEWS, said, strict=True)})
+        engine.looking = {view for view, each in zip(VIEWS, said, strict=True) if each and "go" in each[0]}
+        council = council_of(engine)
+        council.open("a", OPENING)
+        assert tuple(text.text for text in council.fire("a", FRAMES).texts) == expected
 
 
 def test_an_error_in_one_reading_leaves_no_trace_in_any() -> None:

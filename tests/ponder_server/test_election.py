@@ -7,7 +7,7 @@ import re
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ponder_server.election import Said, elected
+from ponder_server.election import Said, elected, elected_place
 
 NEAR = 30
 PLACES = st.tuples(st.integers(0, 1000), st.integers(0, 1000))
@@ -84,3 +84,11 @@ def test_of_two_who_disagree_the_first_is_heard() -> None:
     assert elected([("go to [1, 1]",), ("go to [900, 900]",)], NEAR) == ("go to [1, 1]",)
     assert elected([(), ("go to [1, 1]",)], NEAR) == ()
     assert elected([("go to [1, 1]",), ()], NEAR) == ("go to [1, 1]",)
+
+
+def test_a_second_look_counts_where_more_than_half_of_all_have_found_the_same_place() -> None:
+    here, there = ("pick it up at [100, 200]",), ("pick it up at [400, 200]",)
+    assert elected_place([here, here, there], NEAR, 3) == here
+    assert elected_place([here, here], NEAR, 4) == ()
+    assert elected_place([here, there, there], NEAR, 5) == ()
+    assert elected_place([], NEAR, 3) == ()

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from ponder_server.config import PonderOptions, SizeName
 from ponder_server.contract import ContextFull, Frame, Opening, SessionError
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
-from ponder_server.runner import Session
+from ponder_server.runner import Append, Runner, Session
 from ponderpounce.models import ponder_configs
 from ponderpounce.models.context import Row, Transition
 from ponderpounce.models.ponder import Ponder
@@ -451,14 +451,14 @@ def test_a_query_in_a_full_context_is_measured_there(engine: QwenEngine) -> None
     engine.open("a", WITH_DEMO)
     before = state_of(context_of(engine, "a"))
     seen: list[int] = []
-    append = Session.append
+    append = Runner.append
 
-    def spy(self: Session, ids: Sequence[int], *args: Any, **kwargs: Any) -> torch.Tensor:
-        seen.append(self.num_tokens + len(ids))
-        return append(self, ids, *args, **kwargs)
+    def spy(self: Runner, appends: Sequence[Append]) -> list[torch.Tensor]:
+        seen.extend(one.session.num_tokens + len(one.ids) for one in appends)
+        return append(self, appends)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Session, "append", spy)
+        patch.setattr(Runner, "append", spy)
         durations_ns = engine.warm_up_full()
     opening, *queries = seen
     assert opening < engine.spec.max_context_tokens
