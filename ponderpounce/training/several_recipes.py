@@ -269,7 +269,7 @@ def small_beginnings() -> Curriculum:
 
 
 def small_growing() -> Curriculum:
-    """The PONDER of `small_beginnings`, enlarged (`pp-enlarge`), goes on.
+    """The PONDER of `small_beginnings`, enlarged (`pp-enlarge`), goes on. What it leaves is shipped.
 
     docs/training.md, "Half as broad again".
     """
