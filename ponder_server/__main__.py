@@ -54,11 +54,11 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
         size = getattr(ponder_configs, options.size)()
         ponder = Ponder.random(size, seed=options.seed, device=options.device, dtype=dtype)
     counsel, form = ponder.format.counsel, ponder.format
-    num_members = 1 if counsel is None else 1 + len(counsel.others)
+    num_views = 1 if counsel is None else counsel.num_views
     config = EngineConfig(
         max_context_tokens=options.max_context_tokens,
         when_full=options.when_full,
-        max_sessions=options.max_sessions * num_members,
+        max_sessions=options.max_sessions * num_views,
         max_text_tokens=options.max_text_tokens,
         max_batch_rows=options.max_batch_rows,
         attention_threads=min(options.attention_threads, num_cores),

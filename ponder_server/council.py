@@ -62,7 +62,7 @@ class Council:
         self._engine = engine
         self._near = counsel.near
         self._views_of = views_of
-        self.num_members = 1 + len(counsel.others)
+        self.num_members = counsel.num_views
         self._spec = replace(engine.spec, session_bytes=engine.spec.session_bytes * self.num_members)
         self._sessions: dict[str, _Session] = {}
         self._owner: dict[str, str] = {}
@@ -115,14 +115,20 @@ class Council:
     def step(self, progress: Progress = no_progress) -> list[Outcome[Fire]]:
         """One forward; the queries that all readings are done with, and agree on. See ``BatchingEngine.step``."""
         ended: list[Outcome[Fire]] = []
-        for outcome in self._engine.step(progress):
+        failed: dict[str, Exception | None] = {}
+        outcomes = self._engine.step(progress)
+        for outcome in outcomes:  # all of them first: what failed in this forward takes back what came of it
             session = self._owner[outcome.session]
-            own = self._sessions[session]
             if outcome.result is None:
+                failed[session] = outcome.error
+            else:
+                self._sessions[session].answers[outcome.session] = outcome.result
+        for session in dict.fromkeys(self._owner[outcome.session] for outcome in outcomes):
+            own = self._sessions[session]
+            if session in failed:
                 self._give_up(own)
-                ended.append(Outcome(session, None, outcome.error))
+                ended.append(Outcome(session, None, failed[session]))
                 continue
-            own.answers[outcome.session] = outcome.result
             if len(own.answers) < len(own.members):
                 continue
             try:

@@ -11,10 +11,11 @@ import re
 from collections.abc import Sequence
 from typing import TypeAlias
 
+from ponderpounce.models.ponder_coordinates import XY_1000
+
 Said: TypeAlias = tuple[str, ...]
 """The texts of one answer, the subgoal last; () for silence."""
 
-_PLACE = re.compile(r"\[(\d+), (\d+)\]")
 _NUMBER = re.compile(r"\d+")
 _NEAR_WAIT = 10  # control steps
 _MOST_ALIKE = 2.0
@@ -60,7 +61,7 @@ def _alike(text: str, other: str, near: int) -> float:
 
 def _centred(text: str, others: Sequence[str], near: int) -> str:
     """The text with each place in the middle of those that are near it in the same words."""
-    alike = [_PLACE.findall(other) for other in others if _words(other) == _words(text)]
+    alike = [XY_1000.findall(other) for other in others if _words(other) == _words(text)]
     count = iter(range(len(text)))
 
     def middle(place: re.Match[str]) -> str:
@@ -70,7 +71,7 @@ def _centred(text: str, others: Sequence[str], near: int) -> str:
         x, y = (round(sum(each[axis] for each in there) / len(there)) for axis in (0, 1))
         return f"[{x}, {y}]"
 
-    return _PLACE.sub(middle, text)
+    return XY_1000.sub(middle, text)
 
 
 def _words(text: str) -> str:
@@ -80,8 +81,8 @@ def _words(text: str) -> str:
 
 def _numbers(text: str) -> list[tuple[int, ...]]:
     """Places as pairs, then all other numbers."""
-    places: list[tuple[int, ...]] = [(int(x), int(y)) for x, y in _PLACE.findall(text)]
-    return [*places, *((int(number),) for number in _NUMBER.findall(_PLACE.sub("", text)))]
+    places: list[tuple[int, ...]] = [(int(x), int(y)) for x, y in XY_1000.findall(text)]
+    return [*places, *((int(number),) for number in _NUMBER.findall(XY_1000.sub("", text)))]
 
 
 def _is_same(a: tuple[int, ...], b: tuple[int, ...], near: int) -> bool:

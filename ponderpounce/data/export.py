@@ -49,8 +49,7 @@ class ExportOptions:
     order: Order = "drawn"
     """The one that was played in; for "follow"."""
     demonstration_hz: Literal[1, 2, 4, 5, 10, 20] = 20
-    """How often demonstrations are looked at as they are acted out again: most of the time that one takes. Training
-    reads a picture a second."""
+    """How often demonstrations are looked at as they are acted out again. Training reads a picture a second."""
     only_success: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Leave out episodes that did not succeed."""
     progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True

@@ -117,7 +117,7 @@ class ContextFormat:
 
     def __post_init__(self) -> None:
         if self.counsel is not None:
-            self.counsel.check(self.eyes)
+            self.counsel.text_px(self.eyes, self.image_px)  # words and pictures must move together
         if not 1 <= self.num_carriers <= 16:
             raise ValueError(f"num_carriers is {self.num_carriers}; K must be 1..16 (the paper uses 1).")
         if self.first_carrier_id < self.vocabulary.num_tokens:

@@ -13,8 +13,7 @@ import re
 from dataclasses import dataclass
 
 from ponderpounce.models.eyes import Eyes
-from ponderpounce.models.place_code import PLACE_PX
-from ponderpounce.models.views import View
+from ponderpounce.models.views import View, text_px
 
 _SIDED = re.compile(r"\b(?:left|right)\b(?! (?:after|before))|clockwise", re.IGNORECASE)
 """Sides that an instruction names. "right after" is none."""
@@ -43,29 +42,26 @@ class Counsel:
         if self.near < 1:
             raise ValueError(f"near must be at least 1 thousandth, came {self.near}")
 
-    def check(self, eyes: Eyes) -> None:
-        """Raises ValueError unless words and pictures move together: one eye, symmetric if a view is mirrored."""
-        if eyes is None or len(eyes) != 1:
-            raise ValueError("counsel is for a PONDER with one eye: else pictures lie in texts in several ways")
-        _, left, _, right = eyes[0].box
-        if any(each.is_mirrored for each in self.others) and abs(left + right - 1) > 1e-9:
-            raise ValueError(f"an eye from {left} to {right} is not symmetric about the middle and cannot be mirrored")
+    @property
+    def num_views(self) -> int:
+        """With the one as it is."""
+        return 1 + len(self.others)
+
+    def text_px(self, eyes: Eyes, image_px: tuple[int, int]) -> float:
+        """`View.text_px` of all views; raises ValueError where words and pictures would not move together."""
+        return text_px(eyes, image_px, mirrors=any(each.is_mirrored for each in self.others))
 
     def views(self, eyes: Eyes, image_px: tuple[int, int], instruction: str) -> tuple[View, ...]:
         """The views of one episode, the first as it is. None is mirrored where the instruction names a side."""
-        assert eyes is not None
-        top, _, bottom, _ = eyes[0].box
-        text_px = (bottom - top) * PLACE_PX / image_px[0]
+        scale = self.text_px(eyes, image_px)
         may_mirror = _SIDED.search(instruction) is None
-        return (
-            View(text_px=text_px),
-            *(
-                View(
-                    down_px=each.down_px,
-                    right_px=each.right_px,
-                    is_mirrored=each.is_mirrored and may_mirror,
-                    text_px=text_px,
-                )
-                for each in self.others
-            ),
+        others = (
+            View(
+                down_px=each.down_px,
+                right_px=each.right_px,
+                is_mirrored=each.is_mirrored and may_mirror,
+                text_px=scale,
+            )
+            for each in self.others
         )
+        return (View(text_px=scale), *others)

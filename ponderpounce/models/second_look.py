@@ -14,7 +14,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-_PLACE = re.compile(r"\[(\d+), (\d+)\]")
+from ponderpounce.models.ponder_coordinates import XY_1000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,11 +40,11 @@ class SecondLook:
 
     def can_answer(self, text: str) -> bool:
         """Whether one look can tell the first place of this text."""
-        return _PLACE.search(text) is not None and not (self.unless and re.search(self.unless, text))
+        return XY_1000.search(text) is not None and not (self.unless and re.search(self.unless, text))
 
     def is_another(self, before: str, anew: str) -> bool:
         """Whether two texts' first places are not the same one; False where one of them has none."""
-        places = [_PLACE.search(text) for text in (before, anew)]
+        places = [XY_1000.search(text) for text in (before, anew)]
         if any(place is None for place in places):
             return False
         (x, y), (u, v) = ((int(place[1]), int(place[2])) for place in places if place is not None)
@@ -52,5 +52,5 @@ class SecondLook:
 
     def about(self, text: str) -> str:
         """A text's words in front of its first place."""
-        place = _PLACE.search(text)
+        place = XY_1000.search(text)
         return text if place is None else text[: place.start()]

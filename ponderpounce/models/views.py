@@ -13,11 +13,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ponderpounce.models.eyes import Eyes
 from ponderpounce.models.place_code import PLACE_PX
 from ponderpounce.models.ponder_coordinates import XY_1000, YX_PX
 
 _SIDE = re.compile(r"\b(?:left|right|clockwise|counterclockwise)\b")
 _MIRRORED = {"left": "right", "right": "left", "clockwise": "counterclockwise", "counterclockwise": "clockwise"}
+_ROUNDING = 1e-9
 _WHOLE = 1000  # of a side, in the texts that PONDER says
 
 
@@ -99,6 +101,20 @@ class View:
 
 
 AS_IT_IS = View()
+
+
+def text_px(eyes: Eyes, image_px: tuple[int, int], *, mirrors: bool) -> float:
+    """`View.text_px` of a PONDER, whose pictures may be mirrored if ``mirrors``.
+
+    Raises ValueError if it has several eyes or none, or one that is not symmetric and is to be mirrored: where its
+    pictures lie in the texts' coordinates is then not told by one number.
+    """
+    if eyes is None or len(eyes) != 1:
+        raise ValueError(f"other views are for a PONDER with one eye, this one has {0 if eyes is None else len(eyes)}")
+    top, left, bottom, right = eyes[0].box
+    if mirrors and abs(left + right - 1) > _ROUNDING:
+        raise ValueError(f"an eye from {left} to {right} is not symmetric about the middle and cannot be mirrored")
+    return (bottom - top) * PLACE_PX / image_px[0]
 
 
 def _told(x: float, y: float) -> str:

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ponderpounce.models.context import ContextFormat
-from ponderpounce.models.views import AS_IT_IS, View
-from ponderpounce.training.places import TEXT_PX, WAY
+from ponderpounce.models.views import AS_IT_IS, View, text_px
+from ponderpounce.training.places import WAY
 
 __all__ = ["AS_IT_IS", "NOT_AUGMENTED", "Augmentation", "View", "draw_view"]
 
@@ -54,19 +54,13 @@ def draw_view(config: Augmentation, form: ContextFormat, texts: set[str], rng: n
     """Draws the view of an episode.
 
     Raises:
-        ValueError: PONDER has several eyes or none, or one that is not symmetric and is to be mirrored: where its
-            pictures lie in the texts' coordinates is then not told by one number.
+        ValueError: PONDER's eyes do not fit (`text_px`); leave max_shift_px and mirror out.
     """
     gain = float(np.exp(rng.uniform(-1, 1) * np.log1p(config.max_gain))) if config.max_gain else 1.0
     if not config.moves:
         return View(gain=gain)
-    if form.eyes is None or len(form.eyes) != 1:
-        raise ValueError("moved views are drawn for a PONDER with one eye; leave max_shift_px and mirror out")
-    top, left, bottom, right = form.eyes[0].box
-    if config.mirror and abs(left + right - 1) > 1e-9:
-        raise ValueError(f"an eye from {left} to {right} is not symmetric about the middle and cannot be mirrored")
+    scale = text_px(form.eyes, form.image_px, mirrors=config.mirror)
     down_px, right_px = rng.integers(-config.max_shift_px, config.max_shift_px + 1, size=2).tolist()
     is_sided = any(_SIDED.search(text) and not WAY.search(text) for text in texts)
     is_mirrored = config.mirror and bool(rng.integers(2)) and not is_sided
-    text_px = (bottom - top) * TEXT_PX / form.image_px[0]
-    return View(down_px=down_px, right_px=right_px, is_mirrored=is_mirrored, text_px=text_px, gain=gain)
+    return View(down_px=down_px, right_px=right_px, is_mirrored=is_mirrored, text_px=scale, gain=gain)

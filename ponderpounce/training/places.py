@@ -7,8 +7,9 @@ import re
 import numpy as np
 
 from ponderpounce.models.place_code import PLACE_PX
+from ponderpounce.models.ponder_coordinates import YX_PX
 
-PLACE = re.compile(r"<\s*(\d+)\s*,\s*(\d+)\s*>")
+PLACE = YX_PX
 WAY = re.compile(rf"(\S+) to ({PLACE.pattern})(?:, then |$)")
 """A stretch of a way (`tasks.task.located`): how it is gone, in the last word, and where it ends."""
 PARTS = re.compile(r", (?![^<]*>)")

@@ -119,6 +119,14 @@ def test_of_an_episode_that_ends_early_the_rest_is_told(rounds: Path) -> None:
     assert all("<" in text for text in cut.about.unreached)
 
 
+def test_demonstrations_are_looked_at_as_often_as_asked_for(log: Path, record: EpisodeRecord) -> None:
+    rows = read_episode(log, record, demonstration_hz=2).rows
+    shown = np.flatnonzero(rows.is_demonstration & rows.is_rendered)
+    assert len(shown) > 2
+    assert (np.diff(shown) == 10).all()
+    assert rows.is_rendered[~rows.is_demonstration].all()
+
+
 def test_what_goes_otherwise_here_is_refused(log: Path, record: EpisodeRecord) -> None:
     moved = dataclasses.replace(record.observations[9], proprio=record.observations[9].proprio + 1e-3)
     other = dataclasses.replace(record, observations=[*record.observations[:9], moved, *record.observations[10:]])

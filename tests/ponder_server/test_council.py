@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,12 +12,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ponder_server.__main__ import build_engine
+from ponder_server.config import PonderOptions
 from ponder_server.contract import Fire, Opening, Outcome, SessionError, Text
 from ponder_server.council import Council
 from ponder_server.engine import QwenEngine
 from ponder_server.writer import ends_of_text
 from ponderpounce.models.counsel import Counsel, Otherwise
 from ponderpounce.models.eyes import Eye
+from ponderpounce.models.ponder_checkpoint import load_ponder, save_ponder
+from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.models.views import AS_IT_IS, View
 from tests.ponder_server.test_engine import (
     CONFIG,
@@ -41,8 +47,10 @@ OPENING = Opening(instruction="do it")
 class Scripted:
     """Stands in for a `QwenEngine`: every view says what its script has for the query, or what it is told to."""
 
-    def __init__(self, scripts: dict[View, list[tuple[str, ...]]], broken: View | None = None) -> None:
-        self.scripts, self.broken = scripts, broken
+    def __init__(
+        self, scripts: dict[View, list[tuple[str, ...]]], broken: View | None = None, *, shares: bool = False
+    ) -> None:
+        self.scripts, self.broken, self.shares = scripts, broken, shares
         self.views: dict[str, View] = {}
         self.told: dict[str, list[tuple[str, ...]]] = {}
         self.begun: dict[str, tuple[str, ...] | None] = {}
@@ -71,10 +79,14 @@ class Scripted:
     def step(self, progress: Any) -> list[Outcome[Fire]]:
         if not self.begun:
             return []
+        outcome = self.answer()
+        return [outcome, *self.step(progress)] if self.shares else [outcome]
+
+    def answer(self) -> Outcome[Fire]:
         session = next(reversed(self.begun))  # in whatever order
         saying, view = self.begun.pop(session), self.views[session]
         if view == self.broken:
-            return [Outcome(session, None, ValueError("broken"))]
+            return Outcome(session, None, ValueError("broken"))
         said = self.scripts[view][len(self.told[session])] if saying is None else saying
         self.told[session].append(said)
         texts = tuple(Text(kind="subgoal", text=text, token_ids=(), truncated=False) for text in said)
@@ -86,7 +98,7 @@ class Scripted:
             context_tokens=9,
             is_second_look=bool(said) and saying is None and view in self.looking,
         )
-        return [Outcome(session, fire)]
+        return Outcome(session, fire)
 
 
 def council_of(engine: Any, views: tuple[View, ...] = VIEWS) -> Council:
@@ -127,8 +139,10 @@ def test_what_a_second_look_has_found_gives_way_to_words_of_ones_own() -> None:
         assert tuple(text.text for text in council.fire("a", FRAMES).texts) == expected
 
 
-def test_an_error_in_one_reading_leaves_no_trace_in_any() -> None:
-    engine = Scripted({view: [("go",), ("stop",)] for view in VIEWS}, broken=VIEWS[0])
+@pytest.mark.parametrize("shares", [False, True])
+@pytest.mark.parametrize("broken", VIEWS)
+def test_an_error_in_one_reading_leaves_no_trace_in_any(broken: View, shares: bool) -> None:
+    engine = Scripted({view: [("go",), ("stop",)] for view in VIEWS}, broken=broken, shares=shares)
     council = council_of(engine)
     council.open("a", OPENING)
     with pytest.raises(ValueError, match="broken"):
@@ -196,6 +210,30 @@ def test_what_is_meant_is_what_is_seen_undone(down_px: int, right_px: int, is_mi
     assert ("right" in view.seen(text)) == is_mirrored
 
 
+@given(st.integers(-4, 4), st.integers(-4, 4), st.booleans(), st.integers(20, 230), st.integers(20, 230))
+def test_what_ponder_says_moves_as_the_simulators_words_do(
+    down_px: int, right_px: int, is_mirrored: bool, y: int, x: int
+) -> None:
+    view = View(down_px=down_px, right_px=right_px, is_mirrored=is_mirrored, text_px=2.0)
+    text = f"move right to <{y}, {x}>"
+    ours, theirs = view.seen(normalised_text(text)), normalised_text(view.text(text))
+    assert ours.split()[:2] == theirs.split()[:2]
+    assert np.abs(np.subtract(*([int(n) for n in re.findall(r"\d+", each)] for each in (ours, theirs)))).max() <= 1
+
+
+def test_a_checkpoint_that_asks_for_counsel_is_served_with_it(tmp_path: Path) -> None:
+    ponder = taught(SCRIPT)
+    ponder.format = replace(ponder.format, eyes=EYES, counsel=COUNSEL)
+    save_ponder(ponder, tmp_path)
+    assert load_ponder(tmp_path).format.counsel == COUNSEL
+    engine = build_engine(PonderOptions(checkpoint=tmp_path, max_context_tokens=400, max_sessions=1))
+    assert isinstance(engine, Council)
+    assert engine.num_members == 3
+    engine.open("a", OPENING)
+    with pytest.raises(SessionError, match="does not fit"):
+        engine.open("b", OPENING)
+
+
 def test_nothing_is_mirrored_where_the_instruction_names_a_side() -> None:
     for instruction, may_mirror in (
         ("put it on the left-side target", False),
@@ -208,11 +246,11 @@ def test_nothing_is_mirrored_where_the_instruction_names_a_side() -> None:
 
 
 def test_counsel_is_refused_where_words_and_pictures_would_not_move_together() -> None:
-    COUNSEL.check(EYES)
+    assert COUNSEL.text_px(EYES, (64, 64)) == 2.0
     with pytest.raises(ValueError, match="one eye"):
-        COUNSEL.check(None)
+        COUNSEL.text_px(None, (64, 64))
     with pytest.raises(ValueError, match="not symmetric"):
-        COUNSEL.check((replace(EYES[0], box=(0.0, 0.0, 0.5, 0.5)),))
+        COUNSEL.text_px((replace(EYES[0], box=(0.0, 0.0, 0.5, 0.5)),), (64, 64))
     with pytest.raises(ValueError, match="another view"):
         Counsel(others=(), near=30)
     with pytest.raises(ValueError, match="at least 1"):

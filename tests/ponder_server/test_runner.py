@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ponder_server.contract import ContextFull, SessionError
-from ponder_server.runner import Append, Runner, Session
+from ponder_server.runner import BUCKETS, Append, Runner, Session, fitted
 from ponder_server.slots import slot_size
 from ponderpounce.models.context import Row, Transition
 from ponderpounce.models.ponder import Ponder
@@ -232,3 +232,12 @@ def _tail(middle: int, end: int) -> torch.Tensor:
     session = new_session()
     feed(session, 0, middle)
     return feed(session, middle, end)
+
+
+@given(st.integers(1, 2048))
+def test_a_query_is_not_padded_to_twice_its_length_in_steps(num_query_ids: int) -> None:
+    buckets = fitted(BUCKETS, num_query_ids)
+    assert set(BUCKETS) <= set(buckets)
+    assert list(buckets) == sorted(set(buckets))
+    padded = next(bucket for bucket in buckets if bucket >= num_query_ids)
+    assert padded < 2 * (num_query_ids + 16)
