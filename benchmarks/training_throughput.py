@@ -24,6 +24,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.report import Report, Row, show, spread
 from ponderpounce.models import ponder_configs
+from ponderpounce.models.eyes import readable_sizes
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.pounce import freeze
 from ponderpounce.models.pounce_checkpoint import PounceBundle, random_bundle
@@ -32,6 +33,7 @@ from ponderpounce.models.pounce_family import action_loss, sample_times
 from ponderpounce.training.collate import collate_ponder, collate_pounce
 from ponderpounce.training.example import make_example
 from ponderpounce.training.joint import Draws, JointModel, PonderBatch, PounceBatch, encode_rows
+from ponderpounce.training.nudge import NO_NUDGE
 from ponderpounce.training.recipe import Recipe, stages_of
 from ponderpounce.training.recipes import recipe
 from ponderpounce.training.trainer import Trainer
@@ -128,7 +130,7 @@ def _batch(
     model: JointModel, bundle: PounceBundle, run: Recipe, options: ThroughputOptions
 ) -> tuple[PonderBatch, PounceBatch]:
     rng = np.random.default_rng(0)
-    height, width = model.ponder.image_px
+    (height, width), *_ = readable_sizes(model.ponder.format.eyes, model.ponder.image_px)
     views = tuple(rng.integers(0, 256, (height, width, 3), np.uint8) for _ in range(2))
     recorded = [
         TrainingEpisode(
@@ -143,7 +145,8 @@ def _batch(
         for ticks in options.ticks
     ]
     form = model.ponder.format
-    examples = [make_example(episode, form, run.example, rng) for episode in recorded]
+    config = replace(run.example, nudge=NO_NUDGE)  # of hands that act in another space
+    examples = [make_example(episode, form, config, rng) for episode in recorded]
     episodes = collate_ponder(examples)
     invocations = collate_pounce(examples, bundle.model.config, bundle.tokenizer, bundle.statistics)
     return episodes.to(options.device), invocations.to(options.device)

@@ -51,6 +51,8 @@ class CollectOptions:
     """sim-client --list-tasks shows them."""
     episodes: int = 100
     """Per task, times the scale."""
+    first_episode: int = 0
+    """Leave out so many of each task: a second folder then holds other scenes than the first, and other seeds."""
     scale: Literal["1x", "9x"] = "1x"
     """Paper: 100 episodes a task, or 900."""
     frames: Literal["all", "training"] = "all"
@@ -92,6 +94,8 @@ class CollectOptions:
     def __post_init__(self) -> None:
         if self.episodes < 1 or self.workers < 1:
             raise DatasetError("--episodes and --workers must be at least 1")
+        if self.first_episode < 0:
+            raise DatasetError(f"--first-episode {self.first_episode}: episodes count from 0")
         if self.album < 0:
             raise DatasetError(f"--album {self.album}: a number of pictures, or 0 for no album")
         if self.image_px < 16 or self.image_px % 2:
@@ -138,6 +142,7 @@ class CollectOptions:
             order=self.order,
             texts_follow=self.texts == "follow",
             shove_share=self.shove_share,
+            first_slot=self.first_episode,
         )
         return list(jobs)
 
@@ -151,6 +156,8 @@ class CollectOptions:
             "look": asdict(self.look),
             "versions": versions,
         }
+        if self.first_episode:
+            settings["first_episode"] = self.first_episode
         if self.recovery_share != RECOVERY_SHARE:
             settings["recovery_share"] = self.recovery_share
         if self.difficulties != DIFFICULTY_CYCLE:

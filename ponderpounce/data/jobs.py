@@ -86,10 +86,11 @@ def jobs_of(
     order: Order = "drawn",
     texts_follow: bool = False,
     shove_share: float = 0.0,
+    first_slot: int = 0,
 ) -> Iterator[Job]:
     """Yields the jobs task by task, in the order their episodes have in the dataset."""
     for task in tasks:
-        for slot in range(num_episodes):
+        for slot in range(first_slot, first_slot + num_episodes):
             yield Job(
                 task=task,
                 slot=slot,

@@ -265,26 +265,22 @@ class ContextFormat:
         Raises ValueError if an image does not have ``image_grid`` tokens.
         """
         rows, columns = self.image_grid
-        offset_h, offset_w = np.divmod(np.arange(rows * columns), columns)
+        is_image = np.asarray(ids, np.int64) == self.vocabulary.image_pad
+        edges = np.flatnonzero(np.diff(is_image, prepend=False, append=False))
+        begins, ends = edges[::2], edges[1::2]
+        if (wrong := np.flatnonzero(ends - begins != rows * columns)).size:
+            begin, end = int(begins[wrong[0]]), int(ends[wrong[0]])
+            raise ValueError(f"image at token {first_index + begin} has {end - begin} tokens, not {rows}x{columns}")
+        moves = np.where(is_image, 0, 1)
+        moves[ends - 1] = max(rows, columns)
+        after = first_position + np.cumsum(moves)
         positions_4T = np.empty((4, len(ids)), dtype=np.int64)
         positions_4T[0] = np.arange(first_index, first_index + len(ids))
-        image_pad = self.vocabulary.image_pad
-        index, position = 0, first_position
-        while index < len(ids):
-            if ids[index] != image_pad:
-                positions_4T[1:, index] = position
-                index, position = index + 1, position + 1
-                continue
-            end = index
-            while end < len(ids) and ids[end] == image_pad:
-                end += 1
-            if end - index != rows * columns:
-                raise ValueError(f"image at token {first_index + index} has {end - index} tokens, not {rows}x{columns}")
-            positions_4T[1, index:end] = position
-            positions_4T[2, index:end] = position + offset_h
-            positions_4T[3, index:end] = position + offset_w
-            index, position = end, position + max(rows, columns)
-        return positions_4T, position
+        positions_4T[1:] = after - moves
+        offset_h, offset_w = np.divmod(np.arange(rows * columns), columns)
+        positions_4T[2, is_image] += np.tile(offset_h, len(begins))
+        positions_4T[3, is_image] += np.tile(offset_w, len(begins))
+        return positions_4T, int(after[-1]) if len(ids) else first_position
 
     def _after_a_look(self, segment: Segment) -> Segment:
         """What follows an instant of a demonstration, and its note if there is one: no more is to be written."""

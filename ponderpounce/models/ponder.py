@@ -12,6 +12,8 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 from typing import Any, Self
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 from transformers.models.qwen3_5 import Qwen3_5Config, Qwen3_5ForConditionalGeneration
@@ -143,15 +145,16 @@ class Ponder(nn.Module):
         grid = (height // vision.patch_size, width // vision.patch_size)
         return image_tokens(self.qwen.model.visual, patches.to(self.dtype), grid)
 
-    def embed(self, ids_T: Sequence[int], frames_NHW3: Tensor | None = None) -> Tensor:
+    def embed(self, ids_T: Sequence[int] | npt.NDArray[np.integer], frames_NHW3: Tensor | None = None) -> Tensor:
         """Input embeddings (T, H): rows of the table, with the frames' vision tokens at the image positions.
 
         Raises ValueError if the frames have another number of tokens than ``ids`` has image positions.
         """
-        index_T = torch.tensor(ids_T, dtype=torch.long, device=self.device)
+        ids = np.asarray(ids_T, np.int64)
+        index_T = torch.from_numpy(ids).to(self.device)
         embeds_TH: Tensor = self.qwen.model.language_model.embed_tokens(index_T)
         is_image_T = index_T == self.format.vocabulary.image_pad
-        num_places = sum(i == self.format.vocabulary.image_pad for i in ids_T)
+        num_places = int((ids == self.format.vocabulary.image_pad).sum())
         num_features = 0 if frames_NHW3 is None else len(frames_NHW3) * self.format.num_image_tokens
         if num_places != num_features:
             raise ValueError(f"tokens hold {num_places} image positions, the frames bring {num_features}")

@@ -14,7 +14,7 @@ import tyro
 
 from ponderpounce.models.ponder_checkpoint import load_ponder, save_ponder
 from ponderpounce.models.pounce_checkpoint import load_bundle, save_bundle
-from ponderpounce.training.growing import broadened, grown, reading_more
+from ponderpounce.training.growing import broadened, grown, reading_more, seeing_deeper
 from ponderpounce.training.places import TEXT_PX
 from ponderpounce.training.wide_eyes import wide_eyed
 
@@ -35,6 +35,8 @@ class EnlargeOptions:
     """Neurons of an MLP; None: as many times as the stream's numbers."""
     layers: int = 0
     """So many more, copies of the last ones."""
+    eye_layers: int = 0
+    """So many more of the vision tower, copies of the last ones."""
     box: tuple[int, int, int, int] | None = None
     """What the eye is to look at: top, left, bottom and right in a 256 px picture, whole tokens from where it did."""
     zoom: int = 1
@@ -69,6 +71,8 @@ def enlarge(options: EnlargeOptions) -> None:
         ponder = broadened(ponder, hidden_size, ffn_size, seed=options.seed)
     if options.layers:
         ponder = grown(ponder, options.layers)
+    if options.eye_layers:
+        ponder = seeing_deeper(ponder, options.eye_layers)
     save_ponder(ponder, options.out / "ponder")
     save_bundle(reading_more(bundle, ponder.hidden_size), options.out / "pounce")
 

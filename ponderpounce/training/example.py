@@ -482,7 +482,9 @@ def row_frames(episode: TrainingEpisode, form: ContextFormat, schedule: SampledS
 
 def _before_ponder(episode: TrainingEpisode, form: ContextFormat) -> tuple[Sequence[tuple[Frame, ...]], ContextFormat]:
     """The pictures that PONDER is shown, and its format for them: what was seen once is read as it is."""
-    return (episode.frames, form) if episode.sights is None else (episode.sights, replace(form, eyes=None))
+    return (
+        (episode.frames, form) if episode.sights is None else (episode.sights, replace(form, eyes=None, counsel=None))
+    )
 
 
 def target_rows(episode: TrainingEpisode, tick: int, horizon: int) -> NDArray[np.float32]:

@@ -25,6 +25,8 @@ from ponderpounce.models.pounce_checkpoint import PounceBundle
 
 _LAYER = re.compile(r"(.*language_model\.layers\.)(\d+)(\..*)")
 _WAY_OUT = re.compile(r"(out_proj|o_proj|down_proj)\.weight$")
+_BLOCK = re.compile(r"(.*visual\.blocks\.)(\d+)(\..*)")
+_BLOCK_OUT = re.compile(r"(attn\.proj|mlp\.linear_fc2)\.(weight|bias)$")
 _READS = re.compile(r"(in_proj_\w+|[qkv]_proj|gate_proj|up_proj|conv1d)\.weight$")
 _OF_THE_STREAM = re.compile(r"(input_layernorm|post_attention_layernorm|language_model\.norm)\.weight$")
 _OF_HEADS = re.compile(r"(A_log|dt_bias)$")
@@ -51,6 +53,32 @@ def grown(ponder: Ponder, num_new: int = 2) -> Ponder:
         if found is None or int(found[2]) < num_old:
             weights[name] = known[name]
         elif _WAY_OUT.search(name):
+            weights[name] = torch.zeros_like(drawn)
+        else:
+            weights[name] = known[f"{found[1]}{int(found[2]) - num_new}{found[3]}"].clone()
+    new.qwen.load_state_dict(weights)
+    new.is_random = ponder.is_random
+    return new
+
+
+def seeing_deeper(ponder: Ponder, num_new: int) -> Ponder:
+    """Returns a PONDER with so many more layers of its vision tower, copies of the last ones; it sees what it saw.
+
+    Raises ValueError unless there are as many layers to copy.
+    """
+    config: Any = copy.deepcopy(ponder.qwen.config)
+    num_old = config.vision_config.depth
+    if not 0 < num_new <= num_old:
+        raise ValueError(f"eyes of {num_old} layers can grow by 1 to {num_old} more, not by {num_new}")
+    config.vision_config.depth = num_old + num_new
+    new = Ponder(config, ponder.format, image_px=ponder.image_px, device=ponder.device, dtype=ponder.dtype)
+    known = ponder.qwen.state_dict()
+    weights = {}
+    for name, drawn in new.qwen.state_dict().items():
+        found = _BLOCK.fullmatch(name)
+        if found is None or int(found[2]) < num_old:
+            weights[name] = known[name]
+        elif _BLOCK_OUT.search(name):
             weights[name] = torch.zeros_like(drawn)
         else:
             weights[name] = known[f"{found[1]}{int(found[2]) - num_new}{found[3]}"].clone()

@@ -19,9 +19,12 @@ from dataclasses import dataclass, fields, replace
 from itertools import accumulate
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn.utils.rnn import pad_sequence
 
 from ponderpounce.models.committed import draw_counts
 from ponderpounce.models.context import Row
@@ -68,13 +71,22 @@ class PonderBatch:
         return len(self.rows or self.stand_ins)
 
     def to(self, device: torch.device | str) -> PonderBatch:
+        frames = iter(_moved([each for each in self.frames if each is not None], device))
+        lessons = zip(*(_moved(column, device) for column in zip(*self.place_lessons, strict=True)), strict=True)
         return replace(
             self,
-            frames=tuple(None if f is None else f.to(device) for f in self.frames),
-            stand_ins=tuple(each.to(device) for each in self.stand_ins),
-            stand_in_weights=tuple(each.to(device) for each in self.stand_in_weights),
-            place_lessons=tuple(each.to(device) for each in self.place_lessons),
+            frames=tuple(None if each is None else next(frames) for each in self.frames),
+            stand_ins=tuple(_moved(self.stand_ins, device)),
+            stand_in_weights=tuple(_moved(self.stand_in_weights, device)),
+            place_lessons=tuple(PlaceLessons(*each) for each in lessons),
         )
+
+
+def _moved(tensors: Sequence[Tensor], device: torch.device | str) -> Sequence[Tensor]:
+    """All of them on the device: each transfer to a GPU waits for the one before, and rows are many."""
+    if not tensors or torch.device(device).type == "cpu":
+        return tensors
+    return torch.cat(list(tensors)).to(device).split([len(each) for each in tensors])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -199,9 +211,10 @@ class JointModel(nn.Module):
         trains: Trains = "both",
         keeps_eyes: bool = False,
         reads_together: bool = True,
+        num_groups: int = 1,
     ) -> None:
-        """With ``keeps_eyes`` PONDER's vision tower stays as it is; ``reads_together`` is `encode_rows`'s ``together``;
-        ``aligns_evenly``: numbers of C count as `number_weights` says.
+        """With ``keeps_eyes`` PONDER's vision tower stays as it is; ``reads_together`` and ``num_groups`` are
+        `encode_rows`'s; ``aligns_evenly``: numbers of C count as `number_weights` says.
 
         Raises ValueError if POUNCE was built for another cognition than PONDER gives.
         """
@@ -215,7 +228,7 @@ class JointModel(nn.Module):
         self.w1, self.w2, self.w3, self.w4 = w1, w2, w3, w4
         self._column_weights_H = torch.from_numpy(number_weights(ponder.hidden_size, evenly=aligns_evenly))
         self.trains = trains
-        self.reads_together = reads_together
+        self.reads_together, self.num_groups = reads_together, num_groups
         for name, system in (("ponder", ponder), ("pounce", pounce)):
             if trains not in ("both", name):
                 system.requires_grad_(False)
@@ -241,7 +254,7 @@ class JointModel(nn.Module):
             cognition_QKH = torch.cat(episodes.stand_ins)[:, None].expand(-1, self.ponder.format.num_carriers, -1)
             first_query = _starts([len(each) for each in episodes.stand_ins], device)
         else:
-            hidden = encode_rows(self.ponder, episodes, together=self.reads_together)
+            hidden = encode_rows(self.ponder, episodes, together=self.reads_together, num_groups=self.num_groups)
             grounding, said_N = self._grounding(episodes, hidden)
             cognition_QKH, first_query = gather_cognition(episodes.rows, hidden)
             if self.w3 > 0:
@@ -281,51 +294,78 @@ class JointModel(nn.Module):
         """Mean cross-entropy over every supervised token of the batch; zero, on the graph, if there is none."""
         if self.w2 == 0:  # no annotations: the LM head is not even run
             return hidden[0].new_zeros(()), torch.zeros(0, dtype=torch.int64)
-        read, wanted = [], []
-        for row, hidden_TH in zip(episodes.rows, hidden, strict=True):
-            index = torch.from_numpy(row.supervised_index).to(hidden_TH.device)
-            read.append(hidden_TH[index])
-            wanted.append(torch.tensor(row.targets, device=hidden_TH.device)[index + 1])
-        targets_N = torch.cat(wanted)
-        logits_NV = self.ponder.logits(torch.cat(read))
+        index = [row.supervised_index for row in episodes.rows]
+        wanted = [np.asarray(row.targets)[places + 1] for row, places in zip(episodes.rows, index, strict=True)]
+        targets_N = torch.from_numpy(np.concatenate(wanted)).to(hidden[0].device)
+        logits_NV = self.ponder.logits(_taken(hidden, index))
         said_N = logits_NV.detach().argmax(dim=-1)
         return F.cross_entropy(logits_NV.float(), targets_N) if len(targets_N) else logits_NV.sum(), said_N
 
 
 def _placing(lessons: Sequence[PlaceLessons], hidden: Sequence[Tensor]) -> tuple[Tensor, int]:
     """The loss over all lessons of all rows, and how many there were; zero, on the graph, without any."""
-    answers_MP = torch.cat([each.answers(hidden_TH) for each, hidden_TH in zip(lessons, hidden, strict=True)]).float()
+    index_M, first_M = (torch.cat(column) for column in ([each[n] for each in lessons] for n in range(2)))
+    counts = torch.tensor([len(each.index_M) for each in lessons])
+    starts_M = torch.tensor(_begins(hidden)).repeat_interleave(counts).to(index_M.device)
+    all_lessons = PlaceLessons(index_M + starts_M, first_M, torch.cat([each.features_MP for each in lessons]))
+    answers_MP = all_lessons.answers(torch.cat(list(hidden))).float()
     if not len(answers_MP):
         return answers_MP.sum(), 0
-    return F.mse_loss(answers_MP, torch.cat([each.features_MP for each in lessons])), len(answers_MP)
+    return F.mse_loss(answers_MP, all_lessons.features_MP), len(answers_MP)
 
 
-def encode_rows(ponder: Ponder, episodes: PonderBatch, *, together: bool = True) -> list[Tensor]:
+def _taken(hidden: Sequence[Tensor], index: Sequence[NDArray[np.integer]]) -> Tensor:
+    """(N, H) of all rows: of each the hidden states at these positions. One look-up: on a GPU each costs a dozen
+    launches on the way back."""
+    places = [begin + each.reshape(-1) for begin, each in zip(_begins(hidden), index, strict=True)]
+    return torch.cat(list(hidden))[torch.from_numpy(np.concatenate(places)).to(hidden[0].device)]
+
+
+def _begins(parts: Sequence[Tensor]) -> list[int]:
+    return [0, *accumulate(len(part) for part in parts)][:-1]
+
+
+def encode_rows(ponder: Ponder, episodes: PonderBatch, *, together: bool = True, num_groups: int = 1) -> list[Tensor]:
     """Final hidden states (T, H) of each row.
 
     All pictures are read in one call, however many rows there are. Rows are read ``together``, padded on the right: a
     row is causal, so what stands behind it cannot reach it and pads are never read. With FSDP2 it has to be so: every
     process must call every layer equally often. One after the other they cost a CPU less: no pads, and what a layer
-    leaves for the way back stays small (`benchmarks.training_throughput`).
+    leaves for the way back stays small (`benchmarks.training_throughput`). Between the two, rows of like length go
+    together, in ``num_groups`` (or as many as there are rows): fewer pads for more calls.
     """
     frames = [each for each in episodes.frames if each is not None]
-    ids = [token for row in episodes.rows for token in row.ids]
-    embeds = ponder.embed(ids, torch.cat(frames) if frames else None).split([len(row.ids) for row in episodes.rows])
-    positions = [torch.from_numpy(ponder.format.positions(row.ids)[0]).to(ponder.device) for row in episodes.rows]
+    ids = np.concatenate([row.ids for row in episodes.rows])
+    lengths = [len(row.ids) for row in episodes.rows]
+    embeds = ponder.embed(ids, torch.cat(frames) if frames else None).split(lengths)
+    positions = [ponder.format.positions(row.ids)[0] for row in episodes.rows]
     if not together:
-        return [ponder(embed[None], each[:, None])[0] for embed, each in zip(embeds, positions, strict=True)]
-    longest = max(len(row.ids) for row in episodes.rows)
-    embeds_BTH = torch.stack([F.pad(embed, (0, 0, 0, longest - len(embed))) for embed in embeds])
-    positions_4BT = torch.stack([F.pad(p, (0, longest - p.shape[1])) for p in positions], dim=1)
-    hidden_BTH = ponder(embeds_BTH, positions_4BT)
-    return [hidden[: len(row.ids)] for hidden, row in zip(hidden_BTH, episodes.rows, strict=True)]
+        return [
+            ponder(embed[None], torch.from_numpy(each)[:, None].to(ponder.device))[0]
+            for embed, each in zip(embeds, positions, strict=True)
+        ]
+    by_length = np.argsort(lengths, kind="stable")
+    found: dict[int, Tensor] = {}
+    for group in np.array_split(by_length, min(num_groups, len(by_length))):
+        longest = lengths[group[-1]]
+        positions_4BT = np.zeros((4, len(group), longest), np.int64)
+        is_token_BT = np.arange(longest) < np.array(lengths)[group, None]
+        for place, row in enumerate(group):
+            positions_4BT[:, place, : lengths[row]] = positions[row]
+        embeds_BTH = pad_sequence([embeds[row] for row in group], batch_first=True)
+        hidden_BTH = ponder(embeds_BTH, torch.from_numpy(positions_4BT).to(ponder.device))
+        index = torch.from_numpy(np.flatnonzero(is_token_BT)).to(ponder.device)
+        parts = hidden_BTH.flatten(0, 1)[index].split([lengths[row] for row in group])
+        found |= dict(zip(group.tolist(), parts, strict=True))
+    return [found[row] for row in range(len(lengths))]
 
 
 def gather_cognition(rows: Sequence[Row], hidden: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     """Cognition of all queries of all rows, (Q, K, H), and the index of each row's first, (B,) int64."""
     device = hidden[0].device
-    parts = [h[torch.from_numpy(row.carrier_index).to(device)] for row, h in zip(rows, hidden, strict=True)]
-    return torch.cat(parts), _starts([len(part) for part in parts], device)
+    index = [row.carrier_index for row in rows]
+    cognition_QKH = _taken(hidden, index).unflatten(0, (-1, index[0].shape[1]))
+    return cognition_QKH, _starts([len(each) for each in index], device)
 
 
 def _starts(counts: Sequence[int], device: torch.device) -> Tensor:

@@ -276,6 +276,14 @@ def small_growing() -> Curriculum:
     return _settling_on(small_beginnings(), "small_growing", 20, (700, 1600), batch_episodes=8)
 
 
+def small_at_length() -> Curriculum:
+    """The PONDER of `small_growing`, enlarged once more, goes on for many more rows, on a GPU.
+
+    docs/training.md, "At length".
+    """
+    return _settling_on(small_growing(), "small_at_length", 21, (600, 2400), batch_episodes=64)
+
+
 def _settling_on(
     before: Curriculum, name: str, seed: int, decay: tuple[int, int], *, batch_episodes: int = 16, **example: Any
 ) -> Curriculum:

@@ -34,6 +34,7 @@ from ponderpounce.data.lerobot_v3 import ALBUM, INFO_PATH
 from ponderpounce.models.bfloat16 import warn_of_slow
 from ponderpounce.models.bfloat16_products import multiply_in_bfloat16
 from ponderpounce.models.eyes import check_cameras, readable_sizes
+from ponderpounce.models.fused_attention import fuse_attention
 from ponderpounce.models.normalisation import ROBOMME
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import load_ponder, save_ponder
@@ -43,6 +44,7 @@ from ponderpounce.models.pounce_init import open_gates
 from ponderpounce.models.prompt import Tokenizer, tokenizer_of_instructions
 from ponderpounce.models.recompute import recompute_layers
 from ponderpounce.models.vocabulary import Vocabulary
+from ponderpounce.training.ahead import Ahead
 from ponderpounce.training.collate import collate_ponder, collate_pounce
 from ponderpounce.training.data import Sight, TrainingSet
 from ponderpounce.training.example import make_example
@@ -118,9 +120,13 @@ class TrainOptions:
     device: Literal["cpu", "cuda"] = "cpu"
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Of PONDER's weights and of what POUNCE's stream runs in, when they are loaded."""
-    products: Literal["float32", "bfloat16"] = "float32"
-    """Of float32 weights' linear layers: bfloat16 takes CPUs that have it a third of the time, and rounds to 1 in 250.
-    All else stays float32."""
+    products: Literal["float32", "tfloat32", "bfloat16"] = "float32"
+    """bfloat16: of float32 weights' linear layers; takes CPUs that have it a third of the time, and rounds to 1 in 250;
+    all else stays float32. tfloat32: of all float32 products on GPUs that have it, and rounds to 1 in 2000."""
+    loaders: int = 0
+    """Processes that make batches ahead, for a GPU that learns faster than one lays out rows; 0: none."""
+    length_groups: int = 1
+    """Rows that are read together are padded to the longest of their group of like length: fewer pads, more calls."""
     progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
 
 
@@ -142,19 +148,29 @@ class Batches:
         """Raises ValueError if the batch has fewer episodes than there are processes, or the share is none."""
         if not 0 <= watch_share <= 1:
             raise ValueError(f"--watch-share must be in [0, 1], came {watch_share}")
-        self._data, self._run, self._model = data, run, model
+        self._data, self._run = data, run
         self._watch_share = watch_share
         self._bundle, self._device = bundle, world.device
         self._places = world.share(run.batch_episodes)
+        # not the model itself: another process may ask (`ahead`), and its weights lie on a GPU
+        size = model.ponder.hidden_size
+        self._form, self._pounce = model.ponder.format, model.pounce.config
+        self._stand_in_size = size if model.needs_stand_ins else 0
+        self._place_size = size if model.w4 > 0 else 0
 
     def __call__(self, step: int) -> tuple[PonderBatch, PounceBatch]:
-        run, model, bundle = self._run, self._model, self._bundle
+        episodes, invocations = self.on_cpu(step)
+        return episodes.to(self._device), invocations.to(self._device)
+
+    def on_cpu(self, step: int) -> tuple[PonderBatch, PounceBatch]:
+        """The same, not yet on the device."""
+        run, bundle = self._run, self._bundle
         chance = (run.train.seed, _EPISODE_STREAM, step)
         numbers = self._draw(np.random.default_rng(chance))
         examples = [
             make_example(
                 self._data[int(numbers[place])],
-                model.ponder.format,
+                self._form,
                 run.example,
                 np.random.default_rng([*chance, place]),
             )
@@ -163,14 +179,13 @@ class Batches:
         episodes = collate_ponder(
             examples,
             with_rows=run.trains != "pounce",
-            stand_in_size=model.ponder.hidden_size if model.needs_stand_ins else 0,
+            stand_in_size=self._stand_in_size,
             moved_weight=run.moved_weight,
-            place_size=model.ponder.hidden_size if model.w4 > 0 else 0,
+            place_size=self._place_size,
         )
         if run.trains == "ponder":  # nobody acts: any moment will do, also one that is not to be imitated
             examples = [replace(each, invocations=each.schedule.invocations[:1], nudges_I2=None) for each in examples]
-        invocations = collate_pounce(examples, model.pounce.config, bundle.tokenizer, bundle.statistics)
-        return episodes.to(self._device), invocations.to(self._device)
+        return episodes, collate_pounce(examples, self._pounce, bundle.tokenizer, bundle.statistics)
 
     def _draw(self, rng: np.random.Generator) -> NDArray[np.integer]:
         """Numbers of the batch's episodes; the last of them are watched ones.
@@ -294,6 +309,10 @@ def _train(run: Recipe, data: TrainingSet, options: TrainOptions, world: World) 
         recompute_layers(model.ponder)
     if options.products == "bfloat16":
         multiply_in_bfloat16(model)
+    if options.device == "cuda" and options.dtype == "float32":
+        fuse_attention(model.ponder)
+    torch.backends.cuda.matmul.allow_tf32 = options.products == "tfloat32"
+    model.num_groups = options.length_groups
     if options.weights == "sharded":
         shard(model, world)
     data = TrainingSet(
@@ -305,12 +324,15 @@ def _train(run: Recipe, data: TrainingSet, options: TrainOptions, world: World) 
         sights=options.sights,
     )
     batches = Batches(data, run, model, bundle, world, options.watch_share)
-    trainer = Trainer(model, batches, run.train, data_hash=data.hash, world=world)
+    ahead = Ahead(batches.on_cpu, world.device, options.loaders) if options.loaders else None
+    trainer = Trainer(model, ahead or batches, run.train, data_hash=data.hash, world=world)
     checkpoint = options.out / "checkpoint"
     options.out.mkdir(parents=True, exist_ok=True)
     trainer.resume(checkpoint)
     progress = options.progress and world.is_first
     with ExitStack() as stack:
+        if ahead is not None:
+            stack.callback(ahead.close)
         bar = stack.enter_context(tqdm(total=run.num_steps, initial=trainer.step, unit="step", disable=not progress))
         watch = stack.enter_context(_watch(options, trainer.step)) if world.is_first else None
         for report in trainer.run(run.num_steps):

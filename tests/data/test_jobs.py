@@ -20,6 +20,13 @@ def test_no_two_attempts_of_a_task_share_a_seed() -> None:
     assert min(seeds) == TRAIN_SEED
 
 
+@given(st.integers(0, 900), st.integers(1, 900))
+def test_episodes_from_a_later_one_on_are_those_of_the_whole(first: int, count: int) -> None:
+    whole = list(jobs_of(("A", "B"), first + count, image_px=256, max_steps=1300, look=Look()))
+    later = list(jobs_of(("A", "B"), count, image_px=256, max_steps=1300, look=Look(), first_slot=first))
+    assert later == [job for job in whole if job.slot >= first]
+
+
 def test_keys_sort_as_jobs_do() -> None:
     keys = [job.key for job in JOBS]
     assert keys == sorted(set(keys))

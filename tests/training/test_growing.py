@@ -11,7 +11,7 @@ from ponderpounce.models import pounce_configs
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
 from ponderpounce.models.pounce_checkpoint import random_bundle
-from ponderpounce.training.growing import broadened, grown, reading_more
+from ponderpounce.training.growing import broadened, grown, reading_more, seeing_deeper
 
 IDS = [5, 17, 200, 31, 8, 90, 44]
 
@@ -50,6 +50,20 @@ def test_what_is_new_can_learn() -> None:
     ]
     assert len(ways_out) == 2
     assert all(grad is not None and grad.abs().max() > 0 for grad in ways_out)
+
+
+def test_deeper_eyes_see_the_same_and_can_learn() -> None:
+    old = ponder()
+    depth = old.qwen.config.vision_config.depth
+    new = seeing_deeper(old, 1)
+    assert new.qwen.config.vision_config.depth == len(new.qwen.model.visual.blocks) == depth + 1
+    torch.testing.assert_close(hidden(new), hidden(old), rtol=0, atol=0)
+    hidden(new).square().sum().backward()
+    last = new.qwen.model.visual.blocks[depth]
+    for way_out in (last.attn.proj.weight, last.mlp.linear_fc2.weight):
+        assert way_out.grad.abs().max() > 0
+    with pytest.raises(ValueError, match=f"1 to {depth} more"):
+        seeing_deeper(old, depth + 1)
 
 
 @pytest.mark.parametrize("num_new", [0, 5])

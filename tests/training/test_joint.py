@@ -67,10 +67,10 @@ def gradients(loss: Tensor, model: JointModel) -> dict[str, Tensor]:
     return {name: grad for name, grad in zip(named, found, strict=True) if grad is not None and grad.abs().max() > 0}
 
 
-@pytest.mark.parametrize("together", [True, False])
-def test_rows_of_a_batch_are_read_as_if_alone(model: JointModel, together: bool) -> None:
-    both = episodes(model.ponder, 1, 3)
-    read = encode_rows(model.ponder, both, together=together)
+@pytest.mark.parametrize(("together", "num_groups"), [(True, 1), (True, 2), (True, 9), (False, 1)])
+def test_rows_of_a_batch_are_read_as_if_alone(model: JointModel, together: bool, num_groups: int) -> None:
+    both = episodes(model.ponder, 3, 1, 2)
+    read = encode_rows(model.ponder, both, together=together, num_groups=num_groups)
     for row, frames, hidden in zip(both.rows, both.frames, read, strict=True):
         alone = model.ponder.encode_row(row, frames)
         torch.testing.assert_close(hidden, alone, atol=2e-5, rtol=1e-4)

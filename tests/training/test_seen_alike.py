@@ -13,6 +13,7 @@ from ponder_server.contract import Opening
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
 from ponder_server.writer import TransitionWriter
+from ponderpounce.models.counsel import Counsel, Otherwise
 from ponderpounce.models.eyes import Eye, see
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_configs import tiny_cpu
@@ -141,3 +142,17 @@ def test_a_demonstration_without_a_camera_that_is_looked_through_is_refused() ->
     demo = (recorded.demo[0], recorded.demo[1][:1])
     with pytest.raises(ValueError, match="demo instant 1, 1 views came and an eye looks through camera 1"):
         engine_of(PONDER).open("a", Opening(instruction=INSTRUCTION, demo_frames=demo))
+
+
+def test_who_takes_counsel_goes_on_learning_from_what_it_saw() -> None:
+    """Other views are of cameras' pictures; what its eye made of them once is read as it is."""
+    (_, eye) = EYES
+    counsel = Counsel(others=(Otherwise(down_px=2, right_px=-1),), near=30)
+    form = replace(PONDER.format, eyes=(eye,), counsel=counsel)
+    recorded = episode()
+    seen = [tuple(see(views, form.eyes, form.image_px)) for views in recorded.frames]
+    demo = tuple(tuple(see(views, form.eyes, form.image_px)) for views in recorded.demo)
+    kept = replace(recorded, demo=demo, frames=[()] * recorded.num_ticks, sights=seen)
+    schedule = sample_schedule(np.random.default_rng(0), EVALUATION, recorded.num_ticks)
+    assert episode_row(kept, form, schedule).ids == episode_row(recorded, form, schedule).ids
+    assert torch.equal(row_frames(kept, form, schedule), row_frames(recorded, form, schedule))

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 
 from ponderpounce.data.episode import About, EpisodeWriter, Row, unpack
 from ponderpounce.data.lerobot_v3 import DatasetWriter
@@ -241,6 +242,13 @@ def test_a_step_draws_the_same_batch_whenever_it_is_asked(folder: Path, tmp_path
     assert [r.ids for r in first[0].rows] == [r.ids for r in again[0].rows]
     assert torch.equal(first[1].actions_INA, again[1].actions_INA)
     assert not torch.equal(first[1].actions_INA, batches(6)[1].actions_INA)
+
+
+def test_who_lays_out_the_rows_changes_nothing(folder: Path, tmp_path: Path) -> None:
+    for name, loaders in (("alone", 0), ("helped", 2)):
+        train.train(options(folder, tmp_path / name, loaders=loaders))
+    alone, helped = (load_file(tmp_path / name / "ponder" / "model.safetensors") for name in ("alone", "helped"))
+    assert all(torch.equal(alone[name], helped[name]) for name in alone)
 
 
 def test_out_of_memory_says_what_to_lower(
