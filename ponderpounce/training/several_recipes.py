@@ -281,7 +281,7 @@ def small_at_length() -> Curriculum:
 
     docs/training.md, "At length".
     """
-    return _settling_on(small_growing(), "small_at_length", 21, (600, 2400), batch_episodes=64)
+    return _settling_on(small_growing(), "small_at_length", 21, (430, 1720), batch_episodes=64)
 
 
 def _settling_on(
