@@ -269,7 +269,7 @@ def small_beginnings() -> Curriculum:
 
 
 def small_growing() -> Curriculum:
-    """The PONDER of `small_beginnings`, enlarged (`pp-enlarge`), goes on. What it leaves is shipped.
+    """The PONDER of `small_beginnings`, enlarged (`pp-enlarge`), goes on.
 
     docs/training.md, "Half as broad again".
     """
@@ -277,7 +277,7 @@ def small_growing() -> Curriculum:
 
 
 def small_at_length() -> Curriculum:
-    """The PONDER of `small_growing`, enlarged once more, goes on for many more rows, on a GPU.
+    """The PONDER of `small_growing`, enlarged once more, goes on for many more rows, on a GPU. Its pair is shipped.
 
     docs/training.md, "At length".
     """
