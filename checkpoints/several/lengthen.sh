@@ -35,9 +35,6 @@ done
 [ -d "$next/run/settling/ponder" ] || "$bin/pp-train" --recipe small_at_length --stage settling --device cuda \
     --products tfloat32 --loaders 14 --length-groups 3 --ponder "$next/larger/ponder" --pounce "$next/larger/pounce" \
     --data "${data[@]}" --watch "$grown/a" "$grown/b" --watch-share 0.15 --sights "$next/sights" --out "$next/run"
-for system in ponder pounce; do
-    from=$next/larger/pounce
-    [ $system = pounce ] || from=$next/run/settling/ponder
-    [ -d "$next/pair/$system" ] || halve "$from" "$next/pair/$system"
-done
+[ -d "$next/pair/ponder" ] || halve "$next/run/settling/ponder" "$next/pair/ponder"
+[ -d "$next/pair/pounce" ] || halve "$next/larger/pounce" "$next/pair/pounce"
 evaluate "$next/pair" "$next"

@@ -1,8 +1,7 @@
 """PONDER's attention over whole rows in float32 on a GPU, by a fused kernel.
 
 transformers hands grouped heads to torch as they are. Of its fused kernels only those for 16-bit numbers know groups:
-in float32 torch then makes the whole table of weights, which took most of a training step's memory and a third of its
-time. Here every head is given keys and values of its own first.
+in float32 torch then makes the whole table of weights. Here every head is given keys and values of its own first.
 """
 
 from __future__ import annotations

@@ -45,20 +45,7 @@ def grown(ponder: Ponder, num_new: int = 2) -> Ponder:
         raise ValueError(f"a PONDER of {num_old} layers can grow by 1 to {num_old} more, not by {num_new}")
     text.num_hidden_layers = num_old + num_new
     text.layer_types = [*text.layer_types, *text.layer_types[-num_new:]]
-    new = Ponder(config, ponder.format, image_px=ponder.image_px, device=ponder.device, dtype=ponder.dtype)
-    known = ponder.qwen.state_dict()
-    weights = {}
-    for name, drawn in new.qwen.state_dict().items():
-        found = _LAYER.fullmatch(name)
-        if found is None or int(found[2]) < num_old:
-            weights[name] = known[name]
-        elif _WAY_OUT.search(name):
-            weights[name] = torch.zeros_like(drawn)
-        else:
-            weights[name] = known[f"{found[1]}{int(found[2]) - num_new}{found[3]}"].clone()
-    new.qwen.load_state_dict(weights)
-    new.is_random = ponder.is_random
-    return new
+    return _with_copies(ponder, config, _LAYER, _WAY_OUT, num_old, num_new)
 
 
 def seeing_deeper(ponder: Ponder, num_new: int) -> Ponder:
@@ -71,14 +58,21 @@ def seeing_deeper(ponder: Ponder, num_new: int) -> Ponder:
     if not 0 < num_new <= num_old:
         raise ValueError(f"eyes of {num_old} layers can grow by 1 to {num_old} more, not by {num_new}")
     config.vision_config.depth = num_old + num_new
+    return _with_copies(ponder, config, _BLOCK, _BLOCK_OUT, num_old, num_new)
+
+
+def _with_copies(
+    ponder: Ponder, config: Any, layer: re.Pattern[str], way_out: re.Pattern[str], num_old: int, num_new: int
+) -> Ponder:
+    """A PONDER of ``config``: layers behind the old ones are copies of the last, their ways out zero."""
     new = Ponder(config, ponder.format, image_px=ponder.image_px, device=ponder.device, dtype=ponder.dtype)
     known = ponder.qwen.state_dict()
     weights = {}
     for name, drawn in new.qwen.state_dict().items():
-        found = _BLOCK.fullmatch(name)
+        found = layer.fullmatch(name)
         if found is None or int(found[2]) < num_old:
             weights[name] = known[name]
-        elif _BLOCK_OUT.search(name):
+        elif way_out.search(name):
             weights[name] = torch.zeros_like(drawn)
         else:
             weights[name] = known[f"{found[1]}{int(found[2]) - num_new}{found[3]}"].clone()

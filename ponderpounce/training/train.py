@@ -302,6 +302,13 @@ def _is_finished(out: Path) -> bool:
 
 
 def _train(run: Recipe, data: TrainingSet, options: TrainOptions, world: World) -> None:
+    if options.products == "tfloat32" and options.device == "cpu":
+        raise ValueError("--products tfloat32 is for GPUs; on a CPU leave it out, or give bfloat16")
+    if not 0 < options.length_groups <= max(1, run.batch_episodes // world.size):  # all processes have as many groups
+        raise ValueError(
+            f"--length-groups {options.length_groups}: expected 1 to {run.batch_episodes // world.size}, the rows that "
+            "every process has of a batch"
+        )
     model, bundle = build(run, data, options)
     require_alike(model, world)
     model.reads_together = options.device != "cpu" or (world.size > 1 and options.weights == "sharded")

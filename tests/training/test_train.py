@@ -203,6 +203,10 @@ def test_a_run_that_was_killed_ends_as_one_that_was_not(
     [
         ({"recipe": "tinny"}, "Did you mean 'tiny'?"),
         ({"recipe": "robomme"}, "--ponder, --pounce"),
+        ({"products": "tfloat32"}, "is for GPUs"),
+        ({"length_groups": 0}, "expected 1 to 2"),
+        ({"length_groups": 3}, "expected 1 to 2"),
+        ({"loaders": -1}, "at least one process"),
         ({"tasks": ("StopCube",)}, "has no successful episode of StopCube; it has PickHighlight"),
     ],
 )
