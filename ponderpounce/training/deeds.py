@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from ponderpounce.tasks.captions import ORDINALS
 from ponderpounce.training.lapses import has_moved
 from ponderpounce.training.places import PLACE, WAY
+from ponderpounce.training.ways import seen_side
 
 _OTHER_PX = 6.0  # of a 256 px picture: less than any two things lie apart
 
@@ -122,7 +123,7 @@ def passing_side(text: str) -> str:
     found = _AROUND.search(text)
     if found is None:
         return ""
-    return "backward" if (found[1] == "left") == (found[2] == "clockwise") else "forward"
+    return seen_side(found[1], found[2])
 
 
 def _stretches(texts: Sequence[str]) -> list[Told]:

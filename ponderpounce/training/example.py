@@ -45,8 +45,7 @@ from ponderpounce.training.stand_in import stand_in
 from ponderpounce.training.training_episode import Frame, TrainingEpisode
 
 _SILENCE = repeat(Words())
-_BEGINNING = 8  # queries
-_RECALLING = 2  # queries
+_BEGINNING, _RECALLING = 8, 2  # queries
 _CORRECTED = 0.3  # of own words, at every query
 _SHARES = (
     "text_dropout", "slips", "tells_onward", "cuts_short", "begins", "recalls", "own_words", "misjudges", "even_clocks",
@@ -97,6 +96,9 @@ class ExampleConfig:
     leads to a place; what was done a minute ago is read off pictures in one order, which all rows teach alike."""
     has_plans: bool = False
     """See `TrainingEpisode.with_plans`."""
+    names_plans: bool = False  # also there
+    seen_sides: bool = False
+    """See `TrainingEpisode.with_seen_sides`."""
     cuts_short: float = 0.0
     """Share of episodes that count, of two rounds and more, that are told to end sooner (`cuts`)."""
     slips: float = 0.0
@@ -283,7 +285,8 @@ def make_example(
         episode = replace(episode, subgoals=texts, is_transition_T=is_transition_T)
     cut = _drawn_cut(episode, rng) if config.cuts_short and rng.random() < config.cuts_short else None
     episode = episode if cut is None else episode.cut_short(cut)
-    episode = episode.with_plans() if config.has_plans else episode
+    episode = episode.with_plans(names=config.names_plans) if config.has_plans else episode
+    episode = episode.with_seen_sides() if config.seen_sides else episode
     episode = episode if config.has_reasoning else replace(episode, reasoning="")
     episode = replace(episode, reasoning=narration(episode.demo_subgoals)) if config.narrates else episode
     episode = episode if config.tells_ends else episode.without_ends()

@@ -169,15 +169,19 @@ def demo_notes(
     """
     if any(moving) or len(tools) != len(texts):
         return list(moving)
-    found, done, told = [""] * len(texts), -1, told_deeds(texts)
+    found, done, before, told = [""] * len(texts), -1, "", told_deeds(texts)
     for deed in told:
         # the end of a stretch is where the next one begins
         last = min(deed.last + int(WAY.search(texts[deed.last]) is not None), len(texts) - 1)
         instants = range(min(max(deed.first, done + 1), last), last + 1)
         done = min(instants, key=lambda instant: apart_px(tools[instant], deed.place) or 0.0)  # 0: the text tells none
         side = passing_side(texts[deed.last])
+        whence, before = before or tools[instants.start], deed.place
+        if side and _half_way(instants, tools, whence, deed.place) == len(texts) - 1:
+            found[-1] = side  # as far as it is seen to go: nobody knows in the middle of a stretch that this is all
+            continue
         if side and (way := range(instants.start, done)):
-            found[_half_way(way, tools, deed.place)] = side
+            found[_half_way(way, tools, tools[way.start], deed.place)] = side
         found[done] = f"{found[done]}, {deed.words}" if found[done] else deed.words
         if deed.words == deed.place:  # the one that was picked up: it stays in view, and may move
             found[done : deed.last + 1] = [deed.place] * (deed.last + 1 - done)
@@ -205,10 +209,10 @@ def _which(told: Sequence[Told], place: str) -> str:
     return there[min(there)] if there and min(there) <= _SAME_PX else ""
 
 
-def _half_way(way: range, tools: Sequence[str], end: str) -> int:
-    """Of these instants the one in which the tool is half-way, in columns, from where it is in the first to ``end``:
-    rows are what it leaves its line in."""
-    start, stop = _column(tools[way.start]), _column(end)
+def _half_way(way: range, tools: Sequence[str], begin: str, end: str) -> int:
+    """Of these instants the one in which the tool is half-way between two places, in columns: rows are what it leaves
+    its line in."""
+    start, stop = _column(begin), _column(end)
     return min(way, key=lambda instant: abs(_column(tools[instant]) - (start + stop) / 2))
 
 

@@ -284,6 +284,21 @@ def small_at_length() -> Curriculum:
     return _settling_on(small_growing(), "small_at_length", 21, (430, 1720), batch_episodes=64)
 
 
+def small_by_sight() -> Curriculum:
+    """The PONDER of `small_at_length` learns to tell plans in the words in which it has seen or counts things.
+
+    docs/training.md, "In words that can be copied".
+    """
+    (settling,) = _settling_on(small_at_length(), "small_by_sight", 22, (100, 720), batch_episodes=8).stages
+    gently = replace(settling.train.optim, learning_rate=3e-4, warmup_steps=30)
+    settling = replace(
+        settling,
+        example=replace(settling.example, names_plans=True, seen_sides=True),
+        train=replace(settling.train, optim=gently),
+    )
+    return Curriculum(name="small_by_sight", stages=(settling,))
+
+
 def _settling_on(
     before: Curriculum, name: str, seed: int, decay: tuple[int, int], *, batch_episodes: int = 16, **example: Any
 ) -> Curriculum:

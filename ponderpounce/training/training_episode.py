@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -15,9 +16,11 @@ from ponderpounce.training.cut_short import Cut
 from ponderpounce.training.lapses import has_moved
 from ponderpounce.training.notes import without_end
 from ponderpounce.training.places import PLACE, WAY
+from ponderpounce.training.ways import with_seen_sides
 
 Frame = NDArray[np.uint8]  # (height, width, 3) RGB
 _SAME_PX = 6.0  # of a 256 px picture: less than any two things lie apart
+_NUMBERED = re.compile(r"pick up the (\w+ (?:red|green|blue)) cube")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -140,16 +143,21 @@ class TrainingEpisode:
         notes, moving = ([without_end(note) for note in told] for told in (self.demo_notes, self.moving))
         return replace(self, demo_notes=notes, moving=moving)
 
-    def with_plans(self, *, even_the_first: bool = False) -> TrainingEpisode:
+    def with_plans(self, *, even_the_first: bool = False, names: bool = False) -> TrainingEpisode:
         """The same, every subgoal but the first told with the places of those that come later: ``S, <y, x>, <y, x>``.
 
         What was shown is then written down soon after, and read off from there later; without, a small network loses
         the third of three things. When the first subgoal is told nothing has been seen, but for a demonstration. One
         that is tried again counts once, and so does a place that was told already: where things are carried to and fro
         every text has one. Of a way (`WAY`) every stretch counts, and is told with its last word: on which side.
+
+        With ``names`` plans of cubes that are picked up by their numbers tell what is where, ``second blue <y, x>,
+        button <y, x>``: who is asked for three green ones counts to the third. Of bare places one was told twice, and
+        another was not.
         """
         begins = np.flatnonzero(self.is_transition_T | (np.arange(self.num_ticks) == 0)).tolist()
         from_the_first = even_the_first or bool(self.demo)
+        is_numbered = names and any(_NUMBERED.match(text) for text in {*self.subgoals, *self.unreached})
         planned: list[str] = []
         for begin, end in pairwise([*begins, self.num_ticks]):
             own = PLACE.sub("", self.subgoals[begin])
@@ -162,12 +170,16 @@ class TrainingEpisode:
                     stretches.append(f"{stretch[1]} {stretch[2]}")
                 elif place is not None and PLACE.sub("", text) != own:
                     later.setdefault(PLACE.sub("", text), place[0])
-            for there in later.values():
-                if all(not PLACE.search(text) or has_moved(text, there, _SAME_PX) for text in told):
-                    told.append(there)
+            for text, there in later.items():
+                if all(not PLACE.search(other) or has_moved(other, there, _SAME_PX) for other in told):
+                    told.append(f"{_name(text)}{there}" if is_numbered else there)
             plan = "".join(f", {there}" for there in (*told[1:], *stretches[1:]))  # a stretch's text has the next one
             planned += [text + plan for text in self.subgoals[begin:end]]
         return replace(self, planned=planned)
+
+    def with_seen_sides(self) -> TrainingEpisode:
+        """The same, its words on ways around things telling on which side these are seen to be passed (`ways`)."""
+        return replace(self, planned=[*map(with_seen_sides, self.words)], said=[*map(with_seen_sides, self.said)])
 
     def next_places(self) -> list[str]:
         """Per tick, the place of the subgoal after the one in force, ``<y, x>``; empty where it has none."""
@@ -187,3 +199,11 @@ class TrainingEpisode:
     def transition_ticks(self) -> frozenset[int]:
         """Ticks at which another subgoal begins."""
         return frozenset(np.flatnonzero(self.is_transition_T).tolist())
+
+
+def _name(text: str) -> str:
+    """What a plan calls the place of this subgoal, and a space; empty where it has no name for it."""
+    numbered = _NUMBERED.match(text)
+    if numbered is not None:
+        return f"{numbered[1]} "
+    return next((f"{name} " for name in ("bin", "button") if f" the {name}" in text), "")

@@ -297,6 +297,29 @@ def test_a_plan_of_a_way_tells_every_stretch_and_how_it_is_gone() -> None:
     assert unseen.words[0] == texts[0]  # nothing was shown by then
 
 
+def test_a_plan_of_numbered_cubes_can_name_what_is_where() -> None:
+    """Names do not change which places are told; plans of other things have none."""
+    texts = [
+        "pick up the first red cube at <10, 10>",
+        "put it into the bin at <90, 90>",
+        "pick up the first blue cube at <20, 40>",
+        "put it into the bin at <90, 90>",
+        "press the button at <5, 60>",
+    ]
+    recorded = replace(episode(5, changes=(0, 1, 2, 3, 4)), subgoals=texts)
+    assert [*recorded.with_plans(names=True).words] == [
+        texts[0],
+        f"{texts[1]}, first blue <20, 40>, button <5, 60>",
+        f"{texts[2]}, bin <90, 90>, button <5, 60>",
+        f"{texts[3]}, button <5, 60>",
+        texts[4],
+    ]
+    failed = replace(episode(2, changes=(0, 1)), subgoals=texts[:2], unreached=texts[2:]).with_plans(names=True)
+    assert failed.words[1] == f"{texts[1]}, first blue <20, 40>, button <5, 60>"
+    others = replace(recorded, subgoals=[re.sub("blue|red", "highlighted", text) for text in texts])
+    assert others.with_plans(names=True).words == others.with_plans().words
+
+
 def test_a_stand_in_can_tell_where_it_goes_on() -> None:
     """Of the share of queries that are to be told, and where the next subgoal has a place."""
     texts = ["pick at <1, 1>"] * 60 + ["put at <100, 40>"] * 60 + ["press"] * 60

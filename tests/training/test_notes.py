@@ -221,6 +221,19 @@ def test_the_side_on_which_a_way_passes_is_noted_when_it_is_seen() -> None:
     assert demo_notes(straight, tools[1:4], [""] * 3) == ["", "", "left <89, 167>"], "it goes around nothing"
 
 
+def test_the_end_of_a_stretch_that_is_shown_to_its_middle_alone_is_not_noted() -> None:
+    """Until then a stretch that goes on looks the same, and of that the side alone is noted."""
+    left = "move to the nearest left target by circling around the stick {} to {}"
+    there, back = "<89, 167>, then clockwise to <89, 130>", "<89, 130>"
+    texts = [left.format("clockwise", there)] * 4
+    texts += ["move to the nearest right target by circling around the stick clockwise to <89, 130>"] * 2
+    tools = ["<85, 132>", "<58, 140>", "<56, 151>", "<80, 165>", "<100, 160>", "<103, 152>"]
+    begun = ["", "", "backward", "backward <89, 167>"]
+    assert demo_notes(texts, tools, [""] * 6) == [*begun, "", "forward"]
+    tools[4:] = "<103, 150>", "<98, 138>"
+    assert demo_notes(texts, tools, [""] * 6) == [*begun, "forward", f"forward {back}"], "it was past its middle"
+
+
 def test_a_stretch_that_ends_where_it_began_is_not_over_at_once() -> None:
     texts = [*["move left to <50, 50>, then <52, 52>"] * 2, *["move right to <52, 52>"] * 2]
     tools = ["<90, 90>", "<70, 70>", "<51, 51>", "<60, 60>"]
