@@ -3,7 +3,8 @@
 #
 #     checkpoints/several/see_wider.sh [OUT]    (the OUT of the other scripts)
 #
-# PONDER's eye takes in all that is played with, and plans are told in words that it has seen or counted before.
+# PONDER's eye takes in all that is played with, and plans are told in words that it has seen or counted before. A trial,
+# run by its parts before stretches of ways had numbers; what it left is not shipped.
 set -euo pipefail
 
 out=${1:-out/several}

@@ -81,7 +81,7 @@ def told_deeds(texts: Sequence[str]) -> list[Told]:
     """What was done where, in order; nothing where that is little.
 
     Things are put onto one place after the other, or one is picked up. Of a way every stretch counts: around things
-    with the side on which it passes (`passing_side`), others with their last word, as plans tell them
+    with its `course`, others with their last word, as plans tell them
     (`TrainingEpisode.with_plans`).
     """
     if stretches := _stretches(texts):
@@ -120,24 +120,27 @@ def passing_side(text: str) -> str:
     That is where the tool is seen half-way. Which way round follows from it and from where the stretch leads, and was
     not learned without. Empty for other texts.
     """
+    return course(text).partition(" ")[2]
+
+
+def course(text: str) -> str:
+    """Where the stretch of a way around things leads, and `passing_side`: "left backward". Empty for other texts."""
     found = _AROUND.search(text)
-    if found is None:
-        return ""
-    return seen_side(found[1], found[2])
+    return "" if found is None else f"{found[1]} {seen_side(found[1], found[2])}"
 
 
 def _stretches(texts: Sequence[str]) -> list[Told]:
-    """Every stretch of a way, with its side or its last word and its end."""
+    """Every stretch of a way, with its number, its `course` or its last word, and its end."""
     found: list[Told] = []
     for instant, text in enumerate(texts):
         stretch = WAY.search(text)
         if stretch is None:
             continue
-        words = f"{passing_side(text) or stretch[1]} {stretch[2]}"
-        if found and found[-1].words == words:
+        words = f"{course(text) or stretch[1]} {stretch[2]}"
+        if found and found[-1].words == f"{len(found)} {words}":
             found[-1] = replace(found[-1], last=instant)
         else:
-            found.append(Told(words, stretch[2], instant, instant))
+            found.append(Told(f"{len(found) + 1} {words}", stretch[2], instant, instant))
     return found
 
 

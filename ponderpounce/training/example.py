@@ -97,8 +97,8 @@ class ExampleConfig:
     has_plans: bool = False
     """See `TrainingEpisode.with_plans`."""
     names_plans: bool = False  # also there
-    seen_sides: bool = False
-    """See `TrainingEpisode.with_seen_sides`."""
+    ways_by_sight: bool = False
+    """See `TrainingEpisode.with_ways_by_sight`."""
     cuts_short: float = 0.0
     """Share of episodes that count, of two rounds and more, that are told to end sooner (`cuts`)."""
     slips: float = 0.0
@@ -286,7 +286,7 @@ def make_example(
     cut = _drawn_cut(episode, rng) if config.cuts_short and rng.random() < config.cuts_short else None
     episode = episode if cut is None else episode.cut_short(cut)
     episode = episode.with_plans(names=config.names_plans) if config.has_plans else episode
-    episode = episode.with_seen_sides() if config.seen_sides else episode
+    episode = episode.with_ways_by_sight() if config.ways_by_sight else episode
     episode = episode if config.has_reasoning else replace(episode, reasoning="")
     episode = replace(episode, reasoning=narration(episode.demo_subgoals)) if config.narrates else episode
     episode = episode if config.tells_ends else episode.without_ends()

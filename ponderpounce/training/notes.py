@@ -32,7 +32,7 @@ from ponderpounce.tasks.difficulty import DIFFICULTIES
 from ponderpounce.tasks.front_view import front_pixels
 from ponderpounce.tasks.paces import PASS_STEPS, PRESS_STEPS
 from ponderpounce.training.countdown import rhythm, waits
-from ponderpounce.training.deeds import Told, passing_side, told_deeds
+from ponderpounce.training.deeds import Told, course, told_deeds
 from ponderpounce.training.lapses import Words, has_moved
 from ponderpounce.training.places import PARTS, PLACE, TEXT_PX, WAY, apart_px
 
@@ -156,10 +156,10 @@ def demo_notes(
     """What is noted at every instant of a demonstration, places as texts tell them; ``""`` for nothing.
 
     Where things move by the clock alone, where they are. Else every deed that a narration tells (`told_deeds`), with
-    its number, when the tool is nearest to its place; of a way around things also the side on which it passes one, when
-    the tool is there: that is seen then, and told at the end of the stretch. And where a thing that will be asked for
-    may change places afterwards, its place from then on: "second <y, x>". Which of the deeds was asked for is then one
-    thing to find out, and where it was done another, to be looked up by that word.
+    its number, when the tool is nearest to its place; of a way around things also where it leads and on which side it
+    passes one, when the tool is there: that is seen then, and told at the end of the stretch. And where a thing that
+    will be asked for may change places afterwards, its place from then on: "second <y, x>". Which of the deeds was
+    asked for is then one thing to find out, and where it was done another, to be looked up by that word.
 
     Args:
         texts: what is done in each of D instants, grounded; its places followed (`pp-collect --texts follow`).
@@ -170,18 +170,19 @@ def demo_notes(
     if any(moving) or len(tools) != len(texts):
         return list(moving)
     found, done, before, told = [""] * len(texts), -1, "", told_deeds(texts)
-    for deed in told:
+    for number, deed in enumerate(told, 1):
         # the end of a stretch is where the next one begins
         last = min(deed.last + int(WAY.search(texts[deed.last]) is not None), len(texts) - 1)
         instants = range(min(max(deed.first, done + 1), last), last + 1)
         done = min(instants, key=lambda instant: apart_px(tools[instant], deed.place) or 0.0)  # 0: the text tells none
-        side = passing_side(texts[deed.last])
+        side = course(texts[deed.last])
         whence, before = before or tools[instants.start], deed.place
         if side and _half_way(instants, tools, whence, deed.place) == len(texts) - 1:
-            found[-1] = side  # as far as it is seen to go: nobody knows in the middle of a stretch that this is all
+            # as far as it is seen to go: nobody knows in the middle of a stretch that this is all
+            found[-1] = f"{number} {side}"
             continue
         if side and (way := range(instants.start, done)):
-            found[_half_way(way, tools, tools[way.start], deed.place)] = side
+            found[_half_way(way, tools, tools[way.start], deed.place)] = f"{number} {side}"
         found[done] = f"{found[done]}, {deed.words}" if found[done] else deed.words
         if deed.words == deed.place:  # the one that was picked up: it stays in view, and may move
             found[done : deed.last + 1] = [deed.place] * (deed.last + 1 - done)

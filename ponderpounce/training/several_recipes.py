@@ -285,15 +285,15 @@ def small_at_length() -> Curriculum:
 
 
 def small_by_sight() -> Curriculum:
-    """The PONDER of `small_at_length` learns to tell plans in the words in which it has seen or counts things.
+    """The PONDER of `small_at_length`, its eye wider, learns to tell plans in words that it has seen or counted before.
 
-    docs/training.md, "In words that can be copied".
+    A trial: docs/training.md, "By sight".
     """
     (settling,) = _settling_on(small_at_length(), "small_by_sight", 22, (100, 720), batch_episodes=8).stages
     gently = replace(settling.train.optim, learning_rate=3e-4, warmup_steps=30)
     settling = replace(
         settling,
-        example=replace(settling.example, names_plans=True, seen_sides=True),
+        example=replace(settling.example, names_plans=True, ways_by_sight=True),
         train=replace(settling.train, optim=gently),
     )
     return Curriculum(name="small_by_sight", stages=(settling,))

@@ -16,7 +16,7 @@ from ponderpounce.training.cut_short import Cut
 from ponderpounce.training.lapses import has_moved
 from ponderpounce.training.notes import without_end
 from ponderpounce.training.places import PLACE, WAY
-from ponderpounce.training.ways import with_seen_sides
+from ponderpounce.training.ways import by_sight
 
 Frame = NDArray[np.uint8]  # (height, width, 3) RGB
 _SAME_PX = 6.0  # of a 256 px picture: less than any two things lie apart
@@ -177,9 +177,17 @@ class TrainingEpisode:
             planned += [text + plan for text in self.subgoals[begin:end]]
         return replace(self, planned=planned)
 
-    def with_seen_sides(self) -> TrainingEpisode:
-        """The same, its words on ways around things telling on which side these are seen to be passed (`ways`)."""
-        return replace(self, planned=[*map(with_seen_sides, self.words)], said=[*map(with_seen_sides, self.said)])
+    def with_ways_by_sight(self) -> TrainingEpisode:
+        """The same, its words on ways telling them as they were seen (`ways`), what was said as if it was of then."""
+        begins_T = self.is_transition_T | (np.arange(self.num_ticks) == 0)
+        numbers = np.cumsum(
+            [begin and WAY.search(text) is not None for begin, text in zip(begins_T, self.subgoals, strict=True)]
+        )
+        planned, said = (
+            [by_sight(text, number) for text, number in zip(texts, numbers.tolist(), strict=False)]
+            for texts in (self.words, self.said)
+        )
+        return replace(self, planned=planned, said=said)
 
     def next_places(self) -> list[str]:
         """Per tick, the place of the subgoal after the one in force, ``<y, x>``; empty where it has none."""

@@ -4,13 +4,16 @@ The simulator says "left" and "clockwise", and of what comes later only "clockwi
 half-way, or "forward", depending on where the stretch leads. A small network's notes of a demonstration were right, and
 the sides of the plan that it made of them were not. So the plan keeps the words of the notes, to be copied, and which
 way round is told of the stretch that is gone and the next one alone, behind the two words that it follows from.
+
+Stretches are told by their numbers, in notes and in plans: a way comes back to where it was, and by its place alone a
+stretch was taken for another one that begins there.
 """
 
 from __future__ import annotations
 
 import re
 from functools import lru_cache
-from itertools import pairwise
+from itertools import count, pairwise
 
 from ponderpounce.training.places import PLACE
 
@@ -19,6 +22,8 @@ _AROUND = re.compile(
 )
 _STRETCH = re.compile(rf"((?:counter)?clockwise) (?:to )?{PLACE.pattern}")
 _LEADS = re.compile(r"(left|right) target by circling")
+_STRAIGHT = re.compile(rf"move (\S+ to {PLACE.pattern}.*)")
+_LATER = re.compile(rf", (then )?((?:\S+ )?{PLACE.pattern})")
 
 
 def seen_side(leads: str, turn: str) -> str:
@@ -28,11 +33,17 @@ def seen_side(leads: str, turn: str) -> str:
 
 
 @lru_cache(maxsize=1 << 12)
-def with_seen_sides(text: str) -> str:
-    """The text of a way around things, or its plan, told with the sides on which it is seen to pass; others unchanged.
+def by_sight(text: str, number: int) -> str:
+    """The text of a way, or its plan, that begins with the stretch of this number; other texts unchanged.
 
-    Where a stretch leads follows from its end and that of the one before: the robot's left is the picture's right.
+    Every stretch is told with its number, and of a way around things with where it leads and the side on which it is
+    seen to pass. Where it leads follows from its end and that of the one before, for the robot's left is the picture's
+    right.
     """
+    straight = _STRAIGHT.fullmatch(text)
+    if straight is not None:
+        later = count(number + 1)
+        return f"move {number} " + _LATER.sub(lambda each: f", {each[1] or ''}{next(later)} {each[2]}", straight[1])
     around = _AROUND.fullmatch(text)
     if around is None:
         return text
@@ -41,6 +52,6 @@ def with_seen_sides(text: str) -> str:
     leads = [first, *("left" if after[2] > before[2] else "right" for before, after in pairwise(stretches))]
     told = []
     for nth, (lead, (turn, y, x)) in enumerate(zip(leads, stretches, strict=True)):
-        words = seen_side(lead, turn) if nth > 1 else f"{seen_side(lead, turn)} {turn} to"
-        told.append(f"{f'then {lead} ' if nth == 1 else ''}{words} <{y}, {x}>")
+        words = f"{number + nth} {lead} {seen_side(lead, turn)}" + (f" {turn} to" if nth < 2 else "")
+        told.append(f"{'then ' if nth == 1 else ''}{words} <{y}, {x}>")
     return around["until"] + ", ".join(told)

@@ -85,8 +85,8 @@ def test_of_a_way_around_things_the_side_is_told() -> None:
         *[around("left", "clockwise", 96, 203, ", then clockwise to <89, 167>")] * 2,
         *[around("right", "clockwise", 89, 167)] * 3,
     ]
-    assert narration(texts) == "backward <89, 167>, backward <96, 203>, forward <89, 167>"
-    assert narration(texts[2:4]) == "backward <89, 167>, backward <96, 203>"
+    assert narration(texts) == "1 left backward <89, 167>, 2 left backward <96, 203>, 3 right forward <89, 167>"
+    assert narration(texts[2:4]) == "1 left backward <89, 167>, 2 left backward <96, 203>"
 
 
 @pytest.mark.parametrize("towards", ["left", "right"])

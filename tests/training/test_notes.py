@@ -197,7 +197,7 @@ def test_deeds_are_noted_when_the_tool_is_there_and_a_target_from_then_on() -> N
 def test_stretches_of_a_way_are_noted_where_they_end() -> None:
     texts = [*["move backward to <66, 172>, then <52, 148>"] * 3, *["move backward-right to <52, 148>"] * 2]
     tools = ["<95, 172>", "<85, 172>", "<76, 172>", "<64, 170>", "<56, 158>"]
-    expected = ["", "", "", "backward <66, 172>", "backward-right <52, 148>"]
+    expected = ["", "", "", "1 backward <66, 172>", "2 backward-right <52, 148>"]
     assert demo_notes(texts, tools, [""] * 5) == expected, (
         "the first ends between two looks, and is nearer to the second"
     )
@@ -213,12 +213,12 @@ def test_the_side_on_which_a_way_passes_is_noted_when_it_is_seen() -> None:
     texts = [left.format("clockwise", there)] * 4
     texts += ["move to the nearest right target by circling around the stick clockwise to <89, 130>"] * 2
     tools = ["<85, 132>", "<58, 140>", "<56, 151>", "<80, 165>", "<103, 148>", "<88, 133>"]
-    expected = ["", "", "backward", "backward <89, 167>", "forward", f"forward {back}"]
+    expected = ["", "", "1 left backward", "1 left backward <89, 167>", "2 right forward", f"2 right forward {back}"]
     assert demo_notes(texts, tools, [""] * 6) == expected
     at_once = demo_notes(texts[3:], tools[3:], [""] * 3)
-    assert at_once == ["backward <89, 167>", *expected[4:]], "no instant is left for the side alone"
+    assert at_once == ["1 left backward <89, 167>", *expected[4:]], "no instant is left for the side alone"
     straight = ["move left to <89, 167>"] * 3
-    assert demo_notes(straight, tools[1:4], [""] * 3) == ["", "", "left <89, 167>"], "it goes around nothing"
+    assert demo_notes(straight, tools[1:4], [""] * 3) == ["", "", "1 left <89, 167>"], "it goes around nothing"
 
 
 def test_the_end_of_a_stretch_that_is_shown_to_its_middle_alone_is_not_noted() -> None:
@@ -228,16 +228,18 @@ def test_the_end_of_a_stretch_that_is_shown_to_its_middle_alone_is_not_noted() -
     texts = [left.format("clockwise", there)] * 4
     texts += ["move to the nearest right target by circling around the stick clockwise to <89, 130>"] * 2
     tools = ["<85, 132>", "<58, 140>", "<56, 151>", "<80, 165>", "<100, 160>", "<103, 152>"]
-    begun = ["", "", "backward", "backward <89, 167>"]
-    assert demo_notes(texts, tools, [""] * 6) == [*begun, "", "forward"]
+    begun = ["", "", "1 left backward", "1 left backward <89, 167>"]
+    assert demo_notes(texts, tools, [""] * 6) == [*begun, "", "2 right forward"]
     tools[4:] = "<103, 150>", "<98, 138>"
-    assert demo_notes(texts, tools, [""] * 6) == [*begun, "forward", f"forward {back}"], "it was past its middle"
+    assert demo_notes(texts, tools, [""] * 6) == [*begun, "2 right forward", f"2 right forward {back}"], (
+        "it was past its middle"
+    )
 
 
 def test_a_stretch_that_ends_where_it_began_is_not_over_at_once() -> None:
     texts = [*["move left to <50, 50>, then <52, 52>"] * 2, *["move right to <52, 52>"] * 2]
     tools = ["<90, 90>", "<70, 70>", "<51, 51>", "<60, 60>"]
-    assert demo_notes(texts, tools, [""] * 4) == ["", "", "left <50, 50>", "right <52, 52>"]
+    assert demo_notes(texts, tools, [""] * 4) == ["", "", "1 left <50, 50>", "2 right <52, 52>"]
 
 
 def test_where_nothing_was_put_or_picked_up_to_be_asked_for_nothing_is_noted() -> None:
