@@ -19,15 +19,10 @@ further=(--first-episode 2000 --recovery-share 0.2 --shove-share 0.3 --invocatio
 collect "$next/route" --tasks RouteStick --episodes 140 "${further[@]}"
 collect "$next/filled" --tasks BinFill --episodes 40 "${further[@]}"
 
-pair=$long/pair
-watch() {  # the pair plays EPISODES from SEED on, and what it played becomes a dataset
-    local episodes=$1 seed=$2 into=$3; shift 3
-    "$bin/pp-eval" --tasks "$@" --episodes "$episodes" --runs 1 --seed "$seed" --record --record-hz 1 --workers 2 \
-        --out "$into-played" --ponder-checkpoint "$pair/ponder" --pounce-checkpoint "$pair/pounce"
-    retell "$into-played" "$into"
-}
-watch 14 794000 "$next/ways" RouteStick PatternLock
-watch 12 794100 "$next/rest" VideoRepick SwingXtimes MoveCube VideoPlaceOrder BinFill PickXtimes VideoUnmaskSwap ButtonUnmaskSwap
+play "$long/pair" 14 794000 "$next/ways-played" RouteStick PatternLock
+play "$long/pair" 12 794100 "$next/rest-played" VideoRepick SwingXtimes MoveCube VideoPlaceOrder BinFill PickXtimes \
+    VideoUnmaskSwap ButtonUnmaskSwap
+for played in ways rest; do retell "$next/$played-played" "$next/$played"; done
 
 [ -d "$next/wide/ponder" ] || "$bin/pp-enlarge" --ponder "$long/run/settling/ponder" --pounce "$long/larger/pounce" \
     --out "$next/wide" --box 8 32 168 224

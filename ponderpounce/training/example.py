@@ -286,9 +286,9 @@ def make_example(
     cut = _drawn_cut(episode, rng) if config.cuts_short and rng.random() < config.cuts_short else None
     episode = episode if cut is None else episode.cut_short(cut)
     episode = episode.with_plans(names=config.names_plans) if config.has_plans else episode
-    episode = episode.with_ways_by_sight() if config.ways_by_sight else episode
     episode = episode if config.has_reasoning else replace(episode, reasoning="")
     episode = replace(episode, reasoning=narration(episode.demo_subgoals)) if config.narrates else episode
+    episode = episode.with_ways_by_sight() if config.ways_by_sight else episode.without_numbers()
     episode = episode if config.tells_ends else episode.without_ends()
     is_even = config.even_clocks and rng.random() < config.even_clocks
     clocks = config.clocks.without_spread() if is_even else config.clocks

@@ -289,13 +289,10 @@ def small_by_sight() -> Curriculum:
 
     A trial: docs/training.md, "By sight".
     """
-    (settling,) = _settling_on(small_at_length(), "small_by_sight", 22, (100, 720), batch_episodes=8).stages
+    told = {"names_plans": True, "ways_by_sight": True}
+    (settling,) = _settling_on(small_at_length(), "small_by_sight", 22, (100, 720), batch_episodes=8, **told).stages
     gently = replace(settling.train.optim, learning_rate=3e-4, warmup_steps=30)
-    settling = replace(
-        settling,
-        example=replace(settling.example, names_plans=True, ways_by_sight=True),
-        train=replace(settling.train, optim=gently),
-    )
+    settling = replace(settling, train=replace(settling.train, optim=gently))
     return Curriculum(name="small_by_sight", stages=(settling,))
 
 

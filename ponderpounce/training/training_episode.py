@@ -16,7 +16,7 @@ from ponderpounce.training.cut_short import Cut
 from ponderpounce.training.lapses import has_moved
 from ponderpounce.training.notes import without_end
 from ponderpounce.training.places import PLACE, WAY
-from ponderpounce.training.ways import by_sight
+from ponderpounce.training.ways import by_sight, without_numbers
 
 Frame = NDArray[np.uint8]  # (height, width, 3) RGB
 _SAME_PX = 6.0  # of a 256 px picture: less than any two things lie apart
@@ -188,6 +188,11 @@ class TrainingEpisode:
             for texts in (self.words, self.said)
         )
         return replace(self, planned=planned, said=said)
+
+    def without_numbers(self) -> TrainingEpisode:
+        """The same, its notes and narration telling stretches of ways by their sides alone (`ways.without_numbers`)."""
+        notes = [*map(without_numbers, self.demo_notes)]
+        return replace(self, demo_notes=notes, reasoning=without_numbers(self.reasoning))
 
     def next_places(self) -> list[str]:
         """Per tick, the place of the subgoal after the one in force, ``<y, x>``; empty where it has none."""

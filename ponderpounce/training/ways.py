@@ -6,7 +6,8 @@ the sides of the plan that it made of them were not. So the plan keeps the words
 way round is told of the stretch that is gone and the next one alone, behind the two words that it follows from.
 
 Stretches are told by their numbers, in notes and in plans: a way comes back to where it was, and by its place alone a
-stretch was taken for another one that begins there.
+stretch was taken for another one that begins there. Whether that helps has not been shown (docs/training.md, "By
+sight"), so a recipe has to ask for it.
 """
 
 from __future__ import annotations
@@ -18,12 +19,12 @@ from itertools import count, pairwise
 from ponderpounce.training.places import PLACE
 
 _AROUND = re.compile(
-    r"(?P<until>.*\b(?:left|right) target by circling around the stick )(?P<way>(?:counter)?clockwise to <.*)"
+    r"(?P<until>.*\b(?P<lead>left|right) target by circling around the stick )(?P<way>(?:counter)?clockwise to <.*)"
 )
 _STRETCH = re.compile(rf"((?:counter)?clockwise) (?:to )?{PLACE.pattern}")
-_LEADS = re.compile(r"(left|right) target by circling")
 _STRAIGHT = re.compile(rf"move (\S+ to {PLACE.pattern}.*)")
 _LATER = re.compile(rf", (then )?((?:\S+ )?{PLACE.pattern})")
+_NUMBER = re.compile(r"(?<!\w)\d+ (?:(?:left|right) )?(?=(?:back|for)ward|left|right)")
 
 
 def seen_side(leads: str, turn: str) -> str:
@@ -48,10 +49,14 @@ def by_sight(text: str, number: int) -> str:
     if around is None:
         return text
     stretches = [(each[1], int(each[2]), int(each[3])) for each in _STRETCH.finditer(around["way"])]
-    (first,) = _LEADS.findall(around["until"])
-    leads = [first, *("left" if after[2] > before[2] else "right" for before, after in pairwise(stretches))]
+    leads = [around["lead"], *("left" if after[2] > before[2] else "right" for before, after in pairwise(stretches))]
     told = []
     for nth, (lead, (turn, y, x)) in enumerate(zip(leads, stretches, strict=True)):
         words = f"{number + nth} {lead} {seen_side(lead, turn)}" + (f" {turn} to" if nth < 2 else "")
         told.append(f"{'then ' if nth == 1 else ''}{words} <{y}, {x}>")
     return around["until"] + ", ".join(told)
+
+
+def without_numbers(told: str) -> str:
+    """Notes or a narration of a way without its stretches' numbers, and without where those around things lead."""
+    return _NUMBER.sub("", told)

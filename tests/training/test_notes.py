@@ -207,11 +207,18 @@ def test_stretches_of_a_way_are_noted_where_they_end() -> None:
     assert both == ["", f"{expected[3]}, {expected[4]}"], "what fell between the same two looks is told at once"
 
 
+AROUND_AND_BACK = [
+    f"move to the nearest {way} to {ends}"
+    for way, ends, instants in (
+        ("left target by circling around the stick clockwise", "<89, 167>, then clockwise to <89, 130>", 4),
+        ("right target by circling around the stick clockwise", "<89, 130>", 2),
+    )
+    for _ in range(instants)
+]
+
+
 def test_the_side_on_which_a_way_passes_is_noted_when_it_is_seen() -> None:
-    left = "move to the nearest left target by circling around the stick {} to {}"
-    there, back = "<89, 167>, then clockwise to <89, 130>", "<89, 130>"
-    texts = [left.format("clockwise", there)] * 4
-    texts += ["move to the nearest right target by circling around the stick clockwise to <89, 130>"] * 2
+    texts, back = AROUND_AND_BACK, "<89, 130>"
     tools = ["<85, 132>", "<58, 140>", "<56, 151>", "<80, 165>", "<103, 148>", "<88, 133>"]
     expected = ["", "", "1 left backward", "1 left backward <89, 167>", "2 right forward", f"2 right forward {back}"]
     assert demo_notes(texts, tools, [""] * 6) == expected
@@ -223,10 +230,7 @@ def test_the_side_on_which_a_way_passes_is_noted_when_it_is_seen() -> None:
 
 def test_the_end_of_a_stretch_that_is_shown_to_its_middle_alone_is_not_noted() -> None:
     """Until then a stretch that goes on looks the same, and of that the side alone is noted."""
-    left = "move to the nearest left target by circling around the stick {} to {}"
-    there, back = "<89, 167>, then clockwise to <89, 130>", "<89, 130>"
-    texts = [left.format("clockwise", there)] * 4
-    texts += ["move to the nearest right target by circling around the stick clockwise to <89, 130>"] * 2
+    texts, back = AROUND_AND_BACK, "<89, 130>"
     tools = ["<85, 132>", "<58, 140>", "<56, 151>", "<80, 165>", "<100, 160>", "<103, 152>"]
     begun = ["", "", "1 left backward", "1 left backward <89, 167>"]
     assert demo_notes(texts, tools, [""] * 6) == [*begun, "", "2 right forward"]

@@ -6,14 +6,17 @@ import re
 from dataclasses import replace
 from itertools import pairwise
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from clock.sampling import EVALUATION
 from ponderpounce.training.deeds import narration, passing_side
+from ponderpounce.training.example import ExampleConfig, make_example
 from ponderpounce.training.places import PLACE
-from ponderpounce.training.ways import by_sight, seen_side
-from tests.training.test_example import episode
+from ponderpounce.training.ways import by_sight, seen_side, without_numbers
+from tests.training.test_example import FORM, episode
 
 AROUND = "move to the nearest {} target by circling around the stick {}"
 TURNS = ("clockwise", "counterclockwise")
@@ -108,3 +111,31 @@ def test_plans_of_an_episode_tell_each_stretch_as_its_narration_does() -> None:
         assert found == re.findall(r"\d \w+ \w+ <\d+, \d+>", ", ".join(expected))[n:]
     assert stretch.findall(told.said[3])[0][0].startswith("2 "), "what was said is told as if it was of then"
     assert told.said[-1] == "press the button"
+
+
+@pytest.mark.parametrize(
+    ("told", "plain"),
+    [
+        ("2 right forward <89, 16>, 3 left backward <9, 2>", "forward <89, 16>, backward <9, 2>"),
+        ("2 right forward", "forward"),
+        ("1 forward-left <8, 9>, 2 left <8, 1>", "forward-left <8, 9>, left <8, 1>"),
+        ("second <20, 30>", "second <20, 30>"),
+        ("<20, 30> to <9, 8>", "<20, 30> to <9, 8>"),
+        ("press it, <110, 77>, 80, 137", "press it, <110, 77>, 80, 137"),
+    ],
+)
+def test_without_numbers_sides_and_places_are_left(told: str, plain: str) -> None:
+    assert without_numbers(told) == plain
+
+
+@pytest.mark.parametrize("asked", [False, True])
+def test_ways_have_numbers_where_a_recipe_asks_for_them_and_nowhere_else(asked: bool) -> None:
+    text = AROUND.format("left", "clockwise to <9, 60>")
+    shown = replace(
+        episode(6, num_demo=2), subgoals=[text] * 6, demo_subgoals=[text] * 2, demo_notes=["1 left backward", ""]
+    )
+    config = ExampleConfig(clocks=EVALUATION, narrates=True, ways_by_sight=asked)
+    told = make_example(shown, FORM, config, np.random.default_rng(0)).episode
+    seen = "1 left backward" if asked else "backward"
+    assert [*told.demo_notes, told.reasoning] == [seen, "", f"{seen} <9, 60>"]
+    assert told.words[0] == (by_sight(text, 1) if asked else text)
