@@ -101,6 +101,10 @@ class ContextFormat:
     """Tokens of one image as (rows, columns): (8, 8) for 256 px, patch 16, merge 2."""
     token_px: int = 32
     """Side in pixels of what one image token covers: patch times merge."""
+    fovea: tuple[int, int, int, int] | None = None
+    """First row, first column, rows and columns of ``image_grid`` whose tokens come first, at the positions of an image
+    of that size; the others come behind them, around these positions: what an eye that was widened (`wide_eyes`) saw
+    before stands where it stood. None: row by row, as Qwen3.5 reads an image."""
     eyes: Eyes = None
     """What is seen of an instant's views: how many images it gives, and with ``image_px`` which pixels."""
     proprioception: Proprioception | None = None
@@ -127,6 +131,14 @@ class ContextFormat:
             )
         if self.proprioception is not None:
             check_rows(self.proprioception, self.vocabulary.num_tokens, self.carrier_ids)
+        if self.fovea is not None:
+            row, column, rows, columns = self.fovea
+            if not (
+                0 <= row < row + rows <= self.image_grid[0] and 0 <= column < column + columns <= self.image_grid[1]
+            ):
+                raise ValueError(
+                    f"fovea {self.fovea} (row, column, rows, columns) must lie within the image grid {self.image_grid}"
+                )
 
     @property
     def carrier_ids(self) -> tuple[int, ...]:
@@ -136,6 +148,17 @@ class ContextFormat:
     def num_image_tokens(self) -> int:
         rows, columns = self.image_grid
         return rows * columns
+
+    @property
+    def token_order(self) -> npt.NDArray[np.intp]:
+        """(num_image_tokens,): of the tokens of an image as they stand in a row, each one's number row by row."""
+        rows, columns = self.image_grid
+        if self.fovea is None:
+            return np.arange(rows * columns)
+        first_row, first_column, fovea_rows, fovea_columns = self.fovea
+        is_fovea = np.zeros(self.image_grid, np.bool_)
+        is_fovea[first_row : first_row + fovea_rows, first_column : first_column + fovea_columns] = True
+        return np.argsort(~is_fovea.ravel(), kind="stable")
 
     @property
     def image_px(self) -> tuple[int, int]:
@@ -257,14 +280,15 @@ class ContextFormat:
         """Positions of tokens appended to ``first_index`` others, and the mRoPE position after them.
 
         Returns (4, T) int64, rows [cache index; t; h; w], as transformers' Qwen3.5 text model takes them. An
-        image occupies ``image_grid`` in h and w at one instant t, and moves the position on by its longer
-        side, not by its number of tokens. Left to itself the model would continue an appended image with text
-        positions and a ``rope_deltas`` shared by all contexts of the process. Source: Qwen3.5
+        image occupies ``image_grid`` in h and w at one instant t, and moves the position on by its longer side, or
+        that of its ``fovea``, not by its number of tokens. Left to itself the model would continue an appended image
+        with text positions and a ``rope_deltas`` shared by all contexts of the process. Source: Qwen3.5
         ``get_rope_index``.
 
         Raises ValueError if an image does not have ``image_grid`` tokens.
         """
         rows, columns = self.image_grid
+        first_row, first_column, *sides = self.fovea or (0, 0, rows, columns)
         is_image = np.asarray(ids, np.int64) == self.vocabulary.image_pad
         edges = np.flatnonzero(np.diff(is_image, prepend=False, append=False))
         begins, ends = edges[::2], edges[1::2]
@@ -272,14 +296,14 @@ class ContextFormat:
             begin, end = int(begins[wrong[0]]), int(ends[wrong[0]])
             raise ValueError(f"image at token {first_index + begin} has {end - begin} tokens, not {rows}x{columns}")
         moves = np.where(is_image, 0, 1)
-        moves[ends - 1] = max(rows, columns)
+        moves[ends - 1] = max(sides)
         after = first_position + np.cumsum(moves)
         positions_4T = np.empty((4, len(ids)), dtype=np.int64)
         positions_4T[0] = np.arange(first_index, first_index + len(ids))
         positions_4T[1:] = after - moves
-        offset_h, offset_w = np.divmod(np.arange(rows * columns), columns)
-        positions_4T[2, is_image] += np.tile(offset_h, len(begins))
-        positions_4T[3, is_image] += np.tile(offset_w, len(begins))
+        offset_h, offset_w = np.divmod(self.token_order, columns)
+        positions_4T[2, is_image] += np.tile(offset_h - first_row, len(begins))
+        positions_4T[3, is_image] += np.tile(offset_w - first_column, len(begins))
         return positions_4T, int(after[-1]) if len(ids) else first_position
 
     def _after_a_look(self, segment: Segment) -> Segment:

@@ -133,7 +133,7 @@ class Ponder(nn.Module):
         return weight.dtype
 
     def image_features(self, frames_NHW3: Tensor) -> Tensor:
-        """Vision tokens (N * tokens per image, H) of N frames (N, height, width, 3) uint8."""
+        """Vision tokens (N * tokens per image, H) of N frames (N, height, width, 3) uint8, in their ``token_order``."""
         vision = self.qwen.config.vision_config
         _, height, width, _ = frames_NHW3.shape
         patches = patchify(
@@ -143,7 +143,10 @@ class Ponder(nn.Module):
             temporal=vision.temporal_patch_size,
         )
         grid = (height // vision.patch_size, width // vision.patch_size)
-        return image_tokens(self.qwen.model.visual, patches.to(self.dtype), grid)
+        tokens = image_tokens(self.qwen.model.visual, patches.to(self.dtype), grid)
+        if self.format.fovea is None:
+            return tokens
+        return tokens.unflatten(0, (len(frames_NHW3), -1))[:, self.format.token_order].flatten(0, 1)
 
     def embed(self, ids_T: Sequence[int] | npt.NDArray[np.integer], frames_NHW3: Tensor | None = None) -> Tensor:
         """Input embeddings (T, H): rows of the table, with the frames' vision tokens at the image positions.

@@ -48,14 +48,16 @@ class CheckpointError(ValueError):
 class StoredPonder:
     """Contents of ponder.json. The defaults are for a public Qwen3.5, which has none; a file has every field."""
 
-    format: Literal["ponderpounce.ponder/7"] = "ponderpounce.ponder/7"
-    """Each is the one before and a field more: /6 has no ``counsel``, /5 no ``second_look``, /4 no ``takes_notes``, /3
-    no ``speaks``, /2 no ``proprioception``, /1 no ``eyes``. Such a PONDER speaks and has none of the others."""
+    format: Literal["ponderpounce.ponder/8"] = "ponderpounce.ponder/8"
+    """Each is the one before and a field more: /7 has no ``fovea``, /6 no ``counsel``, /5 no ``second_look``, /4 no
+    ``takes_notes``, /3 no ``speaks``, /2 no ``proprioception``, /1 no ``eyes``. Such a PONDER speaks and has none of
+    the others."""
     num_carriers: int = 1
     first_carrier_id: int | None = None
     """None: the first row after the tokenizer's last id."""
     image_px: tuple[int, int] = (256, 256)
     eyes: Eyes = None
+    fovea: tuple[int, int, int, int] | None = None
     proprioception: Proprioception | None = None
     speaks: bool = True
     takes_notes: bool = False
@@ -90,6 +92,7 @@ def load_ponder(directory: Path, *, device: torch.device | str = "cpu", dtype: t
         first_carrier_id=vocabulary.num_tokens if first_carrier_id is None else first_carrier_id,
         image_grid=image_grid(qwen_config, stored.image_px),
         token_px=token_px(qwen_config),
+        fovea=stored.fovea,
         eyes=stored.eyes,
         proprioception=stored.proprioception,
         speaks=stored.speaks,
@@ -128,6 +131,7 @@ def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_S
         first_carrier_id=ponder.format.first_carrier_id,
         image_px=ponder.image_px,
         eyes=ponder.format.eyes,
+        fovea=ponder.format.fovea,
         proprioception=ponder.format.proprioception,
         speaks=ponder.format.speaks,
         takes_notes=ponder.format.takes_notes,
@@ -229,6 +233,8 @@ def _read_stored(directory: Path) -> StoredPonder:
         values |= {"format": "ponderpounce.ponder/6", "second_look": None}
     if isinstance(values, dict) and values.get("format") == "ponderpounce.ponder/6":
         values |= {"format": "ponderpounce.ponder/7", "counsel": None}
+    if isinstance(values, dict) and values.get("format") == "ponderpounce.ponder/7":
+        values |= {"format": "ponderpounce.ponder/8", "fovea": None}
     return from_json(StoredPonder, values, str(path))
 
 

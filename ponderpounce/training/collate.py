@@ -21,7 +21,8 @@ from ponderpounce.models.pounce_family import AnyPounceConfig
 from ponderpounce.models.pounce_groot import GrootInputs, GrootPounceConfig
 from ponderpounce.models.pounce_reading import groot_inputs, pi05_inputs
 from ponderpounce.models.prompt import Tokenizer
-from ponderpounce.training.example import Example, chunk_ticks
+from ponderpounce.training.chunks import chunk_ticks
+from ponderpounce.training.example import Example
 from ponderpounce.training.joint import NO_QUERY, PonderBatch, PounceBatch
 from ponderpounce.training.nudge import apply_nudges
 from ponderpounce.training.training_episode import Frame

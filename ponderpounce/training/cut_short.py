@@ -80,6 +80,12 @@ def cuts(instruction: str, subgoals: Sequence[str], is_transition_T: NDArray[np.
     return made
 
 
+def drawn_cut(made: Sequence[Cut], imitated_from: int, rng: np.random.Generator) -> Cut | None:
+    """One way to end sooner, of those that leave something to imitate; None where there is none."""
+    sooner = [each for each in made if each.end > imitated_from]
+    return sooner[rng.integers(len(sooner))] if sooner else None
+
+
 def _asking_for(rounds: Sequence[tuple[str, str]], instruction: str) -> str:
     """The instruction, as its task words it, for these rounds alone."""
     if (whole := _BIN.search(instruction)) is not None:

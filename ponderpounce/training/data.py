@@ -22,7 +22,7 @@ from ponderpounce.models.normalisation import Quantiles, RobotStatistics
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.models.prompt import with_subgoal
 from ponderpounce.tasks.front_view import front_pixels
-from ponderpounce.training.example import chunk_ticks
+from ponderpounce.training.chunks import chunk_ticks
 from ponderpounce.training.notes import demo_notes, ends_of_moves, moving_places
 from ponderpounce.training.own_words import as_recorded
 from ponderpounce.training.places import TEXT_PX, WAY

@@ -13,7 +13,6 @@ from typing import Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from clock.sampling import Clocks, SampledInvocation, SampledSchedule, sample_schedule
@@ -22,6 +21,7 @@ from ponderpounce.models.eyes import see
 from ponderpounce.models.normalisation import Floats
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.training.augment import AS_IT_IS, NOT_AUGMENTED, Augmentation, View, draw_view
+from ponderpounce.training.chunks import chunk_ticks
 from ponderpounce.training.countdown import (
     counted,
     misjudged,
@@ -32,7 +32,7 @@ from ponderpounce.training.countdown import (
     waits,
     waits_unplaced,
 )
-from ponderpounce.training.cut_short import Cut, cuts
+from ponderpounce.training.cut_short import cuts, drawn_cut
 from ponderpounce.training.deeds import narration
 from ponderpounce.training.events import EVENT_ROWS, draw_near, event_ticks
 from ponderpounce.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses, has_moved, without_lapses
@@ -43,14 +43,16 @@ from ponderpounce.training.place_lessons import PlaceLessons, place_lessons
 from ponderpounce.training.places import misplaced
 from ponderpounce.training.stand_in import stand_in
 from ponderpounce.training.training_episode import Frame, TrainingEpisode
+from ponderpounce.training.ways import has_sides
 
 _SILENCE = repeat(Words())
 _BEGINNING, _RECALLING = 8, 2  # queries
 _CORRECTED = 0.3  # of own words, at every query
 _SHARES = (
     "text_dropout", "slips", "tells_onward", "cuts_short", "begins", "recalls", "own_words", "misjudges", "even_clocks",
-    "learned_repeats",
+    "other_sides", "learned_repeats",
 )  # fmt: skip
+_MOST_STRETCHES = 50  # more than any way has
 _MOVED_PX = 3.0  # of a 256 px picture: farther than PONDER errs where nothing moves
 
 
@@ -99,6 +101,9 @@ class ExampleConfig:
     names_plans: bool = False  # also there
     ways_by_sight: bool = False
     """See `TrainingEpisode.with_ways_by_sight`."""
+    other_sides: float = 0.0
+    """Share of demonstrated ways around things that are told `TrainingEpisode.with_other_sides`. Their rows end with
+    the second query and their notes are not learned, for the pictures show something else."""
     cuts_short: float = 0.0
     """Share of episodes that count, of two rounds and more, that are told to end sooner (`cuts`)."""
     slips: float = 0.0
@@ -283,7 +288,15 @@ def make_example(
     if config.waits_longer:
         texts, is_transition_T = waiting_longer(episode.subgoals, episode.is_transition_T, config.waits_longer)
         episode = replace(episode, subgoals=texts, is_transition_T=is_transition_T)
-    cut = _drawn_cut(episode, rng) if config.cuts_short and rng.random() < config.cuts_short else None
+    cut = None
+    if config.cuts_short and rng.random() < config.cuts_short:
+        cut = drawn_cut(
+            cuts(episode.instruction, episode.subgoals, episode.is_transition_T), episode.imitated_from, rng
+        )
+    may_differ = bool(config.other_sides) and has_sides(episode.demo_subgoals)
+    if is_otherwise := may_differ and rng.random() < config.other_sides:
+        others = np.flatnonzero(rng.integers(2, size=_MOST_STRETCHES)) + 1
+        episode = episode.with_other_sides(set(others.tolist()))
     episode = episode if cut is None else episode.cut_short(cut)
     episode = episode.with_plans(names=config.names_plans) if config.has_plans else episode
     episode = episode if config.has_reasoning else replace(episode, reasoning="")
@@ -296,7 +309,7 @@ def make_example(
     schedule = _shortened(schedule, config.max_queries)
     if config.begins and rng.random() < config.begins:
         schedule = _shortened(schedule, _BEGINNING)
-    if config.recalls and episode.demo and rng.random() < config.recalls:
+    if is_otherwise or (config.recalls and episode.demo and rng.random() < config.recalls):
         schedule = _shortened(schedule, _RECALLING)
     if cut is not None:
         schedule = SampledSchedule(
@@ -346,8 +359,8 @@ def make_example(
             if config.misjudges and rng.random() < config.misjudges:
                 wrong_waits_Q = misjudged(ticks, told, left_Q, rng)
             words = counted(words, told, left_Q, wrong_waits_Q)
-    heeded_demo = None
-    if config.learned_repeats < 1 and form.takes_notes and episode.demo_notes:
+    heeded_demo = (False,) * len(episode.demo) if is_otherwise else None
+    if heeded_demo is None and config.learned_repeats < 1 and form.takes_notes and episode.demo_notes:
         seen = [in_sight(note, form.eyes) for note in episode.demo_notes]
         heeded_demo = tuple(heeded(seen, config.learned_repeats, rng))
     is_moved = config.augments == "all" or episode.is_watched
@@ -380,13 +393,6 @@ def make_example(
         nudge=config.nudge,
         nudges_I2=nudges_I2,
     )
-
-
-def _drawn_cut(episode: TrainingEpisode, rng: np.random.Generator) -> Cut | None:
-    """One way to end sooner, of those that leave something to imitate; None where there is none."""
-    there = cuts(episode.instruction, episode.subgoals, episode.is_transition_T)
-    sooner = [each for each in there if each.end > episode.imitated_from]
-    return sooner[rng.integers(len(sooner))] if sooner else None
 
 
 def _shortened(schedule: SampledSchedule, max_queries: int | None) -> SampledSchedule:
@@ -488,13 +494,3 @@ def _before_ponder(episode: TrainingEpisode, form: ContextFormat) -> tuple[Seque
     return (
         (episode.frames, form) if episode.sights is None else (episode.sights, replace(form, eyes=None, counsel=None))
     )
-
-
-def target_rows(episode: TrainingEpisode, tick: int, horizon: int) -> NDArray[np.float32]:
-    """Commands (horizon, 8) from ``tick`` on; after the end the last one stays in force, as on the robot."""
-    return episode.action_T8[chunk_ticks(np.array([tick]), horizon, episode.num_ticks)[0]]
-
-
-def chunk_ticks(first_M: NDArray[np.integer], horizon: int, num_ticks: int) -> NDArray[np.intp]:
-    """Whose commands the rows of chunks play, (M, horizon), for `normalise_chunks`: see `target_rows`."""
-    return np.minimum(first_M[:, None] + np.arange(horizon), num_ticks - 1)

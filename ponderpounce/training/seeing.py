@@ -52,6 +52,8 @@ _EXAMINED_TOGETHER = 200
 _PLACE_WEIGHT, _TOLD_WEIGHT, _NAME_WEIGHT = 16.0, 0.5, 0.3
 _NUM_ASKED = 3 + NUM_PLACE_FEATURES  # of a thing, and of the tool: is it here, and where in two ways
 _NUM_ANSWERS = 2 * _NUM_ASKED  # beside names
+_ALIKE_WEIGHT = 10.0
+_ALIKE_EPISODES, _ALIKE_PICTURES = 400, 8  # of one episode
 _SETTLING_RATE = 1e-2
 _SETTLING_STREAM = 1  # of a step's random numbers
 
@@ -68,6 +70,9 @@ class SeeOptions:
     """Folders that pp-album made."""
     ponder: Path | None = None
     """Open the eyes of this one again, all else as it is; --recipe and --data are then not read."""
+    like: Path | None = None
+    """The one whose eye was widened to that of --ponder: what it saw is to be seen as it was, in pictures of the album
+    and of --data's episodes."""
     out: Path
     """OUT/ponder is what `pp-train --ponder` goes on from."""
     steps: int = 2000
@@ -142,6 +147,8 @@ def see_things(options: SeeOptions) -> None:
     if num_learned < 1:
         folders = ", ".join(map(str, options.album))
         raise ValueError(f"{folders}: {len(album.texts)} pictures; some hundreds at least are needed")
+    before = None if options.like is None else _before(options.like, ponder)
+    films = None if before is None else _films(ponder.format, options.data, options.seed)
     torch.manual_seed(options.seed)
     answering = nn.Linear(ponder.hidden_size, _NUM_ANSWERS + len(album.names))
     options.out.mkdir(parents=True, exist_ok=True)
@@ -156,6 +163,9 @@ def see_things(options: SeeOptions) -> None:
             with torch.set_grad_enabled(is_opening):
                 tokens = ponder.image_features(frames_NHW3)
             loss = loss_of(answering(tokens), answers)
+            if before is not None and films is not None and is_opening:
+                filmed = torch.from_numpy(films[rng.integers(len(films), size=options.pictures // 2)])
+                loss = loss + _ALIKE_WEIGHT * unlikeness(ponder, before, filmed)
             loss.backward()  # type: ignore[no-untyped-call]
             optimiser, done = (opening, step) if is_opening else (settling, step + options.settling)
             optimiser.update(done)
@@ -163,6 +173,40 @@ def see_things(options: SeeOptions) -> None:
     held_out = np.arange(num_learned, len(album.texts))
     sys.stdout.write(f"{num_held_out} pictures held out: {examine(ponder, answering, album, held_out)}\n")
     save_ponder(ponder, options.out / "ponder")
+
+
+def unlikeness(ponder: Ponder, before: Ponder, frames_NHW3: Tensor) -> Tensor:
+    """How much ``ponder`` shows otherwise than ``before`` did, of its part of these pictures; 1 is the variance."""
+    assert ponder.format.fovea is not None
+    top, left = (first * ponder.format.token_px for first in ponder.format.fovea[:2])
+    height, width = before.image_px
+    with torch.no_grad():
+        wanted = before.image_features(frames_NHW3[:, top : top + height, left : left + width].contiguous())
+    tokens_NSH = ponder.image_features(frames_NHW3).unflatten(0, (len(frames_NHW3), -1))
+    shown = tokens_NSH[:, : before.format.num_image_tokens].flatten(0, 1)
+    return (shown - wanted).square().mean() / (wanted - wanted.mean(dim=0)).square().mean()
+
+
+def _before(like: Path, ponder: Ponder) -> Ponder:
+    before = load_ponder(like)
+    fovea = ponder.format.fovea
+    if fovea is None or fovea[2:] != before.format.image_grid or ponder.format.token_px != before.format.token_px:
+        raise ValueError(
+            f"{like} sees {before.format.image_grid} tokens of {before.format.token_px} px; it must be what was "
+            f"widened to a fovea of {fovea} and tokens of {ponder.format.token_px} px"
+        )
+    return before
+
+
+def _films(form: ContextFormat, folders: Sequence[Path], seed: int) -> NDArray[np.uint8]:
+    """Pictures of episodes, (N, height, width, 3)."""
+    episodes = TrainingSet(*folders, sight=Sight(form=form, pounce_px=None))
+    rng = np.random.default_rng(seed)
+    pictures: list[NDArray[np.uint8]] = []
+    for number in rng.permutation(len(episodes))[:_ALIKE_EPISODES]:
+        sights = episodes[int(number)].sights or ()
+        pictures += [sights[tick][0] for tick in rng.integers(len(sights), size=_ALIKE_PICTURES)]
+    return np.stack(pictures)
 
 
 def _phase(learning: nn.Module, num_steps: int, rate: float) -> Optimiser:
@@ -254,7 +298,8 @@ def _square(yx_px: tuple[float, float], form: ContextFormat) -> tuple[int, float
     along = (yx_px[1] / TEXT_PX - left) / (right - left) * num_columns
     if not (0 <= down < num_rows and 0 <= along < num_columns):
         return None
-    return int(down) * num_columns + int(along), down % 1 - 0.5, along % 1 - 0.5
+    token = int(np.flatnonzero(form.token_order == int(down) * num_columns + int(along))[0])
+    return token, down % 1 - 0.5, along % 1 - 0.5
 
 
 def _spots(places_N: Sequence[Sequence[tuple[float, float]]], form: ContextFormat) -> Spots:

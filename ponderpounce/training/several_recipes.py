@@ -289,9 +289,9 @@ def small_by_sight() -> Curriculum:
 
     A trial: docs/training.md, "By sight".
     """
-    told = {"names_plans": True, "ways_by_sight": True}
-    (settling,) = _settling_on(small_at_length(), "small_by_sight", 22, (100, 720), batch_episodes=8, **told).stages
-    gently = replace(settling.train.optim, learning_rate=3e-4, warmup_steps=30)
+    told = {"ways_by_sight": True, "other_sides": 0.6}
+    (settling,) = _settling_on(small_at_length(), "small_by_sight", 22, (200, 720), batch_episodes=8, **told).stages
+    gently = replace(settling.train.optim, learning_rate=4e-4, warmup_steps=30)
     settling = replace(settling, train=replace(settling.train, optim=gently))
     return Curriculum(name="small_by_sight", stages=(settling,))
 

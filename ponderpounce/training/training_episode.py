@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -16,7 +16,7 @@ from ponderpounce.training.cut_short import Cut
 from ponderpounce.training.lapses import has_moved
 from ponderpounce.training.notes import without_end
 from ponderpounce.training.places import PLACE, WAY
-from ponderpounce.training.ways import by_sight, without_numbers
+from ponderpounce.training.ways import by_sight, noted_otherwise, stretch_numbers, turned_otherwise, without_numbers
 
 Frame = NDArray[np.uint8]  # (height, width, 3) RGB
 _SAME_PX = 6.0  # of a 256 px picture: less than any two things lie apart
@@ -179,15 +179,34 @@ class TrainingEpisode:
 
     def with_ways_by_sight(self) -> TrainingEpisode:
         """The same, its words on ways telling them as they were seen (`ways`), what was said as if it was of then."""
-        begins_T = self.is_transition_T | (np.arange(self.num_ticks) == 0)
-        numbers = np.cumsum(
-            [begin and WAY.search(text) is not None for begin, text in zip(begins_T, self.subgoals, strict=True)]
-        )
+        numbers = self._stretch_numbers()
         planned, said = (
-            [by_sight(text, number) for text, number in zip(texts, numbers.tolist(), strict=False)]
+            [by_sight(text, number) for text, number in zip(texts, numbers, strict=False)]
             for texts in (self.words, self.said)
         )
         return replace(self, planned=planned, said=said)
+
+    def with_other_sides(self, others: Collection[int]) -> TrainingEpisode:
+        """The same, told as if the stretches of these numbers of a way around things had passed on the other side.
+
+        What is demonstrated is then what words say and no longer what pictures show: who writes a plan has to look it
+        up in the notes, by its number. Before `with_plans`; nothing was said.
+        """
+        demo, own = (
+            [turned_otherwise(text, number, others) for text, number in zip(texts, numbers, strict=True)]
+            for texts, numbers in (
+                (self.demo_subgoals, stretch_numbers(self.demo_subgoals)),
+                (self.subgoals, self._stretch_numbers()),
+            )
+        )
+        notes = [noted_otherwise(note, others) for note in self.demo_notes]
+        return replace(self, demo_subgoals=demo, subgoals=own, demo_notes=notes, said=())
+
+    def _stretch_numbers(self) -> list[int]:
+        """Of every tick, the number of the stretch of a way that is gone."""
+        begins_T = self.is_transition_T | (np.arange(self.num_ticks) == 0)
+        begun = [begin and WAY.search(text) is not None for begin, text in zip(begins_T, self.subgoals, strict=True)]
+        return np.cumsum(begun).tolist()  # type: ignore[no-any-return]
 
     def without_numbers(self) -> TrainingEpisode:
         """The same, its notes and narration telling stretches of ways by their sides alone (`ways.without_numbers`)."""

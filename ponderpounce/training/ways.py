@@ -13,10 +13,11 @@ sight"), so a recipe has to ask for it.
 from __future__ import annotations
 
 import re
+from collections.abc import Collection, Sequence
 from functools import lru_cache
 from itertools import count, pairwise
 
-from ponderpounce.training.places import PLACE
+from ponderpounce.training.places import PLACE, WAY
 
 _AROUND = re.compile(
     r"(?P<until>.*\b(?P<lead>left|right) target by circling around the stick )(?P<way>(?:counter)?clockwise to <.*)"
@@ -24,6 +25,10 @@ _AROUND = re.compile(
 _STRETCH = re.compile(rf"((?:counter)?clockwise) (?:to )?{PLACE.pattern}")
 _STRAIGHT = re.compile(rf"move (\S+ to {PLACE.pattern}.*)")
 _LATER = re.compile(rf", (then )?((?:\S+ )?{PLACE.pattern})")
+_TURN = re.compile(r"(?:counter)?clockwise")
+_NOTED = re.compile(r"((\d+) (?:left|right) )(backward|forward)")
+_OTHER = {"clockwise": "counterclockwise", "backward": "forward"}
+_OTHER |= {other: one for one, other in _OTHER.items()}
 _NUMBER = re.compile(r"(?<!\w)\d+ (?:(?:left|right) )?(?=(?:back|for)ward|left|right)")
 
 
@@ -55,6 +60,34 @@ def by_sight(text: str, number: int) -> str:
         words = f"{number + nth} {lead} {seen_side(lead, turn)}" + (f" {turn} to" if nth < 2 else "")
         told.append(f"{'then ' if nth == 1 else ''}{words} <{y}, {x}>")
     return around["until"] + ", ".join(told)
+
+
+def stretch_numbers(texts: Sequence[str]) -> list[int]:
+    """Of every instant with these texts of the simulator's, the number of the last stretch that had begun; 0: none."""
+    stretches = [found and (found[1], found[2]) for found in map(WAY.search, texts)]
+    numbers: list[int] = []
+    last = None
+    for stretch in stretches:
+        begins = stretch is not None and stretch != last
+        numbers.append((numbers[-1] if numbers else 0) + begins)
+        last = stretch
+    return numbers
+
+
+def has_sides(texts: Sequence[str]) -> bool:
+    """Whether the simulator's texts tell a way around things."""
+    return any(_TURN.search(text) for text in texts)
+
+
+def turned_otherwise(text: str, number: int, others: Collection[int]) -> str:
+    """The simulator's text of the stretch of this number and the next, each the other way round if of ``others``."""
+    numbers = count(number)
+    return _TURN.sub(lambda turn: _OTHER[turn[0]] if next(numbers) in others else turn[0], text)
+
+
+def noted_otherwise(note: str, others: Collection[int]) -> str:
+    """The note of a stretch, on the other side if it is one of ``others``."""
+    return _NOTED.sub(lambda each: each[1] + (_OTHER[each[3]] if int(each[2]) in others else each[3]), note)
 
 
 def without_numbers(told: str) -> str:

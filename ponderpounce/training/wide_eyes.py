@@ -3,7 +3,8 @@
 Its box moves or grows by whole tokens and every patch may have more pixels: the weights that read a pixel are shared
 out among the ones in its place, and the learned positions are continued to the new patches. What a patch attends to
 becomes another, so what it shows changes a little, and what is new is not understood yet: `pp-see --ponder` opens such
-eyes.
+eyes. What was seen before stands first in the context and where it stood (``ContextFormat.fovea``): read row by row,
+with new tokens between the old ones, the shipped PONDER lost three times as much (docs/training.md, "A fovea").
 """
 
 # C vision width, S side of the square table of positions
@@ -46,8 +47,12 @@ def wide_eyed(ponder: Ponder, box: Box, zoom: int = 1) -> Ponder:
     vision.num_position_embeddings = side**2
     new_px = token_px(config)
     image_px = (new_rows * new_px, new_columns * new_px)
+    first_row, first_column, *sides = ponder.format.fovea or (0, 0, rows, columns)
+    fovea = (first_row + above, first_column + left, sides[0], sides[1])
+    sees_all = 0 <= above <= new_rows - rows and 0 <= left <= new_columns - columns
     form = replace(
         ponder.format,
+        fovea=fovea if sees_all and (new_rows, new_columns) != tuple(sides) else None,
         image_grid=image_grid(config, image_px),
         token_px=new_px,
         eyes=(Eye(camera=eye.camera, box=box),),

@@ -134,6 +134,36 @@ def test_an_image_spreads_over_h_and_w_at_one_instant() -> None:
     assert next_position == 10
 
 
+def test_a_fovea_stands_where_an_image_of_its_size_would_and_the_rest_around_it() -> None:
+    """Of 2 x 3 tokens a narrow eye saw the 2 x 2 on the right: they come first, as they did then."""
+    form = replace(FORMAT, image_grid=(2, 3), fovea=(0, 1, 2, 2))
+    assert form.token_order.tolist() == [1, 2, 4, 5, 0, 3]
+    positions, next_position = form.positions(form.observation(1).ids, first_index=10, first_position=5)
+    assert positions[1:].tolist() == [
+        [5, 6, 6, 6, 6, 6, 6, 8],
+        [5, 6, 6, 7, 7, 6, 7, 8],
+        [5, 6, 7, 6, 7, 5, 5, 8],
+    ]
+    narrow = replace(FORMAT, image_grid=(2, 2))
+    before, next_before = narrow.positions(narrow.observation(1).ids, first_index=10, first_position=5)
+    np.testing.assert_array_equal(positions[1:, :5], before[1:, :5])
+    assert next_position == next_before, "and what follows is where it was"
+
+
+@given(st.integers(1, 5), st.integers(1, 5), st.data())
+def test_every_token_of_an_image_comes_once(rows: int, columns: int, data: st.DataObject) -> None:
+    row, column = data.draw(st.integers(0, rows - 1)), data.draw(st.integers(0, columns - 1))
+    sides = data.draw(st.integers(1, rows - row)), data.draw(st.integers(1, columns - column))
+    order = replace(FORMAT, image_grid=(rows, columns), fovea=(row, column, *sides)).token_order
+    assert sorted(order.tolist()) == [*range(rows * columns)]
+
+
+@pytest.mark.parametrize("fovea", [(0, 0, 3, 3), (1, 0, 2, 3), (-1, 0, 2, 3), (0, 0, 0, 1)])
+def test_a_fovea_lies_within_the_image(fovea: tuple[int, int, int, int]) -> None:
+    with pytest.raises(ValueError, match=r"must lie within the image grid \(2, 3\)"):
+        replace(FORMAT, image_grid=(2, 3), fovea=fovea)
+
+
 def test_first_execution_transition_reads_t_yes_reasoning_t_yes_subgoal() -> None:
     t_yes = VOCABULARY.t_yes
     segments = FORMAT.query(2, Transition(subgoal=(7, 8), reasoning=(5, 6)))

@@ -257,19 +257,26 @@ def test_a_checkpoint_remembers_when_it_looks_again(tmp_path: Path) -> None:
     assert load_ponder(tmp_path).format.second_look == SecondLook(after=6, least=8, unless="hides")
 
 
-@pytest.mark.parametrize("version", [1, 2, 3, 4, 5, 6])
+def test_a_fovea_is_read_back(ponder: Ponder, tmp_path: Path) -> None:
+    staring = Ponder(ponder.qwen.config, replace(ponder.format, fovea=(0, 0, 1, 1)), image_px=ponder.image_px)
+    staring.qwen = ponder.qwen
+    save_ponder(staring, tmp_path)
+    assert load_ponder(tmp_path).format.fovea == (0, 0, 1, 1)
+
+
+@pytest.mark.parametrize("version", [1, 2, 3, 4, 5, 6, 7])
 def test_a_folder_from_before_there_were_eyes_proprioception_or_notes_has_none_and_speaks(
     ponder: Ponder, folder: Path, version: int
 ) -> None:
     stored = json.loads((folder / "ponder.json").read_text())
-    for name in ("eyes", "proprioception", "speaks", "takes_notes", "second_look", "counsel")[version - 1 :]:
+    for name in ("eyes", "proprioception", "speaks", "takes_notes", "second_look", "counsel", "fovea")[version - 1 :]:
         del stored[name]
     (folder / "ponder.json").write_text(json.dumps({**stored, "format": f"ponderpounce.ponder/{version}"}))
     loaded = load_ponder(folder)
     assert (loaded.format.eyes, loaded.format.proprioception, loaded.format.speaks) == (None, None, True)
     assert not loaded.format.takes_notes
     assert loaded.format.second_look is None
-    assert loaded.format.counsel is None
+    assert (loaded.format.counsel, loaded.format.fovea) == (None, None)
     assert loaded.image_px == (64, 64)
     assert weights_hash(loaded) == weights_hash(ponder)
 

@@ -22,8 +22,9 @@ from ponderpounce.models.pounce_configs import tiny_groot
 from ponderpounce.models.pounce_groot import GrootInputs
 from ponderpounce.models.pounce_reading import groot_inputs, pi05_inputs
 from ponderpounce.models.prompt import tiny_tokenizer_for_random_weights
+from ponderpounce.training.chunks import target_rows
 from ponderpounce.training.collate import collate_ponder, collate_pounce
-from ponderpounce.training.example import ExampleConfig, episode_row, make_example, row_frames, target_rows
+from ponderpounce.training.example import ExampleConfig, episode_row, make_example, row_frames
 from ponderpounce.training.places import misplaced
 from ponderpounce.training.stand_in import stand_in
 from ponderpounce.training.training_episode import TrainingEpisode

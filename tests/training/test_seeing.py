@@ -15,10 +15,11 @@ from ponderpounce.data import album
 from ponderpounce.data.dataset import Dataset
 from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features
 from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_checkpoint import load_ponder
+from ponderpounce.models.ponder_checkpoint import load_ponder, save_ponder
 from ponderpounce.models.ponder_configs import small
 from ponderpounce.models.vocabulary import Vocabulary
-from ponderpounce.training.seeing import REFUSED, Album, answers_of, draw, loss_of, main, read_album
+from ponderpounce.training.seeing import REFUSED, Album, answers_of, draw, loss_of, main, read_album, unlikeness
+from ponderpounce.training.wide_eyes import wide_eyed
 
 PONDER = Ponder.random(small(), seed=0)
 FORM = PONDER.format
@@ -113,6 +114,25 @@ def test_the_tower_learns_and_nothing_else_moves(tmp_path: Path, capsys: pytest.
     once = dict(seeing.qwen.named_parameters())
     moved = {name for name, weight in reopened.qwen.named_parameters() if not torch.equal(weight, once[name])}
     assert moved == {name for name in once if ".visual." in name}
+
+
+def test_an_eye_that_was_widened_is_held_to_what_it_saw(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder, narrow, wide = tmp_path / "album", tmp_path / "narrow", tmp_path / "wide"
+    assert album.main(["--out", str(folder), "--pictures", "100", "--image-px", "128", "--no-progress"]) == 0
+    save_ponder(PONDER, narrow)
+    save_ponder(wide_eyed(PONDER, (8 / 256, 32 / 256, 168 / 256, 224 / 256)), wide)
+    unlike = []
+    for like in ([], ["--like", str(narrow)]):
+        out = tmp_path / f"out{len(like)}"
+        arguments = ["--recipe", "small", "--data", str(folder), "--album", str(folder), "--ponder", str(wide), *like]
+        assert main([*arguments, "--out", str(out), "--steps", "10", "--pictures", "32", "--no-progress"]) == 0
+        seen = read_album(load_ponder(wide).format, folder).pictures
+        with torch.no_grad():
+            unlike.append(unlikeness(load_ponder(out / "ponder"), PONDER, torch.from_numpy(seen)).item())
+    assert unlike[1] < unlike[0] / 2
+    arguments = ["--recipe", "small", "--data", str(folder), "--album", str(folder), "--ponder", str(narrow)]
+    assert main([*arguments, "--like", str(narrow), "--out", str(tmp_path / "none")]) == REFUSED
+    assert "it must be what was widened to a fovea of None" in capsys.readouterr().err
 
 
 def test_several_albums_are_mixed_and_one_stays_in_order(tmp_path: Path) -> None:

@@ -20,8 +20,9 @@ from ponderpounce.models.pounce import PounceConfig
 from ponderpounce.models.pounce_checkpoint import load_bundle
 from ponderpounce.models.prompt import with_subgoal
 from ponderpounce.training import recipes, train
+from ponderpounce.training.chunks import chunk_ticks
 from ponderpounce.training.data import TrainingSet
-from ponderpounce.training.example import chunk_ticks, make_example
+from ponderpounce.training.example import make_example
 from ponderpounce.training.notes import moving_places
 from ponderpounce.training.parallel import World
 from ponderpounce.training.recipe import Recipe, stages_of

@@ -12,10 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from clock.sampling import EVALUATION
-from ponderpounce.training.deeds import narration, passing_side
+from ponderpounce.models.context import IGNORE
+from ponderpounce.training.deeds import course, narration, passing_side
 from ponderpounce.training.example import ExampleConfig, make_example
 from ponderpounce.training.places import PLACE
-from ponderpounce.training.ways import by_sight, seen_side, without_numbers
+from ponderpounce.training.training_episode import TrainingEpisode
+from ponderpounce.training.ways import by_sight, seen_side, stretch_numbers, without_numbers
 from tests.training.test_example import FORM, episode
 
 AROUND = "move to the nearest {} target by circling around the stick {}"
@@ -139,3 +141,54 @@ def test_ways_have_numbers_where_a_recipe_asks_for_them_and_nowhere_else(asked: 
     seen = "1 left backward" if asked else "backward"
     assert [*told.demo_notes, told.reasoning] == [seen, "", f"{seen} <9, 60>"]
     assert told.words[0] == (by_sight(text, 1) if asked else text)
+
+
+def demonstrated_way(stretches: list[tuple[str, str, int, int]]) -> TrainingEpisode:
+    """Two ticks, and two instants of a demonstration, of every stretch of a way: lead, turn, row and column."""
+    texts = []
+    for n, (lead, turn, y, x) in enumerate(stretches):
+        then = "".join(f", then {turn} to <{y}, {x}>" for _, turn, y, x in stretches[n + 1 : n + 2])
+        texts += [AROUND.format(lead, f"{turn} to <{y}, {x}>{then}")] * 2
+    notes = [f"{n // 2 + 1} {course(text)}" for n, text in enumerate(texts)]
+    shown = episode(len(texts), changes=range(0, len(texts), 2), num_demo=len(texts))
+    return replace(shown, subgoals=texts, demo_subgoals=texts, demo_notes=notes)
+
+
+@given(st.sets(st.integers(1, 5)))
+def test_with_other_sides_all_words_tell_the_same_other_way(others: set[int]) -> None:
+    stretches = [("left", "clockwise", 93, 85), ("left", TURNS[1], 84, 119), ("right", "clockwise", 93, 85)]
+    shown = demonstrated_way([*stretches, ("right", TURNS[1], 99, 40)])
+    told = shown.with_other_sides(others)
+    side = re.compile(r"(?:back|for)ward")
+    before, after = (narration(each.demo_subgoals) for each in (shown, told))
+    pairs = zip(side.findall(before), side.findall(after), strict=True)
+    assert [n for n, (one, other) in enumerate(pairs, 1) if one != other] == sorted(others & {1, 2, 3, 4})
+    assert side.sub("", before) == side.sub("", after)
+    numbers = stretch_numbers(told.demo_subgoals)
+    seen = [f"{number} {course(text)}" for number, text in zip(numbers, told.demo_subgoals, strict=True)]
+    assert [*told.demo_notes] == seen, "notes tell the stretches as the narration does"
+    assert [*told.demo_subgoals] == [*told.subgoals], "and what is to be done is what was shown"
+    assert told.with_other_sides(others).demo_notes == shown.demo_notes
+
+
+def test_stretches_that_come_back_are_numbered_on() -> None:
+    there, back = ("left", "clockwise", 93, 85), ("right", "clockwise", 90, 50)
+    shown = demonstrated_way([there, back, there, back])
+    assert stretch_numbers(["static", *shown.demo_subgoals, "static"]) == [0, 1, 1, 2, 2, 3, 3, 4, 4, 4]
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_a_row_with_other_sides_is_read_from_its_notes_and_ends_soon(share: float) -> None:
+    shown = demonstrated_way([("left", "clockwise", 93, 85), ("left", TURNS[1], 84, 119)] * 6)
+    form = replace(FORM, takes_notes=True)
+    config = ExampleConfig(clocks=EVALUATION, narrates=True, ways_by_sight=True, other_sides=share)
+    made = [make_example(shown, form, config, np.random.default_rng(seed)) for seed in range(5)]
+    told = {each.episode.reasoning for each in made}
+    assert len(told) == (5 if share else 1)
+    for each in made:
+        num_learned = sum(target != IGNORE for target in each.row().targets)
+        alone = replace(each, heeded_demo=None).row()
+        assert (num_learned < sum(target != IGNORE for target in alone.targets)) == bool(share)
+        assert each.heeded_demo == ((False,) * len(shown.demo) if share else None)
+        if share:
+            assert len(each.schedule.queries) <= 2

@@ -43,6 +43,22 @@ def test_a_wide_one_knows_where_every_old_patch_is() -> None:
     torch.testing.assert_close(new[:3, 1:5], old[1:], rtol=1e-4, atol=1e-4)
 
 
+def test_what_was_seen_before_comes_first() -> None:
+    whole = (8 / 256, 32 / 256, 168 / 256, 224 / 256)
+    wide = wide_eyed(PONDER, whole)
+    assert (wide.format.image_grid, wide.format.fovea) == ((5, 6), (0, 1, 4, 4))
+    pictures = torch.randint(0, 256, (2, 80, 96, 3), generator=torch.Generator().manual_seed(0)).byte()
+    seen_NSH = wide.image_features(pictures).unflatten(0, (2, 30))
+    by_row = replace(wide.format, fovea=None)
+    wide.format = by_row
+    grid_NRCH = wide.image_features(pictures).view(2, 5, 6, -1)
+    torch.testing.assert_close(seen_NSH[:, :16].unflatten(1, (4, 4)), grid_NRCH[:, :4, 1:5], rtol=0, atol=0)
+    assert wide_eyed(PONDER, WIDE).format.fovea is None, "a part of what was seen is out of sight"
+    assert wide_eyed(PONDER, EYE.box, 2).format.fovea is None, "nothing is new"
+    wider = wide_eyed(wide_eyed(PONDER, whole), (8 / 256, 0, 168 / 256, 1.0))
+    assert (wider.format.image_grid, wider.format.fovea) == ((5, 8), (0, 2, 4, 4))
+
+
 def test_all_else_stays() -> None:
     wide, before = wide_eyed(PONDER, WIDE, 2).qwen.state_dict(), PONDER.qwen.state_dict()
     other = {
