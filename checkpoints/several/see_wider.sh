@@ -1,10 +1,9 @@
 #!/usr/bin/env bash
-# Goes on from the pair that lengthen.sh has left: see docs/training.md, "By sight".
+# Goes on from the pair that lengthen.sh has left: see docs/training.md, "A fovea".
 #
 #     checkpoints/several/see_wider.sh [OUT]    (the OUT of the other scripts)
 #
-# PONDER's eye takes in all that is played with, and plans are told in words that it has seen or counted before. A trial,
-# run by its parts before stretches of ways had numbers; what it left is not shipped.
+# PONDER's eye takes in all that is played with, around what it saw before, and ways are told as they were seen.
 set -euo pipefail
 
 out=${1:-out/several}
@@ -24,13 +23,27 @@ play "$long/pair" 12 794100 "$next/rest-played" VideoRepick SwingXtimes MoveCube
     VideoUnmaskSwap ButtonUnmaskSwap
 for played in ways rest; do retell "$next/$played-played" "$next/$played"; done
 
+look() {  # at so many PICTURES of a TASK, or of its demonstrations
+    [ -d "$next/album/$3/meta" ] || "$bin/pp-album" --task "$2" --pictures "$1" "${@:4}" --out "$next/album/$3"
+}
+
+for task in RouteStick VideoPlaceOrder BinFill StopCube PickHighlight ButtonUnmaskSwap PatternLock MoveCube VideoRepick \
+    VideoUnmaskSwap SwingXtimes; do look 800 $task $task --seed 3500000; done
+look 600 RouteStick RouteStick-shown --demonstrated --seed 3600000
+for task in MoveCube PatternLock; do look 500 $task $task-shown --demonstrated --seed 3600000; done
+
 [ -d "$next/wide/ponder" ] || "$bin/pp-enlarge" --ponder "$long/run/settling/ponder" --pounce "$long/larger/pounce" \
     --out "$next/wide" --box 8 32 168 224
-data=("$next/route" "$next/filled" "$long/filled" "$grown/filled" "$long/shown" "$grown/shown")
-data+=("${data[@]}" "$next/route")
-for kind in imitated old swaps repick timed highlight; do data+=("$long/$kind" "$grown/$kind"); done
-settle small_by_sight "$next/wide/ponder" "$next/wide/pounce" "$next" --data "${data[@]}" --sights "$next/sights" \
-    --watch "$next/ways" "$next/rest" "$grown/a" "$grown/b" --watch-share 0.2 --products bfloat16
+[ -d "$next/open/ponder" ] || "$bin/pp-see" --recipe small --ponder "$next/wide/ponder" --like "$long/run/settling/ponder" \
+    --album "$next"/album/* --data "$grown"/{imitated,shown,swaps,filled,repick} "$next/route" --settling 300 --steps 500 \
+    --learning-rate 5e-4 --pictures 96 --out "$next/open"
+data=("$next/route" "$next/route" "$next/route" "$next/filled")
+for kind in imitated filled filled shown shown old swaps swaps repick timed highlight; do
+    data+=("$long/$kind" "$grown/$kind")
+done
+data+=("$grown/old" "$grown/repick")
+settle small_by_sight "$next/open/ponder" "$next/wide/pounce" "$next" --data "${data[@]}" --sights "$next/sights" \
+    --watch "$next/ways" "$next/rest" "$grown/a" "$grown/b" --watch-share 0.15 --products bfloat16
 look_again "$next/pair/ponder" 6 8 'highlight|hides|correct'
 take_counsel "$next/pair/ponder" 2,-3 -2,2,mirrored
 evaluate "$next/pair" "$next"

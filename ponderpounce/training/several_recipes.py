@@ -291,7 +291,7 @@ def small_by_sight() -> Curriculum:
     """
     told = {"ways_by_sight": True, "other_sides": 0.6}
     (settling,) = _settling_on(small_at_length(), "small_by_sight", 22, (200, 720), batch_episodes=8, **told).stages
-    gently = replace(settling.train.optim, learning_rate=4e-4, warmup_steps=30)
+    gently = replace(settling.train.optim, learning_rate=2e-4, warmup_steps=30)
     settling = replace(settling, train=replace(settling.train, optim=gently))
     return Curriculum(name="small_by_sight", stages=(settling,))
 
