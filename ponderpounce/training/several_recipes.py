@@ -285,9 +285,9 @@ def small_at_length() -> Curriculum:
 
 
 def small_by_sight() -> Curriculum:
-    """The PONDER of `small_at_length`, its eye wider, learns to tell plans in words that it has seen or counted before.
+    """The PONDER of `small_at_length`, its eye wider, learns to tell ways in words that it has seen before.
 
-    A trial: docs/training.md, "By sight".
+    A trial that was not shipped: docs/training.md, "A fovea".
     """
     told = {"ways_by_sight": True, "other_sides": 0.6}
     (settling,) = _settling_on(small_at_length(), "small_by_sight", 22, (200, 720), batch_episodes=8, **told).stages

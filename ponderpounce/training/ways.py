@@ -6,8 +6,8 @@ the sides of the plan that it made of them were not. So the plan keeps the words
 way round is told of the stretch that is gone and the next one alone, behind the two words that it follows from.
 
 Stretches are told by their numbers, in notes and in plans: a way comes back to where it was, and by its place alone a
-stretch was taken for another one that begins there. Whether that helps has not been shown (docs/training.md, "By
-sight"), so a recipe has to ask for it.
+stretch was taken for another one that begins there. Two trials did not show that it helps (docs/training.md, "A
+fovea"), so a recipe has to ask for it.
 """
 
 from __future__ import annotations
