@@ -69,10 +69,10 @@ class SeeOptions:
     album: tuple[Path, ...]
     """Folders that pp-album made."""
     ponder: Path | None = None
-    """Open the eyes of this one again, all else as it is; --recipe and --data are then not read."""
+    """Open the eyes of this one again, all else as it is; --recipe is then not read, and --data for --like alone."""
     like: Path | None = None
-    """The one whose eye was widened to that of --ponder: what it saw is to be seen as it was, in pictures of the album
-    and of --data's episodes."""
+    """The one whose eye was widened to that of --ponder: what it saw is to be seen as it was. Pictures of --data's
+    episodes are read for that."""
     out: Path
     """OUT/ponder is what `pp-train --ponder` goes on from."""
     steps: int = 2000
