@@ -3,7 +3,8 @@
 #
 #     checkpoints/several/see_wider.sh [OUT]    (the OUT of the other scripts)
 #
-# PONDER's eye takes in all that is played with, around what it saw before, and ways are told as they were seen.
+# PONDER's eye takes in all that is played with, around what it saw before, and ways are told as they were seen. A trial,
+# run by its parts, with another rate at first; what it left is not shipped.
 set -euo pipefail
 
 out=${1:-out/several}

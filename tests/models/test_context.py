@@ -104,14 +104,16 @@ def test_every_decision_is_read_from_an_observation_or_a_text(episode: Episode) 
     assert not any(row.ids[i] in carriers for i in row.supervised_index)
 
 
-@given(episodes, st.integers(0, 40))
-def test_positions_in_pieces_are_the_positions_of_the_whole(episode: Episode, cut: int) -> None:
-    segments = segments_of(episode)
+@given(episodes, st.integers(0, 40), st.sampled_from([None, (1, 2, 4, 3)]))
+def test_positions_in_pieces_are_the_positions_of_the_whole(
+    episode: Episode, cut: int, fovea: tuple[int, int, int, int] | None
+) -> None:
+    form, segments = replace(FORMAT, fovea=fovea), segments_of(episode)
     head, whole = FORMAT.row(segments[:cut]).ids, FORMAT.row(segments).ids
-    head_positions, next_position = FORMAT.positions(head)
-    tail_positions, _ = FORMAT.positions(whole[len(head) :], first_index=len(head), first_position=next_position)
+    head_positions, next_position = form.positions(head)
+    tail_positions, _ = form.positions(whole[len(head) :], first_index=len(head), first_position=next_position)
     both = np.concatenate([head_positions, tail_positions], axis=1)
-    np.testing.assert_array_equal(both, FORMAT.positions(whole)[0])
+    np.testing.assert_array_equal(both, form.positions(whole)[0])
 
 
 @given(episodes)

@@ -99,13 +99,10 @@ def test_a_mirror_changes_both_words_and_not_the_side(lead: str, turn: str) -> N
 def test_plans_of_an_episode_tell_each_stretch_as_its_narration_does() -> None:
     """By number and side: what stands there is copied from one to the next, and looked up."""
     stretches = [("left", "clockwise", 93, 85), ("left", TURNS[1], 84, 119), ("right", "clockwise", 93, 85)]
-    texts = []
-    for n, (lead, turn, y, x) in enumerate(stretches):
-        then = "".join(f", then {turn} to <{y}, {x}>" for _, turn, y, x in stretches[n + 1 : n + 2])
-        texts.append(AROUND.format(lead, f"{turn} to <{y}, {x}>{then}"))
-    ticks = [text for text in texts for _ in range(2)]
-    shown = replace(episode(6, changes=(0, 2, 4)), subgoals=ticks, said=["", *texts, "", "press the button"])
-    told = replace(shown, demo=((shown.frames[0]),) * 3).with_plans().with_ways_by_sight()
+    way = demonstrated_way(stretches)
+    texts = [*way.subgoals][::2]
+    shown = replace(way, said=["", *texts, "", "press the button"])
+    told = shown.with_plans().with_ways_by_sight()
     expected = narration(texts).split(", ")
     stretch = re.compile(r"(\d \w+ (?:back|for)ward)(?: (?:counter)?clockwise to)?( <\d+, \d+>)")
     for n in range(3):
