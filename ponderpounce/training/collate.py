@@ -77,13 +77,14 @@ def collate_ponder(
     """PONDER's side: rows and pictures, stand-ins of ``stand_in_size`` numbers, place lessons for hidden states of
     ``place_size``; what is not asked is not made. ``moved_weight``: see `Example.stand_in_weights`."""
     rows = tuple(each.row() for each in examples) if with_rows else ()
+    are_weighed = moved_weight != 1 or any(each.is_blind for each in examples)
     taught = zip(examples, rows, strict=True) if place_size else ()
     return PonderBatch(
         rows=rows,
         place_lessons=tuple(each.place_lessons(row, place_size) for each, row in taught),
         frames=tuple(each.frames() for each in examples) if with_rows else (),
         stand_ins=tuple(each.stand_ins(stand_in_size) for each in examples) if stand_in_size else (),
-        stand_in_weights=tuple(each.stand_in_weights(moved_weight) for each in examples) if moved_weight != 1 else (),
+        stand_in_weights=tuple(each.stand_in_weights(moved_weight) for each in examples) if are_weighed else (),
     )
 
 

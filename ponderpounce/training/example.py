@@ -6,7 +6,7 @@ hold them equal.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise, repeat
 from typing import Literal
@@ -21,6 +21,7 @@ from ponderpounce.models.eyes import see
 from ponderpounce.models.normalisation import Floats
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.training.augment import AS_IT_IS, NOT_AUGMENTED, Augmentation, View, draw_view
+from ponderpounce.training.blind import shows_a_way, without_pictures
 from ponderpounce.training.chunks import chunk_ticks
 from ponderpounce.training.countdown import (
     counted,
@@ -40,7 +41,7 @@ from ponderpounce.training.notes import heeded, in_sight, misnoted, noted, told_
 from ponderpounce.training.nudge import NO_NUDGE, Nudge, draw_nudges
 from ponderpounce.training.own_words import own_words
 from ponderpounce.training.place_lessons import PlaceLessons, place_lessons
-from ponderpounce.training.places import misplaced
+from ponderpounce.training.slip import Slip
 from ponderpounce.training.stand_in import stand_in
 from ponderpounce.training.training_episode import Frame, TrainingEpisode
 from ponderpounce.training.ways import has_sides
@@ -50,25 +51,10 @@ _BEGINNING, _RECALLING = 8, 2  # queries
 _CORRECTED = 0.3  # of own words, at every query
 _SHARES = (
     "text_dropout", "slips", "tells_onward", "cuts_short", "begins", "recalls", "own_words", "misjudges", "even_clocks",
-    "other_sides", "learned_repeats",
+    "other_sides", "blind", "learned_repeats",
 )  # fmt: skip
 _MOST_STRETCHES = 50  # more than any way has
 _MOVED_PX = 3.0  # of a 256 px picture: farther than PONDER errs where nothing moves
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Slip:
-    """What PONDER is made to have said wrongly in one row."""
-
-    std_px: float
-    seed: int
-    is_learned: bool = False
-    """True: errors so small that PONDER learns to say the words all the same, around the right ones."""
-
-    def saying(self, view: View) -> Callable[[str], str]:
-        """Tells one text after the other of a row as it is in this view, its places wrong."""
-        rng = np.random.default_rng(self.seed)
-        return lambda text: misplaced(view.text(text), self.std_px, rng)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,6 +90,9 @@ class ExampleConfig:
     other_sides: float = 0.0
     """Share of demonstrated ways around things that are told `TrainingEpisode.with_other_sides`. Their rows end with
     the second query and their notes are not learned, for the pictures show something else."""
+    blind: float = 0.0
+    """Share of demonstrated ways whose rows are words alone (`blind`): what is written about a demonstration, and the
+    plan, can then be had from its notes and nowhere else. Their places and sides are other ones in every row."""
     cuts_short: float = 0.0
     """Share of episodes that count, of two rounds and more, that are told to end sooner (`cuts`)."""
     slips: float = 0.0
@@ -203,6 +192,8 @@ class Example:
     nudge: Nudge = NO_NUDGE
     nudges_I2: Floats | None = None
     """Of each invocation's tool [m]; None: starts are as recorded."""
+    is_blind: bool = False
+    """Without pictures. Cognition and what is to be in mind are then not asked for, but what words tell."""
 
     def row(self) -> Row:
         """PONDER's tokens."""
@@ -216,10 +207,13 @@ class Example:
             words=self.words,
             heeded_demo=self.heeded_demo,
         )
+        row = without_pictures(row, self.form.vocabulary) if self.is_blind else row
         return replace(row, targets=(IGNORE,) * len(row.targets)) if self.episode.is_told else row
 
-    def frames(self) -> Tensor:
-        """PONDER's pictures, (num_images, height, width, 3) uint8."""
+    def frames(self) -> Tensor | None:
+        """PONDER's pictures, (num_images, height, width, 3) uint8; None without any."""
+        if self.is_blind:
+            return None
         return self.view.pictures(row_frames(self.episode, self.form, self.schedule))
 
     @property
@@ -249,8 +243,10 @@ class Example:
         """How much each query's stand-in counts, (Q,): ``moved`` where the words said last tell another place, else 1.
 
         The thing was moved, or they are an earlier subgoal's. Everywhere else, and that is nearly everywhere, C can be
-        copied from the words.
+        copied from the words. 0 without pictures.
         """
+        if self.is_blind:
+            return torch.zeros(len(self.schedule.queries))
         if not self.is_grounded:
             return torch.ones(len(self.schedule.queries))
         subgoals, is_change = _subgoals(self.episode, self.schedule)
@@ -267,6 +263,8 @@ class Example:
         While the first subgoal lasts more is seen than there was when it was told: what comes later is in mind then,
         too. What a demonstration does is in mind while it is seen.
         """
+        if self.is_blind:
+            return place_lessons(row, [""] * len(self.schedule.queries), self.form.vocabulary, size)
         episode = self.episode
         if episode.planned is not None and not episode.is_told:
             episode = episode.with_plans(even_the_first=True)
@@ -293,15 +291,17 @@ def make_example(
         cut = drawn_cut(
             cuts(episode.instruction, episode.subgoals, episode.is_transition_T), episode.imitated_from, rng
         )
+    is_blind = bool(config.blind) and shows_a_way(episode.demo_subgoals) and rng.random() < config.blind
     may_differ = bool(config.other_sides) and has_sides(episode.demo_subgoals)
-    if is_otherwise := may_differ and rng.random() < config.other_sides:
+    if is_otherwise := is_blind or (may_differ and rng.random() < config.other_sides):
         others = np.flatnonzero(rng.integers(2, size=_MOST_STRETCHES)) + 1
         episode = episode.with_other_sides(set(others.tolist()))
     episode = episode if cut is None else episode.cut_short(cut)
     episode = episode.with_plans(names=config.names_plans) if config.has_plans else episode
     episode = episode if config.has_reasoning else replace(episode, reasoning="")
     episode = replace(episode, reasoning=narration(episode.demo_subgoals)) if config.narrates else episode
-    episode = episode.with_ways_by_sight() if config.ways_by_sight else episode.without_numbers()
+    by_sight = config.ways_by_sight and has_sides(episode.demo_subgoals)
+    episode = episode.with_ways_by_sight() if by_sight else episode.without_numbers()
     episode = episode if config.tells_ends else episode.without_ends()
     is_even = config.even_clocks and rng.random() < config.even_clocks
     clocks = config.clocks.without_spread() if is_even else config.clocks
@@ -322,10 +322,12 @@ def make_example(
     ticks = [schedule.invocations[index].tick for index in imitated]
     chosen = draw_near(ticks, events, count, config.event_weight, rng)
     invocations = tuple(schedule.invocations[imitated[index]] for index in chosen)
-    is_grounded = config.is_grounded and (rng.random() >= config.text_dropout or episode.is_told)
+    is_grounded = config.is_grounded and (rng.random() >= config.text_dropout or episode.is_told or is_blind)
     is_own = is_grounded and bool(config.own_words and episode.said) and rng.random() < config.own_words
     slip = None
-    if is_grounded and not is_own and config.slips and not episode.is_told and rng.random() < config.slips:
+    if is_blind:
+        slip = Slip(std_px=None, seed=int(rng.integers(1 << 62)), is_learned=True)
+    elif is_grounded and not is_own and config.slips and not episode.is_told and rng.random() < config.slips:
         std_px = float(np.exp(rng.uniform(*np.log(config.slip_px))))
         slip = Slip(std_px=std_px, seed=int(rng.integers(1 << 62)))
     elif is_grounded and config.tremble_px:
@@ -392,6 +394,7 @@ def make_example(
         onward=onward,
         nudge=config.nudge,
         nudges_I2=nudges_I2,
+        is_blind=is_blind,
     )
 
 

@@ -16,6 +16,7 @@ PARTS = re.compile(r", (?![^<]*>)")
 """Commas between the parts of a text, not those within places."""
 TEXT_PX = PLACE_PX
 """Side of the picture that texts speak of, whatever the size of a picture."""
+_NOT_AT_THE_EDGE = (32, 224)
 
 
 def misplaced(text: str, std_px: float, rng: np.random.Generator, count: int = 0) -> str:
@@ -26,6 +27,16 @@ def misplaced(text: str, std_px: float, rng: np.random.Generator, count: int = 0
         return f"<{y}, {x}>"
 
     return PLACE.sub(slipped, text, count=count)
+
+
+def scattered(text: str, seed: int) -> str:
+    """The text with every place anywhere else but at a picture's edge; one place is always the same other one."""
+
+    def elsewhere(place: re.Match[str]) -> str:
+        y, x = np.random.default_rng([seed, *map(int, place.groups())]).integers(*_NOT_AT_THE_EDGE, size=2)
+        return f"<{y}, {x}>"
+
+    return PLACE.sub(elsewhere, text)
 
 
 def apart_px(text: str, other: str) -> float | None:

@@ -285,15 +285,28 @@ def small_at_length() -> Curriculum:
 
 
 def small_by_sight() -> Curriculum:
-    """The PONDER of `small_at_length`, its eye wider, learns to tell ways in words that it has seen before.
+    """The PONDER of `small_at_length`, its eye wider, learns to look up ways in its notes.
 
-    A trial that was not shipped: docs/training.md, "A fovea".
+    `reciting` is for demonstrated ways (`pp-train --tasks PatternLock RouteStick`), nearly all of them words alone;
+    `settling` for all. docs/training.md, "Looked up".
     """
-    told = {"ways_by_sight": True, "other_sides": 0.6}
-    (settling,) = _settling_on(small_at_length(), "small_by_sight", 22, (200, 720), batch_episodes=8, **told).stages
+    told = {"ways_by_sight": True}
+    (settling,) = _settling_on(small_at_length(), "small_by_sight", 22, (200, 640), batch_episodes=8, **told).stages
     gently = replace(settling.train.optim, learning_rate=2e-4, warmup_steps=30)
-    settling = replace(settling, train=replace(settling.train, optim=gently))
-    return Curriculum(name="small_by_sight", stages=(settling,))
+    reciting = replace(
+        settling,
+        name="small_by_sight/reciting",
+        example=replace(settling.example, blind=0.9),
+        train=TrainConfig(seed=23, optim=replace(_TURNING, warmup_steps=20)),
+        num_steps=200,
+        batch_episodes=64,
+    )
+    settling = replace(
+        settling,
+        example=replace(settling.example, blind=0.4),
+        train=replace(settling.train, optim=gently),
+    )
+    return Curriculum(name="small_by_sight", stages=(reciting, settling))
 
 
 def _settling_on(

@@ -5,9 +5,9 @@ half-way, or "forward", depending on where the stretch leads. A small network's 
 the sides of the plan that it made of them were not. So the plan keeps the words of the notes, to be copied, and which
 way round is told of the stretch that is gone and the next one alone, behind the two words that it follows from.
 
-Stretches are told by their numbers, in notes and in plans: a way comes back to where it was, and by its place alone a
-stretch was taken for another one that begins there. Two trials did not show that it helps (docs/training.md, "A
-fovea"), so a recipe has to ask for it.
+Stretches around things are told by their numbers, in notes and in plans: a way comes back to where it was, and by its
+place alone a stretch was taken for another one that begins there. A recipe has to ask for it (docs/training.md, "Looked
+up"). Ways that lead around nothing were told worse with numbers than without (there, "A fovea").
 """
 
 from __future__ import annotations
@@ -23,8 +23,6 @@ _AROUND = re.compile(
     r"(?P<until>.*\b(?P<lead>left|right) target by circling around the stick )(?P<way>(?:counter)?clockwise to <.*)"
 )
 _STRETCH = re.compile(rf"((?:counter)?clockwise) (?:to )?{PLACE.pattern}")
-_STRAIGHT = re.compile(rf"move (\S+ to {PLACE.pattern}.*)")
-_LATER = re.compile(rf", (then )?((?:\S+ )?{PLACE.pattern})")
 _TURN = re.compile(r"(?:counter)?clockwise")
 _NOTED = re.compile(r"((\d+) (?:left|right) )(backward|forward)")
 _OTHER = {"clockwise": "counterclockwise", "backward": "forward"}
@@ -40,16 +38,12 @@ def seen_side(leads: str, turn: str) -> str:
 
 @lru_cache(maxsize=1 << 12)
 def by_sight(text: str, number: int) -> str:
-    """The text of a way, or its plan, that begins with the stretch of this number; other texts unchanged.
+    """The text of a way around things, or its plan, that begins with the stretch of this number; others unchanged.
 
-    Every stretch is told with its number, and of a way around things with where it leads and the side on which it is
-    seen to pass. Where it leads follows from its end and that of the one before, for the robot's left is the picture's
+    Every stretch is told with its number, where it leads, and the side on which it is seen to pass. Where it leads
+    follows from its end and that of the one before, for the robot's left is the picture's
     right.
     """
-    straight = _STRAIGHT.fullmatch(text)
-    if straight is not None:
-        later = count(number + 1)
-        return f"move {number} " + _LATER.sub(lambda each: f", {each[1] or ''}{next(later)} {each[2]}", straight[1])
     around = _AROUND.fullmatch(text)
     if around is None:
         return text

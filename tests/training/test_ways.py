@@ -1,4 +1,4 @@
-"""Ways as PONDER tells them: by number, and around things with the sides on which these are seen to be passed."""
+"""Ways around things as PONDER tells them: by number, and with the sides on which these are seen to be passed."""
 
 from __future__ import annotations
 
@@ -67,18 +67,14 @@ def test_this_stretch_and_the_next_are_told_with_all_that_the_turn_follows_from(
     )
 
 
-def test_a_way_around_nothing_is_told_by_numbers_alone() -> None:
-    text = "move forward-left to <66, 172>, then <52, 148>, left <52, 100>, back <66, 172>"
-    assert by_sight(text, 3) == "move 3 forward-left to <66, 172>, then 4 <52, 148>, 5 left <52, 100>, 6 back <66, 172>"
-    assert by_sight("move left to <1, 2>", 1) == "move 1 left to <1, 2>"
-
-
 @pytest.mark.parametrize(
     "text",
     [
         "",
         "press the button at <60, 90>",
         "move left",
+        "move left to <1, 2>",
+        "move forward-left to <66, 172>, then <52, 148>, left <52, 100>, back <66, 172>",
         "move to the top of the left-side target at <9, 9> for the first time",
         "Hook the cube at <82, 97> to the target at <112, 140> with the peg",
         AROUND.format("left", "clockwise"),

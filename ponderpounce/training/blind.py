@@ -1,0 +1,39 @@
+"""Rows of words alone: notes of a demonstrated way, and what follows from them, without a picture.
+
+Whoever has watched a few hundred ways can tell the plan of one from its pictures and need not look at the notes. Then
+the plan has errors of its own, beside those of the notes. In a row without pictures, of places that were never seen,
+there are only the notes to look at, and it is a fifth as long.
+"""
+
+# T tokens
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import compress
+
+import numpy as np
+
+from ponderpounce.models.context import Row
+from ponderpounce.models.vocabulary import Vocabulary
+from ponderpounce.training.places import WAY
+
+
+def shows_a_way(texts: Sequence[str]) -> bool:
+    """Whether the simulator's texts of a demonstration tell a way, around things or not."""
+    return any(WAY.search(text) for text in texts)
+
+
+def without_pictures(row: Row, vocabulary: Vocabulary) -> Row:
+    """The row without its image tokens; those that begin and end a picture stay, and stand for the look."""
+    is_kept_T = np.asarray(row.ids) != vocabulary.image_pad
+    place_T = np.cumsum(is_kept_T) - 1  # of those that stay
+    return replace(
+        row,
+        ids=tuple(compress(row.ids, is_kept_T)),
+        targets=tuple(compress(row.targets, is_kept_T)),
+        carrier_index=place_T[row.carrier_index],
+        gate_index=place_T[row.gate_index],
+        num_images=0,
+    )
