@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# Goes on from the pair that lengthen.sh has left: see docs/training.md, "A fovea".
+# Goes on from the pair that lengthen.sh has left: see docs/training.md, "Looked up".
 #
 #     checkpoints/several/see_wider.sh [OUT]    (the OUT of the other scripts)
 #
-# PONDER's eye takes in all that is played with, around what it saw before, and ways are told as they were seen. A trial,
-# run by its parts, with another rate at first; what it left is not shipped.
+# PONDER's eye takes in all that is played with, around what it saw before; ways are told as they were seen, and looked up
+# in notes. A trial, run by its parts and not as it stands here; what it left is not shipped.
 set -euo pipefail
 
 out=${1:-out/several}
@@ -38,12 +38,14 @@ for task in MoveCube PatternLock; do look 500 $task $task-shown --demonstrated -
 [ -d "$next/open/ponder" ] || "$bin/pp-see" --recipe small --ponder "$next/wide/ponder" --like "$long/run/settling/ponder" \
     --album "$next"/album/* --data "$grown"/{imitated,shown,swaps,filled,repick} "$next/route" --settling 300 --steps 500 \
     --learning-rate 5e-4 --pictures 96 --out "$next/open"
+learn small_by_sight reciting "$next/open/ponder" "$next/wide/pounce" "$next" --tasks PatternLock RouteStick \
+    --data "$next/route" "$long/imitated" "$grown/imitated" --sights "$next/sights" --products bfloat16
 data=("$next/route" "$next/route" "$next/route" "$next/filled")
-for kind in imitated filled filled shown shown old swaps swaps repick timed highlight; do
+for kind in imitated imitated imitated imitated filled filled shown shown old swaps swaps repick timed timed timed highlight; do
     data+=("$long/$kind" "$grown/$kind")
 done
 data+=("$grown/old" "$grown/repick")
-settle small_by_sight "$next/open/ponder" "$next/wide/pounce" "$next" --data "${data[@]}" --sights "$next/sights" \
+settle small_by_sight "$next/run/reciting/ponder" "$next/wide/pounce" "$next" --data "${data[@]}" --sights "$next/sights" \
     --watch "$next/ways" "$next/rest" "$grown/a" "$grown/b" --watch-share 0.15 --products bfloat16
 look_again "$next/pair/ponder" 6 8 'highlight|hides|correct'
 take_counsel "$next/pair/ponder" 2,-3 -2,2,mirrored

@@ -15,7 +15,7 @@ from itertools import compress
 
 import numpy as np
 
-from ponderpounce.models.context import Row
+from ponderpounce.models.context import IGNORE, Row
 from ponderpounce.models.vocabulary import Vocabulary
 from ponderpounce.training.places import WAY
 
@@ -26,13 +26,17 @@ def shows_a_way(texts: Sequence[str]) -> bool:
 
 
 def without_pictures(row: Row, vocabulary: Vocabulary) -> Row:
-    """The row without its image tokens; those that begin and end a picture stay, and stand for the look."""
+    """The row without its image tokens; those that begin and end a picture stay, and stand for the look.
+
+    Nothing before the first query is learned, nor whether there is a note: that is to be seen.
+    """
+    targets = (*(IGNORE,) * row.gate_index[0], *row.targets[row.gate_index[0] :])
     is_kept_T = np.asarray(row.ids) != vocabulary.image_pad
     place_T = np.cumsum(is_kept_T) - 1  # of those that stay
     return replace(
         row,
         ids=tuple(compress(row.ids, is_kept_T)),
-        targets=tuple(compress(row.targets, is_kept_T)),
+        targets=tuple(compress(targets, is_kept_T)),
         carrier_index=place_T[row.carrier_index],
         gate_index=place_T[row.gate_index],
         num_images=0,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate, pairwise, repeat
+from itertools import accumulate, repeat
 from typing import Literal
 
 import numpy as np
@@ -39,7 +39,7 @@ from ponderpounce.training.events import EVENT_ROWS, draw_near, event_ticks
 from ponderpounce.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses, has_moved, without_lapses
 from ponderpounce.training.notes import heeded, in_sight, misnoted, noted, told_wait, with_notes
 from ponderpounce.training.nudge import NO_NUDGE, Nudge, draw_nudges
-from ponderpounce.training.own_words import own_words
+from ponderpounce.training.own_words import newly_said, own_words
 from ponderpounce.training.place_lessons import PlaceLessons, place_lessons
 from ponderpounce.training.slip import Slip
 from ponderpounce.training.stand_in import stand_in
@@ -51,9 +51,9 @@ _BEGINNING, _RECALLING = 8, 2  # queries
 _CORRECTED = 0.3  # of own words, at every query
 _SHARES = (
     "text_dropout", "slips", "tells_onward", "cuts_short", "begins", "recalls", "own_words", "misjudges", "even_clocks",
-    "other_sides", "blind", "learned_repeats",
+    "other_ways", "blind", "learned_repeats",
 )  # fmt: skip
-_MOST_STRETCHES = 50  # more than any way has
+_MOST_STRETCHES = 50
 _MOVED_PX = 3.0  # of a 256 px picture: farther than PONDER errs where nothing moves
 
 
@@ -87,12 +87,12 @@ class ExampleConfig:
     names_plans: bool = False  # also there
     ways_by_sight: bool = False
     """See `TrainingEpisode.with_ways_by_sight`."""
-    other_sides: float = 0.0
-    """Share of demonstrated ways around things that are told `TrainingEpisode.with_other_sides`. Their rows end with
-    the second query and their notes are not learned, for the pictures show something else."""
+    other_ways: float = 0.0
+    """Share of demonstrated ways told otherwise than pictures show them: around things `with_other_sides`, others
+    `scattered`. The row ends with the second query; what notes say is not learned. Harmful until ``blind`` was."""
     blind: float = 0.0
-    """Share of demonstrated ways whose rows are words alone (`blind`): what is written about a demonstration, and the
-    plan, can then be had from its notes and nowhere else. Their places and sides are other ones in every row."""
+    """Share of demonstrated ways whose rows are words alone (`blind`), of other places and sides in every row:
+    narration and plan can then be had from notes and nowhere else."""
     cuts_short: float = 0.0
     """Share of episodes that count, of two rounds and more, that are told to end sooner (`cuts`)."""
     slips: float = 0.0
@@ -193,7 +193,7 @@ class Example:
     nudges_I2: Floats | None = None
     """Of each invocation's tool [m]; None: starts are as recorded."""
     is_blind: bool = False
-    """Without pictures. Cognition and what is to be in mind are then not asked for, but what words tell."""
+    """Without pictures."""
 
     def row(self) -> Row:
         """PONDER's tokens."""
@@ -209,6 +209,11 @@ class Example:
         )
         row = without_pictures(row, self.form.vocabulary) if self.is_blind else row
         return replace(row, targets=(IGNORE,) * len(row.targets)) if self.episode.is_told else row
+
+    @property
+    def is_scattered(self) -> bool:
+        """Its words tell places that were never seen: it is asked for them in words alone."""
+        return self.slip is not None and self.slip.std_px is None
 
     def frames(self) -> Tensor | None:
         """PONDER's pictures, (num_images, height, width, 3) uint8; None without any."""
@@ -243,9 +248,9 @@ class Example:
         """How much each query's stand-in counts, (Q,): ``moved`` where the words said last tell another place, else 1.
 
         The thing was moved, or they are an earlier subgoal's. Everywhere else, and that is nearly everywhere, C can be
-        copied from the words. 0 without pictures.
+        copied from the words. 0 where places were never seen.
         """
-        if self.is_blind:
+        if self.is_scattered:
             return torch.zeros(len(self.schedule.queries))
         if not self.is_grounded:
             return torch.ones(len(self.schedule.queries))
@@ -263,7 +268,7 @@ class Example:
         While the first subgoal lasts more is seen than there was when it was told: what comes later is in mind then,
         too. What a demonstration does is in mind while it is seen.
         """
-        if self.is_blind:
+        if self.is_scattered:
             return place_lessons(row, [""] * len(self.schedule.queries), self.form.vocabulary, size)
         episode = self.episode
         if episode.planned is not None and not episode.is_told:
@@ -291,17 +296,16 @@ def make_example(
         cut = drawn_cut(
             cuts(episode.instruction, episode.subgoals, episode.is_transition_T), episode.imitated_from, rng
         )
-    is_blind = bool(config.blind) and shows_a_way(episode.demo_subgoals) and rng.random() < config.blind
-    may_differ = bool(config.other_sides) and has_sides(episode.demo_subgoals)
-    if is_otherwise := is_blind or (may_differ and rng.random() < config.other_sides):
+    is_way, is_around = shows_a_way(episode.demo_subgoals), has_sides(episode.demo_subgoals)
+    is_blind = is_way and bool(config.blind) and rng.random() < config.blind
+    if is_otherwise := is_blind or (is_way and bool(config.other_ways) and rng.random() < config.other_ways):
         others = np.flatnonzero(rng.integers(2, size=_MOST_STRETCHES)) + 1
         episode = episode.with_other_sides(set(others.tolist()))
     episode = episode if cut is None else episode.cut_short(cut)
     episode = episode.with_plans(names=config.names_plans) if config.has_plans else episode
     episode = episode if config.has_reasoning else replace(episode, reasoning="")
     episode = replace(episode, reasoning=narration(episode.demo_subgoals)) if config.narrates else episode
-    by_sight = config.ways_by_sight and has_sides(episode.demo_subgoals)
-    episode = episode.with_ways_by_sight() if by_sight else episode.without_numbers()
+    episode = episode.with_ways_by_sight() if config.ways_by_sight and is_around else episode.without_numbers()
     episode = episode if config.tells_ends else episode.without_ends()
     is_even = config.even_clocks and rng.random() < config.even_clocks
     clocks = config.clocks.without_spread() if is_even else config.clocks
@@ -325,7 +329,7 @@ def make_example(
     is_grounded = config.is_grounded and (rng.random() >= config.text_dropout or episode.is_told or is_blind)
     is_own = is_grounded and bool(config.own_words and episode.said) and rng.random() < config.own_words
     slip = None
-    if is_blind:
+    if is_blind or (is_otherwise and not is_around):
         slip = Slip(std_px=None, seed=int(rng.integers(1 << 62)), is_learned=True)
     elif is_grounded and not is_own and config.slips and not episode.is_told and rng.random() < config.slips:
         std_px = float(np.exp(rng.uniform(*np.log(config.slip_px))))
@@ -338,7 +342,8 @@ def make_example(
     if is_grounded and not episode.is_told:
         lapses = config.lapses if config.lapses.rows and rng.random() < config.lapses.rows else NO_LAPSES
         if is_own:
-            words = own_words(_newly_said(episode, schedule), *_subgoals(episode, schedule), rng, _CORRECTED)
+            said = newly_said(episode.said, [query.tick for query in schedule.queries], bool(episode.demo))
+            words = own_words(said, *_subgoals(episode, schedule), rng, _CORRECTED)
         elif lapses != NO_LAPSES or config.retold_px is not None:
             words = drawn_lapses(lapses, *_subgoals(episode, schedule), rng, config.retold_px)
         if config.takes_notes and episode.moving:
@@ -458,17 +463,6 @@ def _subgoals(episode: TrainingEpisode, schedule: SampledSchedule) -> tuple[list
     """What is to be said at every query, and whether it is the first to see a change."""
     queries = schedule.queries
     return [episode.words[query.tick] for query in queries], [query.stamp.is_transition for query in queries]
-
-
-def _newly_said(episode: TrainingEpisode, schedule: SampledSchedule) -> list[str]:
-    """The last words of the recorded PONDER since the query before. After a demonstration the first ones are left out:
-    they followed from what it wrote about it, which no row holds."""
-    ticks = [query.tick for query in schedule.queries]
-    newest = [
-        next((text for text in reversed(episode.said[before + 1 : tick + 1]) if text), "")
-        for before, tick in pairwise([-1, *ticks])
-    ]
-    return ["", *newest[1:]] if episode.demo else newest
 
 
 def said_by_query(episode: TrainingEpisode, schedule: SampledSchedule) -> tuple[str, ...]:

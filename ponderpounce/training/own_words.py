@@ -14,6 +14,7 @@ That is DAgger (Ross et al. 2011) for words; the paper has nothing of it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -28,6 +29,16 @@ def as_recorded(said: str) -> str:
         return pixel_text(said)
     except ValueError:
         return ""
+
+
+def newly_said(said: Sequence[str], ticks: Sequence[int], has_demo: bool) -> list[str]:
+    """The last words of a recorded PONDER, ``said`` tick by tick, since the query before. After a demonstration the
+    first ones are left out: they followed from what it wrote about it, which no row holds."""
+    newest = [
+        next((text for text in reversed(said[before + 1 : tick + 1]) if text), "")
+        for before, tick in pairwise([-1, *ticks])
+    ]
+    return ["", *newest[1:]] if has_demo else newest
 
 
 def own_words(

@@ -291,19 +291,19 @@ def small_by_sight() -> Curriculum:
     `settling` for all. docs/training.md, "Looked up".
     """
     told = {"ways_by_sight": True}
-    (settling,) = _settling_on(small_at_length(), "small_by_sight", 22, (200, 640), batch_episodes=8, **told).stages
-    gently = replace(settling.train.optim, learning_rate=2e-4, warmup_steps=30)
+    (settling,) = _settling_on(small_at_length(), "small_by_sight", 22, (300, 700), batch_episodes=12, **told).stages
+    gently = replace(settling.train.optim, learning_rate=3e-4, warmup_steps=30)
     reciting = replace(
         settling,
         name="small_by_sight/reciting",
         example=replace(settling.example, blind=0.9),
         train=TrainConfig(seed=23, optim=replace(_TURNING, warmup_steps=20)),
-        num_steps=200,
+        num_steps=150,
         batch_episodes=64,
     )
     settling = replace(
         settling,
-        example=replace(settling.example, blind=0.4),
+        example=replace(settling.example, blind=0.5, other_ways=0.4),
         train=replace(settling.train, optim=gently),
     )
     return Curriculum(name="small_by_sight", stages=(reciting, settling))

@@ -174,7 +174,7 @@ def test_stretches_that_come_back_are_numbered_on() -> None:
 def test_a_row_with_other_sides_is_read_from_its_notes_and_ends_soon(share: float) -> None:
     shown = demonstrated_way([("left", "clockwise", 93, 85), ("left", TURNS[1], 84, 119)] * 6)
     form = replace(FORM, takes_notes=True)
-    config = ExampleConfig(clocks=EVALUATION, narrates=True, ways_by_sight=True, other_sides=share)
+    config = ExampleConfig(clocks=EVALUATION, narrates=True, ways_by_sight=True, other_ways=share)
     made = [make_example(shown, form, config, np.random.default_rng(seed)) for seed in range(5)]
     told = {each.episode.reasoning for each in made}
     assert len(told) == (5 if share else 1)
