@@ -2,14 +2,13 @@
 
 Whoever has watched a few hundred ways can tell the plan of one from its pictures and need not look at the notes. Then
 the plan has errors of its own, beside those of the notes. In a row without pictures, of places that were never seen,
-there are only the notes to look at, and it is a fifth as long.
+there are only the notes to look at, and it is a third as long.
 """
 
 # T tokens
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import compress
 
@@ -17,12 +16,6 @@ import numpy as np
 
 from ponderpounce.models.context import IGNORE, Row
 from ponderpounce.models.vocabulary import Vocabulary
-from ponderpounce.training.places import WAY
-
-
-def shows_a_way(texts: Sequence[str]) -> bool:
-    """Whether the simulator's texts of a demonstration tell a way, around things or not."""
-    return any(WAY.search(text) for text in texts)
 
 
 def without_pictures(row: Row, vocabulary: Vocabulary) -> Row:

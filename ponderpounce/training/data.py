@@ -25,9 +25,10 @@ from ponderpounce.tasks.front_view import front_pixels
 from ponderpounce.training.chunks import chunk_ticks
 from ponderpounce.training.notes import demo_notes, ends_of_moves, moving_places
 from ponderpounce.training.own_words import as_recorded
-from ponderpounce.training.places import TEXT_PX, WAY
+from ponderpounce.training.places import TEXT_PX
 from ponderpounce.training.sight_store import SightStore, Views
 from ponderpounce.training.training_episode import Frame, TrainingEpisode
+from ponderpounce.training.ways import shows_a_way
 
 _QUANTILES = (0.01, 0.99)
 _SYSTEMS = ("pounce", "ponder")
@@ -205,8 +206,8 @@ class TrainingSet:
         views, sights = self._pictures(source, own, shown)
         moving = moving_places(entry.task, entry.seed, entry.difficulty, entry.num_rows)
         shown_texts = rows.grounded_subgoal[:start]
-        is_way = any(WAY.search(text) for text in shown_texts[::FPS])
-        tools = _seen_at(rows.tcp_pose[:start:FPS], below_m=_OVER_A_WAY_M if is_way else 0.0)
+        over_m = _OVER_A_WAY_M if shows_a_way(shown_texts[::FPS]) else 0.0
+        tools = _seen_at(rows.tcp_pose[:start:FPS], below_m=over_m)
         whence, rests = ends_of_moves(shown_texts)
         episode = TrainingEpisode(
             instruction=entry.instruction,

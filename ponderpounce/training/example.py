@@ -21,7 +21,7 @@ from ponderpounce.models.eyes import see
 from ponderpounce.models.normalisation import Floats
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.training.augment import AS_IT_IS, NOT_AUGMENTED, Augmentation, View, draw_view
-from ponderpounce.training.blind import shows_a_way, without_pictures
+from ponderpounce.training.blind import without_pictures
 from ponderpounce.training.chunks import chunk_ticks
 from ponderpounce.training.countdown import (
     counted,
@@ -44,7 +44,7 @@ from ponderpounce.training.place_lessons import PlaceLessons, place_lessons
 from ponderpounce.training.slip import Slip
 from ponderpounce.training.stand_in import stand_in
 from ponderpounce.training.training_episode import Frame, TrainingEpisode
-from ponderpounce.training.ways import has_sides
+from ponderpounce.training.ways import has_sides, shows_a_way
 
 _SILENCE = repeat(Words())
 _BEGINNING, _RECALLING = 8, 2  # queries
@@ -53,7 +53,7 @@ _SHARES = (
     "text_dropout", "slips", "tells_onward", "cuts_short", "begins", "recalls", "own_words", "misjudges", "even_clocks",
     "other_ways", "blind", "learned_repeats",
 )  # fmt: skip
-_MOST_STRETCHES = 50
+_MOST_STRETCHES = 50  # more than any way has
 _MOVED_PX = 3.0  # of a 256 px picture: farther than PONDER errs where nothing moves
 
 
@@ -326,7 +326,7 @@ def make_example(
     ticks = [schedule.invocations[index].tick for index in imitated]
     chosen = draw_near(ticks, events, count, config.event_weight, rng)
     invocations = tuple(schedule.invocations[imitated[index]] for index in chosen)
-    is_grounded = config.is_grounded and (rng.random() >= config.text_dropout or episode.is_told or is_blind)
+    is_grounded = config.is_grounded and (rng.random() >= config.text_dropout or episode.is_told or is_otherwise)
     is_own = is_grounded and bool(config.own_words and episode.said) and rng.random() < config.own_words
     slip = None
     if is_blind or (is_otherwise and not is_around):

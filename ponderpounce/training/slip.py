@@ -17,7 +17,7 @@ class Slip:
 
     seed: int
     std_px: float | None
-    """Of each coordinate; None: `scattered`, for a row without pictures."""
+    """Of each coordinate; None: `scattered`, for words that are looked up in words."""
     is_learned: bool = False
     """True: errors so small, or so consistent, that PONDER learns to say the words all the same."""
 

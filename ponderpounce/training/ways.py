@@ -41,8 +41,7 @@ def by_sight(text: str, number: int) -> str:
     """The text of a way around things, or its plan, that begins with the stretch of this number; others unchanged.
 
     Every stretch is told with its number, where it leads, and the side on which it is seen to pass. Where it leads
-    follows from its end and that of the one before, for the robot's left is the picture's
-    right.
+    follows from its end and that of the one before, for the robot's left is the picture's right.
     """
     around = _AROUND.fullmatch(text)
     if around is None:
@@ -66,6 +65,11 @@ def stretch_numbers(texts: Sequence[str]) -> list[int]:
         numbers.append((numbers[-1] if numbers else 0) + begins)
         last = stretch
     return numbers
+
+
+def shows_a_way(texts: Sequence[str]) -> bool:
+    """Whether the simulator's texts tell a way, around things or not."""
+    return any(WAY.search(text) for text in texts)
 
 
 def has_sides(texts: Sequence[str]) -> bool:

@@ -13,12 +13,13 @@ from hypothesis import strategies as st
 
 from clock.sampling import EVALUATION
 from ponderpounce.models.context import IGNORE
-from ponderpounce.training.blind import shows_a_way, without_pictures
+from ponderpounce.training.blind import without_pictures
 from ponderpounce.training.collate import collate_ponder
 from ponderpounce.training.example import Example, ExampleConfig, make_example
 from ponderpounce.training.joint import encode_rows
 from ponderpounce.training.places import PLACE, TEXT_PX, scattered
 from ponderpounce.training.training_episode import TrainingEpisode
+from ponderpounce.training.ways import shows_a_way
 from tests.training.test_example import FORM, PONDER, episode
 from tests.training.test_ways import demonstrated_way
 
@@ -64,10 +65,9 @@ def test_two_places_are_scattered_apart_and_otherwise_in_every_row() -> None:
     assert len(moved) > 55
 
 
-@given(ends=st.lists(st.booleans(), min_size=1, max_size=4), seed=st.integers(0, 99))
+@given(shown=st.sampled_from([straight_way(), noted_way()]), seed=st.integers(0, 99))
 @settings(deadline=None)
-def test_without_pictures_all_else_stands_in_its_order(ends: list[bool], seed: int) -> None:
-    shown = straight_way() if ends[0] else noted_way()
+def test_without_pictures_all_else_stands_in_its_order(shown: TrainingEpisode, seed: int) -> None:
     row = replace(blind(shown, seed), is_blind=False).row()
     pad = FORM.vocabulary.image_pad
     left = without_pictures(row, FORM.vocabulary)
@@ -133,3 +133,19 @@ def test_a_share_of_ways_is_blind_and_nothing_else(share: float) -> None:
     still = replace(episode(6, num_demo=2), demo_subgoals=["pick up the cube at <9, 9>"] * 2)
     assert not shows_a_way(still.demo_subgoals)
     assert not any(blind(still, seed, 1.0).is_blind for seed in range(5))
+
+
+def test_a_straight_way_told_otherwise_has_its_pictures_and_is_read_from_its_notes() -> None:
+    v, shown = FORM.vocabulary, straight_way()
+    config = ExampleConfig(clocks=EVALUATION, narrates=True, has_plans=True, other_ways=1.0, text_dropout=1.0)
+    made = make_example(shown, NOTING, config, np.random.default_rng(0))
+    row, frames = made.row(), made.frames()
+    assert frames is not None
+    assert len(frames) == row.num_images == 2 * (6 + len(made.schedule.queries))
+    first = int(row.gate_index[0])
+    noted, planned = v.decode(row.ids[:first]), v.decode([t for t in row.targets[first:] if t >= 0])
+    assert set(TOLD.findall(planned)) == set(TOLD.findall(noted))
+    assert not set(TOLD.findall(planned)) & set(TOLD.findall(v.decode(blind(shown, share=0.0).row().ids)))
+    assert {*row.targets[:first]} == {IGNORE, v.t_yes, v.t_no}, "when a note is due is to be seen, and learned"
+    assert not made.stand_in_weights(4.0).any()
+    assert not any(made.place_lessons(row, 64).index_M < first)
