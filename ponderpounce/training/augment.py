@@ -16,6 +16,7 @@ import numpy as np
 
 from ponderpounce.models.context import ContextFormat
 from ponderpounce.models.views import AS_IT_IS, View, text_px
+from ponderpounce.training.insertions import manner
 from ponderpounce.training.places import WAY
 
 __all__ = ["AS_IT_IS", "NOT_AUGMENTED", "Augmentation", "View", "draw_view"]
@@ -30,8 +31,8 @@ class Augmentation:
     max_shift_px: int = 0
     """Of PONDER's picture, either way in both directions; edges are repeated."""
     mirror: bool = False
-    """Half of the episodes are mirrored, unless their texts speak of sides. Those of ways (`places.WAY`) may: with
-    "left" for "right" it is the way that the picture then shows."""
+    """Half of the episodes are mirrored, unless their texts speak of sides. Those of ways (`places.WAY`) may, and of
+    what is put into a box (`insertions`): with "left" for "right" it is what the picture then shows."""
     max_gain: float = 0.0
     """Pictures are brighter or darker, at most 1 + that times or 1 / (1 + that); every factor is as likely."""
 
@@ -61,6 +62,6 @@ def draw_view(config: Augmentation, form: ContextFormat, texts: set[str], rng: n
         return View(gain=gain)
     scale = text_px(form.eyes, form.image_px, mirrors=config.mirror)
     down_px, right_px = rng.integers(-config.max_shift_px, config.max_shift_px + 1, size=2).tolist()
-    is_sided = any(_SIDED.search(text) and not WAY.search(text) for text in texts)
+    is_sided = any(_SIDED.search(text) and not (WAY.search(text) or manner(text)) for text in texts)
     is_mirrored = config.mirror and bool(rng.integers(2)) and not is_sided
     return View(down_px=down_px, right_px=right_px, is_mirrored=is_mirrored, text_px=scale, gain=gain)

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from ponderpounce.tasks.captions import ORDINALS
+from ponderpounce.training.insertions import manner
 from ponderpounce.training.lapses import has_moved
 from ponderpounce.training.places import PLACE, WAY
 from ponderpounce.training.ways import seen_side
@@ -23,6 +24,7 @@ _AT = re.compile(rf" (?:at|to) {PLACE.pattern}(?:, then .*|, {PLACE.pattern})?")
 _WATCHED = re.compile(rf"[^<]* at {PLACE.pattern}, {PLACE.pattern}|static at {PLACE.pattern}")
 _AROUND = re.compile(r"(left|right) target by circling around the stick (clockwise|counterclockwise)")
 _PUT, _PRESS, _PICK = "drop the cube onto target", "press the button", "pick up the"
+_GRASP = "Pick up the peg by grasping"
 
 Place = tuple[int, int]
 
@@ -80,7 +82,8 @@ class Told:
 def told_deeds(texts: Sequence[str]) -> list[Told]:
     """What was done where, in order; nothing where that is little.
 
-    Things are put onto one place after the other, or one is picked up. Of a way every stretch counts: around things
+    Things are put onto one place after the other, one is picked up, or a peg is held at one of its ends, which are told
+    both, and put into a box from one side. Of a way every stretch counts: around things
     with its `course`, others with their last word, as plans tell them
     (`TrainingEpisode.with_plans`).
     """
@@ -94,6 +97,9 @@ def told_deeds(texts: Sequence[str]) -> list[Told]:
             there, words = puts, f"{ORDINALS[deed.count - 1]} {place}"
         elif deed.name.startswith(_PRESS):
             there, words = puts, "button"
+        elif (how := manner(texts[instant])) and place:
+            other = deed.name.startswith(_GRASP) and _place(texts[instant], 1)
+            there, words = puts, f"{how} {place}" + ("" if not other else ", <{}, {}>".format(*other))
         elif deed.name.startswith(_PICK) and place:
             there, words = picks, place
         else:

@@ -36,6 +36,7 @@ from ponderpounce.training.countdown import (
 from ponderpounce.training.cut_short import cuts, drawn_cut
 from ponderpounce.training.deeds import narration
 from ponderpounce.training.events import EVENT_ROWS, draw_near, event_ticks
+from ponderpounce.training.insertions import shows_an_insertion
 from ponderpounce.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses, has_moved, without_lapses
 from ponderpounce.training.notes import heeded, in_sight, misnoted, noted, told_wait, with_notes
 from ponderpounce.training.nudge import NO_NUDGE, Nudge, draw_nudges
@@ -296,7 +297,8 @@ def make_example(
         cut = drawn_cut(
             cuts(episode.instruction, episode.subgoals, episode.is_transition_T), episode.imitated_from, rng
         )
-    is_way, is_around = shows_a_way(episode.demo_subgoals), has_sides(episode.demo_subgoals)
+    is_around = has_sides(episode.demo_subgoals)
+    is_way = shows_a_way(episode.demo_subgoals) or shows_an_insertion(episode.demo_subgoals)
     is_blind = is_way and bool(config.blind) and rng.random() < config.blind
     if is_otherwise := is_blind or (is_way and bool(config.other_ways) and rng.random() < config.other_ways):
         others = np.flatnonzero(rng.integers(2, size=_MOST_STRETCHES)) + 1

@@ -33,6 +33,7 @@ from ponderpounce.tasks.front_view import front_pixels
 from ponderpounce.tasks.paces import PASS_STEPS, PRESS_STEPS
 from ponderpounce.training.countdown import rhythm, waits
 from ponderpounce.training.deeds import Told, course, told_deeds
+from ponderpounce.training.insertions import manner
 from ponderpounce.training.lapses import Words, has_moved
 from ponderpounce.training.places import PARTS, PLACE, TEXT_PX, WAY, apart_px
 
@@ -174,6 +175,8 @@ def demo_notes(
         # the end of a stretch is where the next one begins
         last = min(deed.last + int(WAY.search(texts[deed.last]) is not None), len(texts) - 1)
         instants = range(min(max(deed.first, done + 1), last), last + 1)
+        if manner(texts[last]).endswith(" side"):  # on its way the hand may pass over the other one
+            instants = range(last, last + 1)
         done = min(instants, key=lambda instant: apart_px(tools[instant], deed.place) or 0.0)  # 0: the text tells none
         side = course(texts[deed.last])
         whence, before = before or tools[instants.start], deed.place

@@ -291,7 +291,7 @@ def small_by_sight() -> Curriculum:
     `settling` for all. docs/training.md, "Looked up".
     """
     told = {"ways_by_sight": True}
-    (settling,) = _settling_on(small_at_length(), "small_by_sight", 22, (300, 700), batch_episodes=12, **told).stages
+    (settling,) = _settling_on(small_at_length(), "small_by_sight", 22, (250, 600), batch_episodes=12, **told).stages
     gently = replace(settling.train.optim, learning_rate=3e-4, warmup_steps=30)
     reciting = replace(
         settling,
@@ -307,6 +307,29 @@ def small_by_sight() -> Curriculum:
         train=replace(settling.train, optim=gently),
     )
     return Curriculum(name="small_by_sight", stages=(reciting, settling))
+
+
+def small_inserting() -> Curriculum:
+    """The pair of `small_by_sight` learns to put a peg into a box, the last of sixteen tasks.
+
+    `hand` trains POUNCE and does not need the other. docs/training.md, "Pegs".
+    """
+    waiting, _ = small_mastering().stages
+    *_, settling = small_by_sight().stages
+    hand = replace(
+        waiting,
+        name="small_inserting/hand",
+        train=replace(waiting.train, seed=24, optim=replace(_TURNING, warmup_steps=50, decay=(900, 2000))),
+        num_steps=2000,
+    )
+    settling = replace(
+        settling,
+        name="small_inserting/settling",
+        example=replace(settling.example, blind=0.3, other_ways=0.3),
+        train=TrainConfig(seed=25, optim=replace(_TURNING, learning_rate=4e-4, warmup_steps=30, decay=(150, 400))),
+        num_steps=400,
+    )
+    return Curriculum(name="small_inserting", stages=(hand, settling))
 
 
 def _settling_on(

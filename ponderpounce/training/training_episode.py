@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ponderpounce.training.cut_short import Cut
+from ponderpounce.training.insertions import inserted_otherwise, shows_an_insertion
 from ponderpounce.training.lapses import has_moved
 from ponderpounce.training.notes import without_end
 from ponderpounce.training.places import PLACE, WAY
@@ -187,11 +188,18 @@ class TrainingEpisode:
         return replace(self, planned=planned, said=said)
 
     def with_other_sides(self, others: Collection[int]) -> TrainingEpisode:
-        """The same, told as if the stretches of these numbers of a way around things had passed on the other side.
+        """The same, told as if the stretches of these numbers of a way around things had passed on the other side; or,
+        of a peg that is put into a box, as `inserted_otherwise`.
 
         What is demonstrated is then what words say and no longer what pictures show: who writes a plan has to look it
         up in the notes, by its number. Before `with_plans`; nothing was said.
         """
+        if shows_an_insertion(self.demo_subgoals):
+            demo, own, notes = (
+                [inserted_otherwise(text, others) for text in texts]
+                for texts in (self.demo_subgoals, self.subgoals, self.demo_notes)
+            )
+            return replace(self, demo_subgoals=demo, subgoals=own, demo_notes=notes, said=())
         demo, own = (
             [turned_otherwise(text, number, others) for text, number in zip(texts, numbers, strict=True)]
             for texts, numbers in (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from itertools import product
@@ -11,7 +12,7 @@ import pytest
 
 from ponderpounce.tasks import panda, predicates
 from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot
+from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
 from ponderpounce.tasks.geometry import Spot, is_clear
 from ponderpounce.tasks.imitation.insert_peg import ENDS, LIT_STEPS, SIDES, InsertPeg, Layout
 from ponderpounce.tasks.oracle import Motions
@@ -20,6 +21,7 @@ from ponderpounce.tasks.props import RED
 
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]
 Until = Callable[[Environment, int], Snapshot]
+PLACE = re.compile(r"<(\d+), (\d+)>")
 HOME = np.append(panda.HOME_QPOS, 1.0)
 LAYOUT = Layout(
     box=Spot(x_m=0.0, y_m=0.02, yaw_rad=1.5),
@@ -188,3 +190,22 @@ def test_the_oracle_solves_95_of_100_seeds_in_upstreams_time(env: Environment, p
             steps.append(len(env.save().video) + snapshot.step)
     assert len(steps) >= 95
     assert np.mean(steps) == pytest.approx(477, rel=0.12)
+
+
+@pytest.mark.parametrize(("grasped", "side"), list(product(ENDS, SIDES)))
+def test_texts_that_follow_tell_both_ends_and_both_mouths(grasped: str, side: str) -> None:
+    with make_environment("InsertPeg", render=False, texts_follow=True) as env:
+        told = [start(env, grasped=grasped, side=side).grounded_subgoal, *env.to_come()]
+        texts = [PLACE.sub("<>", text) for text in told]
+        assert texts == [
+            f"Pick up the peg by grasping the {ENDS[grasped]} end at <>, <>, {side} side",
+            f"Insert the peg from the {side} side at <>, <>, {ENDS[grasped]} end",
+        ]
+        (held, leading), (mouth, other) = ([tuple(map(int, place)) for place in PLACE.findall(text)] for text in told)
+        assert (held[0] > leading[0]) == (grasped == "head"), "rows count towards the front camera, far from the robot"
+        assert (mouth[1] > other[1]) == (side == "left"), "the robot's left is the picture's right"
+        shown = {PLACE.sub("<>", snapshot.grounded_subgoal) for snapshot in env.demonstration(1)}
+        assert shown == {
+            f"Pick up the peg by grasping the {ENDS[grasped]} end at <>, <>",
+            f"Insert the peg from the {side} side of the box at <>, <>",
+        }, "which side it will be is not to be seen while the peg is picked up"

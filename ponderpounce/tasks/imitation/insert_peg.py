@@ -26,6 +26,7 @@ from ponderpounce.tasks.pegs import (
     BOX_HALF_M,
     BOX_RGBA,
     BOX_Z_M,
+    MOUTHS,
     PEG_HALF_WIDTH_M,
     add_box_with_hole,
     add_peg,
@@ -82,6 +83,13 @@ class Layout:
         axis = transform(self.box.pose(BOX_Z_M))[:3, 0]
         return axis if axis[1] * SIDES[self.side] > 0 else -axis
 
+    @property
+    def mouths(self) -> tuple[str, str]:
+        """The bodies that stand for the hole's mouths: the one where the peg goes in, and the other."""
+        ahead, behind = (f"{_BOX}/{mouth}" for mouth in MOUTHS)
+        axis = transform(self.box.pose(BOX_Z_M))[:3, 0]
+        return (ahead, behind) if axis @ self.outward > 0 else (behind, ahead)
+
     def approach(self) -> list[Array]:
         """Where (4, 4) the held end is carried: in front of the box and above, down, close, and in."""
         turned = np.eye(4)
@@ -136,6 +144,8 @@ class InsertPeg(Task[Layout, Memory]):
 
     def subtasks(self, layout: Layout) -> tuple[Subtask, ...]:
         held, leading = layout.held_end, layout.leading_end
+        # Which end is held says which way to turn, and from where it goes in how to grasp: the wrist turns so far only.
+        end, side = f"{ENDS[layout.grasped]} end", f"{layout.side} side"
         return (
             Subtask(
                 text=f"Pick up the peg by grasping the {ENDS[layout.grasped]} end[ at <>]",
@@ -143,6 +153,8 @@ class InsertPeg(Task[Layout, Memory]):
                 is_done=lambda physics, memory: predicates.is_lifted_by(physics, held, leading),
                 failure=_wrong_grasp(layout),
                 motion=lambda motions: motions.pick_bar(held, onward=layout.approach()),
+                way=f"[, <>, {side}]",
+                way_grounds=(held, leading),
             ),
             Subtask(
                 text=f"Insert the peg from the {layout.side} side[ at <>]",
@@ -150,17 +162,27 @@ class InsertPeg(Task[Layout, Memory]):
                 is_done=lambda physics, memory: _is_in(layout, physics),
                 failure=_wrong_insertion(layout),
                 motion=lambda motions: motions.carry(held, layout.approach()),
+                way=f"[, <>, {end}]",
+                way_grounds=layout.mouths,
             ),
         )
 
     def demonstration(self, layout: Layout) -> tuple[Shown, ...]:
         pick, insert = self.subtasks(layout)
         return (
-            Shown(text=pick.text, grounds=pick.grounds, motion=pick.motion),
+            Shown(
+                text=pick.text,
+                grounds=pick.grounds,
+                motion=pick.motion,
+                way="[, <>]",
+                way_grounds=pick.way_grounds,
+            ),
             Shown(
                 text=f"Insert the peg from the {layout.side} side of the box[ at <>]",
                 grounds=insert.grounds,
                 motion=insert.motion,
+                way="[, <>]",
+                way_grounds=insert.way_grounds,
             ),
             # Straight home from there, as upstream goes, the hand would catch on the box.
             Shown(text="let go", motion=Motions.let_go, is_recorded=False),
