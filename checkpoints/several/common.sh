@@ -43,11 +43,11 @@ stored = json.loads(path.read_text()) | {"counsel": {"others": views, "near": 30
 path.write_text(json.dumps(stored, indent=2) + "\n")' "$@"
 }
 
-evaluate() {  # a PAIR on the test scenes of fifteen tasks, with cognition and without: OUT/real, OUT/null, OUT/tables
+evaluate() {  # a PAIR on the test scenes of fifteen tasks and of OTHERS, with cognition and without: OUT/real, OUT/null, OUT/tables
     local pair=$1 out=$2 cognition
     for cognition in real null; do
         "$bin/pp-eval" --tasks PickHighlight StopCube MoveCube PatternLock RouteStick VideoPlaceButton VideoPlaceOrder VideoRepick \
-            ButtonUnmask VideoUnmask PickXtimes SwingXtimes BinFill ButtonUnmaskSwap VideoUnmaskSwap --episodes 50 --runs 1 \
+            ButtonUnmask VideoUnmask PickXtimes SwingXtimes BinFill ButtonUnmaskSwap VideoUnmaskSwap "${@:3}" --episodes 50 --runs 1 \
             --seed 1000 --workers 2 --cognition "$cognition" --ponder-checkpoint "$pair/ponder" --pounce-checkpoint "$pair/pounce" \
             --out "$out/$cognition"
     done

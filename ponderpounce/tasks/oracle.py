@@ -225,16 +225,11 @@ class Motions:
         ``onward`` are poses (4, 4) that the end will be carried to. The bar is grasped the way round that leads there.
         """
         yield from self.open()
-        lying = transform(self._physics.pose(end))
-        grasps = [_at(_tool(side * lying[:3, 1]), *lying[:3, 3]) for side in (-1.0, 1.0)]
-        above, grasp, *_ = self._first_way(
-            [
-                [_at_height(grasp, height_m), grasp, _at_height(grasp, height_m), *way]
-                for height_m in _BAR_LIFTS_M
-                for grasp in grasps
-                for way in _ways_of_carrying(lying, grasp, onward)
-            ]
-        )
+        failed, self.num_grasps = self._failed_grasp, self.num_grasps + 1
+        above, grasp = self._over_bar(end, onward)
+        if failed is not None and failed.before == self.num_grasps - 1:
+            yield from self._miss_bar(end, above, grasp, is_high=failed.offset[2] > 0)
+            above, grasp = self._over_bar(end, onward)
         yield from self.move(above)
         yield from self.move(grasp)
         yield from self.close()
@@ -355,6 +350,28 @@ class Motions:
             yield from self.move(_at_height(above, grasp_z_m))
         yield from self.close()
         yield from self.move(above)
+
+    def _over_bar(self, end: str, onward: Sequence[Array]) -> tuple[Array, Array]:
+        """Where the tool (4, 4) waits above a lying bar's end, and where it closes upon it: a way leads onward."""
+        lying = transform(self._physics.pose(end))
+        grasps = [_at(_tool(side * lying[:3, 1]), *lying[:3, 3]) for side in (-1.0, 1.0)]
+        ways = [
+            [_at_height(grasp, height_m), grasp, _at_height(grasp, height_m), *way]
+            for height_m in _BAR_LIFTS_M
+            for grasp in grasps
+            for way in _ways_of_carrying(lying, grasp, onward)
+        ]
+        above, grasp, *_ = self._first_way(ways)
+        return above, grasp
+
+    def _miss_bar(self, end: str, above: Array, grasp: Array, *, is_high: bool) -> Actions:
+        """Closes above a bar, or beyond its end: beside it a finger would come down upon it. Comes up and opens."""
+        outward = self._physics.position_m(end) - self._physics.position_m(end.split("/")[0])
+        aside_m = np.array([0.0, 0.0, _MISS_M]) if is_high else _MISS_M * outward / np.linalg.norm(outward)
+        missed, over = (_at(pose, *(pose[:3, 3] + aside_m)) for pose in (grasp, above))
+        for pose, grip in ((over, self.open), (missed, self.close), (over, self.open)):
+            yield from self.move(pose)
+            yield from grip()
 
     def _miss(self, body: str, from_z_m: float, grasp_z_m: float, offset_m: Array) -> Actions:
         """Grasps beside or above a body, comes back up and opens; the body may have been pushed by then."""

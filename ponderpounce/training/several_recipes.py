@@ -251,7 +251,7 @@ def small_foreseeing() -> Curriculum:
             slips=0.0,
         ),
         train=TrainConfig(seed=17, optim=replace(_TURNING, warmup_steps=50)),
-        num_steps=400,
+        num_steps=340,
         batch_episodes=16,
     )
     last = _settling_on(small_watching(), "small_foreseeing", 18, (220, 520), batch_episodes=8, tells_ends=True)
@@ -312,7 +312,8 @@ def small_by_sight() -> Curriculum:
 def small_inserting() -> Curriculum:
     """The pair of `small_by_sight` learns to put a peg into a box, the last of sixteen tasks.
 
-    `hand` trains POUNCE and does not need the other. docs/training.md, "Pegs".
+    `hand` and `righting` train POUNCE and do not need the other; `righting` is for grasps that fail first, too.
+    docs/training.md, "Pegs".
     """
     waiting, _ = small_mastering().stages
     *_, settling = small_by_sight().stages
@@ -322,14 +323,20 @@ def small_inserting() -> Curriculum:
         train=replace(waiting.train, seed=24, optim=replace(_TURNING, warmup_steps=50, decay=(900, 2000))),
         num_steps=2000,
     )
+    righting = replace(
+        hand,
+        name="small_inserting/righting",
+        train=replace(waiting.train, seed=26, optim=replace(_TURNING, warmup_steps=50, decay=(400, 1200))),
+        num_steps=1200,
+    )
     settling = replace(
         settling,
         name="small_inserting/settling",
         example=replace(settling.example, blind=0.3, other_ways=0.3),
-        train=TrainConfig(seed=25, optim=replace(_TURNING, learning_rate=4e-4, warmup_steps=30, decay=(150, 400))),
-        num_steps=400,
+        train=TrainConfig(seed=25, optim=replace(_TURNING, learning_rate=4e-4, warmup_steps=30, decay=(150, 340))),
+        num_steps=340,
     )
-    return Curriculum(name="small_inserting", stages=(hand, settling))
+    return Curriculum(name="small_inserting", stages=(hand, righting, settling))
 
 
 def _settling_on(

@@ -16,7 +16,7 @@ Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]
 
 
 @pytest.mark.parametrize("offset", [(0, 0, 1), (1, 0, 0), (-1, 1, 0)])
-@pytest.mark.parametrize("task", ["PickHighlight", "VideoUnmask"])  # a cube, a container
+@pytest.mark.parametrize("task", ["PickHighlight", "VideoUnmask", "InsertPeg"])  # a cube, a container, a bar
 def test_it_lifts_nothing_and_recovers(
     environment: Callable[[str], Environment], task: str, offset: tuple[int, int, int]
 ) -> None:
