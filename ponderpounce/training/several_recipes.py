@@ -74,7 +74,7 @@ def small_further() -> Curriculum:
         name="small_further/releasing",
         example=replace(hand.example, nudge=replace(BESIDE_THE_WAY, spares_release=True)),
         train=replace(hand.train, seed=2, optim=replace(FROM_SCRATCH, warmup_steps=50, decay=(400, 1200))),
-        num_steps=1200,
+        num_steps=2000,
     )
     binding = replace(
         binding,
@@ -326,8 +326,8 @@ def small_inserting() -> Curriculum:
     righting = replace(
         hand,
         name="small_inserting/righting",
-        train=replace(waiting.train, seed=26, optim=replace(_TURNING, warmup_steps=50, decay=(400, 1200))),
-        num_steps=1200,
+        train=replace(waiting.train, seed=26, optim=replace(_TURNING, warmup_steps=50, decay=(800, 2000))),
+        num_steps=2000,
     )
     settling = replace(
         settling,

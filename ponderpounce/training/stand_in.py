@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ponderpounce.models.place_code import NUM_PLACE_FEATURES, PLACE_PX, VALUE_SCALE, WAVE_PX, place_features
+from ponderpounce.training.insertions import manner
 from ponderpounce.training.places import PLACE
 
 MOST_NUMBERS = 128
@@ -58,6 +59,7 @@ _ORDINAL_OF = {"two": "second", "three": "third", "four": "fourth", "five": "fif
 _SECOND_PLACE_SEED = 2
 _MAX_EVEN_WEIGHT = 64.0
 _NOWHERE = (PLACE_PX // 2, PLACE_PX // 2)
+_AHEAD_PX = 60.0
 
 
 @functools.lru_cache(maxsize=1 << 16)
@@ -65,7 +67,8 @@ def stand_in(subgoal: str, size: int, instruction: str = "", onward: str = "") -
     """Returns the stand-in (size,) for a grounded subgoal, ``<y, x>`` in pixels of a 256 px picture.
 
     The first coordinates are the place; a subgoal without any points at the middle. Second ones, where the skill leads
-    from one place to another, are within its code; without, those of ``onward`` are, where it goes on afterwards. The
+    from one place to another, are within its code; without, those of ``onward`` are, where it goes on afterwards. Of a
+    peg or a hole (`insertions`) both ends are told, and the second only tells in which direction it lies. The
     instruction tells what follows where the subgoal does not (`skill_of`).
 
     Raises:
@@ -128,8 +131,21 @@ def _skill_code(subgoal: str, instruction: str, onward: str, size: int) -> NDArr
     places = [*PLACE.findall(subgoal)[1:], *PLACE.findall(onward)]
     if not places:
         return code
-    second = _second_place(size) @ place_features((int(places[0][0]), int(places[0][1])))
-    return _mixed(code, second)
+    second = int(places[0][0]), int(places[0][1])
+    if manner(subgoal) and (place := PLACE.search(subgoal)):
+        second = _ahead((int(place[1]), int(place[2])), second)
+    return _mixed(code, _second_place(size) @ place_features(second))
+
+
+def _ahead(first: tuple[int, int], second: tuple[int, int]) -> tuple[float, float]:
+    """A place in the direction of the second one from the first, far enough away to tell that direction.
+
+    A peg's ends lie some ten pixels apart. Told as they are, a hand turned itself by up to 66 degrees too far or not
+    far enough: it hardly read the second place, which is otherwise where it goes on to, as exactly as that takes.
+    """
+    away = np.subtract(second, first)
+    y, x = np.array(first) + away * (_AHEAD_PX / max(float(np.hypot(*away)), 1.0))
+    return float(y), float(x)
 
 
 def _mixed(code: NDArray[np.float32], other: NDArray[np.float32]) -> NDArray[np.float32]:

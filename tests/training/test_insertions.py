@@ -80,8 +80,15 @@ def test_every_manner_is_a_skill_of_its_own_and_tells_two_places() -> None:
     codes = np.stack([stand_in(text, 128) for text in texts])
     likeness = np.corrcoef(codes[:, NUM_PLACE_FEATURES:])
     assert np.abs(likeness - np.eye(8)).max() < 0.75  # they share a second place, which is 0.36 of each
-    moved = stand_in(texts[0].replace("<83, 127>", "<100, 140>"), 128)
-    assert not np.allclose(moved, codes[0])
+
+
+@given(st.integers(-9, 9), st.integers(-9, 9), st.integers(2, 4))
+def test_of_the_second_place_the_direction_alone_is_told(down: int, right: int, times: int) -> None:
+    pick = asked()[0].replace("<91, 134>", "<100, 100>")
+    near, far = (pick.replace("<83, 127>", f"<{100 + n * down}, {100 + n * right}>") for n in (1, times))
+    np.testing.assert_allclose(stand_in(near, 128), stand_in(far, 128), atol=1e-5)
+    turned = pick.replace("<83, 127>", f"<{100 - right}, {100 + down}>")
+    assert np.allclose(stand_in(near, 128), stand_in(turned, 128)) == (down == right == 0)
 
 
 def test_a_mirrored_picture_shows_the_other_side_and_the_same_end() -> None:
