@@ -131,7 +131,7 @@ def _skill_code(subgoal: str, instruction: str, onward: str, size: int) -> NDArr
     places = [*PLACE.findall(subgoal)[1:], *PLACE.findall(onward)]
     if not places:
         return code
-    second = int(places[0][0]), int(places[0][1])
+    second: tuple[float, float] = int(places[0][0]), int(places[0][1])
     if manner(subgoal) and (place := PLACE.search(subgoal)):
         second = _ahead((int(place[1]), int(place[2])), second)
     return _mixed(code, _second_place(size) @ place_features(second))
