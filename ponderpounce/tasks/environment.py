@@ -184,13 +184,14 @@ class Environment:
         """Yields the conditioning video of this episode, the first frame and every so many after; nothing without one.
 
         It can be watched at any time and as often as one likes: pictures are rendered as they are asked for, and the
-        episode itself stands still meanwhile. With ``look_hz`` only so many of its snapshots a second have pictures.
-        Raises ValueError unless the rates divide 20 Hz.
+        episode itself stands still meanwhile. With ``look_hz`` only so many of its snapshots a second have pictures,
+        and the last one: a movement often ends between two looks. Raises ValueError unless the rates divide 20 Hz.
         """
         self._require_episode()
         every, look_every = _steps_between(rate_hz), _steps_between(look_hz or rate_hz)
         shown = range(0, len(self._video), every)
-        return (self._demonstrated(step, self._video[step], look=step % look_every == 0) for step in shown)
+        looked_at = {*(step for step in shown if step % look_every == 0), *shown[-1:]}
+        return (self._demonstrated(step, self._video[step], look=step in looked_at) for step in shown)
 
     def step(self, action: ArrayLike, *, look: bool = True) -> Snapshot:
         """Applies an action (8,) for exactly 50 ms and returns what is seen then; without ``look``, no pictures.

@@ -19,6 +19,18 @@ from ponderpounce.tasks.geometry import Array, transform
 from ponderpounce.tasks.kinematics import Kinematics, UnreachableError
 from ponderpounce.tasks.physics import CONTROL_HZ, Physics
 from ponderpounce.tasks.scene import BUTTON_BASE_HEIGHT_M
+from ponderpounce.tasks.tool_poses import (
+    DOWN,
+    LEFT,
+    OVER_M,
+    OVER_Z_M,
+    at_height,
+    facing_down,
+    is_over,
+    lying_along,
+    put_at,
+    ways_of_carrying,
+)
 
 Action = NDArray[np.float32]
 Actions = Iterator[Action]
@@ -36,16 +48,12 @@ _SWING_M = 0.10
 _TIP_M = 0.07  # of the stick, over what it points at
 _ARC_POINTS, _ARC_PAUSE = 45, 5  # control steps
 _MISS_M, _MISS_CONTAINER_M = 0.04, 0.035
-_OVER_M, _OVER_COS, _OVER_Z_M = 0.01, 0.98, 0.02  # of the tool over a grasp: aside, turned (11 degrees), in height
 _UPRIGHT = 0.7  # of a cube's axis: one that points up this much is none to close along
 _EMPTY_M = 0.01  # of a finger: closed that far, there is nothing between them
 _BAR_LIFTS_M = (0.20, 0.16, 0.13)  # a bar counts as lifted above 0.10
 _PUSH_FROM_M, _PUSH_SHORT_M, _PUSH_BACK_M = 0.05, 0.02, 0.02  # of the tool: behind the body, before the target
 _HOOK_FROM_M, _HOOK_SHORT_M, _HOOK_ASIDE_M, _HOOK_ABOVE_M = 0.1, 0.03, 0.1, 0.1
-_MIDDLE_M = (-0.15, 0.0, 0.25)  # from here the arm gets nearly everywhere
 _QUARTERS = ((1, 0), (0, 1), (0, -1), (-1, 0))  # cosine and sine of 0, 90, -90 and 180 degrees
-_LEFT = np.array([0.0, 1.0, 0.0])
-_DOWN = np.array([0.0, 0.0, -1.0])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,6 +93,11 @@ class Motions:
         self._max_speed_rad_s = physics.robot.oracle_speed_rad_s
         self._gripper = physics.gripper_command()  # it may be holding something already
 
+    @property
+    def strays_by(self) -> int:
+        """1 or -1 where a grasp was made to fail: to which side an insertion first goes astray, too; else 0."""
+        return 0 if self._failed_grasp is None else next((sign for sign in self._failed_grasp.offset if sign), 1)
+
     def move(self, target: Array) -> Actions:
         """Moves the tool along a straight screw to a transform (4, 4). Raises UnreachableError, before moving."""
         path = self._kinematics.screw_path(self._physics.arm_qpos(), target, _PATH_POINTS, stopping_at_limits=True)
@@ -122,7 +135,7 @@ class Motions:
         """Presses the button below with the closed gripper and comes back up."""
         yield from self.close()
         above = self._above_button(button)
-        yield from self.move(_at_height(above, BUTTON_BASE_HEIGHT_M / 2))
+        yield from self.move(at_height(above, BUTTON_BASE_HEIGHT_M / 2))
         yield from self.move(above)
 
     def wait_until(self, elapsed_steps: int) -> Actions:
@@ -157,14 +170,14 @@ class Motions:
         """Lowers the tool straight down to a height, lets go, and comes back up."""
         here = self._physics.tcp_transform()
         x_m, y_m, _ = here[:3, 3]
-        yield from self.move(_at(here, x_m, y_m, release_z_m))
+        yield from self.move(put_at(here, x_m, y_m, release_z_m))
         yield from self.open()
-        yield from self.move(_at(here, x_m, y_m, _ABOVE_M))
+        yield from self.move(put_at(here, x_m, y_m, _ABOVE_M))
 
     def let_go(self) -> Actions:
         """Opens the gripper where it is and comes straight up."""
         yield from self.open()
-        yield from self.move(_at_height(self._physics.tcp_transform(), _ABOVE_M))
+        yield from self.move(at_height(self._physics.tcp_transform(), _ABOVE_M))
 
     def place(self, target: str) -> Actions:
         """Carries what is held over a target, sets it down there and comes back up."""
@@ -174,7 +187,7 @@ class Motions:
         """Carries what is held over a point, lowers the tool to a height, lets go and comes back up."""
         above = self._carried_to(x_m, y_m, _ABOVE_M)
         yield from self.move(above)
-        yield from self.move(_at_height(above, release_z_m))
+        yield from self.move(at_height(above, release_z_m))
         yield from self.open()
         yield from self.move(above)
 
@@ -213,7 +226,7 @@ class Motions:
         qpos, path = self._physics.arm_qpos(), []
         for s in np.linspace(0.0, 1.0, _ARC_POINTS):
             x_m, y_m = (1 - s) ** 2 * start_m + 2 * s * (1 - s) * control_m + s**2 * end_m
-            qpos = self._kinematics.solve(_at(here, x_m, y_m, _TIP_M), qpos)
+            qpos = self._kinematics.solve(put_at(here, x_m, y_m, _TIP_M), qpos)
             path.append(qpos)
         for qpos in path:
             yield self._action(qpos)
@@ -239,7 +252,7 @@ class Motions:
     def carry(self, body: str, poses: Sequence[Array]) -> Actions:
         """Carries a held body to poses (4, 4), one after another, however it lies in the hand."""
         way = self._first_way(
-            _ways_of_carrying(transform(self._physics.pose(body)), self._physics.tcp_transform(), poses)
+            ways_of_carrying(transform(self._physics.pose(body)), self._physics.tcp_transform(), poses)
         )
         for detour in way[: -len(poses)]:
             yield from self.move(detour)
@@ -253,16 +266,18 @@ class Motions:
         start_m -= _PUSH_FROM_M * ahead
         end_m = self._physics.position_m(target) - _PUSH_SHORT_M * ahead
         end_m[2] = start_m[2]
-        tools = sorted((_tool(left), _tool(-left)), key=lambda T: -float(T[0, 0]))  # rather facing away from the robot
+        tools = sorted(
+            (facing_down(left), facing_down(-left)), key=lambda T: -float(T[0, 0])
+        )  # rather facing away from the robot
         above, behind, _ = self._first_way(
-            [[_at_height(_at(T, *start_m), _ABOVE_M), _at(T, *start_m), _at(T, *end_m)] for T in tools]
+            [[at_height(put_at(T, *start_m), _ABOVE_M), put_at(T, *start_m), put_at(T, *end_m)] for T in tools]
         )
         yield from self.open()
         yield from self.move(above)
         yield from self.move(behind)
         yield from self.close()
-        yield from self.move(_at(behind, *end_m))
-        yield from self.move(_at(behind, *(end_m - _PUSH_BACK_M * ahead)))  # opening fingers would kick the body
+        yield from self.move(put_at(behind, *end_m))
+        yield from self.move(put_at(behind, *(end_m - _PUSH_BACK_M * ahead)))  # opening fingers would kick the body
         yield from self.open()
 
     def hook(self, end: str, body: str, target: str) -> Actions:
@@ -277,9 +292,9 @@ class Motions:
         """
         start_m, ahead, left = self._straight_to(body, target)
         across = left if left[0] > 0 else -left
-        behind = _at(_lying(across), *(start_m - _HOOK_FROM_M * ahead - _HOOK_ASIDE_M * across))
+        behind = put_at(lying_along(across), *(start_m - _HOOK_FROM_M * ahead - _HOOK_ASIDE_M * across))
         end_m = self._physics.position_m(target) - _HOOK_SHORT_M * ahead - _HOOK_ASIDE_M * across
-        return [_at_height(behind, _HOOK_ABOVE_M), behind, _at(behind, end_m[0], end_m[1], start_m[2])]
+        return [at_height(behind, _HOOK_ABOVE_M), behind, put_at(behind, end_m[0], end_m[1], start_m[2])]
 
     def open_at(self, target: Array) -> Actions:
         """Moves the tool to a transform (4, 4), then opens the gripper there."""
@@ -291,7 +306,7 @@ class Motions:
         start_m = self._physics.position_m(body)
         ahead = (self._physics.position_m(target) - start_m) * [1.0, 1.0, 0.0]
         ahead /= np.linalg.norm(ahead)
-        return start_m, ahead, np.cross(-_DOWN, ahead)
+        return start_m, ahead, np.cross(-DOWN, ahead)
 
     def _grasp(self, body: str, *, from_z_m: float, grasp_z_m: float, miss_m: float) -> Actions:
         resumes, self._resumes = self._resumes, False
@@ -317,12 +332,12 @@ class Motions:
         while self._watches and self._is_elsewhere(body, above):
             above = self._above_block(body, from_z_m, grasp_z_m)
             yield from self.open_at(above)
-        yield from self.move(_at_height(above, grasp_z_m))
+        yield from self.move(at_height(above, grasp_z_m))
         return above
 
     def _is_elsewhere(self, body: str, above: Array) -> bool:
         """Whether a body has left the place below a transform (4, 4)."""
-        return bool(np.linalg.norm(self._physics.position_m(body)[:2] - above[:2, 3]) > _OVER_M)
+        return bool(np.linalg.norm(self._physics.position_m(body)[:2] - above[:2, 3]) > OVER_M)
 
     def _resume(self, body: str, from_z_m: float, grasp_z_m: float) -> Actions:
         """A grasp that somebody else has begun, well or badly."""
@@ -330,36 +345,36 @@ class Motions:
         here = self._physics.tcp_transform()
         if self._physics.is_grasped(body):
             yield from self.close()
-            yield from self.move(_at_height(here, from_z_m))
+            yield from self.move(at_height(here, from_z_m))
             return
         above = self._above_block(body, from_z_m, grasp_z_m)
         is_closed = self._gripper < 0
         is_empty = is_closed and float(np.min(self._physics.finger_openings_m())) < _EMPTY_M
-        if _is_over(here, above, grasp_z_m) and not is_empty:
-            if here[2, 3] > grasp_z_m + _OVER_Z_M:
+        if is_over(here, above, grasp_z_m) and not is_empty:
+            if here[2, 3] > grasp_z_m + OVER_Z_M:
                 if is_closed:
                     yield from self.open()
-                yield from self.move(_at_height(above, grasp_z_m))
+                yield from self.move(at_height(above, grasp_z_m))
         else:
-            if here[2, 3] < from_z_m - _OVER_Z_M:
-                yield from self.move(_at_height(here, from_z_m))  # beside the thing there may be others
+            if here[2, 3] < from_z_m - OVER_Z_M:
+                yield from self.move(at_height(here, from_z_m))  # beside the thing there may be others
             if is_closed:
                 yield from self.open()
             above = self._above_block(body, from_z_m, grasp_z_m)
             yield from self.open_at(above)
-            yield from self.move(_at_height(above, grasp_z_m))
+            yield from self.move(at_height(above, grasp_z_m))
         yield from self.close()
         yield from self.move(above)
 
     def _over_bar(self, end: str, onward: Sequence[Array]) -> tuple[Array, Array]:
         """Where the tool (4, 4) waits above a lying bar's end, and where it closes upon it: a way leads onward."""
         lying = transform(self._physics.pose(end))
-        grasps = [_at(_tool(side * lying[:3, 1]), *lying[:3, 3]) for side in (-1.0, 1.0)]
+        grasps = [put_at(facing_down(side * lying[:3, 1]), *lying[:3, 3]) for side in (-1.0, 1.0)]
         ways = [
-            [_at_height(grasp, height_m), grasp, _at_height(grasp, height_m), *way]
+            [at_height(grasp, height_m), grasp, at_height(grasp, height_m), *way]
             for height_m in _BAR_LIFTS_M
             for grasp in grasps
-            for way in _ways_of_carrying(lying, grasp, onward)
+            for way in ways_of_carrying(lying, grasp, onward)
         ]
         above, grasp, *_ = self._first_way(ways)
         return above, grasp
@@ -368,7 +383,7 @@ class Motions:
         """Closes above a bar, or beyond its end: beside it a finger would come down upon it. Comes up and opens."""
         outward = self._physics.position_m(end) - self._physics.position_m(end.split("/")[0])
         aside_m = np.array([0.0, 0.0, _MISS_M]) if is_high else _MISS_M * outward / np.linalg.norm(outward)
-        missed, over = (_at(pose, *(pose[:3, 3] + aside_m)) for pose in (grasp, above))
+        missed, over = (put_at(pose, *(pose[:3, 3] + aside_m)) for pose in (grasp, above))
         for pose, grip in ((over, self.open), (missed, self.close), (over, self.open)):
             yield from self.move(pose)
             yield from grip()
@@ -378,7 +393,7 @@ class Motions:
         above = self._above_block(body, from_z_m, grasp_z_m)
         above[:2, 3] += offset_m[:2]
         yield from self.open_at(above)
-        yield from self.move(_at_height(above, grasp_z_m + offset_m[2]))
+        yield from self.move(at_height(above, grasp_z_m + offset_m[2]))
         yield from self.close()
         yield from self.move(above)
         yield from self.open()
@@ -390,12 +405,12 @@ class Motions:
     def _tip_over(self, target: str) -> Array:
         """Where the stick points at a target (4, 4), turned as it is now."""
         x_m, y_m, _ = self._physics.position_m(target)
-        return _at(self._physics.tcp_transform(), x_m, y_m, _TIP_M)
+        return put_at(self._physics.tcp_transform(), x_m, y_m, _TIP_M)
 
     def _above_button(self, button: str) -> Array:
         """Where the tool waits above a button, fingers along y; the wrist is turned round if it must be."""
         x_m, y_m, _ = self._physics.position_m(button)
-        return self._first_reachable([_at(_tool(side), x_m, y_m, _ABOVE_M) for side in (-_LEFT, _LEFT)])
+        return self._first_reachable([put_at(facing_down(side), x_m, y_m, _ABOVE_M) for side in (-LEFT, LEFT)])
 
     def _above_block(self, body: str, from_z_m: float, grasp_z_m: float) -> Array:
         """Where the tool waits above a square body, turned least among the grasps with most room for the open fingers.
@@ -406,7 +421,7 @@ class Motions:
         closing = self._physics.tcp_transform()[:3, 1]
         sides = [side for side in transform(self._physics.pose(body))[:3, :3].T if abs(side[2]) < _UPRIGHT]
         directions = sorted([*sides, *(-side for side in sides)], key=lambda side: -float(side @ closing))
-        waiting = [_at(_tool(direction), x_m, y_m, from_z_m) for direction in directions]
+        waiting = [put_at(facing_down(direction), x_m, y_m, from_z_m) for direction in directions]
         return self._first_reachable(sorted(waiting, key=lambda above: self._overlap_m(above, grasp_z_m, body)))
 
     def _overlap_m(self, above: Array, z_m: float, cube: str) -> float:
@@ -417,7 +432,7 @@ class Motions:
         try:
             qpos = self._kinematics.solve(above, self._physics.arm_qpos())
             return self._kinematics.overlap_m(
-                self._physics.data, self._kinematics.solve(_at_height(above, z_m), qpos), cube
+                self._physics.data, self._kinematics.solve(at_height(above, z_m), qpos), cube
             )
         except UnreachableError:
             return 0.0
@@ -426,7 +441,7 @@ class Motions:
         """The tool (4, 4) at a place as it is turned now, or by quarter turns if the wrist cannot get there so."""
         held = self._physics.tcp_transform()
         quarters = [np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) for c, s in _QUARTERS]
-        return self._first_reachable([_at(T @ held, x_m, y_m, z_m) for T in quarters])
+        return self._first_reachable([put_at(T @ held, x_m, y_m, z_m) for T in quarters])
 
     def _first_reachable(self, targets: Sequence[Array]) -> Array:
         """The first transform (4, 4) that a straight screw from here leads to. Raises UnreachableError if none does."""
@@ -454,47 +469,3 @@ class Motions:
 
     def _action(self, qpos: Array) -> Action:
         return np.append(qpos, self._gripper).astype(np.float32)
-
-
-def _tool(closing: Array) -> Array:
-    """A transform (4, 4) at the origin with the palm facing down and the fingers closing along a direction (3,)."""
-    y = closing * [1.0, 1.0, 0.0]
-    y = y / np.linalg.norm(y)
-    T = np.eye(4)
-    T[:3, :3] = np.column_stack([np.cross(y, _DOWN), y, _DOWN])
-    return T
-
-
-def _is_over(tool: Array, above: Array, grasp_z_m: float) -> bool:
-    """Whether a tool (4, 4) is on the straight way down from where it would wait above a thing."""
-    aside_m = np.linalg.norm(tool[:2, 3] - above[:2, 3])
-    is_between = grasp_z_m - _OVER_Z_M < tool[2, 3] < above[2, 3] + _OVER_Z_M
-    return bool(aside_m < _OVER_M and is_between and tool[:3, 1] @ above[:3, 1] > _OVER_COS)
-
-
-def _at_height(T: Array, z_m: float) -> Array:
-    moved = T.copy()
-    moved[2, 3] = z_m
-    return moved
-
-
-def _at(T: Array, x_m: float, y_m: float, z_m: float) -> Array:
-    moved = T.copy()
-    moved[:3, 3] = x_m, y_m, z_m
-    return moved
-
-
-def _lying(along: Array) -> Array:
-    """A transform (4, 4) at the origin, upright and with its x axis along a horizontal unit direction (3,)."""
-    T = np.eye(4)
-    T[:3, :3] = np.column_stack([along, np.cross(-_DOWN, along), -_DOWN])
-    return T
-
-
-def _ways_of_carrying(body: Array, tool: Array, poses: Sequence[Array]) -> list[list[Array]]:
-    """Where the tool (4, 4) goes so that a body held by it comes to poses (4, 4): straight, or by way of the middle."""
-    targets = [pose @ np.linalg.inv(body) @ tool for pose in poses]
-    if not targets:
-        return [[]]
-    detours: tuple[list[Array], ...] = ([], [_at(targets[0], *_MIDDLE_M)], [_at(_tool(-_LEFT), *_MIDDLE_M)])
-    return [[*detour, *targets] for detour in detours]

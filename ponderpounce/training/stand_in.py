@@ -137,7 +137,7 @@ def _skill_code(subgoal: str, instruction: str, onward: str, size: int) -> NDArr
     return _mixed(code, _second_place(size) @ place_features(second))
 
 
-def _ahead(first: tuple[int, int], second: tuple[int, int]) -> tuple[float, float]:
+def _ahead(first: tuple[int, int], second: tuple[float, float]) -> tuple[float, float]:
     """A place in the direction of the second one from the first, far enough away to tell that direction.
 
     A peg's ends lie some ten pixels apart. Told as they are, a hand turned itself by up to 66 degrees too far or not

@@ -209,3 +209,17 @@ def test_texts_that_follow_tell_both_ends_and_both_mouths(grasped: str, side: st
             f"Pick up the peg by grasping the {ENDS[grasped]} end at <>, <>",
             f"Insert the peg from the {side} side of the box at <>, <>",
         }, "which side it will be is not to be seen while the peg is picked up"
+
+
+@pytest.mark.parametrize("strays_by", [1, -1])
+@pytest.mark.parametrize(("grasped", "side"), list(product(ENDS, SIDES)))
+def test_who_goes_astray_is_in_front_of_the_hole_before_going_in(grasped: str, side: str, strays_by: int) -> None:
+    layout = replace(LAYOUT, grasped=grasped, side=side)
+    straight, straying = layout.approach(), layout.approach(strays_by)
+    beside, in_front = straying[3:5]
+    for pose, wanted in zip([*straying[:3], straying[-1]], straight, strict=True):
+        np.testing.assert_array_equal(pose, wanted)
+    aside_m = beside[:3, 3] - in_front[:3, 3]
+    assert np.linalg.norm(aside_m) == pytest.approx(0.015)
+    assert aside_m @ layout.outward == pytest.approx(0.0, abs=1e-9)
+    assert np.cross(in_front[:3, 3] - straight[-1][:3, 3], layout.outward) == pytest.approx(0.0, abs=1e-9)

@@ -49,7 +49,8 @@ _PEG_REACH_M, _PEG_YAW_RAD = (0.2, 0.3), np.pi / 4
 _PEG_FROM_BOX_M, _PEG_FROM_PEG_M, _MAX_TRIES = 0.06, 0.075, 512
 _PEG_HALF_LENGTH_M = 0.05
 _BETWEEN_ENDS_M = 0.05  # their centres
-_APPROACH = ((0.2, 0.15), (0.2, 0.0), (0.15, 0.0), (0.025, 0.0))  # of the leading end: out of the box, above the hole
+_APPROACH = ((0.2, 0.15, 0.0), (0.2, 0.0, 0.0), (0.15, 0.0, 0.0), (0.025, 0.0, 0.0))
+_STRAYING = ((0.1, 0.0, 0.015), (0.1, 0.0, 0.0))  # of the leading end, as before: out of the box, above the hole, aside
 _ARM_REACH_M = 0.78  # from the base to a tool that points straight down
 _GAP_M, _FINGERS_HALF_M, _HAND_HALF_M = 0.005, (0.012, 0.065), (0.035, 0.105)
 _BOX, _LAMP = "box", "box/core"
@@ -90,15 +91,19 @@ class Layout:
         axis = transform(self.box.pose(BOX_Z_M))[:3, 0]
         return (ahead, behind) if axis @ self.outward > 0 else (behind, ahead)
 
-    def approach(self) -> list[Array]:
-        """Where (4, 4) the held end is carried: in front of the box and above, down, close, and in."""
+    def approach(self, strays_by: int = 0) -> list[Array]:
+        """Where (4, 4) the held end is carried: in front of the box and above, down, close, and in.
+
+        With ``strays_by`` 1 or -1 it comes closer beside the hole first, and goes aside until it is in front of it.
+        """
         turned = np.eye(4)
         x = self.outward if self.grasped == "head" else -self.outward
         turned[:3, 0], turned[:3, 1] = x, np.cross(turned[:3, 2], x)
         poses = []
-        for out_m, above_m in _APPROACH:
+        for out_m, above_m, aside_m in (*_APPROACH[:-1], *(_STRAYING if strays_by else ()), *_APPROACH[-1:]):
             held = turned.copy()
             held[:3, 3] = np.array([*self.box.xy_m, BOX_Z_M + above_m]) + (out_m + _BETWEEN_ENDS_M) * self.outward
+            held[:3, 3] += strays_by * aside_m * turned[:3, 1]
             poses.append(held)
         return poses
 
@@ -161,7 +166,7 @@ class InsertPeg(Task[Layout, Memory]):
                 grounds=(_BOX,),
                 is_done=lambda physics, memory: _is_in(layout, physics),
                 failure=_wrong_insertion(layout),
-                motion=lambda motions: motions.carry(held, layout.approach()),
+                motion=lambda motions: motions.carry(held, layout.approach(motions.strays_by)),
                 way=f"[, <>, {end}]",
                 way_grounds=layout.mouths,
             ),
