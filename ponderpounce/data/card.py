@@ -128,9 +128,9 @@ def _origin(dataset: Dataset) -> list[str]:
         settings = json.loads(path.read_text())["settings"]
         look = settings["look"]
         lines.append(
-            f"Pictures were rendered {look['demonstration_hz']} times a second in demonstrations and "
-            f"{look['execution_hz']} times afterwards; other rows repeat the last one (`is_rendered` is false). Seeds "
-            f"begin at {settings['first_seed']}. Made with "
+            f"Pictures were rendered {look['demonstration_hz']} times a second in demonstrations, once more at "
+            f"their end, and {look['execution_hz']} times afterwards; other rows repeat the last one (`is_rendered` is "
+            f"false). Seeds begin at {settings['first_seed']}. Made with "
             + ", ".join(f"{name} {version}" for name, version in settings["versions"].items())
             + "."
         )

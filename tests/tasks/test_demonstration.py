@@ -89,6 +89,17 @@ def test_pictures_of_the_video_are_rendered_when_watched_and_own_their_memory() 
         assert before.frames.keys() == a.frames.keys() == after.frames.keys()
 
 
+@pytest.mark.sim
+@pytest.mark.parametrize("look_hz", [1, 2, 5, 10])
+def test_who_looks_now_and_then_looks_at_the_end(look_hz: int) -> None:
+    with Environment(WithDemonstration(), image_px=32, render=True, max_steps=4) as env:
+        env.reset(0)
+        seen = [bool(snapshot.frames) for snapshot in env.demonstration(look_hz=look_hz)]
+        last = len(seen) - 1
+        assert last % 20, "it ends between two looks"
+        assert [step for step, looked in enumerate(seen) if looked] == sorted({*range(0, last, 20 // look_hz), last})
+
+
 def test_watching_needs_an_episode() -> None:
     env = Environment(WithDemonstration(), image_px=32, render=False, max_steps=4)
     with pytest.raises(RuntimeError, match="call reset first"):
