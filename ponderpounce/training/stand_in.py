@@ -140,8 +140,8 @@ def _skill_code(subgoal: str, instruction: str, onward: str, size: int) -> NDArr
 def _ahead(first: tuple[int, int], second: tuple[float, float]) -> tuple[float, float]:
     """A place in the direction of the second one from the first, far enough away to tell that direction.
 
-    A peg's ends lie some ten pixels apart. Told as they are, a hand turned itself by up to 66 degrees too far or not
-    far enough: it hardly read the second place, which is otherwise where it goes on to, as exactly as that takes.
+    A peg's ends lie some ten pixels apart. Told as they are, a hand closed turned by up to 66 degrees from it. Other
+    second places are where it goes on to, and need not be read as exactly.
     """
     away = np.subtract(second, first)
     y, x = np.array(first) + away * (_AHEAD_PX / max(float(np.hypot(*away)), 1.0))
