@@ -89,11 +89,11 @@ class ExampleConfig:
     ways_by_sight: bool = False
     """See `TrainingEpisode.with_ways_by_sight`."""
     other_ways: float = 0.0
-    """Share of demonstrated ways told otherwise than pictures show them: around things `with_other_sides`, others
-    `scattered`. The row ends with the second query; what notes say is not learned. Harmful until ``blind`` was."""
+    """Share of demonstrated ways and insertions told otherwise than pictures show: `with_other_sides`, and but for ways
+    around things `scattered`. The row ends with the second query; what notes say is not learned. Harmful until ``blind`` was."""
     blind: float = 0.0
-    """Share of demonstrated ways whose rows are words alone (`blind`), of other places and sides in every row:
-    narration and plan can then be had from notes and nowhere else."""
+    """Share of them whose rows are words alone (`blind`), of other places and sides in every row: narration and plan
+    can then be had from notes and nowhere else."""
     cuts_short: float = 0.0
     """Share of episodes that count, of two rounds and more, that are told to end sooner (`cuts`)."""
     slips: float = 0.0
