@@ -90,7 +90,7 @@ class ExampleConfig:
     """See `TrainingEpisode.with_ways_by_sight`."""
     other_ways: float = 0.0
     """Share of demonstrated ways and insertions told otherwise than pictures show: `with_other_sides`, and but for ways
-    around things `scattered`. The row ends with the second query; what notes say is not learned. Harmful until ``blind`` was."""
+    around things `scattered`. The row ends with the second query; what notes say is not learned. Not before blind."""
     blind: float = 0.0
     """Share of them whose rows are words alone (`blind`), of other places and sides in every row: narration and plan
     can then be had from notes and nowhere else."""
