@@ -238,9 +238,9 @@ class Motions:
         ``onward`` are poses (4, 4) that the end will be carried to. The bar is grasped the way round that leads there.
         """
         yield from self.open()
-        failed, self.num_grasps = self._failed_grasp, self.num_grasps + 1
+        failed = self._begin_grasp()
         above, grasp = self._over_bar(end, onward)
-        if failed is not None and failed.before == self.num_grasps - 1:
+        if failed is not None:
             yield from self._miss_bar(end, above, grasp, is_high=failed.offset[2] > 0)
             above, grasp = self._over_bar(end, onward)
         yield from self.move(above)
@@ -266,9 +266,8 @@ class Motions:
         start_m -= _PUSH_FROM_M * ahead
         end_m = self._physics.position_m(target) - _PUSH_SHORT_M * ahead
         end_m[2] = start_m[2]
-        tools = sorted(
-            (facing_down(left), facing_down(-left)), key=lambda T: -float(T[0, 0])
-        )  # rather facing away from the robot
+        # rather facing away from the robot
+        tools = sorted((facing_down(left), facing_down(-left)), key=lambda T: -float(T[0, 0]))
         above, behind, _ = self._first_way(
             [[at_height(put_at(T, *start_m), _ABOVE_M), put_at(T, *start_m), put_at(T, *end_m)] for T in tools]
         )
@@ -315,8 +314,8 @@ class Motions:
             yield from self._resume(body, from_z_m, grasp_z_m)
             return
         yield from self.open()
-        failed, self.num_grasps = self._failed_grasp, self.num_grasps + 1
-        if failed is not None and failed.before == self.num_grasps - 1:
+        failed = self._begin_grasp()
+        if failed is not None:
             yield from self._miss(body, from_z_m, grasp_z_m, miss_m * np.array(failed.offset))
         above = yield from self._reach_down(body, from_z_m, grasp_z_m)
         while self._watches and self._is_elsewhere(body, above):
@@ -324,6 +323,11 @@ class Motions:
             above = yield from self._reach_down(body, from_z_m, grasp_z_m)
         yield from self.close()
         yield from self.move(above)
+
+    def _begin_grasp(self) -> FailedGrasp | None:
+        """Counts a grasp; returns how it is to fail first, or None."""
+        failed, self.num_grasps = self._failed_grasp, self.num_grasps + 1
+        return failed if failed is not None and failed.before == self.num_grasps - 1 else None
 
     def _reach_down(self, body: str, from_z_m: float, grasp_z_m: float) -> Generator[Action, None, Array]:
         """Brings the open fingers around a body; returns where it was taken to be: the tool waiting above it (4, 4)."""

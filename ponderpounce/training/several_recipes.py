@@ -74,7 +74,7 @@ def small_further() -> Curriculum:
         name="small_further/releasing",
         example=replace(hand.example, nudge=replace(BESIDE_THE_WAY, spares_release=True)),
         train=replace(hand.train, seed=2, optim=replace(FROM_SCRATCH, warmup_steps=50, decay=(400, 1200))),
-        num_steps=2000,
+        num_steps=1200,
     )
     binding = replace(
         binding,
@@ -251,7 +251,7 @@ def small_foreseeing() -> Curriculum:
             slips=0.0,
         ),
         train=TrainConfig(seed=17, optim=replace(_TURNING, warmup_steps=50)),
-        num_steps=340,
+        num_steps=400,
         batch_episodes=16,
     )
     last = _settling_on(small_watching(), "small_foreseeing", 18, (220, 520), batch_episodes=8, tells_ends=True)

@@ -132,8 +132,8 @@ def _skill_code(subgoal: str, instruction: str, onward: str, size: int) -> NDArr
     if not places:
         return code
     second: tuple[float, float] = int(places[0][0]), int(places[0][1])
-    if manner(subgoal) and (place := PLACE.search(subgoal)):
-        second = _ahead((int(place[1]), int(place[2])), second)
+    if manner(subgoal) and len(told := PLACE.findall(subgoal)) > 1:
+        second = _ahead((int(told[0][0]), int(told[0][1])), second)
     return _mixed(code, _second_place(size) @ place_features(second))
 
 

@@ -49,8 +49,9 @@ _PEG_REACH_M, _PEG_YAW_RAD = (0.2, 0.3), np.pi / 4
 _PEG_FROM_BOX_M, _PEG_FROM_PEG_M, _MAX_TRIES = 0.06, 0.075, 512
 _PEG_HALF_LENGTH_M = 0.05
 _BETWEEN_ENDS_M = 0.05  # their centres
+# Of the leading end: out of the box, above the hole, beside it.
 _APPROACH = ((0.2, 0.15, 0.0), (0.2, 0.0, 0.0), (0.15, 0.0, 0.0), (0.025, 0.0, 0.0))
-_STRAYING = ((0.1, 0.0, 0.015), (0.1, 0.0, 0.0))  # of the leading end, as before: out of the box, above the hole, aside
+_STRAYING = ((0.1, 0.0, 0.015), (0.1, 0.0, 0.0))
 _ARM_REACH_M = 0.78  # from the base to a tool that points straight down
 _GAP_M, _FINGERS_HALF_M, _HAND_HALF_M = 0.005, (0.012, 0.065), (0.035, 0.105)
 _BOX, _LAMP = "box", "box/core"
