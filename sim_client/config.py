@@ -73,6 +73,8 @@ class SimOptions:
     allow_starved: bool = False
     """Start although the schedule leaves ticks without a row."""
     max_steps: int = 1300
+    video_end: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Show a demonstration's last frame, too, beside one a second: for a PONDER that has learned from it."""
 
     record: bool = True
     """Write one MCAP per episode."""

@@ -82,6 +82,8 @@ class EvalOptions:
     pounce_checkpoint: Path | None = None
     max_steps: int = 1300
     """Per episode (paper: 1300)."""
+    video_end: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Show a demonstration's last frame, too, beside one a second (paper: 1 Hz): for a PONDER that has learned so."""
 
     cognition: Literal["real", "null", "other-episode", "stand-in"] = "real"
     """null: POUNCE gets the learned null cognition. other-episode: what PONDER said in another episode of the task.
@@ -194,6 +196,7 @@ class EvalOptions:
             deliver="null" if self.cognition == "null" else self.deliver,
             held_age_ms=self.reported_age_ms,
             max_steps=self.max_steps,
+            video_end=self.video_end,
             record=self.record,
             record_hz=self.record_hz,
             progress=False,
@@ -203,6 +206,8 @@ class EvalOptions:
         """As in ``results.json``: sim-client's options, and those that make an evaluation of them."""
         config: dict[str, Any] = as_json(dataclasses.asdict(self.sim()))
         del config["task"], config["list_tasks"]
+        if not self.video_end:
+            del config["video_end"]
         own = {"tasks": self.task_names(), "runs": self.runs, "cognition": self.cognition, "donors": self.donors}
         if self.subgoal_text is not None:
             own["subgoal_text"] = self.subgoal_text

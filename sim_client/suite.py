@@ -154,7 +154,8 @@ class Suite:
     def _demonstration(self, environment: Environment) -> tuple[m.DemoFrame, ...]:
         if self._options.policy != "servers":
             return ()
-        return demonstration(environment, images.wire_codec(self._link.bus.is_local))
+        codec = images.wire_codec(self._link.bus.is_local)
+        return demonstration(environment, codec, to_its_end=self._options.video_end)
 
     def _open(self, request: m.OpenRequest) -> m.OpenReply:
         """Asks the clock service until its servers are ready.

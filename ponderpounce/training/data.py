@@ -200,21 +200,21 @@ class TrainingSet:
         source = self._sources[number]
         entry, rows = source.entry, source.rows()
         start = entry.num_demonstration_rows
-        shown = [*range(0, start, FPS), *range(start, entry.num_rows)]
-        num_shown = len(range(0, start, FPS))
+        demo = _looked_at(start, rows)
+        num_shown, shown = len(demo), [*demo, *range(start, entry.num_rows)]
         own = np.maximum.accumulate(np.where(rows.is_rendered, np.arange(len(rows.is_rendered)), 0))
         views, sights = self._pictures(source, own, shown)
         moving = moving_places(entry.task, entry.seed, entry.difficulty, entry.num_rows)
-        shown_texts = rows.grounded_subgoal[:start]
-        over_m = _OVER_A_WAY_M if shows_a_way(shown_texts[::FPS]) else 0.0
-        tools = _seen_at(rows.tcp_pose[:start:FPS], below_m=over_m)
-        whence, rests = ends_of_moves(shown_texts)
+        demo_texts = [rows.grounded_subgoal[row] for row in demo]
+        over_m = _OVER_A_WAY_M if shows_a_way(demo_texts) else 0.0
+        tools = _seen_at(rows.tcp_pose[demo], below_m=over_m)
+        moves = [[texts[row] for row in demo] for texts in ends_of_moves(rows.grounded_subgoal[:start])]
         episode = TrainingEpisode(
             instruction=entry.instruction,
             demo=tuple((views if sights is None else sights)[:num_shown]),
-            demo_subgoals=shown_texts[::FPS],
+            demo_subgoals=demo_texts,
             demo_tools=tools,
-            demo_notes=demo_notes(shown_texts[::FPS], tools, moving[:start:FPS], (whence[::FPS], rests[::FPS])),
+            demo_notes=demo_notes(demo_texts, tools, [moving[row] for row in demo], (moves[0], moves[1])),
             frames=views[num_shown:],
             sights=None if sights is None else sights[num_shown:],
             state_T8=rows.state[start:],
@@ -292,6 +292,12 @@ def _sources(dataset: Dataset, tasks: Sequence[str], *, is_watched: bool) -> lis
         kind = "" if is_watched else "successful "
         raise ValueError(f"{dataset.root} has no {kind}episode of {', '.join(tasks) or 'any task'}; it has {there}")
     return [_Source(dataset=dataset, entry=entry, is_watched=is_watched) for entry in entries]
+
+
+def _looked_at(num_rows: int, rows: Rows) -> list[int]:
+    """The rows of a demonstration of so many that PONDER is shown: one a second, and the last if it was rendered."""
+    seconds = [*range(0, num_rows, FPS)]
+    return [*seconds, num_rows - 1] if num_rows and rows.is_rendered[num_rows - 1] and (num_rows - 1) % FPS else seconds
 
 
 def _seen_at(poses_T7: NDArray[np.float32], below_m: float = 0.0) -> list[str]:

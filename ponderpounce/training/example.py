@@ -94,6 +94,8 @@ class ExampleConfig:
     blind: float = 0.0
     """Share of them whose rows are words alone (`blind`), of other places and sides in every row: narration and plan
     can then be had from notes and nowhere else."""
+    spares_bare_ways: bool = False
+    """`other_ways` and `blind` are of ways around things and of insertions alone: no other ways have sides."""
     cuts_short: float = 0.0
     """Share of episodes that count, of two rounds and more, that are told to end sooner (`cuts`)."""
     slips: float = 0.0
@@ -298,7 +300,8 @@ def make_example(
             cuts(episode.instruction, episode.subgoals, episode.is_transition_T), episode.imitated_from, rng
         )
     is_around = has_sides(episode.demo_subgoals)
-    is_way = shows_a_way(episode.demo_subgoals) or shows_an_insertion(episode.demo_subgoals)
+    is_bare = not is_around and shows_a_way(episode.demo_subgoals)
+    is_way = is_around or shows_an_insertion(episode.demo_subgoals) or (is_bare and not config.spares_bare_ways)
     is_blind = is_way and bool(config.blind) and rng.random() < config.blind
     if is_otherwise := is_blind or (is_way and bool(config.other_ways) and rng.random() < config.other_ways):
         others = np.flatnonzero(rng.integers(2, size=_MOST_STRETCHES)) + 1

@@ -158,7 +158,8 @@ def demo_notes(
 
     Where things move by the clock alone, where they are. Else every deed that a narration tells (`told_deeds`), with
     its number, when the tool is nearest to its place; of a way around things also where it leads and on which side it
-    passes one, when the tool is there: that is seen then, and told at the end of the stretch. And where a thing that
+    passes one, when the tool is there: that is seen then, and told at the end of the stretch. Of a peg its place when
+    it is grasped, and when it is lifted at which end; and when it is in, from which side. And where a thing that
     will be asked for may change places afterwards, its place from then on: "second <y, x>". Which of the deeds was
     asked for is then one thing to find out, and where it was done another, to be looked up by that word.
 
@@ -175,9 +176,12 @@ def demo_notes(
         # the end of a stretch is where the next one begins
         last = min(deed.last + int(WAY.search(texts[deed.last]) is not None), len(texts) - 1)
         instants = range(min(max(deed.first, done + 1), last), last + 1)
-        if manner(texts[last]).endswith(" side"):  # on its way the hand may pass over the other one
+        how = manner(texts[last])
+        if how.endswith(" end") and (grasped := _nearest(instants, tools, deed.place)) < last:
+            found[grasped] = deed.place  # fingers hide it there; which end they hold is seen when it is lifted
+        if how:  # on its way to one side the hand may pass over the other one
             instants = range(last, last + 1)
-        done = min(instants, key=lambda instant: apart_px(tools[instant], deed.place) or 0.0)  # 0: the text tells none
+        done = _nearest(instants, tools, deed.place)
         side = course(texts[deed.last])
         whence, before = before or tools[instants.start], deed.place
         if side and _half_way(instants, tools, whence, deed.place) == len(texts) - 1:
@@ -201,6 +205,11 @@ def demo_notes(
             which = _which(told, still[0][3]) if which is None else which
             found[instant] = f"{which} {_onward(*(match[3] for match in still))}".lstrip()
     return found
+
+
+def _nearest(instants: range, tools: Sequence[str], place: str) -> int:
+    """Of these instants the one in which the tool is nearest to a place; the first if there is none."""
+    return min(instants, key=lambda instant: apart_px(tools[instant], place) or 0.0)
 
 
 def _which(told: Sequence[Told], place: str) -> str:

@@ -112,6 +112,7 @@ RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
     "small_at_length": several.small_at_length,
     "small_by_sight": several.small_by_sight,
     "small_inserting": several.small_inserting,
+    "small_to_the_end": several.small_to_the_end,
     "small_refresh_1s": partial(small.small_refresh, 1),
     "small_refresh_2s": partial(small.small_refresh, 2),
     "small_refresh_4s": partial(small.small_refresh, 4),

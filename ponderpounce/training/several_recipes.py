@@ -339,6 +339,23 @@ def small_inserting() -> Curriculum:
     return Curriculum(name="small_inserting", stages=(hand, righting, settling))
 
 
+def small_to_the_end() -> Curriculum:
+    """The PONDER of `small_inserting` goes on, now with videos that it is shown to their end.
+
+    docs/training.md, "To the end".
+    """
+    *_, settling = small_inserting().stages
+    optim = replace(_TURNING, learning_rate=2.5e-4, warmup_steps=30, decay=(120, 420))
+    settling = replace(
+        settling,
+        name="small_to_the_end/settling",
+        example=replace(settling.example, spares_bare_ways=True),
+        train=replace(settling.train, seed=27, optim=optim),
+        num_steps=420,
+    )
+    return Curriculum(name="small_to_the_end", stages=(settling,))
+
+
 def _settling_on(
     before: Curriculum, name: str, seed: int, decay: tuple[int, int], *, batch_episodes: int = 16, **example: Any
 ) -> Curriculum:

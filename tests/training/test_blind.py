@@ -135,6 +135,22 @@ def test_a_share_of_ways_is_blind_and_nothing_else(share: float) -> None:
     assert not any(blind(still, seed, 1.0).is_blind for seed in range(5))
 
 
+def test_ways_around_nothing_can_be_spared() -> None:
+    plain = ExampleConfig(clocks=EVALUATION, narrates=True, has_plans=True, ways_by_sight=True)
+    otherwise = replace(plain, blind=0.6, other_ways=0.6, spares_bare_ways=True)
+    for shown, is_spared in ((straight_way(), True), (noted_way(), False)):
+        for seed in range(20):
+            made, as_shown = (
+                make_example(shown, NOTING, config, np.random.default_rng(seed)) for config in (otherwise, plain)
+            )
+            if is_spared:
+                assert not made.is_blind
+                assert made.row().ids == as_shown.row().ids
+            elif made.is_blind:
+                break
+        assert made.is_blind != is_spared
+
+
 def test_a_straight_way_told_otherwise_has_its_pictures_and_is_read_from_its_notes() -> None:
     v, shown = FORM.vocabulary, straight_way()
     config = ExampleConfig(clocks=EVALUATION, narrates=True, has_plans=True, other_ways=1.0, text_dropout=1.0)

@@ -65,11 +65,12 @@ def test_the_narration_tells_end_and_side_with_their_places() -> None:
     assert (grasp.first, grasp.last, put.first, put.last) == (0, 4, 5, 10)
 
 
-def test_the_end_is_noted_when_the_tool_is_there_and_the_side_when_it_is_in() -> None:
+def test_the_place_is_noted_when_the_tool_is_there_the_end_when_it_is_lifted_and_the_side_when_it_is_in() -> None:
     tools = [f"<{y}, 134>" for y in (10, 60, 88, 60, 60)] + [f"<{y}, 100>" for y in (60, 111, 80, 90, 100, 100)]
     notes = demo_notes(shown(), tools, [""] * 11)
     assert {n: note for n, note in enumerate(notes) if note} == {
-        2: "far end <91, 134>, <83, 127>",
+        2: "<91, 134>",
+        4: "far end <91, 134>, <83, 127>",
         10: "right side <111, 135>",
     }
 

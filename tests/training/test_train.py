@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,7 +46,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def _episode(seed: int, num_demo: int) -> dict[str, bytes]:
+def _episode(seed: int, num_demo: int, unseen: Collection[int] = ()) -> dict[str, bytes]:
     rng = np.random.default_rng(seed)
     episode = EpisodeWriter(PX)
     for index in range(num_demo + 45):
@@ -60,7 +61,7 @@ def _episode(seed: int, num_demo: int) -> dict[str, bytes]:
             demonstration_reasoning="Demo selected <3, 4>." if num_demo and index == num_demo else "",
         )
         picture = np.full((PX, PX, 3), 20 + index, np.uint8)
-        episode.add(row, {"front": picture, "wrist": 255 - picture})
+        episode.add(row, {} if index in unseen else {"front": picture, "wrist": 255 - picture})
     about = About(
         task="PickHighlight", instruction="pick what was shown", seed=seed, difficulty="easy", origin="oracle",
         is_success=True, image_px=PX,
@@ -99,6 +100,23 @@ def test_an_episode_is_read_as_it_was_written(folder: Path) -> None:
     brightness = [int(views[0].mean()) for views in (*episode.demo, episode.frames[0], episode.frames[44])]
     assert brightness == pytest.approx([20, 40, 60, 20 + NUM_DEMO_ROWS, 64 + NUM_DEMO_ROWS], abs=2)  # H.264 rounds
     assert int(episode.frames[0][1].mean()) == pytest.approx(255 - 20 - NUM_DEMO_ROWS, abs=2)
+
+
+@pytest.mark.parametrize("num_demo", [1, 20, 21, 22, 40, 59])
+@pytest.mark.parametrize("is_rendered", [True, False])
+def test_a_video_is_looked_at_once_a_second_and_at_its_end_if_that_was_rendered(
+    tmp_path: Path, num_demo: int, is_rendered: bool
+) -> None:
+    writer = DatasetWriter(tmp_path / "set")
+    last = num_demo - 1
+    writer.add(unpack(_episode(1, num_demo, () if is_rendered or last % 20 == 0 else (last,))))
+    writer.finish()
+    episode = TrainingSet(tmp_path / "set")[0]
+    rows = sorted({*range(0, num_demo, 20), *([last] if is_rendered else [])})
+    assert [int(views[0].mean()) for views in episode.demo] == pytest.approx([20 + row for row in rows], abs=2)
+    told = [f"pick it at <{1 + row // 60}, 7>" for row in rows]
+    assert [list(episode.demo_subgoals), len(episode.demo_tools), len(episode.demo_notes)] == [told, *[len(rows)] * 2]
+    assert int(episode.frames[0][0].mean()) == pytest.approx(20 + num_demo, abs=2)
 
 
 def test_what_was_still_to_come_what_was_said_and_what_moves_are_read(tmp_path: Path) -> None:
