@@ -43,7 +43,18 @@ stored = json.loads(path.read_text()) | {"counsel": {"others": views, "near": 30
 path.write_text(json.dumps(stored, indent=2) + "\n")' "$@"
 }
 
-evaluate() {  # a PAIR on the test scenes of fifteen tasks and of OTHERS, with cognition and without: OUT/real, OUT/null, OUT/tables
+blend() {  # two PONDERs' weights, a SHARE of the second's, INTO a folder
+    mkdir -p "$4"
+    cp "$1"/* "$4"
+    "$bin/python" -c 'import pathlib, sys
+from safetensors.torch import load_file, save_file
+one, other = (load_file(pathlib.Path(folder, "model.safetensors")) for folder in sys.argv[1:3])
+share, path = float(sys.argv[3]), pathlib.Path(sys.argv[4], "model.safetensors")
+blended = {name: weight.float() * (1 - share) + other[name].float() * share for name, weight in one.items()}
+save_file(blended, path, metadata={"format": "pt"})' "$@"
+}
+
+evaluate() {  # a PAIR on the test scenes of fifteen tasks and of OTHERS (and as pp-eval is told), with cognition and without: OUT/real, OUT/null, OUT/tables
     local pair=$1 out=$2 cognition
     for cognition in real null; do
         "$bin/pp-eval" --tasks PickHighlight StopCube MoveCube PatternLock RouteStick VideoPlaceButton VideoPlaceOrder VideoRepick \
