@@ -24,7 +24,6 @@ _AT = re.compile(rf" (?:at|to) {PLACE.pattern}(?:, then .*|, {PLACE.pattern})?")
 _WATCHED = re.compile(rf"[^<]* at {PLACE.pattern}, {PLACE.pattern}|static at {PLACE.pattern}")
 _AROUND = re.compile(r"(left|right) target by circling around the stick (clockwise|counterclockwise)")
 _PUT, _PRESS, _PICK = "drop the cube onto target", "press the button", "pick up the"
-_GRASP = "Pick up the peg by grasping"
 
 Place = tuple[int, int]
 
@@ -82,10 +81,9 @@ class Told:
 def told_deeds(texts: Sequence[str]) -> list[Told]:
     """What was done where, in order; nothing where that is little.
 
-    Things are put onto one place after the other, one is picked up, or a peg is held at one of its ends, which are told
-    both, and put into a box from one side. Of a way every stretch counts: around things
-    with its `course`, others with their last word, as plans tell them
-    (`TrainingEpisode.with_plans`).
+    Things are put onto one place after the other, one is picked up, or a peg is held at one of its ends and put into a
+    box from one side. Of a way every stretch counts: around things with its `course`, others with their last word, as
+    plans tell them (`TrainingEpisode.with_plans`).
     """
     if stretches := _stretches(texts):
         return stretches
@@ -98,8 +96,7 @@ def told_deeds(texts: Sequence[str]) -> list[Told]:
         elif deed.name.startswith(_PRESS):
             there, words = puts, "button"
         elif (how := manner(texts[instant])) and place:
-            other = deed.name.startswith(_GRASP) and _place(texts[instant], 1)
-            there, words = puts, f"{how} {place}" + ("" if not other else ", <{}, {}>".format(*other))
+            there, words = puts, f"{how} {place}"
         elif deed.name.startswith(_PICK) and place:
             there, words = picks, place
         else:

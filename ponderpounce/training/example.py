@@ -89,8 +89,8 @@ class ExampleConfig:
     ways_by_sight: bool = False
     """See `TrainingEpisode.with_ways_by_sight`."""
     other_ways: float = 0.0
-    """Share of demonstrated ways and insertions told otherwise than pictures show: `with_other_sides`, and but for ways
-    around things `scattered`. The row ends with the second query; what notes say is not learned. Not before blind."""
+    """Share of demonstrated ways and insertions told otherwise than pictures show: `with_other_sides`, and ways around
+    nothing `scattered`. The row ends with the second query; what notes say is not learned. Not before blind."""
     blind: float = 0.0
     """Share of them whose rows are words alone (`blind`), of other places and sides in every row: narration and plan
     can then be had from notes and nowhere else."""
@@ -334,7 +334,7 @@ def make_example(
     is_grounded = config.is_grounded and (rng.random() >= config.text_dropout or episode.is_told or is_otherwise)
     is_own = is_grounded and bool(config.own_words and episode.said) and rng.random() < config.own_words
     slip = None
-    if is_blind or (is_otherwise and not is_around):
+    if is_blind or (is_otherwise and is_bare):
         slip = Slip(std_px=None, seed=int(rng.integers(1 << 62)), is_learned=True)
     elif is_grounded and not is_own and config.slips and not episode.is_told and rng.random() < config.slips:
         std_px = float(np.exp(rng.uniform(*np.log(config.slip_px))))

@@ -12,7 +12,9 @@ import pytest
 
 from ponderpounce.data.album import INSTRUCTION, REFUSED, Studio, main
 from ponderpounce.data.dataset import Dataset
+from ponderpounce.tasks.imitation.insert_peg import InsertPeg
 from ponderpounce.tasks.scene import CUBE_COLORS
+from ponderpounce.tasks.task import Task
 
 NUM_SCENES = 24
 _SAID = re.compile(r"(highlighted )?(\w+ cube|button) at <(\d+), (\d+)>")
@@ -58,6 +60,7 @@ NAMED = {
     "MoveCube": {"red cube", "target", "peg"},
     "PatternLock": {"grey target", "red target"},
     "RouteStick": {"grey target", "red target", "post"},
+    "InsertPeg": {"box", "far end", "near end"},
 }
 
 
@@ -115,6 +118,9 @@ def test_it_is_a_dataset_of_pages(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "another --out" in capsys.readouterr().err
 
 
-def test_a_task_that_names_nothing_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_task_that_names_nothing_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(InsertPeg, "things", Task.things)
     assert main(["--out", str(tmp_path), "--task", "InsertPeg"]) == REFUSED
     assert "'InsertPeg' does not name its things" in capsys.readouterr().err

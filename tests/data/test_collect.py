@@ -28,6 +28,8 @@ from ponderpounce.data.lerobot_v3 import ALBUM
 from ponderpounce.data.rollout import UNSOLVED
 from ponderpounce.data.shove import SHOVES
 from ponderpounce.data.store import Store
+from ponderpounce.tasks.imitation.insert_peg import InsertPeg
+from ponderpounce.tasks.task import Task
 
 TASKS, EPISODES = ("PickHighlight", "VideoUnmask"), 3  # names only: nothing is simulated here
 WorkOut = Callable[[Job], Package]
@@ -303,6 +305,7 @@ def test_an_album_of_a_task_that_names_nothing_is_refused_before_anything_starts
 ) -> None:
     idle = InOrder(pretend)
     monkeypatch.setattr(module, "_workers", lambda _: idle)
+    monkeypatch.setattr(InsertPeg, "things", Task.things)
     arguments = ["--out", str(tmp_path), "--tasks", "PickHighlight", "InsertPeg", "--episodes", "1"]
     assert module.main([*arguments, "--album", "100", "--no-progress"]) == module.REFUSED
     assert "'InsertPeg' does not name its things" in capsys.readouterr().err

@@ -14,7 +14,9 @@ from ponderpounce.data.dataset import Dataset
 from ponderpounce.data.episode import WANDERING, EpisodeWriter, Rows, unpack
 from ponderpounce.data.video import FPS
 from ponderpounce.data.wander import REFUSED, Wanderers, main
+from ponderpounce.tasks.imitation.insert_peg import InsertPeg
 from ponderpounce.tasks.scene import CUBE_COLORS
+from ponderpounce.tasks.task import Task
 
 LOOKS = 9
 _SAID = re.compile(r"pick up the (?:\w+ )?highlighted cube at <(\d+), (\d+)>, which is (\w+)")
@@ -94,6 +96,9 @@ def test_it_is_a_dataset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert "another --out" in capsys.readouterr().err
 
 
-def test_a_task_that_names_nothing_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_task_that_names_nothing_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(InsertPeg, "things", Task.things)
     assert main(["--out", str(tmp_path), "--task", "InsertPeg"]) == REFUSED
     assert "does not name its things" in capsys.readouterr().err

@@ -60,7 +60,7 @@ def test_told_otherwise_twice_is_told_as_it_was_and_places_stay(end: str, side: 
 
 
 def test_the_narration_tells_end_and_side_with_their_places() -> None:
-    assert narration(shown()) == "far end <91, 134>, <83, 127>, right side <111, 135>"
+    assert narration(shown()) == "far end <91, 134>, right side <111, 135>"
     grasp, put = told_deeds(shown())
     assert (grasp.first, grasp.last, put.first, put.last) == (0, 4, 5, 10)
 
@@ -70,7 +70,7 @@ def test_the_place_is_noted_when_the_tool_is_there_the_end_when_it_is_lifted_and
     notes = demo_notes(shown(), tools, [""] * 11)
     assert {n: note for n, note in enumerate(notes) if note} == {
         2: "<91, 134>",
-        4: "far end <91, 134>, <83, 127>",
+        4: "far end <91, 134>",
         10: "right side <111, 135>",
     }
 
@@ -103,7 +103,7 @@ def test_a_mirrored_picture_shows_the_other_side_and_the_same_end() -> None:
 
 
 def inserted_episode() -> TrainingEpisode:
-    notes = [*[""] * 4, "far end <91, 134>, <83, 127>", *[""] * 5, "right side <111, 135>"]
+    notes = [*[""] * 4, "far end <91, 134>", *[""] * 5, "right side <111, 135>"]
     told = replace(episode(4, changes=(0, 2), num_demo=11), subgoals=[asked()[0]] * 2 + [asked()[1]] * 2)
     return replace(told, demo_subgoals=shown(), demo_notes=notes)
 
@@ -116,7 +116,7 @@ def test_what_a_blind_row_teaches_of_a_peg_stands_in_its_notes() -> None:
         assert made.frames() is None
         first = int(row.gate_index[0])
         noted, told = v.decode(row.ids[:first]), v.decode([token for token in row.targets[first:] if token >= 0])
-        assert set(TOLD.findall(told)) == set(TOLD.findall(noted)), "both ends and the mouth, and no other place"
+        assert set(TOLD.findall(noted)) < set(TOLD.findall(told)), "the held end and the mouth; where it points is seen"
         words = [re.findall(r"(?:far|near) end|(?:left|right) side", text) for text in (noted, told)]
         assert set(words[0]) == set(words[1])
         manners.add(tuple(words[0]))

@@ -36,7 +36,7 @@ from ponderpounce.tasks.physics import Physics
 from ponderpounce.tasks.placing import Point, until_it_fits
 from ponderpounce.tasks.props import RED
 from ponderpounce.tasks.scene import SceneFullError, display_rgba
-from ponderpounce.tasks.task import Reasoning, Shown, Subtask, Task, task
+from ponderpounce.tasks.task import Reasoning, Shown, Subtask, Task, Thing, task
 
 NUM_PEGS = 3
 ENDS = {"head": "far", "tail": "near"}  # seen from the robot
@@ -203,6 +203,11 @@ class InsertPeg(Task[Layout, Memory]):
             f"Reproduce exactly; next is: {captions.simple(self.subtasks(layout)[index].text)}.",
             grounds=(layout.held_end, _BOX),
         )
+
+    def things(self, layout: Layout, step: int, memory: Memory | None = None) -> tuple[Thing, ...]:
+        """The box, and both ends of each peg as it lies: half a peg cannot be put anywhere by itself."""
+        ends = [(f"{end} end", f"{peg}/{half}") for peg in _PEGS for half, end in ENDS.items()]
+        return tuple(Thing(name=name, body=body, is_movable=False) for name, body in (("box", _BOX), *ends))
 
     def retold(self, layout: Layout) -> tuple[Layout, ...]:
         """The peg was grasped at the other end, or inserted from the other side, or both, as far as there is room."""
