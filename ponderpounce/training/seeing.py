@@ -71,8 +71,8 @@ class SeeOptions:
     ponder: Path | None = None
     """Open the eyes of this one again, all else as it is; --recipe is then not read, and --data for --like alone."""
     like: Path | None = None
-    """The one whose eye was widened to that of --ponder: what it saw is to be seen as it was. Pictures of --data's
-    episodes are read for that."""
+    """The one whose eye was widened to that of --ponder, or --ponder itself: what it saw is to be seen as it was.
+    Pictures of --data's episodes are read for that."""
     out: Path
     """OUT/ponder is what `pp-train --ponder` goes on from."""
     steps: int = 2000
@@ -177,8 +177,10 @@ def see_things(options: SeeOptions) -> None:
 
 def unlikeness(ponder: Ponder, before: Ponder, frames_NHW3: Tensor) -> Tensor:
     """How much ``ponder`` shows otherwise than ``before`` did, of its part of these pictures; 1 is the variance."""
-    assert ponder.format.fovea is not None
-    top, left = (first * ponder.format.token_px for first in ponder.format.fovea[:2])
+    first_token = (
+        (0, 0) if before.format.image_grid == ponder.format.image_grid else (ponder.format.fovea or (0, 0))[:2]
+    )
+    top, left = (first * ponder.format.token_px for first in first_token)
     height, width = before.image_px
     with torch.no_grad():
         wanted = before.image_features(frames_NHW3[:, top : top + height, left : left + width].contiguous())
@@ -189,11 +191,13 @@ def unlikeness(ponder: Ponder, before: Ponder, frames_NHW3: Tensor) -> Tensor:
 
 def _before(like: Path, ponder: Ponder) -> Ponder:
     before = load_ponder(like)
-    fovea = ponder.format.fovea
-    if fovea is None or fovea[2:] != before.format.image_grid or ponder.format.token_px != before.format.token_px:
+    fovea, grid = ponder.format.fovea, before.format.image_grid
+    sees_part = fovea is not None and fovea[2:] == grid
+    if not (sees_part or grid == ponder.format.image_grid) or ponder.format.token_px != before.format.token_px:
         raise ValueError(
-            f"{like} sees {before.format.image_grid} tokens of {before.format.token_px} px; it must be what was "
-            f"widened to a fovea of {fovea} and tokens of {ponder.format.token_px} px"
+            f"{like} sees {grid} tokens of {before.format.token_px} px; it must see the same as --ponder, which sees "
+            f"{ponder.format.image_grid}, or be what was widened to a fovea of {fovea}; tokens of "
+            f"{ponder.format.token_px} px"
         )
     return before
 

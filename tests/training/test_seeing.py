@@ -24,6 +24,7 @@ from ponderpounce.training.wide_eyes import wide_eyed
 PONDER = Ponder.random(small(), seed=0)
 FORM = PONDER.format
 NAMES = ("blue cube", "button", "red cube")
+BOX = (8 / 256, 32 / 256, 168 / 256, 224 / 256)
 TOP_PX, LEFT_PX, SIDE_PX, TOKEN_PX = 8, 64, 128, 32
 
 
@@ -116,23 +117,27 @@ def test_the_tower_learns_and_nothing_else_moves(tmp_path: Path, capsys: pytest.
     assert moved == {name for name in once if ".visual." in name}
 
 
-def test_an_eye_that_was_widened_is_held_to_what_it_saw(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("is_widened", [True, False])
+def test_an_eye_is_held_to_what_it_saw_before_it_was_widened_or_opened_again(
+    is_widened: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder, narrow, wide = tmp_path / "album", tmp_path / "narrow", tmp_path / "wide"
     assert album.main(["--out", str(folder), "--pictures", "100", "--image-px", "128", "--no-progress"]) == 0
     save_ponder(PONDER, narrow)
-    save_ponder(wide_eyed(PONDER, (8 / 256, 32 / 256, 168 / 256, 224 / 256)), wide)
+    save_ponder(wide_eyed(PONDER, BOX), wide)
+    opened = wide if is_widened else narrow
     unlike = []
     for like in ([], ["--like", str(narrow)]):
         out = tmp_path / f"out{len(like)}"
-        arguments = ["--recipe", "small", "--data", str(folder), "--album", str(folder), "--ponder", str(wide), *like]
+        arguments = ["--recipe", "small", "--data", str(folder), "--album", str(folder), "--ponder", str(opened), *like]
         assert main([*arguments, "--out", str(out), "--steps", "10", "--pictures", "32", "--no-progress"]) == 0
-        seen = read_album(load_ponder(wide).format, folder).pictures
+        seen = read_album(load_ponder(opened).format, folder).pictures
         with torch.no_grad():
             unlike.append(unlikeness(load_ponder(out / "ponder"), PONDER, torch.from_numpy(seen)).item())
     assert unlike[1] < unlike[0] / 2
     arguments = ["--recipe", "small", "--data", str(folder), "--album", str(folder), "--ponder", str(narrow)]
-    assert main([*arguments, "--like", str(narrow), "--out", str(tmp_path / "none")]) == REFUSED
-    assert "it must be what was widened to a fovea of None" in capsys.readouterr().err
+    assert main([*arguments, "--like", str(wide), "--out", str(tmp_path / "none")]) == REFUSED
+    assert "or be what was widened to a fovea of None" in capsys.readouterr().err
 
 
 def test_several_albums_are_mixed_and_one_stays_in_order(tmp_path: Path) -> None:
