@@ -342,7 +342,7 @@ def small_inserting() -> Curriculum:
 def small_to_the_end() -> Curriculum:
     """The PONDER of `small_inserting` goes on, now with videos that it is shown to their end.
 
-    docs/training.md, "To the end".
+    `pointing` once more, when its eye has been opened to pegs (`pp-see --like`). docs/training.md, "To the end".
     """
     *_, settling = small_inserting().stages
     optim = replace(_TURNING, learning_rate=2.5e-4, warmup_steps=30, decay=(120, 420))
@@ -353,7 +353,13 @@ def small_to_the_end() -> Curriculum:
         train=replace(settling.train, seed=27, optim=optim),
         num_steps=420,
     )
-    return Curriculum(name="small_to_the_end", stages=(settling,))
+    pointing = replace(
+        settling,
+        name="small_to_the_end/pointing",
+        example=replace(settling.example, blind=0.2),
+        train=replace(settling.train, seed=28, optim=replace(optim, decay=(150, 420))),
+    )
+    return Curriculum(name="small_to_the_end", stages=(settling, pointing))
 
 
 def _settling_on(
