@@ -84,7 +84,7 @@ class Opening:
 
     instruction: str
     demo_frames: tuple[tuple[Frame, ...], ...] = field(default=())
-    """Demonstration sampled at 1 Hz: for each instant, its views."""
+    """Demonstration sampled at 1 Hz, and at its end if the client shows it: for each instant, its views."""
 
     @property
     def has_demo(self) -> bool:
