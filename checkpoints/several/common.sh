@@ -43,6 +43,12 @@ stored = json.loads(path.read_text()) | {"counsel": {"others": views, "near": 30
 path.write_text(json.dumps(stored, indent=2) + "\n")' "$@"
 }
 
+take_none() {  # a PONDER's folder is served in its own view alone
+    "$bin/python" -c 'import json, pathlib, sys
+path = pathlib.Path(sys.argv[1], "ponder.json")
+path.write_text(json.dumps(json.loads(path.read_text()) | {"counsel": None}, indent=2) + "\n")' "$@"
+}
+
 blend() {  # two PONDERs' weights, a SHARE of the second's, INTO a folder
     mkdir -p "$4"
     cp "$1"/* "$4"

@@ -49,4 +49,5 @@ for kind in imitated filled shown old swaps swaps repick timed timed highlight h
 settle small_to_the_end "$next/begun" "$next/hand/run/righting/pounce" "$next" --data "${data[@]}" --sights "$side/sights" \
     --watch "$side/ways" "$side/rest" "$grown/a" "$grown/b" --watch-share 0.15 --products bfloat16
 look_again "$next/pair/ponder" 6 8 'highlight|hides|correct|grasping'
+take_none "$next/pair/ponder"
 evaluate "$next/pair" "$next" InsertPeg --video-end
