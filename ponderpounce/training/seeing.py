@@ -177,9 +177,8 @@ def see_things(options: SeeOptions) -> None:
 
 def unlikeness(ponder: Ponder, before: Ponder, frames_NHW3: Tensor) -> Tensor:
     """How much ``ponder`` shows otherwise than ``before`` did, of its part of these pictures; 1 is the variance."""
-    first_token = (
-        (0, 0) if before.format.image_grid == ponder.format.image_grid else (ponder.format.fovea or (0, 0))[:2]
-    )
+    first_token = _first_token(ponder, before)
+    assert first_token is not None
     top, left = (first * ponder.format.token_px for first in first_token)
     height, width = before.image_px
     with torch.no_grad():
@@ -191,15 +190,23 @@ def unlikeness(ponder: Ponder, before: Ponder, frames_NHW3: Tensor) -> Tensor:
 
 def _before(like: Path, ponder: Ponder) -> Ponder:
     before = load_ponder(like)
-    fovea, grid = ponder.format.fovea, before.format.image_grid
-    sees_part = fovea is not None and fovea[2:] == grid
-    if not (sees_part or grid == ponder.format.image_grid) or ponder.format.token_px != before.format.token_px:
+    if _first_token(ponder, before) is None:
         raise ValueError(
-            f"{like} sees {grid} tokens of {before.format.token_px} px; it must see the same as --ponder, which sees "
-            f"{ponder.format.image_grid}, or be what was widened to a fovea of {fovea}; tokens of "
-            f"{ponder.format.token_px} px"
+            f"{like} sees {before.format.image_grid} tokens of {before.format.token_px} px; it must see the same as "
+            f"--ponder, which sees {ponder.format.image_grid}, or be what was widened to a fovea of "
+            f"{ponder.format.fovea}; tokens of {ponder.format.token_px} px"
         )
     return before
+
+
+def _first_token(ponder: Ponder, before: Ponder) -> tuple[int, int] | None:
+    """Row and column, among the tokens of ``ponder``, of the first that ``before`` sees; None: no such part."""
+    fovea, grid = ponder.format.fovea, before.format.image_grid
+    if ponder.format.token_px != before.format.token_px:
+        return None
+    if grid == ponder.format.image_grid:
+        return 0, 0
+    return fovea[:2] if fovea is not None and fovea[2:] == grid else None
 
 
 def _films(form: ContextFormat, folders: Sequence[Path], seed: int) -> NDArray[np.uint8]:

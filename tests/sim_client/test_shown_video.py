@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from ponderpounce.tasks.environment import make_environment
 from protocol import images
+from sim_client.evaluate import EvalOptions
 from sim_client.robot import CAMERAS, DEMO_HZ, demonstration
+from sim_client.suite import Suite
 
 CODEC = images.wire_codec(is_local=True)
 
@@ -34,3 +39,18 @@ def test_without_a_video_nothing_is_shown(to_its_end: bool) -> None:
     with make_environment("PickHighlight", image_px=32) as env:
         env.reset(3)
         assert demonstration(env, CODEC, to_its_end=to_its_end) == ()
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("video_end", [False, True])
+def test_an_evaluation_is_shown_the_end_if_it_was_told_to_and_says_so(video_end: bool, tmp_path: Path) -> None:
+    evaluation = EvalOptions(out=tmp_path, video_end=video_end)
+    assert evaluation.config().get("video_end", False) is video_end
+    suite = SimpleNamespace(_options=evaluation.sim(), _link=SimpleNamespace(bus=SimpleNamespace(is_local=True)))
+    with make_environment("VideoUnmask", image_px=32) as env:
+        env.reset(3)
+        shown = Suite._demonstration(suite, env)  # type: ignore[arg-type]
+        wanted = demonstration(env, CODEC, to_its_end=video_end)
+        assert len(shown) == len(wanted)
+        last, wanted_last = (images.unpack(frames[-1].images[0]) for frames in (shown, wanted))
+        np.testing.assert_array_equal(last, wanted_last)

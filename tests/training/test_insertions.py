@@ -10,9 +10,11 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from clock.sampling import EVALUATION
 from ponderpounce.models.place_code import NUM_PLACE_FEATURES
 from ponderpounce.training.augment import Augmentation, draw_view
 from ponderpounce.training.deeds import narration, told_deeds
+from ponderpounce.training.example import ExampleConfig, make_example
 from ponderpounce.training.insertions import inserted_otherwise, manner, shows_an_insertion
 from ponderpounce.training.notes import demo_notes
 from ponderpounce.training.places import PLACE
@@ -130,3 +132,20 @@ def test_an_episode_told_otherwise_agrees_with_itself() -> None:
     assert [*dict.fromkeys(other.subgoals)] == asked("near", "left")
     assert narration(other.demo_subgoals) == ", ".join(note for note in other.demo_notes if note)
     assert all(PLACE.findall(a) == PLACE.findall(b) for a, b in zip(other.subgoals, inserted.subgoals, strict=True))
+
+
+def test_what_is_told_otherwise_of_a_peg_keeps_its_places() -> None:
+    config = ExampleConfig(clocks=EVALUATION, narrates=True, has_plans=True, ways_by_sight=True, other_ways=1.0)
+    v, manners = NOTING.vocabulary, set()
+    shown = v.decode(blind(inserted_episode(), share=0.0).row().ids)
+    for seed in range(20):
+        row = make_example(inserted_episode(), NOTING, config, np.random.default_rng(seed)).row()
+        told = v.decode(row.ids)
+        assert set(TOLD.findall(told)) <= set(TOLD.findall(shown))
+        manners.add(tuple(dict.fromkeys(re.findall(r"(?:far|near) end|(?:left|right) side", told))))
+    assert len(manners) == 4
+
+
+def test_a_peg_that_is_lifted_when_it_is_next_looked_at_has_one_note() -> None:
+    notes = demo_notes(shown()[4:6], ["<88, 134>", "<111, 135>"], [""] * 2)
+    assert notes == ["far end <91, 134>", "right side <111, 135>"]
