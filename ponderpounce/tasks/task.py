@@ -190,6 +190,14 @@ class Task(ABC, Generic[LayoutT, MemoryT]):
         """
         return step, step
 
+    def laid_out(self, layout: LayoutT) -> tuple[tuple[tuple[float, float, float], ...], ...]:
+        """Returns where things lie [m] that are to be written down at the first look at a demonstration, the places of
+        one thing together and always in one order.
+
+        What is done with one of them hides it; written down before, its places can be copied. The default is nothing.
+        """
+        return ()
+
     def due_step(self, layout: LayoutT) -> int | None:
         """Returns when the arm is to begin with what must happen at one instant, in steps from reset on.
 

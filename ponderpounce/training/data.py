@@ -23,7 +23,7 @@ from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.models.prompt import with_subgoal
 from ponderpounce.tasks.front_view import front_pixels
 from ponderpounce.training.chunks import chunk_ticks
-from ponderpounce.training.notes import demo_notes, ends_of_moves, moving_places
+from ponderpounce.training.notes import demo_notes, ends_of_moves, laid_out_places, moving_places
 from ponderpounce.training.own_words import as_recorded
 from ponderpounce.training.places import TEXT_PX
 from ponderpounce.training.sight_store import SightStore, Views
@@ -214,7 +214,13 @@ class TrainingSet:
             demo=tuple((views if sights is None else sights)[:num_shown]),
             demo_subgoals=demo_texts,
             demo_tools=tools,
-            demo_notes=demo_notes(demo_texts, tools, [moving[row] for row in demo], (moves[0], moves[1])),
+            demo_notes=demo_notes(
+                demo_texts,
+                tools,
+                [moving[row] for row in demo],
+                (moves[0], moves[1]),
+                laid_out_places(entry.task, entry.seed, entry.difficulty) if start else "",
+            ),
             frames=views[num_shown:],
             sights=None if sights is None else sights[num_shown:],
             state_T8=rows.state[start:],

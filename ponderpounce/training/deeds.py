@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from ponderpounce.tasks.captions import ORDINALS
-from ponderpounce.training.insertions import manner
+from ponderpounce.training.insertions import in_words, manner
 from ponderpounce.training.lapses import has_moved
 from ponderpounce.training.places import PLACE, WAY
 from ponderpounce.training.ways import seen_side
@@ -41,7 +41,8 @@ class Deed:
     place: Place | None
     """Row and column; None where the text tells none."""
     place_before: Place | None
-    """Of the deed before this one; where things are only watched, of the second of them."""
+    """Of the deed before this one; where things are only watched, of the second of them; of a peg, of its other end, or
+    of the hole's other mouth."""
 
 
 def deeds(texts: Sequence[str]) -> list[Deed]:
@@ -61,7 +62,7 @@ def deeds(texts: Sequence[str]) -> list[Deed]:
             counts[_name(text)] += 1
             number, before = number + 1, last
         last = text
-        other = _place(text, 1) if is_watched else _place(before)
+        other = _place(text, 1) if is_watched or manner(text) else _place(before)
         found.append(Deed(_name(text), counts[_name(text)], number, _place(text), other))
     return found
 
@@ -95,8 +96,8 @@ def told_deeds(texts: Sequence[str]) -> list[Told]:
             there, words = puts, f"{ORDINALS[deed.count - 1]} {place}"
         elif deed.name.startswith(_PRESS):
             there, words = puts, "button"
-        elif (how := manner(texts[instant])) and place:
-            there, words = puts, f"{how} {place}"
+        elif manner(texts[instant]) and place:
+            there, words = puts, in_words(texts[instant])
         elif deed.name.startswith(_PICK) and place:
             there, words = picks, place
         else:

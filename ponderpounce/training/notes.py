@@ -24,8 +24,10 @@ import re
 from collections.abc import Sequence
 from importlib.util import find_spec
 from itertools import groupby, pairwise
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ponderpounce.models.eyes import Eyes
 from ponderpounce.tasks.difficulty import DIFFICULTIES
@@ -33,9 +35,12 @@ from ponderpounce.tasks.front_view import front_pixels
 from ponderpounce.tasks.paces import PASS_STEPS, PRESS_STEPS
 from ponderpounce.training.countdown import rhythm, waits
 from ponderpounce.training.deeds import Told, course, told_deeds
-from ponderpounce.training.insertions import manner
+from ponderpounce.training.insertions import ends, manner
 from ponderpounce.training.lapses import Words, has_moved
 from ponderpounce.training.places import PARTS, PLACE, TEXT_PX, WAY, apart_px
+
+if TYPE_CHECKING:
+    from ponderpounce.tasks.task import Task
 
 _ONE = PLACE.pattern.replace("(", "").replace(")", "")
 _WATCHED = "static at "
@@ -62,14 +67,10 @@ def moving_places(task: str, seed: int, difficulty: str, num_steps: int) -> list
     physics: what the seed draws tells it (`Task.moving`, `Task.underway`). Empty, too, where nothing can be drawn
     (`can_follow`).
     """
-    if not can_follow():
+    drawn = _drawn(task, seed, difficulty)
+    if drawn is None:
         return [""] * num_steps
-    from ponderpounce.tasks.task import make_task, task_names  # here alone: it imports MuJoCo
-
-    if task not in task_names() or difficulty not in DIFFICULTIES:  # somebody else's data, or pictures of many scenes
-        return [""] * num_steps
-    found_task = make_task(task)
-    layout = found_task.sample(np.random.default_rng(seed), difficulty)
+    found_task, layout = drawn
     found: list[str] = []
     for step in range(num_steps):
         points_m = found_task.moving(layout, step)
@@ -82,10 +83,44 @@ def moving_places(task: str, seed: int, difficulty: str, num_steps: int) -> list
     return found
 
 
+def laid_out_places(task: str, seed: int, difficulty: str) -> str:
+    """Where things lie that are noted at the first look at a demonstration (`Task.laid_out`), ``<y, x>, <v, u>``.
+
+    From the picture's top on: mirrored, it has the same order. Empty where there are none, or nothing can be drawn.
+    """
+    drawn = _drawn(task, seed, difficulty)
+    if drawn is None:
+        return ""
+    found_task, layout = drawn
+    # the simulator's texts, which tell them too, cut off fractions
+    places = [_told(front_pixels(np.array(each), TEXT_PX)) for each in found_task.laid_out(layout)]
+    return ", ".join(place for each in sorted(filter(all, places), key=_row) for place in each)
+
+
+def _row(places: Sequence[str]) -> int:
+    found = PLACE.search(places[0])
+    return 0 if found is None else int(found[1])
+
+
+def _drawn(task: str, seed: int, difficulty: str) -> tuple[Task[Any, Any], Any] | None:
+    """The task and its layout; None where nothing can be drawn (`can_follow`), or it is none of ours."""
+    if not can_follow():
+        return None
+    from ponderpounce.tasks.task import make_task, task_names  # here alone: it imports MuJoCo
+
+    if task not in task_names() or difficulty not in DIFFICULTIES:  # somebody else's data, or pictures of many scenes
+        return None
+    found_task = make_task(task)
+    return found_task, found_task.sample(np.random.default_rng(seed), difficulty)
+
+
 def _in_picture(points_m: Sequence[tuple[float, float, float]]) -> list[str]:
     """``<y, x>`` of each; empty outside of the picture."""
-    pixels = front_pixels(np.array(points_m), TEXT_PX).round().astype(int).tolist()
-    return [f"<{y}, {x}>" if min(y, x) >= 0 and max(y, x) <= TEXT_PX else "" for y, x in pixels]
+    return _told(front_pixels(np.array(points_m), TEXT_PX).round())
+
+
+def _told(pixels_K2: NDArray[np.float64]) -> list[str]:
+    return [f"<{y}, {x}>" if min(y, x) >= 0 and max(y, x) <= TEXT_PX else "" for y, x in pixels_K2.astype(int).tolist()]
 
 
 def _onward(now: str, whence: str, rest: str) -> str:
@@ -153,21 +188,24 @@ def demo_notes(
     tools: Sequence[str],
     moving: Sequence[str],
     moves: tuple[Sequence[str], Sequence[str]] | None = None,
+    laid_out: str = "",
 ) -> list[str]:
     """What is noted at every instant of a demonstration, places as texts tell them; ``""`` for nothing.
 
     Where things move by the clock alone, where they are. Else every deed that a narration tells (`told_deeds`), with
     its number, when the tool is nearest to its place; of a way around things also where it leads and on which side it
-    passes one, when the tool is there: that is seen then, and told at the end of the stretch. Of a peg its place when
-    it is grasped, and when it is lifted at which end; and when it is in, from which side. And where a thing that
-    will be asked for may change places afterwards, its place from then on: "second <y, x>". Which of the deeds was
-    asked for is then one thing to find out, and where it was done another, to be looked up by that word.
+    passes one, when the tool is there: that is seen then, and told at the end of the stretch. Of pegs at the first look
+    where the near end and the far one of each lies, for nothing hides them then; of the one that is grasped the same
+    two, then; when it is lifted, at which end, that one before the other; and when it is in, from which side. And where
+    a thing that will be asked for may change places afterwards, its place from then on: "second <y, x>". Which of the
+    deeds was asked for is then one thing to find out, and where it was done another, to be looked up by that word.
 
     Args:
         texts: what is done in each of D instants, grounded; its places followed (`pp-collect --texts follow`).
         tools: where the tool is then, ``<y, x>``.
         moving: `moving_places` of these instants.
         moves: `ends_of_moves` at these instants; None: nothing changes places.
+        laid_out: `laid_out_places` of the scene.
     """
     if any(moving) or len(tools) != len(texts):
         return list(moving)
@@ -178,7 +216,9 @@ def demo_notes(
         instants = range(min(max(deed.first, done + 1), last), last + 1)
         how = manner(texts[last])
         if how.endswith(" end") and (grasped := _nearest(instants, tools, deed.place)) < last:
-            found[grasped] = deed.place  # fingers hide it there; which end they hold is seen when it is lifted
+            found[grasped] = ends(
+                texts[last]
+            )  # which of them fingers hold they hide; it is seen when the peg is lifted
         if how:  # on its way to one side the hand may pass over the other one
             instants = range(last, last + 1)
         done = _nearest(instants, tools, deed.place)
@@ -193,6 +233,8 @@ def demo_notes(
         found[done] = f"{found[done]}, {deed.words}" if found[done] else deed.words
         if deed.words == deed.place:  # the one that was picked up: it stays in view, and may move
             found[done : deed.last + 1] = [deed.place] * (deed.last + 1 - done)
+    if laid_out and found:
+        found[0] = ", ".join(filter(None, (laid_out, found[0])))
     which: str | None = None
     is_picked_alone = any(PLACE.fullmatch(note) for note in found)
     for instant, captions in enumerate(zip(texts, *(moves or (texts, texts)), strict=True)):

@@ -342,7 +342,9 @@ def small_inserting() -> Curriculum:
 def small_to_the_end() -> Curriculum:
     """The PONDER of `small_inserting` goes on, now with videos that it is shown to their end.
 
-    `pointing` once more, when its eye has been opened to pegs (`pp-see --like`). docs/training.md, "To the end".
+    `pointing` once more, when its eye has been opened to pegs (`pp-see --like`), and `listing` when all pegs that lie
+    there are noted at first; most of what a demonstration teaches, its rows teach by their second query.
+    docs/training.md, "To the end".
     """
     *_, settling = small_inserting().stages
     optim = replace(_TURNING, learning_rate=2.5e-4, warmup_steps=30, decay=(120, 420))
@@ -359,7 +361,14 @@ def small_to_the_end() -> Curriculum:
         example=replace(settling.example, blind=0.2),
         train=replace(settling.train, seed=28, optim=replace(optim, decay=(150, 420))),
     )
-    return Curriculum(name="small_to_the_end", stages=(settling, pointing))
+    listing = replace(
+        pointing,
+        name="small_to_the_end/listing",
+        example=replace(pointing.example, blind=0.1, other_ways=0.15, recalls=0.7),
+        train=replace(pointing.train, seed=29, optim=replace(optim, learning_rate=3e-4, decay=(150, 540))),
+        num_steps=540,
+    )
+    return Curriculum(name="small_to_the_end", stages=(settling, pointing, listing))
 
 
 def _settling_on(

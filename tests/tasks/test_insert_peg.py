@@ -62,6 +62,13 @@ def test_sampled_scenes_obey_the_rules() -> None:
     assert {(layout.grasped, layout.side) for layout in layouts} == set(product(ENDS, SIDES))
 
 
+def test_ends_are_laid_out_where_they_lie_at_first(env: Environment) -> None:
+    start(env)
+    told = np.array(InsertPeg().laid_out(LAYOUT))
+    lie = [[env.physics.position_m(f"peg_{n}/{half}") for half in ("tail", "head")] for n in range(3)]
+    np.testing.assert_allclose(told, lie, atol=1e-4)
+
+
 def test_a_peg_weighs_what_upstreams_weighs_and_lies_in_the_hole_with_7_mm_to_spare(env: Environment) -> None:
     start(env)
     physics = env.physics

@@ -12,11 +12,12 @@ from hypothesis import strategies as st
 
 from clock.sampling import EVALUATION
 from ponderpounce.models.place_code import NUM_PLACE_FEATURES
+from ponderpounce.tasks.environment import make_environment
 from ponderpounce.training.augment import Augmentation, draw_view
-from ponderpounce.training.deeds import narration, told_deeds
+from ponderpounce.training.deeds import deeds, narration, told_deeds
 from ponderpounce.training.example import ExampleConfig, make_example
-from ponderpounce.training.insertions import inserted_otherwise, manner, shows_an_insertion
-from ponderpounce.training.notes import demo_notes
+from ponderpounce.training.insertions import ends, inserted_otherwise, manner, shows_an_insertion
+from ponderpounce.training.notes import demo_notes, laid_out_places
 from ponderpounce.training.places import PLACE
 from ponderpounce.training.stand_in import skill_of, stand_in
 from ponderpounce.training.training_episode import TrainingEpisode
@@ -24,7 +25,8 @@ from tests.training.test_augment import FORM
 from tests.training.test_blind import NOTING, TOLD, blind
 from tests.training.test_example import episode
 
-PICK = "Pick up the peg by grasping the {end} end at <91, 134>, <83, 127>"
+AT = {"far": "<91, 134>, <83, 127>", "near": "<83, 127>, <91, 134>"}  # the held end first
+PICK = "Pick up the peg by grasping the {end} end at {at}"
 PUT = "Insert the peg from the {side} side of the box at <111, 135>, <115, 165>"
 ENDS, SIDES = ("far", "near"), ("left", "right")
 OTHERS = st.sets(st.sampled_from([1, 2]))
@@ -32,12 +34,12 @@ OTHERS = st.sets(st.sampled_from([1, 2]))
 
 def shown(end: str = "far", side: str = "right") -> list[str]:
     """Once a second."""
-    return [PICK.format(end=end)] * 5 + [PUT.format(side=side)] * 6
+    return [PICK.format(end=end, at=AT[end])] * 5 + [PUT.format(side=side)] * 6
 
 
 def asked(end: str = "far", side: str = "right") -> list[str]:
     return [
-        f"{PICK.format(end=end)}, {side} side",
+        f"{PICK.format(end=end, at=AT[end])}, {side} side",
         f"Insert the peg from the {side} side at <111, 135>, <115, 165>, {end} end",
     ]
 
@@ -52,7 +54,7 @@ def test_every_text_of_a_peg_tells_its_manner_and_no_other_does(end: str, side: 
 
 
 @given(st.sampled_from(ENDS), st.sampled_from(SIDES), OTHERS)
-def test_told_otherwise_twice_is_told_as_it_was_and_places_stay(end: str, side: str, others: Collection[int]) -> None:
+def test_told_otherwise_twice_is_told_as_it_was(end: str, side: str, others: Collection[int]) -> None:
     other_end = ENDS[1 - ENDS.index(end)] if 1 in others else end
     other_side = SIDES[1 - SIDES.index(side)] if 2 in others else side
     for texts, wanted in ((shown, shown(other_end, other_side)), (asked, asked(other_end, other_side))):
@@ -61,20 +63,46 @@ def test_told_otherwise_twice_is_told_as_it_was_and_places_stay(end: str, side: 
         assert [inserted_otherwise(text, others) for text in told] == texts(end, side)
 
 
+def test_a_deed_with_a_peg_has_its_other_place_beside_its_own() -> None:
+    grasp, *_, put = deeds(shown("near"))
+    assert (grasp.place, grasp.place_before) == ((83, 127), (91, 134))
+    assert (put.place, put.place_before) == ((111, 135), (115, 165))
+
+
 def test_the_narration_tells_end_and_side_with_their_places() -> None:
-    assert narration(shown()) == "far end <91, 134>, right side <111, 135>"
+    assert narration(shown()) == "far end <91, 134>, <83, 127>, right side <111, 135>"
     grasp, put = told_deeds(shown())
     assert (grasp.first, grasp.last, put.first, put.last) == (0, 4, 5, 10)
 
 
-def test_the_place_is_noted_when_the_tool_is_there_the_end_when_it_is_lifted_and_the_side_when_it_is_in() -> None:
+@given(st.sampled_from(ENDS))
+def test_places_are_noted_at_first_and_at_the_grasp_the_end_when_it_is_lifted_and_the_side_when_it_is_in(
+    end: str,
+) -> None:
     tools = [f"<{y}, 134>" for y in (10, 60, 88, 60, 60)] + [f"<{y}, 100>" for y in (60, 111, 80, 90, 100, 100)]
-    notes = demo_notes(shown(), tools, [""] * 11)
+    lie = "<60, 50>, <67, 55>, <83, 127>, <91, 134>"
+    notes = demo_notes(shown(end), tools, [""] * 11, laid_out=lie)
     assert {n: note for n, note in enumerate(notes) if note} == {
-        2: "<91, 134>",
-        4: "far end <91, 134>",
+        0: lie,
+        2: "<83, 127>, <91, 134>",  # as they were noted before, whichever is held
+        4: f"{end} end {AT[end]}",
         10: "right side <111, 135>",
     }
+
+
+def test_what_lies_there_is_noted_as_the_demonstration_tells_it() -> None:
+    task, seed = "InsertPeg", 799100
+    environment = make_environment(task, render=False)
+    environment.reset(seed, "easy")
+    told = next(iter(environment.demonstration(1))).grounded_subgoal
+    lie = laid_out_places(task, seed, "easy")
+    places = PLACE.findall(lie)
+    assert len(places) == 6
+    assert ends(told) in lie
+    assert all(near[0] < far[0] for near, far in zip(places[::2], places[1::2], strict=True))
+    assert places[::2] == sorted(places[::2], key=lambda place: int(place[0]))
+    assert not laid_out_places("PickHighlight", seed, "easy")
+    assert not laid_out_places("somebody's own", seed, "easy")
 
 
 def test_every_manner_is_a_skill_of_its_own_and_tells_two_places() -> None:
@@ -99,13 +127,14 @@ def test_a_mirrored_picture_shows_the_other_side_and_the_same_end() -> None:
     views = [draw_view(mirrors, FORM, set(asked()), np.random.default_rng(seed)) for seed in range(20)]
     assert {view.is_mirrored for view in views} == {True, False}
     mirrored = next(view for view in views if view.is_mirrored)
+    assert mirrored.text("<60, 50>, <67, 55>") == "<60, 206>, <67, 201>"  # the same order
     assert mirrored.text(asked()[0]) == "Pick up the peg by grasping the far end at <91, 122>, <83, 129>, left side"
     sided = {"move to the top of the left-side target at <1, 2> for the first time"}
     assert not any(draw_view(mirrors, FORM, sided, np.random.default_rng(seed)).is_mirrored for seed in range(20))
 
 
 def inserted_episode() -> TrainingEpisode:
-    notes = [*[""] * 4, "far end <91, 134>", *[""] * 5, "right side <111, 135>"]
+    notes = [*[""] * 4, "far end <91, 134>, <83, 127>", *[""] * 5, "right side <111, 135>"]
     told = replace(episode(4, changes=(0, 2), num_demo=11), subgoals=[asked()[0]] * 2 + [asked()[1]] * 2)
     return replace(told, demo_subgoals=shown(), demo_notes=notes)
 
@@ -118,7 +147,7 @@ def test_what_a_blind_row_teaches_of_a_peg_stands_in_its_notes() -> None:
         assert made.frames() is None
         first = int(row.gate_index[0])
         noted, told = v.decode(row.ids[:first]), v.decode([token for token in row.targets[first:] if token >= 0])
-        assert set(TOLD.findall(noted)) < set(TOLD.findall(told)), "the held end and the mouth; where it points is seen"
+        assert set(TOLD.findall(noted)) == set(TOLD.findall(told)), "both ends and the mouth"
         words = [re.findall(r"(?:far|near) end|(?:left|right) side", text) for text in (noted, told)]
         assert set(words[0]) == set(words[1])
         manners.add(tuple(words[0]))
@@ -131,10 +160,11 @@ def test_an_episode_told_otherwise_agrees_with_itself() -> None:
     assert list(other.demo_subgoals) == shown("near", "left")
     assert [*dict.fromkeys(other.subgoals)] == asked("near", "left")
     assert narration(other.demo_subgoals) == ", ".join(note for note in other.demo_notes if note)
-    assert all(PLACE.findall(a) == PLACE.findall(b) for a, b in zip(other.subgoals, inserted.subgoals, strict=True))
+    for now, before in zip(other.subgoals, inserted.subgoals, strict=True):
+        assert sorted(PLACE.findall(now)) == sorted(PLACE.findall(before))
 
 
-def test_what_is_told_otherwise_of_a_peg_keeps_its_places() -> None:
+def test_what_is_told_otherwise_of_a_peg_lies_where_it_lay() -> None:
     config = ExampleConfig(clocks=EVALUATION, narrates=True, has_plans=True, ways_by_sight=True, other_ways=1.0)
     v, manners = NOTING.vocabulary, set()
     shown = v.decode(blind(inserted_episode(), share=0.0).row().ids)
@@ -148,4 +178,4 @@ def test_what_is_told_otherwise_of_a_peg_keeps_its_places() -> None:
 
 def test_a_peg_that_is_lifted_when_it_is_next_looked_at_has_one_note() -> None:
     notes = demo_notes(shown()[4:6], ["<88, 134>", "<111, 135>"], [""] * 2)
-    assert notes == ["far end <91, 134>", "right side <111, 135>"]
+    assert notes == ["far end <91, 134>, <83, 127>", "right side <111, 135>"]

@@ -209,6 +209,10 @@ class InsertPeg(Task[Layout, Memory]):
         ends = [(f"{end} end", f"{peg}/{half}") for peg in _PEGS for half, end in ENDS.items()]
         return tuple(Thing(name=name, body=body, is_movable=False) for name, body in (("box", _BOX), *ends))
 
+    def laid_out(self, layout: Layout) -> tuple[tuple[tuple[float, float, float], ...], ...]:
+        """Of every peg the near end and the far one."""
+        return tuple(tuple(_end_m(peg, towards) for towards in (-1.0, 1.0)) for peg in layout.pegs)
+
     def retold(self, layout: Layout) -> tuple[Layout, ...]:
         """The peg was grasped at the other end, or inserted from the other side, or both, as far as there is room."""
         others = (replace(layout, grasped=grasped, side=side) for side in SIDES for grasped in ENDS)
@@ -253,6 +257,12 @@ def _draw_peg(rng: np.random.Generator, box: Spot, others: list[Spot]) -> Spot:
         ):
             return peg
     raise SceneFullError(f"no place for a peg after {_MAX_TRIES} tries. Draw the scene again.")
+
+
+def _end_m(peg: Spot, towards: float) -> tuple[float, float, float]:
+    """Where the middle of one end of a peg lies: the head's with ``towards`` 1, the tail's with -1."""
+    x_m, y_m, z_m, _ = transform(peg.pose(PEG_HALF_WIDTH_M)) @ [towards * _BETWEEN_ENDS_M / 2, 0.0, 0.0, 1.0]
+    return float(x_m), float(y_m), float(z_m)
 
 
 def _has_room(layout: Layout) -> bool:
