@@ -42,6 +42,7 @@ from ponderpounce.training.notes import heeded, in_sight, misnoted, noted, told_
 from ponderpounce.training.nudge import NO_NUDGE, Nudge, draw_nudges
 from ponderpounce.training.own_words import newly_said, own_words
 from ponderpounce.training.place_lessons import PlaceLessons, place_lessons
+from ponderpounce.training.row_ends import glanced, is_noted_at_once, shortened, with_notes_alone
 from ponderpounce.training.slip import Slip
 from ponderpounce.training.stand_in import stand_in
 from ponderpounce.training.training_episode import Frame, TrainingEpisode
@@ -52,7 +53,7 @@ _BEGINNING, _RECALLING = 8, 2  # queries
 _CORRECTED = 0.3  # of own words, at every query
 _SHARES = (
     "text_dropout", "slips", "tells_onward", "cuts_short", "begins", "recalls", "own_words", "misjudges", "even_clocks",
-    "other_ways", "blind", "learned_repeats",
+    "other_ways", "blind", "learned_repeats", "glances",
 )  # fmt: skip
 _MOST_STRETCHES = 50  # more than any way has
 _MOVED_PX = 3.0  # of a 256 px picture: farther than PONDER errs where nothing moves
@@ -150,6 +151,8 @@ class ExampleConfig:
     recalls: float = 0.0
     """Share of demonstrated episodes whose row ends with the second query: what a demonstration did is looked up when
     the first words come, and that costs a fraction of a whole row."""
+    glances: float = 0.0
+    """Share of episodes with a note at the first look at their demonstration alone whose row ends with it."""
 
     def __post_init__(self) -> None:
         if self.max_queries is not None and self.max_queries < 1:
@@ -197,6 +200,8 @@ class Example:
     """Of each invocation's tool [m]; None: starts are as recorded."""
     is_blind: bool = False
     """Without pictures."""
+    is_glance: bool = False
+    """Only what is noted at the first look at the demonstration is learned."""
 
     def row(self) -> Row:
         """PONDER's tokens."""
@@ -211,12 +216,13 @@ class Example:
             heeded_demo=self.heeded_demo,
         )
         row = without_pictures(row, self.form.vocabulary) if self.is_blind else row
+        row = with_notes_alone(row) if self.is_glance else row
         return replace(row, targets=(IGNORE,) * len(row.targets)) if self.episode.is_told else row
 
     @property
-    def is_scattered(self) -> bool:
-        """Its words tell places that were never seen: it is asked for them in words alone."""
-        return self.slip is not None and self.slip.std_px is None
+    def is_of_words(self) -> bool:
+        """C is asked for nothing: words tell places that were never seen, or what is to be done was not seen."""
+        return self.is_glance or (self.slip is not None and self.slip.std_px is None)
 
     def frames(self) -> Tensor | None:
         """PONDER's pictures, (num_images, height, width, 3) uint8; None without any."""
@@ -251,9 +257,9 @@ class Example:
         """How much each query's stand-in counts, (Q,): ``moved`` where the words said last tell another place, else 1.
 
         The thing was moved, or they are an earlier subgoal's. Everywhere else, and that is nearly everywhere, C can be
-        copied from the words. 0 where places were never seen.
+        copied from the words. 0 where C is asked for nothing.
         """
-        if self.is_scattered:
+        if self.is_of_words:
             return torch.zeros(len(self.schedule.queries))
         if not self.is_grounded:
             return torch.ones(len(self.schedule.queries))
@@ -271,7 +277,7 @@ class Example:
         While the first subgoal lasts more is seen than there was when it was told: what comes later is in mind then,
         too. What a demonstration does is in mind while it is seen.
         """
-        if self.is_scattered:
+        if self.is_of_words:
             return place_lessons(row, [""] * len(self.schedule.queries), self.form.vocabulary, size)
         episode = self.episode
         if episode.planned is not None and not episode.is_told:
@@ -294,8 +300,10 @@ def make_example(
     if config.waits_longer:
         texts, is_transition_T = waiting_longer(episode.subgoals, episode.is_transition_T, config.waits_longer)
         episode = replace(episode, subgoals=texts, is_transition_T=is_transition_T)
+    is_glance = bool(config.glances) and is_noted_at_once(episode) and rng.random() < config.glances
+    episode = glanced(episode) if is_glance else episode
     cut = None
-    if config.cuts_short and rng.random() < config.cuts_short:
+    if config.cuts_short and not is_glance and rng.random() < config.cuts_short:
         cut = drawn_cut(
             cuts(episode.instruction, episode.subgoals, episode.is_transition_T), episode.imitated_from, rng
         )
@@ -315,11 +323,12 @@ def make_example(
     is_even = config.even_clocks and rng.random() < config.even_clocks
     clocks = config.clocks.without_spread() if is_even else config.clocks
     schedule = sample_schedule(rng, clocks, episode.num_ticks, transition_ticks=episode.transition_ticks)
-    schedule = _shortened(schedule, config.max_queries)
+    schedule = shortened(schedule, config.max_queries)
     if config.begins and rng.random() < config.begins:
-        schedule = _shortened(schedule, _BEGINNING)
+        schedule = shortened(schedule, _BEGINNING)
     if is_otherwise or (config.recalls and episode.demo and rng.random() < config.recalls):
-        schedule = _shortened(schedule, _RECALLING)
+        schedule = shortened(schedule, _RECALLING)
+    schedule = shortened(schedule, 1) if is_glance else schedule
     if cut is not None:
         schedule = SampledSchedule(
             queries=tuple(each for each in schedule.queries if each.tick < cut.shown),
@@ -331,12 +340,13 @@ def make_example(
     ticks = [schedule.invocations[index].tick for index in imitated]
     chosen = draw_near(ticks, events, count, config.event_weight, rng)
     invocations = tuple(schedule.invocations[imitated[index]] for index in chosen)
-    is_grounded = config.is_grounded and (rng.random() >= config.text_dropout or episode.is_told or is_otherwise)
+    is_spared = episode.is_told or is_glance  # slips and lapses: its words are not learned, or all in its notes
+    is_grounded = config.is_grounded and (rng.random() >= config.text_dropout or is_spared or is_otherwise)
     is_own = is_grounded and bool(config.own_words and episode.said) and rng.random() < config.own_words
     slip = None
     if is_blind or (is_otherwise and is_bare):
         slip = Slip(std_px=None, seed=int(rng.integers(1 << 62)), is_learned=True)
-    elif is_grounded and not is_own and config.slips and not episode.is_told and rng.random() < config.slips:
+    elif is_grounded and not is_own and config.slips and not is_spared and rng.random() < config.slips:
         std_px = float(np.exp(rng.uniform(*np.log(config.slip_px))))
         slip = Slip(std_px=std_px, seed=int(rng.integers(1 << 62)))
     elif is_grounded and config.tremble_px:
@@ -344,7 +354,7 @@ def make_example(
     words: tuple[Words, ...] | None = None
     notes: tuple[str, ...] = ()
     wrong_waits_Q: list[int | None] | None = None
-    if is_grounded and not episode.is_told:
+    if is_grounded and not is_spared:
         lapses = config.lapses if config.lapses.rows and rng.random() < config.lapses.rows else NO_LAPSES
         if is_own:
             said = newly_said(episode.said, [query.tick for query in schedule.queries], bool(episode.demo))
@@ -405,17 +415,7 @@ def make_example(
         nudge=config.nudge,
         nudges_I2=nudges_I2,
         is_blind=is_blind,
-    )
-
-
-def _shortened(schedule: SampledSchedule, max_queries: int | None) -> SampledSchedule:
-    """Only the first queries, and the invocations before the next one."""
-    if max_queries is None or max_queries >= len(schedule.queries):
-        return schedule
-    end = schedule.queries[max_queries].tick
-    return SampledSchedule(
-        queries=schedule.queries[:max_queries],
-        invocations=tuple(each for each in schedule.invocations if each.tick < end),
+        is_glance=is_glance,
     )
 
 

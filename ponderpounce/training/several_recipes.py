@@ -343,7 +343,8 @@ def small_to_the_end() -> Curriculum:
     """The PONDER of `small_inserting` goes on, now with videos that it is shown to their end.
 
     `pointing` once more, when its eye has been opened to pegs (`pp-see --like`), and `listing` when all pegs that lie
-    there are noted at first; most of what a demonstration teaches, its rows teach by their second query.
+    there are noted at first; most of what a demonstration teaches, its rows teach by their second query. `glancing` has
+    more rows in a step, many of that first look alone.
     docs/training.md, "To the end".
     """
     *_, settling = small_inserting().stages
@@ -368,7 +369,15 @@ def small_to_the_end() -> Curriculum:
         train=replace(pointing.train, seed=29, optim=replace(optim, learning_rate=3e-4, decay=(150, 540))),
         num_steps=540,
     )
-    return Curriculum(name="small_to_the_end", stages=(settling, pointing, listing))
+    glancing = replace(
+        listing,
+        name="small_to_the_end/glancing",
+        example=replace(listing.example, glances=0.7),
+        train=replace(listing.train, seed=30, optim=replace(optim, learning_rate=3e-4, decay=(100, 300))),
+        num_steps=300,
+        batch_episodes=16,
+    )
+    return Curriculum(name="small_to_the_end", stages=(settling, pointing, listing, glancing))
 
 
 def _settling_on(
