@@ -3,7 +3,8 @@
 #
 #     checkpoints/several/to_the_end.sh [OUT]    (the OUT of the other scripts)
 #
-# Videos are shown to their end, in rows and in play. It was run by its parts and not as it stands here.
+# Videos are shown to their end, in rows and in play. It was run by its parts and not as it stands here. The recipe's further
+# stages, none of which was shipped, are not in it.
 set -euo pipefail
 
 out=${1:-out/several}

@@ -373,8 +373,8 @@ def small_to_the_end() -> Curriculum:
         listing,
         name="small_to_the_end/glancing",
         example=replace(listing.example, glances=0.7),
-        train=replace(listing.train, seed=30, optim=replace(optim, learning_rate=3e-4, decay=(100, 300))),
-        num_steps=300,
+        train=replace(listing.train, seed=30, optim=replace(optim, learning_rate=3e-4, decay=(60, 200))),
+        num_steps=200,
         batch_episodes=16,
     )
     return Curriculum(name="small_to_the_end", stages=(settling, pointing, listing, glancing))
