@@ -343,8 +343,8 @@ def small_to_the_end() -> Curriculum:
     """The PONDER of `small_inserting` goes on, now with videos that it is shown to their end.
 
     `pointing` once more, when its eye has been opened to pegs (`pp-see --like`), and `listing` when all pegs that lie
-    there are noted at first; most of what a demonstration teaches, its rows teach by their second query. `glancing` has
-    more rows in a step, many of that first look alone.
+    there are noted at first; most of what a demonstration teaches, its rows teach by their second query. `glancing` is
+    for episodes with such notes alone, and nearly all of its rows end with that first look.
     docs/training.md, "To the end".
     """
     *_, settling = small_inserting().stages
@@ -372,10 +372,10 @@ def small_to_the_end() -> Curriculum:
     glancing = replace(
         listing,
         name="small_to_the_end/glancing",
-        example=replace(listing.example, glances=0.7),
-        train=replace(listing.train, seed=30, optim=replace(optim, learning_rate=3e-4, decay=(60, 200))),
-        num_steps=200,
-        batch_episodes=16,
+        example=replace(listing.example, glances=0.9),
+        train=replace(listing.train, seed=30, optim=replace(optim, learning_rate=3e-4, decay=(60, 160))),
+        num_steps=160,
+        batch_episodes=32,
     )
     return Curriculum(name="small_to_the_end", stages=(settling, pointing, listing, glancing))
 
