@@ -77,7 +77,7 @@ def collate_ponder(
     """PONDER's side: rows and pictures, stand-ins of ``stand_in_size`` numbers, place lessons for hidden states of
     ``place_size``; what is not asked is not made. ``moved_weight``: see `Example.stand_in_weights`."""
     rows = tuple(each.row() for each in examples) if with_rows else ()
-    are_weighed = moved_weight != 1 or any(each.is_of_words for each in examples)
+    are_weighed = moved_weight != 1 or any(each.asks_for_no_cognition for each in examples)
     taught = zip(examples, rows, strict=True) if place_size else ()
     return PonderBatch(
         rows=rows,

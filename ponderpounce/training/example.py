@@ -220,7 +220,7 @@ class Example:
         return replace(row, targets=(IGNORE,) * len(row.targets)) if self.episode.is_told else row
 
     @property
-    def is_of_words(self) -> bool:
+    def asks_for_no_cognition(self) -> bool:
         """C is asked for nothing: words tell places that were never seen, or what is to be done was not seen."""
         return self.is_glance or (self.slip is not None and self.slip.std_px is None)
 
@@ -259,7 +259,7 @@ class Example:
         The thing was moved, or they are an earlier subgoal's. Everywhere else, and that is nearly everywhere, C can be
         copied from the words. 0 where C is asked for nothing.
         """
-        if self.is_of_words:
+        if self.asks_for_no_cognition:
             return torch.zeros(len(self.schedule.queries))
         if not self.is_grounded:
             return torch.ones(len(self.schedule.queries))
@@ -277,7 +277,7 @@ class Example:
         While the first subgoal lasts more is seen than there was when it was told: what comes later is in mind then,
         too. What a demonstration does is in mind while it is seen.
         """
-        if self.is_of_words:
+        if self.asks_for_no_cognition:
             return place_lessons(row, [""] * len(self.schedule.queries), self.form.vocabulary, size)
         episode = self.episode
         if episode.planned is not None and not episode.is_told:

@@ -10,13 +10,12 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Sequence
 
-from ponderpounce.training.places import PLACE
+from ponderpounce.training.places import ONE_PLACE, PLACE
 
 _HELD = re.compile(r"\b(far|near) end\b")
 _SIDE = re.compile(r"\b(left|right) side\b")
 _DONE = re.compile(rf"Pick up the peg by grasping the ({_HELD.pattern})|Insert the peg from the ({_SIDE.pattern})")
-_ONE = PLACE.pattern.replace("(", "").replace(")", "")
-_PAIR = re.compile(rf"((?:far|near) end(?: at)? )({_ONE}), ({_ONE})")
+_PAIR = re.compile(rf"((?:far|near) end(?: at)? )({ONE_PLACE}), ({ONE_PLACE})")
 _OTHER = {"far": "near", "near": "far", "left": "right", "right": "left"}
 _END, _FROM = 1, 2  # as "stretches" of a way, the numbers of what is done
 

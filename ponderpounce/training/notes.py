@@ -37,16 +37,17 @@ from ponderpounce.training.countdown import rhythm, waits
 from ponderpounce.training.deeds import Told, course, told_deeds
 from ponderpounce.training.insertions import ends, manner
 from ponderpounce.training.lapses import Words, has_moved
-from ponderpounce.training.places import PARTS, PLACE, TEXT_PX, WAY, apart_px
+from ponderpounce.training.places import ONE_PLACE, PARTS, PLACE, TEXT_PX, WAY, apart_px
 
 if TYPE_CHECKING:
     from ponderpounce.tasks.task import Task
 
-_ONE = PLACE.pattern.replace("(", "").replace(")", "")
 _WATCHED = "static at "
-_STILL = re.compile(rf"drop the cube on the table at ({_ONE})(?:, {_ONE})?|{_WATCHED}({_ONE})(?:, ({_ONE}))?")
+_STILL = re.compile(
+    rf"drop the cube on the table at ({ONE_PLACE})(?:, {ONE_PLACE})?|{_WATCHED}({ONE_PLACE})(?:, ({ONE_PLACE}))?"
+)
 _TO = " to "
-_END = re.compile(rf"{_TO}{_ONE}")
+_END = re.compile(rf"{_TO}{ONE_PLACE}")
 _UNDERWAY_PX = 3.0
 _SAME_PX = 8.0  # less than any two targets lie apart
 _WAIT = re.compile(r", \d+, (\d+)$")
@@ -216,9 +217,8 @@ def demo_notes(
         instants = range(min(max(deed.first, done + 1), last), last + 1)
         how = manner(texts[last])
         if how.endswith(" end") and (grasped := _nearest(instants, tools, deed.place)) < last:
-            found[grasped] = ends(
-                texts[last]
-            )  # which of them fingers hold they hide; it is seen when the peg is lifted
+            # fingers hide which of both they hold; that is seen when the peg is lifted
+            found[grasped] = ends(texts[last]) or deed.place
         if how:  # on its way to one side the hand may pass over the other one
             instants = range(last, last + 1)
         done = _nearest(instants, tools, deed.place)

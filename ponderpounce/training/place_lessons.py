@@ -97,7 +97,7 @@ def place_lessons(
 
 
 def _seen_done(row: Row, texts: Sequence[str], vocabulary: Vocabulary, num_slots: int) -> Iterator[_Lesson]:
-    """Slot 0: where it is done, 1: where the deed before was, 2: which it is, and how often by now, 3: its number."""
+    """Slot 0: where it is done, 1: its `place_before`, 2: which it is, and how often by now, 3: its number."""
     for index, deed in zip(_picture_ends(row, len(texts), vocabulary), deeds(texts), strict=False):
         places = [None if place is None else place_features(place) for place in (deed.place, deed.place_before)]
         codes = [text_code(name, NUM_PLACE_FEATURES) for name in (f"{deed.name} {deed.count}", f"deed {deed.number}")]

@@ -10,6 +10,8 @@ from ponderpounce.models.place_code import PLACE_PX
 from ponderpounce.models.ponder_coordinates import YX_PX
 
 PLACE = YX_PX
+ONE_PLACE = PLACE.pattern.replace("(", "").replace(")", "")
+"""The same for use within other patterns: it captures nothing."""
 WAY = re.compile(rf"(\S+) to ({PLACE.pattern})(?:, then |$)")
 """A stretch of a way (`tasks.task.located`): how it is gone, in the last word, and where it ends."""
 PARTS = re.compile(r", (?![^<]*>)")

@@ -92,9 +92,9 @@ def test_places_are_noted_at_first_and_at_the_grasp_the_end_when_it_is_lifted_an
 
 def test_what_lies_there_is_noted_as_the_demonstration_tells_it() -> None:
     task, seed = "InsertPeg", 799100
-    environment = make_environment(task, render=False)
-    environment.reset(seed, "easy")
-    told = next(iter(environment.demonstration(1))).grounded_subgoal
+    with make_environment(task, render=False) as environment:
+        environment.reset(seed, "easy")
+        told = next(iter(environment.demonstration(1))).grounded_subgoal
     lie = laid_out_places(task, seed, "easy")
     places = PLACE.findall(lie)
     assert len(places) == 6
@@ -179,3 +179,8 @@ def test_what_is_told_otherwise_of_a_peg_lies_where_it_lay() -> None:
 def test_a_peg_that_is_lifted_when_it_is_next_looked_at_has_one_note() -> None:
     notes = demo_notes(shown()[4:6], ["<88, 134>", "<111, 135>"], [""] * 2)
     assert notes == ["far end <91, 134>, <83, 127>", "right side <111, 135>"]
+
+
+def test_a_peg_whose_texts_tell_one_place_has_it_noted() -> None:
+    alone = ["Pick up the peg by grasping the far end at <91, 134>"] * 2
+    assert demo_notes(alone, ["<90, 134>", "<60, 134>"], [""] * 2) == ["<91, 134>", "far end <91, 134>"]

@@ -211,7 +211,7 @@ class InsertPeg(Task[Layout, Memory]):
 
     def laid_out(self, layout: Layout) -> tuple[tuple[tuple[float, float, float], ...], ...]:
         """Of every peg the near end and the far one."""
-        return tuple(tuple(_end_m(peg, towards) for towards in (-1.0, 1.0)) for peg in layout.pegs)
+        return tuple((_end_m(peg, "tail"), _end_m(peg, "head")) for peg in layout.pegs)
 
     def retold(self, layout: Layout) -> tuple[Layout, ...]:
         """The peg was grasped at the other end, or inserted from the other side, or both, as far as there is room."""
@@ -259,18 +259,18 @@ def _draw_peg(rng: np.random.Generator, box: Spot, others: list[Spot]) -> Spot:
     raise SceneFullError(f"no place for a peg after {_MAX_TRIES} tries. Draw the scene again.")
 
 
-def _end_m(peg: Spot, towards: float) -> tuple[float, float, float]:
-    """Where the middle of one end of a peg lies: the head's with ``towards`` 1, the tail's with -1."""
-    x_m, y_m, z_m, _ = transform(peg.pose(PEG_HALF_WIDTH_M)) @ [towards * _BETWEEN_ENDS_M / 2, 0.0, 0.0, 1.0]
-    return float(x_m), float(y_m), float(z_m)
+def _end_m(peg: Spot, end: str) -> tuple[float, float, float]:
+    """Where the middle of one of ENDS lies."""
+    axis = np.array([np.cos(peg.yaw_rad), np.sin(peg.yaw_rad)])
+    x_m, y_m = np.array(peg.xy_m) + (1.0 if end == "head" else -1.0) * _BETWEEN_ENDS_M / 2 * axis
+    return float(x_m), float(y_m), PEG_HALF_WIDTH_M
 
 
 def _has_room(layout: Layout) -> bool:
     """True if the arm reaches the peg and the box, and the open hand finds room to grasp."""
     peg, *others = layout.pegs
-    axis = np.array([np.cos(peg.yaw_rad), np.sin(peg.yaw_rad)])
-    held = np.array(peg.xy_m) + (1.0 if layout.grasped == "head" else -1.0) * _BETWEEN_ENDS_M / 2 * axis
-    grasp_xy_m, outermost_xy_m = (float(held[0]), float(held[1])), layout.approach()[0][:2, 3]
+    x_m, y_m, _ = _end_m(peg, layout.grasped)
+    grasp_xy_m, outermost_xy_m = (x_m, y_m), layout.approach()[0][:2, 3]
     fingers, hand = (
         Footprint(center_m=grasp_xy_m, half_m=half_m, yaw_rad=peg.yaw_rad) for half_m in (_FINGERS_HALF_M, _HAND_HALF_M)
     )
