@@ -73,6 +73,8 @@ class SimOptions:
     allow_starved: bool = False
     """Start although the schedule leaves ticks without a row."""
     max_steps: int = 1300
+    demo_hz: Literal[1, 2, 4, 5, 10, 20] = 1
+    """How many frames of a demonstration are shown a second (paper: 1): as many as PONDER has learned from."""
     video_end: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Show a demonstration's last frame, too, beside one a second: for a PONDER that has learned from it."""
 

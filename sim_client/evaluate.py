@@ -82,6 +82,8 @@ class EvalOptions:
     pounce_checkpoint: Path | None = None
     max_steps: int = 1300
     """Per episode (paper: 1300)."""
+    demo_hz: Literal[1, 2, 4, 5, 10, 20] = 1
+    """How many frames of a demonstration are shown a second (paper: 1): as many as PONDER has learned from."""
     video_end: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Show a demonstration's last frame, too, beside one a second (paper: 1 Hz): for a PONDER that has learned so."""
 
@@ -196,6 +198,7 @@ class EvalOptions:
             deliver="null" if self.cognition == "null" else self.deliver,
             held_age_ms=self.reported_age_ms,
             max_steps=self.max_steps,
+            demo_hz=self.demo_hz,
             video_end=self.video_end,
             record=self.record,
             record_hz=self.record_hz,
@@ -206,6 +209,8 @@ class EvalOptions:
         """As in ``results.json``: sim-client's options, and those that make an evaluation of them."""
         config: dict[str, Any] = as_json(dataclasses.asdict(self.sim()))
         del config["task"], config["list_tasks"]
+        if self.demo_hz == 1:
+            del config["demo_hz"]
         if not self.video_end:
             del config["video_end"]
         own = {"tasks": self.task_names(), "runs": self.runs, "cognition": self.cognition, "donors": self.donors}

@@ -44,13 +44,16 @@ def simulated_robot(robot: panda.Robot, initial_state: np.ndarray) -> Robot:
 DEMO_HZ = 1  # the paper's rate (B.1)
 
 
-def demonstration(environment: Environment, codec: ImageCodec, *, to_its_end: bool = False) -> tuple[DemoFrame, ...]:
+def demonstration(
+    environment: Environment, codec: ImageCodec, *, demo_hz: int = DEMO_HZ, to_its_end: bool = False
+) -> tuple[DemoFrame, ...]:
     """The conditioning video as PONDER reads it, before the first query; () for tasks without one.
 
-    ``to_its_end``: its last frame, too, in which a movement has ended that still went on in the one before.
+    ``demo_hz``: frames a second, a divisor of 20. ``to_its_end``: the last frame, too, in which a movement has ended
+    that still went on in the one before.
     """
-    rate_hz = CONTROL_HZ if to_its_end else DEMO_HZ
-    shown = environment.demonstration(rate_hz, look_hz=DEMO_HZ)
+    rate_hz = CONTROL_HZ if to_its_end else demo_hz
+    shown = environment.demonstration(rate_hz, look_hz=demo_hz)
     return tuple(DemoFrame(images=_pictures(frame, codec)) for frame in shown if frame.frames or not to_its_end)
 
 

@@ -155,7 +155,7 @@ class Suite:
         if self._options.policy != "servers":
             return ()
         codec = images.wire_codec(self._link.bus.is_local)
-        return demonstration(environment, codec, to_its_end=self._options.video_end)
+        return demonstration(environment, codec, demo_hz=self._options.demo_hz, to_its_end=self._options.video_end)
 
     def _open(self, request: m.OpenRequest) -> m.OpenReply:
         """Asks the clock service until its servers are ready.

@@ -106,6 +106,7 @@ class TrainingSet:
         sight: Sight | None = None,
         cache_mb: int = 4000,
         sights: Path | None = None,
+        demo_hz: int = 1,
     ) -> None:
         """Reads the episodes of ``tasks``, or all; their pictures whole, or as ``sight`` says.
 
@@ -116,12 +117,14 @@ class TrainingSet:
             sight: see its class.
             cache_mb: of pictures that are kept.
             sights: a folder for what ``sight`` makes of pictures, to be read instead of videos from then on.
+            demo_hz: how often demonstrations are looked at, a divisor of 20; reading one whose pictures were rendered
+                more seldom raises ValueError.
 
         Raises:
             DatasetError: a folder holds no dataset of ours.
             ValueError: no episode of these tasks is in a folder, or the folders' pictures differ in size.
         """
-        self._sight = sight
+        self._sight, self._demo_hz = sight, demo_hz
         self._store = None if sights is None or sight is None else SightStore(sights, sight.kind)
         self._sources = [source for root in roots for source in _sources(Dataset(root), tasks, is_watched=False)]
         self.num_imitated = len(self._sources)
@@ -200,7 +203,13 @@ class TrainingSet:
         source = self._sources[number]
         entry, rows = source.entry, source.rows()
         start = entry.num_demonstration_rows
-        demo = _looked_at(start, rows)
+        demo = _looked_at(start, rows, self._demo_hz)
+        if blank := [row for row in demo if not rows.is_rendered[row]]:
+            raise ValueError(
+                f"{source.dataset.root}: the demonstration of {entry.task} {entry.seed} is to be looked at "
+                f"{self._demo_hz} times a second, and {len(blank)} of these {len(demo)} pictures were not rendered; "
+                f"collect with --demonstration-hz {self._demo_hz}"
+            )
         num_shown, shown = len(demo), [*demo, *range(start, entry.num_rows)]
         own = np.maximum.accumulate(np.where(rows.is_rendered, np.arange(len(rows.is_rendered)), 0))
         views, sights = self._pictures(source, own, shown)
@@ -255,7 +264,7 @@ class TrainingSet:
 
     def _seen(self, source: _Source, sight: Sight, rows: Sequence[int]) -> tuple[Views, ...]:
         """What POUNCE and what PONDER see in these rows; from the store, if there is one and it has them."""
-        key = source.key
+        key = source.key + (f" {self._demo_hz}".encode() if self._demo_hz != 1 else b"")
         if self._store is not None and (kept := self._store.read(key, len(rows), _SYSTEMS)) is not None:
             return kept
         whole = list(source.frames([c for n, c in enumerate(CAMERAS) if sight.needs(n)], rows))
@@ -300,10 +309,11 @@ def _sources(dataset: Dataset, tasks: Sequence[str], *, is_watched: bool) -> lis
     return [_Source(dataset=dataset, entry=entry, is_watched=is_watched) for entry in entries]
 
 
-def _looked_at(num_rows: int, rows: Rows) -> list[int]:
-    """The rows of a demonstration of so many that PONDER is shown: one a second, and the last if it was rendered."""
-    seconds = [*range(0, num_rows, FPS)]
-    return [*seconds, num_rows - 1] if num_rows and rows.is_rendered[num_rows - 1] and (num_rows - 1) % FPS else seconds
+def _looked_at(num_rows: int, rows: Rows, demo_hz: int) -> list[int]:
+    """The rows of a demonstration of so many that PONDER is shown: so many a second, and the last if rendered."""
+    every, last = FPS // demo_hz, num_rows - 1
+    looks = [*range(0, num_rows, every)]
+    return [*looks, last] if num_rows and rows.is_rendered[last] and last % every else looks
 
 
 def _seen_at(poses_T7: NDArray[np.float32], below_m: float = 0.0) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ponderpounce.data.video import FPS
 from ponderpounce.models.action_space import ActionSpace
 from ponderpounce.models.ponder_configs import PonderConfig
 from ponderpounce.models.pounce import Freeze
@@ -38,6 +39,9 @@ class Recipe:
     """Of the auxiliary lessons in places to have in mind (`place_lessons`); the paper has no such loss."""
     trains: Trains = "both"
     """Which systems; the other is not run."""
+    demo_hz: int = 1
+    """How often PONDER looks at a demonstration (paper: once a second). Things that change places pass each other in
+    less, and from one look to the next the nearest thing is then another one. Serve it so (`sim-client --demo-hz`)."""
     keeps_eyes: bool = False
     """PONDER's vision tower stays as it is: a language model that needs few of the things in a picture lets the eyes
     forget the others."""
@@ -53,6 +57,8 @@ class Recipe:
     def __post_init__(self) -> None:
         if self.trains != "pounce" and self.example.is_grounded != (self.w2 > 0):
             raise ValueError(f"recipe {self.name}: is_grounded is {self.example.is_grounded}, but w2 is {self.w2}")
+        if self.demo_hz < 1 or FPS % self.demo_hz:
+            raise ValueError(f"recipe {self.name}: demo_hz must divide {FPS}, came {self.demo_hz}")
         if self.trains == "both" and self.example.augmentation.moves and self.example.augments == "all":
             raise ValueError(f"recipe {self.name}: views are moved and actions are not; augment watched episodes only")
 

@@ -284,6 +284,26 @@ def small_at_length() -> Curriculum:
     return _settling_on(small_growing(), "small_at_length", 21, (430, 1720), batch_episodes=64)
 
 
+def small_twice_a_second() -> Curriculum:
+    """The PONDER of `small_at_length` goes on, looking at demonstrations twice a second and at their last frame.
+
+    Whoever changes places with another is then nearest to where it was at every look. docs/training.md, "Twice a
+    second".
+    """
+    *_, settling = small_at_length().stages
+    optim = replace(_TURNING, learning_rate=3e-4, warmup_steps=30, decay=(200, 800))
+    settling = replace(
+        settling,
+        name="small_twice_a_second/settling",
+        example=replace(settling.example, recalls=0.6),
+        train=replace(settling.train, seed=31, optim=optim),
+        num_steps=800,
+        batch_episodes=12,
+        demo_hz=2,
+    )
+    return Curriculum(name="small_twice_a_second", stages=(settling,))
+
+
 def small_by_sight() -> Curriculum:
     """The PONDER of `small_at_length`, its eye wider, learns to look up ways in its notes.
 

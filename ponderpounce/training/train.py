@@ -329,6 +329,7 @@ def _train(run: Recipe, data: TrainingSet, options: TrainOptions, world: World) 
         sight=_sight(run, model),
         cache_mb=options.cache_mb,
         sights=options.sights,
+        demo_hz=run.demo_hz,
     )
     batches = Batches(data, run, model, bundle, world, options.watch_share)
     ahead = Ahead(batches.on_cpu, world.device, options.loaders) if options.loaders else None

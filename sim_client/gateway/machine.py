@@ -64,6 +64,8 @@ class Plan:
     task: str = "gateway"
     image_px: int | None = None  # side of the squares that pictures are resized to; None: as they come
     seed: int = 0
+    demo_hz: int = 1  # frames of a video that are shown a second (paper: 1)
+    video_end: bool = False  # and its last one
     out: Path | None = None  # None: no logs
     pixels: Literal["jpeg", "exact"] = "jpeg"
     patience_ns: int = 120_000_000_000
@@ -298,7 +300,12 @@ class Machine:
         self._link.enter_episode(self._session, f"{task}-{seed}-{secrets.token_hex(3)}", self._num_episodes)
         demo = tuple(
             m.DemoFrame(images=self._packed(resized(shown, self._plan.image_px)))
-            for shown in at_demo_rate(step.demo, self._plan.schedule(seed).control_hz)
+            for shown in at_demo_rate(
+                step.demo,
+                self._plan.schedule(seed).control_hz,
+                demo_hz=self._plan.demo_hz,
+                to_its_end=self._plan.video_end,
+            )
         )
         image_px = next(iter(frames.values())).shape[:2]
         info = m.EpisodeInfo(

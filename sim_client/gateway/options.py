@@ -73,6 +73,10 @@ class GatewayOptions:
     """Between PONDER's looks (paper: 1 Hz)."""
     invoke_every_ticks: int | None = None
     """Between POUNCE's invocations. None: with every request of several rows; else 20 in lockstep, 10 in real time."""
+    demo_hz: Literal[1, 2, 4, 5, 10, 20] = 1
+    """How many frames of a video are shown a second (paper: 1): as many as PONDER has learned from."""
+    video_end: bool = False
+    """Show a video's last frame, too: for a PONDER that has learned from it."""
     delay_ms: int = 300
     """Lockstep: PONDER's modelled delay (paper: 300 ms)."""
     max_age_ms: int = 2000
@@ -189,6 +193,8 @@ class GatewayOptions:
             task=self.task,
             image_px=self.image_px,
             seed=self.seed,
+            demo_hz=self.demo_hz,
+            video_end=self.video_end,
             out=self.out if self.record else None,
             pixels=self.pixels,
             patience_ns=round(self.patience_s * 1e9),

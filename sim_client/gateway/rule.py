@@ -10,12 +10,15 @@ from clock.limits import within_limits
 from protocol.messages import Action, ActionChunk, Floats, Level, Robot
 from sim_client.gateway.exchange import Frames
 
-DEMO_HZ = 1  # the paper's rate (B.1)
 
-
-def at_demo_rate(video: Sequence[Frames], control_hz: int) -> Sequence[Frames]:
-    """The frames of a video at the control rate that PONDER reads: the first, and one a second after it."""
-    return video[:: control_hz // DEMO_HZ]
+def at_demo_rate(
+    video: Sequence[Frames], control_hz: int, *, demo_hz: int = 1, to_its_end: bool = False
+) -> Sequence[Frames]:
+    """The frames of a video at the control rate that PONDER reads: the first and so many a second after it, one in the
+    paper (B.1), and the last one if it is shown to its end. ``demo_hz`` divides ``control_hz``."""
+    every = control_hz // demo_hz
+    shown = video[::every]
+    return [*shown, video[-1]] if to_its_end and video and (len(video) - 1) % every else shown
 
 
 def ahead(command: Action, chunk: ActionChunk | None, robot: Robot, num_rows: int) -> tuple[Floats, tuple[Level, ...]]:

@@ -22,7 +22,7 @@ from ponderpounce.models.pounce_checkpoint import load_bundle
 from ponderpounce.models.prompt import with_subgoal
 from ponderpounce.training import recipes, train
 from ponderpounce.training.chunks import chunk_ticks
-from ponderpounce.training.data import TrainingSet
+from ponderpounce.training.data import Sight, TrainingSet
 from ponderpounce.training.example import make_example
 from ponderpounce.training.notes import moving_places
 from ponderpounce.training.parallel import World
@@ -102,21 +102,45 @@ def test_an_episode_is_read_as_it_was_written(folder: Path) -> None:
     assert int(episode.frames[0][1].mean()) == pytest.approx(255 - 20 - NUM_DEMO_ROWS, abs=2)
 
 
-@pytest.mark.parametrize("num_demo", [1, 20, 21, 22, 40, 59])
+@pytest.mark.parametrize("num_demo", [1, 10, 20, 21, 22, 40, 59])
 @pytest.mark.parametrize("is_rendered", [True, False])
-def test_a_video_is_looked_at_once_a_second_and_at_its_end_if_that_was_rendered(
-    tmp_path: Path, num_demo: int, is_rendered: bool
+@pytest.mark.parametrize("demo_hz", [1, 2])
+def test_a_video_is_looked_at_so_often_and_at_its_end_if_that_was_rendered(
+    tmp_path: Path, num_demo: int, is_rendered: bool, demo_hz: int
 ) -> None:
     writer = DatasetWriter(tmp_path / "set")
-    last = num_demo - 1
-    writer.add(unpack(_episode(1, num_demo, () if is_rendered or last % 20 == 0 else (last,))))
+    last, every = num_demo - 1, 20 // demo_hz
+    writer.add(unpack(_episode(1, num_demo, () if is_rendered or last % every == 0 else (last,))))
     writer.finish()
-    episode = TrainingSet(tmp_path / "set")[0]
-    rows = sorted({*range(0, num_demo, 20), *([last] if is_rendered else [])})
+    episode = TrainingSet(tmp_path / "set", demo_hz=demo_hz)[0]
+    rows = sorted({*range(0, num_demo, every), *([last] if is_rendered else [])})
     assert [int(views[0].mean()) for views in episode.demo] == pytest.approx([20 + row for row in rows], abs=2)
     told = [f"pick it at <{1 + row // 60}, 7>" for row in rows]
     assert [list(episode.demo_subgoals), len(episode.demo_tools), len(episode.demo_notes)] == [told, *[len(rows)] * 2]
     assert int(episode.frames[0][0].mean()) == pytest.approx(20 + num_demo, abs=2)
+
+
+def test_a_video_whose_pictures_were_taken_more_seldom_is_refused(tmp_path: Path) -> None:
+    writer = DatasetWriter(tmp_path / "set")
+    writer.add(unpack(_episode(1, 41, tuple(row for row in range(41) if row % 20))))
+    writer.finish()
+    assert len(TrainingSet(tmp_path / "set")[0].demo) == 3
+    with pytest.raises(
+        ValueError, match=r"set: the demonstration of PickHighlight 1 .* 2 of these 5 .*--demonstration-hz 2"
+    ):
+        TrainingSet(tmp_path / "set", demo_hz=2)[0]
+
+
+def test_sights_of_other_rates_lie_beside_each_other(tmp_path: Path) -> None:
+    writer = DatasetWriter(tmp_path / "set")
+    writer.add(unpack(_episode(1, 41)))
+    writer.finish()
+    sight = Sight(form=None, pounce_px=16)
+    for demo_hz in (1, 2, 1):
+        episode = TrainingSet(tmp_path / "set", sight=sight, sights=tmp_path / "sights", demo_hz=demo_hz)[0]
+        assert len(episode.demo) == 1 + 2 * demo_hz
+        assert int(episode.frames[0][0].mean()) == pytest.approx(20 + 41, abs=2)
+    assert len([*(tmp_path / "sights").rglob("*.npz")]) == 2
 
 
 def test_what_was_still_to_come_what_was_said_and_what_moves_are_read(tmp_path: Path) -> None:

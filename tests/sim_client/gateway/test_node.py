@@ -167,3 +167,13 @@ def test_rows_ahead_obey_the_limits(robot_with: Callable[..., m.Robot]) -> None:
 def test_of_a_video_ponder_reads_the_first_frame_and_one_a_second(num_frames: int, read: list[int]) -> None:
     video: Any = list(range(num_frames))
     assert list(at_demo_rate(video, 20)) == read
+
+
+@pytest.mark.parametrize(
+    ("num_frames", "read"), [(0, []), (1, [0]), (10, [0, 9]), (11, [0, 10]), (12, [0, 10, 11]), (21, [0, 10, 20])]
+)
+def test_of_a_video_that_is_shown_twice_a_second_and_to_its_end_ponder_reads_the_last_frame_too(
+    num_frames: int, read: list[int]
+) -> None:
+    video: Any = list(range(num_frames))
+    assert list(at_demo_rate(video, 20, demo_hz=2, to_its_end=True)) == read
