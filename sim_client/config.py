@@ -10,9 +10,11 @@ import tyro
 
 from clock import schedules
 from clock.timebase import NS_PER_MS
+from ponderpounce.models.showing import Showing
 from ponderpounce.tasks.difficulty import Difficulty
 from protocol.messages import Delay, DelayKind, Delivery, DeliveryKind, Schedule, Seam, SeamKind, WaitKind
 from protocol.options import LinkOptions
+from sim_client.shown import how_shown
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,10 +75,11 @@ class SimOptions:
     allow_starved: bool = False
     """Start although the schedule leaves ticks without a row."""
     max_steps: int = 1300
-    demo_hz: Literal[1, 2, 4, 5, 10, 20] = 1
-    """How many frames of a demonstration are shown a second (paper: 1): as many as PONDER has learned from."""
+    demo_hz: Literal[1, 2, 4, 5, 10, 20] | None = None
+    """How many frames of a demonstration are shown a second. None: as many as the --ponder-checkpoint says that it has
+    learned from; without one, the paper's 1."""
     video_end: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Show a demonstration's last frame, too, beside one a second: for a PONDER that has learned from it."""
+    """Show a demonstration's last frame, too, although the --ponder-checkpoint does not say that it has learned so."""
 
     record: bool = True
     """Write one MCAP per episode."""
@@ -86,6 +89,11 @@ class SimOptions:
     """jpeg: raw frames are logged as JPEG; exact: also bit for bit as the models saw them (8 MB/s)."""
     progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
     """Show a progress bar."""
+
+    @property
+    def showing(self) -> Showing:
+        """How demonstrations are shown. Raises ValueError if the checkpoint says nothing that can be read."""
+        return how_shown(self.demo_hz, self.video_end, self.ponder_checkpoint)
 
     @property
     def runs_clock_daemon(self) -> bool:

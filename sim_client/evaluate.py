@@ -82,10 +82,11 @@ class EvalOptions:
     pounce_checkpoint: Path | None = None
     max_steps: int = 1300
     """Per episode (paper: 1300)."""
-    demo_hz: Literal[1, 2, 4, 5, 10, 20] = 1
-    """How many frames of a demonstration are shown a second (paper: 1): as many as PONDER has learned from."""
+    demo_hz: Literal[1, 2, 4, 5, 10, 20] | None = None
+    """How many frames of a demonstration are shown a second. None: as many as the --ponder-checkpoint says that it has
+    learned from; without one, the paper's 1."""
     video_end: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Show a demonstration's last frame, too, beside one a second (paper: 1 Hz): for a PONDER that has learned so."""
+    """Show a demonstration's last frame, too, although the --ponder-checkpoint does not say that it has learned so."""
 
     cognition: Literal["real", "null", "other-episode", "stand-in"] = "real"
     """null: POUNCE gets the learned null cognition. other-episode: what PONDER said in another episode of the task.
@@ -207,12 +208,13 @@ class EvalOptions:
 
     def config(self) -> dict[str, Any]:
         """As in ``results.json``: sim-client's options, and those that make an evaluation of them."""
-        config: dict[str, Any] = as_json(dataclasses.asdict(self.sim()))
-        del config["task"], config["list_tasks"]
-        if self.demo_hz == 1:
-            del config["demo_hz"]
-        if not self.video_end:
-            del config["video_end"]
+        sim = self.sim()
+        config: dict[str, Any] = as_json(dataclasses.asdict(sim))
+        del config["task"], config["list_tasks"], config["demo_hz"], config["video_end"]
+        if sim.showing.hz != 1:
+            config["demo_hz"] = sim.showing.hz
+        if sim.showing.to_its_end:
+            config["video_end"] = True
         own = {"tasks": self.task_names(), "runs": self.runs, "cognition": self.cognition, "donors": self.donors}
         if self.subgoal_text is not None:
             own["subgoal_text"] = self.subgoal_text

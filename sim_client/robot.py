@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ponderpounce.models.showing import Showing
 from ponderpounce.tasks import panda
 from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import IMAGE_PX, Environment, Snapshot
@@ -41,20 +42,11 @@ def simulated_robot(robot: panda.Robot, initial_state: np.ndarray) -> Robot:
     )
 
 
-DEMO_HZ = 1  # the paper's rate (B.1)
-
-
-def demonstration(
-    environment: Environment, codec: ImageCodec, *, demo_hz: int = DEMO_HZ, to_its_end: bool = False
-) -> tuple[DemoFrame, ...]:
-    """The conditioning video as PONDER reads it, before the first query; () for tasks without one.
-
-    ``demo_hz``: frames a second, a divisor of 20. ``to_its_end``: the last frame, too, in which a movement has ended
-    that still went on in the one before.
-    """
-    rate_hz = CONTROL_HZ if to_its_end else demo_hz
-    shown = environment.demonstration(rate_hz, look_hz=demo_hz)
-    return tuple(DemoFrame(images=_pictures(frame, codec)) for frame in shown if frame.frames or not to_its_end)
+def demonstration(environment: Environment, codec: ImageCodec, showing: Showing) -> tuple[DemoFrame, ...]:
+    """The conditioning video as PONDER reads it, before the first query; () for tasks without one."""
+    rate_hz = CONTROL_HZ if showing.to_its_end else showing.hz
+    shown = environment.demonstration(rate_hz, look_hz=showing.hz)
+    return tuple(DemoFrame(images=_pictures(frame, codec)) for frame in shown if frame.frames or not showing.to_its_end)
 
 
 def observation(snapshot: Snapshot, tick: int, source_ns: int, codec: ImageCodec) -> Observation:

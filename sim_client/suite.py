@@ -67,7 +67,8 @@ class Suite:
         out = self._options.out
         out.mkdir(parents=True, exist_ok=True)
         results: dict[str, Any] = {
-            "config": as_json(dataclasses.asdict(self._options)),
+            "config": as_json(dataclasses.asdict(self._options))
+            | {"demo_hz": self._options.showing.hz, "video_end": self._options.showing.to_its_end},
             "versions": versions(),
             "episodes": [],
         }
@@ -155,7 +156,7 @@ class Suite:
         if self._options.policy != "servers":
             return ()
         codec = images.wire_codec(self._link.bus.is_local)
-        return demonstration(environment, codec, demo_hz=self._options.demo_hz, to_its_end=self._options.video_end)
+        return demonstration(environment, codec, self._options.showing)
 
     def _open(self, request: m.OpenRequest) -> m.OpenReply:
         """Asks the clock service until its servers are ready.

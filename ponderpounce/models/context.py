@@ -32,6 +32,7 @@ from ponderpounce.models.counsel import Counsel
 from ponderpounce.models.eyes import Eyes, num_seen
 from ponderpounce.models.proprioception import Proprioception, check_rows
 from ponderpounce.models.second_look import SecondLook
+from ponderpounce.models.showing import AS_IN_THE_PAPER, Showing
 from ponderpounce.models.vocabulary import Vocabulary
 
 IGNORE = -100
@@ -118,6 +119,8 @@ class ContextFormat:
     """When serving looks again for what it has said (`second_look`); None: never, as in the paper."""
     counsel: Counsel | None = None
     """In which other views serving reads an episode as well (`counsel`); None: in none, as in the paper."""
+    demonstrations: Showing = AS_IN_THE_PAPER
+    """How they were shown to it; whoever serves it shows them so."""
 
     def __post_init__(self) -> None:
         if self.counsel is not None:

@@ -29,12 +29,12 @@ from ponderpounce.models.eyes import Eyes, check_eyes
 from ponderpounce.models.ponder import Ponder, image_grid, skeleton, token_px
 from ponderpounce.models.proprioception import Proprioception
 from ponderpounce.models.second_look import SecondLook
+from ponderpounce.models.showing import AS_IN_THE_PAPER, OWN_NAME, Showing
 from ponderpounce.models.vocabulary import Vocabulary
 
 CONFIG_NAME = "config.json"
 INDEX_NAME = "model.safetensors.index.json"
 SINGLE_NAME = "model.safetensors"
-OWN_NAME = "ponder.json"
 MTP_PREFIX = "mtp."  # multi-token prediction: in public checkpoints, not in transformers' Qwen3.5
 MAX_SHARD_BYTES = 5_000_000_000
 MAX_NAMES_SHOWN = 5
@@ -48,10 +48,10 @@ class CheckpointError(ValueError):
 class StoredPonder:
     """Contents of ponder.json. The defaults are for a public Qwen3.5, which has none; a file has every field."""
 
-    format: Literal["ponderpounce.ponder/8"] = "ponderpounce.ponder/8"
-    """Each is the one before and a field more: /7 has no ``fovea``, /6 no ``counsel``, /5 no ``second_look``, /4 no
-    ``takes_notes``, /3 no ``speaks``, /2 no ``proprioception``, /1 no ``eyes``. Such a PONDER speaks and has none of
-    the others."""
+    format: Literal["ponderpounce.ponder/9"] = "ponderpounce.ponder/9"
+    """Each is the one before and a field more: /8 has no ``demonstrations``, /7 no ``fovea``, /6 no ``counsel``, /5 no
+    ``second_look``, /4 no ``takes_notes``, /3 no ``speaks``, /2 no ``proprioception``, /1 no ``eyes``. Such a PONDER
+    speaks, is shown demonstrations as in the paper, and has none of the others."""
     num_carriers: int = 1
     first_carrier_id: int | None = None
     """None: the first row after the tokenizer's last id."""
@@ -63,6 +63,7 @@ class StoredPonder:
     takes_notes: bool = False
     second_look: SecondLook | None = None
     counsel: Counsel | None = None
+    demonstrations: Showing = AS_IN_THE_PAPER
     is_random: bool = True
     """The carriers were never trained."""
 
@@ -99,6 +100,7 @@ def load_ponder(directory: Path, *, device: torch.device | str = "cpu", dtype: t
         takes_notes=stored.takes_notes,
         second_look=stored.second_look,
         counsel=stored.counsel,
+        demonstrations=stored.demonstrations,
     )
     if qwen_config.image_token_id != vocabulary.image_pad:
         raise CheckpointError(
@@ -137,6 +139,7 @@ def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_S
         takes_notes=ponder.format.takes_notes,
         second_look=ponder.format.second_look,
         counsel=ponder.format.counsel,
+        demonstrations=ponder.format.demonstrations,
         is_random=ponder.is_random,
     )
     (directory / OWN_NAME).write_text(json.dumps(asdict(stored), indent=2) + "\n")
@@ -235,6 +238,8 @@ def _read_stored(directory: Path) -> StoredPonder:
         values |= {"format": "ponderpounce.ponder/7", "counsel": None}
     if isinstance(values, dict) and values.get("format") == "ponderpounce.ponder/7":
         values |= {"format": "ponderpounce.ponder/8", "fovea": None}
+    if isinstance(values, dict) and values.get("format") == "ponderpounce.ponder/8":
+        values |= {"format": "ponderpounce.ponder/9", "demonstrations": {"hz": 1, "to_its_end": False}}
     return from_json(StoredPonder, values, str(path))
 
 

@@ -21,6 +21,7 @@ from ponderpounce.models.images import resized
 from ponderpounce.models.normalisation import Quantiles, RobotStatistics
 from ponderpounce.models.ponder_coordinates import normalised_text
 from ponderpounce.models.prompt import with_subgoal
+from ponderpounce.models.showing import Showing
 from ponderpounce.tasks.front_view import front_pixels
 from ponderpounce.training.chunks import chunk_ticks
 from ponderpounce.training.notes import demo_notes, ends_of_moves, laid_out_places, moving_places
@@ -160,6 +161,16 @@ class TrainingSet:
     def num_rows(self, number: int) -> int:
         """How long an episode is, without reading it; a demonstration counts."""
         return self._sources[number].entry.num_rows
+
+    def showing(self, demo_hz: int) -> Showing | None:
+        """How demonstrations are shown when they are looked at so often; None if there are none.
+
+        To their end if most of those have their last frame rendered that end between two looks.
+        """
+        begins = [source.entry.num_demonstration_rows for source in self._sources]
+        shown = [(source, begin - 1) for source, begin in zip(self._sources, begins, strict=True) if begin]
+        ends = [bool(source.rows().is_rendered[last]) for source, last in shown if last % (FPS // demo_hz)]
+        return Showing(hz=demo_hz, to_its_end=2 * sum(ends) > len(ends)) if shown else None
 
     def instructions(self) -> list[str]:
         """Every instruction once, in order."""

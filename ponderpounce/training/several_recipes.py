@@ -291,13 +291,13 @@ def small_twice_a_second() -> Curriculum:
     second".
     """
     *_, settling = small_at_length().stages
-    optim = replace(_TURNING, learning_rate=3e-4, warmup_steps=30, decay=(200, 800))
+    optim = replace(_TURNING, learning_rate=3e-4, warmup_steps=30, decay=(120, 430))
     settling = replace(
         settling,
         name="small_twice_a_second/settling",
-        example=replace(settling.example, recalls=0.6),
+        example=replace(settling.example, recalls=0.7),
         train=replace(settling.train, seed=31, optim=optim),
-        num_steps=800,
+        num_steps=430,
         batch_episodes=12,
         demo_hz=2,
     )

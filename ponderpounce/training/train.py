@@ -394,7 +394,12 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
         folders = ", ".join(map(str, options.data))
         raise ValueError(f"{folders}: {error}; collect with --image-px {wanted_px}") from None
     if run.trains != "pounce":
-        ponder.format = replace(ponder.format, speaks=run.w2 > 0, takes_notes=run.example.takes_notes)
+        ponder.format = replace(
+            ponder.format,
+            speaks=run.w2 > 0,
+            takes_notes=run.example.takes_notes,
+            demonstrations=data.showing(run.demo_hz) or ponder.format.demonstrations,
+        )
     measured = partial(data.statistics, run.pounce.horizon, run.space, by_row=run.statistics_by_row)
     if options.pounce is None:
         bundle = random_bundle(run.pounce, seed, statistics=measured(), tokenizer=_own_tokenizer(run, data))

@@ -22,6 +22,7 @@ from typing import Literal, TypeVar
 from clock.report import statistics, stream_sha256
 from clock.service import ClockService
 from clock.timebase import MonotonicClock
+from ponderpounce.models.showing import AS_IN_THE_PAPER, Showing
 from protocol import images
 from protocol import messages as m
 from protocol.errors import CallFailed, MalformedMessage, TransportError
@@ -32,7 +33,7 @@ from sim_client.gateway.body import Body
 from sim_client.gateway.exchange import Answer, Finish, Frames, Refused, Step
 from sim_client.gateway.node import LiveNode, LockstepNode, Node, Shown
 from sim_client.gateway.pictures import resized
-from sim_client.gateway.rule import at_demo_rate
+from sim_client.gateway.rule import as_shown
 from sim_client.gateway.seat import Seat
 from sim_client.recorder import Recorder
 from sim_client.suite import versions
@@ -64,8 +65,7 @@ class Plan:
     task: str = "gateway"
     image_px: int | None = None  # side of the squares that pictures are resized to; None: as they come
     seed: int = 0
-    demo_hz: int = 1  # frames of a video that are shown a second (paper: 1)
-    video_end: bool = False  # and its last one
+    showing: Showing = AS_IN_THE_PAPER  # of a video
     out: Path | None = None  # None: no logs
     pixels: Literal["jpeg", "exact"] = "jpeg"
     patience_ns: int = 120_000_000_000
@@ -300,12 +300,7 @@ class Machine:
         self._link.enter_episode(self._session, f"{task}-{seed}-{secrets.token_hex(3)}", self._num_episodes)
         demo = tuple(
             m.DemoFrame(images=self._packed(resized(shown, self._plan.image_px)))
-            for shown in at_demo_rate(
-                step.demo,
-                self._plan.schedule(seed).control_hz,
-                demo_hz=self._plan.demo_hz,
-                to_its_end=self._plan.video_end,
-            )
+            for shown in as_shown(step.demo, self._plan.schedule(seed).control_hz, self._plan.showing)
         )
         image_px = next(iter(frames.values())).shape[:2]
         info = m.EpisodeInfo(

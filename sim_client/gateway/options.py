@@ -10,6 +10,7 @@ from typing import Literal
 
 from clock import schedules
 from clock.timebase import NS_PER_MS
+from ponderpounce.models.showing import Showing
 from protocol.errors import TransportError
 from protocol.messages import Delay, DelayKind, Schedule, WaitKind
 from protocol.options import LinkOptions
@@ -17,6 +18,7 @@ from protocol.version import version
 from sim_client.gateway import body, challenge, openpi, vla_eval
 from sim_client.gateway.exchange import Dialect, Terms
 from sim_client.gateway.machine import Plan
+from sim_client.shown import how_shown
 
 DialectName = Literal["openpi", "challenge", "challenge-http", "vla-eval"]
 _SPOKEN: dict[DialectName, tuple[type[Dialect], Mapping[str, str], str, int]] = {
@@ -73,10 +75,11 @@ class GatewayOptions:
     """Between PONDER's looks (paper: 1 Hz)."""
     invoke_every_ticks: int | None = None
     """Between POUNCE's invocations. None: with every request of several rows; else 20 in lockstep, 10 in real time."""
-    demo_hz: Literal[1, 2, 4, 5, 10, 20] = 1
-    """How many frames of a video are shown a second (paper: 1): as many as PONDER has learned from."""
+    demo_hz: Literal[1, 2, 4, 5, 10, 20] | None = None
+    """How many frames of a video are shown a second. None: as many as the --ponder-checkpoint says that it has learned
+    from; without one, the paper's 1."""
     video_end: bool = False
-    """Show a video's last frame, too: for a PONDER that has learned from it."""
+    """Show a video's last frame, too, although the --ponder-checkpoint does not say that it has learned so."""
     delay_ms: int = 300
     """Lockstep: PONDER's modelled delay (paper: 300 ms)."""
     max_age_ms: int = 2000
@@ -183,8 +186,15 @@ class GatewayOptions:
         """The robot that clients drive. Raises TransportError if its file does not describe one."""
         return body.read_body(self.robot_file) if self.robot_file else body.PANDA
 
+    def showing(self) -> Showing:
+        """How videos are shown. Raises TransportError if the checkpoint says nothing that can be read."""
+        try:
+            return how_shown(self.demo_hz, self.video_end, self.ponder_checkpoint)
+        except ValueError as error:
+            raise TransportError(f"--ponder-checkpoint: {error}") from None
+
     def plan(self) -> Plan:
-        """What all episodes have in common. Raises TransportError as ``body``."""
+        """What all episodes have in common. Raises TransportError as ``body`` and ``showing``."""
         return Plan(
             schedule=self.schedule,
             num_rows=self.terms().rows,
@@ -193,8 +203,7 @@ class GatewayOptions:
             task=self.task,
             image_px=self.image_px,
             seed=self.seed,
-            demo_hz=self.demo_hz,
-            video_end=self.video_end,
+            showing=self.showing(),
             out=self.out if self.record else None,
             pixels=self.pixels,
             patience_ns=round(self.patience_s * 1e9),

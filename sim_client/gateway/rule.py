@@ -7,18 +7,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from clock.limits import within_limits
+from ponderpounce.models.showing import Showing
 from protocol.messages import Action, ActionChunk, Floats, Level, Robot
 from sim_client.gateway.exchange import Frames
 
 
-def at_demo_rate(
-    video: Sequence[Frames], control_hz: int, *, demo_hz: int = 1, to_its_end: bool = False
-) -> Sequence[Frames]:
-    """The frames of a video at the control rate that PONDER reads: the first and so many a second after it, one in the
-    paper (B.1), and the last one if it is shown to its end. ``demo_hz`` divides ``control_hz``."""
-    every = control_hz // demo_hz
+def as_shown(video: Sequence[Frames], control_hz: int, showing: Showing) -> Sequence[Frames]:
+    """The frames of a video at the control rate that PONDER reads: the first and so many a second after it, and the
+    last one if it is shown to its end."""
+    every = control_hz // showing.hz
     shown = video[::every]
-    return [*shown, video[-1]] if to_its_end and video and (len(video) - 1) % every else shown
+    return [*shown, video[-1]] if showing.to_its_end and video and (len(video) - 1) % every else shown
 
 
 def ahead(command: Action, chunk: ActionChunk | None, robot: Robot, num_rows: int) -> tuple[Floats, tuple[Level, ...]]:

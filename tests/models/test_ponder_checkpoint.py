@@ -25,6 +25,7 @@ from ponderpounce.models.ponder_checkpoint import (
 from ponderpounce.models.ponder_configs import PonderConfig, qwen35_0p8b, qwen35_2b, qwen35_4b, qwen35_9b, tiny_cpu
 from ponderpounce.models.proprioception import Proprioception
 from ponderpounce.models.second_look import SecondLook
+from ponderpounce.models.showing import Showing, declared
 from ponderpounce.models.vocabulary import Vocabulary
 
 VOCABULARY = Vocabulary.tiny()
@@ -264,12 +265,23 @@ def test_a_fovea_is_read_back(ponder: Ponder, tmp_path: Path) -> None:
     assert load_ponder(tmp_path).format.fovea == (0, 0, 1, 1)
 
 
-@pytest.mark.parametrize("version", [1, 2, 3, 4, 5, 6, 7])
+def test_how_demonstrations_were_shown_is_read_back_and_told_to_who_asks_for_it_alone(
+    ponder: Ponder, tmp_path: Path
+) -> None:
+    watching = Ponder(ponder.qwen.config, ponder.format, image_px=ponder.image_px)
+    watching.qwen = ponder.qwen
+    watching.format = replace(watching.format, demonstrations=Showing(hz=2, to_its_end=True))
+    save_ponder(watching, tmp_path)
+    assert load_ponder(tmp_path).format.demonstrations == Showing(hz=2, to_its_end=True) == declared(tmp_path)
+
+
+@pytest.mark.parametrize("version", [1, 2, 3, 4, 5, 6, 7, 8])
 def test_a_folder_from_before_there_were_eyes_proprioception_or_notes_has_none_and_speaks(
     ponder: Ponder, folder: Path, version: int
 ) -> None:
     stored = json.loads((folder / "ponder.json").read_text())
-    for name in ("eyes", "proprioception", "speaks", "takes_notes", "second_look", "counsel", "fovea")[version - 1 :]:
+    since_1 = ("eyes", "proprioception", "speaks", "takes_notes", "second_look", "counsel", "fovea", "demonstrations")
+    for name in since_1[version - 1 :]:
         del stored[name]
     (folder / "ponder.json").write_text(json.dumps({**stored, "format": f"ponderpounce.ponder/{version}"}))
     loaded = load_ponder(folder)
@@ -277,6 +289,7 @@ def test_a_folder_from_before_there_were_eyes_proprioception_or_notes_has_none_a
     assert not loaded.format.takes_notes
     assert loaded.format.second_look is None
     assert (loaded.format.counsel, loaded.format.fovea) == (None, None)
+    assert loaded.format.demonstrations == Showing()
     assert loaded.image_px == (64, 64)
     assert weights_hash(loaded) == weights_hash(ponder)
 

@@ -20,6 +20,7 @@ from ponderpounce.models.ponder_checkpoint import load_ponder
 from ponderpounce.models.pounce import PounceConfig
 from ponderpounce.models.pounce_checkpoint import load_bundle
 from ponderpounce.models.prompt import with_subgoal
+from ponderpounce.models.showing import Showing, declared
 from ponderpounce.training import recipes, train
 from ponderpounce.training.chunks import chunk_ticks
 from ponderpounce.training.data import Sight, TrainingSet
@@ -118,6 +119,24 @@ def test_a_video_is_looked_at_so_often_and_at_its_end_if_that_was_rendered(
     told = [f"pick it at <{1 + row // 60}, 7>" for row in rows]
     assert [list(episode.demo_subgoals), len(episode.demo_tools), len(episode.demo_notes)] == [told, *[len(rows)] * 2]
     assert int(episode.frames[0][0].mean()) == pytest.approx(20 + num_demo, abs=2)
+
+
+@pytest.mark.parametrize("is_rendered", [True, False])
+def test_a_trained_ponder_says_how_demonstrations_were_shown(tmp_path: Path, is_rendered: bool) -> None:
+    writer = DatasetWriter(tmp_path / "set")
+    for seed, num_demo in ((1, 42), (2, 46), (3, 0)):
+        writer.add(unpack(_episode(seed, num_demo, () if is_rendered else (num_demo - 1,))))
+    writer.finish()
+    assert TrainingSet(tmp_path / "set").showing(2) == Showing(hz=2, to_its_end=is_rendered)
+    train.train(options(tmp_path / "set", tmp_path / "out"))
+    assert declared(tmp_path / "out" / "ponder") == Showing(hz=1, to_its_end=is_rendered)
+
+
+def test_without_demonstrations_nobody_says_how_they_are_shown(tmp_path: Path) -> None:
+    writer = DatasetWriter(tmp_path / "set")
+    writer.add(unpack(_episode(1, 0)))
+    writer.finish()
+    assert TrainingSet(tmp_path / "set").showing(2) is None
 
 
 def test_a_video_whose_pictures_were_taken_more_seldom_is_refused(tmp_path: Path) -> None:

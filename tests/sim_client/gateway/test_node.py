@@ -11,10 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from clock import schedules
+from ponderpounce.models.showing import Showing
 from protocol import messages as m
 from sim_client.episode import STOPPED_TICKS
 from sim_client.gateway.node import LiveNode, LockstepNode, Shown
-from sim_client.gateway.rule import ahead, at_demo_rate
+from sim_client.gateway.rule import ahead, as_shown
 
 TICK_NS = 50_000_000
 START_NS = 300_000_000
@@ -166,7 +167,7 @@ def test_rows_ahead_obey_the_limits(robot_with: Callable[..., m.Robot]) -> None:
 @pytest.mark.parametrize(("num_frames", "read"), [(0, []), (1, [0]), (20, [0]), (21, [0, 20]), (45, [0, 20, 40])])
 def test_of_a_video_ponder_reads_the_first_frame_and_one_a_second(num_frames: int, read: list[int]) -> None:
     video: Any = list(range(num_frames))
-    assert list(at_demo_rate(video, 20)) == read
+    assert list(as_shown(video, 20, Showing())) == read
 
 
 @pytest.mark.parametrize(
@@ -176,4 +177,4 @@ def test_of_a_video_that_is_shown_twice_a_second_and_to_its_end_ponder_reads_the
     num_frames: int, read: list[int]
 ) -> None:
     video: Any = list(range(num_frames))
-    assert list(at_demo_rate(video, 20, demo_hz=2, to_its_end=True)) == read
+    assert list(as_shown(video, 20, Showing(hz=2, to_its_end=True))) == read

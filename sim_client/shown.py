@@ -1,0 +1,13 @@
+"""How demonstrations are shown: as the PONDER that is served has learned from them, unless one is told otherwise."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ponderpounce.models.showing import Showing, declared
+
+
+def how_shown(demo_hz: int | None, video_end: bool, ponder_checkpoint: Path | None) -> Showing:
+    """What ``--demo-hz``, ``--video-end`` and the checkpoint say together. Raises ValueError as `declared`."""
+    said = declared(ponder_checkpoint)
+    return Showing(hz=said.hz if demo_hz is None else demo_hz, to_its_end=video_end or said.to_its_end)
