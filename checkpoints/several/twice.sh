@@ -41,4 +41,5 @@ data+=("$next/timed" "$next/highlight")
 settle small_twice_a_second "$long/pair/ponder" "$long/pair/pounce" "$next" --data "${data[@]}" --sights "$next/sights" \
     --watch "$next/watched" --watch-share 0.17 --products bfloat16
 look_again "$next/pair/ponder" 6 8 'highlight|hides|correct'
-evaluate "$next/pair" "$next" --demo-hz 2 --video-end
+take_none "$next/pair/ponder"
+evaluate "$next/pair" "$next"

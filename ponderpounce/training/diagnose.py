@@ -106,7 +106,7 @@ def diagnose(options: DiagnoseOptions) -> dict[str, Any]:
         given = (ponder.format.num_carriers, ponder.hidden_size)
         raise ValueError(f"{options.pounce} reads (K, H) = {wanted}, {options.ponder} gives {given}: not a pair")
     sight = Sight(form=ponder.format, pounce_px=pounce.config.image_px if pounce.config.num_cameras else None)
-    data = TrainingSet(options.data, tasks=options.tasks, sight=sight)
+    data = TrainingSet(options.data, tasks=options.tasks, sight=sight, demo_hz=ponder.format.demonstrations.hz)
     numbers = in_turns([task for task, _ in data.names], options.episodes)
     examples = [_example(data, number, ponder) for number in numbers]
     shown = tqdm(examples, desc="PONDER", unit="episode", disable=not options.progress)
