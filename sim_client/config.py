@@ -92,7 +92,7 @@ class SimOptions:
 
     @property
     def showing(self) -> Showing:
-        """How demonstrations are shown. Raises ValueError if the checkpoint says nothing that can be read."""
+        """How demonstrations are shown. Raises TransportError as `how_shown`."""
         return how_shown(self.demo_hz, self.video_end, self.ponder_checkpoint)
 
     @property

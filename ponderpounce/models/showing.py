@@ -29,6 +29,12 @@ class Showing:
         if self.hz < 1 or _FASTEST_HZ % self.hz:
             raise ValueError(f"hz must divide {_FASTEST_HZ}, came {self.hz}")
 
+    def looks(self, num_frames: int, video_hz: int = _FASTEST_HZ) -> list[int]:
+        """Which frames of a video of so many are shown; ``hz`` divides ``video_hz``."""
+        every, last = video_hz // self.hz, num_frames - 1
+        looks = [*range(0, num_frames, every)]
+        return [*looks, last] if self.to_its_end and looks and looks[-1] != last else looks
+
 
 AS_IN_THE_PAPER = Showing()
 
@@ -36,7 +42,7 @@ AS_IN_THE_PAPER = Showing()
 def declared(directory: Path | None) -> Showing:
     """What the PONDER of a checkpoint folder has learned from; the paper's way without one, and where it does not say.
 
-    Raises ValueError, with the path, if its ponder.json says nothing that can be read.
+    Raises ValueError if its ponder.json says nothing that can be read.
     """
     path = None if directory is None else directory / OWN_NAME
     if path is None or not path.is_file():

@@ -322,9 +322,7 @@ def _sources(dataset: Dataset, tasks: Sequence[str], *, is_watched: bool) -> lis
 
 def _looked_at(num_rows: int, rows: Rows, demo_hz: int) -> list[int]:
     """The rows of a demonstration of so many that PONDER is shown: so many a second, and the last if rendered."""
-    every, last = FPS // demo_hz, num_rows - 1
-    looks = [*range(0, num_rows, every)]
-    return [*looks, last] if num_rows and rows.is_rendered[last] and last % every else looks
+    return Showing(hz=demo_hz, to_its_end=num_rows > 0 and bool(rows.is_rendered[num_rows - 1])).looks(num_rows, FPS)
 
 
 def _seen_at(poses_T7: NDArray[np.float32], below_m: float = 0.0) -> list[str]:

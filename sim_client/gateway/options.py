@@ -10,7 +10,6 @@ from typing import Literal
 
 from clock import schedules
 from clock.timebase import NS_PER_MS
-from ponderpounce.models.showing import Showing
 from protocol.errors import TransportError
 from protocol.messages import Delay, DelayKind, Schedule, WaitKind
 from protocol.options import LinkOptions
@@ -186,15 +185,8 @@ class GatewayOptions:
         """The robot that clients drive. Raises TransportError if its file does not describe one."""
         return body.read_body(self.robot_file) if self.robot_file else body.PANDA
 
-    def showing(self) -> Showing:
-        """How videos are shown. Raises TransportError if the checkpoint says nothing that can be read."""
-        try:
-            return how_shown(self.demo_hz, self.video_end, self.ponder_checkpoint)
-        except ValueError as error:
-            raise TransportError(f"--ponder-checkpoint: {error}") from None
-
     def plan(self) -> Plan:
-        """What all episodes have in common. Raises TransportError as ``body`` and ``showing``."""
+        """What all episodes have in common. Raises TransportError as ``body`` and `how_shown`."""
         return Plan(
             schedule=self.schedule,
             num_rows=self.terms().rows,
@@ -203,7 +195,7 @@ class GatewayOptions:
             task=self.task,
             image_px=self.image_px,
             seed=self.seed,
-            showing=self.showing(),
+            showing=how_shown(self.demo_hz, self.video_end, self.ponder_checkpoint),
             out=self.out if self.record else None,
             pixels=self.pixels,
             patience_ns=round(self.patience_s * 1e9),

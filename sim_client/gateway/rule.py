@@ -15,9 +15,7 @@ from sim_client.gateway.exchange import Frames
 def as_shown(video: Sequence[Frames], control_hz: int, showing: Showing) -> Sequence[Frames]:
     """The frames of a video at the control rate that PONDER reads: the first and so many a second after it, and the
     last one if it is shown to its end."""
-    every = control_hz // showing.hz
-    shown = video[::every]
-    return [*shown, video[-1]] if showing.to_its_end and video and (len(video) - 1) % every else shown
+    return [video[look] for look in showing.looks(len(video), control_hz)]
 
 
 def ahead(command: Action, chunk: ActionChunk | None, robot: Robot, num_rows: int) -> tuple[Floats, tuple[Level, ...]]:

@@ -96,7 +96,11 @@ def test_a_checkpoint_that_does_not_say_is_shown_what_the_paper_shows(said: dict
 )
 def test_a_checkpoint_that_says_nonsense_is_refused(said: str, sentence: str, tmp_path: Path) -> None:
     (tmp_path / "ponder.json").write_text(said)
-    with pytest.raises(ValueError, match=sentence):
-        how_shown(None, False, tmp_path)
+    for tell in (
+        lambda: how_shown(None, False, tmp_path),
+        EvalOptions(out=tmp_path, ponder_checkpoint=tmp_path).config,
+    ):
+        with pytest.raises(TransportError, match=sentence):
+            tell()
     with pytest.raises(TransportError, match=sentence):
         GatewayOptions(dialect="openpi", ponder_checkpoint=tmp_path).plan()
