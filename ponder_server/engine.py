@@ -116,9 +116,8 @@ class QwenEngine:
             dtype=str(ponder.dtype).removeprefix("torch."),
             session_bytes=session_bytes,
         )
-        model = ponder.qwen.model
         draft = draft or NoDraft()
-        self._parts = [*(layer.mlp for layer in (*model.visual.blocks, *model.language_model.layers)), *draft.parts]
+        self._parts = [*(layer.mlp for layer in ponder.layers), *draft.parts]
         self._writer = TransitionWriter(ponder, draft, max_text_tokens=config.max_text_tokens)
         self._num_query_ids = len(self._query_ids(WARM_UP_PROPRIO))
         self._opener = Opener(
@@ -181,6 +180,7 @@ class QwenEngine:
                     demo = [self._see(each, f"demo instant {n}", view) for n, each in enumerate(opening.demo_frames)]
                     pictures = [picture for instant in demo for picture in instant]
                     contexts[session] = context = self._runner.open(session)
+                    context.is_shown = opening.has_demo
                     steps = self._opener.encode(context, opening, segments, pictures, view)
                     thoughts.add(session, steps, thoughts.turn())
                 while len(opened) < len(views):

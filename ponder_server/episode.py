@@ -40,11 +40,13 @@ class Episode:
             saved=saved,
             num_spans=len(self.spans),
             owes_reasoning=self.owes_reasoning,
+            is_shown=self.context.is_shown,
             notes=self.notes,
             standing=copy(self.standing),
         )
         self.spans += spans
         self.owes_reasoning &= not texts
+        self.context.is_shown = False
         self.notes = ()
         if self.standing is not None:
             self.standing.answered([(text.text, text.token_ids) for text in texts], looked_again=looked_again)
@@ -56,6 +58,7 @@ class Episode:
             raise SessionError(f"session {self.context.name!r} has no answer that could be taken back")
         self.context.restore(before.saved)
         del self.spans[before.num_spans :]
+        self.context.is_shown = before.is_shown
         self.owes_reasoning, self.notes, self.standing = before.owes_reasoning, before.notes, before.standing
 
 
@@ -66,6 +69,7 @@ class Before:
     saved: SavedState
     num_spans: int
     owes_reasoning: bool
+    is_shown: bool
     notes: tuple[Note, ...]
     standing: Standing | None
 

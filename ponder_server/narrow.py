@@ -31,6 +31,8 @@ def quantise(ponder: Ponder, weights: WeightsName) -> int:
     """Replaces the layers in place; returns how many bytes that saved, 0 for float weights."""
     if weights == "float":
         return 0
-    return quantise_where(
-        ponder.qwen, lambda name: name.startswith(_NARROW) and not name.endswith(_KEPT), _LAYERS[weights]
-    )
+    kind = _LAYERS[weights]
+    saved = quantise_where(ponder.qwen, lambda name: name.startswith(_NARROW) and not name.endswith(_KEPT), kind)
+    if ponder.reader is not None:
+        saved += quantise_where(ponder.reader, lambda name: not name.endswith(_KEPT), kind)
+    return saved

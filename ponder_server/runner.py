@@ -91,6 +91,7 @@ class Runner:
         self._ponder = ponder
         self._threads = threads
         self._text_model = ponder.qwen.model.language_model
+        self._reader = self._text_model if ponder.reader is None else ponder.reader
         self._buckets = buckets
         text_config = ponder.qwen.config.text_config
         self.memory = SlotMemory(
@@ -103,7 +104,8 @@ class Runner:
     def capture(self, capture: Capture, *, num_read: int) -> None:
         """Forwards are captured from now on (``captured``), when they are first met or by :meth:`prepare`.
 
-        What is captured keeps the weights that it saw: replace none afterwards. A row's hidden states are handed out
+        What is captured keeps the weights that it saw: replace none afterwards. A reader's forwards, before an episode
+        begins and at its first query, run as they did. A row's hidden states are handed out
         ``num_read`` at most; forwards that are asked for more run as they did.
         """
         self._captured = CapturedDecoder(self._text_model, self.memory, capture, num_read=num_read)
@@ -155,7 +157,8 @@ class Runner:
         rows = [_Row(one, self._ponder) for one in appends]
         while active := [row for row in rows if row.num_left]:
             length = max(self.bucket(row.num_left) for row in active)
-            self._forward([row for row in active if self.bucket(row.num_left) == length], length)
+            together = [row for row in active if self.bucket(row.num_left) == length]
+            self._forward([row for row in together if row.is_shown == together[0].is_shown], length)
         for one, row in zip(appends, rows, strict=True):
             one.session.ids.extend(one.ids)
             one.session.next_position = row.next_position
@@ -182,10 +185,11 @@ class Runner:
             places.append(place)
             row.num_done = end
         positions = torch.from_numpy(positions_3BT)
-        if self._captured is not None:
+        text_model = self._reader if rows[0].is_shown else self._text_model
+        if self._captured is not None and text_model is self._text_model:
             hidden = self._captured(places, embeds_BTH, positions)
         else:
-            hidden = decode(self._text_model, self.memory, places, embeds_BTH, positions, self._threads)
+            hidden = decode(text_model, self.memory, places, embeds_BTH, positions, self._threads)
         for row, hidden_NH in zip(rows, hidden, strict=True):
             row.hidden.append(hidden_NH)
 
@@ -198,6 +202,7 @@ class _Row:
         self.embeds_TH = append.embeds_TH
         self.num_tokens, self.num_done = len(append.ids), 0
         self.slot, self.num_past = session.slot, session.num_tokens
+        self.is_shown = session.is_shown
         self.first_wanted = 0 if append.num_wanted is None else self.num_tokens - append.num_wanted
         positions_4T, self.next_position = ponder.format.positions(
             append.ids, first_index=session.num_tokens, first_position=session.next_position
@@ -226,6 +231,8 @@ class Session:
         """Every token of the episode, as its training row would have it."""
         self.num_forgotten = 0
         """Of them, those whose keys and values are gone (:meth:`keep`)."""
+        self.is_shown = False
+        """What is appended is a demonstration, or the first query after one: a `Reader` reads it, if there is one."""
 
     @property
     def num_tokens(self) -> int:

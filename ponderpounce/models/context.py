@@ -84,6 +84,8 @@ class Row:
     gate_index: npt.NDArray[np.int64]
     """(Q,): the last token of each query's observation; its logits say whether text comes."""
     num_images: int
+    num_shown: int = 0
+    """Of a row with a demonstration, its tokens up to the end of the first query: what a `Reader` reads; else 0."""
 
     @property
     def supervised_index(self) -> npt.NDArray[np.int64]:
@@ -260,8 +262,9 @@ class ContextFormat:
         targets: list[int] = []
         carriers: list[range] = []
         gates: list[int] = []
-        num_images = 0
+        num_images, has_demo = 0, False
         for segment in segments:
+            has_demo |= segment.kind is SegmentKind.DEMO
             if segment.kind is SegmentKind.CARRIERS:
                 carriers.append(range(len(ids), len(ids) + len(segment)))
             ids.extend(segment.ids)
@@ -269,12 +272,14 @@ class ContextFormat:
             num_images += segment.num_images
             if segment.kind is SegmentKind.OBSERVATION:
                 gates.append(len(ids) - 1)
+        num_read = carriers[0].stop if carriers else len(ids)
         return Row(
             ids=tuple(ids),
             targets=tuple(targets),
             carrier_index=np.array(carriers, dtype=np.int64).reshape(-1, self.num_carriers),
             gate_index=np.array(gates, dtype=np.int64),
             num_images=num_images,
+            num_shown=num_read if has_demo else 0,
         )
 
     def positions(

@@ -27,6 +27,7 @@ from ponderpounce.models.gated_delta import GatedDelta
 from ponderpounce.models.ponder_configs import PonderConfig
 from ponderpounce.models.ponder_images import patchify
 from ponderpounce.models.ponder_vision import image_tokens
+from ponderpounce.models.reader import Reader, read_apart
 from ponderpounce.models.vocabulary import Vocabulary
 
 FLOAT32_PARAMETERS = ("linear_attn.A_log", "linear_attn.norm.weight")
@@ -82,6 +83,9 @@ class Ponder(nn.Module):
         qwen.model.language_model.rotary_emb = Qwen3_5TextRotaryEmbedding(text).to(device)
         qwen.model.visual.rotary_pos_emb = Qwen3_5VisionRotaryEmbedding(vision).to(device)
         self.qwen: Any = qwen.eval()
+        self.reader: Reader | None = None
+        """Reads demonstrations, if there is one (:meth:`add_reader`); None: there is one set of weights, as in the
+        paper."""
 
     @classmethod
     def random(
@@ -121,6 +125,13 @@ class Ponder(nn.Module):
     def vocab_size(self) -> int:
         """Rows of the embedding table."""
         return int(self.qwen.config.text_config.vocab_size)
+
+    @property
+    def layers(self) -> list[Any]:
+        """Of the vision tower, the language model and the reader."""
+        model = self.qwen.model
+        reading: list[Any] = [] if self.reader is None else [*self.reader.layers]
+        return [*model.visual.blocks, *model.language_model.layers, *reading]
 
     @property
     def device(self) -> torch.device:
@@ -166,11 +177,19 @@ class Ponder(nn.Module):
         features = self.image_features(frames_NHW3).to(embeds_TH.dtype)
         return embeds_TH.masked_scatter(is_image_T[:, None], features)
 
-    def forward(self, embeds_BTH: Tensor, positions_4BT: Tensor) -> Tensor:
+    def add_reader(self) -> Reader:
+        """Demonstrations have weights of their own from now on, which begin as the others; nothing changes yet."""
+        self.reader = Reader.like(self.qwen.model.language_model)
+        return self.reader
+
+    def forward(self, embeds_BTH: Tensor, positions_4BT: Tensor, num_shown_B: Sequence[int] = ()) -> Tensor:
         """Final hidden states (B, T, H), after the last norm, of whole contexts; causal.
 
-        Rows may be padded on the right, where nothing follows.
+        Rows may be padded on the right, where nothing follows. ``num_shown_B``: `Row.num_shown` of each, which a
+        reader needs; () if there are no demonstrations.
         """
+        if self.reader is not None and any(num_shown_B):
+            return read_apart(self.qwen.model.language_model, self.reader, embeds_BTH, positions_4BT, num_shown_B)
         output = self.qwen.model.language_model(
             inputs_embeds=embeds_BTH,
             position_ids=positions_4BT,
@@ -190,7 +209,7 @@ class Ponder(nn.Module):
         """Final hidden states (T, H) of a whole row in one cacheless pass: how training sees an episode."""
         positions_4T, _ = self.format.positions(row.ids)
         positions_4BT = torch.from_numpy(positions_4T)[:, None].to(self.device)
-        hidden_BTH: Tensor = self(self.embed(row.ids, frames_NHW3)[None], positions_4BT)
+        hidden_BTH: Tensor = self(self.embed(row.ids, frames_NHW3)[None], positions_4BT, [row.num_shown])
         return hidden_BTH[0]
 
 

@@ -4,6 +4,7 @@
     tokenizer.json       the tokenizer
     model.safetensors    the weights, or model.safetensors.index.json and its shards
     ponder.json          what PONDER adds: carriers, image size, eyes, proprioception
+    reader.safetensors   the weights of its reader of demonstrations, if ponder.json says it has one
 
 A public Qwen3.5 checkpoint has no ponder.json and loads as it is; its carriers are untrained padding rows. Loaded in
 the dtype it was written in, it is written back bit for bit, multi-token prediction included.
@@ -35,6 +36,7 @@ from ponderpounce.models.vocabulary import Vocabulary
 CONFIG_NAME = "config.json"
 INDEX_NAME = "model.safetensors.index.json"
 SINGLE_NAME = "model.safetensors"
+READER_NAME = "reader.safetensors"
 MTP_PREFIX = "mtp."  # multi-token prediction: in public checkpoints, not in transformers' Qwen3.5
 MAX_SHARD_BYTES = 5_000_000_000
 MAX_NAMES_SHOWN = 5
@@ -48,10 +50,10 @@ class CheckpointError(ValueError):
 class StoredPonder:
     """Contents of ponder.json. The defaults are for a public Qwen3.5, which has none; a file has every field."""
 
-    format: Literal["ponderpounce.ponder/9"] = "ponderpounce.ponder/9"
-    """Each is the one before and a field more: /8 has no ``demonstrations``, /7 no ``fovea``, /6 no ``counsel``, /5 no
-    ``second_look``, /4 no ``takes_notes``, /3 no ``speaks``, /2 no ``proprioception``, /1 no ``eyes``. Such a PONDER
-    speaks, is shown demonstrations as in the paper, and has none of the others."""
+    format: Literal["ponderpounce.ponder/10"] = "ponderpounce.ponder/10"
+    """Each is the one before and a field more: /9 has no ``has_reader``, /8 no ``demonstrations``, /7 no ``fovea``, /6
+    no ``counsel``, /5 no ``second_look``, /4 no ``takes_notes``, /3 no ``speaks``, /2 no ``proprioception``, /1 no
+    ``eyes``. Such a PONDER speaks, is shown demonstrations as in the paper, and has none of the others."""
     num_carriers: int = 1
     first_carrier_id: int | None = None
     """None: the first row after the tokenizer's last id."""
@@ -64,6 +66,8 @@ class StoredPonder:
     second_look: SecondLook | None = None
     counsel: Counsel | None = None
     demonstrations: Showing = AS_IN_THE_PAPER
+    has_reader: bool = False
+    """See ``reader``."""
     is_random: bool = True
     """The carriers were never trained."""
 
@@ -115,6 +119,8 @@ def load_ponder(directory: Path, *, device: torch.device | str = "cpu", dtype: t
     ponder = Ponder(qwen_config, context_format, image_px=stored.image_px, device=device, dtype=dtype)
     ponder.is_random = stored.is_random
     _read_tensors(files, ponder)
+    if stored.has_reader:
+        _read_reader(directory, ponder)
     return ponder
 
 
@@ -140,9 +146,13 @@ def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_S
         second_look=ponder.format.second_look,
         counsel=ponder.format.counsel,
         demonstrations=ponder.format.demonstrations,
+        has_reader=ponder.reader is not None,
         is_random=ponder.is_random,
     )
     (directory / OWN_NAME).write_text(json.dumps(asdict(stored), indent=2) + "\n")
+    if ponder.reader is not None:
+        own = {name: tensor.contiguous() for name, tensor in _own_tensors(ponder.reader).items()}
+        save_file(own, directory / READER_NAME, metadata={"format": "pt"})
     shards: list[dict[str, Tensor]] = [{}]
     shard_bytes = 0
     for name, tensor in (_own_tensors(ponder.qwen) | ponder.mtp).items():
@@ -170,7 +180,10 @@ def weights_hash(ponder: Ponder) -> str:
     Reads every weight once, which takes seconds per ten gigabytes: compute it when a network is loaded.
     """
     digest = hashlib.sha256()
-    for name, tensor in sorted(_own_tensors(ponder.qwen).items()):
+    own = _own_tensors(ponder.qwen)
+    if ponder.reader is not None:
+        own |= {f"reader.{name}": tensor for name, tensor in _own_tensors(ponder.reader).items()}
+    for name, tensor in sorted(own.items()):
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
         flat = tensor.detach().contiguous().reshape(-1).view(torch.uint8)
         digest.update(flat.cpu().numpy().data)
@@ -240,6 +253,8 @@ def _read_stored(directory: Path) -> StoredPonder:
         values |= {"format": "ponderpounce.ponder/8", "fovea": None}
     if isinstance(values, dict) and values.get("format") == "ponderpounce.ponder/8":
         values |= {"format": "ponderpounce.ponder/9", "demonstrations": {"hz": 1, "to_its_end": False}}
+    if isinstance(values, dict) and values.get("format") == "ponderpounce.ponder/9":
+        values |= {"format": "ponderpounce.ponder/10", "has_reader": False}
     return from_json(StoredPonder, values, str(path))
 
 
@@ -279,6 +294,19 @@ def _check_tensors(
         rest = len(faults) - MAX_NAMES_SHOWN
         shown = "; ".join(faults[:MAX_NAMES_SHOWN]) + (f"; and {rest} more" if rest > 0 else "")
         raise CheckpointError(f"{directory} does not match its config.json ({len(faults)} faults): {shown}.")
+
+
+@torch.no_grad()
+def _read_reader(directory: Path, ponder: Ponder) -> None:
+    path = directory / READER_NAME
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: {OWN_NAME} says that it has a reader; its weights are here.")
+    own = _own_tensors(ponder.add_reader())
+    shapes = {name: tuple(tensor.shape) for name, tensor in own.items()}
+    with _open(path) as file:
+        _check_tensors(directory, dict.fromkeys(file.keys(), path), shapes, tied=False)
+        for name, tensor in own.items():
+            tensor.copy_(file.get_tensor(name))
 
 
 @torch.no_grad()

@@ -33,4 +33,5 @@ def without_pictures(row: Row, vocabulary: Vocabulary) -> Row:
         carrier_index=place_T[row.carrier_index],
         gate_index=place_T[row.gate_index],
         num_images=0,
+        num_shown=int(is_kept_T[: row.num_shown].sum()),
     )

@@ -210,10 +210,12 @@ class JointModel(nn.Module):
         aligns_evenly: bool = False,
         trains: Trains = "both",
         keeps_eyes: bool = False,
+        reads_apart: bool = False,
         reads_together: bool = True,
         num_groups: int = 1,
     ) -> None:
-        """With ``keeps_eyes`` PONDER's vision tower stays as it is; ``reads_together`` and ``num_groups`` are
+        """With ``keeps_eyes`` PONDER's vision tower stays as it is; with ``reads_apart`` all of it does but a `Reader`
+        of demonstrations, which it is given if it has none; ``reads_together`` and ``num_groups`` are
         `encode_rows`'s; ``aligns_evenly``: numbers of C count as `number_weights` says.
 
         Raises ValueError if POUNCE was built for another cognition than PONDER gives.
@@ -232,6 +234,9 @@ class JointModel(nn.Module):
         for name, system in (("ponder", ponder), ("pounce", pounce)):
             if trains not in ("both", name):
                 system.requires_grad_(False)
+        if reads_apart:
+            ponder.qwen.requires_grad_(False)
+            (ponder.reader or ponder.add_reader()).requires_grad_(True)
         if keeps_eyes:
             ponder.qwen.model.visual.requires_grad_(False)
 
@@ -339,10 +344,11 @@ def encode_rows(ponder: Ponder, episodes: PonderBatch, *, together: bool = True,
     lengths = [len(row.ids) for row in episodes.rows]
     embeds = ponder.embed(ids, torch.cat(frames) if frames else None).split(lengths)
     positions = [ponder.format.positions(row.ids)[0] for row in episodes.rows]
+    num_shown = [row.num_shown for row in episodes.rows]
     if not together:
         return [
-            ponder(embed[None], torch.from_numpy(each)[:, None].to(ponder.device))[0]
-            for embed, each in zip(embeds, positions, strict=True)
+            ponder(embed[None], torch.from_numpy(each)[:, None].to(ponder.device), [shown])[0]
+            for embed, each, shown in zip(embeds, positions, num_shown, strict=True)
         ]
     by_length = np.argsort(lengths, kind="stable")
     found: dict[int, Tensor] = {}
@@ -353,7 +359,8 @@ def encode_rows(ponder: Ponder, episodes: PonderBatch, *, together: bool = True,
         for place, row in enumerate(group):
             positions_4BT[:, place, : lengths[row]] = positions[row]
         embeds_BTH = pad_sequence([embeds[row] for row in group], batch_first=True)
-        hidden_BTH = ponder(embeds_BTH, torch.from_numpy(positions_4BT).to(ponder.device))
+        shown_B = [num_shown[row] for row in group]
+        hidden_BTH = ponder(embeds_BTH, torch.from_numpy(positions_4BT).to(ponder.device), shown_B)
         index = torch.from_numpy(np.flatnonzero(is_token_BT)).to(ponder.device)
         parts = hidden_BTH.flatten(0, 1)[index].split([lengths[row] for row in group])
         found |= dict(zip(group.tolist(), parts, strict=True))

@@ -22,6 +22,7 @@ from torch.distributed.device_mesh import init_device_mesh
 from torch.distributed.fsdp import MixedPrecisionPolicy, fully_shard
 from torch.distributed.tensor import DTensor
 
+from ponderpounce.models.reader import Reader
 from ponderpounce.models.units import units_of
 
 _BITS = {1: torch.int8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
@@ -128,6 +129,8 @@ def shard(model: nn.Module, world: World) -> None:
     """
     if world.size == 1:
         return
+    if any(isinstance(each, Reader) for each in model.modules()):  # whose layers run by their parts (`read_apart`)
+        raise ValueError("a PONDER with a reader of demonstrations cannot be sharded: give --weights whole")
     mesh = init_device_mesh(world.device, (world.size,))
     left_whole: set[nn.Parameter] = set()
     for unit in [*units_of(model), model]:

@@ -45,6 +45,8 @@ class Recipe:
     keeps_eyes: bool = False
     """PONDER's vision tower stays as it is: a language model that needs few of the things in a picture lets the eyes
     forget the others."""
+    reads_apart: bool = False
+    """Of PONDER only a `Reader` of demonstrations learns; whatever is done without one stays as it is, to the bit."""
     space: ActionSpace = "joint_delta"
     """What POUNCE's actions are."""
     statistics_by_row: bool = False
@@ -57,6 +59,8 @@ class Recipe:
     def __post_init__(self) -> None:
         if self.trains != "pounce" and self.example.is_grounded != (self.w2 > 0):
             raise ValueError(f"recipe {self.name}: is_grounded is {self.example.is_grounded}, but w2 is {self.w2}")
+        if self.reads_apart and self.trains != "ponder":
+            raise ValueError(f"recipe {self.name}: a reader learns alone (reads_apart), but it trains {self.trains}")
         if self.demo_hz < 1 or FPS % self.demo_hz:
             raise ValueError(f"recipe {self.name}: demo_hz must divide {FPS}, came {self.demo_hz}")
         if self.trains == "both" and self.example.augmentation.moves and self.example.augments == "all":

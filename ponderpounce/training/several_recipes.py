@@ -304,6 +304,25 @@ def small_twice_a_second() -> Curriculum:
     return Curriculum(name="small_twice_a_second", stages=(settling,))
 
 
+def small_reading() -> Curriculum:
+    """A reader of demonstrations, which has learned from `small_twice_a_second`, learns beside the PONDER of
+    `small_at_length`, of which nothing else changes (`reader`). For demonstrated episodes alone.
+
+    docs/training.md, "A reader of demonstrations".
+    """
+    *_, settling = small_twice_a_second().stages
+    settling = replace(
+        settling,
+        name="small_reading/settling",
+        # what acts is learned: most of what is left to learn is over when the first words have come
+        example=replace(settling.example, recalls=0.8, text_dropout=0.05, slips=0.1),
+        train=replace(settling.train, seed=41, optim=replace(settling.train.optim, decay=(150, 500))),
+        num_steps=500,
+        reads_apart=True,
+    )
+    return Curriculum(name="small_reading", stages=(settling,))
+
+
 def small_by_sight() -> Curriculum:
     """The PONDER of `small_at_length`, its eye wider, learns to look up ways in its notes.
 

@@ -426,6 +426,7 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
         aligns_evenly=run.aligns_evenly,
         trains=run.trains,
         keeps_eyes=run.keeps_eyes,
+        reads_apart=run.reads_apart,
     ), bundle
 
 

@@ -275,12 +275,13 @@ def test_how_demonstrations_were_shown_is_read_back_and_told_to_who_asks_for_it_
     assert load_ponder(tmp_path).format.demonstrations == Showing(hz=2, to_its_end=True) == declared(tmp_path)
 
 
-@pytest.mark.parametrize("version", [1, 2, 3, 4, 5, 6, 7, 8])
+@pytest.mark.parametrize("version", [1, 2, 3, 4, 5, 6, 7, 8, 9])
 def test_a_folder_from_before_there_were_eyes_proprioception_or_notes_has_none_and_speaks(
     ponder: Ponder, folder: Path, version: int
 ) -> None:
     stored = json.loads((folder / "ponder.json").read_text())
     since_1 = ("eyes", "proprioception", "speaks", "takes_notes", "second_look", "counsel", "fovea", "demonstrations")
+    since_1 = (*since_1, "has_reader")
     for name in since_1[version - 1 :]:
         del stored[name]
     (folder / "ponder.json").write_text(json.dumps({**stored, "format": f"ponderpounce.ponder/{version}"}))

@@ -126,6 +126,24 @@ def test_action_loss_reaches_ponder_at_half_strength_and_only_through_cognition(
     assert "ponder.qwen.lm_head.weight" not in full
 
 
+def test_a_reader_learns_alone_from_all_losses(model: JointModel) -> None:
+    """From C of queries that others answer, too: through the keys, values and states that it leaves them."""
+    with torch.no_grad():
+        before = encode_rows(model.ponder, episodes(model.ponder, 3))[0]
+    apart = JointModel(model.ponder, model.pounce, trains="ponder", reads_apart=True)
+    both = episodes(model.ponder, 3)
+    (hidden_TH,) = encode_rows(model.ponder, both)
+    torch.testing.assert_close(hidden_TH, before, atol=2e-5, rtol=1e-4)
+    assert {name.split(".")[1] for name, each in apart.named_parameters() if each.requires_grad} == {"reader"}
+    grounding = gradients(apart(both, batch := invocations(model.pounce, (0, 0)), draws_of(batch)).grounding, apart)
+    last = hidden_TH[int(both.rows[0].carrier_index[-1, 0])]
+    told = gradients(last.square().sum(), apart)
+    for reached in (grounding, told):
+        layers = {name.split(".")[3] for name in reached if name.startswith("ponder.reader.layers")}
+        assert layers == {str(layer) for layer in range(CONFIG.num_layers)}
+    assert model.ponder.reader is apart.ponder.reader, "whoever has one goes on with it"
+
+
 def test_null_cognition_tells_ponder_nothing(model: JointModel) -> None:
     both, batch = episodes(model.ponder, 2), invocations(model.pounce, (0, NO_QUERY), (0, NO_QUERY))
     reached = gradients(model(both, batch, draws_of(batch)).flow_matching, model)

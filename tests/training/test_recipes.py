@@ -36,6 +36,13 @@ def test_both_systems_of_a_recipe_fit(name: str) -> None:
         assert run.pounce.cognition.num_carriers == (0 if run.pounce.reads_subgoal else run.ponder.num_carriers)
 
 
+def test_a_reader_learns_beside_nobody() -> None:
+    (stage,) = stages_of(recipe("small_reading"))
+    assert stage.reads_apart
+    with pytest.raises(ValueError, match="a reader learns alone"):
+        replace(stage, trains="both")
+
+
 def test_a_mistyped_name_is_answered_with_the_nearest() -> None:
     with pytest.raises(ValueError, match="Did you mean 'robomme'"):
         recipe("robome")
