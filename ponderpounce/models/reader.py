@@ -74,7 +74,8 @@ def read_apart(
     kinds = _Kinds(num_read_B, embeds_BTH.shape[1], embeds_BTH.device)
     cos_sin = text_model.rotary_emb(embeds_BTH, positions_4BT[1:])
     hidden = embeds_BTH
-    for reading, acting in zip(reader.layers, text_model.layers, strict=True):
+    layers: Any = reader.layers
+    for reading, acting in zip(layers, text_model.layers, strict=True):
         normed_BTH = kinds.each(reading.input_layernorm, acting.input_layernorm, hidden)
         if hasattr(acting, "self_attn"):
             mixed_BTH = _attention(kinds, reading.self_attn, acting.self_attn, normed_BTH, cos_sin)

@@ -316,8 +316,8 @@ def small_reading() -> Curriculum:
         name="small_reading/settling",
         # what acts is learned: most of what is left to learn is over when the first words have come
         example=replace(settling.example, recalls=0.8, text_dropout=0.05, slips=0.1),
-        train=replace(settling.train, seed=41, optim=replace(settling.train.optim, decay=(150, 500))),
-        num_steps=500,
+        train=replace(settling.train, seed=41, optim=replace(settling.train.optim, decay=(300, 1000))),
+        num_steps=1000,
         reads_apart=True,
     )
     return Curriculum(name="small_reading", stages=(settling,))
