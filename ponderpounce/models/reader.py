@@ -61,7 +61,8 @@ class _Kinds:
         """Every token through what its kind has; (B, T, width out)."""
         x_MX = x_BTX.flatten(0, 1)
         x_MX = x_MX if self._order is None else x_MX[self._order]
-        y_MY = torch.cat([reading(x_MX[: self._num_read]), acting(x_MX[self._num_read :])])
+        parts = ((reading, x_MX[: self._num_read]), (acting, x_MX[self._num_read :]))
+        y_MY = torch.cat([through(part) for through, part in parts if len(part)])
         y_MY = y_MY if self._back is None else y_MY[self._back]
         return y_MY.unflatten(0, x_BTX.shape[:2])
 

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import load_file, save_file
 
+from ponderpounce.models.bfloat16_products import multiply_in_bfloat16
 from ponderpounce.models.context import Row, Transition
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import READER_NAME, CheckpointError, load_ponder, save_ponder, weights_hash
@@ -89,6 +90,16 @@ def test_rows_read_together_are_what_each_is_alone() -> None:
         for together in (True, False):
             for row, found in zip(rows, encode_rows(ponder, batch, together=together), strict=True):
                 torch.testing.assert_close(found, hidden(ponder, row), rtol=0, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("num_queries", [0, 1])
+def test_a_row_that_is_all_the_readers_multiplies_in_bfloat16(num_queries: int) -> None:
+    ponder = with_reader(is_other=True)
+    row = row_of(ponder, 2, num_queries)
+    exact = hidden(ponder, row)
+    multiply_in_bfloat16(ponder, least_size=8)
+    narrow = hidden(ponder, row)
+    assert 0 < (narrow - exact).norm() / exact.norm() < 0.2
 
 
 def test_it_is_causal() -> None:
