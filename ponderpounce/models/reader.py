@@ -8,7 +8,8 @@ Mixture-of-Transformers (arXiv:2411.04996); pi0's action expert is one. The pape
 
 Embeddings, vision tower and LM head are shared.
 
-# B rows, T tokens, H hidden, D head dimension, C conv channels, W conv width, N tokens of one kind
+# B rows, T tokens, H hidden, h heads, g heads of keys, D head dimension, E value dimensions, C conv channels
+# N tokens of one kind
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from transformers.models.qwen3_5.modeling_qwen3_5 import causal_conv1d_fn
 from ponderpounce.models.gated_delta import gated_delta_rule
 from ponderpounce.models.ponder_kernels import rotate
 
-PerToken = Callable[[Tensor], Tensor]
-"""(N, width in) to (N, width out), every token by itself."""
+PerToken = Callable[..., tuple[Tensor, ...]]
+"""One or more (N, width in) to one or more (N, width out), every token by itself."""
 
 
 class Reader(nn.Module):
@@ -51,20 +52,29 @@ class _Kinds:
     def __init__(self, num_read_B: Sequence[int], length: int, device: torch.device) -> None:
         is_read_BT = torch.arange(length) < torch.tensor(list(num_read_B))[:, None]
         self.is_read_BT = is_read_BT.to(device)
+        self.range_read = min(num_read_B), max(num_read_B)
+        """How many tokens of every row, and of any row, are the reader's."""
         order = torch.cat([torch.nonzero(each.flatten())[:, 0] for each in (is_read_BT, ~is_read_BT)])
         self._num_read = int(is_read_BT.sum())
         is_in_order = bool((order == torch.arange(len(order))).all())  # one row alone: its beginning is the reader's
         self._order = None if is_in_order else order.to(device)
         self._back = None if is_in_order else order.argsort().to(device)
 
-    def each(self, reading: PerToken, acting: PerToken, x_BTX: Tensor) -> Tensor:
-        """Every token through what its kind has; (B, T, width out)."""
+    def each(self, reading: PerToken, acting: PerToken, *given_BTX: Tensor) -> tuple[Tensor, ...]:
+        """Every token through what its kind has; each (B, T, width out)."""
+        given = [self._sorted(x_BTX) for x_BTX in given_BTX]
+        parts = ((reading, slice(self._num_read)), (acting, slice(self._num_read, None)))
+        found = [through(*(x_MX[part] for x_MX in given)) for through, part in parts if len(given[0][part])]
+        shape = given_BTX[0].shape[:2]
+        return tuple(self._unsorted(torch.cat(same)).unflatten(0, shape) for same in zip(*found, strict=True))
+
+    def _sorted(self, x_BTX: Tensor) -> Tensor:
+        """The reader's tokens first, (B T, width)."""
         x_MX = x_BTX.flatten(0, 1)
-        x_MX = x_MX if self._order is None else x_MX[self._order]
-        parts = ((reading, x_MX[: self._num_read]), (acting, x_MX[self._num_read :]))
-        y_MY = torch.cat([through(part) for through, part in parts if len(part)])
-        y_MY = y_MY if self._back is None else y_MY[self._back]
-        return y_MY.unflatten(0, x_BTX.shape[:2])
+        return x_MX if self._order is None else x_MX[self._order]
+
+    def _unsorted(self, x_MX: Tensor) -> Tensor:
+        return x_MX if self._back is None else x_MX[self._back]
 
 
 def read_apart(
@@ -77,98 +87,105 @@ def read_apart(
     hidden = embeds_BTH
     layers: Any = reader.layers
     for reading, acting in zip(layers, text_model.layers, strict=True):
-        normed_BTH = kinds.each(reading.input_layernorm, acting.input_layernorm, hidden)
         if hasattr(acting, "self_attn"):
-            mixed_BTH = _attention(kinds, reading.self_attn, acting.self_attn, normed_BTH, cos_sin)
+            mixed_BTH = _attention(kinds, reading, acting, hidden, cos_sin)
         else:
-            mixed_BTH = _gated_delta(kinds, reading.linear_attn, acting.linear_attn, normed_BTH)
+            mixed_BTH = _gated_delta(kinds, reading, acting, hidden)
         hidden = hidden + mixed_BTH
-        hidden = hidden + kinds.each(_thinking(reading), _thinking(acting), hidden)
-    return kinds.each(reader.norm, text_model.norm, hidden)
+        (thought_BTH,) = kinds.each(_thinking(reading), _thinking(acting), hidden)
+        hidden = hidden + thought_BTH
+    (normed_BTH,) = kinds.each(_alone(reader.norm), _alone(text_model.norm), hidden)
+    return normed_BTH
+
+
+def _alone(module: Any) -> PerToken:
+    return lambda x_NH: (module(x_NH),)
 
 
 def _thinking(layer: Any) -> PerToken:
-    def think(x_NH: Tensor) -> Tensor:
-        y_NH: Tensor = layer.mlp(layer.post_attention_layernorm(x_NH))
-        return y_NH
-
-    return think
+    return lambda x_NH: (layer.mlp(layer.post_attention_layernorm(x_NH)),)
 
 
 def _attention(kinds: _Kinds, reading: Any, acting: Any, x_BTH: Tensor, cos_sin: tuple[Tensor, Tensor]) -> Tensor:
-    size, groups = acting.head_dim, acting.num_key_value_groups
+    size, groups = acting.self_attn.head_dim, acting.self_attn.num_key_value_groups
 
-    def projecting(attention: Any) -> PerToken:
-        def project(x_NH: Tensor) -> Tensor:
-            queries_ND, gate_ND = attention.q_proj(x_NH).unflatten(-1, (-1, 2 * size)).chunk(2, dim=-1)
-            keys_ND = attention.k_norm(attention.k_proj(x_NH).unflatten(-1, (-1, size)))
-            wanted = [attention.q_norm(queries_ND), gate_ND, keys_ND]
-            return torch.cat([*(each.flatten(1) for each in wanted), attention.v_proj(x_NH)], dim=-1)
+    def projecting(layer: Any) -> PerToken:
+        attention = layer.self_attn
+
+        def project(x_NH: Tensor) -> tuple[Tensor, ...]:
+            x_NH = layer.input_layernorm(x_NH)
+            queries_NhD, gate_NhD = attention.q_proj(x_NH).unflatten(-1, (-1, 2 * size)).chunk(2, dim=-1)
+            keys_NgD = attention.k_norm(attention.k_proj(x_NH).unflatten(-1, (-1, size)))
+            values_NgD = attention.v_proj(x_NH).unflatten(-1, (-1, size))
+            return attention.q_norm(queries_NhD), keys_NgD, values_NgD, gate_NhD.flatten(1)
 
         return project
 
-    def finishing(attention: Any) -> PerToken:
-        def finish(seen_and_gate: Tensor) -> Tensor:
-            seen, gate = seen_and_gate.chunk(2, dim=-1)
-            y_NH: Tensor = attention.o_proj(seen * gate.sigmoid())
-            return y_NH
+    def finishing(layer: Any) -> PerToken:
+        return lambda seen_NH, gate_NH: (layer.self_attn.o_proj(seen_NH * gate_NH.sigmoid()),)
 
-        return finish
-
-    projected = kinds.each(projecting(reading), projecting(acting), x_BTH)
-    heads = projected.shape[-1] // size // (2 * groups + 2)  # of keys
-    sizes = [heads * groups * size, heads * groups * size, heads * size, heads * size]
-    queries, gate, keys, values = projected.split(sizes, dim=-1)
-    queries, keys, values = (each.unflatten(-1, (-1, size)).transpose(1, 2) for each in (queries, keys, values))
+    *projected, gate_BTH = kinds.each(projecting(reading), projecting(acting), x_BTH)
+    queries, keys, values = (each.transpose(1, 2) for each in projected)
     queries, keys = rotate(queries, keys, *cos_sin)
     # every head with keys of its own: only for 16-bit numbers do torch's fused kernels know groups
     keys, values = (each.repeat_interleave(groups, dim=1) for each in (keys, values))
-    seen = F.scaled_dot_product_attention(queries, keys, values, scale=acting.scaling, is_causal=True)
-    return kinds.each(finishing(reading), finishing(acting), torch.cat([seen.transpose(1, 2).flatten(2), gate], dim=-1))
+    scale = acting.self_attn.scaling
+    seen = F.scaled_dot_product_attention(queries, keys, values, scale=scale, is_causal=True)
+    (mixed_BTH,) = kinds.each(finishing(reading), finishing(acting), seen.transpose(1, 2).flatten(2), gate_BTH)
+    return mixed_BTH
 
 
 def _gated_delta(kinds: _Kinds, reading: Any, acting: Any, x_BTH: Tensor) -> Tensor:
     batch, length, _ = x_BTH.shape
-    sizes = [acting.key_dim, acting.key_dim, acting.value_dim]
+    size = acting.linear_attn
 
-    def projecting(delta: Any) -> PerToken:
-        def project(x_NH: Tensor) -> Tensor:
-            beta, gate = delta.in_proj_b(x_NH).sigmoid(), delta.in_proj_z(x_NH)
-            return torch.cat([delta.in_proj_qkv(x_NH), beta, gate], dim=-1)
+    def projecting(layer: Any) -> PerToken:
+        delta = layer.linear_attn
+
+        def project(x_NH: Tensor) -> tuple[Tensor, ...]:
+            x_NH = layer.input_layernorm(x_NH)
+            decay = -delta.A_log.float().exp() * F.softplus(delta.in_proj_a(x_NH).float() + delta.dt_bias)
+            return delta.in_proj_qkv(x_NH), decay, delta.in_proj_b(x_NH).sigmoid(), delta.in_proj_z(x_NH)
 
         return project
 
-    def decaying(delta: Any) -> PerToken:
-        def decay(x_NH: Tensor) -> Tensor:
-            logs_NV: Tensor = -delta.A_log.float().exp() * F.softplus(delta.in_proj_a(x_NH).float() + delta.dt_bias)
-            return logs_NV
+    def finishing(layer: Any) -> PerToken:
+        delta = layer.linear_attn
 
-        return decay
-
-    def finishing(delta: Any) -> PerToken:
-        def finish(read_and_gate: Tensor) -> Tensor:
-            read, gate = (each.reshape(-1, delta.head_v_dim) for each in read_and_gate.chunk(2, dim=-1))
-            y_NH: Tensor = delta.out_proj(delta.norm(read, gate).reshape(len(read_and_gate), delta.value_dim))
-            return y_NH
+        def finish(read_NE: Tensor, gate_NE: Tensor) -> tuple[Tensor, ...]:
+            read, gate = (each.reshape(-1, delta.head_v_dim) for each in (read_NE, gate_NE))
+            return (delta.out_proj(delta.norm(read, gate).reshape(read_NE.shape)),)
 
         return finish
 
-    def convolved(delta: Any, inputs_BCT: Tensor) -> Tensor:
-        weight, bias = delta.conv1d.weight.squeeze(1), delta.conv1d.bias
-        mixed_BCT: Tensor = causal_conv1d_fn(inputs_BCT, weight, bias, activation=delta.activation)
-        return mixed_BCT
-
-    projected = kinds.each(projecting(reading), projecting(acting), x_BTH)
-    inputs, beta, gate = projected.split([sum(sizes), acting.num_v_heads, acting.value_dim], dim=-1)
-    inputs_BCT = inputs.transpose(1, 2)
-    mixed_BCT = torch.where(kinds.is_read_BT[:, None], convolved(reading, inputs_BCT), convolved(acting, inputs_BCT))
-    queries, keys, values = mixed_BCT.transpose(1, 2).split(sizes, dim=-1)
+    inputs_BTC, decay, beta, gate = kinds.each(projecting(reading), projecting(acting), x_BTH)
+    mixed_BTC = _convolved(kinds, reading.linear_attn, acting.linear_attn, inputs_BTC)
+    queries, keys, values = mixed_BTC.split([size.key_dim, size.key_dim, size.value_dim], dim=-1)
     read, _ = gated_delta_rule(
-        queries.reshape(batch, length, -1, acting.head_k_dim),
-        keys.reshape(batch, length, -1, acting.head_k_dim),
-        values.reshape(batch, length, -1, acting.head_v_dim),
-        g=kinds.each(decaying(reading), decaying(acting), x_BTH),
+        queries.reshape(batch, length, -1, size.head_k_dim),
+        keys.reshape(batch, length, -1, size.head_k_dim),
+        values.reshape(batch, length, -1, size.head_v_dim),
+        g=decay,
         beta=beta,
         use_qk_l2norm_in_kernel=True,
     )
-    return kinds.each(finishing(reading), finishing(acting), torch.cat([read.flatten(2), gate], dim=-1))
+    (mixed_BTH,) = kinds.each(finishing(reading), finishing(acting), read.flatten(2), gate)
+    return mixed_BTH
+
+
+def _convolved(kinds: _Kinds, reading: Any, acting: Any, inputs_BTC: Tensor) -> Tensor:
+    """Each token by its kind's convolution, over its own and the other's inputs before it; (B, T, C)."""
+
+    def through(delta: Any, first: int, end: int) -> Tensor:
+        before = min(first, delta.conv_kernel_size - 1)
+        inputs_BCT = inputs_BTC[:, first - before : end].transpose(1, 2)
+        weight, bias = delta.conv1d.weight.squeeze(1), delta.conv1d.bias
+        mixed_BCT: Tensor = causal_conv1d_fn(inputs_BCT, weight, bias, activation=delta.activation)
+        return mixed_BCT[:, :, before:].transpose(1, 2)
+
+    length, (first, last) = inputs_BTC.shape[1], kinds.range_read
+    between = slice(first, last)  # where it depends on the row
+    pieces = [through(reading, 0, last), through(acting, first, length)]
+    is_read_BT1 = kinds.is_read_BT[:, between, None]
+    both = torch.where(is_read_BT1, pieces[0][:, between], pieces[1][:, : last - first])
+    return torch.cat([pieces[0][:, :first], both, pieces[1][:, last - first :]], dim=1)
