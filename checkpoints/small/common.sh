@@ -23,8 +23,8 @@ halve() {  # a PONDER's or a POUNCE's folder INTO another, its weights in half p
     cp "$folder"/* "$into"
     "$bin/python" -c 'import pathlib, sys
 from safetensors.torch import load_file, save_file
-path = pathlib.Path(sys.argv[1], "model.safetensors")
-save_file({name: tensor.half() for name, tensor in load_file(path).items()}, path, metadata={"format": "pt"})' "$into"
+for path in pathlib.Path(sys.argv[1]).glob("*.safetensors"):  # a reader has its own
+    save_file({name: tensor.half() for name, tensor in load_file(path).items()}, path, metadata={"format": "pt"})' "$into"
 }
 
 collect() {  # into a folder, the oracle's way with these options

@@ -117,6 +117,18 @@ class Ponder(nn.Module):
         fill_randomly(ponder.qwen, seed=seed)
         return ponder
 
+    def reshaped(
+        self, qwen_config: Qwen3_5Config, *, form: ContextFormat | None = None, image_px: tuple[int, int] | None = None
+    ) -> Self:
+        """One of another shape on the same device, its weights undefined; the caller fills them from this one's.
+
+        Raises ValueError if this one has a reader, which would be lost: reshape what it was made from.
+        """
+        if self.reader is not None:
+            raise ValueError("a PONDER with a reader of demonstrations keeps its shape; reshape one without it")
+        image_px = image_px or self.image_px
+        return type(self)(qwen_config, form or self.format, image_px=image_px, device=self.device, dtype=self.dtype)
+
     @property
     def hidden_size(self) -> int:
         return int(self.qwen.config.text_config.hidden_size)

@@ -65,7 +65,7 @@ def _with_copies(
     ponder: Ponder, config: Any, layer: re.Pattern[str], way_out: re.Pattern[str], num_old: int, num_new: int
 ) -> Ponder:
     """A PONDER of ``config``: layers behind the old ones are copies of the last, their ways out zero."""
-    new = Ponder(config, ponder.format, image_px=ponder.image_px, device=ponder.device, dtype=ponder.dtype)
+    new = ponder.reshaped(config)
     known = ponder.qwen.state_dict()
     weights = {}
     for name, drawn in new.qwen.state_dict().items():
@@ -106,7 +106,7 @@ def broadened(ponder: Ponder, hidden_size: int, ffn_size: int, *, seed: int = 0)
         setattr(text, name, count)
     text.hidden_size, text.intermediate_size = hidden_size, ffn_size
     config.vision_config.out_hidden_size = hidden_size
-    new = Ponder(config, ponder.format, image_px=ponder.image_px, device=ponder.device, dtype=ponder.dtype)
+    new = ponder.reshaped(config)
     before: Any = ponder.qwen.config.text_config
     blocks = [(rows, there.start) for rows, there in zip(_mixed(before), _mixed(text), strict=True)]
     generator = torch.Generator().manual_seed(seed)

@@ -57,7 +57,7 @@ def wide_eyed(ponder: Ponder, box: Box, zoom: int = 1) -> Ponder:
         token_px=new_px,
         eyes=(Eye(camera=eye.camera, box=box),),
     )
-    new = Ponder(config, form, image_px=image_px, device=ponder.device, dtype=ponder.dtype)
+    new = ponder.reshaped(config, form=form, image_px=image_px)
     known = ponder.qwen.state_dict()
     for name, value in known.items():
         if name.endswith("patch_embed.proj.weight"):

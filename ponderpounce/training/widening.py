@@ -82,7 +82,7 @@ def with_more_rows(ponder: Ponder, num_rows: int) -> Ponder:
         first_carrier_id=first + num_rows,
         proprioception=None if senses is None else replace(senses, first_id=senses.first_id + num_rows),
     )
-    new = Ponder(config, form, image_px=ponder.image_px, device=ponder.device, dtype=ponder.dtype)
+    new = ponder.reshaped(config, form=form)
     known = ponder.qwen.state_dict()
     for name in _TABLES & known.keys():
         before, after = known[name][:first], known[name][first:]

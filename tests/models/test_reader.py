@@ -17,6 +17,7 @@ from ponderpounce.models.ponder_configs import tiny_cpu
 from ponderpounce.models.recompute import recompute_layers
 from ponderpounce.models.vocabulary import Vocabulary
 from ponderpounce.training.blind import without_pictures
+from ponderpounce.training.growing import grown
 from ponderpounce.training.joint import PonderBatch, encode_rows
 
 TOLERANCE = 1e-4  # float32, hidden states of size 4
@@ -134,6 +135,11 @@ def test_a_folder_without_its_weights_or_with_others_is_refused(tmp_path: Path) 
     (tmp_path / READER_NAME).unlink()
     with pytest.raises(FileNotFoundError, match=rf"{READER_NAME}.*it has a reader"):
         load_ponder(tmp_path)
+
+
+def test_it_is_not_lost_where_a_ponder_takes_another_shape() -> None:
+    with pytest.raises(ValueError, match="keeps its shape"):
+        grown(with_reader(is_other=False))
 
 
 def test_layers_that_run_by_their_parts_cannot_be_run_again() -> None:
