@@ -61,6 +61,7 @@ class Council:
         """``views_of``: an instruction's (`Counsel.views`)."""
         self._engine = engine
         self._near = counsel.near
+        self._on_demonstrations = counsel.on_demonstrations
         self._views_of = views_of
         self.num_members = counsel.num_views
         self._spec = replace(engine.spec, session_bytes=engine.spec.session_bytes * self.num_members)
@@ -74,6 +75,8 @@ class Council:
     def open(self, session: str, opening: Opening, progress: Progress = no_progress) -> int:
         """Opens every reading; see ``PonderEngine.open``."""
         views = self._views_of(opening.instruction)
+        if opening.has_demo and not self._on_demonstrations:
+            views = views[:1]
         members = {session: views[0]}
         members |= {f"{session}, seen otherwise {n}": view for n, view in enumerate(views[1:], 1)}
         num_tokens = self._engine.open_views(members, opening, progress)

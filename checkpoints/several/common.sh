@@ -35,11 +35,12 @@ stored = json.loads(path.read_text()) | {"second_look": {"after": after, "least"
 path.write_text(json.dumps(stored, indent=2) + "\n")' "$@"
 }
 
-take_counsel() {  # a PONDER's folder is served in OTHER views too, each of them DOWN,RIGHT or DOWN,RIGHT,mirrored
+take_counsel() {  # a PONDER's folder is served in OTHER views too, each of them DOWN,RIGHT or DOWN,RIGHT,mirrored; on `all`
+    # episodes, or on `others` than those with a demonstration
     "$bin/python" -c 'import json, pathlib, sys
-path, others = pathlib.Path(sys.argv[1], "ponder.json"), [each.split(",") for each in sys.argv[2:]]
+path, others = pathlib.Path(sys.argv[1], "ponder.json"), [each.split(",") for each in sys.argv[3:]]
 views = [{"down_px": int(down), "right_px": int(right), "is_mirrored": bool(mirrored)} for down, right, *mirrored in others]
-stored = json.loads(path.read_text()) | {"counsel": {"others": views, "near": 30}}
+stored = json.loads(path.read_text()) | {"counsel": {"others": views, "near": 30, "on_demonstrations": sys.argv[2] == "all"}}
 path.write_text(json.dumps(stored, indent=2) + "\n")' "$@"
 }
 
@@ -47,6 +48,19 @@ take_none() {  # a PONDER's folder is served in its own view alone
     "$bin/python" -c 'import json, pathlib, sys
 path = pathlib.Path(sys.argv[1], "ponder.json")
 path.write_text(json.dumps(json.loads(path.read_text()) | {"counsel": None}, indent=2) + "\n")' "$@"
+}
+
+give_reader() {  # a PONDER gets a reader of demonstrations, which reads as ANOTHER does, INTO a folder
+    mkdir -p "$3"
+    cp "$1"/* "$3"
+    "$bin/python" -c 'import json, pathlib, sys
+from safetensors.torch import load_file, save_file
+weights, into = load_file(pathlib.Path(sys.argv[2], "model.safetensors")), pathlib.Path(sys.argv[3])
+own = {name.removeprefix("model.language_model."): weight for name, weight in weights.items()}
+save_file({name: own[name] for name in own if name.startswith("layers.") or name == "norm.weight"}, into / "reader.safetensors")
+stored = json.loads((into / "ponder.json").read_text()) | {"format": "ponderpounce.ponder/10", "has_reader": True}
+stored = {"fovea": None, "demonstrations": {"hz": 2, "to_its_end": True}} | stored  # as the other was shown them
+(into / "ponder.json").write_text(json.dumps(stored, indent=2) + "\n")' "$@"
 }
 
 blend() {  # two PONDERs' weights, a SHARE of the second's, INTO a folder

@@ -40,5 +40,5 @@ done
 settle small_growing "$next/larger/ponder" "$next/larger/pounce" "$next" --data "${data[@]}" --sights "$next/sights" \
     --watch "$next/a" "$next/b" --watch-share 0.15 --products bfloat16
 look_again "$next/pair/ponder" 6 8 'highlight|hides|correct'
-take_counsel "$next/pair/ponder" 2,-3 -2,2,mirrored
+take_counsel "$next/pair/ponder" all 2,-3 -2,2,mirrored
 evaluate "$next/pair" "$next"

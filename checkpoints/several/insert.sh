@@ -35,5 +35,5 @@ for kind in imitated imitated filled shown old swaps repick timed timed highligh
 settle small_inserting "$side/run/settling/ponder" "$next/run/righting/pounce" "$next" --data "${all[@]}" --sights "$side/sights" \
     --watch "$side/ways" "$side/rest" "$grown/a" "$grown/b" --watch-share 0.15 --products bfloat16
 look_again "$next/pair/ponder" 6 8 'highlight|hides|correct|grasping'
-take_counsel "$next/pair/ponder" 2,-3 -2,2,mirrored
+take_counsel "$next/pair/ponder" all 2,-3 -2,2,mirrored
 evaluate "$next/pair" "$next" InsertPeg

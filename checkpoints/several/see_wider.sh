@@ -48,5 +48,5 @@ data+=("$grown/old" "$grown/repick")
 settle small_by_sight "$next/run/reciting/ponder" "$next/wide/pounce" "$next" --data "${data[@]}" --sights "$next/sights" \
     --watch "$next/ways" "$next/rest" "$grown/a" "$grown/b" --watch-share 0.15 --products bfloat16
 look_again "$next/pair/ponder" 6 8 'highlight|hides|correct'
-take_counsel "$next/pair/ponder" 2,-3 -2,2,mirrored
+take_counsel "$next/pair/ponder" all 2,-3 -2,2,mirrored
 evaluate "$next/pair" "$next"

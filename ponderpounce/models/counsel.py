@@ -35,6 +35,9 @@ class Counsel:
     others: tuple[Otherwise, ...]
     near: int
     """Thousandths of the picture: places nearer than that are one."""
+    on_demonstrations: bool = True
+    """False: an episode with a demonstration is read in one view alone. Every further one costs as much again before
+    the robot may begin."""
 
     def __post_init__(self) -> None:
         if not self.others:

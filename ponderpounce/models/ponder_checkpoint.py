@@ -51,9 +51,10 @@ class StoredPonder:
     """Contents of ponder.json. The defaults are for a public Qwen3.5, which has none; a file has every field."""
 
     format: Literal["ponderpounce.ponder/10"] = "ponderpounce.ponder/10"
-    """Each is the one before and a field more: /9 has no ``has_reader``, /8 no ``demonstrations``, /7 no ``fovea``, /6
-    no ``counsel``, /5 no ``second_look``, /4 no ``takes_notes``, /3 no ``speaks``, /2 no ``proprioception``, /1 no
-    ``eyes``. Such a PONDER speaks, is shown demonstrations as in the paper, and has none of the others."""
+    """Each is the one before and a field more: /9 has no ``has_reader`` (nor ``on_demonstrations`` in its counsel), /8
+    no ``demonstrations``, /7 no ``fovea``, /6 no ``counsel``, /5 no ``second_look``, /4 no ``takes_notes``, /3 no
+    ``speaks``, /2 no ``proprioception``, /1 no ``eyes``. Such a PONDER speaks, is shown demonstrations as in the paper,
+    takes counsel on all episodes if on any, and has none of the others."""
     num_carriers: int = 1
     first_carrier_id: int | None = None
     """None: the first row after the tokenizer's last id."""
@@ -255,6 +256,8 @@ def _read_stored(directory: Path) -> StoredPonder:
         values |= {"format": "ponderpounce.ponder/9", "demonstrations": {"hz": 1, "to_its_end": False}}
     if isinstance(values, dict) and values.get("format") == "ponderpounce.ponder/9":
         values |= {"format": "ponderpounce.ponder/10", "has_reader": False}
+        if isinstance(values.get("counsel"), dict):
+            values["counsel"] |= {"on_demonstrations": True}
     return from_json(StoredPonder, values, str(path))
 
 

@@ -295,6 +295,18 @@ def test_a_folder_from_before_there_were_eyes_proprioception_or_notes_has_none_a
     assert weights_hash(loaded) == weights_hash(ponder)
 
 
+def test_who_took_counsel_before_one_could_choose_takes_it_on_all_episodes(folder: Path) -> None:
+    stored = json.loads((folder / "ponder.json").read_text())
+    del stored["has_reader"]
+    eyes = [{"camera": 0, "box": [0.25, 0.25, 0.75, 0.75]}]
+    counsel = {"others": [{"down_px": 2, "right_px": -3, "is_mirrored": False}], "near": 30}
+    before = {**stored, "eyes": eyes, "counsel": counsel, "format": "ponderpounce.ponder/9"}
+    (folder / "ponder.json").write_text(json.dumps(before))
+    taken = load_ponder(folder).format.counsel
+    assert taken is not None
+    assert taken.on_demonstrations
+
+
 @pytest.mark.parametrize("eyes", [[], [{"camera": 0}], [{"camera": 0, "box": [0, 0, 2, 1]}], 7])
 def test_eyes_that_are_none_are_refused(folder: Path, eyes: object) -> None:
     stored = json.loads((folder / "ponder.json").read_text())

@@ -234,6 +234,24 @@ def test_a_checkpoint_that_asks_for_counsel_is_served_with_it(tmp_path: Path) ->
         engine.open("b", OPENING)
 
 
+def test_episodes_with_a_demonstration_can_be_left_without_it() -> None:
+    """They are then answered as by the engine alone, to the bit, and others in all views."""
+    counsel = replace(COUNSEL, on_demonstrations=False)
+    engine, alone = QwenEngine(taught(SCRIPT), replace(CONFIG, max_sessions=4)), QwenEngine(taught(SCRIPT), CONFIG)
+    council = Council(engine, counsel, lambda instruction: VIEWS)
+    assert council.open("shown", WITH_DEMO) == alone.open("shown", WITH_DEMO)
+    assert [*engine._episodes] == ["shown"]
+    for query in range(len(SCRIPT)):
+        answer, expected = (each.fire("shown", observation(query)) for each in (council, alone))
+        assert np.array_equal(answer.cognition, expected.cognition)
+        assert [text.text for text in answer.texts] == [text.text for text in expected.texts]
+    council.open("plain", OPENING)
+    assert len(engine._episodes) == 1 + len(VIEWS)
+    council.close("shown")
+    council.close("plain")
+    assert not engine._episodes
+
+
 def test_nothing_is_mirrored_where_the_instruction_names_a_side() -> None:
     for instruction, may_mirror in (
         ("put it on the left-side target", False),
