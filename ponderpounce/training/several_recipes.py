@@ -277,7 +277,7 @@ def small_growing() -> Curriculum:
 
 
 def small_at_length() -> Curriculum:
-    """The PONDER of `small_growing`, enlarged once more, goes on for many more rows, on a GPU. Its pair is shipped.
+    """The PONDER of `small_growing`, enlarged once more, goes on for many more rows, on a GPU.
 
     docs/training.md, "At length".
     """
@@ -306,7 +306,7 @@ def small_twice_a_second() -> Curriculum:
 
 def small_reading() -> Curriculum:
     """A reader of demonstrations, which has learned from `small_twice_a_second`, learns beside the PONDER of
-    `small_at_length`, of which nothing else changes (`reader`). For demonstrated episodes alone.
+    `small_at_length`, of which nothing else changes (`reader`). For demonstrated episodes alone. Its pair is shipped.
 
     docs/training.md, "A reader of demonstrations".
     """
