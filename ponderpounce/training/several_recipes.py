@@ -311,13 +311,14 @@ def small_reading() -> Curriculum:
     docs/training.md, "A reader of demonstrations".
     """
     *_, settling = small_twice_a_second().stages
+    optim = replace(settling.train.optim, learning_rate=2e-4, decay=(160, 400))
     settling = replace(
         settling,
         name="small_reading/settling",
         # what acts is learned: most of what is left to learn is over when the first words have come
         example=replace(settling.example, recalls=0.8, text_dropout=0.05, slips=0.1),
-        train=replace(settling.train, seed=41, optim=replace(settling.train.optim, decay=(300, 1000))),
-        num_steps=1000,
+        train=replace(settling.train, seed=41, optim=optim),
+        num_steps=400,
         reads_apart=True,
     )
     return Curriculum(name="small_reading", stages=(settling,))
