@@ -8,6 +8,7 @@ import torch
 
 from ponder_server.engine import QwenEngine
 from ponderpounce.models.context import Transition
+from ponderpounce.models.int8 import Int8Linear
 from ponderpounce.models.ponder import Ponder
 from tests.ponder_server.test_engine import (
     CONFIG,
@@ -91,8 +92,14 @@ def test_a_first_query_that_fails_leaves_the_next_to_the_reader(monkeypatch: pyt
 
 
 def test_narrow_weights_are_the_readers_too() -> None:
-    engine = QwenEngine(reading(), replace(CONFIG, weights="int8"))
-    exact = QwenEngine(reading(), CONFIG)
+    ponder = reading()
+    engine, exact = QwenEngine(ponder, replace(CONFIG, weights="int8")), QwenEngine(reading(), CONFIG)
+    assert ponder.reader is not None
+    layers = [module for layer in ponder.reader.layers for module in layer.modules()]
+    exact_ones = [module for module in layers if type(module) is torch.nn.Linear]
+    num_recurrent = sum(hasattr(layer, "linear_attn") for layer in ponder.reader.layers)
+    assert len(exact_ones) == 2 * num_recurrent, "only what sets decay and writing strength stays as it is"
+    assert any(isinstance(module, Int8Linear) for module in layers)
     for each in (engine, exact):
         each.open("a", WITH_DEMO)
     told, wanted = (each.fire("a", observation(0)).cognition for each in (engine, exact))
