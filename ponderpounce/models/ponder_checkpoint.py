@@ -4,7 +4,7 @@
     tokenizer.json       the tokenizer
     model.safetensors    the weights, or model.safetensors.index.json and its shards
     ponder.json          what PONDER adds: carriers, image size, eyes, proprioception
-    reader.safetensors   the weights of its reader of demonstrations, if ponder.json says it has one
+    reader.safetensors   the weights of its reader of demonstrations, if ponder.json says it has one (``reader_file``)
 
 A public Qwen3.5 checkpoint has no ponder.json and loads as it is; its carriers are untrained padding rows. Loaded in
 the dtype it was written in, it is written back bit for bit, multi-token prediction included.
@@ -29,6 +29,7 @@ from ponderpounce.models.counsel import Counsel
 from ponderpounce.models.eyes import Eyes, check_eyes
 from ponderpounce.models.ponder import Ponder, image_grid, skeleton, token_px
 from ponderpounce.models.proprioception import Proprioception
+from ponderpounce.models.reader_file import narrowing_of, read_weights, stored_shapes, write_reader
 from ponderpounce.models.second_look import SecondLook
 from ponderpounce.models.showing import AS_IN_THE_PAPER, OWN_NAME, Showing
 from ponderpounce.models.vocabulary import Vocabulary
@@ -152,8 +153,7 @@ def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_S
     )
     (directory / OWN_NAME).write_text(json.dumps(asdict(stored), indent=2) + "\n")
     if ponder.reader is not None:
-        own = {name: tensor.contiguous() for name, tensor in _own_tensors(ponder.reader).items()}
-        save_file(own, directory / READER_NAME, metadata={"format": "pt"})
+        write_reader(ponder.reader, ponder.qwen.model.language_model, directory / READER_NAME)
     shards: list[dict[str, Tensor]] = [{}]
     shard_bytes = 0
     for name, tensor in (_own_tensors(ponder.qwen) | ponder.mtp).items():
@@ -299,17 +299,18 @@ def _check_tensors(
         raise CheckpointError(f"{directory} does not match its config.json ({len(faults)} faults): {shown}.")
 
 
-@torch.no_grad()
 def _read_reader(directory: Path, ponder: Ponder) -> None:
     path = directory / READER_NAME
     if not path.is_file():
         raise FileNotFoundError(f"{path}: {OWN_NAME} says that it has a reader; its weights are here.")
-    own = _own_tensors(ponder.add_reader())
-    shapes = {name: tuple(tensor.shape) for name, tensor in own.items()}
+    reader, text_model = ponder.add_reader(), ponder.qwen.model.language_model
     with _open(path) as file:
-        _check_tensors(directory, dict.fromkeys(file.keys(), path), shapes, tied=False)
-        for name, tensor in own.items():
-            tensor.copy_(file.get_tensor(name))
+        try:
+            narrowing = narrowing_of(file)
+        except ValueError as error:
+            raise CheckpointError(f"{path}: {error}") from None
+        _check_tensors(directory, dict.fromkeys(file.keys(), path), stored_shapes(reader, narrowing), tied=False)
+        read_weights(file, reader, text_model, narrowing)
 
 
 @torch.no_grad()

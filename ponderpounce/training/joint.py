@@ -15,6 +15,7 @@ that are off otherwise, to carry the stand-in (w3 L_align) and to have places in
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, fields, replace
 from itertools import accumulate
 from typing import Any, Literal, NamedTuple
@@ -32,6 +33,7 @@ from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.pounce import PounceInputs
 from ponderpounce.models.pounce_family import AnyPounce, action_loss
 from ponderpounce.models.pounce_groot import GrootInputs
+from ponderpounce.models.reader_file import Narrowing, as_stored, confine
 from ponderpounce.training.place_lessons import PlaceLessons
 from ponderpounce.training.stand_in import number_weights
 
@@ -211,12 +213,14 @@ class JointModel(nn.Module):
         trains: Trains = "both",
         keeps_eyes: bool = False,
         reads_apart: bool = False,
+        reader_narrowing: Narrowing | None = None,
         reads_together: bool = True,
         num_groups: int = 1,
     ) -> None:
         """With ``keeps_eyes`` PONDER's vision tower stays as it is; with ``reads_apart`` all of it does but a `Reader`
-        of demonstrations, which it is given if it has none; ``reads_together`` and ``num_groups`` are
-        `encode_rows`'s; ``aligns_evenly``: numbers of C count as `number_weights` says.
+        of demonstrations, which it is given if it has none, and which learns as what ``reader_narrowing`` would store;
+        ``reads_together`` and ``num_groups`` are `encode_rows`'s; ``aligns_evenly``: numbers of C count as
+        `number_weights` says.
 
         Raises ValueError if POUNCE was built for another cognition than PONDER gives.
         """
@@ -231,12 +235,15 @@ class JointModel(nn.Module):
         self._column_weights_H = torch.from_numpy(number_weights(ponder.hidden_size, evenly=aligns_evenly))
         self.trains = trains
         self.reads_together, self.num_groups = reads_together, num_groups
+        self._reader_narrowing = reader_narrowing
         for name, system in (("ponder", ponder), ("pounce", pounce)):
             if trains not in ("both", name):
                 system.requires_grad_(False)
         if reads_apart:
             ponder.qwen.requires_grad_(False)
-            (ponder.reader or ponder.add_reader()).requires_grad_(True)
+            reader = (ponder.reader or ponder.add_reader()).requires_grad_(True)
+            if reader_narrowing is not None:
+                confine(reader, ponder.qwen.model.language_model, reader_narrowing)
         if keeps_eyes:
             ponder.qwen.model.visual.requires_grad_(False)
 
@@ -259,7 +266,8 @@ class JointModel(nn.Module):
             cognition_QKH = torch.cat(episodes.stand_ins)[:, None].expand(-1, self.ponder.format.num_carriers, -1)
             first_query = _starts([len(each) for each in episodes.stand_ins], device)
         else:
-            hidden = encode_rows(self.ponder, episodes, together=self.reads_together, num_groups=self.num_groups)
+            with self._as_stored():
+                hidden = encode_rows(self.ponder, episodes, together=self.reads_together, num_groups=self.num_groups)
             grounding, said_N = self._grounding(episodes, hidden)
             cognition_QKH, first_query = gather_cognition(episodes.rows, hidden)
             if self.w3 > 0:
@@ -290,6 +298,12 @@ class JointModel(nn.Module):
             num_placed=num_placed,
             num_null=num_null,
         )
+
+    def _as_stored(self) -> AbstractContextManager[None]:
+        reader, narrowing = self.ponder.reader, self._reader_narrowing
+        if reader is None or narrowing is None:
+            return nullcontext()
+        return as_stored(reader, self.ponder.qwen.model.language_model, narrowing)
 
     def weigh(self, matching: Tensor, grounding: Tensor, alignment: Tensor, placing: Tensor) -> Tensor:
         """L of its parts."""

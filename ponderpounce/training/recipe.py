@@ -9,6 +9,7 @@ from ponderpounce.models.action_space import ActionSpace
 from ponderpounce.models.ponder_configs import PonderConfig
 from ponderpounce.models.pounce import Freeze
 from ponderpounce.models.pounce_family import AnyPounceConfig
+from ponderpounce.models.reader_file import Narrowing
 from ponderpounce.training.example import ExampleConfig
 from ponderpounce.training.joint import Trains
 from ponderpounce.training.trainer import TrainConfig
@@ -47,6 +48,8 @@ class Recipe:
     forget the others."""
     reads_apart: bool = False
     """Of PONDER only a `Reader` of demonstrations learns; whatever is done without one stays as it is, to the bit."""
+    reader_narrowing: Narrowing | None = None
+    """It learns as one that is stored so; None: as one whose weights are all stored whole."""
     space: ActionSpace = "joint_delta"
     """What POUNCE's actions are."""
     statistics_by_row: bool = False
@@ -61,6 +64,8 @@ class Recipe:
             raise ValueError(f"recipe {self.name}: is_grounded is {self.example.is_grounded}, but w2 is {self.w2}")
         if self.reads_apart and self.trains != "ponder":
             raise ValueError(f"recipe {self.name}: a reader learns alone (reads_apart), but it trains {self.trains}")
+        if self.reader_narrowing is not None and not self.reads_apart:
+            raise ValueError(f"recipe {self.name}: reader_narrowing is of a reader that learns (reads_apart)")
         if self.demo_hz < 1 or FPS % self.demo_hz:
             raise ValueError(f"recipe {self.name}: demo_hz must divide {FPS}, came {self.demo_hz}")
         if self.trains == "both" and self.example.augmentation.moves and self.example.augments == "all":

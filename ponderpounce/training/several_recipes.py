@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from ponderpounce.models.reader_file import Narrowing
 from ponderpounce.training.lapses import NO_LAPSES
 from ponderpounce.training.recipe import Curriculum
 from ponderpounce.training.small_recipes import BESIDE_THE_WAY, FROM_SCRATCH, small, small_noticing
@@ -322,6 +323,22 @@ def small_reading() -> Curriculum:
         reads_apart=True,
     )
     return Curriculum(name="small_reading", stages=(settling,))
+
+
+def small_in_three_bits() -> Curriculum:
+    """The reader of `small_reading` goes on in its first six layers, and learns to be stored in three bits a number
+    beside the layers of `small_at_length`: the pair has to fit into 20 MB. docs/training.md, "In three bits".
+    """
+    (settling,) = small_reading().stages
+    optim = replace(settling.train.optim, learning_rate=2e-4, warmup_steps=20, decay=(170, 440))
+    settling = replace(
+        settling,
+        name="small_in_three_bits/settling",
+        train=replace(settling.train, seed=43, optim=optim),
+        num_steps=440,
+        reader_narrowing=Narrowing(num_layers=6, bits=3),
+    )
+    return Curriculum(name="small_in_three_bits", stages=(settling,))
 
 
 def small_by_sight() -> Curriculum:

@@ -391,8 +391,7 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
         check_cameras([(data.image_px, data.image_px)] * len(CAMERAS), ponder.format.eyes, ponder.image_px)
     except ValueError as error:
         wanted_px = readable_sizes(ponder.format.eyes, ponder.image_px)[0][0]
-        folders = ", ".join(map(str, options.data))
-        raise ValueError(f"{folders}: {error}; collect with --image-px {wanted_px}") from None
+        raise ValueError(f"{', '.join(map(str, options.data))}: {error}; collect with --image-px {wanted_px}") from None
     if run.trains != "pounce":
         ponder.format = replace(
             ponder.format,
@@ -427,6 +426,7 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
         trains=run.trains,
         keeps_eyes=run.keeps_eyes,
         reads_apart=run.reads_apart,
+        reader_narrowing=run.reader_narrowing,
     ), bundle
 
 
