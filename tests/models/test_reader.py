@@ -14,6 +14,7 @@ from ponderpounce.models.context import Row, Transition
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.ponder_checkpoint import READER_NAME, CheckpointError, load_ponder, save_ponder, weights_hash
 from ponderpounce.models.ponder_configs import tiny_cpu
+from ponderpounce.models.reader_file import Narrowing, as_stored, confine, write_reader
 from ponderpounce.models.recompute import recompute_layers
 from ponderpounce.models.vocabulary import Vocabulary
 from ponderpounce.training.blind import without_pictures
@@ -145,3 +146,73 @@ def test_it_is_not_lost_where_a_ponder_takes_another_shape() -> None:
 def test_layers_that_run_by_their_parts_cannot_be_run_again() -> None:
     with pytest.raises(ValueError, match="leave --recompute out"):
         recompute_layers(with_reader(is_other=False))
+
+
+NARROWING = Narrowing(num_layers=3, bits=3)
+
+
+def narrowed_reader(ponder: Ponder, path: Path) -> None:
+    assert ponder.reader is not None
+    write_reader(ponder.reader, ponder.qwen.model.language_model, path / READER_NAME, NARROWING)
+
+
+def test_stored_in_few_bits_it_reads_as_it_did_while_it_learned_so(tmp_path: Path) -> None:
+    ponder = with_reader(is_other=True)
+    reader, text_model = ponder.reader, ponder.qwen.model.language_model
+    assert reader is not None
+    for vector in (weight for weight in reader.parameters() if weight.ndim == 1):
+        vector.data = vector.data.half().float()
+    save_ponder(ponder, tmp_path)
+    whole_bytes = (tmp_path / READER_NAME).stat().st_size
+    confine(reader, text_model, NARROWING)
+    narrowed_reader(ponder, tmp_path)
+    assert (tmp_path / READER_NAME).stat().st_size < 0.4 * whole_bytes
+    row = row_of(ponder, 2, 2)
+    wide = hidden(ponder, row)
+    with as_stored(reader, text_model, NARROWING):
+        expected = hidden(ponder, row)
+    assert torch.equal(hidden(load_ponder(tmp_path), row), expected)
+    assert torch.equal(hidden(ponder, row), wide), "and then it has its own weights again"
+    assert (expected - wide).abs().max() > TOLERANCE
+
+
+def test_confined_it_differs_and_learns_in_its_first_layers_alone() -> None:
+    ponder = with_reader(is_other=True)
+    reader, text_model = ponder.reader, ponder.qwen.model.language_model
+    assert reader is not None
+    confine(reader, text_model, NARROWING)
+    learning = {name.split(".")[1] for name, each in reader.named_parameters() if each.requires_grad}
+    assert learning == {"0", "1", "2", "weight"}, "weight: of the last norm"
+    begun = dict(text_model.named_parameters())
+    same = {name for name, each in reader.named_parameters() if torch.equal(each, begun[name])}
+    assert {name.split(".")[1] for name in same} == {"3"}
+    with as_stored(reader, text_model, NARROWING):
+        hidden_TH = ponder.encode_row(row_of(ponder, 2, 1), pictures(row_of(ponder, 2, 1)))
+    hidden_TH.square().mean().backward()
+    for name, weight in reader.named_parameters():
+        assert (weight.grad is not None) == weight.requires_grad, name
+
+
+@pytest.mark.parametrize(
+    ("header", "expected"),
+    [({"bits": "3"}, "expected layers and bits"), ({"bits": "9", "layers": "3"}, "9 bits: expected 2, 3, 4, 5")],
+)
+def test_a_header_that_tells_no_narrowing_is_refused(tmp_path: Path, header: dict[str, str], expected: str) -> None:
+    ponder = with_reader(is_other=True)
+    save_ponder(ponder, tmp_path)
+    narrowed_reader(ponder, tmp_path)
+    save_file(load_file(tmp_path / READER_NAME), tmp_path / READER_NAME, metadata=header)
+    with pytest.raises(CheckpointError, match=expected):
+        load_ponder(tmp_path)
+
+
+def test_few_bits_of_another_reader_are_refused(tmp_path: Path) -> None:
+    ponder = with_reader(is_other=True)
+    save_ponder(ponder, tmp_path)
+    narrowed_reader(ponder, tmp_path)
+    tensors = load_file(tmp_path / READER_NAME)
+    name = "layers.0.mlp.up_proj.weight.codes"
+    header = {"bits": "3", "layers": "3"}
+    save_file(tensors | {name: tensors[name][:, 1:].clone()}, tmp_path / READER_NAME, metadata=header)
+    with pytest.raises(CheckpointError, match=f"misshapen {name}"):
+        load_ponder(tmp_path)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 
 import pytest
 import torch
@@ -11,10 +13,12 @@ from torch import Tensor
 from ponderpounce.models import flow
 from ponderpounce.models.context import Row, Transition
 from ponderpounce.models.ponder import Ponder
+from ponderpounce.models.ponder_checkpoint import READER_NAME, load_ponder, save_ponder
 from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
 from ponderpounce.models.pounce import Pounce, freeze
 from ponderpounce.models.pounce_configs import tiny_cpu as tiny_pounce
 from ponderpounce.models.pounce_init import random_pounce
+from ponderpounce.models.reader_file import Narrowing, write_reader
 from ponderpounce.training.joint import NO_QUERY, Draws, JointModel, PonderBatch, PounceBatch, encode_rows
 
 CONFIG = replace(tiny_ponder(), image_px=(32, 32), num_carriers=2, num_layers=4)
@@ -142,6 +146,27 @@ def test_a_reader_learns_alone_from_all_losses(model: JointModel) -> None:
         layers = {name.split(".")[3] for name in reached if name.startswith("ponder.reader.layers")}
         assert layers == {str(layer) for layer in range(CONFIG.num_layers)}
     assert model.ponder.reader is apart.ponder.reader, "whoever has one goes on with it"
+
+
+def test_a_reader_learns_as_what_will_be_stored(model: JointModel, tmp_path: Path) -> None:
+    """Its loss is the one of a reader that was written to a file and read again."""
+    narrowing = Narrowing(num_layers=1, bits=2)
+    reader, text_model = model.ponder.add_reader(), model.ponder.qwen.model.language_model
+    with torch.no_grad():
+        for weight in reader.parameters():
+            weight.add_(0.02 * torch.randn(weight.shape, generator=torch.Generator().manual_seed(weight.numel())))
+            weight.copy_(weight if weight.ndim > 1 else weight.half())
+    both, batch = episodes(model.ponder, 2), invocations(model.pounce, (0, 0))
+    losing = partial(JointModel, pounce=model.pounce, trains="ponder", reads_apart=True)
+    wide = losing(model.ponder)(both, batch, draws_of(batch)).grounding
+    narrow = losing(model.ponder, reader_narrowing=narrowing)
+    learned = gradients(grounding := narrow(both, batch, draws_of(batch)).grounding, narrow)
+    save_ponder(model.ponder, tmp_path)
+    write_reader(reader, text_model, tmp_path / READER_NAME, narrowing)
+    stored = losing(load_ponder(tmp_path))(both, batch, draws_of(batch)).grounding
+    assert stored == grounding
+    assert grounding != wide
+    assert {name.split(".")[3] for name in learned if name.startswith("ponder.reader.layers")} == {"0"}
 
 
 def test_null_cognition_tells_ponder_nothing(model: JointModel) -> None:

@@ -41,6 +41,9 @@ def test_a_reader_learns_beside_nobody() -> None:
     assert stage.reads_apart
     with pytest.raises(ValueError, match="a reader learns alone"):
         replace(stage, trains="both")
+    (stage,) = stages_of(recipe("small_in_three_bits"))
+    with pytest.raises(ValueError, match="reader_narrowing is of a reader that learns"):
+        replace(stage, reads_apart=False)
 
 
 def test_a_mistyped_name_is_answered_with_the_nearest() -> None:
