@@ -78,7 +78,8 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     engine = QwenEngine(ponder, config, FirstOf(drafts))
     if counsel is None:
         return engine
-    return Council(engine, counsel, partial(counsel.views, form.eyes, ponder.image_px))
+    views_of = partial(counsel.views, form.eyes, ponder.image_px)
+    return Council(engine, counsel, views_of, max_sessions=options.max_sessions)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -57,12 +57,21 @@ class _Session:
 class Council:
     """A ``BatchingEngine`` over another, whose sessions it takes ``num_members`` at a time."""
 
-    def __init__(self, engine: QwenEngine, counsel: Counsel, views_of: Callable[[str], tuple[View, ...]]) -> None:
-        """``views_of``: an instruction's (`Counsel.views`)."""
+    def __init__(
+        self,
+        engine: QwenEngine,
+        counsel: Counsel,
+        views_of: Callable[[str], tuple[View, ...]],
+        *,
+        max_sessions: int | None = None,
+    ) -> None:
+        """``views_of``: an instruction's (`Counsel.views`); ``max_sessions``: episodes open at once, if that is to be
+        fewer than the engine has contexts for (one that is read in one view takes one)."""
         self._engine = engine
         self._near = counsel.near
         self._on_demonstrations = counsel.on_demonstrations
         self._views_of = views_of
+        self._max_sessions = max_sessions
         self.num_members = counsel.num_views
         self._spec = replace(engine.spec, session_bytes=engine.spec.session_bytes * self.num_members)
         self._sessions: dict[str, _Session] = {}
@@ -74,6 +83,11 @@ class Council:
 
     def open(self, session: str, opening: Opening, progress: Progress = no_progress) -> int:
         """Opens every reading; see ``PonderEngine.open``."""
+        if session not in self._sessions and len(self._sessions) == self._max_sessions:
+            raise SessionError(
+                f"session {session!r} does not fit: {sorted(self._sessions)} are open and max_sessions is "
+                f"{self._max_sessions}. Close one, or raise max_sessions."
+            )
         views = self._views_of(opening.instruction)
         if opening.has_demo and not self._on_demonstrations:
             views = views[:1]

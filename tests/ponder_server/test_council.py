@@ -221,17 +221,23 @@ def test_what_ponder_says_moves_as_the_simulators_words_do(
     assert np.abs(np.subtract(*([int(n) for n in re.findall(r"\d+", each)] for each in (ours, theirs)))).max() <= 1
 
 
-def test_a_checkpoint_that_asks_for_counsel_is_served_with_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("opening", [OPENING, WITH_DEMO])
+def test_a_checkpoint_that_asks_for_counsel_is_served_with_it(tmp_path: Path, opening: Opening) -> None:
+    """And to as many robots as it was told, also where an episode takes one of its contexts only."""
+    counsel = replace(COUNSEL, on_demonstrations=False)
+    opening = replace(opening, demo_frames=((np.zeros((128, 128, 3), np.uint8),),) if opening.has_demo else ())
     ponder = taught(SCRIPT)
-    ponder.format = replace(ponder.format, eyes=EYES, counsel=COUNSEL)
+    ponder.format = replace(ponder.format, eyes=EYES, counsel=counsel)
     save_ponder(ponder, tmp_path)
-    assert load_ponder(tmp_path).format.counsel == COUNSEL
+    assert load_ponder(tmp_path).format.counsel == counsel
     engine = build_engine(PonderOptions(checkpoint=tmp_path, max_context_tokens=400, max_sessions=1))
     assert isinstance(engine, Council)
     assert engine.num_members == 3
-    engine.open("a", OPENING)
-    with pytest.raises(SessionError, match="does not fit"):
-        engine.open("b", OPENING)
+    engine.open("a", opening)
+    with pytest.raises(SessionError, match=r"'b' does not fit: \['a'\] are open and max_sessions is 1"):
+        engine.open("b", opening)
+    engine.close("a")
+    engine.open("b", opening)
 
 
 def test_episodes_with_a_demonstration_can_be_left_without_it() -> None:
