@@ -63,6 +63,14 @@ stored = {"fovea": None, "demonstrations": {"hz": 2, "to_its_end": True}} | stor
 (into / "ponder.json").write_text(json.dumps(stored, indent=2) + "\n")' "$@"
 }
 
+narrow_reader() {  # a PONDER's reader INTO another's folder, in its first LAYERS and in few BITS, as it has learned to be
+    "$bin/python" -c 'import pathlib, sys
+from ponderpounce.models.ponder_checkpoint import READER_NAME, load_ponder
+from ponderpounce.models.reader_file import Narrowing, write_reader
+ponder, narrowing = load_ponder(pathlib.Path(sys.argv[1])), Narrowing(num_layers=int(sys.argv[3]), bits=int(sys.argv[4]))
+write_reader(ponder.reader, ponder.qwen.model.language_model, pathlib.Path(sys.argv[2], READER_NAME), narrowing)' "$@"
+}
+
 blend() {  # two PONDERs' weights, a SHARE of the second's, INTO a folder
     mkdir -p "$4"
     cp "$1"/* "$4"
