@@ -39,7 +39,7 @@ Read = Callable[[str, Sequence[Views], Sequence[Views], NDArray[np.float32]], ND
 def build_reader(checkpoint: Path | None) -> tuple[Read, EngineSpec]:
     """A PONDER outside of any episode, for offline measurements.
 
-    Returns a function from an instruction, a demonstration at 1 Hz and the observations since, with the robot's states
+    Returns a function from an instruction, a demonstration's looks and the observations since, with the robot's states
     (T, 8) at these, to the cognition (K, H) of the last one, as served: texts are PONDER's own. And what the engine is.
     """
     engine = build_engine(PonderOptions(checkpoint=checkpoint))

@@ -26,7 +26,8 @@ import ponderpounce.tasks.headless  # noqa: F401 - before anything that imports 
 
 from clock.timebase import NS_PER_MS
 from ponderpounce.analysis.counterfactual import COUNTERFACTUAL, SCHEMA, follows_own_past
-from ponderpounce.tasks.pair_files import read_pairs
+from ponderpounce.models.showing import declared
+from ponderpounce.tasks.pair_files import how_shown_in, read_pairs
 from ponderpounce.tasks.pairs import Pair, Telling
 from sim_client.ledger import write_json
 from sim_client.robot import CAMERAS
@@ -49,7 +50,8 @@ class CounterfactualOptions:
     pounce: Path
     """POUNCE's checkpoint, trained with it."""
     pairs: Path
-    """A folder of pp-pairs, of pictures as large as the cameras that PONDER was trained on."""
+    """A folder of pp-pairs, of pictures as large as the cameras that PONDER was trained on, and of videos shown as it
+    has learned from them."""
     out: Path
     """Folder for counterfactual.json."""
     draws: int = 4
@@ -65,6 +67,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     try:
         pairs = read_pairs(options.pairs)
+        _require_shown_so(options)
         read, ponder = importlib.import_module("ponder_server.party").build_reader(options.ponder)
         act, pounce = importlib.import_module("pounce_server.party").build_actor(options.pounce)
         entries = scored(tqdm(pairs, unit="pair", disable=not options.progress), read, act, options)
@@ -80,6 +83,17 @@ def main(argv: list[str] | None = None) -> int:
     write_json(options.out / COUNTERFACTUAL, {"schema": SCHEMA, "config": config, "models": models, "pairs": entries})
     sys.stdout.write(f"{options.out / COUNTERFACTUAL}; tables: pp-tables {options.out} --out {options.out}\n")
     return 0
+
+
+def _require_shown_so(options: CounterfactualOptions) -> None:
+    learned = declared(options.ponder)
+    demo_hz, video_end = how_shown_in(options.pairs)
+    if (demo_hz, video_end) != (learned.hz, learned.to_its_end):
+        way = f"--demo-hz {learned.hz}" + (" --video-end" if learned.to_its_end else "")
+        raise ValueError(
+            f"{options.pairs} shows videos {demo_hz} times a second{' and at their end' if video_end else ''}; "
+            f"{options.ponder} has learned from others. Make pairs with pp-pairs {way}."
+        )
 
 
 def scored(pairs: Iterable[Pair], read: Read, act: Act, options: CounterfactualOptions) -> list[dict[str, Any]]:

@@ -1,11 +1,12 @@
 """``pp-pairs``: a dataset of counterfactual pairs, and how to read it.
 
-A folder holds ``pairs.json``, an index with one entry per pair (everything of `Pair` that is not an array, and the name
-of its file), and one ``.npz`` file per pair with these arrays; cameras are ``front`` and ``wrist``:
+A folder holds ``pairs.json``, an index that says how videos are shown and has one entry per pair (everything of `Pair`
+that is not an array, and the name of its file), and one ``.npz`` file per pair with these arrays; cameras are ``front``
+and ``wrist``:
 
     now/<camera>                  (image_px, image_px, 3) uint8   the present, the same for both branches
     now/state                     (8,) float32
-    <branch>/<camera>             (T, image_px, image_px, 3) uint8   the past at 1 Hz, conditioning video first
+    <branch>/<camera>             (T, image_px, image_px, 3) uint8   the past at 1 Hz; before it the conditioning video
     <branch>/state                (T, 8) float32
     <branch>/step                 (T,) int64   control steps since reset, or frames since the video began
     <branch>/is_demonstration     (T,) bool
@@ -55,6 +56,10 @@ class PairsOptions:
     seed: int = 0
     """The first to be tried."""
     image_px: int = IMAGE_PX
+    demo_hz: Literal[1, 2, 4, 5, 10, 20] = 1
+    """How often a second conditioning videos are looked at: as the PONDER to be scored has learned from them."""
+    video_end: bool = False
+    """Their last frame, too."""
     max_seeds: int = 300
     """A task that shows no pair in so many seeds is left out, and named."""
 
@@ -79,10 +84,11 @@ def write_pair(pair: Pair, folder: Path) -> dict[str, Any]:
     return entry
 
 
-def write_index(entries: list[dict[str, Any]], folder: Path) -> None:
+def write_index(entries: list[dict[str, Any]], folder: Path, *, demo_hz: int = 1, video_end: bool = False) -> None:
     """Replaces the index in one go."""
     partial = folder / f"{INDEX}.partial"
-    partial.write_text(json.dumps({"schema": SCHEMA, "pairs": entries}, indent=1) + "\n")
+    index = {"schema": SCHEMA, "demo_hz": demo_hz, "video_end": video_end, "pairs": entries}
+    partial.write_text(json.dumps(index, indent=1) + "\n")
     partial.replace(folder / INDEX)
 
 
@@ -91,10 +97,23 @@ def read_pairs(folder: Path) -> Iterator[Pair]:
 
     Raises FileNotFoundError without an index, and ValueError for another schema.
     """
-    index = json.loads((folder / INDEX).read_text())
+    return (_read_pair(entry, folder) for entry in _index(folder)["pairs"])
+
+
+def how_shown_in(folder: Path) -> tuple[int, bool]:
+    """How often a second a folder's videos are looked at, and whether at their last frame, too.
+
+    Raises as `read_pairs`.
+    """
+    index = _index(folder)
+    return index.get("demo_hz", 1), index.get("video_end", False)  # folders of before say neither
+
+
+def _index(folder: Path) -> dict[str, Any]:
+    index: dict[str, Any] = json.loads((folder / INDEX).read_text())
     if index.get("schema") != SCHEMA:
         raise ValueError(f"{folder / INDEX} has schema {index.get('schema')!r}; expected {SCHEMA!r}")
-    return (_read_pair(entry, folder) for entry in index["pairs"])
+    return index
 
 
 def _read_pair(entry: dict[str, Any], folder: Path) -> Pair:
@@ -129,7 +148,7 @@ def _pairs_of(task: str, options: PairsOptions) -> Generator[Pair]:
     ):
         num_barren = 0
         for seed in itertools.count(options.seed):
-            pair = find_pair(own, other, task, seed)
+            pair = find_pair(own, other, task, seed, demo_hz=options.demo_hz, video_end=options.video_end)
             num_barren = 0 if pair else num_barren + 1
             if pair:
                 yield pair
@@ -167,7 +186,7 @@ def main(argv: list[str] | None = None) -> int:
                 bar.update()
     for source in sources.values():
         source.close()  # frees its cameras
-    write_index(entries, options.out)
+    write_index(entries, options.out, demo_hz=options.demo_hz, video_end=options.video_end)
     sys.stdout.write(f"{len(entries)} pairs of {options.family}: {options.out / INDEX}\n")
     return 0 if len(entries) == options.pairs else 1
 

@@ -61,10 +61,20 @@ class Pair:
     twin: Telling
 
 
-def find_pair(own: Environment, other: Environment, task: str, seed: int, variant: int | None = None) -> Pair | None:
+def find_pair(
+    own: Environment,
+    other: Environment,
+    task: str,
+    seed: int,
+    variant: int | None = None,
+    *,
+    demo_hz: int = PAST_HZ,
+    video_end: bool = False,
+) -> Pair | None:
     """Plays one episode until its twin would go another way; None if there is no such moment in it.
 
-    Without a variant, those of `Task.retold` take turns by seed, and cuts are the latest.
+    Without a variant, those of `Task.retold` take turns by seed, and cuts are the latest. Conditioning videos are
+    looked at ``demo_hz`` times a second and, with ``video_end``, at their last frame.
 
     Both environments must be of the task; only the first needs cameras. Raises RuntimeError if the two branches turn
     out not to look the same, which would be a defect.
@@ -95,8 +105,8 @@ def find_pair(own: Environment, other: Environment, task: str, seed: int, varian
         instruction=own.instruction,
         frames=dict(now.frames),
         state=now.state,
-        own=_telling(own, fork.own),
-        twin=_telling(own, fork.twin),
+        own=_telling(own, fork.own, demo_hz, video_end),
+        twin=_telling(own, fork.twin, demo_hz, video_end),
     )
 
 
@@ -154,9 +164,9 @@ def _goes_apart(environment: Environment, fork: Fork) -> bool:
     return bool(np.abs(own - twin).max() > _PARTED)
 
 
-def _telling(environment: Environment, branch: Branch) -> Telling:
+def _telling(environment: Environment, branch: Branch, demo_hz: int, video_end: bool) -> Telling:
     environment.restore(branch.now, look=False)
-    seen = [*environment.demonstration(PAST_HZ), *_past(environment, branch)]
+    seen = [*_shown(environment, demo_hz, video_end), *_past(environment, branch)]
     oracle = oracle_chunk(environment, branch.now)
     environment.restore(branch.now, look=False)
     next_ = environment.step(oracle[0], look=False)  # texts follow by one step
@@ -170,6 +180,14 @@ def _telling(environment: Environment, branch: Branch) -> Telling:
         subgoal=next_.grounded_subgoal,
         reasoning=environment.reasoning(),
     )
+
+
+def _shown(environment: Environment, demo_hz: int, video_end: bool) -> list[Snapshot]:
+    if not video_end:
+        return [*environment.demonstration(demo_hz)]
+    every = CONTROL_HZ // demo_hz
+    video = [*environment.demonstration(look_hz=demo_hz)]  # in between there are no pictures
+    return [*video[:-1][::every], *video[-1:]]
 
 
 def _past(environment: Environment, branch: Branch) -> Iterator[Snapshot]:

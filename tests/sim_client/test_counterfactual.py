@@ -10,6 +10,7 @@ import pytest
 
 from ponderpounce.analysis import tables
 from ponderpounce.analysis.counterfactual import read_counterfactual
+from ponderpounce.models.showing import OWN_NAME
 from ponderpounce.tasks.pair_files import write_index, write_pair
 from ponderpounce.tasks.pairs import Pair, Telling
 from sim_client import counterfactual
@@ -105,3 +106,17 @@ def test_the_served_models_answer_and_the_table_says_that_they_are_untrained(
     assert found.scores_P.tolist()[0] in (0.0, 0.5, 1.0)
     assert tables.main([str(tmp_path / "out"), "--out", str(tmp_path)]) == 0
     assert "| VideoRepick | 1 |" in (tmp_path / "tables.md").read_text()
+
+
+def test_pairs_whose_videos_are_shown_otherwise_than_ponder_learned_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ponder, pairs = tmp_path / "ponder", tmp_path / "pairs"
+    ponder.mkdir()
+    pairs.mkdir()
+    (ponder / OWN_NAME).write_text('{"demonstrations": {"hz": 2, "to_its_end": true}}')
+    write_index([write_pair(pair(0, px=PX), pairs)], pairs)
+    arguments = ["--ponder", str(ponder), "--pounce", "any", "--pairs", str(pairs), "--out", str(tmp_path / "out")]
+    assert counterfactual.main(arguments) == 2
+    assert "shows videos 1 times a second; " in (told := capsys.readouterr().err)
+    assert "Make pairs with pp-pairs --demo-hz 2 --video-end." in told

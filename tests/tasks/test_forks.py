@@ -235,6 +235,22 @@ def test_after_either_video_the_picture_is_the_same() -> None:
 
 
 @pytest.mark.sim
+def test_videos_can_be_looked_at_more_often_and_at_their_end() -> None:
+    name = "PatternLock"
+    with make_environment(name, image_px=64) as env, make_environment(name, render=False) as other:
+        once, twice = (find_pair(env, other, name, VIDEO_SEEDS[name], demo_hz=hz, video_end=hz > 1) for hz in (1, 2))
+        assert once is not None
+        assert twice is not None
+        looks, more = (each.own.steps[each.own.is_demonstration] for each in (once, twice))
+        assert np.diff(looks).tolist() == [20] * (len(looks) - 1)
+        assert np.diff(more)[:-1].tolist() == [10] * (len(more) - 2)
+        assert 0 < more[-1] - more[-2] <= 10
+        assert looks[-1] <= more[-1] < looks[-1] + 20
+        past = [each.own.steps[~each.own.is_demonstration].tolist() for each in (once, twice)]
+        assert past[0] == past[1]
+
+
+@pytest.mark.sim
 def test_the_two_presents_are_one_picture_and_the_pasts_are_not() -> None:
     with make_environment("PickHighlight", image_px=64) as env:
         pair = find_pair(env, make_environment("PickHighlight", render=False), "PickHighlight", 1)
