@@ -307,7 +307,7 @@ def small_twice_a_second() -> Curriculum:
 
 def small_reading() -> Curriculum:
     """A reader of demonstrations, which has learned from `small_twice_a_second`, learns beside the PONDER of
-    `small_at_length`, of which nothing else changes (`reader`). For demonstrated episodes alone. Its pair is shipped.
+    `small_at_length`, of which nothing else changes (`reader`). For demonstrated episodes alone.
 
     docs/training.md, "A reader of demonstrations".
     """
@@ -327,7 +327,8 @@ def small_reading() -> Curriculum:
 
 def small_in_three_bits() -> Curriculum:
     """The reader of `small_reading` goes on in its first six layers, and learns to be stored in three bits a number
-    beside the layers of `small_at_length`: the pair has to fit into 20 MB. docs/training.md, "In three bits".
+    beside the layers of `small_at_length`: the pair has to fit into 20 MB. It is shipped. docs/training.md, "In three
+    bits".
     """
     (settling,) = small_reading().stages
     optim = replace(settling.train.optim, learning_rate=2e-4, warmup_steps=20, decay=(170, 440))
