@@ -21,6 +21,9 @@ _TAIL = struct.Struct("<qq")  # cognition reference or -1, age_ns
 
 PLAYED = (Level.PLAY, Level.STALE)
 
+CLOCK_LOST_EVENT = "clock_lost"
+"""The robot's side heard no command for so long that it gave up."""
+
 
 def stream_sha256(ticks: Iterable[Tick]) -> str:
     """One hash over what was commanded and from which cognition: equal streams, equal episodes.

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from clock.playback import deadline_ns
+from clock.report import CLOCK_LOST_EVENT
 from clock.timebase import NS_PER_MS
 from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import Environment, Snapshot
@@ -89,7 +90,7 @@ class RobotSide:
             if silent_ns > self._limit_ns(info):
                 if self._tick == 0:
                     return self._abort(f"no command came within {silent_ns / 1e9:.0f} s")
-                self._tell("clock_lost", f"no command for {silent_ns / 1e6:.0f} ms: holding the last one")
+                self._tell(CLOCK_LOST_EVENT, f"no command for {silent_ns / 1e6:.0f} ms: holding the last one")
                 self._hold()
                 return self._abort("clock lost")
             self.let_others(20 * NS_PER_MS)

@@ -13,7 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clock.check import disagreements, main
+from clock.check import check_result, disagreements, main
+from clock.report import stream_sha256
 from protocol import messages as m
 from protocol.mcap_log import EpisodeRecord, read_log
 
@@ -126,6 +127,25 @@ def test_a_stalled_clock_skips_ticks_and_says_so(timing: Any, realtime: Any, rec
     hidden = changed(record, "ticks", skipped.tick, level=m.Level.HOLD)
     found = next(disagreements(hidden))
     assert (found.message, found.index, found.field) == ("Tick", skipped.tick, "is_skipped")
+
+
+@pytest.mark.parametrize(("num_missing", "is_lost", "agrees"), [(1, True, True), (2, True, False), (1, False, False)])
+def test_of_a_clock_that_was_killed_the_last_account_may_be_missing(
+    num_missing: int, is_lost: bool, agrees: bool, timing: Any, realtime: Any, record_of: Any
+) -> None:
+    """It died after the action, which the robot obeyed and counts. The hash is over what was told."""
+    record = record_of(realtime(timing(), 40, seed=2))
+    assert record.result is not None
+    told = record.ticks[: record.result.num_ticks - num_missing]
+    lost = m.Event(severity=m.Severity.ERROR, name="clock_lost", text="no command for 600 ms")
+    killed = replace(
+        record,
+        ticks=told,
+        events=[*record.events, *([lost] if is_lost else [])],
+        result=replace(record.result, stream_sha256=stream_sha256(told)),
+    )
+    found = list(check_result(killed))
+    assert not found if agrees else [each.field for each in found] == ["num_ticks"]
 
 
 def changed(record: EpisodeRecord, name: str, index: int, **fields: Any) -> EpisodeRecord:
