@@ -1,8 +1,8 @@
 """What matrices differ by from those they began as, in few bits a number.
 
 Layers that go on from layers that are there already differ from them by little: of the shipped reader's matrices the
-difference has 3 % of the norm, and numbers of much the same size, where whole weights in 8 bits would be rounded more
-coarsely than that. So every row of a difference has a step, and the difference is an odd number of half steps: with 2
+difference has 3 % of the norm in the median, and numbers of much the same size: whole weights in 8 bits would lose more
+of it. So every row of a difference has a step, and the difference is an odd number of half steps: with 2
 bits -1.5, -0.5, 0.5 or 1.5. The step is the one with which so many levels lose least of normally distributed numbers
 (Max, Quantizing for minimum distortion, 1960, table II). While it learns, `rounded` lets the gradient through
 (straight-through estimator, Bengio et al., arXiv:1308.3432), so that it learns what will be stored.
