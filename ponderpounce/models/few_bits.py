@@ -76,9 +76,9 @@ def _levels(difference: Tensor, bits: int) -> tuple[Tensor, Tensor]:
         raise ValueError(f"a vector of {len(difference)} is stored as it is; matrices are narrowed")
     difference_RC = difference.float().flatten(1)
     steps_R = (STEP_OF_STD[bits] * difference_RC.square().mean(dim=1).sqrt()).half()
-    smallest = torch.finfo(torch.float16).smallest_normal  # a row that has not moved has no step: any level is zero
+    divisors_R = steps_R.float().where(steps_R != 0, 1)  # a row that has not moved has no step: any level is zero
     half = 2 ** (bits - 1)
-    return (difference_RC / steps_R.float().clamp(min=smallest)[:, None]).floor().clamp(-half, half - 1), steps_R
+    return (difference_RC / divisors_R[:, None]).floor().clamp(-half, half - 1), steps_R
 
 
 def _value(levels_RC: Tensor, steps_R: Tensor) -> Tensor:
