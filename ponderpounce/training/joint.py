@@ -214,11 +214,13 @@ class JointModel(nn.Module):
         keeps_eyes: bool = False,
         reads_apart: bool = False,
         reader_narrowing: Narrowing | None = None,
+        reads_throughout: bool = False,
         reads_together: bool = True,
         num_groups: int = 1,
     ) -> None:
         """With ``keeps_eyes`` PONDER's vision tower stays as it is; with ``reads_apart`` all of it does but a `Reader`
         of demonstrations, which it is given if it has none, and which learns as what ``reader_narrowing`` would store;
+        with ``reads_throughout`` it reads whole rows and not demonstrations alone, as a specialist does;
         ``reads_together`` and ``num_groups`` are `encode_rows`'s; ``aligns_evenly``: numbers of C count as
         `number_weights` says.
 
@@ -236,6 +238,7 @@ class JointModel(nn.Module):
         self.trains = trains
         self.reads_together, self.num_groups = reads_together, num_groups
         self._reader_narrowing = reader_narrowing
+        self._reads_throughout = reads_throughout
         for name, system in (("ponder", ponder), ("pounce", pounce)):
             if trains not in ("both", name):
                 system.requires_grad_(False)
@@ -267,7 +270,13 @@ class JointModel(nn.Module):
             first_query = _starts([len(each) for each in episodes.stand_ins], device)
         else:
             with self._as_stored():
-                hidden = encode_rows(self.ponder, episodes, together=self.reads_together, num_groups=self.num_groups)
+                hidden = encode_rows(
+                    self.ponder,
+                    episodes,
+                    together=self.reads_together,
+                    num_groups=self.num_groups,
+                    throughout=self._reads_throughout,
+                )
             grounding, said_N = self._grounding(episodes, hidden)
             cognition_QKH, first_query = gather_cognition(episodes.rows, hidden)
             if self.w3 > 0:
@@ -344,8 +353,10 @@ def _begins(parts: Sequence[Tensor]) -> list[int]:
     return [0, *accumulate(len(part) for part in parts)][:-1]
 
 
-def encode_rows(ponder: Ponder, episodes: PonderBatch, *, together: bool = True, num_groups: int = 1) -> list[Tensor]:
-    """Final hidden states (T, H) of each row.
+def encode_rows(
+    ponder: Ponder, episodes: PonderBatch, *, together: bool = True, num_groups: int = 1, throughout: bool = False
+) -> list[Tensor]:
+    """Final hidden states (T, H) of each row; of PONDER's reader if it reads ``throughout``.
 
     All pictures are read in one call, however many rows there are. Rows are read ``together``, padded on the right: a
     row is causal, so what stands behind it cannot reach it and pads are never read. With FSDP2 it has to be so: every
@@ -358,7 +369,7 @@ def encode_rows(ponder: Ponder, episodes: PonderBatch, *, together: bool = True,
     lengths = [len(row.ids) for row in episodes.rows]
     embeds = ponder.embed(ids, torch.cat(frames) if frames else None).split(lengths)
     positions = [ponder.format.positions(row.ids)[0] for row in episodes.rows]
-    num_shown = [row.num_shown for row in episodes.rows]
+    num_shown = lengths if throughout else [row.num_shown for row in episodes.rows]
     if not together:
         return [
             ponder(embed[None], torch.from_numpy(each)[:, None].to(ponder.device), [shown])[0]

@@ -50,6 +50,8 @@ class Recipe:
     """Of PONDER only a `Reader` of demonstrations learns; whatever is done without one stays as it is, to the bit."""
     reader_narrowing: Narrowing | None = None
     """It learns as one that is stored so; None: as one whose weights are all stored whole."""
+    reads_throughout: bool = False
+    """It reads whole rows and not demonstrations alone: what learns is a specialist (`specialists`)."""
     space: ActionSpace = "joint_delta"
     """What POUNCE's actions are."""
     statistics_by_row: bool = False
@@ -64,8 +66,10 @@ class Recipe:
             raise ValueError(f"recipe {self.name}: is_grounded is {self.example.is_grounded}, but w2 is {self.w2}")
         if self.reads_apart and self.trains != "ponder":
             raise ValueError(f"recipe {self.name}: a reader learns alone (reads_apart), but it trains {self.trains}")
-        if self.reader_narrowing is not None and not self.reads_apart:
-            raise ValueError(f"recipe {self.name}: reader_narrowing is of a reader that learns (reads_apart)")
+        if (self.reader_narrowing is not None or self.reads_throughout) and not self.reads_apart:
+            raise ValueError(
+                f"recipe {self.name}: reader_narrowing and reads_throughout are of a reader that learns (reads_apart)"
+            )
         if self.demo_hz < 1 or FPS % self.demo_hz:
             raise ValueError(f"recipe {self.name}: demo_hz must divide {FPS}, came {self.demo_hz}")
         if self.trains == "both" and self.example.augmentation.moves and self.example.augments == "all":

@@ -113,6 +113,7 @@ RECIPES: dict[str, Callable[[], Recipe | Curriculum]] = {
     "small_twice_a_second": several.small_twice_a_second,
     "small_reading": several.small_reading,
     "small_in_three_bits": several.small_in_three_bits,
+    "small_specializing": several.small_specializing,
     "small_by_sight": several.small_by_sight,
     "small_inserting": several.small_inserting,
     "small_to_the_end": several.small_to_the_end,

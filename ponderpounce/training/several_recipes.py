@@ -342,6 +342,27 @@ def small_in_three_bits() -> Curriculum:
     return Curriculum(name="small_in_three_bits", stages=(settling,))
 
 
+def small_specializing() -> Curriculum:
+    """A specialist for what counts, which begins as the PONDER of `small_at_length` and learns from what that has
+    played, and to be stored in three bits a number beside it; nothing else changes. For PickXtimes, SwingXtimes and
+    BinFill (`pp-train --watch` for what was played). docs/training.md, "A specialist".
+    """
+    *_, settling = small_at_length().stages
+    optim = replace(_TURNING, learning_rate=3e-4, warmup_steps=20, decay=(150, 380))
+    settling = replace(
+        settling,
+        name="small_specializing/settling",
+        example=replace(settling.example, begins=0.15),  # what counts goes wrong late
+        train=replace(settling.train, seed=47, optim=optim),
+        num_steps=380,
+        batch_episodes=12,
+        reads_apart=True,
+        reads_throughout=True,
+        reader_narrowing=Narrowing(num_layers=10, bits=3),
+    )
+    return Curriculum(name="small_specializing", stages=(settling,))
+
+
 def small_by_sight() -> Curriculum:
     """The PONDER of `small_at_length`, its eye wider, learns to look up ways in its notes.
 

@@ -384,9 +384,8 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
     if options.ponder is not None:
         ponder = load_ponder(options.ponder, device=options.device, dtype=dtype)
     else:
-        is_own = run.has_own_tokenizers
-        vocabulary = Vocabulary.trained_on(data.texts(), run.ponder.first_carrier_id) if is_own else None
-        ponder = Ponder.random(run.ponder, vocabulary, seed=seed, device=options.device, dtype=dtype)
+        own = Vocabulary.trained_on(data.texts(), run.ponder.first_carrier_id) if run.has_own_tokenizers else None
+        ponder = Ponder.random(run.ponder, own, seed=seed, device=options.device, dtype=dtype)
     try:
         check_cameras([(data.image_px, data.image_px)] * len(CAMERAS), ponder.format.eyes, ponder.image_px)
     except ValueError as error:
@@ -427,6 +426,7 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
         keeps_eyes=run.keeps_eyes,
         reads_apart=run.reads_apart,
         reader_narrowing=run.reader_narrowing,
+        reads_throughout=run.reads_throughout,
     ), bundle
 
 

@@ -169,6 +169,26 @@ def test_a_reader_learns_as_what_will_be_stored(model: JointModel, tmp_path: Pat
     assert {name.split(".")[3] for name in learned if name.startswith("ponder.reader.layers")} == {"0"}
 
 
+def test_throughout_a_reader_reads_whole_rows_and_nobody_else_does(model: JointModel) -> None:
+    reader, text_model = model.ponder.add_reader(), model.ponder.qwen.model.language_model
+    with torch.no_grad():
+        for weight in reader.parameters():
+            weight.add_(0.05 * torch.randn(weight.shape, generator=torch.Generator().manual_seed(weight.numel())))
+    both = episodes(model.ponder, 2, 3)
+    kept = {name: weight.clone() for name, weight in text_model.named_parameters()}
+    read = encode_rows(model.ponder, both, together=False, throughout=True)
+    together = encode_rows(model.ponder, both, throughout=True)
+    given = dict(text_model.named_parameters())
+    with torch.no_grad():
+        for name, weight in reader.named_parameters():
+            given[name].copy_(weight)
+    model.ponder.reader = None
+    for row, each, padded in zip(encode_rows(model.ponder, both, together=False), read, together, strict=True):
+        torch.testing.assert_close(each, row, atol=2e-5, rtol=1e-4)
+        torch.testing.assert_close(padded, row, atol=2e-5, rtol=1e-4)
+    assert any(not torch.equal(given[name], kept[name]) for name in kept)
+
+
 def test_null_cognition_tells_ponder_nothing(model: JointModel) -> None:
     both, batch = episodes(model.ponder, 2), invocations(model.pounce, (0, NO_QUERY), (0, NO_QUERY))
     reached = gradients(model(both, batch, draws_of(batch)).flow_matching, model)

@@ -42,8 +42,11 @@ def test_a_reader_learns_beside_nobody() -> None:
     with pytest.raises(ValueError, match="a reader learns alone"):
         replace(stage, trains="both")
     (stage,) = stages_of(recipe("small_in_three_bits"))
-    with pytest.raises(ValueError, match="reader_narrowing is of a reader that learns"):
+    with pytest.raises(ValueError, match="reader_narrowing and reads_throughout are of a reader that learns"):
         replace(stage, reads_apart=False)
+    (stage,) = stages_of(recipe("small_specializing"))
+    with pytest.raises(ValueError, match="reader_narrowing and reads_throughout are of a reader that learns"):
+        replace(stage, reads_apart=False, reader_narrowing=None)
 
 
 def test_a_mistyped_name_is_answered_with_the_nearest() -> None:
