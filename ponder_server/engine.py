@@ -152,9 +152,8 @@ class QwenEngine:
     def open_views(self, views: Mapping[str, View], opening: Opening, progress: Progress = no_progress) -> int:
         """Opens several sessions on one opening, whose pictures each of them sees in its own way; the forwards are
         shared. All or none of them; otherwise as ``PonderEngine.open``. Returns the first one's tokens."""
-        for session in views:
-            if session in self._episodes:
-                raise SessionError(f"session {session!r} is already open; close it first.")
+        if already := [session for session in views if session in self._episodes]:
+            raise SessionError(f"session {already[0]!r} is already open; close it first.")
         first = next(iter(views))
         if len(self._episodes) + len(views) > self._config.max_sessions:
             raise SessionError(
@@ -170,6 +169,7 @@ class QwenEngine:
         wanted = sum(len(segment) for segment in segments)
         if wanted > self._config.max_context_tokens:
             raise ContextFull(session=first, used=0, wanted=wanted, limit=self._config.max_context_tokens)
+        reads, acts = self._ponder.readers(opening.instruction, has_demo=opening.has_demo)
         alone = tuple(token for each in self._format.opening(opening.instruction) for token in each.ids)
         thoughts: Batch[Opened] = Batch(self._runner, max_rows=self._config.max_batch_rows)
         contexts: dict[str, Session] = {}
@@ -179,8 +179,7 @@ class QwenEngine:
                 for session, view in views.items():
                     demo = [self._see(each, f"demo instant {n}", view) for n, each in enumerate(opening.demo_frames)]
                     pictures = [picture for instant in demo for picture in instant]
-                    contexts[session] = context = self._runner.open(session)
-                    context.is_shown = opening.has_demo
+                    contexts[session] = context = self._runner.open(session, reads)
                     steps = self._opener.encode(context, opening, segments, pictures, view)
                     thoughts.add(session, steps, thoughts.turn())
                 while len(opened) < len(views):
@@ -199,6 +198,7 @@ class QwenEngine:
                 notes=opened[session].notes,
                 alone=alone,
                 standing=None if self._second_look is None else Standing(self._second_look),
+                acts=acts,
                 view=view,
             )
         return contexts[first].num_tokens
@@ -346,7 +346,7 @@ class QwenEngine:
         assert standing is not None
         ids = (*episode.alone, *query.ids[: len(observation_TH)])
         embeds_TH = torch.cat([self._ponder.embed(episode.alone), observation_TH])
-        context = self._runner.open(f"{episode.context.name}, looked at again")
+        context = self._runner.open(f"{episode.context.name}, looked at again", episode.acts)
         try:
             words = yield from self._writer.complete_place(context, ids, embeds_TH, standing.token_ids)
         finally:

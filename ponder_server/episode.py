@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
+from typing import Any
 
 from ponder_server.context_policy import Span
 from ponder_server.contract import Note, SessionError, Text
@@ -29,6 +30,8 @@ class Episode:
     """The opening without its demonstration: what a second look begins with."""
     standing: Standing | None
     """None: it never looks again."""
+    acts: Any
+    """Who reads it from the second query on (`Ponder.readers`)."""
     view: View
     """The way in which all of its pictures are seen."""
     before: Before | None = None
@@ -40,13 +43,13 @@ class Episode:
             saved=saved,
             num_spans=len(self.spans),
             owes_reasoning=self.owes_reasoning,
-            is_shown=self.context.is_shown,
+            text_model=self.context.text_model,
             notes=self.notes,
             standing=copy(self.standing),
         )
         self.spans += spans
         self.owes_reasoning &= not texts
-        self.context.is_shown = False
+        self.context.text_model = self.acts
         self.notes = ()
         if self.standing is not None:
             self.standing.answered([(text.text, text.token_ids) for text in texts], looked_again=looked_again)
@@ -58,7 +61,7 @@ class Episode:
             raise SessionError(f"session {self.context.name!r} has no answer that could be taken back")
         self.context.restore(before.saved)
         del self.spans[before.num_spans :]
-        self.context.is_shown = before.is_shown
+        self.context.text_model = before.text_model
         self.owes_reasoning, self.notes, self.standing = before.owes_reasoning, before.notes, before.standing
 
 
@@ -69,7 +72,7 @@ class Before:
     saved: SavedState
     num_spans: int
     owes_reasoning: bool
-    is_shown: bool
+    text_model: Any
     notes: tuple[Note, ...]
     standing: Standing | None
 

@@ -33,6 +33,7 @@ def quantise(ponder: Ponder, weights: WeightsName) -> int:
         return 0
     kind = _LAYERS[weights]
     saved = quantise_where(ponder.qwen, lambda name: name.startswith(_NARROW) and not name.endswith(_KEPT), kind)
-    if ponder.reader is not None:
-        saved += quantise_where(ponder.reader, lambda name: not name.endswith(_KEPT), kind)
+    for reader in (ponder.reader, *ponder.specialists.values()):
+        if reader is not None:
+            saved += quantise_where(reader, lambda name: not name.endswith(_KEPT), kind)
     return saved

@@ -13,7 +13,7 @@ allocated at construction, and everything writes in place.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -91,7 +91,6 @@ class Runner:
         self._ponder = ponder
         self._threads = threads
         self._text_model = ponder.qwen.model.language_model
-        self._reader = self._text_model if ponder.reader is None else ponder.reader
         self._buckets = buckets
         text_config = ponder.qwen.config.text_config
         self.memory = SlotMemory(
@@ -104,8 +103,8 @@ class Runner:
     def capture(self, capture: Capture, *, num_read: int) -> None:
         """Forwards are captured from now on (``captured``), when they are first met or by :meth:`prepare`.
 
-        What is captured keeps the weights that it saw: replace none afterwards. A reader's forwards, before an episode
-        begins and at its first query, run as they did. A row's hidden states are handed out
+        What is captured keeps the weights that it saw: replace none afterwards. Forwards of others than the language
+        model, a reader's of demonstrations or a specialist's, run as they did. A row's hidden states are handed out
         ``num_read`` at most; forwards that are asked for more run as they did.
         """
         self._captured = CapturedDecoder(self._text_model, self.memory, capture, num_read=num_read)
@@ -130,13 +129,14 @@ class Runner:
         finally:
             self._captured = captured
 
-    def open(self, name: str) -> "Session":
-        """An empty context in a free slot. Raises SessionError if there is none."""
+    def open(self, name: str, text_model: Any = None) -> "Session":
+        """An empty context in a free slot, read by ``text_model``, None: by the language model. Raises SessionError if
+        there is none."""
         if not self._free_slots:
             raise SessionError(f"session {name!r} does not fit: all {self.memory.num_slots} slots are in use.")
         slot = self._free_slots.pop()
         self.memory.clear(slot)
-        return Session(self, name, slot, *self._saved[slot])
+        return Session(self, name, slot, self._text_model if text_model is None else text_model, *self._saved[slot])
 
     def close(self, session: "Session") -> None:
         """Gives the slot back; the session must not be used again."""
@@ -158,7 +158,7 @@ class Runner:
         while active := [row for row in rows if row.num_left]:
             length = max(self.bucket(row.num_left) for row in active)
             together = [row for row in active if self.bucket(row.num_left) == length]
-            self._forward([row for row in together if row.is_shown == together[0].is_shown], length)
+            self._forward([row for row in together if row.text_model is together[0].text_model], length)
         for one, row in zip(appends, rows, strict=True):
             one.session.ids.extend(one.ids)
             one.session.next_position = row.next_position
@@ -185,7 +185,7 @@ class Runner:
             places.append(place)
             row.num_done = end
         positions = torch.from_numpy(positions_3BT)
-        text_model = self._reader if rows[0].is_shown else self._text_model
+        text_model = rows[0].text_model
         if self._captured is not None and text_model is self._text_model:
             hidden = self._captured(places, embeds_BTH, positions)
         else:
@@ -202,7 +202,7 @@ class _Row:
         self.embeds_TH = append.embeds_TH
         self.num_tokens, self.num_done = len(append.ids), 0
         self.slot, self.num_past = session.slot, session.num_tokens
-        self.is_shown = session.is_shown
+        self.text_model = session.text_model
         self.first_wanted = 0 if append.num_wanted is None else self.num_tokens - append.num_wanted
         positions_4T, self.next_position = ponder.format.positions(
             append.ids, first_index=session.num_tokens, first_position=session.next_position
@@ -218,7 +218,15 @@ class _Row:
 class Session:
     """One context in a slot of its runner, which opens and closes it."""
 
-    def __init__(self, runner: Runner, name: str, slot: int, before_fire: SavedState, before_draft: SavedState) -> None:
+    def __init__(
+        self,
+        runner: Runner,
+        name: str,
+        slot: int,
+        text_model: Any,
+        before_fire: SavedState,
+        before_draft: SavedState,
+    ) -> None:
         self.before_fire = before_fire
         self.before_draft = before_draft
         self._runner = runner
@@ -231,8 +239,8 @@ class Session:
         """Every token of the episode, as its training row would have it."""
         self.num_forgotten = 0
         """Of them, those whose keys and values are gone (:meth:`keep`)."""
-        self.is_shown = False
-        """What is appended is a demonstration, or the first query after one: a `Reader` reads it, if there is one."""
+        self.text_model = text_model
+        """Who reads what is appended (`Ponder.readers`): the language model, or a `Reader`."""
 
     @property
     def num_tokens(self) -> int:

@@ -409,7 +409,9 @@ def checkpoint(kind: str, folder: Path) -> Finding:
     """The files a checkpoint folder must have; loading, which checks every tensor, is the server's work."""
     needed = ["config.json", "tokenizer.json"] if kind == "ponder" else ["tokenizer.model"]
     missing = [name for name in needed if not (folder / name).is_file()]
-    if not any((folder / name).is_file() for name in ("model.safetensors", "model.safetensors.index.json")):
+    weights = ["model.safetensors", "model.safetensors.index.json"]
+    weights += ["model.safetensors.packed"] if kind == "ponder" else []
+    if not any((folder / name).is_file() for name in weights):
         missing.append("model.safetensors")
     if missing:
         text = f"{folder} has no {', '.join(missing)}"

@@ -71,6 +71,21 @@ ponder, narrowing = load_ponder(pathlib.Path(sys.argv[1])), Narrowing(num_layers
 write_reader(ponder.reader, ponder.qwen.model.language_model, pathlib.Path(sys.argv[2], READER_NAME), narrowing)' "$@"
 }
 
+give_specialist() {  # a PONDER's reader INTO another's folder, NAMED specialist for INSTRUCTIONS, in its first LAYERS and in few BITS
+    "$bin/python" -c 'import json, pathlib, sys
+from ponderpounce.models.ponder_checkpoint import load_ponder, specialist_name
+from ponderpounce.models.reader_file import Narrowing, write_reader
+from ponderpounce.models.specialty import Specialty
+ponder, path = load_ponder(pathlib.Path(sys.argv[1])), pathlib.Path(sys.argv[2], "ponder.json")
+specialty = Specialty(name=sys.argv[3], instructions=sys.argv[4])
+narrowing = Narrowing(num_layers=int(sys.argv[5]), bits=int(sys.argv[6]))
+write_reader(ponder.reader, ponder.qwen.model.language_model, path.with_name(specialist_name(specialty)), narrowing)
+told = {"name": specialty.name, "instructions": specialty.instructions}
+stored = {"specialties": []} | json.loads(path.read_text()) | {"format": "ponderpounce.ponder/11"}
+stored["specialties"] = [each for each in stored["specialties"] if each["name"] != specialty.name] + [told]
+path.write_text(json.dumps(stored, indent=2) + "\n")' "$@"
+}
+
 blend() {  # two PONDERs' weights, a SHARE of the second's, INTO a folder
     mkdir -p "$4"
     cp "$1"/* "$4"

@@ -33,6 +33,7 @@ from ponderpounce.models.eyes import Eyes, num_seen
 from ponderpounce.models.proprioception import Proprioception, check_rows
 from ponderpounce.models.second_look import SecondLook
 from ponderpounce.models.showing import AS_IN_THE_PAPER, Showing
+from ponderpounce.models.specialty import Specialty, check_specialties
 from ponderpounce.models.vocabulary import Vocabulary
 
 IGNORE = -100
@@ -123,8 +124,11 @@ class ContextFormat:
     """In which other views serving reads an episode as well (`counsel`); None: in none, as in the paper."""
     demonstrations: Showing = AS_IN_THE_PAPER
     """How they were shown to it; whoever serves it shows them so."""
+    specialties: tuple[Specialty, ...] = ()
+    """Which episodes have weights of their own (`specialty`); () as in the paper."""
 
     def __post_init__(self) -> None:
+        check_specialties(self.specialties)
         if self.counsel is not None:
             self.counsel.text_px(self.eyes, self.image_px)  # words and pictures must move together
         if not 1 <= self.num_carriers <= 16:

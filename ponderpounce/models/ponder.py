@@ -9,6 +9,7 @@ the same modules over a few tokens at a time; how is the daemon's business (``po
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any, Self
 
@@ -28,6 +29,7 @@ from ponderpounce.models.ponder_configs import PonderConfig
 from ponderpounce.models.ponder_images import patchify
 from ponderpounce.models.ponder_vision import image_tokens
 from ponderpounce.models.reader import Reader, read_apart
+from ponderpounce.models.specialty import Specialty, specialist_for
 from ponderpounce.models.vocabulary import Vocabulary
 
 FLOAT32_PARAMETERS = ("linear_attn.A_log", "linear_attn.norm.weight")
@@ -86,6 +88,8 @@ class Ponder(nn.Module):
         self.reader: Reader | None = None
         """Reads demonstrations, if there is one (:meth:`add_reader`); None: there is one set of weights, as in the
         paper."""
+        self.specialists = nn.ModuleDict()
+        """By name, `Reader`s of whole episodes (:meth:`add_specialist`)."""
 
     @classmethod
     def random(
@@ -122,10 +126,12 @@ class Ponder(nn.Module):
     ) -> Self:
         """One of another shape on the same device, its weights undefined; the caller fills them from this one's.
 
-        Raises ValueError if this one has a reader, which would be lost: reshape what it was made from.
+        Raises ValueError if this one has a reader or specialists, which would be lost: reshape what it was made from.
         """
-        if self.reader is not None:
-            raise ValueError("a PONDER with a reader of demonstrations keeps its shape; reshape one without it")
+        if self.reader is not None or self.specialists:
+            raise ValueError(
+                "a PONDER with a reader of demonstrations or specialists keeps its shape; reshape one without them"
+            )
         image_px = image_px or self.image_px
         return type(self)(qwen_config, form or self.format, image_px=image_px, device=self.device, dtype=self.dtype)
 
@@ -140,10 +146,11 @@ class Ponder(nn.Module):
 
     @property
     def layers(self) -> list[Any]:
-        """Of the vision tower, the language model and the reader."""
+        """Of the vision tower, the language model, the reader and the specialists."""
         model = self.qwen.model
-        reading: list[Any] = [] if self.reader is None else [*self.reader.layers]
-        return [*model.visual.blocks, *model.language_model.layers, *reading]
+        beside: Any = [*([] if self.reader is None else [self.reader]), *self.specialists.values()]
+        others = [layer for each in beside for layer in each.layers]
+        return [*model.visual.blocks, *model.language_model.layers, *others]
 
     @property
     def device(self) -> torch.device:
@@ -193,6 +200,25 @@ class Ponder(nn.Module):
         """Demonstrations have weights of their own from now on, which begin as the others; nothing changes yet."""
         self.reader = Reader.like(self.qwen.model.language_model)
         return self.reader
+
+    def add_specialist(self, specialty: Specialty) -> Reader:
+        """Such episodes have weights of their own from now on, which begin as the others; nothing changes yet.
+
+        Raises ValueError if there is one of that name.
+        """
+        self.format = replace(self.format, specialties=(*self.format.specialties, specialty))
+        specialist = Reader.like(self.qwen.model.language_model)
+        self.specialists[specialty.name] = specialist
+        return specialist
+
+    def readers(self, instruction: str, *, has_demo: bool) -> tuple[Any, Any]:
+        """Who reads an episode to the end of its first query, and from then on: text models, as a `Reader` is."""
+        everybody = self.qwen.model.language_model
+        if has_demo:
+            return everybody if self.reader is None else self.reader, everybody
+        name = specialist_for(self.format.specialties, instruction)
+        specialist = everybody if name is None else self.specialists[name]
+        return specialist, specialist
 
     def forward(self, embeds_BTH: Tensor, positions_4BT: Tensor, num_shown_B: Sequence[int] = ()) -> Tensor:
         """Final hidden states (B, T, H), after the last norm, of whole contexts; causal.

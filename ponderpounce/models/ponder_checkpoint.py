@@ -2,9 +2,10 @@
 
     config.json          transformers' Qwen3.5 configuration
     tokenizer.json       the tokenizer
-    model.safetensors    the weights, or model.safetensors.index.json and its shards
+    model.safetensors    the weights, or model.safetensors.index.json and its shards, or model.safetensors.packed
     ponder.json          what PONDER adds: carriers, image size, eyes, proprioception
     reader.safetensors   the weights of its reader of demonstrations, if ponder.json says it has one (``reader_file``)
+    specialist_NAME.safetensors   those of each specialist that ponder.json names, likewise
 
 A public Qwen3.5 checkpoint has no ponder.json and loads as it is; its carriers are untrained padding rows. Loaded in
 the dtype it was written in, it is written back bit for bit, multi-token prediction included.
@@ -27,16 +28,20 @@ from ponderpounce.models.config_json import from_json
 from ponderpounce.models.context import ContextFormat
 from ponderpounce.models.counsel import Counsel
 from ponderpounce.models.eyes import Eyes, check_eyes
+from ponderpounce.models.packed import PackedFile
 from ponderpounce.models.ponder import Ponder, image_grid, skeleton, token_px
 from ponderpounce.models.proprioception import Proprioception
+from ponderpounce.models.reader import Reader
 from ponderpounce.models.reader_file import narrowing_of, read_weights, stored_shapes, write_reader
 from ponderpounce.models.second_look import SecondLook
 from ponderpounce.models.showing import AS_IN_THE_PAPER, OWN_NAME, Showing
+from ponderpounce.models.specialty import Specialty, check_specialties
 from ponderpounce.models.vocabulary import Vocabulary
 
 CONFIG_NAME = "config.json"
 INDEX_NAME = "model.safetensors.index.json"
 SINGLE_NAME = "model.safetensors"
+PACKED_NAME = "model.safetensors.packed"
 READER_NAME = "reader.safetensors"
 MTP_PREFIX = "mtp."  # multi-token prediction: in public checkpoints, not in transformers' Qwen3.5
 MAX_SHARD_BYTES = 5_000_000_000
@@ -51,11 +56,12 @@ class CheckpointError(ValueError):
 class StoredPonder:
     """Contents of ponder.json. The defaults are for a public Qwen3.5, which has none; a file has every field."""
 
-    format: Literal["ponderpounce.ponder/10"] = "ponderpounce.ponder/10"
-    """Each is the one before and a field more: /9 has no ``has_reader`` (nor ``on_demonstrations`` in its counsel), /8
-    no ``demonstrations``, /7 no ``fovea``, /6 no ``counsel``, /5 no ``second_look``, /4 no ``takes_notes``, /3 no
-    ``speaks``, /2 no ``proprioception``, /1 no ``eyes``. Such a PONDER speaks, is shown demonstrations as in the paper,
-    takes counsel on all episodes if on any, and has none of the others."""
+    format: Literal["ponderpounce.ponder/11"] = "ponderpounce.ponder/11"
+    """Each is the one before and a field more: /10 has no ``specialties``, /9 no ``has_reader`` (nor
+    ``on_demonstrations`` in its counsel), /8 no ``demonstrations``, /7 no ``fovea``, /6 no ``counsel``, /5 no
+    ``second_look``, /4 no ``takes_notes``, /3 no ``speaks``, /2 no ``proprioception``, /1 no ``eyes``. Such a PONDER
+    speaks, is shown demonstrations as in the paper, takes counsel on all episodes if on any, and has none of the
+    others."""
     num_carriers: int = 1
     first_carrier_id: int | None = None
     """None: the first row after the tokenizer's last id."""
@@ -70,11 +76,13 @@ class StoredPonder:
     demonstrations: Showing = AS_IN_THE_PAPER
     has_reader: bool = False
     """See ``reader``."""
+    specialties: tuple[Specialty, ...] = ()
     is_random: bool = True
     """The carriers were never trained."""
 
     def __post_init__(self) -> None:
         check_eyes(self.eyes, self.image_px)
+        check_specialties(self.specialties)
 
 
 def load_ponder(directory: Path, *, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Ponder:
@@ -122,7 +130,9 @@ def load_ponder(directory: Path, *, device: torch.device | str = "cpu", dtype: t
     ponder.is_random = stored.is_random
     _read_tensors(files, ponder)
     if stored.has_reader:
-        _read_reader(directory, ponder)
+        _read_reader(directory / READER_NAME, ponder.add_reader(), ponder)
+    for specialty in stored.specialties:
+        _read_reader(directory / specialist_name(specialty), ponder.add_specialist(specialty), ponder)
     return ponder
 
 
@@ -149,11 +159,12 @@ def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_S
         counsel=ponder.format.counsel,
         demonstrations=ponder.format.demonstrations,
         has_reader=ponder.reader is not None,
+        specialties=ponder.format.specialties,
         is_random=ponder.is_random,
     )
     (directory / OWN_NAME).write_text(json.dumps(asdict(stored), indent=2) + "\n")
-    if ponder.reader is not None:
-        write_reader(ponder.reader, ponder.qwen.model.language_model, directory / READER_NAME)
+    for path, reader in _readers(ponder, directory):
+        write_reader(reader, ponder.qwen.model.language_model, path)
     shards: list[dict[str, Tensor]] = [{}]
     shard_bytes = 0
     for name, tensor in (_own_tensors(ponder.qwen) | ponder.mtp).items():
@@ -182,8 +193,8 @@ def weights_hash(ponder: Ponder) -> str:
     """
     digest = hashlib.sha256()
     own = _own_tensors(ponder.qwen)
-    if ponder.reader is not None:
-        own |= {f"reader.{name}": tensor for name, tensor in _own_tensors(ponder.reader).items()}
+    for path, reader in _readers(ponder):
+        own |= {f"{path.stem}.{name}": tensor for name, tensor in _own_tensors(reader).items()}
     for name, tensor in sorted(own.items()):
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
         flat = tensor.detach().contiguous().reshape(-1).view(torch.uint8)
@@ -228,7 +239,7 @@ def _read_json(path: Path) -> Any:
 
 def _open(path: Path) -> Any:
     try:
-        return safe_open(path, framework="pt")
+        return PackedFile(path) if path.name == PACKED_NAME else safe_open(path, framework="pt")
     except SafetensorError as error:
         raise CheckpointError(f"{path} is no safetensors file, or was cut short: {error}") from error
 
@@ -258,6 +269,8 @@ def _read_stored(directory: Path) -> StoredPonder:
         values |= {"format": "ponderpounce.ponder/10", "has_reader": False}
         if isinstance(values.get("counsel"), dict):
             values["counsel"] |= {"on_demonstrations": True}
+    if isinstance(values, dict) and values.get("format") == "ponderpounce.ponder/10":
+        values |= {"format": "ponderpounce.ponder/11", "specialties": []}
     return from_json(StoredPonder, values, str(path))
 
 
@@ -270,9 +283,10 @@ def _files_by_tensor(directory: Path) -> dict[str, Path]:
             if not (directory / file_name).is_file():
                 raise FileNotFoundError(f"{directory / file_name}: named by {INDEX_NAME}, but not there.")
         return {name: directory / file_name for name, file_name in weight_map.items()}
-    single = directory / SINGLE_NAME
-    if not single.is_file():
-        raise FileNotFoundError(f"{directory}: neither {SINGLE_NAME} nor {INDEX_NAME} is there.")
+    there = [directory / name for name in (SINGLE_NAME, PACKED_NAME) if (directory / name).is_file()]
+    if not there:
+        raise FileNotFoundError(f"{directory}: neither {SINGLE_NAME} nor {INDEX_NAME} nor {PACKED_NAME} is there.")
+    single, *_ = there
     with _open(single) as file:
         return dict.fromkeys(file.keys(), single)
 
@@ -299,17 +313,28 @@ def _check_tensors(
         raise CheckpointError(f"{directory} does not match its config.json ({len(faults)} faults): {shown}.")
 
 
-def _read_reader(directory: Path, ponder: Ponder) -> None:
-    path = directory / READER_NAME
+def specialist_name(specialty: Specialty) -> str:
+    """The file of its weights in a checkpoint folder."""
+    return f"specialist_{specialty.name}.safetensors"
+
+
+def _readers(ponder: Ponder, directory: Path = Path()) -> list[tuple[Path, Reader]]:
+    """Everybody who has weights beside the language model's, and the files of these."""
+    specialists: Any = ponder.specialists
+    found = [(directory / specialist_name(each), specialists[each.name]) for each in ponder.format.specialties]
+    return found if ponder.reader is None else [(directory / READER_NAME, ponder.reader), *found]
+
+
+def _read_reader(path: Path, reader: Reader, ponder: Ponder) -> None:
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: {OWN_NAME} says that it has a reader; its weights are here.")
-    reader, text_model = ponder.add_reader(), ponder.qwen.model.language_model
+        raise FileNotFoundError(f"{path}: {OWN_NAME} says that there is one; its weights are here.")
+    text_model = ponder.qwen.model.language_model
     with _open(path) as file:
         try:
             narrowing = narrowing_of(file)
         except ValueError as error:
             raise CheckpointError(f"{path}: {error}") from None
-        _check_tensors(directory, dict.fromkeys(file.keys(), path), stored_shapes(reader, narrowing), tied=False)
+        _check_tensors(path.parent, dict.fromkeys(file.keys(), path), stored_shapes(reader, narrowing), tied=False)
         read_weights(file, reader, text_model, narrowing)
 
 

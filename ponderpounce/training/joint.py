@@ -242,6 +242,7 @@ class JointModel(nn.Module):
         for name, system in (("ponder", ponder), ("pounce", pounce)):
             if trains not in ("both", name):
                 system.requires_grad_(False)
+        ponder.specialists.requires_grad_(False)
         if reads_apart:
             ponder.qwen.requires_grad_(False)
             reader = (ponder.reader or ponder.add_reader()).requires_grad_(True)

@@ -275,13 +275,13 @@ def test_how_demonstrations_were_shown_is_read_back_and_told_to_who_asks_for_it_
     assert load_ponder(tmp_path).format.demonstrations == Showing(hz=2, to_its_end=True) == declared(tmp_path)
 
 
-@pytest.mark.parametrize("version", [1, 2, 3, 4, 5, 6, 7, 8, 9])
+@pytest.mark.parametrize("version", [1, 2, 3, 4, 5, 6, 7, 8, 9, 10])
 def test_a_folder_from_before_there_were_eyes_proprioception_or_notes_has_none_and_speaks(
     ponder: Ponder, folder: Path, version: int
 ) -> None:
     stored = json.loads((folder / "ponder.json").read_text())
     since_1 = ("eyes", "proprioception", "speaks", "takes_notes", "second_look", "counsel", "fovea", "demonstrations")
-    since_1 = (*since_1, "has_reader")
+    since_1 = (*since_1, "has_reader", "specialties")
     for name in since_1[version - 1 :]:
         del stored[name]
     (folder / "ponder.json").write_text(json.dumps({**stored, "format": f"ponderpounce.ponder/{version}"}))
@@ -297,7 +297,7 @@ def test_a_folder_from_before_there_were_eyes_proprioception_or_notes_has_none_a
 
 def test_who_took_counsel_before_one_could_choose_takes_it_on_all_episodes(folder: Path) -> None:
     stored = json.loads((folder / "ponder.json").read_text())
-    del stored["has_reader"]
+    del stored["has_reader"], stored["specialties"]
     eyes = [{"camera": 0, "box": [0.25, 0.25, 0.75, 0.75]}]
     counsel = {"others": [{"down_px": 2, "right_px": -3, "is_mirrored": False}], "near": 30}
     before = {**stored, "eyes": eyes, "counsel": counsel, "format": "ponderpounce.ponder/9"}

@@ -134,7 +134,7 @@ def test_a_folder_without_its_weights_or_with_others_is_refused(tmp_path: Path) 
     with pytest.raises(CheckpointError, match=rf"misshapen {name}"):
         load_ponder(tmp_path)
     (tmp_path / READER_NAME).unlink()
-    with pytest.raises(FileNotFoundError, match=rf"{READER_NAME}.*it has a reader"):
+    with pytest.raises(FileNotFoundError, match=rf"{READER_NAME}.*there is one"):
         load_ponder(tmp_path)
 
 
