@@ -18,6 +18,7 @@ from torch.nn import functional as F
 from ponder_server.attention import attend
 from ponder_server.slots import AttentionMemory, RecurrentMemory, SlotMemory
 from ponder_server.threads import ALONE, Threads
+from ponderpounce.models import mixers
 from ponderpounce.models.gated_delta import gated_delta_rule
 from ponderpounce.models.ponder_kernels import DeltaRule, delta_rule_of_many, delta_rule_of_one, rotate
 
@@ -81,13 +82,9 @@ def project(
     attention: Any, hidden_BTH: Tensor, cos_sin: tuple[Tensor, Tensor]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Queries, keys and values (B, heads, T, D), rotated by their positions, and the output gate (B, T, heads, D)."""
-    batch, length, _ = hidden_BTH.shape
-    heads = (batch, length, -1, attention.head_dim)
-    queries, gate = attention.q_proj(hidden_BTH).view(batch, length, -1, 2 * attention.head_dim).chunk(2, dim=-1)
-    queries = attention.q_norm(queries).transpose(1, 2)
-    keys = attention.k_norm(attention.k_proj(hidden_BTH).view(heads)).transpose(1, 2)
-    values = attention.v_proj(hidden_BTH).view(heads).transpose(1, 2)
-    return *rotate(queries, keys, *cos_sin), values, gate
+    asked = mixers.ask(attention, hidden_BTH)
+    queries, keys, values = (each.transpose(1, 2) for each in asked[:3])
+    return *rotate(queries, keys, *cos_sin), values, asked.gate
 
 
 def _attention(
@@ -111,8 +108,7 @@ def _attention(
             seen[row, asking] = attend(
                 queries[row, :, asking], memory.keys[place.slot, :, :end], memory.values[place.slot, :, :end], threads
             ).transpose(0, 1)
-    mixed_BTH: Tensor = attention.o_proj((seen * gate.sigmoid()).flatten(2))
-    return mixed_BTH
+    return mixers.attended(attention, seen, gate)
 
 
 def _rule(length: int, device: torch.device) -> DeltaRule:
@@ -129,30 +125,23 @@ def gated_delta(delta: Any, memory: RecurrentMemory, slot_B: Tensor, num_new_B: 
     """
     batch, length = len(slot_B), hidden_BTH.shape[1]
     width = delta.conv_kernel_size
-    inputs_BCT = torch.cat([memory.conv[slot_B], delta.in_proj_qkv(hidden_BTH)[:batch].transpose(1, 2)], dim=-1)
+    new_BTC, decay, beta, gate = mixers.write(delta, hidden_BTH, batch)
+    inputs_BCT = torch.cat([memory.conv[slot_B], new_BTC.transpose(1, 2)], dim=-1)
     # The last W inputs of each row end at its last valid token, not at its padding.
     kept_BW = num_new_B[:, None] + torch.arange(width, device=hidden_BTH.device)
     memory.conv[slot_B] = inputs_BCT.gather(2, kept_BW[:, None].expand(-1, inputs_BCT.shape[1], -1))
     mixed_BCT = F.silu(F.conv1d(inputs_BCT, delta.conv1d.weight, delta.conv1d.bias, groups=inputs_BCT.shape[1]))
-    sizes = [delta.key_dim, delta.key_dim, delta.value_dim]
-    queries, keys, values = mixed_BCT[..., -length:].transpose(1, 2).split(sizes, dim=-1)
-
     # Beta 0 writes nothing, decay exp(0) forgets nothing: a pad leaves the state as it is, to the last bit.
     is_valid_BT1 = (torch.arange(length, device=hidden_BTH.device) < num_new_B[:, None])[..., None]
-    beta = delta.in_proj_b(hidden_BTH)[:batch].sigmoid() * is_valid_BT1
-    decay = -delta.A_log.float().exp() * F.softplus(delta.in_proj_a(hidden_BTH)[:batch].float() + delta.dt_bias)
     read, state = _rule(length, hidden_BTH.device)(
-        queries.reshape(batch, length, -1, delta.head_k_dim),
-        keys.reshape(batch, length, -1, delta.head_k_dim),
-        values.reshape(batch, length, -1, delta.head_v_dim),
+        *mixers.heads(delta, mixed_BCT[..., -length:].transpose(1, 2)),
         g=decay * is_valid_BT1,
-        beta=beta,
+        beta=beta * is_valid_BT1,
         initial_state=memory.state[slot_B],
         output_final_state=True,
         use_qk_l2norm_in_kernel=True,
     )
     memory.state[slot_B] = state
-    gate = delta.in_proj_z(hidden_BTH)[:batch].reshape(-1, delta.head_v_dim)
-    normed_BTD = delta.norm(read.reshape(-1, delta.head_v_dim), gate).reshape(batch, length, -1)
-    mixed_BTH: Tensor = delta.out_proj(F.pad(normed_BTD, (0, 0, 0, 0, 0, len(hidden_BTH) - batch)))
+    normed_BTX = mixers.normed(delta, read, gate)
+    mixed_BTH: Tensor = delta.out_proj(F.pad(normed_BTX, (0, 0, 0, 0, 0, len(hidden_BTH) - batch)))
     return mixed_BTH

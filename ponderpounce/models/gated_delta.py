@@ -16,6 +16,8 @@ from torch import Tensor
 from torch.nn import functional as F
 from transformers.models.qwen3_5.modeling_qwen3_5 import Qwen3_5GatedDeltaNet, causal_conv1d_fn
 
+from ponderpounce.models import mixers
+
 CHUNK = 32
 _GPU_CHUNK = 64
 """Half as many turns of a loop that only waits for its launches."""
@@ -113,22 +115,15 @@ class GatedDelta(Qwen3_5GatedDeltaNet):  # type: ignore[misc]  # transformers is
         """(B, T, H) to (B, T, H), causal; rows may be padded on the right."""
         if cache_params is not None or attention_mask is not None:
             return super().forward(hidden_states, cache_params, attention_mask, **kwargs)
-        batch, length, _ = hidden_states.shape
-        mixed_BCT = self.in_proj_qkv(hidden_states).transpose(1, 2)
+        inputs_BTC, decay, beta, gate = mixers.write(self, hidden_states)
         weight = self.conv1d.weight.squeeze(1)
-        mixed_BCT = causal_conv1d_fn(mixed_BCT, weight, self.conv1d.bias, activation=self.activation)
-        sizes = [self.key_dim, self.key_dim, self.value_dim]
-        queries, keys, values = mixed_BCT.transpose(1, 2).split(sizes, dim=-1)
+        mixed_BCT = causal_conv1d_fn(inputs_BTC.transpose(1, 2), weight, self.conv1d.bias, activation=self.activation)
         read, _ = gated_delta_rule(
-            queries.reshape(batch, length, -1, self.head_k_dim),
-            keys.reshape(batch, length, -1, self.head_k_dim),
-            values.reshape(batch, length, -1, self.head_v_dim),
-            g=-self.A_log.float().exp() * F.softplus(self.in_proj_a(hidden_states).float() + self.dt_bias),
-            beta=self.in_proj_b(hidden_states).sigmoid(),
+            *mixers.heads(self, mixed_BCT.transpose(1, 2)),
+            g=decay,
+            beta=beta,
             chunk_size=_GPU_CHUNK if hidden_states.is_cuda else CHUNK,
             use_qk_l2norm_in_kernel=True,
         )
-        gate = self.in_proj_z(hidden_states).reshape(-1, self.head_v_dim)
-        normed = self.norm(read.reshape(-1, self.head_v_dim), gate).reshape(batch, length, -1)
-        mixed_BTH: Tensor = self.out_proj(normed)
+        mixed_BTH: Tensor = self.out_proj(mixers.normed(self, read, gate))
         return mixed_BTH

@@ -9,7 +9,7 @@ Mixture-of-Transformers (arXiv:2411.04996); pi0's action expert is one. The pape
 Embeddings, vision tower and LM head are shared.
 
 # B rows, T tokens, H hidden, h heads, g heads of keys, D head dimension, E value dimensions, C conv channels
-# N tokens of one kind
+# V value heads, X all numbers of a token, N tokens of one kind
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from transformers.models.qwen3_5.modeling_qwen3_5 import causal_conv1d_fn
 
+from ponderpounce.models import mixers
 from ponderpounce.models.gated_delta import gated_delta_rule
 from ponderpounce.models.ponder_kernels import rotate
 
@@ -107,69 +108,38 @@ def _thinking(layer: Any) -> PerToken:
 
 
 def _attention(kinds: _Kinds, reading: Any, acting: Any, x_BTH: Tensor, cos_sin: tuple[Tensor, Tensor]) -> Tensor:
-    size, groups = acting.self_attn.head_dim, acting.self_attn.num_key_value_groups
+    groups = acting.self_attn.num_key_value_groups
 
     def projecting(layer: Any) -> PerToken:
-        attention = layer.self_attn
-
-        def project(x_NH: Tensor) -> tuple[Tensor, ...]:
-            x_NH = layer.input_layernorm(x_NH)
-            queries_NhD, gate_NhD = attention.q_proj(x_NH).unflatten(-1, (-1, 2 * size)).chunk(2, dim=-1)
-            keys_NgD = attention.k_norm(attention.k_proj(x_NH).unflatten(-1, (-1, size)))
-            values_NgD = attention.v_proj(x_NH).unflatten(-1, (-1, size))
-            return attention.q_norm(queries_NhD), keys_NgD, values_NgD, gate_NhD.flatten(1)
-
-        return project
+        return lambda x_NH: mixers.ask(layer.self_attn, layer.input_layernorm(x_NH))
 
     def finishing(layer: Any) -> PerToken:
-        return lambda seen_NH, gate_NH: (layer.self_attn.o_proj(seen_NH * gate_NH.sigmoid()),)
+        return lambda seen_NhD, gate_NhD: (mixers.attended(layer.self_attn, seen_NhD, gate_NhD),)
 
-    *projected, gate_BTH = kinds.each(projecting(reading), projecting(acting), x_BTH)
+    *projected, gate_BThD = kinds.each(projecting(reading), projecting(acting), x_BTH)
     queries, keys, values = (each.transpose(1, 2) for each in projected)
     queries, keys = rotate(queries, keys, *cos_sin)
     # every head with keys of its own: only for 16-bit numbers do torch's fused kernels know groups
     keys, values = (each.repeat_interleave(groups, dim=1) for each in (keys, values))
     scale = acting.self_attn.scaling
     seen = F.scaled_dot_product_attention(queries, keys, values, scale=scale, is_causal=True)
-    (mixed_BTH,) = kinds.each(finishing(reading), finishing(acting), seen.transpose(1, 2).flatten(2), gate_BTH)
+    (mixed_BTH,) = kinds.each(finishing(reading), finishing(acting), seen.transpose(1, 2), gate_BThD)
     return mixed_BTH
 
 
 def _gated_delta(kinds: _Kinds, reading: Any, acting: Any, x_BTH: Tensor) -> Tensor:
-    batch, length, _ = x_BTH.shape
-    size = acting.linear_attn
-
     def projecting(layer: Any) -> PerToken:
-        delta = layer.linear_attn
-
-        def project(x_NH: Tensor) -> tuple[Tensor, ...]:
-            x_NH = layer.input_layernorm(x_NH)
-            decay = -delta.A_log.float().exp() * F.softplus(delta.in_proj_a(x_NH).float() + delta.dt_bias)
-            return delta.in_proj_qkv(x_NH), decay, delta.in_proj_b(x_NH).sigmoid(), delta.in_proj_z(x_NH)
-
-        return project
+        return lambda x_NH: mixers.write(layer.linear_attn, layer.input_layernorm(x_NH))
 
     def finishing(layer: Any) -> PerToken:
         delta = layer.linear_attn
-
-        def finish(read_NE: Tensor, gate_NE: Tensor) -> tuple[Tensor, ...]:
-            read, gate = (each.reshape(-1, delta.head_v_dim) for each in (read_NE, gate_NE))
-            return (delta.out_proj(delta.norm(read, gate).reshape(read_NE.shape)),)
-
-        return finish
+        return lambda read_NVE, gate_NX: (delta.out_proj(mixers.normed(delta, read_NVE, gate_NX)),)
 
     inputs_BTC, decay, beta, gate = kinds.each(projecting(reading), projecting(acting), x_BTH)
     mixed_BTC = _convolved(kinds, reading.linear_attn, acting.linear_attn, inputs_BTC)
-    queries, keys, values = mixed_BTC.split([size.key_dim, size.key_dim, size.value_dim], dim=-1)
-    read, _ = gated_delta_rule(
-        queries.reshape(batch, length, -1, size.head_k_dim),
-        keys.reshape(batch, length, -1, size.head_k_dim),
-        values.reshape(batch, length, -1, size.head_v_dim),
-        g=decay,
-        beta=beta,
-        use_qk_l2norm_in_kernel=True,
-    )
-    (mixed_BTH,) = kinds.each(finishing(reading), finishing(acting), read.flatten(2), gate)
+    grouped = mixers.heads(acting.linear_attn, mixed_BTC)
+    read, _ = gated_delta_rule(*grouped, g=decay, beta=beta, use_qk_l2norm_in_kernel=True)
+    (mixed_BTH,) = kinds.each(finishing(reading), finishing(acting), read, gate)
     return mixed_BTH
 
 
