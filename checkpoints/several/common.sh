@@ -86,6 +86,15 @@ stored["specialties"] = [each for each in stored["specialties"] if each["name"] 
 path.write_text(json.dumps(stored, indent=2) + "\n")' "$@"
 }
 
+pack() {  # the weights of a PONDER's folder, without loss
+    "$bin/python" -c 'import pathlib, sys
+from ponderpounce.models.packed import pack
+from ponderpounce.models.ponder_checkpoint import PACKED_NAME, SINGLE_NAME
+path = pathlib.Path(sys.argv[1], SINGLE_NAME)
+path.with_name(PACKED_NAME).write_bytes(pack(path.read_bytes()))
+path.unlink()' "$@"
+}
+
 blend() {  # two PONDERs' weights, a SHARE of the second's, INTO a folder
     mkdir -p "$4"
     cp "$1"/* "$4"
