@@ -71,18 +71,18 @@ ponder, narrowing = load_ponder(pathlib.Path(sys.argv[1])), Narrowing(num_layers
 write_reader(ponder.reader, ponder.qwen.model.language_model, pathlib.Path(sys.argv[2], READER_NAME), narrowing)' "$@"
 }
 
-give_specialist() {  # a PONDER's reader INTO another's folder, NAMED specialist for INSTRUCTIONS, in its first LAYERS and in few BITS
+give_specialist() {  # a PONDER's NAMED specialist INTO another's folder, in its first LAYERS and in few BITS, as it has learned to be
     "$bin/python" -c 'import json, pathlib, sys
+from dataclasses import asdict
 from ponderpounce.models.ponder_checkpoint import load_ponder, specialist_name
 from ponderpounce.models.reader_file import Narrowing, write_reader
-from ponderpounce.models.specialty import Specialty
 ponder, path = load_ponder(pathlib.Path(sys.argv[1])), pathlib.Path(sys.argv[2], "ponder.json")
-specialty = Specialty(name=sys.argv[3], instructions=sys.argv[4])
-narrowing = Narrowing(num_layers=int(sys.argv[5]), bits=int(sys.argv[6]))
-write_reader(ponder.reader, ponder.qwen.model.language_model, path.with_name(specialist_name(specialty)), narrowing)
-told = {"name": specialty.name, "instructions": specialty.instructions}
+(specialty,) = (each for each in ponder.format.specialties if each.name == sys.argv[3])
+narrowing = Narrowing(num_layers=int(sys.argv[4]), bits=int(sys.argv[5]))
+own, text_model = ponder.specialists[specialty.name], ponder.qwen.model.language_model
+write_reader(own, text_model, path.with_name(specialist_name(specialty)), narrowing)
 stored = {"specialties": []} | json.loads(path.read_text()) | {"format": "ponderpounce.ponder/11"}
-stored["specialties"] = [each for each in stored["specialties"] if each["name"] != specialty.name] + [told]
+stored["specialties"] = [each for each in stored["specialties"] if each["name"] != specialty.name] + [asdict(specialty)]
 path.write_text(json.dumps(stored, indent=2) + "\n")' "$@"
 }
 

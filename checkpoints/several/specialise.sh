@@ -29,6 +29,6 @@ learn small_specializing settling "$out/long/pair/ponder" "$four/pair/pounce" "$
     --watch "$next/own" "$next/own" "$two/watched" --watch-share 0.5 --products bfloat16
 mkdir -p "$next/pair"
 cp -r "$four/pair/ponder" "$four/pair/pounce" "$next/pair"
-give_specialist "$next/run/settling/ponder" "$next/pair/ponder" counting '(then|finally) press the button to stop$' 10 3
+give_specialist "$next/run/settling/ponder" "$next/pair/ponder" counting 10 3
 pack "$next/pair/ponder"
 evaluate "$next/pair" "$next"

@@ -214,20 +214,27 @@ class Ponder(nn.Module):
     def readers(self, instruction: str, *, has_demo: bool) -> tuple[Any, Any]:
         """Who reads an episode to the end of its first query, and from then on: text models, as a `Reader` is."""
         everybody = self.qwen.model.language_model
-        if has_demo:
-            return everybody if self.reader is None else self.reader, everybody
         name = specialist_for(self.format.specialties, instruction)
-        specialist = everybody if name is None else self.specialists[name]
-        return specialist, specialist
+        acts = everybody if name is None else self.specialists[name]
+        return acts if self.reader is None or not has_demo else self.reader, acts
 
-    def forward(self, embeds_BTH: Tensor, positions_4BT: Tensor, num_shown_B: Sequence[int] = ()) -> Tensor:
+    def forward(
+        self,
+        embeds_BTH: Tensor,
+        positions_4BT: Tensor,
+        num_shown_B: Sequence[int] = (),
+        specialist: Reader | None = None,
+    ) -> Tensor:
         """Final hidden states (B, T, H), after the last norm, of whole contexts; causal.
 
         Rows may be padded on the right, where nothing follows. ``num_shown_B``: `Row.num_shown` of each, which a
-        reader needs; () if there are no demonstrations.
+        reader needs; () if there are no demonstrations. ``specialist``: whose these rows are, None: everybody's.
         """
+        acts = self.qwen.model.language_model if specialist is None else specialist
         if self.reader is not None and any(num_shown_B):
-            return read_apart(self.qwen.model.language_model, self.reader, embeds_BTH, positions_4BT, num_shown_B)
+            return read_apart(acts, self.reader, embeds_BTH, positions_4BT, num_shown_B)
+        if specialist is not None:
+            return read_apart(acts, specialist, embeds_BTH, positions_4BT, [embeds_BTH.shape[1]] * len(embeds_BTH))
         output = self.qwen.model.language_model(
             inputs_embeds=embeds_BTH,
             position_ids=positions_4BT,

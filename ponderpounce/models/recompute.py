@@ -20,10 +20,12 @@ def recompute_layers(ponder: Ponder) -> None:
 
     Raises:
         TypeError: transformers' layers cannot any more.
-        ValueError: it has a reader of demonstrations, which runs layers by their parts.
+        ValueError: it has a reader of demonstrations or specialists, which run layers by their parts.
     """
-    if ponder.reader is not None:
-        raise ValueError("a PONDER with a reader of demonstrations cannot be recomputed: leave --recompute out")
+    if ponder.reader is not None or ponder.specialists:
+        raise ValueError(
+            "a PONDER with a reader of demonstrations or specialists cannot be recomputed: leave --recompute out"
+        )
     for layer in ponder.qwen.model.language_model.layers:
         if not isinstance(layer, GradientCheckpointingLayer):
             raise TypeError(f"expected a GradientCheckpointingLayer of transformers, came {type(layer).__name__}")

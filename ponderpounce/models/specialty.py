@@ -1,8 +1,9 @@
 """Which episodes have weights of their own: a specialist reads what an instruction says it is for.
 
 A small network that learns one more thing forgets a little of all others. A specialist is layers of its own for
-episodes of one kind (a `Reader`, that reads them from the first token to the last), and everybody else's stay as they
-are. Which kind an episode is of its instruction tells. The paper has one network for all.
+episodes of one kind (a `Reader` that reads them from the first token to the last, or, where a demonstration has a
+reader of its own, what that leaves), and everybody else's stay as they are. Which kind an episode is of its instruction
+tells. The paper has one network for all.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ class Specialty:
 
     name: str
     instructions: str
-    """A regular expression, searched for whatever its case. Episodes with a demonstration are never a specialist's."""
+    """A regular expression, searched for whatever its case."""
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.name):

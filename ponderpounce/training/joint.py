@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, fields, replace
 from itertools import accumulate
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -33,7 +33,9 @@ from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.pounce import PounceInputs
 from ponderpounce.models.pounce_family import AnyPounce, action_loss
 from ponderpounce.models.pounce_groot import GrootInputs
+from ponderpounce.models.reader import Reader
 from ponderpounce.models.reader_file import Narrowing, as_stored, confine
+from ponderpounce.models.specialty import Specialty
 from ponderpounce.training.place_lessons import PlaceLessons
 from ponderpounce.training.stand_in import number_weights
 
@@ -213,16 +215,15 @@ class JointModel(nn.Module):
         trains: Trains = "both",
         keeps_eyes: bool = False,
         reads_apart: bool = False,
-        reader_narrowing: Narrowing | None = None,
-        reads_throughout: bool = False,
+        specialty: Specialty | None = None,
+        narrowing: Narrowing | None = None,
         reads_together: bool = True,
         num_groups: int = 1,
     ) -> None:
-        """With ``keeps_eyes`` PONDER's vision tower stays as it is; with ``reads_apart`` all of it does but a `Reader`
-        of demonstrations, which it is given if it has none, and which learns as what ``reader_narrowing`` would store;
-        with ``reads_throughout`` it reads whole rows and not demonstrations alone, as a specialist does;
-        ``reads_together`` and ``num_groups`` are `encode_rows`'s; ``aligns_evenly``: numbers of C count as
-        `number_weights` says.
+        """With ``keeps_eyes`` PONDER's vision tower stays as it is, with ``reads_apart`` all of it but a `Reader` of
+        demonstrations, with a ``specialty`` all but this specialist, whose all rows are then; PONDER is given one if it
+        has none, and it learns as what ``narrowing`` would store. ``reads_together`` and ``num_groups`` are
+        `encode_rows`'s; ``aligns_evenly``: numbers of C count as `number_weights` says.
 
         Raises ValueError if POUNCE was built for another cognition than PONDER gives.
         """
@@ -237,17 +238,22 @@ class JointModel(nn.Module):
         self._column_weights_H = torch.from_numpy(number_weights(ponder.hidden_size, evenly=aligns_evenly))
         self.trains = trains
         self.reads_together, self.num_groups = reads_together, num_groups
-        self._reader_narrowing = reader_narrowing
-        self._reads_throughout = reads_throughout
+        self._narrowing = narrowing
         for name, system in (("ponder", ponder), ("pounce", pounce)):
             if trains not in ("both", name):
                 system.requires_grad_(False)
         ponder.specialists.requires_grad_(False)
-        if reads_apart:
-            ponder.qwen.requires_grad_(False)
-            reader = (ponder.reader or ponder.add_reader()).requires_grad_(True)
-            if reader_narrowing is not None:
-                confine(reader, ponder.qwen.model.language_model, reader_narrowing)
+        self._specialty = specialty
+        if specialty is not None and specialty not in ponder.format.specialties:
+            ponder.add_specialist(specialty)
+        if reads_apart and ponder.reader is None:
+            ponder.add_reader()
+        if (learner := self._learner(reads_apart)) is not None:
+            ponder.requires_grad_(False)
+            learner.requires_grad_(True)
+            if narrowing is not None:
+                confine(learner, ponder.qwen.model.language_model, narrowing)
+        self._reads_apart = reads_apart
         if keeps_eyes:
             ponder.qwen.model.visual.requires_grad_(False)
 
@@ -276,7 +282,7 @@ class JointModel(nn.Module):
                     episodes,
                     together=self.reads_together,
                     num_groups=self.num_groups,
-                    throughout=self._reads_throughout,
+                    specialist=self._specialist,
                 )
             grounding, said_N = self._grounding(episodes, hidden)
             cognition_QKH, first_query = gather_cognition(episodes.rows, hidden)
@@ -310,10 +316,19 @@ class JointModel(nn.Module):
         )
 
     def _as_stored(self) -> AbstractContextManager[None]:
-        reader, narrowing = self.ponder.reader, self._reader_narrowing
-        if reader is None or narrowing is None:
+        learner = self._learner(self._reads_apart)
+        if learner is None or self._narrowing is None:
             return nullcontext()
-        return as_stored(reader, self.ponder.qwen.model.language_model, narrowing)
+        return as_stored(learner, self.ponder.qwen.model.language_model, self._narrowing)
+
+    @property
+    def _specialist(self) -> Reader | None:
+        """Whose all rows are; None: everybody's."""
+        return None if self._specialty is None else cast(Reader, self.ponder.specialists[self._specialty.name])
+
+    def _learner(self, reads_apart: bool) -> Reader | None:
+        """Who learns alone, if anybody does."""
+        return self.ponder.reader if reads_apart else self._specialist
 
     def weigh(self, matching: Tensor, grounding: Tensor, alignment: Tensor, placing: Tensor) -> Tensor:
         """L of its parts."""
@@ -355,9 +370,14 @@ def _begins(parts: Sequence[Tensor]) -> list[int]:
 
 
 def encode_rows(
-    ponder: Ponder, episodes: PonderBatch, *, together: bool = True, num_groups: int = 1, throughout: bool = False
+    ponder: Ponder,
+    episodes: PonderBatch,
+    *,
+    together: bool = True,
+    num_groups: int = 1,
+    specialist: Reader | None = None,
 ) -> list[Tensor]:
-    """Final hidden states (T, H) of each row; of PONDER's reader if it reads ``throughout``.
+    """Final hidden states (T, H) of each row, which are all a ``specialist``'s if one is given.
 
     All pictures are read in one call, however many rows there are. Rows are read ``together``, padded on the right: a
     row is causal, so what stands behind it cannot reach it and pads are never read. With FSDP2 it has to be so: every
@@ -370,10 +390,10 @@ def encode_rows(
     lengths = [len(row.ids) for row in episodes.rows]
     embeds = ponder.embed(ids, torch.cat(frames) if frames else None).split(lengths)
     positions = [ponder.format.positions(row.ids)[0] for row in episodes.rows]
-    num_shown = lengths if throughout else [row.num_shown for row in episodes.rows]
+    num_shown = [row.num_shown for row in episodes.rows]
     if not together:
         return [
-            ponder(embed[None], torch.from_numpy(each)[:, None].to(ponder.device), [shown])[0]
+            ponder(embed[None], torch.from_numpy(each)[:, None].to(ponder.device), [shown], specialist)[0]
             for embed, each, shown in zip(embeds, positions, num_shown, strict=True)
         ]
     by_length = np.argsort(lengths, kind="stable")
@@ -386,7 +406,7 @@ def encode_rows(
             positions_4BT[:, place, : lengths[row]] = positions[row]
         embeds_BTH = pad_sequence([embeds[row] for row in group], batch_first=True)
         shown_B = [num_shown[row] for row in group]
-        hidden_BTH = ponder(embeds_BTH, torch.from_numpy(positions_4BT).to(ponder.device), shown_B)
+        hidden_BTH = ponder(embeds_BTH, torch.from_numpy(positions_4BT).to(ponder.device), shown_B, specialist)
         index = torch.from_numpy(np.flatnonzero(is_token_BT)).to(ponder.device)
         parts = hidden_BTH.flatten(0, 1)[index].split([lengths[row] for row in group])
         found |= dict(zip(group.tolist(), parts, strict=True))

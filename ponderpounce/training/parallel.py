@@ -130,7 +130,9 @@ def shard(model: nn.Module, world: World) -> None:
     if world.size == 1:
         return
     if any(isinstance(each, Reader) for each in model.modules()):  # whose layers run by their parts (`read_apart`)
-        raise ValueError("a PONDER with a reader of demonstrations cannot be sharded: give --weights whole")
+        raise ValueError(
+            "a PONDER with a reader of demonstrations or specialists cannot be sharded: give --weights whole"
+        )
     mesh = init_device_mesh(world.device, (world.size,))
     left_whole: set[nn.Parameter] = set()
     for unit in [*units_of(model), model]:

@@ -10,6 +10,7 @@ from ponderpounce.models.ponder_configs import PonderConfig
 from ponderpounce.models.pounce import Freeze
 from ponderpounce.models.pounce_family import AnyPounceConfig
 from ponderpounce.models.reader_file import Narrowing
+from ponderpounce.models.specialty import Specialty
 from ponderpounce.training.example import ExampleConfig
 from ponderpounce.training.joint import Trains
 from ponderpounce.training.trainer import TrainConfig
@@ -48,10 +49,10 @@ class Recipe:
     forget the others."""
     reads_apart: bool = False
     """Of PONDER only a `Reader` of demonstrations learns; whatever is done without one stays as it is, to the bit."""
-    reader_narrowing: Narrowing | None = None
-    """It learns as one that is stored so; None: as one whose weights are all stored whole."""
-    reads_throughout: bool = False
-    """It reads whole rows and not demonstrations alone: what learns is a specialist (`specialists`)."""
+    specialty: Specialty | None = None
+    """Of PONDER only this specialist learns; the data are for episodes of its kind."""
+    narrowing: Narrowing | None = None
+    """Who learns so alone does as one that is stored so; None: as one whose weights are all stored whole."""
     space: ActionSpace = "joint_delta"
     """What POUNCE's actions are."""
     statistics_by_row: bool = False
@@ -64,12 +65,14 @@ class Recipe:
     def __post_init__(self) -> None:
         if self.trains != "pounce" and self.example.is_grounded != (self.w2 > 0):
             raise ValueError(f"recipe {self.name}: is_grounded is {self.example.is_grounded}, but w2 is {self.w2}")
-        if self.reads_apart and self.trains != "ponder":
-            raise ValueError(f"recipe {self.name}: a reader learns alone (reads_apart), but it trains {self.trains}")
-        if (self.reader_narrowing is not None or self.reads_throughout) and not self.reads_apart:
+        learners = [self.reads_apart, self.specialty is not None]
+        if any(learners) and (all(learners) or self.trains != "ponder"):
             raise ValueError(
-                f"recipe {self.name}: reader_narrowing and reads_throughout are of a reader that learns (reads_apart)"
+                f"recipe {self.name}: a reader (reads_apart) or a specialist (specialty) learns alone, but it trains "
+                f"{'both of them' if all(learners) else self.trains}"
             )
+        if self.narrowing is not None and not any(learners):
+            raise ValueError(f"recipe {self.name}: narrowing is of a reader (reads_apart) or a specialist that learns")
         if self.demo_hz < 1 or FPS % self.demo_hz:
             raise ValueError(f"recipe {self.name}: demo_hz must divide {FPS}, came {self.demo_hz}")
         if self.trains == "both" and self.example.augmentation.moves and self.example.augments == "all":

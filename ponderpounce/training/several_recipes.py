@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from ponderpounce.models.reader_file import Narrowing
+from ponderpounce.models.specialty import Specialty
 from ponderpounce.training.lapses import NO_LAPSES
 from ponderpounce.training.recipe import Curriculum
 from ponderpounce.training.small_recipes import BESIDE_THE_WAY, FROM_SCRATCH, small, small_noticing
@@ -337,7 +338,7 @@ def small_in_three_bits() -> Curriculum:
         name="small_in_three_bits/settling",
         train=replace(settling.train, seed=43, optim=optim),
         num_steps=440,
-        reader_narrowing=Narrowing(num_layers=6, bits=3),
+        narrowing=Narrowing(num_layers=6, bits=3),
     )
     return Curriculum(name="small_in_three_bits", stages=(settling,))
 
@@ -356,9 +357,8 @@ def small_specializing() -> Curriculum:
         train=replace(settling.train, seed=47, optim=optim),
         num_steps=380,
         batch_episodes=12,
-        reads_apart=True,
-        reads_throughout=True,
-        reader_narrowing=Narrowing(num_layers=10, bits=3),
+        specialty=Specialty(name="counting", instructions="(then|finally) press the button to stop$"),
+        narrowing=Narrowing(num_layers=10, bits=3),
     )
     return Curriculum(name="small_specializing", stages=(settling,))
 

@@ -425,8 +425,8 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
         trains=run.trains,
         keeps_eyes=run.keeps_eyes,
         reads_apart=run.reads_apart,
-        reader_narrowing=run.reader_narrowing,
-        reads_throughout=run.reads_throughout,
+        specialty=run.specialty,
+        narrowing=run.narrowing,
     ), bundle
 
 

@@ -44,15 +44,16 @@ def test_the_first_that_is_for_an_instruction_takes_it(before: str, instruction:
     assert specialist_for((), told) is None
 
 
-def test_it_reads_whole_episodes_that_show_nothing() -> None:
+def test_it_reads_whole_episodes_but_what_a_reader_of_demonstrations_does() -> None:
     ponder = with_specialist()
     everybody, specialist = ponder.qwen.model.language_model, ponder.specialists["counting"]
     told = "pick it up, then press the button to stop"
     assert ponder.readers(told, has_demo=False) == (specialist, specialist)
     assert ponder.readers("press the button", has_demo=False) == (everybody, everybody)
-    assert ponder.readers(told, has_demo=True) == (everybody, everybody)
+    assert ponder.readers(told, has_demo=True) == (specialist, specialist)
     reader = ponder.add_reader()
-    assert ponder.readers(told, has_demo=True) == (reader, everybody)
+    assert ponder.readers(told, has_demo=True) == (reader, specialist)
+    assert ponder.readers("press the button", has_demo=True) == (reader, everybody)
     assert ponder.readers(told, has_demo=False) == (specialist, specialist)
     assert len(ponder.layers) == CONFIG.vision_depth + 3 * CONFIG.num_layers
 

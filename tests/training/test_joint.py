@@ -19,9 +19,13 @@ from ponderpounce.models.pounce import Pounce, freeze
 from ponderpounce.models.pounce_configs import tiny_cpu as tiny_pounce
 from ponderpounce.models.pounce_init import random_pounce
 from ponderpounce.models.reader_file import Narrowing, write_reader
+from ponderpounce.models.specialty import Specialty
 from ponderpounce.training.joint import NO_QUERY, Draws, JointModel, PonderBatch, PounceBatch, encode_rows
 
 CONFIG = replace(tiny_ponder(), image_px=(32, 32), num_carriers=2, num_layers=4)
+
+
+SPECIALTY = Specialty(name="counting", instructions="count")
 
 
 @pytest.fixture
@@ -159,7 +163,7 @@ def test_a_reader_learns_as_what_will_be_stored(model: JointModel, tmp_path: Pat
     both, batch = episodes(model.ponder, 2), invocations(model.pounce, (0, 0))
     losing = partial(JointModel, pounce=model.pounce, trains="ponder", reads_apart=True)
     wide = losing(model.ponder)(both, batch, draws_of(batch)).grounding
-    narrow = losing(model.ponder, reader_narrowing=narrowing)
+    narrow = losing(model.ponder, narrowing=narrowing)
     learned = gradients(grounding := narrow(both, batch, draws_of(batch)).grounding, narrow)
     save_ponder(model.ponder, tmp_path)
     write_reader(reader, text_model, tmp_path / READER_NAME, narrowing)
@@ -169,24 +173,54 @@ def test_a_reader_learns_as_what_will_be_stored(model: JointModel, tmp_path: Pat
     assert {name.split(".")[3] for name in learned if name.startswith("ponder.reader.layers")} == {"0"}
 
 
-def test_throughout_a_reader_reads_whole_rows_and_nobody_else_does(model: JointModel) -> None:
-    reader, text_model = model.ponder.add_reader(), model.ponder.qwen.model.language_model
-    with torch.no_grad():
-        for weight in reader.parameters():
-            weight.add_(0.05 * torch.randn(weight.shape, generator=torch.Generator().manual_seed(weight.numel())))
+def test_whole_rows_are_a_specialists_and_nobody_else_learns(model: JointModel) -> None:
+    alone = JointModel(model.ponder, model.pounce, trains="ponder", specialty=SPECIALTY)
+    both, batch = episodes(model.ponder, 2, 3), invocations(model.pounce, (0, 0), (1, 1))
+    reached = gradients(alone(both, batch, draws_of(batch)).grounding, alone)
+    learning = {name for name, each in alone.named_parameters() if each.requires_grad}
+    assert (
+        {".".join(name.split(".")[:3]) for name in learning}
+        == {"ponder.specialists.counting"}
+        == {".".join(name.split(".")[:3]) for name in reached}
+    )
+    assert {name.split(".")[4] for name in reached if ".layers." in name} == {str(n) for n in range(CONFIG.num_layers)}
+    again = JointModel(model.ponder, model.pounce, trains="ponder", specialty=SPECIALTY)
+    assert again.ponder.specialists["counting"] is alone.ponder.specialists["counting"], (
+        "whoever has one goes on with it"
+    )
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_a_specialist_reads_rows_as_everybody_with_its_weights(model: JointModel, together: bool) -> None:
+    specialist = model.ponder.add_specialist(SPECIALTY)
     both = episodes(model.ponder, 2, 3)
-    kept = {name: weight.clone() for name, weight in text_model.named_parameters()}
-    read = encode_rows(model.ponder, both, together=False, throughout=True)
-    together = encode_rows(model.ponder, both, throughout=True)
-    given = dict(text_model.named_parameters())
     with torch.no_grad():
-        for name, weight in reader.named_parameters():
+        for weight in specialist.parameters():
+            weight.add_(0.05 * torch.randn(weight.shape, generator=torch.Generator().manual_seed(weight.numel())))
+        others = encode_rows(model.ponder, both, together=together)
+        read = encode_rows(model.ponder, both, together=together, specialist=specialist)
+        given = dict(model.ponder.qwen.model.language_model.named_parameters())
+        for name, weight in specialist.named_parameters():
             given[name].copy_(weight)
-    model.ponder.reader = None
-    for row, each, padded in zip(encode_rows(model.ponder, both, together=False), read, together, strict=True):
-        torch.testing.assert_close(each, row, atol=2e-5, rtol=1e-4)
-        torch.testing.assert_close(padded, row, atol=2e-5, rtol=1e-4)
-    assert any(not torch.equal(given[name], kept[name]) for name in kept)
+        for row, other, each in zip(encode_rows(model.ponder, both, together=together), others, read, strict=True):
+            torch.testing.assert_close(each, row, atol=2e-5, rtol=1e-4)
+            assert (other - row).abs().max() > 1e-3
+
+
+def test_a_specialist_learns_as_what_will_be_stored(model: JointModel) -> None:
+    both, batch = episodes(model.ponder, 2), invocations(model.pounce, (0, 0))
+    narrowing = Narrowing(num_layers=1, bits=2)
+    specialist = model.ponder.add_specialist(SPECIALTY)
+    with torch.no_grad():
+        for weight in specialist.parameters():
+            weight.add_(0.02 * torch.randn(weight.shape, generator=torch.Generator().manual_seed(weight.numel())))
+    losing = partial(JointModel, model.ponder, model.pounce, trains="ponder", specialty=SPECIALTY)
+    wide = losing()(both, batch, draws_of(batch)).grounding
+    narrow = losing(narrowing=narrowing)
+    grounding = narrow(both, batch, draws_of(batch)).grounding
+    reached = {name.split(".")[4] for name in gradients(grounding, narrow) if ".layers." in name}
+    assert grounding != wide
+    assert reached == {"0"}
 
 
 def test_null_cognition_tells_ponder_nothing(model: JointModel) -> None:

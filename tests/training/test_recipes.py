@@ -39,14 +39,17 @@ def test_both_systems_of_a_recipe_fit(name: str) -> None:
 def test_a_reader_learns_beside_nobody() -> None:
     (stage,) = stages_of(recipe("small_reading"))
     assert stage.reads_apart
-    with pytest.raises(ValueError, match="a reader learns alone"):
+    with pytest.raises(ValueError, match=r"learns alone, but it trains both$"):
         replace(stage, trains="both")
     (stage,) = stages_of(recipe("small_in_three_bits"))
-    with pytest.raises(ValueError, match="reader_narrowing and reads_throughout are of a reader that learns"):
+    with pytest.raises(ValueError, match="narrowing is of a reader"):
         replace(stage, reads_apart=False)
     (stage,) = stages_of(recipe("small_specializing"))
-    with pytest.raises(ValueError, match="reader_narrowing and reads_throughout are of a reader that learns"):
-        replace(stage, reads_apart=False, reader_narrowing=None)
+    assert stage.specialty is not None
+    with pytest.raises(ValueError, match="but it trains both of them"):
+        replace(stage, reads_apart=True)
+    with pytest.raises(ValueError, match=r"learns alone, but it trains both$"):
+        replace(stage, trains="both")
 
 
 def test_a_mistyped_name_is_answered_with_the_nearest() -> None:
