@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
+from itertools import product
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from ponderpounce.models.ponder_checkpoint import load_ponder
 from ponderpounce.models.pounce_checkpoint import load_bundle
+from ponderpounce.models.specialty import specialist_for
+from ponderpounce.tasks.difficulty import DIFFICULTIES
+from ponderpounce.tasks.task import make_task, task_names
 from sim_client import evaluate
 
 CHECKPOINTS = Path(__file__).parents[2] / "checkpoints"
@@ -42,6 +47,16 @@ def test_who_knows_several_tasks_was_told_of_them_in_few_words() -> None:
     assert len(vocabulary.encode(text)) < 0.75 * len(old.encode(text))
     known = "pick up the first highlighted cube at [441, 430], which is blue"
     assert vocabulary.encode(known) == old.encode(known)
+
+
+def test_its_specialist_is_for_the_tasks_that_count_and_no_others() -> None:
+    specialties = load_ponder(CHECKPOINTS / "several" / "ponder").format.specialties
+    counting = {"PickXtimes", "SwingXtimes", "BinFill"}
+    for name in task_names():
+        task = make_task(name)
+        for difficulty, seed in product(DIFFICULTIES, range(8)):
+            instruction = task.instruction(task.sample(np.random.default_rng(seed), difficulty))
+            assert (specialist_for(specialties, instruction) == "counting") == (name in counting), instruction
 
 
 @pytest.mark.slow
