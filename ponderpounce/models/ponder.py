@@ -88,7 +88,7 @@ class Ponder(nn.Module):
         self.reader: Reader | None = None
         """Reads demonstrations, if there is one (:meth:`add_reader`); None: there is one set of weights, as in the
         paper."""
-        self.specialists = nn.ModuleDict()
+        self.specialists = nn.ModuleDict().eval()
         """By name, `Reader`s of whole episodes (:meth:`add_specialist`)."""
 
     @classmethod
