@@ -35,12 +35,14 @@ def with_specialist(*, is_other: bool = True) -> Ponder:
     return ponder
 
 
-@given(st.text(max_size=30), st.sampled_from(["Sort the cubes", "pick, then press the button to stop", "press"]))
-def test_the_first_that_is_for_an_instruction_takes_it(before: str, instruction: str) -> None:
-    told = f"{before} {instruction}"
-    name = specialist_for((SORTING, COUNTING), told)
-    takers = [each.name for each in (SORTING, COUNTING) if each.is_for(told)]
-    assert name == (takers[0] if takers else None)
+@given(st.permutations((SORTING, COUNTING)), st.booleans(), st.booleans(), st.booleans())
+def test_the_first_that_is_for_an_instruction_takes_it(
+    specialties: list[Specialty], sorts: bool, counts: bool, is_loud: bool
+) -> None:
+    told = f"{'sort' if sorts else 'find'} the cubes, then press the button{' to stop' if counts else ''}"
+    wanted = [each.name for each in specialties if {"sorting": sorts, "counting": counts}[each.name]]
+    expected = wanted[0] if wanted else None
+    assert specialist_for(specialties, told.upper() if is_loud else told) == expected
     assert specialist_for((), told) is None
 
 

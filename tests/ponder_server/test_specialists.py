@@ -1,6 +1,7 @@
 """An episode that a specialist is for is served as if there were nobody else's weights, beside others."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from ponderpounce.models.int8 import Int8Linear
 from ponderpounce.models.ponder import Ponder
 from ponderpounce.models.second_look import SecondLook
 from ponderpounce.models.specialty import Specialty
-from tests.ponder_server.test_engine import CONFIG, TOLERANCE, WITHOUT_DEMO, observation, untrained
+from tests.ponder_server.test_engine import CONFIG, TOLERANCE, WITH_DEMO, WITHOUT_DEMO, observation, untrained
 
 COUNTING = Specialty(name="counting", instructions="count")
 COUNTED = Opening(instruction="count the buttons")
@@ -62,6 +63,33 @@ def test_each_session_is_read_by_its_own_weights(buckets: tuple[int, ...]) -> No
                 assert np.abs(outcome.unwrap().cognition - wanted).max() < TOLERANCE
     by_others = cognitions(untrained(), COUNTED)
     assert all(np.abs(x - y).max() > TOLERANCE for x, y in zip(by_others, expected["counted"], strict=True))
+
+
+def test_after_a_demonstration_it_goes_on_from_what_the_reader_leaves() -> None:
+    ponder = specialised()
+    generator = torch.Generator().manual_seed(4)
+    with torch.no_grad():
+        for weight in ponder.add_reader().parameters():
+            weight.mul_(1 + 0.1 * torch.randn(weight.shape, generator=generator))
+    shown = replace(WITH_DEMO, instruction=COUNTED.instruction)
+    form = ponder.format
+    queries = [segment for _ in range(NUM_QUERIES) for segment in form.query(2, None)]
+    row = form.row([*form.opening(shown.instruction, [len(views) for views in shown.demo_frames]), *queries])
+    frames = [frame for views in shown.demo_frames for frame in views]
+    frames += [frame for query in range(NUM_QUERIES) for frame in observation(query)]
+    positions = torch.from_numpy(form.positions(row.ids)[0])[:, None]
+    embeds = ponder.embed(row.ids, torch.from_numpy(np.stack(frames)))[None]
+    specialist: Any = ponder.specialists["counting"]
+    with torch.inference_mode():
+        read, by_everybody = (ponder(embeds, positions, [row.num_shown], each)[0] for each in (specialist, None))
+    engine = QwenEngine(ponder, CONFIG)
+    engine.open("a", shown)
+    for query, carriers in enumerate(torch.from_numpy(row.carrier_index)):
+        cognition = torch.from_numpy(engine.fire("a", observation(query)).cognition)
+        assert (cognition - read[carriers]).abs().max() < TOLERANCE
+        assert ((cognition - by_everybody[carriers]).abs().max() < TOLERANCE) == (query == 0), (
+            "the first is the reader's"
+        )
 
 
 def test_an_answer_that_is_taken_back_is_the_specialists_once_more() -> None:
