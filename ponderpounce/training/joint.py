@@ -243,17 +243,16 @@ class JointModel(nn.Module):
             if trains not in ("both", name):
                 system.requires_grad_(False)
         ponder.specialists.requires_grad_(False)
-        self._specialty = specialty
+        self._reads_apart, self._specialty = reads_apart, specialty
         if specialty is not None and specialty not in ponder.format.specialties:
             ponder.add_specialist(specialty)
         if reads_apart and ponder.reader is None:
             ponder.add_reader()
-        if (learner := self._learner(reads_apart)) is not None:
+        if (learner := self._learner) is not None:
             ponder.requires_grad_(False)
             learner.requires_grad_(True)
             if narrowing is not None:
                 confine(learner, ponder.qwen.model.language_model, narrowing)
-        self._reads_apart = reads_apart
         if keeps_eyes:
             ponder.qwen.model.visual.requires_grad_(False)
 
@@ -316,7 +315,7 @@ class JointModel(nn.Module):
         )
 
     def _as_stored(self) -> AbstractContextManager[None]:
-        learner = self._learner(self._reads_apart)
+        learner = self._learner
         if learner is None or self._narrowing is None:
             return nullcontext()
         return as_stored(learner, self.ponder.qwen.model.language_model, self._narrowing)
@@ -326,9 +325,10 @@ class JointModel(nn.Module):
         """Whose all rows are; None: everybody's."""
         return None if self._specialty is None else cast(Reader, self.ponder.specialists[self._specialty.name])
 
-    def _learner(self, reads_apart: bool) -> Reader | None:
+    @property
+    def _learner(self) -> Reader | None:
         """Who learns alone, if anybody does."""
-        return self.ponder.reader if reads_apart else self._specialist
+        return self.ponder.reader if self._reads_apart else self._specialist
 
     def weigh(self, matching: Tensor, grounding: Tensor, alignment: Tensor, placing: Tensor) -> Tensor:
         """L of its parts."""

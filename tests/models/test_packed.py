@@ -40,7 +40,7 @@ def test_other_files_are_refused(other: bytes) -> None:
         unpack(other)
 
 
-def test_weights_in_half_precision_take_four_fifths() -> None:
+def test_weights_in_half_precision_take_less() -> None:
     weights = torch.randn(200, 256, generator=torch.Generator().manual_seed(0)).mul(0.05).half()
     raw = weights.numpy().tobytes()
     assert len(pack(raw)) < 0.87 * len(raw)
