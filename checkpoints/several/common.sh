@@ -81,9 +81,19 @@ ponder, path = load_ponder(pathlib.Path(sys.argv[1])), pathlib.Path(sys.argv[2],
 narrowing = Narrowing(num_layers=int(sys.argv[4]), bits=int(sys.argv[5]))
 own, text_model = ponder.specialists[specialty.name], ponder.qwen.model.language_model
 write_reader(own, text_model, path.with_name(specialist_name(specialty)), narrowing)
-stored = {"specialties": []} | json.loads(path.read_text()) | {"format": "ponderpounce.ponder/11"}
+stored = json.loads(path.read_text())
+if "specialties" not in stored: stored |= {"specialties": [], "format": "ponderpounce.ponder/11"}
 stored["specialties"] = [each for each in stored["specialties"] if each["name"] != specialty.name] + [asdict(specialty)]
 path.write_text(json.dumps(stored, indent=2) + "\n")' "$@"
+}
+
+grip_firmly() {  # both of a PAIR are told fingers between STRAIGHT and ASKEW, in metres of one, as if they were at the first
+    "$bin/python" -c 'import json, pathlib, sys
+pair, grip = pathlib.Path(sys.argv[1]), {"straight_m": float(sys.argv[2]), "askew_m": float(sys.argv[3])}
+ponder, pounce = json.loads((pair / "ponder/ponder.json").read_text()), json.loads((pair / "pounce/config.json").read_text())
+ponder["proprioception"]["grip"] = pounce["statistics"]["grip"] = grip
+(pair / "ponder/ponder.json").write_text(json.dumps(ponder | {"format": "ponderpounce.ponder/12"}, indent=2) + "\n")
+(pair / "pounce/config.json").write_text(json.dumps(pounce, indent=1) + "\n")' "$@"
 }
 
 pack() {  # the weights of a PONDER's folder, without loss

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ponderpounce.models.action_space import ActionSpace, actions_in, num_dims, states_in, targets_from
+from ponderpounce.models.grip import Grip, as_told
 
 Floats = NDArray[np.float32]
 
@@ -63,6 +64,8 @@ class RobotStatistics:
     """Of each row of a chunk, how far it moves compared with all of them; () takes all rows as one, as the released
     RoboMME statistics do. The first rows move little: measured by the whole chunk's spread, what decides over a grasp
     is lost in a flow's last bit of noise."""
+    grip: Grip | None = None
+    """How the network is told the fingers; None, as they are. What it answers is not changed by it."""
 
     def __post_init__(self) -> None:
         expected = num_dims(self.space)
@@ -77,7 +80,7 @@ class RobotStatistics:
 
     def normalise_states(self, states_8: ArrayLike) -> Floats:
         """The robot's states (..., 8) -> (..., D) as the network reads them."""
-        return self.state.normalise(states_in(self.space, states_8))
+        return self.state.normalise(as_told(states_in(self.space, states_8), self.grip))
 
     def normalise_targets(self, targets_N8: ArrayLike, state_8: ArrayLike, *, first_row: int = 0) -> Floats:
         """Absolute joint targets -> the network's actions (N, D); all rows are relative to the one current state.

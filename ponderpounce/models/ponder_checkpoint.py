@@ -56,12 +56,12 @@ class CheckpointError(ValueError):
 class StoredPonder:
     """Contents of ponder.json. The defaults are for a public Qwen3.5, which has none; a file has every field."""
 
-    format: Literal["ponderpounce.ponder/11"] = "ponderpounce.ponder/11"
-    """Each is the one before and a field more: /10 has no ``specialties``, /9 no ``has_reader`` (nor
-    ``on_demonstrations`` in its counsel), /8 no ``demonstrations``, /7 no ``fovea``, /6 no ``counsel``, /5 no
-    ``second_look``, /4 no ``takes_notes``, /3 no ``speaks``, /2 no ``proprioception``, /1 no ``eyes``. Such a PONDER
-    speaks, is shown demonstrations as in the paper, takes counsel on all episodes if on any, and has none of the
-    others."""
+    format: Literal["ponderpounce.ponder/12"] = "ponderpounce.ponder/12"
+    """Each is the one before and a field more: /11 has no ``grip`` in its proprioception, /10 no
+    ``specialties``, /9 no ``has_reader`` (nor ``on_demonstrations`` in its counsel), /8 no ``demonstrations``, /7 no
+    ``fovea``, /6 no ``counsel``, /5 no ``second_look``, /4 no ``takes_notes``, /3 no ``speaks``, /2 no
+    ``proprioception``, /1 no ``eyes``. Such a PONDER speaks, is shown demonstrations as in the paper, takes counsel on
+    all episodes if on any, and has none of the others."""
     num_carriers: int = 1
     first_carrier_id: int | None = None
     """None: the first row after the tokenizer's last id."""
@@ -271,6 +271,10 @@ def _read_stored(directory: Path) -> StoredPonder:
             values["counsel"] |= {"on_demonstrations": True}
     if isinstance(values, dict) and values.get("format") == "ponderpounce.ponder/10":
         values |= {"format": "ponderpounce.ponder/11", "specialties": []}
+    if isinstance(values, dict) and values.get("format") == "ponderpounce.ponder/11":
+        values |= {"format": "ponderpounce.ponder/12"}
+        if isinstance(values.get("proprioception"), dict):
+            values["proprioception"] |= {"grip": None}
     return from_json(StoredPonder, values, str(path))
 
 

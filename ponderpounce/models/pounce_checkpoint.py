@@ -40,7 +40,7 @@ GROOT_FORMAT: Final = "ponderpounce.pounce-groot/1"
 CONFIG_FILE = "config.json"
 JAX_FOLDER = "params"
 WEIGHTS_FILE = "model.safetensors"
-_LATER_STATISTICS = {"space": "joint_delta", "reach": []}
+_LATER_STATISTICS: dict[str, Any] = {"space": "joint_delta", "reach": [], "grip": None}
 _LATER_FIELDS: dict[str, Any] = {
     "max_committed_rows": 0,
     "reads_subgoal": False,
@@ -129,7 +129,10 @@ class PounceBundle:
     def digest(self) -> str:
         """Returns 16 hex digits over weights, config, statistics and tokenizer: equal digests act equally."""
         digest = hashlib.blake2b(digest_size=8)
-        digest.update(json.dumps(asdict(self.stored_config()), sort_keys=True).encode())
+        stored = asdict(self.stored_config())
+        if stored["statistics"]["grip"] is None:
+            del stored["statistics"]["grip"]  # what was recorded before there was such a field names these digests
+        digest.update(json.dumps(stored, sort_keys=True).encode())
         digest.update(self.tokenizer.model_bytes)
         for name, tensor in sorted(self.model.state_dict().items()):
             digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())

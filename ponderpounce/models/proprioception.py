@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ponderpounce.models.arm import NUM_ARM_JOINTS, tool_poses
+from ponderpounce.models.grip import Grip, as_told
 
 NUM_PROPRIO = NUM_ARM_JOINTS + 1
 """The Panda's: joint angles [rad], and the place of one finger [m], 0 closed."""
@@ -29,6 +30,8 @@ class Proprioception:
     first_id: int
     num_finger_bins: int = 16
     num_height_bins: int = 32
+    grip: Grip | None = None
+    """None: fingers are told as they are."""
 
     def __post_init__(self) -> None:
         if min(self.num_finger_bins, self.num_height_bins) < 1 or self.first_id < 0:
@@ -52,6 +55,7 @@ class Proprioception:
         state = np.asarray(proprio, np.float64)
         if state.shape != (NUM_PROPRIO,) or not np.isfinite(state).all():
             raise ValueError(f"proprio is {state}; PONDER reads {NUM_PROPRIO} finite numbers, 7 joints and a finger")
+        state = as_told(state, self.grip)
         height_m = tool_poses(state[:NUM_ARM_JOINTS]).position_m[2]
         finger = _bin(state[-1] / MAX_FINGER_M, self.num_finger_bins)
         height = _bin(height_m / MAX_HEIGHT_M, self.num_height_bins)

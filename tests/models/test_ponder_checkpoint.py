@@ -275,7 +275,7 @@ def test_how_demonstrations_were_shown_is_read_back_and_told_to_who_asks_for_it_
     assert load_ponder(tmp_path).format.demonstrations == Showing(hz=2, to_its_end=True) == declared(tmp_path)
 
 
-@pytest.mark.parametrize("version", [1, 2, 3, 4, 5, 6, 7, 8, 9, 10])
+@pytest.mark.parametrize("version", [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11])
 def test_a_folder_from_before_there_were_eyes_proprioception_or_notes_has_none_and_speaks(
     ponder: Ponder, folder: Path, version: int
 ) -> None:
