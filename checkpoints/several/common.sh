@@ -92,7 +92,7 @@ grip_firmly() {  # both of a PAIR are told fingers between STRAIGHT and ASKEW, i
 pair, grip = pathlib.Path(sys.argv[1]), {"straight_m": float(sys.argv[2]), "askew_m": float(sys.argv[3])}
 ponder, pounce = json.loads((pair / "ponder/ponder.json").read_text()), json.loads((pair / "pounce/config.json").read_text())
 ponder["proprioception"]["grip"] = pounce["statistics"]["grip"] = grip
-(pair / "ponder/ponder.json").write_text(json.dumps(ponder | {"format": "ponderpounce.ponder/12"}, indent=2) + "\n")
+(pair / "ponder/ponder.json").write_text(json.dumps({"specialties": []} | ponder | {"format": "ponderpounce.ponder/12"}, indent=2) + "\n")
 (pair / "pounce/config.json").write_text(json.dumps(pounce, indent=1) + "\n")' "$@"
 }
 

@@ -346,7 +346,7 @@ def small_in_three_bits() -> Curriculum:
 def small_specializing() -> Curriculum:
     """A specialist for what counts, which begins as the PONDER of `small_at_length` and learns from what that has
     played, and to be stored in three bits a number beside it; nothing else changes. For PickXtimes, SwingXtimes and
-    BinFill (`pp-train --watch` for what was played). It is shipped. docs/training.md, "A specialist".
+    BinFill (`pp-train --watch` for what was played). Shipped, with a firm grip. docs/training.md, "A specialist".
     """
     *_, settling = small_at_length().stages
     optim = replace(_TURNING, learning_rate=3e-4, warmup_steps=20, decay=(150, 380))

@@ -59,6 +59,13 @@ def test_its_specialist_is_for_the_tasks_that_count_and_no_others() -> None:
             assert (specialist_for(specialties, instruction) == "counting") == (name in counting), instruction
 
 
+@pytest.mark.parametrize("name", ["small", "several"])
+def test_both_of_a_pair_are_told_the_fingers_alike(name: str) -> None:
+    told = load_ponder(CHECKPOINTS / name / "ponder").format.proprioception
+    assert told is not None
+    assert told.grip == load_bundle(CHECKPOINTS / name / "pounce").statistics.grip
+
+
 @pytest.mark.slow
 @pytest.mark.e2e
 def test_it_picks_what_was_highlighted_and_without_cognition_it_does_not(tmp_path: Path) -> None:
