@@ -1,9 +1,9 @@
 """How far apart the fingers are, as the networks are told it.
 
 A script that grasps straight holds a cube of 4 cm with fingers 4 cm apart. What a policy grasps askew holds them
-further apart, up to the cube's diagonal, and rows of the script's have that only where a grasp fails: learned from them
-alone a hand lets go of what it holds, half-way up, and PONDER tells it to pick that up once more. Told as if it hung
-straight, both go on. See docs/training.md, "A firm grip". Pure numpy.
+further apart, up to the cube's diagonal, and rows of the script's have that nearly only where something is set down and
+about to be let go: a hand that learned from them lets go of what it holds, half-way up. Told as if it hung straight, it
+goes on. See docs/training.md, "A firm grip". Pure numpy.
 """
 
 from __future__ import annotations

@@ -66,6 +66,14 @@ def test_both_of_a_pair_are_told_the_fingers_alike(name: str) -> None:
     assert told.grip == load_bundle(CHECKPOINTS / name / "pounce").statistics.grip
 
 
+@pytest.mark.parametrize(("name", "without_fingers"), [("small", set()), ("several", {"PatternLock", "RouteStick"})])
+def test_its_results_are_of_this_hand(name: str, without_fingers: set[str]) -> None:
+    """Where a robot has no fingers a grip changes nothing, and what was played before there was one is kept."""
+    results = json.loads((CHECKPOINTS / name / "results" / "real" / "results.json").read_text())
+    hands = {e["models"]["pounce"]["model_hash"] for e in results["episodes"] if e["task"] not in without_fingers}
+    assert hands == {load_bundle(CHECKPOINTS / name / "pounce").digest()}
+
+
 @pytest.mark.slow
 @pytest.mark.e2e
 def test_it_picks_what_was_highlighted_and_without_cognition_it_does_not(tmp_path: Path) -> None:
