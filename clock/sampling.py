@@ -44,11 +44,6 @@ class Clocks:
     delay: LogNormal
     control_hz: int = CONTROL_HZ
 
-    def without_spread(self) -> Clocks:
-        """The same on the average, every interval and delay like the other: as evaluation runs them."""
-        query, invoke, delay = (replace(each, sigma=0.0) for each in (self.query, self.invoke, self.delay))
-        return replace(self, query=query, invoke=invoke, delay=delay)
-
 
 ROBOMME: Final = Clocks(  # paper, A.1
     query=LogNormal(mean_ns=NS_PER_S, sigma=0.05),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import sys
-from functools import partial
 
 import tyro
 
@@ -27,16 +26,15 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     """
     import torch  # here, so that --help and a mistyped option answer at once
 
-    from ponder_server.council import Council
+    from dual_system.models.bfloat16 import warn_of_slow
+    from dual_system.models.ponder import configs as ponder_configs
+    from dual_system.models.ponder.checkpoint import load_ponder
+    from dual_system.models.ponder.network import Ponder
     from ponder_server.draft import Draft, FirstOf, TrieDraft
     from ponder_server.engine import QwenEngine
     from ponder_server.engine_config import EngineConfig
     from ponder_server.mtp import MtpDraft
     from ponder_server.threads import num_usable_cores
-    from ponderpounce.models import ponder_configs
-    from ponderpounce.models.bfloat16 import warn_of_slow
-    from ponderpounce.models.ponder import Ponder
-    from ponderpounce.models.ponder_checkpoint import load_ponder
 
     num_robots = 1 + len(options.other_robots)
     if options.max_sessions < num_robots:
@@ -53,12 +51,10 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     else:
         size = getattr(ponder_configs, options.size)()
         ponder = Ponder.random(size, seed=options.seed, device=options.device, dtype=dtype)
-    counsel, form = ponder.format.counsel, ponder.format
-    num_views = 1 if counsel is None else counsel.num_views
     config = EngineConfig(
         max_context_tokens=options.max_context_tokens,
         when_full=options.when_full,
-        max_sessions=options.max_sessions * num_views,
+        max_sessions=options.max_sessions,
         max_text_tokens=options.max_text_tokens,
         max_batch_rows=options.max_batch_rows,
         attention_threads=min(options.attention_threads, num_cores),
@@ -75,11 +71,7 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
         log.warning(
             "--draft-tokens: these weights have no multi-token prediction (mtp.*); texts are written without it"
         )
-    engine = QwenEngine(ponder, config, FirstOf(drafts))
-    if counsel is None:
-        return engine
-    views_of = partial(counsel.views, form.eyes, ponder.image_px)
-    return Council(engine, counsel, views_of, max_sessions=options.max_sessions)
+    return QwenEngine(ponder, config, FirstOf(drafts))
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -12,13 +12,14 @@ from typing import Generic, Literal, Protocol, TypeAlias, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from ponderpounce.models.eyes import Eyes
+from dual_system.models.ponder.observation import WHOLE_VIEWS, ObservationReader
+from dual_system.models.ponder.showing import AS_IN_THE_PAPER, Showing
 
 Frame: TypeAlias = npt.NDArray[np.uint8]
 """One camera image, (h, w, 3) uint8 RGB."""
 
 Proprio: TypeAlias = npt.NDArray[np.float32]
-"""The robot's state at the observation, (8,): 7 joint angles [rad], a finger [m]. Most networks are not told."""
+"""The robot's state at the observation, (8,): 7 joint angles [rad], a finger [m]. Most models ignore it."""
 
 Result = TypeVar("Result")
 
@@ -57,9 +58,9 @@ class EngineSpec:
     hidden_size: int
     """H"""
     image_px: tuple[int, int]
-    """(h, w) of every picture that the network reads; of every frame, if there are no ``eyes``."""
+    """(h, w) of every image that the network reads."""
     num_cameras: int
-    """Frames per fire, always the same cameras in the same order, whatever is seen of them."""
+    """Frames per fire, always the same cameras in the same order."""
     max_context_tokens: int
     model_hash: str
     """12 hex digits over the weights, and how they were narrowed."""
@@ -67,10 +68,10 @@ class EngineSpec:
     """The carriers were never trained: every cognition is noise, and reports must say so."""
     dtype: str
     """Of weights and activations, e.g. "float32"; cognition is float32 always."""
-    eyes: Eyes = None
-    """What is seen of the frames."""
-    reads_proprio: bool = False
-    """It is also told of the robot's state: a query without is refused."""
+    reader: ObservationReader = WHOLE_VIEWS
+    """What is read of the frames and of the robot's state."""
+    demonstrations: Showing = AS_IN_THE_PAPER
+    """How a demonstration is to be sampled."""
     session_bytes: int = 0
     """Memory of one session at its longest; that of all of them is allocated at start."""
     weights: WeightsName = "float"
@@ -84,7 +85,7 @@ class Opening:
 
     instruction: str
     demo_frames: tuple[tuple[Frame, ...], ...] = field(default=())
-    """Demonstration sampled at 1 Hz, and at its end if the client shows it: for each instant, its views."""
+    """Demonstration, sampled as ``EngineSpec.demonstrations`` says: for each instant, its views."""
 
     @property
     def has_demo(self) -> bool:
@@ -102,14 +103,6 @@ class Text:
     """True if it was cut at the token limit and closed as it was."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Note:
-    """What PONDER wrote after an instant of a demonstration, counted from 0."""
-
-    instant: int
-    text: Text
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Fire:
     """The answer to one query."""
@@ -121,10 +114,6 @@ class Fire:
     texts: tuple[Text, ...]
     context_tokens: int
     """Tokens in the session after this fire."""
-    notes: tuple[Note, ...] = ()
-    """Of the demonstration, with the first answer of an episode; () with all others."""
-    is_second_look: bool = False
-    """Its words are those in force, with a place that a second look has found."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,7 +12,7 @@ a session.
 """
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import accumulate
 
@@ -20,6 +20,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dual_system.models.action_space import ROBOT_DIM
+from dual_system.models.graphs import Capture, graphs_for
+from dual_system.models.ponder.checkpoint import weights_hash
+from dual_system.models.ponder.context import SegmentKind
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.observation import Pictures, check_cameras
 from ponder_server.audible import audible
 from ponder_server.batching import Batch
 from ponder_server.context_policy import POLICIES, Span
@@ -28,7 +34,6 @@ from ponder_server.contract import (
     EngineSpec,
     Fire,
     Frame,
-    Note,
     Opening,
     Outcome,
     Progress,
@@ -42,26 +47,17 @@ from ponder_server.engine_config import EngineConfig
 from ponder_server.episode import Episode, Query
 from ponder_server.narrow import check_weights, quantise
 from ponder_server.opening import Opener
-from ponder_server.prefixes import Opened
 from ponder_server.runner import NUM_SAVED_STATES, Append, Runner, Session, fitted
 from ponder_server.slots import slot_size
-from ponder_server.standing import Standing
 from ponder_server.threads import Threads
 from ponder_server.writer import MAX_CHECKED_TOKENS, Steps, TransitionWriter
-from ponderpounce.models.context import SegmentKind
-from ponderpounce.models.eyes import Pictures, check_cameras, readable_sizes, see
-from ponderpounce.models.graphs import Capture, graphs_for
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_checkpoint import weights_hash
-from ponderpounce.models.proprioception import NUM_PROPRIO
-from ponderpounce.models.views import AS_IT_IS, View
 
 WARM_UP_SESSION = "warm-up"
 WARM_UP_OPENING = Opening(instruction="warm up")
 NUM_UNMEASURED_FIRES = 5
 NUM_MEASURED_FIRES = 30
 NUM_FULL_FIRES = 10
-WARM_UP_PROPRIO = np.zeros(NUM_PROPRIO, np.float32)
+WARM_UP_PROPRIO = np.zeros(ROBOT_DIM, np.float32)
 
 
 class QwenEngine:
@@ -82,17 +78,15 @@ class QwenEngine:
         self._config = config
         self._format = ponder.format
         self._episodes: dict[str, Episode] = {}
-        self._frame_px = readable_sizes(self._format.eyes, ponder.image_px)[0]
-        check_cameras([self._frame_px] * config.num_cameras, self._format.eyes, ponder.image_px)
+        reader = self._format.reader
+        self._frame_px = reader.readable_sizes(ponder.image_px)[0]
+        check_cameras([self._frame_px] * config.num_cameras, reader, ponder.image_px)
         size = slot_size(ponder.qwen.config.text_config, ponder.dtype)
-        self._second_look = self._format.second_look if self._format.speaks else None
-        contexts_each = 1 if self._second_look is None else 2  # a second look has one of its own
-        slot_bytes = size.slot_bytes(config.max_context_tokens) + NUM_SAVED_STATES * size.state_bytes
-        session_bytes = slot_bytes * contexts_each
+        session_bytes = size.slot_bytes(config.max_context_tokens) + NUM_SAVED_STATES * size.state_bytes
         try:
             self._runner = Runner(
                 ponder,
-                num_slots=config.max_sessions * contexts_each,
+                num_slots=config.max_sessions,
                 max_tokens=config.max_context_tokens,
                 buckets=fitted(config.buckets, len(self._query_ids(WARM_UP_PROPRIO))),
                 threads=Threads(config.attention_threads),
@@ -108,8 +102,8 @@ class QwenEngine:
             hidden_size=ponder.hidden_size,
             image_px=ponder.image_px,
             num_cameras=config.num_cameras,
-            eyes=self._format.eyes,
-            reads_proprio=self._format.proprioception is not None,
+            reader=reader,
+            demonstrations=self._format.demonstrations,
             max_context_tokens=config.max_context_tokens,
             model_hash=weights_hash(ponder),
             is_random=ponder.is_random,
@@ -120,13 +114,7 @@ class QwenEngine:
         self._parts = [*(layer.mlp for layer in ponder.layers), *draft.parts]
         self._writer = TransitionWriter(ponder, draft, max_text_tokens=config.max_text_tokens)
         self._num_query_ids = len(self._query_ids(WARM_UP_PROPRIO))
-        self._opener = Opener(
-            ponder,
-            self._writer,
-            self._embed,
-            max_prefixes=config.max_prefixes,
-            chunk_tokens=config.prefill_chunk_tokens,
-        )
+        self._opener = Opener(self._embed, max_prefixes=config.max_prefixes, chunk_tokens=config.prefill_chunk_tokens)
         self._begun: dict[str, Query] = {}
         self._batch: Batch[Fire] = Batch(self._runner, max_rows=config.max_batch_rows)
         if config.weights != "float":
@@ -144,64 +132,42 @@ class QwenEngine:
     def spec(self) -> EngineSpec:
         return self._spec
 
+    @torch.inference_mode()
     def open(self, session: str, opening: Opening, progress: Progress = no_progress) -> int:
         """Encodes instruction and demonstration; see ``PonderEngine.open``."""
-        return self.open_views({session: AS_IT_IS}, opening, progress)
-
-    @torch.inference_mode()
-    def open_views(self, views: Mapping[str, View], opening: Opening, progress: Progress = no_progress) -> int:
-        """Opens several sessions on one opening, whose pictures each of them sees in its own way; the forwards are
-        shared. All or none of them; otherwise as ``PonderEngine.open``. Returns the first one's tokens."""
-        if already := [session for session in views if session in self._episodes]:
-            raise SessionError(f"session {already[0]!r} is already open; close it first.")
-        first = next(iter(views))
-        if len(self._episodes) + len(views) > self._config.max_sessions:
+        if session in self._episodes:
+            raise SessionError(f"session {session!r} is already open; close it first.")
+        if len(self._episodes) >= self._config.max_sessions:
             raise SessionError(
-                f"session {first!r} does not fit: {sorted(self._episodes)} are open and max_sessions is "
+                f"session {session!r} does not fit: {sorted(self._episodes)} are open and max_sessions is "
                 f"{self._config.max_sessions}. Close one, or raise max_sessions."
             )
         if not opening.instruction.strip():
-            raise ValueError(f"session {first!r}: the instruction is empty; PONDER needs the task's text")
+            raise ValueError(f"session {session!r}: the instruction is empty; PONDER needs the task's text")
         for instant, cameras in enumerate(opening.demo_frames):
             if not cameras:
                 raise ValueError(f"demo instant {instant} has no view")
         segments = self._format.opening(opening.instruction, [len(cameras) for cameras in opening.demo_frames])
         wanted = sum(len(segment) for segment in segments)
         if wanted > self._config.max_context_tokens:
-            raise ContextFull(session=first, used=0, wanted=wanted, limit=self._config.max_context_tokens)
-        reads, acts = self._ponder.readers(opening.instruction, has_demo=opening.has_demo)
-        alone = tuple(token for each in self._format.opening(opening.instruction) for token in each.ids)
-        thoughts: Batch[Opened] = Batch(self._runner, max_rows=self._config.max_batch_rows)
-        contexts: dict[str, Session] = {}
-        opened: dict[str, Opened] = {}
+            raise ContextFull(session=session, used=0, wanted=wanted, limit=self._config.max_context_tokens)
+        demo = [self._see(views, f"demo instant {n}") for n, views in enumerate(opening.demo_frames)]
+        context = self._runner.open(session)
         try:
             with audible(self._parts, progress):
-                for session, view in views.items():
-                    demo = [self._see(each, f"demo instant {n}", view) for n, each in enumerate(opening.demo_frames)]
-                    pictures = [picture for instant in demo for picture in instant]
-                    contexts[session] = context = self._runner.open(session, reads)
-                    steps = self._opener.encode(context, opening, segments, pictures, view)
-                    thoughts.add(session, steps, thoughts.turn())
-                while len(opened) < len(views):
-                    opened |= {outcome.session: outcome.unwrap() for outcome in thoughts.step(progress)}
+                pictures = [picture for instant in demo for picture in instant]
+                self._opener.encode(context, opening, segments, pictures, progress)
         except BaseException as error:
-            for context in contexts.values():
-                self._runner.close(context)
-            if isinstance(error, SessionError):  # a forward's, which knows no names
-                raise SessionError(f"session {first!r}: {error}") from error
+            self._runner.close(context)
+            if isinstance(error, torch.OutOfMemoryError):
+                raise SessionError(f"session {session!r}: the device has no memory left to encode it.") from error
             raise
-        for session, view in views.items():
-            self._episodes[session] = Episode(
-                context=contexts[session],
-                spans=[*opened[session].spans],
-                owes_reasoning=opening.has_demo,
-                notes=opened[session].notes,
-                alone=alone,
-                standing=None if self._second_look is None else Standing(self._second_look),
-                acts=acts,
-                view=view,
-            )
-        return contexts[first].num_tokens
+        self._episodes[session] = Episode(
+            context=context,
+            spans=[Span(segment.kind, len(segment)) for segment in segments],
+            owes_reasoning=opening.has_demo,
+        )
+        return context.num_tokens
 
     def fire(
         self,
@@ -233,23 +199,18 @@ class QwenEngine:
         *,
         proprio: Proprio | None = None,
         force_text_tokens: int | None = None,
-        saying: tuple[str, ...] | None = None,
     ) -> None:
-        """Takes on one query, to be answered by :meth:`step`; see ``BatchingEngine.begin``.
-
-        ``saying``: the texts to answer it with, the subgoal last, whatever the model wants to say; () for silence.
-        """
+        """Takes on one query, to be answered by :meth:`step`; see ``BatchingEngine.begin``."""
         episode = self._episode(session)
         context = episode.context
         if session in (*self._begun, *self._batch.sessions):
             raise SessionError(f"session {session!r} is thinking about a query already; one at a time.")
         if len(frames) != self._config.num_cameras:
             raise ValueError(f"fire got {len(frames)} frames, this engine has num_cameras {self._config.num_cameras}")
-        pictures = self._see(frames, "observation", episode.view)
+        pictures = self._see(frames, "observation")
         ids = self._query_ids(proprio)
         if force_text_tokens is not None and force_text_tokens < 1:
             raise ValueError(f"force_text_tokens is {force_text_tokens}; at least 1, or None")
-        episode.before = None
         self._make_room(episode)
         context.check_room(len(ids))
         self._begun[session] = Query(
@@ -257,7 +218,6 @@ class QwenEngine:
             pictures=pictures,
             ids=ids,
             force_text_tokens=force_text_tokens,
-            saying=saying,
             turn=self._batch.turn(),
         )
 
@@ -265,11 +225,6 @@ class QwenEngine:
         """Forgets a query that was begun and not answered; without one it changes nothing."""
         self._begun.pop(session, None)
         self._batch.drop(session)
-
-    @torch.inference_mode()
-    def undo(self, session: str) -> None:
-        """The session is as it was before its last query, which was answered. Raises SessionError if none was."""
-        self._episode(session).undo()
 
     @torch.inference_mode()
     def step(self, progress: Progress = no_progress) -> list[Outcome[Fire]]:
@@ -295,26 +250,13 @@ class QwenEngine:
         is_answered = False
         try:
             texts: tuple[Text, ...] = ()
-            is_transition = exactly is not None or bool(query.saying)
+            is_transition = exactly is not None
             if not is_transition:
                 wanted = 1 + self._format.num_carriers
                 hidden_NH = yield Append(session=context, ids=query.ids, embeds_TH=embeds_TH, num_wanted=wanted)
-                is_asked = self._format.speaks and query.saying is None
-                is_transition = is_asked and self._writer.wants_to_write(hidden_NH[:1])
+                is_transition = self._format.speaks and self._writer.wants_to_write(hidden_NH[:1])
                 hidden_KH = hidden_NH[1:]
-            standing = episode.standing
-            # who is told what to say has looked, if it was time: what was found is in what he is told
-            may_look = query.saying is not None or not is_transition
-            looks_again = standing is not None and standing.is_due and may_look
-            said = [] if query.saying is None else [*map(self._format.vocabulary.encode, query.saying)]
-            if looks_again and query.saying is None:
-                words = yield from self._look_again(query, observation_TH)
-                said = [words] if words else []
-            if said:
-                context.restore(before)
-                texts = yield from self._writer.say(context, before, query.ids[:num_observed], observation_TH, said)
-                hidden_KH = yield Append(session=context, ids=self._format.carrier_ids, embeds_TH=carriers_KH)
-            elif is_transition:
+            if is_transition:
                 context.restore(before)
                 texts = yield from self._writer.write(
                     context,
@@ -325,34 +267,19 @@ class QwenEngine:
                     exactly=exactly,
                 )
                 hidden_KH = yield Append(session=context, ids=self._format.carrier_ids, embeds_TH=carriers_KH)
-            found = bool(said) and query.saying is None
-            answer = self._answer(context, hidden_KH, texts, episode.notes, is_second_look=found)
+            answer = self._answer(context, hidden_KH, texts)
             num_written = len(context.ids) - before.num_ids - len(query.ids)
-            spans = [
+            episode.spans += [
                 Span(SegmentKind.OBSERVATION, num_observed),
                 Span(SegmentKind.TEXT, num_written),
                 Span(SegmentKind.CARRIERS, self._format.num_carriers),
             ]
-            episode.answered(texts, spans, before, looked_again=looks_again)
+            episode.owes_reasoning &= not texts
             is_answered = True
             return answer
         finally:
             if not is_answered:
                 context.restore(before)
-
-    def _look_again(self, query: Query, observation_TH: Tensor) -> Steps[tuple[int, ...]]:
-        """What is to be said of a silent query after all: the words in force with another place; () for nothing."""
-        episode, standing = query.episode, query.episode.standing
-        assert standing is not None
-        ids = (*episode.alone, *query.ids[: len(observation_TH)])
-        embeds_TH = torch.cat([self._ponder.embed(episode.alone), observation_TH])
-        context = self._runner.open(f"{episode.context.name}, looked at again", episode.acts)
-        try:
-            words = yield from self._writer.complete_place(context, ids, embeds_TH, standing.token_ids)
-        finally:
-            self._runner.close(context)
-        anew = self._format.vocabulary.decode(words)
-        return words if standing.is_another(anew) else ()
 
     @torch.inference_mode()
     def close(self, session: str) -> None:
@@ -441,10 +368,9 @@ class QwenEngine:
         observed = self._format.observation(self._config.num_cameras, proprio)
         return (*observed.ids, *self._format.carrier_ids)
 
-    def _see(self, frames: tuple[Frame, ...], where: str, view: View = AS_IT_IS) -> Pictures:
+    def _see(self, frames: tuple[Frame, ...], where: str) -> Pictures:
         try:
-            pictures = see(frames, self._format.eyes, self._format.image_px)
-            return pictures if view.shows_it_as_it_is else view.pictures(torch.from_numpy(pictures)).numpy()
+            return self._format.reader.images(frames, self._format.image_px)
         except ValueError as error:
             raise ValueError(f"{where}, {error}") from None
 
@@ -474,15 +400,7 @@ class QwenEngine:
         )
         episode.spans = [span for span, stay in zip(episode.spans, stays, strict=True) if stay]
 
-    def _answer(
-        self,
-        context: Session,
-        hidden_KH: Tensor,
-        texts: tuple[Text, ...],
-        notes: tuple[Note, ...],
-        *,
-        is_second_look: bool,
-    ) -> Fire:
+    def _answer(self, context: Session, hidden_KH: Tensor, texts: tuple[Text, ...]) -> Fire:
         # a copy: a view would keep the hidden states of the whole observation alive
         cognition = hidden_KH.to("cpu", torch.float32, copy=True).numpy()
         if not np.isfinite(cognition).all():
@@ -495,6 +413,4 @@ class QwenEngine:
             is_transition=bool(texts),
             texts=texts,
             context_tokens=context.num_tokens,
-            notes=notes,
-            is_second_look=is_second_look,
         )

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from clock.rendezvous import Rendezvous
+from dual_system.models.action_space import ROBOT_DIM
 from ponder_server.contract import EngineSpec, Fire, Frame, Proprio
-from ponderpounce.models.eyes import unreadable
-from ponderpounce.models.proprioception import NUM_PROPRIO
 from protocol import images
 from protocol import messages as m
 from protocol.errors import MalformedMessage
@@ -82,10 +81,7 @@ class PonderNode:
         return list(self._rendezvous.give_up())
 
     def answer(self, work: Work, fire: Fire, *, ready_ns: int, infer_ns: int) -> tuple[m.Cognition, list[m.Subgoal]]:
-        """What is published: the cognition, and for the log alone the texts that PONDER wrote to itself.
-
-        A note of the demonstration has its instant in place of the tick, and no query.
-        """
+        """What is published: the cognition, and for the log alone the texts that PONDER wrote to itself."""
         query = work.query
         self.next_query = query.query + 1
         vector = np.ascontiguousarray(fire.cognition, np.float32)
@@ -102,16 +98,6 @@ class PonderNode:
             model_hash=self._spec.model_hash,
             is_fake=self._spec.is_random,
         )
-        notes = [
-            m.Subgoal(
-                kind=m.SubgoalKind.DEMO_NOTE,
-                text=note.text.text,
-                tick=note.instant,
-                token_ids=note.text.token_ids,
-                is_truncated=note.text.truncated,
-            )
-            for note in fire.notes
-        ]
         texts = [
             m.Subgoal(
                 kind=_KINDS[text.kind],
@@ -123,7 +109,7 @@ class PonderNode:
             )
             for text in fire.texts
         ]
-        return cognition, [*notes, *texts]
+        return cognition, texts
 
 
 def _work(query: m.Query, observation: m.Observation) -> Work:
@@ -138,13 +124,13 @@ def check_robot(robot: m.Robot, spec: EngineSpec) -> None:
             f"robot {robot.name!r} has {len(robot.cameras)} cameras {list(robot.cameras)}; PONDER expects "
             f"{spec.num_cameras}"
         )
-    if spec.reads_proprio and robot.num_proprio != NUM_PROPRIO:
+    if spec.reader.state_rows and robot.num_proprio != ROBOT_DIM:
         raise ValueError(
-            f"robot {robot.name!r} tells {robot.num_proprio} numbers of itself; this PONDER reads {NUM_PROPRIO}, the "
+            f"robot {robot.name!r} has a state of {robot.num_proprio} numbers; this PONDER reads {ROBOT_DIM}, the "
             "Panda's joints and a finger"
         )
     size = (robot.image_height, robot.image_width)
-    found = unreadable([size] * len(robot.cameras), spec.eyes, spec.image_px)
+    found = spec.reader.unreadable([size] * len(robot.cameras), spec.image_px)
     if found is not None:
         camera, wanted = found
         raise ValueError(
@@ -157,7 +143,7 @@ def check_pictures(observation: m.Observation, spec: EngineSpec) -> None:
     """Raises MalformedMessage unless the images have the number and sizes that the engine can read."""
     if len(observation.images) != spec.num_cameras:
         raise MalformedMessage("Observation", "images", f"{spec.num_cameras} cameras", f"{len(observation.images)}")
-    found = unreadable([(image.height, image.width) for image in observation.images], spec.eyes, spec.image_px)
+    found = spec.reader.unreadable([(image.height, image.width) for image in observation.images], spec.image_px)
     if found is not None:
         image = observation.images[found[0]]
         raise MalformedMessage("Image", image.camera, found[1], f"{image.height} x {image.width} px")

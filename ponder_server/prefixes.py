@@ -2,21 +2,11 @@
 
 import hashlib
 from collections import OrderedDict
-from dataclasses import dataclass
 
 import torch
 
-from ponder_server.context_policy import Span
-from ponder_server.contract import Note, Opening
+from ponder_server.contract import Opening
 from ponder_server.runner import Prefix, Session
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Opened:
-    """What fills a context that was just opened, and what PONDER wrote meanwhile."""
-
-    spans: tuple[Span, ...]
-    notes: tuple[Note, ...] = ()
 
 
 class Prefixes:
@@ -27,23 +17,23 @@ class Prefixes:
 
     def __init__(self, max_prefixes: int) -> None:
         self._max_prefixes = max_prefixes
-        self._prefixes: OrderedDict[bytes, tuple[Prefix, Opened]] = OrderedDict()
+        self._prefixes: OrderedDict[bytes, Prefix] = OrderedDict()
 
-    def find(self, opening: Opening) -> tuple[Prefix, Opened] | None:
-        """An equal opening's context, and what its tokens are."""
+    def find(self, opening: Opening) -> Prefix | None:
+        """An equal opening's context."""
         key = _digest(opening)
         found = self._prefixes.get(key)
         if found is not None:
             self._prefixes.move_to_end(key)
         return found
 
-    def keep(self, opening: Opening, context: Session, opened: Opened) -> None:
+    def keep(self, opening: Opening, context: Session) -> None:
         """Copies a context that holds exactly ``opening``; does without if the device has no memory for it."""
         while self._prefixes and len(self._prefixes) >= self._max_prefixes:
             self._prefixes.popitem(last=False)
         if self._max_prefixes:
             try:
-                self._prefixes[_digest(opening)] = (context.copy(), opened)
+                self._prefixes[_digest(opening)] = context.copy()
             except torch.OutOfMemoryError:
                 self._prefixes.clear()
 

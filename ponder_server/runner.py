@@ -13,19 +13,19 @@ allocated at construction, and everything writes in place.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from dual_system.models.graphs import Capture
+from dual_system.models.ponder.network import Ponder
 from ponder_server.captured import CapturedDecoder, check_captured
 from ponder_server.contract import ContextFull, SessionError
 from ponder_server.decoder import LEAST_TOKENS, Place, decode
 from ponder_server.slots import SlotMemory
 from ponder_server.threads import ALONE, Threads
-from ponderpounce.models.graphs import Capture
-from ponderpounce.models.ponder import Ponder
 
 NUM_SAVED_STATES = 2
 """Per slot, allocated with it: before a query, and before a draft."""
@@ -103,9 +103,8 @@ class Runner:
     def capture(self, capture: Capture, *, num_read: int) -> None:
         """Forwards are captured from now on (``captured``), when they are first met or by :meth:`prepare`.
 
-        What is captured keeps the weights that it saw: replace none afterwards. Forwards of others than the language
-        model, a reader's of demonstrations or a specialist's, run as they did. A row's hidden states are handed out
-        ``num_read`` at most; forwards that are asked for more run as they did.
+        What is captured keeps the weights that it saw: replace none afterwards. A row's hidden states are handed out
+        ``num_read`` at most; forwards that are asked for more run uncaptured.
         """
         self._captured = CapturedDecoder(self._text_model, self.memory, capture, num_read=num_read)
 
@@ -129,14 +128,13 @@ class Runner:
         finally:
             self._captured = captured
 
-    def open(self, name: str, text_model: Any = None) -> "Session":
-        """An empty context in a free slot, read by ``text_model``, None: by the language model. Raises SessionError if
-        there is none."""
+    def open(self, name: str) -> "Session":
+        """An empty context in a free slot. Raises SessionError if there is none."""
         if not self._free_slots:
             raise SessionError(f"session {name!r} does not fit: all {self.memory.num_slots} slots are in use.")
         slot = self._free_slots.pop()
         self.memory.clear(slot)
-        return Session(self, name, slot, self._text_model if text_model is None else text_model, *self._saved[slot])
+        return Session(self, name, slot, *self._saved[slot])
 
     def close(self, session: "Session") -> None:
         """Gives the slot back; the session must not be used again."""
@@ -158,7 +156,7 @@ class Runner:
         while active := [row for row in rows if row.num_left]:
             length = max(self.bucket(row.num_left) for row in active)
             together = [row for row in active if self.bucket(row.num_left) == length]
-            self._forward([row for row in together if row.text_model is together[0].text_model], length)
+            self._forward(together, length)
         for one, row in zip(appends, rows, strict=True):
             one.session.ids.extend(one.ids)
             one.session.next_position = row.next_position
@@ -185,11 +183,10 @@ class Runner:
             places.append(place)
             row.num_done = end
         positions = torch.from_numpy(positions_3BT)
-        text_model = rows[0].text_model
-        if self._captured is not None and text_model is self._text_model:
+        if self._captured is not None:
             hidden = self._captured(places, embeds_BTH, positions)
         else:
-            hidden = decode(text_model, self.memory, places, embeds_BTH, positions, self._threads)
+            hidden = decode(self._text_model, self.memory, places, embeds_BTH, positions, self._threads)
         for row, hidden_NH in zip(rows, hidden, strict=True):
             row.hidden.append(hidden_NH)
 
@@ -202,7 +199,6 @@ class _Row:
         self.embeds_TH = append.embeds_TH
         self.num_tokens, self.num_done = len(append.ids), 0
         self.slot, self.num_past = session.slot, session.num_tokens
-        self.text_model = session.text_model
         self.first_wanted = 0 if append.num_wanted is None else self.num_tokens - append.num_wanted
         positions_4T, self.next_position = ponder.format.positions(
             append.ids, first_index=session.num_tokens, first_position=session.next_position
@@ -223,7 +219,6 @@ class Session:
         runner: Runner,
         name: str,
         slot: int,
-        text_model: Any,
         before_fire: SavedState,
         before_draft: SavedState,
     ) -> None:
@@ -239,8 +234,6 @@ class Session:
         """Every token of the episode, as its training row would have it."""
         self.num_forgotten = 0
         """Of them, those whose keys and values are gone (:meth:`keep`)."""
-        self.text_model = text_model
-        """Who reads what is appended (`Ponder.readers`): the language model, or a `Reader`."""
 
     @property
     def num_tokens(self) -> int:

@@ -12,11 +12,11 @@ from typing import Literal, TypeAlias, TypeVar
 import torch
 from torch import Tensor
 
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.vocabulary import Vocabulary
 from ponder_server.contract import ContextFull, Text
 from ponder_server.draft import Draft
 from ponder_server.runner import Append, SavedState, Session
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.vocabulary import Vocabulary
 
 Result = TypeVar("Result")
 Steps: TypeAlias = Generator[Append, Tensor, Result]
@@ -94,57 +94,6 @@ class TransitionWriter:
         limit = self._limit(context, before, num_carriers, exactly)
         text, _ = yield from self._decode(context, hidden_NH, "subgoal", limit, exactly)
         return (*texts, text)
-
-    def say(
-        self,
-        context: Session,
-        before: SavedState,
-        observation_ids: Sequence[int],
-        observation_TH: Tensor,
-        texts: Sequence[Sequence[int]],
-    ) -> Steps[tuple[Text, ...]]:
-        """Writes a transition of given texts, the subgoal last, as :meth:`write` does its own."""
-        ids = [token for text in texts for token in (self._t_yes, *text)]
-        self._limit(context, before, self._ponder.format.num_carriers, len(observation_ids) + len(ids))
-        embeds_TH = torch.cat([observation_TH, self._ponder.embed(ids)])
-        yield Append(session=context, ids=[*observation_ids, *ids], embeds_TH=embeds_TH, num_wanted=0)
-        decode = self._ponder.format.vocabulary.decode
-        return tuple(
-            Text(
-                kind="subgoal" if n == len(texts) else "demo_reasoning",
-                text=decode(text),
-                token_ids=tuple(text),
-                truncated=False,
-            )
-            for n, text in enumerate(texts, 1)
-        )
-
-    def complete_place(
-        self, context: Session, ids: Sequence[int], embeds_TH: Tensor, text_ids: Sequence[int]
-    ) -> Steps[tuple[int, ...]]:
-        """The same words with the place that they have when they follow these ``ids`` (T) in an empty ``context``.
-
-        Up to the first bracket the words stand, as many tokens of a place are decoded as that one had at most and one
-        more, and the rest stands again. Returns ``text_ids`` where they tell no place.
-        """
-        decode = self._ponder.format.vocabulary.decode
-        pieces = [decode([token]) for token in text_ids]
-        opens = next((n for n, piece in enumerate(pieces) if "[" in piece), len(pieces))
-        closes = next((n for n in range(opens, len(pieces)) if "]" in pieces[n]), len(pieces))
-        if closes == len(pieces):
-            return tuple(text_ids)
-        begun = [self._t_yes, *text_ids[: opens + 1]]
-        embeds_TH = torch.cat([embeds_TH, self._ponder.embed(begun)])
-        hidden_NH = yield Append(session=context, ids=[*ids, *begun], embeds_TH=embeds_TH, num_wanted=1)
-        place: list[int] = []
-        while True:
-            (token,) = self._greedy(hidden_NH, self._is_text_V)
-            if "]" in decode([token]):
-                return (*text_ids[: opens + 1], *place, *text_ids[closes:])
-            if len(place) > closes - opens:
-                return tuple(text_ids)
-            place.append(token)
-            hidden_NH = yield self._append(context, [token], num_wanted=1)
 
     def _limit(self, context: Session, before: SavedState, num_kept: int, exactly: int | None) -> int:
         """Tokens the next text may have while ``num_kept`` positions stay free; ContextFull if that is too few."""

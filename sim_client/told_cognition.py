@@ -1,7 +1,7 @@
 """PONDER's stand-in that knows the task: what does the hand alone make of perfect cognition?
 
 Every query is answered with the simulator's own subgoal of that instant, as the numbers that a POUNCE trained by itself
-has learned to act from (`ponderpounce.training.stand_in`, stage ``motor`` of the recipe ``small``). To any other POUNCE
+has learned to act from (`dual_system.training.stand_in`, stage ``motor`` of the recipe ``small``). To any other POUNCE
 they mean nothing. Told places can be made as wrong as a PONDER's are: the hand then misses as it would with one.
 """
 
@@ -13,10 +13,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from dual_system.training.countdown import is_waiting, stood_at, told_until
+from dual_system.training.places import misplaced
+from dual_system.training.stand_in import stand_in
 
-from ponderpounce.training.countdown import is_waiting, stood_at, told_until
-from ponderpounce.training.places import misplaced
-from ponderpounce.training.stand_in import stand_in
 from protocol import messages as m
 from protocol import topics
 from protocol.link import Link, is_of_episode

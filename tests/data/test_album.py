@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ponderpounce.data.album import INSTRUCTION, REFUSED, Studio, main
-from ponderpounce.data.dataset import Dataset
-from ponderpounce.tasks.imitation.insert_peg import InsertPeg
-from ponderpounce.tasks.scene import CUBE_COLORS
-from ponderpounce.tasks.task import Task
+from dual_system.data.album import INSTRUCTION, REFUSED, Studio, main
+from dual_system.data.dataset import Dataset
+from dual_system.tasks.imitation.insert_peg import InsertPeg
+from dual_system.tasks.scene import CUBE_COLORS
+from dual_system.tasks.task import Task
 
 NUM_SCENES = 24
 _SAID = re.compile(r"(highlighted )?(\w+ cube|button) at <(\d+), (\d+)>")

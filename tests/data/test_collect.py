@@ -15,21 +15,21 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ponderpounce.data import collect as module
-from ponderpounce.data.album import AlbumOptions
-from ponderpounce.data.card import card
-from ponderpounce.data.collect import COLLECTING, COLLECTION_PATH, CollectOptions, collect, disk_needed
-from ponderpounce.data.dart import DART
-from ponderpounce.data.dataset import Dataset
-from ponderpounce.data.episode import Package
-from ponderpounce.data.errors import DatasetError
-from ponderpounce.data.jobs import Job
-from ponderpounce.data.lerobot_v3 import ALBUM
-from ponderpounce.data.rollout import UNSOLVED
-from ponderpounce.data.shove import SHOVES
-from ponderpounce.data.store import Store
-from ponderpounce.tasks.imitation.insert_peg import InsertPeg
-from ponderpounce.tasks.task import Task
+from dual_system.data import collect as module
+from dual_system.data.album import AlbumOptions
+from dual_system.data.card import card
+from dual_system.data.collect import COLLECTING, COLLECTION_PATH, CollectOptions, collect, disk_needed
+from dual_system.data.dart import DART
+from dual_system.data.dataset import Dataset
+from dual_system.data.episode import Package
+from dual_system.data.errors import DatasetError
+from dual_system.data.jobs import Job
+from dual_system.data.lerobot_v3 import ALBUM
+from dual_system.data.rollout import UNSOLVED
+from dual_system.data.shove import SHOVES
+from dual_system.data.store import Store
+from dual_system.tasks.imitation.insert_peg import InsertPeg
+from dual_system.tasks.task import Task
 
 TASKS, EPISODES = ("PickHighlight", "VideoUnmask"), 3  # names only: nothing is simulated here
 WorkOut = Callable[[Job], Package]

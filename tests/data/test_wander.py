@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ponderpounce.data.dataset import Dataset
-from ponderpounce.data.episode import WANDERING, EpisodeWriter, Rows, unpack
-from ponderpounce.data.video import FPS
-from ponderpounce.data.wander import REFUSED, Wanderers, main
-from ponderpounce.tasks.imitation.insert_peg import InsertPeg
-from ponderpounce.tasks.scene import CUBE_COLORS
-from ponderpounce.tasks.task import Task
+from dual_system.data.dataset import Dataset
+from dual_system.data.episode import WANDERING, EpisodeWriter, Rows, unpack
+from dual_system.data.video import FPS
+from dual_system.data.wander import REFUSED, Wanderers, main
+from dual_system.tasks.imitation.insert_peg import InsertPeg
+from dual_system.tasks.scene import CUBE_COLORS
+from dual_system.tasks.task import Task
 
 LOOKS = 9
 _SAID = re.compile(r"pick up the (?:\w+ )?highlighted cube at <(\d+), (\d+)>, which is (\w+)")

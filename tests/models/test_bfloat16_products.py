@@ -6,9 +6,8 @@ import copy
 
 import pytest
 import torch
+from dual_system.models.bfloat16_products import Bfloat16Linear, multiply_in_bfloat16
 from torch import nn
-
-from ponderpounce.models.bfloat16_products import Bfloat16Linear, multiply_in_bfloat16
 
 _ROUNDING = 2**-8
 

@@ -2,10 +2,9 @@
 
 import pytest
 import torch
+from dual_system.models.few_bits import STEP_OF_STD, narrowed, rounded, shape_of_codes, widened
 from hypothesis import example, given
 from hypothesis import strategies as st
-
-from ponderpounce.models.few_bits import STEP_OF_STD, narrowed, rounded, shape_of_codes, widened
 
 BITS = sorted(STEP_OF_STD)
 SHAPES = st.one_of(

@@ -6,7 +6,6 @@ import re
 
 from hypothesis import given
 from hypothesis import strategies as st
-
 from ponder_server.election import Said, elected, elected_place
 
 NEAR = 30

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from dual_system.training.stand_in import stand_in
 
-from ponderpounce.training.stand_in import stand_in
 from protocol import messages as m
 from protocol.link import Link
 from protocol.topics import COGNITION, SUBGOAL

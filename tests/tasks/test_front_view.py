@@ -6,10 +6,10 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ponderpounce.tasks.environment import make_environment
-from ponderpounce.tasks.front_view import front_pixels
-from ponderpounce.tasks.scene import FRONT
-from ponderpounce.tasks.sight import extrinsic, intrinsic, project
+from dual_system.tasks.environment import make_environment
+from dual_system.tasks.front_view import front_pixels
+from dual_system.tasks.scene import FRONT
+from dual_system.tasks.sight import extrinsic, intrinsic, project
 
 PHYSICS = make_environment("PickHighlight", render=False).physics
 ON_THE_TABLE = st.tuples(st.floats(-0.4, 0.2), st.floats(-0.4, 0.4), st.floats(0.0, 0.3))

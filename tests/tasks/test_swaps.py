@@ -8,10 +8,10 @@ from itertools import product
 import numpy as np
 import pytest
 
-from ponderpounce.tasks.front_view import front_pixels
-from ponderpounce.tasks.geometry import Spot
-from ponderpounce.tasks.swaps import SWAP_STEPS, Swap, nearest, spots_after
-from ponderpounce.tasks.task import make_task
+from dual_system.tasks.front_view import front_pixels
+from dual_system.tasks.geometry import Spot
+from dual_system.tasks.swaps import SWAP_STEPS, Swap, nearest, spots_after
+from dual_system.tasks.task import make_task
 
 SPOTS = (
     Spot(x_m=0.0, y_m=0.0, yaw_rad=0.1),

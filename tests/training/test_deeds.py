@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import pytest
+from dual_system.training.augment import View
+from dual_system.training.deeds import deeds, narration, passing_side
 from hypothesis import given
 from hypothesis import strategies as st
-
-from ponderpounce.training.augment import View
-from ponderpounce.training.deeds import deeds, narration, passing_side
 
 DONE = st.lists(st.tuples(st.sampled_from(["pick at", "put onto a target at", "move left to"]), st.integers(0, 3)))
 

@@ -1,0 +1,263 @@
+"""PONDER on disk: a HuggingFace-layout folder, checked name by name before a single weight is read.
+
+    config.json          transformers' Qwen3.5 configuration
+    tokenizer.json       the tokenizer
+    model.safetensors    the weights, or model.safetensors.index.json and its shards
+    ponder.json          what PONDER adds: carriers, image size, whether it speaks, how demonstrations are sampled
+
+A public Qwen3.5 checkpoint has no ponder.json and loads as it is; its carriers are untrained padding rows. Loaded in
+the dtype it was written in, it is written back bit for bit, multi-token prediction included.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+from transformers.models.qwen3_5 import Qwen3_5Config
+
+from dual_system.models.config_json import from_json
+from dual_system.models.ponder.context import ContextFormat
+from dual_system.models.ponder.network import Ponder, image_grid, skeleton, token_px
+from dual_system.models.ponder.observation import WHOLE_VIEWS, ObservationReader
+from dual_system.models.ponder.showing import AS_IN_THE_PAPER, Showing
+from dual_system.models.ponder.vocabulary import Vocabulary
+
+CONFIG_NAME = "config.json"
+OWN_NAME = "ponder.json"
+INDEX_NAME = "model.safetensors.index.json"
+SINGLE_NAME = "model.safetensors"
+SMALL_PAIR = "small_pair"
+"""Key of ponder.json under which the demo's PONDER declares its `CropReader`."""
+MTP_PREFIX = "mtp."  # multi-token prediction: in public checkpoints, not in transformers' Qwen3.5
+MAX_SHARD_BYTES = 5_000_000_000
+MAX_NAMES_SHOWN = 5
+
+
+class CheckpointError(ValueError):
+    """A checkpoint folder does not hold the network its config.json describes."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredPonder:
+    """Contents of ponder.json. An absent field has its default, which is the paper's; an unknown one is refused."""
+
+    format: Literal["ponderpounce.ponder/1"] = "ponderpounce.ponder/1"
+    num_carriers: int = 1
+    first_carrier_id: int | None = None
+    """None: the first row after the tokenizer's last id."""
+    image_px: tuple[int, int] = (256, 256)
+    speaks: bool = True
+    demonstrations: Showing = AS_IN_THE_PAPER
+    is_random: bool = True
+    """The carriers were never trained."""
+
+
+def load_ponder(directory: Path, *, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Ponder:
+    """Reads a checkpoint folder.
+
+    Raises FileNotFoundError for a file that is not there, CheckpointError naming every missing, extra or
+    misshapen tensor, and ValueError for a configuration that contradicts itself.
+    """
+    config_path = directory / CONFIG_NAME
+    if not config_path.is_file():
+        raise FileNotFoundError(f"{config_path}: not a checkpoint folder (--checkpoint DIR needs config.json).")
+    raw = _read_json(config_path)
+    if raw.get("model_type") != "qwen3_5":
+        raise CheckpointError(f"{config_path}: model_type is {raw.get('model_type')!r}; PONDER reads 'qwen3_5'.")
+    qwen_config = Qwen3_5Config.from_dict(raw)
+    vocabulary = Vocabulary.load(directory)
+    stored, reader = _read_stored(directory)
+    first_carrier_id = stored.first_carrier_id
+    context_format = ContextFormat(
+        vocabulary=vocabulary,
+        num_carriers=stored.num_carriers,
+        first_carrier_id=vocabulary.num_tokens if first_carrier_id is None else first_carrier_id,
+        image_grid=image_grid(qwen_config, stored.image_px),
+        token_px=token_px(qwen_config),
+        reader=reader,
+        speaks=stored.speaks,
+        demonstrations=stored.demonstrations,
+    )
+    if qwen_config.image_token_id != vocabulary.image_pad:
+        raise CheckpointError(
+            f"{config_path}: image_token_id is {qwen_config.image_token_id}, but tokenizer.json says "
+            f"<|image_pad|> is {vocabulary.image_pad}; the two files are from different checkpoints."
+        )
+    files = _files_by_tensor(directory)
+    shapes = {name: tuple(tensor.shape) for name, tensor in _own_tensors(skeleton(qwen_config)).items()}
+    if any(name.startswith(MTP_PREFIX) for name in files):
+        shapes |= mtp_shapes(qwen_config.text_config, shapes)
+    _check_tensors(directory, files, shapes, tied=qwen_config.tie_word_embeddings)
+    ponder = Ponder(qwen_config, context_format, image_px=stored.image_px, device=device, dtype=dtype)
+    ponder.is_random = stored.is_random
+    _read_tensors(files, ponder)
+    return ponder
+
+
+def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_SHARD_BYTES) -> None:
+    """Writes a folder that :func:`load_ponder` and transformers' ``from_pretrained`` both read.
+
+    Raises FileExistsError rather than mix two checkpoints in one folder.
+    """
+    if (directory / CONFIG_NAME).exists():
+        raise FileExistsError(f"{directory} already holds a checkpoint; save into a new folder.")
+    directory.mkdir(parents=True, exist_ok=True)
+    ponder.qwen.config.save_pretrained(directory)
+    ponder.format.vocabulary.save(directory)
+    stored = StoredPonder(
+        num_carriers=ponder.format.num_carriers,
+        first_carrier_id=ponder.format.first_carrier_id,
+        image_px=ponder.image_px,
+        speaks=ponder.format.speaks,
+        demonstrations=ponder.format.demonstrations,
+        is_random=ponder.is_random,
+    )
+    values = asdict(stored)
+    if ponder.format.reader != WHOLE_VIEWS:
+        values[SMALL_PAIR] = asdict(cast(Any, ponder.format.reader))
+    (directory / OWN_NAME).write_text(json.dumps(values, indent=2) + "\n")
+    shards: list[dict[str, Tensor]] = [{}]
+    shard_bytes = 0
+    for name, tensor in (_own_tensors(ponder.qwen) | ponder.mtp).items():
+        if shards[-1] and shard_bytes + tensor.nbytes > max_shard_bytes:
+            shards.append({})
+            shard_bytes = 0
+        shards[-1][name] = tensor.contiguous()
+        shard_bytes += tensor.nbytes
+    if len(shards) == 1:
+        save_file(shards[0], directory / SINGLE_NAME, metadata={"format": "pt"})
+        return
+    weight_map: dict[str, str] = {}
+    for number, shard in enumerate(shards, start=1):
+        file_name = f"model-{number:05d}-of-{len(shards):05d}.safetensors"
+        save_file(shard, directory / file_name, metadata={"format": "pt"})
+        weight_map |= dict.fromkeys(shard, file_name)
+    total_size = sum(tensor.nbytes for shard in shards for tensor in shard.values())
+    index = {"metadata": {"total_size": total_size}, "weight_map": weight_map}
+    (directory / INDEX_NAME).write_text(json.dumps(index, indent=2) + "\n")
+
+
+def weights_hash(ponder: Ponder) -> str:
+    """12 hex digits of sha256 over the name, dtype, shape and bytes of every tensor: provenance.
+
+    Reads every weight once, which takes seconds per ten gigabytes: compute it when a network is loaded.
+    """
+    digest = hashlib.sha256()
+    for name, tensor in sorted(_own_tensors(ponder.qwen).items()):
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
+        flat = tensor.detach().contiguous().reshape(-1).view(torch.uint8)
+        digest.update(flat.cpu().numpy().data)
+    return digest.hexdigest()[:12]
+
+
+def mtp_shapes(text_config: Any, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
+    """The multi-token prediction block that belongs to a network with tensors of these ``shapes``.
+
+    Attention layers like the network's own, behind a projection of [embedding; hidden] and before a norm. Source:
+    tensor names of public Qwen3.5 checkpoints; the sum is their published number of parameters.
+    """
+    hidden = text_config.hidden_size
+    like = f"model.language_model.layers.{text_config.layer_types.index('full_attention')}."
+    layer = {name.removeprefix(like): shape for name, shape in shapes.items() if name.startswith(like)}
+    norms = ("norm", "pre_fc_norm_embedding", "pre_fc_norm_hidden")
+    block: dict[str, tuple[int, ...]] = {"fc.weight": (hidden, 2 * hidden)}
+    block |= {f"{norm}.weight": (hidden,) for norm in norms}
+    for index in range(getattr(text_config, "mtp_num_hidden_layers", 1)):
+        block |= {f"layers.{index}.{name}": shape for name, shape in layer.items()}
+    return {MTP_PREFIX + name: shape for name, shape in block.items()}
+
+
+def _own_tensors(module: nn.Module) -> dict[str, Tensor]:
+    """State dict without the second name of a tied tensor."""
+    seen: set[int] = set()
+    own = {}
+    for name, tensor in module.state_dict(keep_vars=True).items():
+        if id(tensor) not in seen:
+            seen.add(id(tensor))
+            own[name] = tensor.detach()
+    return own
+
+
+def _read_json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text())
+    except ValueError as error:
+        raise CheckpointError(f"{path} is no JSON: {error}") from error
+
+
+def _open(path: Path) -> Any:
+    try:
+        return safe_open(path, framework="pt")
+    except SafetensorError as error:
+        raise CheckpointError(f"{path} is no safetensors file, or was cut short: {error}") from error
+
+
+def _read_stored(directory: Path) -> tuple[StoredPonder, ObservationReader]:
+    path = directory / OWN_NAME
+    if not path.is_file():
+        return StoredPonder(), WHOLE_VIEWS
+    values = _read_json(path)
+    declared = values.pop(SMALL_PAIR, None) if isinstance(values, dict) else None
+    stored = from_json(StoredPonder, values, str(path))
+    if declared is None:
+        return stored, WHOLE_VIEWS
+    from dual_system.models.small_pair.reading import CropReader  # here: no other checkpoint may need it
+
+    return stored, from_json(CropReader, declared, f"{path}: {SMALL_PAIR}")
+
+
+def _files_by_tensor(directory: Path) -> dict[str, Path]:
+    """Tensor name -> the safetensors file that holds it."""
+    index_path = directory / INDEX_NAME
+    if index_path.is_file():
+        weight_map: dict[str, str] = _read_json(index_path)["weight_map"]
+        for file_name in sorted(set(weight_map.values())):
+            if not (directory / file_name).is_file():
+                raise FileNotFoundError(f"{directory / file_name}: named by {INDEX_NAME}, but not there.")
+        return {name: directory / file_name for name, file_name in weight_map.items()}
+    single = directory / SINGLE_NAME
+    if not single.is_file():
+        raise FileNotFoundError(f"{directory}: neither {SINGLE_NAME} nor {INDEX_NAME} is there.")
+    with _open(single) as file:
+        return dict.fromkeys(file.keys(), single)
+
+
+def _check_tensors(
+    directory: Path, files: dict[str, Path], expected_shapes: dict[str, tuple[int, ...]], *, tied: bool
+) -> None:
+    found = set(files)
+    if tied:
+        found.discard("lm_head.weight")  # some exporters write the tied tensor twice
+    faults = [f"missing {name} {expected_shapes[name]}" for name in sorted(set(expected_shapes) - found)]
+    faults += [f"extra {name}" for name in sorted(found - set(expected_shapes))]
+    for path in sorted(set(files.values())):
+        with _open(path) as file:
+            in_file = set(file.keys())
+            for name in sorted(n for n in found & set(expected_shapes) if files[n] == path):
+                if name not in in_file:
+                    faults.append(f"missing {name}: {INDEX_NAME} places it in {path.name}, which lacks it")
+                elif (shape := tuple(file.get_slice(name).get_shape())) != expected_shapes[name]:
+                    faults.append(f"misshapen {name}: {shape}, config.json says {expected_shapes[name]}")
+    if faults:
+        rest = len(faults) - MAX_NAMES_SHOWN
+        shown = "; ".join(faults[:MAX_NAMES_SHOWN]) + (f"; and {rest} more" if rest > 0 else "")
+        raise CheckpointError(f"{directory} does not match its config.json ({len(faults)} faults): {shown}.")
+
+
+@torch.no_grad()
+def _read_tensors(files: dict[str, Path], ponder: Ponder) -> None:
+    own = _own_tensors(ponder.qwen)
+    for path in sorted(set(files.values())):
+        with _open(path) as file:
+            for name in file.keys():  # noqa: SIM118 - safe_open is not a mapping
+                if name in own and files.get(name) == path:
+                    own[name].copy_(file.get_tensor(name))
+                elif name.startswith(MTP_PREFIX) and files.get(name) == path:
+                    ponder.mtp[name] = file.get_tensor(name)  # mapped, not read: until it is saved it costs no memory

@@ -1,0 +1,54 @@
+"""The code of a place, and the snap of noisy numbers to the nearest code, for a POUNCE with ``rounds_places``.
+
+The demo's PONDER was taught to put a place of the 256 px picture into C as sines and cosines of both coordinates, with
+periods from 512 px, two pictures, down to 16 px, and then the coordinates themselves. A network that is unsure of two
+places gives the mean of their codes, whose slow waves lie between the two, where nothing is; the nearest code is at
+the likelier one.
+"""
+
+# F numbers of a code, N places along a side
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+PLACE_PX = 256
+"""Side of the picture whose pixels are counted."""
+_PERIODS = 2.0 ** np.arange(1, -5, -1)  # of the picture's side
+NUM_PLACE_FEATURES = 2 * (2 * len(_PERIODS) + 1)
+_VALUE_SCALE = 2 * 3**0.5  # a coordinate is uniform in [-1/2, 1/2] at most: rms 1
+_STEP_PX = 0.5
+
+
+def place_features(yx_px: tuple[float, float]) -> NDArray[np.float32]:
+    """A place in a 256 px picture as (NUM_PLACE_FEATURES,) numbers, rms 1."""
+    yx = np.array(yx_px, np.float64) / PLACE_PX
+    angles = 2 * np.pi * np.outer(1 / _PERIODS, yx).ravel()
+    waves = 2**0.5 * np.concatenate([np.sin(angles), np.cos(angles)])
+    return np.concatenate([waves, (yx - 0.5) * _VALUE_SCALE]).astype(np.float32)
+
+
+def snap_to_code(cognition: Tensor) -> Tensor:
+    """Cognition (..., H) with its first NUM_PLACE_FEATURES numbers replaced by the nearest place's code.
+
+    Places are half a pixel apart. Backwards it is the identity (straight through): a rounded code has no slope.
+    """
+    numbers, rest = cognition.tensor_split([NUM_PLACE_FEATURES], dim=-1)
+    codes_NF = _codes(numbers.device)
+    found = torch.empty_like(numbers)
+    for side in (0, 1):  # y and x have numbers of their own
+        own_N, own = codes_NF[:, side::2], numbers.detach()[..., side::2]
+        found[..., side::2] = own_N[(own_N.square().sum(dim=1) - 2 * own @ own_N.T).argmin(dim=-1)]
+    return torch.cat([numbers + (found - numbers).detach(), rest], dim=-1)
+
+
+@functools.cache
+def _codes(device: torch.device) -> Tensor:
+    """Codes (N, F) of the places on the picture's diagonal: every y, and every x."""
+    along = np.arange(0, PLACE_PX, _STEP_PX)
+    return torch.from_numpy(np.stack([place_features((px, px)) for px in along])).to(device)

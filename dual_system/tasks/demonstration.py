@@ -1,0 +1,62 @@
+"""The conditioning video: what happens before the robot is asked to act, kept as states and rendered when looked at.
+
+A frame is kept as the world's state and the text that goes with it, some kilobytes. Pictures are made on demand:
+PONDER reads one a second, and rendering them all would take longer than the whole episode.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from dual_system.tasks import captions
+from dual_system.tasks.captions import Caption
+from dual_system.tasks.geometry import Array
+from dual_system.tasks.oracle import Motions
+from dual_system.tasks.physics import Physics, PhysicsState
+from dual_system.tasks.task import Shown, Task
+
+Look = Callable[[Shown], list[captions.Pixel] | None]  # where the front camera sees what a part grounds, in order
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """One frame of the video, 50 ms after the one before unless something unrecorded lies between."""
+
+    physics: PhysicsState
+    caption: Caption
+    memory: Any
+    """The task's, of what has happened by then."""
+
+
+def perform(
+    task: Task[Any, Any], layout: Any, parts: Sequence[Shown], physics: Physics, look: Look
+) -> tuple[tuple[Row, ...], Array | None]:
+    """Acts out a demonstration in a freshly arranged scene.
+
+    Returns its frames and the last action (8,), which is still in force; None if there was nothing to act out. A frame
+    is the world after an action, under the text of the part that the action belongs to: texts change when a motion
+    ends, not, as later, one step after a predicate.
+    """
+    rows: list[Row] = []
+    memory: Any = None
+    caption: Caption | None = None
+    action: Array | None = None
+    motions = Motions(physics)
+    for index, part in enumerate(parts):
+        for target in part.motion(motions):
+            action = target.astype(np.float64)
+            physics.advance(action)
+            task.stage(physics, layout, memory, physics.elapsed_steps() - 1)
+            memory = task.remember(memory, physics, layout)
+            if part.is_recorded:
+                caption = captions.follow(caption, index, part.text, partial(look, part))
+                rows.append(Row(physics=physics.save(), caption=caption, memory=memory))
+        if part.afterwards is not None:
+            part.afterwards(physics)
+            physics.refresh()
+    return tuple(rows), action

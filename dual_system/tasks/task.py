@@ -1,0 +1,293 @@
+"""What a task is: a scene, a list of subtasks, and a registry of the tasks that exist.
+
+Task, physics and environment are three things. Physics knows numbers by name, a task knows what they mean, the
+environment knows the order of calls. A task never steps, physics never scores, predicates are pure readings. Task
+objects hold no state: what one episode asks is its layout, what has happened so far is its memory, and both are
+frozen values, so that an episode can be saved and restored.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import importlib.util
+import pkgutil
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Generic, TypeVar
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from dual_system.tasks.oracle import Motions
+from dual_system.tasks.panda import PANDA_WRISTCAM, Robot
+from dual_system.tasks.physics import Physics
+
+FAMILIES = ("counting", "permanence", "reference", "imitation")
+
+LayoutT = TypeVar("LayoutT")
+MemoryT = TypeVar("MemoryT")
+TaskT = TypeVar("TaskT", bound="type[Task[Any, Any]]")
+
+
+class TaskError(ValueError):
+    """A task or difficulty was asked for that does not exist."""
+
+
+def never(physics: Physics, memory: Any) -> str | None:
+    """The failure predicate of a subtask that cannot fail."""
+    return None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Subtask:
+    """One entry of an episode's list."""
+
+    text: str  # template, see `captions`
+    is_done: Callable[[Physics, Any], bool]
+    motion: Callable[[Motions], Iterator[NDArray[np.float32]]]  # what the oracle does for it
+    failure: Callable[[Physics, Any], str | None] = never  # the reason, or None while there is none
+    grounds: tuple[str, ...] = ()  # bodies whose pixels fill the template's coordinates, in order
+    carries: tuple[str, ...] = ()  # the cube that must be in the hand for it, and others that will do
+    way: str = ""  # what `located` adds to the text; nothing in most tasks, whose texts tell places anyway
+    way_grounds: tuple[str, ...] = ()  # bodies whose pixels fill its coordinates, in order
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shown:
+    """One part of a demonstration: what the robot does in it, and the text that goes with it. It cannot fail."""
+
+    text: str  # template, see `captions`
+    motion: Callable[[Motions], Iterator[NDArray[np.float32]]]
+    grounds: tuple[str, ...] = ()  # as in a subtask
+    way: str = ""  # as in a subtask
+    way_grounds: tuple[str, ...] = ()
+    is_recorded: bool = True  # False: it happens, but the video leaves it out
+    afterwards: Callable[[Physics], None] | None = None  # what is moved in the scene when the part is over
+
+
+StepT = TypeVar("StepT", Subtask, Shown)
+
+
+def located(step: StepT) -> StepT:
+    """Returns the step with the places of its way in its grounded text, where upstream tells none.
+
+    "move left to <102, 101>, then <83, 103>" for "move left". Which target that is can be seen; a learner from scratch
+    is told, and since it acts for a while on what it heard last, also where it goes on from there.
+    """
+    if not step.way:
+        return step
+    return replace(step, text=step.text + step.way, grounds=step.way_grounds)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Thing:
+    """Something that stands in a scene and has a name; two may share one."""
+
+    name: str
+    body: str
+    is_movable: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reasoning:
+    """What must be kept in mind at one point of an episode, in words (paper, Table 6)."""
+
+    text: str  # template, see `captions`; the environment appends the current grounded subgoal
+    grounds: tuple[str, ...] = ()  # bodies whose pixels, now, fill the template's coordinates, in order
+
+
+class Task(ABC, Generic[LayoutT, MemoryT]):
+    """One kind of episode. Subclasses carry `@task(family=...)`, one file each.
+
+    All methods but `furnish`, `arrange` and `stage` are pure functions of their arguments. Of a demonstration's parts
+    only `Shown.afterwards` changes the physics.
+    """
+
+    name: ClassVar[str]
+    family: ClassVar[str]
+    robot: ClassVar[Robot] = PANDA_WRISTCAM
+    repeats_itself: ClassVar[bool] = False  # its episodes have rounds that look alike, see `forks`
+    retells_video: ClassVar[bool] = False  # `retold` changes the video and nothing of the scene after it
+
+    @abstractmethod
+    def furnish(self, spec: mujoco.MjSpec) -> None:
+        """Adds all props that any difficulty may need; those a layout leaves out stay parked."""
+
+    @abstractmethod
+    def sample(self, rng: np.random.Generator, difficulty: str) -> LayoutT:
+        """Draws what one episode looks like and asks for."""
+
+    @abstractmethod
+    def arrange(self, physics: Physics, layout: LayoutT) -> None:
+        """Places and paints the props of a freshly reset scene as the layout says."""
+
+    @abstractmethod
+    def instruction(self, layout: LayoutT) -> str:
+        """Returns the sentence the robot is given, upstream's first wording."""
+
+    @abstractmethod
+    def subtasks(self, layout: LayoutT) -> tuple[Subtask, ...]:
+        """Returns the ordered list of subtasks."""
+
+    def subtasks_after(self, layout: LayoutT, memory: MemoryT) -> tuple[Subtask, ...]:
+        """Returns the list as it should read after what has been done, where the list leaves open what comes first.
+
+        As long, and entry by entry with the same completion and failure: success is what it was. Of two cubes that are
+        both wanted either may come first; who followed the list from here on would otherwise be sent to the one that is
+        in the bin. The default is `subtasks`.
+        """
+        return self.subtasks(layout)
+
+    def demonstration(self, layout: LayoutT) -> tuple[Shown, ...]:
+        """Returns what happens before the robot is asked to act. The default is nothing.
+
+        The clock of `stage` runs through it; the memory of it is gone when the episode proper begins.
+        """
+        return ()
+
+    def reasoning(self, layout: LayoutT, index: int) -> Reasoning | None:
+        """Returns what subtask ``index`` needs from the past, by its family's schema in the paper's Table 6.
+
+        PONDER is taught to write it once, at the first transition after a demonstration.
+        """
+        return None
+
+    def retold(self, layout: LayoutT) -> tuple[LayoutT, ...]:
+        """Returns layouts whose episodes show other things at first and look the same later; see `forks`.
+
+        The instruction is the same, and so is the physics under the same actions, bit for bit, but for things that are
+        only shown. Once nothing is shown any more only memory tells which of them one is in, and what must be done
+        next is wrong in the others. Where only the video is another, `retells_video`, the physics need be the same but
+        for what motion leaves behind. The default is none.
+        """
+        return ()
+
+    def near_first(self, layout: LayoutT) -> LayoutT:
+        """Returns the same episode with an order that can be seen: what is nearest to the front camera comes first.
+
+        What counts as success is the same. Where a task asks for one order, or for one thing only, there is nothing to
+        choose: the default returns the layout. A drawn order nobody can foresee, so a learner can only guess at it.
+        """
+        return layout
+
+    def moving(self, layout: LayoutT, step: int) -> tuple[tuple[float, float, float], ...]:
+        """Returns where things are [m] that move by the step clock alone and must be followed, in the observation of
+        ``step``; those that have not begun to move count, too.
+
+        Empty when nothing moves any more. ``step`` counts from reset, a demonstration included. The default follows
+        nothing.
+        """
+        return ()
+
+    def underway(self, layout: LayoutT, step: int) -> tuple[int, int]:
+        """Returns when what is on its way (`moving`) in the observation of ``step`` left, and when it will be at rest,
+        were it for a moment.
+
+        ``step`` twice, and that is the default, where nothing is, or where it never rests.
+        """
+        return step, step
+
+    def laid_out(self, layout: LayoutT) -> tuple[tuple[tuple[float, float, float], ...], ...]:
+        """Returns where things lie [m] that are to be written down at the first look at a demonstration, the places of
+        one thing together and always in one order.
+
+        What is done with one of them hides it; written down before, its places can be copied. The default is nothing.
+        """
+        return ()
+
+    def due_step(self, layout: LayoutT) -> int | None:
+        """Returns when the arm is to begin with what must happen at one instant, in steps from reset on.
+
+        None, and that is the default, where nothing must.
+        """
+        return None
+
+    def things(self, layout: LayoutT, step: int, memory: MemoryT | None = None) -> tuple[Thing, ...]:
+        """Returns all that is to be named in the observation of ``step`` (`data.album`). The default names nothing."""
+        return ()
+
+    def imagined(self, rng: np.random.Generator, layout: LayoutT) -> MemoryT | None:
+        """Draws what may have happened, where a scene that stands still shows traces of it (`data.album`).
+
+        The default is None: nothing has.
+        """
+        return None
+
+    @classmethod
+    def can_be_forked(cls) -> bool:
+        """True if there may be other pasts that lead to the same present."""
+        return cls.repeats_itself or cls.retold is not Task.retold
+
+    @abstractmethod
+    def remember(self, memory: MemoryT | None, physics: Physics, layout: LayoutT) -> MemoryT:
+        """Returns the memory after one more observation; ``memory`` is None at the first."""
+
+    def stage(self, physics: Physics, layout: LayoutT, memory: MemoryT | None, step: int) -> None:
+        """Moves scripted things to where the observation of ``step`` shall show them. The default moves nothing.
+
+        Called after every control step with the number of control steps since reset, and at reset with 0. The memory
+        is that of the observation before: what is seen now can move things in the next one. It is None at reset.
+        """
+        return
+
+    def is_accomplished(self, memory: MemoryT, layout: LayoutT) -> bool:
+        """True if the whole task is done whatever the list says. The default leaves it to the list."""
+        return False
+
+
+_REGISTRY: dict[str, type[Task[Any, Any]]] = {}
+
+
+def task(*, family: str) -> Callable[[TaskT], TaskT]:
+    """Registers a task under its class name. Raises TaskError for an unknown family or a name taken twice."""
+    if family not in FAMILIES:
+        raise TaskError(f"unknown task family {family!r}; expected one of {', '.join(FAMILIES)}")
+
+    def register(cls: TaskT) -> TaskT:
+        name = cls.__name__
+        if name in _REGISTRY:
+            raise TaskError(f"task {name!r} is defined in both {_REGISTRY[name].__module__} and {cls.__module__}")
+        cls.name, cls.family = name, family
+        _REGISTRY[name] = cls
+        return cls
+
+    return register
+
+
+def task_names() -> tuple[str, ...]:
+    """Returns the names of all tasks that can be made, sorted."""
+    _import_all_tasks()
+    return tuple(sorted(_REGISTRY))
+
+
+def chosen_tasks(names: Sequence[str]) -> tuple[str, ...]:
+    """Returns the tasks of a program's ``--tasks``, sorted, each once; "all" stands for all. Raises TaskError."""
+    if "all" in names:
+        return task_names()
+    for name in names:
+        make_task(name)
+    return tuple(sorted(set(names)))
+
+
+def make_task(name: str) -> Task[Any, Any]:
+    """Returns a new task object. Raises TaskError for an unknown name."""
+    known = task_names()
+    if name not in known:
+        close = difflib.get_close_matches(name, known, n=1)
+        hint = f"Did you mean {close[0]!r}? " if close else ""
+        raise TaskError(f"unknown task {name!r}. {hint}sim-client --list-tasks shows all.")
+    return _REGISTRY[name]()
+
+
+def _import_all_tasks() -> None:
+    """Imports every module of the family packages: a task registers itself where it is defined, and nowhere else."""
+    for family in FAMILIES:
+        package_name = f"{__package__}.{family}"
+        if importlib.util.find_spec(package_name) is None:
+            continue
+        package = importlib.import_module(package_name)
+        for module in pkgutil.iter_modules(package.__path__):
+            importlib.import_module(f"{package_name}.{module.name}")

@@ -1,0 +1,285 @@
+"""A collected dataset as training reads it: whole episodes, decoded once and kept while there is room."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dual_system.data.dataset import Dataset, Entry
+from dual_system.data.episode import CAMERAS, Rows
+from dual_system.data.video import FPS
+from dual_system.models.action_space import ActionSpace, actions_in, num_dims, states_in
+from dual_system.models.images import resized
+from dual_system.models.normalisation import Quantiles, RobotStatistics
+from dual_system.models.pi05.prompt import with_subgoal
+from dual_system.models.ponder.context import ContextFormat
+from dual_system.models.ponder.coordinates import normalised_text
+from dual_system.models.ponder.showing import Showing
+from dual_system.training.chunks import chunk_ticks
+from dual_system.training.episode import Frame, TrainingEpisode
+from dual_system.training.picture_store import PictureStore, Views
+
+_QUANTILES = (0.01, 0.99)
+_SYSTEMS = ("pounce", "ponder")
+_MIN_REACH = 1e-3
+_MIN_SPAN = 1e-3
+"""A dimension that hardly moves is not blown up to fill [-1, 1]."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PictureSizes:
+    """At which sizes a run reads pictures. Kept so, a set of hundreds of episodes stays in memory."""
+
+    form: ContextFormat | None = None
+    """PONDER's, which says what it reads of the views; None: PONDER is not run."""
+    pounce_px: int | None = None
+    """Side of POUNCE's pictures, to which they are resized as serving does; None: POUNCE reads none."""
+
+    @property
+    def key(self) -> str:
+        """Equal for equal pictures of one episode."""
+        return f"{None if self.form is None else (self.form.reader, self.form.image_px)} {self.pounce_px}"
+
+    def of_ponder(self, views: tuple[Frame, ...]) -> tuple[Frame, ...]:
+        return () if self.form is None else tuple(self.form.reader.images(views, self.form.image_px))
+
+    def of_pounce(self, views: tuple[Frame, ...]) -> tuple[Frame, ...]:
+        return () if self.pounce_px is None else tuple(resized(view, self.pounce_px) for view in views)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Source:
+    """Where an episode lies."""
+
+    dataset: Dataset
+    entry: Entry
+
+    def rows(self) -> Rows:
+        return self.dataset.rows(self.entry.index)
+
+    def frames(self, rows: Sequence[int]) -> Iterator[tuple[Frame, ...]]:
+        """Every camera's picture at each of these rows."""
+        return zip(*(self.dataset.frames(self.entry.index, camera, rows) for camera in CAMERAS), strict=True)
+
+    @property
+    def key(self) -> bytes:
+        """Equal for equal pictures: the scene, what was done in it, and when it was rendered."""
+        rows = self.rows()
+        scene = f"{self.entry.task} {self.entry.seed} {self.entry.difficulty} {self.dataset.image_px}"
+        return b" ".join((scene.encode(), rows.state.tobytes(), rows.action.tobytes(), rows.is_rendered.tobytes()))
+
+
+class TrainingSet:
+    """Episodes by number. ``pp-collect`` and ``pp-export`` make the folders.
+
+    Where a dataset holds only some pictures (``--frames training``), a tick without its own has the one before it,
+    as in the video, and PONDER's texts are of the tick that was rendered (`TrainingEpisode.as_seen`).
+    """
+
+    def __init__(
+        self,
+        *roots: Path,
+        tasks: Sequence[str] = (),
+        sizes: PictureSizes | None = None,
+        cache_mb: int = 4000,
+        store: Path | None = None,
+        demo_hz: int = 1,
+    ) -> None:
+        """Reads the successful episodes of ``tasks``, or all.
+
+        Args:
+            roots: folders of datasets.
+            tasks: the tasks to read; () for all.
+            sizes: of the pictures; None reads none.
+            cache_mb: memory for pictures.
+            store: a folder for pictures at these sizes, to be read instead of videos from then on.
+            demo_hz: frames a second of demonstrations, a divisor of 20; reading one whose pictures were rendered more
+                seldom raises ValueError.
+
+        Raises:
+            DatasetError: a folder holds no dataset of ours.
+            ValueError: no episode of these tasks is in a folder, or the folders' pictures differ in size.
+        """
+        self._sizes, self._demo_hz = sizes or PictureSizes(), demo_hz
+        self._store = None if store is None else PictureStore(store, self._sizes.key)
+        self._sources = [source for root in roots for source in _sources(Dataset(root), tasks)]
+        found_px = {source.dataset.image_px for source in self._sources}
+        if len(found_px) > 1:
+            folders = ", ".join(map(str, roots))
+            raise ValueError(f"pictures of {sorted(found_px)} px in {folders}; collect all at one --image-px")
+        (self.image_px,) = found_px
+        self._cache: OrderedDict[int, TrainingEpisode] = OrderedDict()
+        self._cache_bytes = cache_mb * 1_000_000
+        self._cached_bytes = 0
+
+    def __len__(self) -> int:
+        return len(self._sources)
+
+    @property
+    def hash(self) -> str:
+        """16 hex digits over which episodes these are and what was done in them."""
+        digest = hashlib.blake2b(digest_size=8)
+        for source in self._sources:
+            entry = source.entry
+            digest.update(f"{entry.task} {entry.seed} {entry.instruction}".encode())
+            digest.update(source.rows().action.tobytes())
+        return digest.hexdigest()
+
+    @property
+    def names(self) -> list[tuple[str, int]]:
+        """Task and seed of every episode, in order."""
+        return [(source.entry.task, source.entry.seed) for source in self._sources]
+
+    def num_rows(self, number: int) -> int:
+        """Length of an episode, its demonstration included, without reading it."""
+        return self._sources[number].entry.num_rows
+
+    def showing(self) -> Showing | None:
+        """How these demonstrations are sampled; None if there are none.
+
+        To their end if most of those that end between two samples have their last frame rendered.
+        """
+        begins = [source.entry.num_demonstration_rows for source in self._sources]
+        shown = [(source, begin - 1) for source, begin in zip(self._sources, begins, strict=True) if begin]
+        ends = [bool(source.rows().is_rendered[last]) for source, last in shown if last % (FPS // self._demo_hz)]
+        return Showing(hz=self._demo_hz, to_its_end=2 * sum(ends) > len(ends)) if shown else None
+
+    def instructions(self) -> list[str]:
+        """Every instruction once, in order."""
+        return sorted({source.entry.instruction for source in self._sources})
+
+    def instructions_with_subgoals(self) -> list[str]:
+        """Every instruction, alone and with each subgoal of its episodes, in order: see `prompt.with_subgoal`."""
+        found = {
+            with_subgoal(source.entry.instruction, normalised_text(text))
+            for source in self._sources
+            for text in {"", *source.rows().grounded_subgoal}
+        }
+        return sorted(found)
+
+    def texts(self) -> list[str]:
+        """All that PONDER reads or writes in these episodes, each text once, in order."""
+        found = set()
+        for source in self._sources:
+            rows = source.rows()
+            written = {*rows.grounded_subgoal, *rows.demonstration_reasoning} - {""}
+            found |= {source.entry.instruction, *(normalised_text(text) for text in written)}
+        return sorted(found)
+
+    def __getitem__(self, number: int) -> TrainingEpisode:
+        if number in self._cache:
+            self._cache.move_to_end(number)
+            return self._cache[number]
+        episode = self._read(number)
+        self._cache[number] = episode
+        self._cached_bytes += _num_bytes(episode)
+        while self._cached_bytes > self._cache_bytes and len(self._cache) > 1:
+            _, dropped = self._cache.popitem(last=False)
+            self._cached_bytes -= _num_bytes(dropped)
+        return episode
+
+    def _read(self, number: int) -> TrainingEpisode:
+        source = self._sources[number]
+        entry, rows = source.entry, source.rows()
+        start = entry.num_demonstration_rows
+        showing = Showing(hz=self._demo_hz, to_its_end=start > 0 and bool(rows.is_rendered[start - 1]))
+        demo = showing.looks(start, FPS)
+        if blank := [row for row in demo if not rows.is_rendered[row]]:
+            raise ValueError(
+                f"{source.dataset.root}: the demonstration of {entry.task} {entry.seed} is to be sampled "
+                f"{self._demo_hz} times a second, and {len(blank)} of these {len(demo)} pictures were not rendered; "
+                f"collect with --demonstration-hz {self._demo_hz}"
+            )
+        rendered = np.maximum.accumulate(np.where(rows.is_rendered, np.arange(len(rows.is_rendered)), 0))
+        views, images = self._pictures(source, rendered[[*demo, *range(start, entry.num_rows)]].tolist())
+        episode = TrainingEpisode(
+            instruction=entry.instruction,
+            demo=tuple(images[: len(demo)]),
+            images=images[len(demo) :],
+            views=views[len(demo) :],
+            state_T8=rows.state[start:],
+            action_T8=rows.action[start:],
+            subgoals=rows.grounded_subgoal[start:],
+            is_transition_T=rows.is_transition[start:],
+            reasoning=rows.demonstration_reasoning[start],
+            imitated_from=entry.corrected_from,
+        )
+        return episode if self._sizes.form is None else episode.as_seen((rendered[start:] - start).clip(min=0))
+
+    def _pictures(self, source: _Source, rows: Sequence[int]) -> tuple[Views, Views]:
+        """POUNCE's views and PONDER's images of the rows, which may repeat."""
+        if self._sizes == PictureSizes():
+            return [()] * len(rows), [()] * len(rows)
+        once = sorted(set(rows))
+        views, images = (dict(zip(once, each, strict=True)) for each in self._decoded(source, once))
+        return [views[row] for row in rows], [images[row] for row in rows]
+
+    def _decoded(self, source: _Source, rows: Sequence[int]) -> tuple[Views, ...]:
+        """The same of different rows; from the store, if there is one and it has them."""
+        key = source.key + (f" {self._demo_hz}".encode() if self._demo_hz != 1 else b"")
+        if self._store is not None and (kept := self._store.read(key, len(rows), _SYSTEMS)) is not None:
+            return kept
+        whole = list(source.frames(rows))
+        views, images = [self._sizes.of_pounce(each) for each in whole], [self._sizes.of_ponder(each) for each in whole]
+        if self._store is not None:
+            self._store.write(key, dict(zip(_SYSTEMS, (views, images), strict=True)))
+        return views, images
+
+    def statistics(self, horizon: int, space: ActionSpace = "joint_delta", *, by_row: bool = False) -> RobotStatistics:
+        """Quantiles of the states as the network reads them, and of the actions as it learns them in an `action_space`.
+
+        All rows of a chunk are pooled, as the released RoboMME statistics are; ``by_row`` first brings every row to
+        the same spread (`RobotStatistics.reach`).
+        """
+        states, actions = [], []
+        for source in self._sources:
+            rows = source.rows()
+            own = ~rows.is_demonstration
+            state, action, begin = rows.state[own], rows.action[own], source.entry.corrected_from
+            ticks = chunk_ticks(np.arange(begin, len(action)), horizon, len(action))
+            state = state[begin:]
+            states.append(states_in(space, state).astype(np.float32))
+            actions.append(actions_in(space, action, state, ticks).astype(np.float32))
+        actions_MND = np.concatenate(actions)
+        reach_N = _reach(actions_MND[..., :-1]) if by_row else np.ones(horizon)
+        actions_MND[..., :-1] /= reach_N[:, None]
+        return RobotStatistics(
+            state=_quantiles(np.concatenate(states)),
+            action=_quantiles(actions_MND.reshape(-1, num_dims(space))),
+            space=space,
+            reach=tuple(reach_N.tolist()) if by_row else (),
+        )
+
+
+def _sources(dataset: Dataset, tasks: Sequence[str]) -> list[_Source]:
+    entries = [e for e in dataset.episodes if e.is_success and (not tasks or e.task in tasks)]
+    if not entries:
+        there = ", ".join(sorted({e.task for e in dataset.episodes}))
+        wanted = ", ".join(tasks) or "any task"
+        raise ValueError(f"{dataset.root} has no successful episode of {wanted}; it has {there}")
+    return [_Source(dataset=dataset, entry=entry) for entry in entries]
+
+
+def _reach(moves_MND: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Each row's rms move over that of all rows, dims weighed alike; never 0."""
+    squares_ND = np.square(moves_MND, dtype=np.float64).mean(axis=0)
+    share_N: NDArray[np.float64] = np.sqrt((squares_ND / squares_ND.mean(axis=0).clip(_MIN_SPAN**2)).mean(axis=1))
+    return share_N.clip(_MIN_REACH)
+
+
+def _quantiles(values: NDArray[np.float32]) -> Quantiles:
+    low, high = np.quantile(values.astype(np.float64), _QUANTILES, axis=0)
+    middle, half = (low + high) / 2, np.maximum(high - low, _MIN_SPAN) / 2
+    return Quantiles(q01=tuple((middle - half).tolist()), q99=tuple((middle + half).tolist()))
+
+
+def _num_bytes(episode: TrainingEpisode) -> int:
+    """Size of its pictures, each counted once however many rows share it."""
+    instants = {id(each): each for each in (*episode.demo, *episode.images, *episode.views)}
+    return sum(picture.nbytes for pictures in instants.values() for picture in pictures)

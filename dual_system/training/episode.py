@@ -1,0 +1,83 @@
+"""What training reads of a recorded episode."""
+
+# T ticks
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+Frame = NDArray[np.uint8]  # (height, width, 3) RGB
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrainingEpisode:
+    """What training reads of an episode of T ticks. Row k is the world before action k.
+
+    Raises:
+        ValueError: the columns differ in length, or ``imitated_from`` is none of the ticks.
+    """
+
+    instruction: str
+    demo: tuple[tuple[Frame, ...], ...]
+    """Per sampled instant of the demonstration, the images that PONDER reads; () without one."""
+    images: Sequence[tuple[Frame, ...]]
+    """Per tick, the images that PONDER reads of the views (`ObservationReader.images`); () where PONDER is not run."""
+    views: Sequence[tuple[Frame, ...]]
+    """Per tick, POUNCE's views in the order of the robot's cameras; () where POUNCE reads none."""
+    state_T8: NDArray[np.float32]
+    action_T8: NDArray[np.float32]
+    """Absolute joint targets and the gripper's command."""
+    subgoals: Sequence[str]
+    """T grounded texts; empty texts for data without annotations."""
+    is_transition_T: NDArray[np.bool_]
+    """Where another subgoal begins. Texts do not tell: two in a row may be the same, and one changes when its object
+    comes into sight."""
+    reasoning: str = ""
+    """What PONDER writes at the first transition after a demonstration; empty without one."""
+    imitated_from: int = 0
+    """The tick from which POUNCE imitates; before it a policy acted (`pp-collect correct`, DAgger)."""
+    seen_at_T: NDArray[np.intp] | None = None
+    """The tick that the picture of each tick was taken at (`as_seen`); None: itself."""
+
+    def __post_init__(self) -> None:
+        columns = (self.images, self.views, self.state_T8, self.action_T8, self.subgoals, self.is_transition_T)
+        sizes = {len(column) for column in columns}
+        if len(sizes) != 1 or 0 in sizes:
+            raise ValueError(
+                "an episode needs images, views, state, action, text and transition flag per tick; it has "
+                f"{', '.join(str(len(column)) for column in columns)}"
+            )
+        if not 0 <= self.imitated_from < self.num_ticks:
+            raise ValueError(f"imitated_from {self.imitated_from} is none of the {self.num_ticks} ticks")
+
+    @property
+    def num_ticks(self) -> int:
+        return len(self.subgoals)
+
+    @property
+    def transition_ticks(self) -> frozenset[int]:
+        """Ticks at which another subgoal begins."""
+        return frozenset(np.flatnonzero(self.is_transition_T).tolist())
+
+    def as_seen(self, seen_at_T: NDArray[np.intp]) -> TrainingEpisode:
+        """The same episode with pictures taken at some ticks only: tick t shows the picture of ``seen_at_T[t]``.
+
+        PONDER's texts are then of that instant, too: a PONDER whose pictures lag behind its texts learns not to look.
+        POUNCE's state and commands stay. Transitions that no picture tells apart become one.
+        """
+        count_T = np.cumsum(self.is_transition_T)[seen_at_T]
+        return replace(
+            self,
+            subgoals=[self.subgoals[tick] for tick in seen_at_T],
+            is_transition_T=np.diff(count_T, prepend=0) > 0,
+            seen_at_T=seen_at_T,
+        )
+
+    def ponder_state(self, tick: int) -> NDArray[np.float32]:
+        """The robot's state (8,) when the picture of this tick was taken."""
+        state_8: NDArray[np.float32] = self.state_T8[tick if self.seen_at_T is None else self.seen_at_T[tick]]
+        return state_8

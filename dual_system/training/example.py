@@ -1,0 +1,97 @@
+"""One recorded episode under one drawn schedule: PONDER's row, and what each POUNCE invocation saw and should do.
+
+Serving builds the same row segment by segment (``ponder.context``) and refers by the same rule (``clock.reference``);
+tests hold them equal.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from clock.sampling import Clocks, SampledInvocation, SampledSchedule, sample_schedule
+from dual_system.models.ponder.context import ContextFormat, Row, Transition
+from dual_system.models.ponder.coordinates import normalised_text
+from dual_system.training.episode import TrainingEpisode
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExampleConfig:
+    """How an episode becomes a training example."""
+
+    clocks: Clocks
+    max_invocations: int = 16
+    """POUNCE invocations drawn from an episode's schedule: they cost most."""
+    is_grounded: bool = True
+    """False: the row has no texts, as in RoboCasa-DC."""
+    has_reasoning: bool = True
+    """False: the first transition after a demonstration writes the subgoal alone (paper, Table 3)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Example:
+    """An episode under a schedule."""
+
+    episode: TrainingEpisode
+    row: Row
+    images: Tensor | None
+    """PONDER's images in the order of the row, (N, height, width, 3) uint8; None where PONDER is not run."""
+    schedule: SampledSchedule
+    invocations: tuple[SampledInvocation, ...]
+    """The drawn ones of the schedule's."""
+    said: tuple[str, ...]
+    """Per query, the subgoal that PONDER wrote last; empty texts without grounding."""
+
+
+def make_example(
+    episode: TrainingEpisode, form: ContextFormat, config: ExampleConfig, rng: np.random.Generator
+) -> Example:
+    """Draws a schedule and lays the episode out under it."""
+    schedule = sample_schedule(rng, config.clocks, episode.num_ticks, transition_ticks=episode.transition_ticks)
+    imitated = [each for each in schedule.invocations if each.tick >= episode.imitated_from]
+    count = min(config.max_invocations, len(imitated))
+    chosen = np.sort(rng.choice(len(imitated), size=count, replace=False)) if count else np.empty(0, np.intp)
+    said = subgoals_by_query(episode, schedule) if config.is_grounded else ("",) * len(schedule.queries)
+    return Example(
+        episode=episode,
+        row=episode_row(episode, form, schedule, config),
+        images=row_images(episode, schedule),
+        schedule=schedule,
+        invocations=tuple(imitated[index] for index in chosen),
+        said=said,
+    )
+
+
+def episode_row(episode: TrainingEpisode, form: ContextFormat, schedule: SampledSchedule, config: ExampleConfig) -> Row:
+    """The tokens of the episode. The first transition after a demonstration begins with its reasoning."""
+    encode = form.vocabulary.encode
+    num_views = len(episode.images[0])
+    segments = list(form.opening(episode.instruction, [len(images) for images in episode.demo]))
+    reasoning = encode(normalised_text(episode.reasoning)) if config.has_reasoning and episode.reasoning else None
+    for query in schedule.queries:
+        transition, text = None, episode.subgoals[query.tick]
+        if config.is_grounded and query.stamp.is_transition and text:
+            transition = Transition(subgoal=encode(normalised_text(text)), reasoning=reasoning)
+            reasoning = None
+        segments += form.query(num_views, transition, episode.ponder_state(query.tick))
+    return form.row(segments)
+
+
+def subgoals_by_query(episode: TrainingEpisode, schedule: SampledSchedule) -> tuple[str, ...]:
+    """The newest subgoal at every query, as PONDER writes it: new ones come at predicted transitions only."""
+    texts: list[str] = []
+    for query in schedule.queries:
+        text = episode.subgoals[query.tick]
+        is_new = query.stamp.is_transition and bool(text)
+        texts.append(normalised_text(text) if is_new else (texts[-1] if texts else ""))
+    return tuple(texts)
+
+
+def row_images(episode: TrainingEpisode, schedule: SampledSchedule) -> Tensor | None:
+    """All images of the row: the demonstration's, then every query's; (N, height, width, 3) uint8."""
+    instants = [*episode.demo, *(episode.images[query.tick] for query in schedule.queries)]
+    pictures = [picture for images in instants for picture in images]
+    return torch.from_numpy(np.stack(pictures)) if pictures else None

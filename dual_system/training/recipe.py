@@ -1,0 +1,51 @@
+"""What a training run is, apart from its data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dual_system.data.video import FPS
+from dual_system.models.action_space import ActionSpace
+from dual_system.models.pi05.pounce import Freeze
+from dual_system.models.ponder.configs import PonderConfig
+from dual_system.models.pounce.family import AnyPounceConfig
+from dual_system.training.example import ExampleConfig
+from dual_system.training.joint import Trains
+from dual_system.training.trainer import TrainConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recipe:
+    """A training run, apart from its data and the machine."""
+
+    name: str
+    ponder: PonderConfig
+    pounce: AnyPounceConfig
+    freeze: Freeze
+    """Which of POUNCE's pretrained parts stay as they are."""
+    example: ExampleConfig
+    train: TrainConfig
+    num_steps: int
+    batch_episodes: int
+    w1: float = 1.0
+    """Weight of flow matching."""
+    w2: float = 0.1
+    """Weight of grounding: the LM head's cross-entropy. 0 goes with examples that are not grounded."""
+    trains: Trains = "both"
+    """Which systems learn."""
+    demo_hz: int = 1
+    """Frames a second of demonstrations (paper: 1); PONDER's checkpoint and contract keep it."""
+    space: ActionSpace = "joint_delta"
+    """What POUNCE's actions are."""
+    statistics_by_row: bool = False
+    """Normalise every row of a chunk by its own spread (`RobotStatistics.reach`)."""
+    has_own_tokenizers: bool = False
+    """Train both tokenizers on the data's texts, which then take fewer tokens; for networks from scratch."""
+    from_scratch: bool = False
+    """True: weights are drawn. False: both systems start from pretrained checkpoints, given to the program."""
+
+    def __post_init__(self) -> None:
+        if self.trains != "pounce" and self.example.is_grounded != (self.w2 > 0):
+            raise ValueError(f"recipe {self.name}: is_grounded is {self.example.is_grounded}, but w2 is {self.w2}")
+        if self.demo_hz < 1 or FPS % self.demo_hz:
+            raise ValueError(f"recipe {self.name}: demo_hz must divide {FPS}, came {self.demo_hz}")

@@ -1,0 +1,405 @@
+"""``pp-train``: trains both systems together on a collected dataset, and leaves folders that the servers load.
+
+    OUT/checkpoint/     where a killed run goes on: weights, optimiser, step
+    OUT/log.jsonl       one line per step; OUT/run.png draws it at the end
+    OUT/samples.jsonl   what PONDER writes at intervals, beside what it should
+    OUT/ponder, pounce  at the end: what ponder-serve and pounce-serve take as --checkpoint
+
+The same command again resumes. On several GPUs or hosts:
+
+    torchrun --nproc-per-node=8 -m dual_system.training.train --device cuda ...
+"""
+
+from __future__ import annotations
+
+import sys
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+import tyro
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from dual_system.data.episode import CAMERAS
+from dual_system.data.errors import DatasetError
+from dual_system.models.bfloat16 import warn_of_slow
+from dual_system.models.normalisation import ROBOMME
+from dual_system.models.pi05.pounce import PounceConfig, freeze
+from dual_system.models.pi05.prompt import Tokenizer, tokenizer_of_instructions
+from dual_system.models.ponder.checkpoint import load_ponder, save_ponder
+from dual_system.models.ponder.fused_attention import fuse_attention
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.observation import check_cameras
+from dual_system.models.ponder.recompute import recompute_layers
+from dual_system.models.ponder.vocabulary import Vocabulary
+from dual_system.models.pounce.checkpoint import PounceBundle, declares_config, load_bundle, random_bundle, save_bundle
+from dual_system.models.pounce.initialise import open_gates
+from dual_system.training.collate import collate_ponder, collate_pounce
+from dual_system.training.data import PictureSizes, TrainingSet
+from dual_system.training.example import make_example
+from dual_system.training.joint import JointModel, PonderBatch, PounceBatch, Trains
+from dual_system.training.parallel import World, gather, joined, require_alike, shard
+from dual_system.training.plot import plot_log
+from dual_system.training.prefetch import Prefetcher
+from dual_system.training.recipe import Recipe
+from dual_system.training.recipes import recipe
+from dual_system.training.trainer import CheckpointError, SaveError, Trainer
+from dual_system.training.watch import LOG_FILE, Watch
+
+DONE, REFUSED, INTERRUPTED = 0, 2, 130
+_SYSTEMS = ("ponder", "pounce")
+_EPISODE_STREAM = 7  # of a step's random numbers: which episodes, which schedules
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InsteadOptions:
+    """Values that take the place of the recipe's."""
+
+    steps: int | None = None
+    """Number of updates."""
+    seed: int | None = None
+    """Seed of batches, schedules and flow draws."""
+    batch_episodes: int | None = None
+    """Episodes per update, over all processes."""
+    max_invocations: int | None = None
+    """POUNCE invocations drawn from each episode of a batch."""
+    max_committed_rows: int | None = None
+    """Most rows of a chunk that pi0.5 learns to continue, for `pounce-serve --continuity trained`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MachineOptions:
+    """How the run uses the machine; results are the same up to rounding."""
+
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Device of both systems."""
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """Of PONDER's weights and of POUNCE's stream, when they are loaded; the optimiser keeps float32 masters."""
+    tf32: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Multiply float32 matrices in TF32 on a GPU that has it, which rounds to 1 in 2000."""
+    weights: Literal["sharded", "whole"] = "sharded"
+    """With several processes: each holds its rows of the weights (FSDP2), or all of them, which is faster where they
+    fit many times over."""
+    recompute: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Recompute PONDER's activations in the backward pass: less memory for long rows, more time."""
+    length_groups: int = 1
+    """Groups of like length into which the rows of a batch are divided: fewer padding tokens, more calls."""
+    loaders: int = 0
+    """Processes that prepare batches ahead; 0 prepares them in the training process."""
+    cache_mb: int = 6000
+    """Memory for decoded pictures [MB], at the sizes that the networks read."""
+    picture_store: Path | None = None
+    """Folder for decoded pictures at those sizes: other processes and runs then need not decode videos."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LogOptions:
+    """What the run writes while it goes."""
+
+    save_every: int = 100
+    """Updates between checkpoints."""
+    sample_every: int = 20
+    """Updates between samples of PONDER's texts (OUT/samples.jsonl)."""
+    tensorboard: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Write losses, pictures and samples to OUT/tensorboard as well."""
+    progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
+    """Do not show a progress bar."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainOptions:
+    """Trains PONDER and POUNCE together. The same command again resumes a run that was killed."""
+
+    recipe: str
+    """Name of a recipe: robomme and robocasa_dc are the paper's runs, robomme_* its ablations; tiny, tiny_groot and
+    tiny_subgoal_text are for a try."""
+    data: tuple[Path, ...]
+    """Folders that pp-collect or pp-export made."""
+    out: Path
+    """Folder for checkpoints, log and the trained models."""
+    ponder: Path | None = None
+    """Pretrained Qwen3.5 folder; needed unless the recipe is from scratch."""
+    pounce: Path | None = None
+    """Pretrained pi0.5 or GR00T N1.5 folder; needed unless the recipe is from scratch."""
+    tasks: tuple[str, ...] = ()
+    """Tasks of the data to train on; () for all."""
+    instead: tyro.conf.OmitArgPrefixes[InsteadOptions] = field(default_factory=InsteadOptions)
+    machine: tyro.conf.OmitArgPrefixes[MachineOptions] = field(default_factory=MachineOptions)
+    log: tyro.conf.OmitArgPrefixes[LogOptions] = field(default_factory=LogOptions)
+
+
+class Batches:
+    """This process's share of a step's batch: which episodes, under which schedules.
+
+    Each schedule follows from (seed, step, place in the batch), so the shares of N processes are the batch of one.
+    """
+
+    def __init__(self, data: TrainingSet, run: Recipe, model: JointModel, bundle: PounceBundle, world: World) -> None:
+        """Raises ValueError if the batch has fewer episodes than there are processes."""
+        self._data, self._run = data, run
+        self._bundle, self._device = bundle, world.device
+        self._places = world.share(run.batch_episodes)
+        # not the model itself: another process may ask (`prefetch`), and its weights lie on a GPU
+        self._form, self._pounce, self._runs_ponder = model.ponder.format, model.pounce.config, model.runs_ponder
+
+    def __call__(self, step: int) -> tuple[PonderBatch, PounceBatch]:
+        episodes, invocations = self.on_cpu(step)
+        return episodes.to(self._device), invocations.to(self._device)
+
+    def on_cpu(self, step: int) -> tuple[PonderBatch, PounceBatch]:
+        """The same, not yet on the device."""
+        run, bundle = self._run, self._bundle
+        chance = (run.train.seed, _EPISODE_STREAM, step)
+        numbers = self._draw(np.random.default_rng(chance))
+        examples = [
+            make_example(
+                self._data[int(numbers[place])],
+                self._form,
+                run.example,
+                np.random.default_rng([*chance, place]),
+            )
+            for place in self._places
+        ]
+        episodes = collate_ponder(examples if self._runs_ponder else [])
+        if run.trains == "ponder":  # POUNCE is not run: one moment stands for the batch's shape
+            examples = [replace(each, invocations=each.schedule.invocations[:1]) for each in examples]
+        return episodes, collate_pounce(examples, self._pounce, bundle.tokenizer, bundle.statistics)
+
+    def _draw(self, rng: np.random.Generator) -> NDArray[np.integer]:
+        """Numbers of the batch's episodes, long ones first, so that the processes' shares are of like length."""
+        numbers = rng.integers(len(self._data), size=self._run.batch_episodes)
+        return np.array(sorted(numbers.tolist(), key=lambda number: -self._data.num_rows(number)))
+
+
+def main(argv: list[str] | None = None) -> int:
+    options = tyro.cli(TrainOptions, args=argv, prog="pp-train", description=TrainOptions.__doc__)
+    if warning := warn_of_slow(options.machine.dtype, options.machine.device):
+        sys.stderr.write(f"pp-train: {warning}\n")
+    try:
+        train(options)
+    except (DatasetError, CheckpointError, SaveError, OSError, ValueError, FloatingPointError) as error:
+        sys.stderr.write(f"pp-train: {error}\n")
+        return REFUSED
+    except torch.OutOfMemoryError as error:
+        sys.stderr.write(f"pp-train: {_out_of_memory(options, error)}\n")
+        return REFUSED
+    except KeyboardInterrupt:
+        sys.stderr.write("pp-train: interrupted; the last checkpoint is kept, the same command goes on from it\n")
+        return INTERRUPTED
+    return DONE
+
+
+def train(options: TrainOptions) -> None:
+    """Runs a recipe to its end, alone or as one of torchrun's processes.
+
+    Raises:
+        DatasetError, CheckpointError, FileNotFoundError, ValueError: what was given does not fit; the message says why.
+        FloatingPointError: the loss is not finite; the last checkpoint is kept.
+        SaveError: a checkpoint could not be written; the one before is kept.
+    """
+    machine, run = options.machine, _adjusted(recipe(options.recipe), options.instead)
+    if _is_finished(options.out):
+        raise CheckpointError(f"{options.out} holds a finished run; use another --out")
+    if machine.tf32 and machine.device == "cpu":
+        raise ValueError("--tf32 is for GPUs; on a CPU leave it out")
+    data = TrainingSet(*options.data, tasks=options.tasks, demo_hz=run.demo_hz)
+    with joined(machine.device) as world:
+        if not 0 < machine.length_groups <= max(1, run.batch_episodes // world.size):  # all processes have as many
+            raise ValueError(
+                f"--length-groups {machine.length_groups}: expected 1 to {run.batch_episodes // world.size}, the rows "
+                "that every process has of a batch"
+            )
+        model, bundle = build(run, data, options)
+        _prepare(model, machine, world)
+        data = TrainingSet(
+            *options.data,
+            tasks=options.tasks,
+            sizes=_picture_sizes(run, model),
+            cache_mb=machine.cache_mb,
+            store=machine.picture_store,
+            demo_hz=run.demo_hz,
+        )
+        _update(run, model, Batches(data, run, model, bundle, world), data.hash, options, world)
+        _write(run, model, bundle, data, options, world)
+
+
+def _update(
+    run: Recipe, model: JointModel, batches: Batches, data_hash: str, options: TrainOptions, world: World
+) -> None:
+    """All updates of the run, from the checkpoint on if there is one; leaves the averaged weights in ``model``."""
+    log, checkpoint = options.log, options.out / "checkpoint"
+    with ExitStack() as stack:
+        prefetcher = None
+        if options.machine.loaders:
+            prefetcher = Prefetcher(batches.on_cpu, world.device, options.machine.loaders)
+            stack.callback(prefetcher.close)
+        trainer = Trainer(model, prefetcher or batches, run.train, data_hash=data_hash, world=world)
+        options.out.mkdir(parents=True, exist_ok=True)
+        trainer.resume(checkpoint)
+        shows = log.progress and world.is_first
+        bar = stack.enter_context(tqdm(total=run.num_steps, initial=trainer.step, unit="step", disable=not shows))
+        watch = None
+        if world.is_first:
+            watch = stack.enter_context(
+                Watch(
+                    options.out,
+                    first_step=trainer.step,
+                    sample_every=log.sample_every,
+                    tensorboard=log.tensorboard,
+                )
+            )
+        for report in trainer.run(run.num_steps):
+            if watch is not None:
+                watch.step(report, trainer)
+            bar.set_postfix_str(f"flow {report.flow_matching:.3f} text {report.grounding:.3f}", refresh=False)
+            bar.update()
+            if trainer.step % log.save_every == 0:
+                if watch is not None:
+                    watch.flush()
+                trainer.save(checkpoint)
+        trainer.save(checkpoint)
+        trainer.take_average()
+
+
+def _is_finished(out: Path) -> bool:
+    return any((out / system).exists() for system in _SYSTEMS)
+
+
+def _prepare(model: JointModel, machine: MachineOptions, world: World) -> None:
+    """Makes a model that was just built ready for the machine and the other processes."""
+    require_alike(model, world)
+    model.reads_together = machine.device != "cpu" or (world.size > 1 and machine.weights == "sharded")
+    model.num_groups = machine.length_groups
+    if machine.recompute:
+        recompute_layers(model.ponder)
+    if machine.device == "cuda" and machine.dtype == "float32":
+        fuse_attention(model.ponder)
+    torch.backends.cuda.matmul.allow_tf32 = machine.tf32
+    if machine.weights == "sharded":
+        shard(model, world)
+
+
+def _write(
+    run: Recipe, model: JointModel, bundle: PounceBundle, data: TrainingSet, options: TrainOptions, world: World
+) -> None:
+    """Writes what was trained, once."""
+    if world.size == 1:
+        export(model, bundle, options.out, trained=run.trains)
+    else:
+        on_cpu = replace(options, machine=replace(options.machine, device="cpu"))
+        whole = build(run, data, on_cpu) if world.is_first else None
+        gather(model, None if whole is None else whole[0])
+        if whole is not None:
+            export(*whole, options.out, trained=run.trains)
+    if world.is_first:
+        plot_log(options.out / LOG_FILE, options.out / "run.png")
+
+
+def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointModel, PounceBundle]:
+    """Both systems, drawn or loaded, frozen as the recipe says, with the data's own statistics.
+
+    Raises:
+        ValueError: pretrained weights are missing, or the pictures have another size than PONDER reads.
+        FileNotFoundError: a given folder holds no checkpoint.
+    """
+    device, seed = options.machine.device, run.train.seed
+    dtype = {"float32": torch.float32, "bfloat16": torch.bfloat16}[options.machine.dtype]
+    if not run.from_scratch and (options.ponder is None or options.pounce is None):
+        raise ValueError(
+            f"recipe {run.name} starts from pretrained weights; give their folders with --ponder, --pounce"
+        )
+    if options.ponder is not None:
+        ponder = load_ponder(options.ponder, device=device, dtype=dtype)
+    else:
+        own = Vocabulary.trained_on(data.texts(), run.ponder.first_carrier_id) if run.has_own_tokenizers else None
+        ponder = Ponder.random(run.ponder, own, seed=seed, device=device, dtype=dtype)
+    try:
+        check_cameras([(data.image_px, data.image_px)] * len(CAMERAS), ponder.format.reader, ponder.image_px)
+    except ValueError as error:
+        wanted_px = ponder.format.reader.readable_sizes(ponder.image_px)[0][0]
+        raise ValueError(f"{', '.join(map(str, options.data))}: {error}; collect with --image-px {wanted_px}") from None
+    if run.trains != "pounce":
+        ponder.format = replace(
+            ponder.format,
+            speaks=run.w2 > 0,
+            demonstrations=data.showing() or ponder.format.demonstrations,
+        )
+    measured = partial(data.statistics, run.pounce.horizon, run.space, by_row=run.statistics_by_row)
+    if options.pounce is None:
+        bundle = random_bundle(run.pounce, seed, statistics=measured(), tokenizer=_own_tokenizer(run, data))
+        open_gates(bundle.model)
+    else:
+        # A public folder has no prefix and does not say what it should read; the recipe does.
+        bundle = load_bundle(options.pounce, config=None if declares_config(options.pounce) else run.pounce)
+        if bundle.statistics == ROBOMME:  # a public folder; our own act in the measure that they were trained in
+            bundle = replace(bundle, statistics=measured())
+    pounce = bundle.model.to(device)
+    if type(pounce.config) is not type(run.pounce):
+        raise ValueError(f"recipe {run.name} is of another action model than {options.pounce} holds")
+    if isinstance(pounce.config, PounceConfig) and isinstance(run.pounce, PounceConfig):
+        pounce.config = replace(pounce.config, max_committed_rows=run.pounce.max_committed_rows)
+    freeze(pounce, run.freeze)
+    return JointModel(ponder, pounce, w1=run.w1, w2=run.w2, trains=run.trains), bundle
+
+
+def _own_tokenizer(run: Recipe, data: TrainingSet) -> Tokenizer | None:
+    """A tokenizer for POUNCE of all prompts in the data; None: the family's."""
+    if not run.has_own_tokenizers or not isinstance(run.pounce, PounceConfig):
+        return None
+    return tokenizer_of_instructions(
+        data.instructions_with_subgoals() if run.pounce.reads_subgoal else data.instructions()
+    )
+
+
+def export(model: JointModel, bundle: PounceBundle, out: Path, *, trained: Trains = "both") -> None:
+    """Writes the folders of what was trained, as the servers read them."""
+    if trained != "pounce":
+        model.ponder.is_random = False
+        save_ponder(model.ponder, out / "ponder")
+    if trained != "ponder":
+        save_bundle(replace(bundle, is_random=False, has_fresh_prefix=False), out / "pounce")
+
+
+def _adjusted(run: Recipe, instead: InsteadOptions) -> Recipe:
+    """The recipe with the command line's values in place of its own."""
+    pounce = run.pounce
+    if instead.max_committed_rows is not None:
+        if not isinstance(pounce, PounceConfig):
+            raise ValueError(f"--max-committed-rows is pi0.5's, recipe {run.name} trains GR00T")
+        pounce = replace(pounce, max_committed_rows=instead.max_committed_rows)
+    return replace(
+        run,
+        pounce=pounce,
+        num_steps=instead.steps or run.num_steps,
+        batch_episodes=instead.batch_episodes or run.batch_episodes,
+        example=replace(run.example, max_invocations=instead.max_invocations or run.example.max_invocations),
+        train=replace(run.train, seed=run.train.seed if instead.seed is None else instead.seed),
+    )
+
+
+def _picture_sizes(run: Recipe, model: JointModel) -> PictureSizes:
+    """What the run reads of the pictures."""
+    pounce = model.pounce.config
+    sees = run.trains != "ponder" and pounce.num_cameras > 0
+    return PictureSizes(
+        form=model.ponder.format if model.runs_ponder else None, pounce_px=pounce.image_px if sees else None
+    )
+
+
+def _out_of_memory(options: TrainOptions, error: BaseException) -> str:
+    run = _adjusted(recipe(options.recipe), options.instead)
+    tried = f"{run.batch_episodes} x {run.example.max_invocations}"
+    return (
+        f"out of memory at {tried} (episodes a step x invocations each; {error}). Lower --max-invocations first, then "
+        "--batch-episodes; --recompute keeps less of PONDER's rows; --dtype bfloat16 halves PONDER; or start more "
+        "processes with torchrun. The last checkpoint is kept: the same command with the lower number goes on."
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
