@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from dual_system.training.training_episode import TrainingEpisode
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -34,6 +33,7 @@ from dual_system.training.diagnose import (
     next_alike,
     stale,
 )
+from dual_system.training.episode import TrainingEpisode
 from dual_system.training.example import Example, make_example
 
 PX, NUM_TICKS = 64, 150
@@ -48,7 +48,8 @@ def example() -> Example:
     episode = TrainingEpisode(
         instruction="pick it",
         demo=(),
-        frames=views,
+        images=views,
+        views=views,
         state_T8=rng.uniform(-0.2, 0.2, (NUM_TICKS, 8)).astype(np.float32),
         action_T8=rng.uniform(-0.2, 0.2, (NUM_TICKS, 8)).astype(np.float32),
         subgoals=["pick"] * NUM_TICKS,
@@ -62,7 +63,7 @@ def own() -> torch.Tensor:
     return torch.randn(8, 1, PONDER.hidden_size, generator=torch.Generator().manual_seed(0))
 
 
-def test_what_k_queries_ago_was_thought_is_told_its_true_age(own: torch.Tensor) -> None:
+def test_cognition_of_k_queries_ago_has_its_true_age(own: torch.Tensor) -> None:
     seen = example()
     batch = collate_pounce([seen], BUNDLE.model.config, BUNDLE.tokenizer, BUNDLE.statistics)
     for k in STALE_BY:

@@ -3,29 +3,31 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
-from pathlib import Path
 
 import pytest
 import torch
-from dual_system.models.reader_file import Narrowing, write_reader
-from dual_system.models.specialty import Specialty
 from torch import Tensor
 
 from dual_system.models import flow
 from dual_system.models.pi05.pounce import Pounce, freeze
-from dual_system.models.ponder.checkpoint import READER_NAME, load_ponder, save_ponder
 from dual_system.models.ponder.configs import tiny_cpu as tiny_ponder
 from dual_system.models.ponder.context import Row, Transition
 from dual_system.models.ponder.network import Ponder
 from dual_system.models.pounce.configs import tiny_cpu as tiny_pounce
 from dual_system.models.pounce.initialise import random_pounce
-from dual_system.training.joint import NO_QUERY, Draws, JointModel, PonderBatch, PounceBatch, encode_rows
+from dual_system.training.joint import (
+    NO_QUERY,
+    Draws,
+    JointModel,
+    PonderBatch,
+    PounceBatch,
+    Trains,
+    encode_rows,
+    runs_ponder,
+)
 
 CONFIG = replace(tiny_ponder(), image_px=(32, 32), num_carriers=2, num_layers=4)
-
-
-SPECIALTY = Specialty(name="counting", instructions="count")
+SYSTEMS: tuple[Trains, ...] = ("ponder", "pounce")
 
 
 @pytest.fixture
@@ -134,95 +136,6 @@ def test_action_loss_reaches_ponder_at_half_strength_and_only_through_cognition(
     assert "ponder.qwen.lm_head.weight" not in full
 
 
-def test_a_reader_learns_alone_from_all_losses(model: JointModel) -> None:
-    """From C of queries that others answer, too: through the keys, values and states that it leaves them."""
-    with torch.no_grad():
-        before = encode_rows(model.ponder, episodes(model.ponder, 3))[0]
-    apart = JointModel(model.ponder, model.pounce, trains="ponder", reads_apart=True)
-    both = episodes(model.ponder, 3)
-    (hidden_TH,) = encode_rows(model.ponder, both)
-    torch.testing.assert_close(hidden_TH, before, atol=2e-5, rtol=1e-4)
-    assert {name.split(".")[1] for name, each in apart.named_parameters() if each.requires_grad} == {"reader"}
-    grounding = gradients(apart(both, batch := invocations(model.pounce, (0, 0)), draws_of(batch)).grounding, apart)
-    last = hidden_TH[int(both.rows[0].carrier_index[-1, 0])]
-    told = gradients(last.square().sum(), apart)
-    for reached in (grounding, told):
-        layers = {name.split(".")[3] for name in reached if name.startswith("ponder.reader.layers")}
-        assert layers == {str(layer) for layer in range(CONFIG.num_layers)}
-    assert model.ponder.reader is apart.ponder.reader, "whoever has one goes on with it"
-
-
-def test_a_reader_learns_as_what_will_be_stored(model: JointModel, tmp_path: Path) -> None:
-    """Its loss is the one of a reader that was written to a file and read again."""
-    narrowing = Narrowing(num_layers=1, bits=2)
-    reader, text_model = model.ponder.add_reader(), model.ponder.qwen.model.language_model
-    with torch.no_grad():
-        for weight in reader.parameters():
-            weight.add_(0.02 * torch.randn(weight.shape, generator=torch.Generator().manual_seed(weight.numel())))
-            weight.copy_(weight if weight.ndim > 1 else weight.half())
-    both, batch = episodes(model.ponder, 2), invocations(model.pounce, (0, 0))
-    losing = partial(JointModel, pounce=model.pounce, trains="ponder", reads_apart=True)
-    wide = losing(model.ponder)(both, batch, draws_of(batch)).grounding
-    narrow = losing(model.ponder, narrowing=narrowing)
-    learned = gradients(grounding := narrow(both, batch, draws_of(batch)).grounding, narrow)
-    save_ponder(model.ponder, tmp_path)
-    write_reader(reader, text_model, tmp_path / READER_NAME, narrowing)
-    stored = losing(load_ponder(tmp_path))(both, batch, draws_of(batch)).grounding
-    assert stored == grounding
-    assert grounding != wide
-    assert {name.split(".")[3] for name in learned if name.startswith("ponder.reader.layers")} == {"0"}
-
-
-def test_whole_rows_are_a_specialists_and_nobody_else_learns(model: JointModel) -> None:
-    alone = JointModel(model.ponder, model.pounce, trains="ponder", specialty=SPECIALTY)
-    both, batch = episodes(model.ponder, 2, 3), invocations(model.pounce, (0, 0), (1, 1))
-    reached = gradients(alone(both, batch, draws_of(batch)).grounding, alone)
-    learning = {name for name, each in alone.named_parameters() if each.requires_grad}
-    assert (
-        {".".join(name.split(".")[:3]) for name in learning}
-        == {"ponder.specialists.counting"}
-        == {".".join(name.split(".")[:3]) for name in reached}
-    )
-    assert {name.split(".")[4] for name in reached if ".layers." in name} == {str(n) for n in range(CONFIG.num_layers)}
-    again = JointModel(model.ponder, model.pounce, trains="ponder", specialty=SPECIALTY)
-    assert again.ponder.specialists["counting"] is alone.ponder.specialists["counting"], (
-        "whoever has one goes on with it"
-    )
-
-
-@pytest.mark.parametrize("together", [True, False])
-def test_a_specialist_reads_rows_as_everybody_with_its_weights(model: JointModel, together: bool) -> None:
-    specialist = model.ponder.add_specialist(SPECIALTY)
-    both = episodes(model.ponder, 2, 3)
-    with torch.no_grad():
-        for weight in specialist.parameters():
-            weight.add_(0.05 * torch.randn(weight.shape, generator=torch.Generator().manual_seed(weight.numel())))
-        others = encode_rows(model.ponder, both, together=together)
-        read = encode_rows(model.ponder, both, together=together, specialist=specialist)
-        given = dict(model.ponder.qwen.model.language_model.named_parameters())
-        for name, weight in specialist.named_parameters():
-            given[name].copy_(weight)
-        for row, other, each in zip(encode_rows(model.ponder, both, together=together), others, read, strict=True):
-            torch.testing.assert_close(each, row, atol=2e-5, rtol=1e-4)
-            assert (other - row).abs().max() > 1e-3
-
-
-def test_a_specialist_learns_as_what_will_be_stored(model: JointModel) -> None:
-    both, batch = episodes(model.ponder, 2), invocations(model.pounce, (0, 0))
-    narrowing = Narrowing(num_layers=1, bits=2)
-    specialist = model.ponder.add_specialist(SPECIALTY)
-    with torch.no_grad():
-        for weight in specialist.parameters():
-            weight.add_(0.02 * torch.randn(weight.shape, generator=torch.Generator().manual_seed(weight.numel())))
-    losing = partial(JointModel, model.ponder, model.pounce, trains="ponder", specialty=SPECIALTY)
-    wide = losing()(both, batch, draws_of(batch)).grounding
-    narrow = losing(narrowing=narrowing)
-    grounding = narrow(both, batch, draws_of(batch)).grounding
-    reached = {name.split(".")[4] for name in gradients(grounding, narrow) if ".layers." in name}
-    assert grounding != wide
-    assert reached == {"0"}
-
-
 def test_null_cognition_tells_ponder_nothing(model: JointModel) -> None:
     both, batch = episodes(model.ponder, 2), invocations(model.pounce, (0, NO_QUERY), (0, NO_QUERY))
     reached = gradients(model(both, batch, draws_of(batch)).flow_matching, model)
@@ -280,6 +193,53 @@ def test_frozen_backbone_lets_gradients_pass(model: JointModel) -> None:
     reached = gradients(model(both, batch, draws_of(batch)).flow_matching, model)
     assert [name for name in reached if name.startswith("ponder.")]
     assert not [name for name in reached if name.startswith("pounce.pi05.language.")]
+
+
+@pytest.mark.parametrize("trains", ["both", "ponder", "pounce"])
+def test_a_loss_reaches_the_systems_that_learn_and_no_other(model: JointModel, trains: Trains) -> None:
+    both, batch = episodes(model.ponder, 2), invocations(model.pounce, (0, 0))
+    alone = JointModel(model.ponder, model.pounce, trains=trains)
+    reached = gradients(alone(both, batch, draws_of(batch)).total, alone)
+    assert {name.split(".")[0] for name in reached} == ({"ponder", "pounce"} if trains == "both" else {trains})
+
+
+def test_both_systems_alone_lose_what_they_lose_together(model: JointModel) -> None:
+    both, batch = episodes(model.ponder, 2, 3), invocations(model.pounce, (0, 0), (1, 2))
+    draws = draws_of(batch, dropout=0.5)
+    together = model(both, batch, draws)
+    alone = {name: JointModel(model.ponder, model.pounce, trains=name)(both, batch, draws) for name in SYSTEMS}
+    assert torch.equal(alone["pounce"].flow_matching, together.flow_matching)
+    assert torch.equal(alone["ponder"].grounding, together.grounding)
+    assert (alone["pounce"].num_null, alone["pounce"].num_rows) == (together.num_null, together.num_rows)
+    assert torch.equal(alone["ponder"].said_N, together.said_N)
+    for name, part in (("pounce", "grounding"), ("ponder", "flow_matching")):
+        assert float(getattr(alone[name], part)) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("trains", "num_carriers", "expected"),
+    [("both", 1, True), ("both", 0, True), ("ponder", 1, True), ("ponder", 0, True), ("pounce", 1, True),
+     ("pounce", 0, False)],
+)  # fmt: skip
+def test_ponder_is_run_unless_nobody_needs_it(trains: Trains, num_carriers: int, expected: bool) -> None:
+    assert runs_ponder(trains, num_carriers) == expected
+
+
+def test_several_flow_samples_are_the_mean_of_single_ones(model: JointModel) -> None:
+    both, batch = episodes(model.ponder, 2), invocations(model.pounce, (0, 0), (0, 1))
+    drawn = Draws.draw(batch, flow.sample_times, 0.0, [torch.Generator().manual_seed(1)], num_samples=2)
+    loss = model(both, batch, drawn)
+    singles = [
+        replace(drawn, noise_SNA=drawn.noise_SNA[part], time_S=drawn.time_S[part]) for part in (slice(2), slice(2, 4))
+    ]
+    apart = torch.stack([model(both, batch, one).flow_matching for one in singles])
+    torch.testing.assert_close(loss.flow_matching, apart.mean())
+    assert loss.num_rows == 2 * 2 * batch.actions_INA.shape[1]
+
+
+def test_frames_without_rows_are_refused() -> None:
+    with pytest.raises(ValueError, match="0 rows, frames for 1"):
+        PonderBatch(frames=(None,))
 
 
 def test_models_that_do_not_fit_are_refused() -> None:

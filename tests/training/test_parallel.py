@@ -14,7 +14,6 @@ from unittest.mock import patch
 
 import pytest
 import torch
-from dual_system.training.place_lessons import place_lessons
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
@@ -43,32 +42,22 @@ def joint(dtype: torch.dtype = torch.float32) -> JointModel:
     config = tiny_pounce(num_carriers=1, cognition_size=CONFIG.hidden_size, horizon=4)
     pounce = random_pounce(replace(config, max_committed_rows=2), seed=2)
     freeze(pounce, "vision")
-    return JointModel(Ponder.random(CONFIG, seed=1, dtype=dtype), pounce, w3=0.5, w4=0.5)
+    return JointModel(Ponder.random(CONFIG, seed=1, dtype=dtype), pounce)
 
 
 def batch_of(model: JointModel, places: range, step: int) -> tuple[PonderBatch, PounceBatch]:
-    """Three unequal episodes: one query or two, texts of another length, one to three places and invocations."""
+    """Three unequal episodes: one query or two, texts of another length, one to three invocations."""
     form, config = model.ponder.format, model.pounce.config
-    rows, frames, stand_ins, weights, lessons, invocations = [], [], [], [], [], []
+    rows, frames, invocations = [], [], []
     for index, place in enumerate(places):
         said = Transition(subgoal=form.vocabulary.encode("pick the cube" + " now" * (5 * place)))
         rows.append(form.row([*form.opening("press"), *form.query(1, said), *form.query(1) * (place % 2)]))
-        texts = [" ".join(f"<{20 * n}, {90 * place}>" for n in range(place + 1))] * len(rows[-1].gate_index)
-        lessons.append(place_lessons(rows[-1], texts, form.vocabulary, model.ponder.hidden_size))
         generator = torch.Generator().manual_seed(100 * step + place)
         shape = (rows[-1].num_images, 32, 32, 3)
         frames.append(torch.randint(0, 256, shape, generator=generator, dtype=torch.uint8))
-        stand_ins.append(torch.randn(len(rows[-1].gate_index), model.ponder.hidden_size, generator=generator))
-        weights.append(torch.arange(1.0, 1 + len(stand_ins[-1])) * (1 + place))
         invocations += [(index, query, 100 * step + 10 * place + query) for query in (NO_QUERY, 0, 0)[: place + 1]]
     inputs = [config.example_inputs(1, seed=seed) for _, _, seed in invocations]
-    episodes = PonderBatch(
-        rows=tuple(rows),
-        frames=tuple(frames),
-        stand_ins=tuple(stand_ins),
-        stand_in_weights=tuple(weights),
-        place_lessons=tuple(lessons),
-    )
+    episodes = PonderBatch(rows=tuple(rows), frames=tuple(frames))
     return episodes, PounceBatch(
         inputs=replace(
             inputs[0],
@@ -99,38 +88,44 @@ def weights_of(trainer: Trainer) -> dict[str, Tensor]:
     return {name: parameter.detach().clone() for name, parameter in whole.named_parameters()}
 
 
-def run_as_one_of_several(folder: Path, weights: str) -> None:
+def run_as_one_of_several(folder: Path) -> None:
     """What each process of torchrun does."""
     with joined("cpu") as world:
-        trainer = trainer_of(world, weights)
-        reports = [asdict(report) for report in trainer.run(STEPS)]
-        trainer.save(folder / "two")
-        last = weights_of(trainer)
-        trainer.take_average()
-        average = weights_of(trainer)
-        resumed = trainer_of(world, weights)
-        resumed.resume(folder / "one")
-        reports += [asdict(report) for report in resumed.run(STEPS + 1)]
-        if world.is_first:
-            torch.save({"last": last, "average": average}, folder / "weights.pt")
-            (folder / "reports.json").write_text(json.dumps(reports))
+        for held in ("sharded", "whole"):
+            (folder / held).mkdir(exist_ok=True)
+            _run_float32(folder, held, world)
+        _run_rounded(folder, world)
 
 
-def run_rounded_as_one_of_several(folder: Path) -> None:
+def _run_float32(folder: Path, held: str, world: World) -> None:
+    trainer = trainer_of(world, held)
+    reports = [asdict(report) for report in trainer.run(STEPS)]
+    trainer.save(folder / held / "two")
+    last = weights_of(trainer)
+    trainer.take_average()
+    average = weights_of(trainer)
+    resumed = trainer_of(world, held)
+    resumed.resume(folder / "one")
+    reports += [asdict(report) for report in resumed.run(STEPS + 1)]
+    if world.is_first:
+        torch.save({"last": last, "average": average}, folder / held / "weights.pt")
+        (folder / held / "reports.json").write_text(json.dumps(reports))
+
+
+def _run_rounded(folder: Path, world: World) -> None:
     """The same for a PONDER in bfloat16 beside a POUNCE in float32."""
-    with joined("cpu") as world:
-        trainer = trainer_of(world, "rounded")
-        reports = [asdict(report) for report in trainer.run(STEPS)]
-        trainer.save(folder / "rounded")
-        resumed = trainer_of(world, "rounded")
-        resumed.resume(folder / "rounded")
-        kinds: dict[str, int] = {}
-        for weight in trainer.model.parameters():
-            kind = f"{weight.dtype} {type(weight).__name__ if isinstance(weight, DTensor) else 'whole'}"
-            kinds[kind] = kinds.get(kind, 0) + weight.numel()
-        on, again = ([asdict(report) for report in each.run(STEPS + 2)] for each in (trainer, resumed))
-        if world.is_first:
-            (folder / "rounded.json").write_text(json.dumps([reports, on, again, kinds]))
+    trainer = trainer_of(world, "rounded")
+    reports = [asdict(report) for report in trainer.run(STEPS)]
+    trainer.save(folder / "rounded")
+    resumed = trainer_of(world, "rounded")
+    resumed.resume(folder / "rounded")
+    kinds: dict[str, int] = {}
+    for weight in trainer.model.parameters():
+        kind = f"{weight.dtype} {type(weight).__name__ if isinstance(weight, DTensor) else 'whole'}"
+        kinds[kind] = kinds.get(kind, 0) + weight.numel()
+    on, again = ([asdict(report) for report in each.run(STEPS + 2)] for each in (trainer, resumed))
+    if world.is_first:
+        (folder / "rounded.json").write_text(json.dumps([reports, on, again, kinds]))
 
 
 @pytest.fixture(scope="module")
@@ -143,11 +138,13 @@ def one(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[dict[str, float]
     return reports, folder
 
 
-def _run_two(folder: Path, what: str) -> None:
-    """Two of this file's processes."""
+@pytest.fixture(scope="module")
+def two(one: tuple[list[dict[str, float]], Path]) -> Path:
+    """Where two of this file's processes left what they did, in every way of holding the weights."""
+    _, folder = one
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", __file__]
     done = subprocess.run(
-        [*command, str(folder), what],
+        [*command, str(folder)],
         env=os.environ | {"OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
@@ -155,18 +152,18 @@ def _run_two(folder: Path, what: str) -> None:
         check=False,
     )
     assert done.returncode == 0, done.stderr[-3000:]
+    return folder
 
 
 @pytest.mark.e2e
 @pytest.mark.slow
 @pytest.mark.parametrize("held", ["sharded", "whole"])
-def test_two_processes_are_one(one: tuple[list[dict[str, float]], Path], held: str) -> None:
+def test_two_processes_are_one(one: tuple[list[dict[str, float]], Path], two: Path, held: str) -> None:
     reports, folder = one
     trainer = trainer_of(World())
     assert trainer.resume(folder / "one")
-    _run_two(folder, held)
-    theirs = json.loads((folder / "reports.json").read_text())
-    weights = torch.load(folder / "weights.pt", weights_only=True)
+    theirs = json.loads((two / held / "reports.json").read_text())
+    weights = torch.load(two / held / "weights.pt", weights_only=True)
 
     assert len(theirs) == STEPS + 1
     for mine, other in zip(reports, theirs[:STEPS], strict=True):
@@ -178,7 +175,7 @@ def test_two_processes_are_one(one: tuple[list[dict[str, float]], Path], held: s
 
     # A checkpoint of two is read by one, bit for bit, and one of one by two: the next step is the same.
     again = trainer_of(World())
-    assert again.resume(folder / "two")
+    assert again.resume(two / held / "two")
     assert again.step == STEPS
     for name, tensor in weights_of(again).items():
         assert torch.equal(weights["last"][name], tensor), name
@@ -191,12 +188,11 @@ def test_two_processes_are_one(one: tuple[list[dict[str, float]], Path], held: s
 
 @pytest.mark.e2e
 @pytest.mark.slow
-def test_weights_of_two_dtypes_are_cut_as_well(tmp_path: Path) -> None:
+def test_weights_of_two_dtypes_are_sharded_too(two: Path) -> None:
     """Two processes round at other places than one: as near as bfloat16 lets them; resumed they are the same."""
     alone = trainer_of(World(), "rounded")
     reports = [asdict(report) for report in alone.run(STEPS)]
-    _run_two(tmp_path, "rounded")
-    theirs, on, again, kinds = json.loads((tmp_path / "rounded.json").read_text())
+    theirs, on, again, kinds = json.loads((two / "rounded.json").read_text())
     for mine, other in zip(reports, theirs, strict=True):
         assert other == pytest.approx(mine, rel=0.02, abs=0.02)
     assert on == again
@@ -204,7 +200,7 @@ def test_weights_of_two_dtypes_are_cut_as_well(tmp_path: Path) -> None:
     assert kinds["torch.float32 DTensor"] > 0
     assert "torch.bfloat16 whole" not in kinds
     resumed = trainer_of(World(), "rounded")
-    assert resumed.resume(tmp_path / "rounded")
+    assert resumed.resume(two / "rounded")
     (fourth,) = [asdict(report) for report in resumed.run(STEPS + 1)]
     assert fourth == pytest.approx(on[0], rel=0.02, abs=0.02)
 
@@ -258,7 +254,4 @@ def test_alone_nothing_is_sharded() -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[2] == "rounded":
-        run_rounded_as_one_of_several(Path(sys.argv[1]))
-    else:
-        run_as_one_of_several(Path(sys.argv[1]), sys.argv[2])
+    run_as_one_of_several(Path(sys.argv[1]))

@@ -1,4 +1,4 @@
-"""The reference channel: POUNCE is told PONDER's newest subgoal in words, and nothing else of it."""
+"""The text channel (paper, Table 3): POUNCE reads PONDER's newest subgoal as text, and no cognition."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from dual_system.training.training_episode import TrainingEpisode
 
 from clock.sampling import EVALUATION, sample_schedule
 from dual_system.models.groot.prompt import tiny_eagle_tokenizer_for_random_weights
@@ -21,7 +20,8 @@ from dual_system.models.pounce.configs import tiny_cpu, tiny_groot
 from dual_system.models.pounce.initialise import random_pounce
 from dual_system.models.pounce.reading import groot_inputs, pi05_inputs
 from dual_system.training.collate import collate_ponder, collate_pounce
-from dual_system.training.example import Example, ExampleConfig, make_example, said_by_query
+from dual_system.training.episode import TrainingEpisode
+from dual_system.training.example import Example, ExampleConfig, make_example, subgoals_by_query
 from dual_system.training.joint import Draws, JointModel
 from pounce_server.contract import Request, example_request
 from pounce_server.engine import EagerEngine
@@ -40,7 +40,8 @@ def episode() -> TrainingEpisode:
     return TrainingEpisode(
         instruction="press the button, then pick",
         demo=(),
-        frames=views,
+        images=views,
+        views=views,
         state_T8=rng.uniform(-0.2, 0.2, (NUM_TICKS, 8)).astype(np.float32),
         action_T8=rng.uniform(-0.2, 0.2, (NUM_TICKS, 8)).astype(np.float32),
         subgoals=["press at <5, 5>"] * 30 + ["pick at <10, 20>"] * 30 + ["pick at <30, 40>"] * 30,
@@ -53,10 +54,10 @@ def example(*, is_grounded: bool = True) -> Example:
     return make_example(episode(), PONDER.format, config, np.random.default_rng(0))
 
 
-def test_it_is_what_ponder_wrote_at_the_last_transition() -> None:
-    """At one query a second: the text of tick 60 is new words for the old subgoal, which nobody writes."""
+def test_the_subgoal_is_what_ponder_wrote_at_the_last_transition() -> None:
+    """At one query a second: the text of tick 60 is another text of the old subgoal, which PONDER does not write."""
     schedule = sample_schedule(np.random.default_rng(0), EVALUATION, NUM_TICKS, transition_ticks=frozenset(CHANGES))
-    said = said_by_query(episode(), schedule)
+    said = subgoals_by_query(episode(), schedule)
     written = {query.tick: text for query, text in zip(schedule.queries, said, strict=True)}
     first, second = "press at [20, 20]", "pick at [78, 39]"
     assert [text for _, text in sorted(written.items())] == [first, first, second, second, second]
@@ -68,7 +69,7 @@ def test_training_reads_the_subgoal_of_the_query_it_refers_to() -> None:
     for place, asked in enumerate(seen.invocations):
         assert asked.reference.query is not None
         request = Request(
-            frames=seen.episode.frames[asked.tick],
+            frames=seen.episode.views[asked.tick],
             proprio=seen.episode.state_T8[asked.tick],
             instruction=seen.episode.instruction,
             cognition=None,
@@ -77,8 +78,8 @@ def test_training_reads_the_subgoal_of_the_query_it_refers_to() -> None:
             subgoal=seen.said[asked.reference.query],
         )
         served = pi05_inputs(request, POUNCE, TOKENIZER, STATISTICS, CPU)
-        told = served.token_ids.shape[1]
-        assert torch.equal(batch.inputs.token_ids[place, :told], served.token_ids[0])
+        num_tokens = served.token_ids.shape[1]
+        assert torch.equal(batch.inputs.token_ids[place, :num_tokens], served.token_ids[0])
         assert "Subgoal: p" in TOKENIZER._pieces.decode(served.token_ids[0].tolist())
     assert len({tuple(ids.tolist()) for ids in batch.inputs.token_ids}) > 1
 
@@ -88,15 +89,15 @@ def test_without_a_subgoal_the_prompt_is_the_ordinary_one(family: str) -> None:
     request = replace(example_request(EagerEngine(random_bundle(POUNCE, seed=0)).spec), subgoal="pick")
     tokens: dict[tuple[bool, bool], Any] = {}
     for reads in (True, False):
-        for is_told in (True, False):
-            asked = request if is_told else replace(request, subgoal="")
+        for has_subgoal in (True, False):
+            asked = request if has_subgoal else replace(request, subgoal="")
             if family == "pi05":
                 config = replace(POUNCE, reads_subgoal=reads)
-                tokens[reads, is_told] = pi05_inputs(asked, config, TOKENIZER, STATISTICS, CPU).token_ids
+                tokens[reads, has_subgoal] = pi05_inputs(asked, config, TOKENIZER, STATISTICS, CPU).token_ids
             else:
                 groot = replace(tiny_groot(num_carriers=0), reads_subgoal=reads)
                 eagle = tiny_eagle_tokenizer_for_random_weights()
-                tokens[reads, is_told] = groot_inputs(asked, groot, eagle, STATISTICS, CPU).token_ids
+                tokens[reads, has_subgoal] = groot_inputs(asked, groot, eagle, STATISTICS, CPU).token_ids
     assert torch.equal(tokens[True, False], tokens[False, False])
     assert torch.equal(tokens[False, True], tokens[False, False])
     assert tokens[True, True].shape[1] > tokens[True, False].shape[1]
@@ -106,7 +107,7 @@ def test_without_grounding_there_is_nothing_to_read() -> None:
     assert set(example(is_grounded=False).said) == {""}
 
 
-def test_actions_teach_ponder_nothing_through_text_and_words_do() -> None:
+def test_action_loss_does_not_reach_ponder_through_text_and_grounding_does() -> None:
     model = JointModel(PONDER, random_pounce(POUNCE, 0))
     seen = [example()]
     episodes, batch = collate_ponder(seen), collate_pounce(seen, POUNCE, TOKENIZER, STATISTICS)
@@ -114,9 +115,9 @@ def test_actions_teach_ponder_nothing_through_text_and_words_do() -> None:
     loss = model(episodes, batch, draws)
     weights = [parameter for parameter in model.ponder.parameters() if parameter.requires_grad]
     by_actions = torch.autograd.grad(loss.flow_matching, weights, allow_unused=True, retain_graph=True)
-    by_words = torch.autograd.grad(loss.grounding, weights, allow_unused=True)
+    by_texts = torch.autograd.grad(loss.grounding, weights, allow_unused=True)
     assert all(gradient is None or not gradient.any() for gradient in by_actions)
-    assert any(gradient is not None and gradient.any() for gradient in by_words)
+    assert any(gradient is not None and gradient.any() for gradient in by_texts)
 
 
 @pytest.mark.parametrize("config", [tiny_cpu(num_carriers=1), tiny_groot(num_carriers=1)])

@@ -24,24 +24,24 @@ from dual_system.training.trainer import CheckpointError, SaveError, TrainConfig
 
 CONFIG = replace(tiny_ponder(), image_px=(32, 32), num_layers=4)
 TRAIN = TrainConfig(seed=1, dropout=0.3, optim=OptimConfig(learning_rate=1e-3, warmup_steps=3, ema_decay=0.9))
+FORM = Ponder.random(CONFIG, seed=1).format
+POUNCE_CONFIG = tiny_pounce(num_carriers=1, cognition_size=CONFIG.hidden_size, horizon=4)
 
 
 def joint(seed: int = 1) -> JointModel:
-    pounce = random_pounce(tiny_pounce(num_carriers=1, cognition_size=CONFIG.hidden_size, horizon=4), seed=seed)
+    pounce = random_pounce(POUNCE_CONFIG, seed=seed)
     return JointModel(Ponder.random(CONFIG, seed=seed), pounce)
 
 
 def batch(step: int) -> tuple[PonderBatch, PounceBatch]:
     """One short episode of noise and three invocations, another one for every step."""
-    model = joint()
-    form, pounce = model.ponder.format, model.pounce
-    said = Transition(subgoal=form.vocabulary.encode("pick the cube"))
-    row = form.row([*form.opening("press"), *form.query(1, said), *form.query(1)])
+    said = Transition(subgoal=FORM.vocabulary.encode("pick the cube"))
+    row = FORM.row([*FORM.opening("press"), *FORM.query(1, said), *FORM.query(1)])
     generator = torch.Generator().manual_seed(step)
     frames = torch.randint(0, 256, (row.num_images, 32, 32, 3), generator=generator, dtype=torch.uint8)
     invocations = PounceBatch(
-        inputs=replace(pounce.config.example_inputs(3, seed=step), cognition=None),
-        actions_INA=pounce.config.example_actions(3, seed=step),
+        inputs=replace(POUNCE_CONFIG.example_inputs(3, seed=step), cognition=None),
+        actions_INA=POUNCE_CONFIG.example_actions(3, seed=step),
         episode_I=torch.zeros(3, dtype=torch.int64),
         query_I=torch.tensor([-1, 0, 1]),
     )

@@ -1,4 +1,4 @@
-"""What a run shows: words beside words, and a plot."""
+"""What a run shows: texts beside the texts of the data, and a plot."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def form() -> ContextFormat:
     return Ponder.random(replace(tiny_cpu(), image_px=(32, 32), num_layers=4), seed=1).format
 
 
-def test_what_is_said_stands_beside_what_is_wanted(form: ContextFormat) -> None:
+def test_what_ponder_writes_stands_beside_what_it_should(form: ContextFormat) -> None:
     v = form.vocabulary
     row = form.row([*form.opening("go"), *form.query(1, Transition(subgoal=v.encode("pick"))), *form.query(1)])
     wanted = [target for target in row.targets if target != IGNORE]
@@ -89,7 +89,7 @@ def test_tensorboard_that_is_not_installed_is_said(tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_tensorboard_gets_scalars_words_and_pictures(tmp_path: Path, form: ContextFormat) -> None:
+def test_tensorboard_gets_scalars_texts_and_pictures(tmp_path: Path, form: ContextFormat) -> None:
     events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     row = form.row([*form.opening("go"), *form.query(1, Transition(subgoal=form.vocabulary.encode("pick")))])
     said_N = torch.tensor([target for target in row.targets if target != IGNORE])
@@ -101,8 +101,6 @@ def test_tensorboard_gets_scalars_words_and_pictures(tmp_path: Path, form: Conte
         total=2.5,
         flow_matching=1.0,
         grounding=1.5,
-        alignment=0.0,
-        placing=0.0,
         gradient_norm=1.0,
         num_supervised=3,
         num_null=0,
