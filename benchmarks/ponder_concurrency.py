@@ -17,9 +17,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 import tyro
+from clock.membership import percentile_ns
 
 from benchmarks.report import Report, Row, show, spread
-from clock.membership import percentile_ns
 from dual_system.models.ponder.configs import tiny_cpu
 from dual_system.models.ponder.network import Ponder
 from ponder_server.admission import Admission

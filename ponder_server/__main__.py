@@ -7,7 +7,7 @@ import sys
 
 import tyro
 
-from clock.daemon import serve_model
+from model_server.daemon import serve_model
 from ponder_server.config import NUM_TORCH_THREADS, PonderOptions
 from ponder_server.contract import BatchingEngine
 from ponder_server.fleet import PonderFleet

@@ -78,6 +78,11 @@ class EngineSpec:
     cognition_error: float = 0.0
     """Relative L2 change of C that ``weights`` cost, after one and the same short context (the warm-up's)."""
 
+    @property
+    def is_fake(self) -> bool:
+        """Something that was drawn, not trained, decides the answers."""
+        return self.is_random
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Opening:

@@ -7,7 +7,7 @@ import sys
 
 import tyro
 
-from clock.daemon import serve_model
+from model_server.daemon import serve_model
 from pounce_server.config import NUM_TORCH_THREADS, PounceOptions
 from pounce_server.contract import PounceEngine
 from pounce_server.serve import PounceServer

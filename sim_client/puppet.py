@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 from clock.membership import Membership
+
 from protocol import messages as m
 from protocol import topics
 from protocol.heartbeat import Heartbeat
