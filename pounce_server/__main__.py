@@ -36,21 +36,25 @@ def build_engine(options: PounceOptions) -> PounceEngine:
     if options.checkpoint is not None:
         bundle = load_bundle(options.checkpoint, tokenizer=options.tokenizer)
         family = family_of_config(bundle.model.config)
-        if options.family not in (None, family):
-            raise ValueError(f"checkpoint {options.checkpoint} holds {family}; leave --family {options.family} out")
+        if options.random.family not in (None, family):
+            raise ValueError(
+                f"checkpoint {options.checkpoint} holds {family}; leave --family {options.random.family} out"
+            )
     else:
-        hidden_size = options.hidden_size or tiny_ponder().hidden_size
-        tiny = tiny_groot if options.family == "groot" else tiny_cpu
-        bundle = random_bundle(tiny(num_carriers=options.num_carriers, cognition_size=hidden_size), options.seed)
+        hidden_size = options.random.hidden_size or tiny_ponder().hidden_size
+        tiny = tiny_groot if options.random.family == "groot" else tiny_cpu
+        bundle = random_bundle(
+            tiny(num_carriers=options.random.num_carriers, cognition_size=hidden_size), options.random.seed
+        )
     return EagerEngine(
         bundle,
         device=options.device,
         dtype=options.dtype,
-        continuity=options.continuity,
-        path=options.path,
-        rolls_forward=options.roll_forward,
-        weights=options.weights,
-        autotune=options.autotune,
+        continuity=options.chunks.continuity,
+        path=options.speed.path,
+        rolls_forward=options.chunks.roll_forward,
+        weights=options.speed.weights,
+        autotune=options.speed.autotune,
     )
 
 
