@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ponderpounce.tasks import captions, demonstration, engine, forks, panda, predicates, sight
+from ponderpounce.tasks import captions, demonstration, engine, panda, predicates, sight
 from ponderpounce.tasks.captions import Caption
 from ponderpounce.tasks.demonstration import Row
 from ponderpounce.tasks.difficulty import DIFFICULTIES, Order
 from ponderpounce.tasks.engine import Progress, Status
-from ponderpounce.tasks.forks import Fork
 from ponderpounce.tasks.geometry import Array, pose_of
 from ponderpounce.tasks.kinematics import UnreachableError
 from ponderpounce.tasks.oracle import Motions
@@ -103,7 +102,7 @@ class Environment:
         texts_follow: bool = False,
         order: Order = "drawn",
     ) -> None:
-        self._task = task
+        self.task = task
         self._order = order
         self._texts_follow = texts_follow
         self._said_of: Array = np.zeros((0, 3))  # where the things of the grounded text were when it was made
@@ -126,7 +125,7 @@ class Environment:
     def instruction(self) -> str:
         """The sentence the robot is given in this episode."""
         self._require_episode()
-        return self._task.instruction(self._layout)
+        return self.task.instruction(self._layout)
 
     @property
     def layout(self) -> Any:
@@ -153,12 +152,12 @@ class Environment:
             raise TaskError(f"unknown difficulty {difficulty!r}; expected one of {', '.join(DIFFICULTIES)}")
         rng, is_given = np.random.default_rng(seed), layout is not None
         for tries_left in reversed(range(_MAX_DRAWS)):
-            layout = layout if is_given else self._task.sample(rng, difficulty)
-            layout = self._task.near_first(layout) if self._order == "near-first" else layout
+            layout = layout if is_given else self.task.sample(rng, difficulty)
+            layout = self.task.near_first(layout) if self._order == "near-first" else layout
             self._begin(difficulty, layout)
-            parts = [self._told(part) for part in self._task.demonstration(layout)]
+            parts = [self._told(part) for part in self.task.demonstration(layout)]
             try:
-                self._video, last_action = demonstration.perform(self._task, layout, parts, self.physics, self._look_at)
+                self._video, last_action = demonstration.perform(self.task, layout, parts, self.physics, self._look_at)
                 break
             except UnreachableError:
                 if is_given or tries_left == 0:
@@ -218,7 +217,7 @@ class Environment:
         """
         self._require_episode()
         assert self._caption is not None
-        needed = self._task.reasoning(self._layout, self._caption.index)
+        needed = self.task.reasoning(self._layout, self._caption.index)
         if needed is None:
             return ""
         points = [point for body in needed.grounds for point in self._look_for([body]) or self._recall(body)]
@@ -250,7 +249,7 @@ class Environment:
     def due_step(self) -> int | None:
         """Returns when what must happen at one instant is to begin (`Task.due_step`), in steps from reset on."""
         self._require_episode()
-        due: int | None = self._task.due_step(self._layout)
+        due: int | None = self.task.due_step(self._layout)
         return due
 
     def to_come(self) -> tuple[str, ...]:
@@ -272,7 +271,7 @@ class Environment:
         self._require_episode()
         assert self._caption is not None
         return EpisodeState(
-            task=self._task.name,
+            task=self.task.name,
             difficulty=self.difficulty,
             layout=self._layout,
             step=self._step,
@@ -286,8 +285,8 @@ class Environment:
 
     def restore(self, state: EpisodeState, *, look: bool = True) -> Snapshot:
         """Continues a saved episode and returns its snapshot. Raises TaskError if it is another task's."""
-        if state.task != self._task.name:
-            raise TaskError(f"the saved episode is of task {state.task!r}; this environment runs {self._task.name!r}")
+        if state.task != self.task.name:
+            raise TaskError(f"the saved episode is of task {state.task!r}; this environment runs {self.task.name!r}")
         self._begin(state.difficulty, state.layout)
         self.physics.load(state.physics)
         self._step, self._memory = state.step, state.memory
@@ -295,14 +294,6 @@ class Environment:
         self._actions = list(state.actions)
         self._read_on()
         return self._snapshot(look=look)
-
-    def fork(self, variant: int = 0) -> Fork:
-        """Returns this episode and a twin that looks the same now and had another past; see `forks`.
-
-        The episode itself stands still meanwhile. Raises ForkError where there is no such twin, or not so many.
-        """
-        self._require_episode()
-        return forks.fork(self, self._task, variant)
 
     def close(self) -> None:
         """Frees the renderer. May be called twice."""
@@ -320,17 +311,17 @@ class Environment:
 
     def _begin(self, difficulty: str, layout: Any) -> None:
         self.difficulty, self._layout = difficulty, layout
-        self._subtasks = tuple(self._told(subtask) for subtask in self._task.subtasks(layout))
+        self._subtasks = tuple(self._told(subtask) for subtask in self.task.subtasks(layout))
         self._step, self._memory, self._caption, self._progress = 0, None, None, Progress()
         self._actions = []
         self.physics.reset()
-        self._task.arrange(self.physics, layout)
+        self.task.arrange(self.physics, layout)
         self.physics.refresh()
 
     def _read_on(self) -> None:
         """With ``texts_follow``: the list goes on from what has been done, in whatever order."""
         if self._texts_follow:
-            done = self._task.subtasks_after(self._layout, self._memory)
+            done = self.task.subtasks_after(self._layout, self._memory)
             self._subtasks = tuple(self._told(subtask) for subtask in done)
 
     def _told(self, step: StepT) -> StepT:
@@ -338,9 +329,9 @@ class Environment:
 
     def _observe(self, *, look: bool = True) -> Snapshot:
         """Stages, remembers, judges and captions the instant the physics is at."""
-        self._task.stage(self.physics, self._layout, self._memory, self.physics.elapsed_steps() - 1)
+        self.task.stage(self.physics, self._layout, self._memory, self.physics.elapsed_steps() - 1)
         spoken_of = self._progress.index  # texts change one step after the engine does
-        before, self._memory = self._memory, self._task.remember(self._memory, self.physics, self._layout)
+        before, self._memory = self._memory, self.task.remember(self._memory, self.physics, self._layout)
         if self._memory != before:
             self._read_on()
         self._progress = engine.judge(
@@ -348,7 +339,7 @@ class Environment:
             self._subtasks,
             self.physics,
             self._memory,
-            is_accomplished=self._task.is_accomplished(self._memory, self._layout),
+            is_accomplished=self.task.is_accomplished(self._memory, self._layout),
         )
         if self._progress.status is Status.ONGOING and self._step >= self._max_steps:
             reason = f"not done after {self._max_steps} steps"

@@ -21,16 +21,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from ponderpounce.tasks import sight
 from ponderpounce.tasks.engine import Status
+from ponderpounce.tasks.environment import Environment, EpisodeState
+from ponderpounce.tasks.physics import Physics, PhysicsState
 from ponderpounce.tasks.scene import CAMERAS
-from ponderpounce.tasks.task import Task
-
-if TYPE_CHECKING:
-    from ponderpounce.tasks.environment import Environment, EpisodeState
-    from ponderpounce.tasks.physics import Physics, PhysicsState
 
 MAX_SEAM = 0.005  # rad or m; about half a pixel of the front camera
 
@@ -63,13 +60,13 @@ class Fork:
     seam: float  # rad or m: how far things jump, on a cut twin's last step or after another video; 0 without either
 
 
-def fork(environment: Environment, task: Task[Any, Any], variant: int) -> Fork:
+def fork(environment: Environment, variant: int = 0) -> Fork:
     """Returns the episode that an environment is in, and a twin; the environment is left as it was.
 
     Variants count from 0: retold layouts in the task's order, cuts from the latest on. Raises ForkError if the episode
     is over, did not come here from its own reset, or has no such twin now.
     """
-    now = environment.save()
+    task, now = environment.task, environment.save()
     if now.progress.status is not Status.ONGOING:
         raise ForkError(f"the episode ended at step {now.step}; fork it before it does")
     try:
@@ -79,7 +76,7 @@ def fork(environment: Environment, task: Task[Any, Any], variant: int) -> Fork:
             raise ForkError("this episode did not come here from its own reset; fork the one that it was forked from")
         if not task.repeats_itself:
             layouts = task.retold(now.layout)
-            seam = retell(environment, task, _nth(layouts, variant, now.step), (*own.past, own.now)[0])
+            seam = retell(environment, _nth(layouts, variant, now.step), (*own.past, own.now)[0])
             told = _replayed(environment, now)
             if _is_another_world(environment.physics, told.now.physics, now.physics):
                 raise ForkError(f"at step {now.step} one still sees which past it was; step on until nothing is shown")
@@ -94,13 +91,13 @@ def fork(environment: Environment, task: Task[Any, Any], variant: int) -> Fork:
         environment.restore(now, look=False)
 
 
-def retell(environment: Environment, task: Task[Any, Any], layout: Any, first: EpisodeState) -> float:
+def retell(environment: Environment, layout: Any, first: EpisodeState) -> float:
     """Begins the other telling of an episode whose first observation is given; returns the seam in rad or m.
 
     Raises ForkError if it has another video that leaves things too far from where the episode found them.
     """
     environment.reset(0, first.difficulty, layout=layout)
-    if not task.retells_video:
+    if not environment.task.retells_video:
         return 0.0
     seam = environment.physics.gap(environment.save().physics, first.physics, scripted=False)
     if seam > MAX_SEAM:

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from ponderpounce.tasks.difficulty import DIFFICULTIES
 from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import Environment, EpisodeState, Snapshot
-from ponderpounce.tasks.forks import Branch, Fork, ForkError, retell
+from ponderpounce.tasks.forks import Branch, Fork, ForkError, fork, retell
 from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.physics import CONTROL_HZ
-from ponderpounce.tasks.task import Task, make_task
+from ponderpounce.tasks.task import make_task
 
 PAST_HZ = 1  # the rate at which PONDER looks
 ORACLE_STEPS = 20  # one chunk
@@ -83,30 +83,30 @@ def find_pair(
     own.reset(seed)
     if kind.repeats_itself:
         variant = variant or 0
-        fork = _cut(own, variant)
+        found = _cut(own, variant)
     else:
         told = kind.retold(own.layout)
         if variant is None:
             variant = seed // len(DIFFICULTIES) % max(len(told), 1)  # the remainder decides the difficulty
-        fork = _retold(own, other, kind, told[variant], variant) if variant < len(told) else None
-    if fork is None:
+        found = _retold(own, other, told[variant], variant) if variant < len(told) else None
+    if found is None:
         return None
-    now, twin_now = own.restore(fork.own.now), own.restore(fork.twin.now)
+    now, twin_now = own.restore(found.own.now), own.restore(found.twin.now)
     if _bytes(now) != _bytes(twin_now):
         raise RuntimeError(f"{task}, seed {seed}, variant {variant}: the branches do not look the same at {now.step}")
     return Pair(
         task=task,
         family=kind.family,
         seed=seed,
-        difficulty=fork.own.now.difficulty,
+        difficulty=found.own.now.difficulty,
         variant=variant,
-        is_cut=fork.is_cut,
-        seam=fork.seam,
+        is_cut=found.is_cut,
+        seam=found.seam,
         instruction=own.instruction,
         frames=dict(now.frames),
         state=now.state,
-        own=_telling(own, fork.own, demo_hz, video_end),
-        twin=_telling(own, fork.twin, demo_hz, video_end),
+        own=_telling(own, found.own, demo_hz, video_end),
+        twin=_telling(own, found.twin, demo_hz, video_end),
     )
 
 
@@ -121,9 +121,9 @@ def oracle_chunk(environment: Environment, state: EpisodeState, num_steps: int =
     return np.stack(rows + rows[-1:] * (num_steps - len(rows)))
 
 
-def _retold(own: Environment, other: Environment, kind: Task[Any, Any], layout: Any, variant: int) -> Fork | None:
+def _retold(own: Environment, other: Environment, layout: Any, variant: int) -> Fork | None:
     try:
-        retell(other, kind, layout, own.save())
+        retell(other, layout, own.save())
     except ForkError:
         return None
     for action, others_action in zip(own.oracle(), other.oracle(), strict=False):
@@ -134,12 +134,12 @@ def _retold(own: Environment, other: Environment, kind: Task[Any, Any], layout: 
         other.step(action, look=False)
     for _ in range(_PATIENCE_STEPS):
         try:
-            fork = own.fork(variant)
+            found = fork(own, variant)
         except ForkError:
             if own.step(own.physics.command(), look=False).status is not Status.ONGOING:
                 return None
             continue
-        return fork if _goes_apart(own, fork) else None
+        return found if _goes_apart(own, found) else None
     return None
 
 
@@ -150,17 +150,17 @@ def _cut(own: Environment, variant: int) -> Fork | None:
             if own.step(action, look=False).status is not Status.ONGOING:
                 return None
         try:
-            fork = own.fork(variant)
+            found = fork(own, variant)
         except ForkError:
             continue
-        if _goes_apart(own, fork):
-            return fork
-        own.restore(fork.own.now, look=False)
+        if _goes_apart(own, found):
+            return found
+        own.restore(found.own.now, look=False)
     return None
 
 
-def _goes_apart(environment: Environment, fork: Fork) -> bool:
-    own, twin = (oracle_chunk(environment, branch.now) for branch in (fork.own, fork.twin))
+def _goes_apart(environment: Environment, found: Fork) -> bool:
+    own, twin = (oracle_chunk(environment, branch.now) for branch in (found.own, found.twin))
     return bool(np.abs(own - twin).max() > _PARTED)
 
 
