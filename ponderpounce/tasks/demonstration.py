@@ -18,9 +18,10 @@ from ponderpounce.tasks.captions import Caption
 from ponderpounce.tasks.geometry import Array
 from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.physics import Physics, PhysicsState
-from ponderpounce.tasks.task import Shown, Task
+from ponderpounce.tasks.task import Task
 
-Look = Callable[[Shown], list[captions.Pixel] | None]  # where the front camera sees what a part grounds, in order
+Look = Callable[[Sequence[str]], list[captions.Pixel] | None]
+"""Returns where the front camera sees bodies, in order; None if one of them is hidden."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,13 +30,9 @@ class Row:
 
     physics: PhysicsState
     caption: Caption
-    memory: Any
-    """The task's, of what has happened by then."""
 
 
-def perform(
-    task: Task[Any, Any], layout: Any, parts: Sequence[Shown], physics: Physics, look: Look
-) -> tuple[tuple[Row, ...], Array | None]:
+def perform(task: Task[Any, Any], layout: Any, physics: Physics, look: Look) -> tuple[tuple[Row, ...], Array | None]:
     """Acts out a demonstration in a freshly arranged scene.
 
     Returns its frames and the last action (8,), which is still in force; None if there was nothing to act out. A frame
@@ -47,15 +44,15 @@ def perform(
     caption: Caption | None = None
     action: Array | None = None
     motions = Motions(physics)
-    for index, part in enumerate(parts):
+    for index, part in enumerate(task.demonstration(layout)):
         for target in part.motion(motions):
             action = target.astype(np.float64)
             physics.advance(action)
             task.stage(physics, layout, memory, physics.elapsed_steps() - 1)
             memory = task.remember(memory, physics, layout)
             if part.is_recorded:
-                caption = captions.follow(caption, index, part.text, partial(look, part))
-                rows.append(Row(physics=physics.save(), caption=caption, memory=memory))
+                caption = captions.follow(caption, index, part.text, partial(look, part.grounds))
+                rows.append(Row(physics=physics.save(), caption=caption))
         if part.afterwards is not None:
             part.afterwards(physics)
             physics.refresh()

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from ponderpounce.tasks import captions, demonstration, engine, panda, predicates, sight
 from ponderpounce.tasks.captions import Caption
 from ponderpounce.tasks.demonstration import Row
-from ponderpounce.tasks.difficulty import DIFFICULTIES, Order
+from ponderpounce.tasks.difficulty import DIFFICULTIES
 from ponderpounce.tasks.engine import Progress, Status
 from ponderpounce.tasks.geometry import Array, pose_of
 from ponderpounce.tasks.kinematics import UnreachableError
@@ -21,12 +21,11 @@ from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.physics import CONTROL_HZ, Physics, PhysicsState
 from ponderpounce.tasks.rendering import Cameras
 from ponderpounce.tasks.scene import FRONT, table_scene
-from ponderpounce.tasks.task import Shown, StepT, Subtask, Task, TaskError, located, make_task
+from ponderpounce.tasks.task import Subtask, Task, TaskError, make_task
 
 IMAGE_PX = 256  # upstream's; grounded texts count in these pixels
 _MAX_DRAWS = 20
 _PUSHED_M = 0.01  # texts that follow are corrected from this distance on
-_NUM_WATCHED = 2  # as many as PONDER is taught to have in mind at a picture (`place_lessons`)
 MAX_STEPS = 1300  # the paper's limit; upstream's own default is 10000
 
 
@@ -71,18 +70,16 @@ def make_environment(
     render: bool = True,
     max_steps: int = MAX_STEPS,
     texts_follow: bool = False,
-    order: Order = "drawn",
 ) -> Environment:
     """Returns an environment of a registered task. Raises TaskError for an unknown name.
 
-    With ``texts_follow`` the coordinates of a grounded subgoal are corrected when its things have been pushed
-    elsewhere, there are some where upstream tells a way without its end (`located`) or a demonstration's text names no
-    place, what was dropped on its way is to be picked up again, and of things that will all do the next is one that is
-    left (`Task.subtasks_after`); upstream's stay where they were first seen, and go on. An ``order`` other than
-    upstream's changes the list of subtasks, and with it texts and oracle; scenes and what counts as success stay.
+    With ``texts_follow`` the texts follow the scene: a grounded subgoal's coordinates are corrected when its objects
+    have been pushed elsewhere, an object that was dropped on its way is to be picked up again, and of several objects
+    that all count the next subgoal names one that is left (`Task.subtasks_after`). Upstream's texts keep the
+    coordinates at which the objects were first seen, and go on down the list.
     """
     return Environment(
-        make_task(name), image_px=image_px, render=render, max_steps=max_steps, texts_follow=texts_follow, order=order
+        make_task(name), image_px=image_px, render=render, max_steps=max_steps, texts_follow=texts_follow
     )
 
 
@@ -100,10 +97,8 @@ class Environment:
         render: bool,
         max_steps: int,
         texts_follow: bool = False,
-        order: Order = "drawn",
     ) -> None:
         self.task = task
-        self._order = order
         self._texts_follow = texts_follow
         self._said_of: Array = np.zeros((0, 3))  # where the things of the grounded text were when it was made
         spec = table_scene(task.robot)
@@ -153,11 +148,9 @@ class Environment:
         rng, is_given = np.random.default_rng(seed), layout is not None
         for tries_left in reversed(range(_MAX_DRAWS)):
             layout = layout if is_given else self.task.sample(rng, difficulty)
-            layout = self.task.near_first(layout) if self._order == "near-first" else layout
             self._begin(difficulty, layout)
-            parts = [self._told(part) for part in self.task.demonstration(layout)]
             try:
-                self._video, last_action = demonstration.perform(self.task, layout, parts, self.physics, self._look_at)
+                self._video, last_action = demonstration.perform(self.task, layout, self.physics, self._look_for)
                 break
             except UnreachableError:
                 if is_given or tries_left == 0:
@@ -238,34 +231,6 @@ class Environment:
         for subtask in self._subtasks[self._progress.index :]:
             yield from subtask.motion(motions)
 
-    def onward(self) -> str:
-        """Returns where the next subgoal will be, ``<y, x>``: the first of its things as it stands; empty if none."""
-        self._require_episode()
-        assert self._caption is not None
-        is_lost = self._to_pick_up_again() is not None
-        following = self._subtasks[self._progress.index if is_lost else self._caption.index + 1 :][:1]
-        return "".join("<{}, {}>".format(*self._project(step.grounds[:1])[0]) for step in following if step.grounds)
-
-    def due_step(self) -> int | None:
-        """Returns when what must happen at one instant is to begin (`Task.due_step`), in steps from reset on."""
-        self._require_episode()
-        due: int | None = self.task.due_step(self._layout)
-        return due
-
-    def to_come(self) -> tuple[str, ...]:
-        """Returns the grounded texts of the subtasks after the one that is spoken of, with where their things stand.
-
-        What is not in the scene yet has no place.
-        """
-        self._require_episode()
-        assert self._caption is not None
-        texts = []
-        for step in self._subtasks[self._caption.index + 1 :]:
-            is_there = not any(map(self.physics.is_parked, step.grounds))
-            points = self._project(step.grounds) if is_there else []
-            texts.append(captions.grounded(step.text, points) if is_there else captions.simple(step.text))
-        return tuple(texts)
-
     def save(self) -> EpisodeState:
         """Returns a copy of the whole episode as it stands."""
         self._require_episode()
@@ -311,7 +276,7 @@ class Environment:
 
     def _begin(self, difficulty: str, layout: Any) -> None:
         self.difficulty, self._layout = difficulty, layout
-        self._subtasks = tuple(self._told(subtask) for subtask in self.task.subtasks(layout))
+        self._subtasks = self.task.subtasks(layout)
         self._step, self._memory, self._caption, self._progress = 0, None, None, Progress()
         self._actions = []
         self.physics.reset()
@@ -321,11 +286,7 @@ class Environment:
     def _read_on(self) -> None:
         """With ``texts_follow``: the list goes on from what has been done, in whatever order."""
         if self._texts_follow:
-            done = self.task.subtasks_after(self._layout, self._memory)
-            self._subtasks = tuple(self._told(subtask) for subtask in done)
-
-    def _told(self, step: StepT) -> StepT:
-        return located(step) if self._texts_follow else step
+            self._subtasks = self.task.subtasks_after(self._layout, self._memory)
 
     def _observe(self, *, look: bool = True) -> Snapshot:
         """Stages, remembers, judges and captions the instant the physics is at."""
@@ -347,7 +308,7 @@ class Environment:
         if self._progress.index == spoken_of and (again := self._to_pick_up_again()) is not None:
             spoken_of = again
         subtask = self._subtasks[spoken_of]
-        caption = captions.follow(self._caption, spoken_of, subtask.text, lambda: self._look_at(subtask))
+        caption = captions.follow(self._caption, spoken_of, subtask.text, lambda: self._look_for(subtask.grounds))
         if self._texts_follow:
             caption = self._following(caption, subtask)
         if self._progress.status is Status.SUCCESS:
@@ -381,26 +342,11 @@ class Environment:
         was_pushed = moved_m[:2].max() >= _PUSHED_M and moved_m[2] < _PUSHED_M
         if not caption.is_latched or not was_pushed:
             return caption
-        points = self._look_at(subtask)
+        points = self._look_for(subtask.grounds)
         if points is None:
             return caption
         self._said_of = now
         return replace(caption, grounded=captions.grounded(subtask.text, points))
-
-    def _look_at(self, step: Subtask | Shown) -> list[captions.Pixel] | None:
-        """The coordinates of its text; None if one of its things is hidden.
-
-        Those of a way are where its ends stand, hidden or not: half a target's pixels would lead beside it.
-        """
-        if not (self._texts_follow and step.way):
-            return self._look_for(step.grounds)
-        return self._project(step.grounds)
-
-    def _project(self, bodies: Sequence[str]) -> list[captions.Pixel]:
-        """Where bodies stand in the front camera's picture, hidden or not."""
-        K, Rt = sight.intrinsic(self.physics, FRONT, IMAGE_PX), sight.extrinsic(self.physics, FRONT)
-        points_px = sight.project(K, Rt, np.array([self.physics.position_m(body) for body in bodies]).reshape(-1, 3))
-        return [(int(y), int(x)) for x, y in points_px.tolist()]
 
     def _look_for(self, bodies: Sequence[str]) -> list[captions.Pixel] | None:
         """Where the front camera sees bodies; None if one of them is hidden.
@@ -432,20 +378,9 @@ class Environment:
         """A frame of the video, seen through a world that is put back as it was."""
         now = self.physics.save()
         self.physics.load(row.physics)
-        snapshot = self._seen(step, Progress(), self._watching(row.caption), look=look, is_demonstration=True)
+        snapshot = self._seen(step, Progress(), row.caption, look=look, is_demonstration=True)
         self.physics.load(now)
         return snapshot
-
-    def _watching(self, caption: Caption) -> Caption:
-        """With ``texts_follow``: the caption of a frame that names no place, with where the first two things are that
-        the robot will be asked for. What changes places meanwhile is to be followed; nothing else says where to.
-        """
-        if not self._texts_follow or "<" in caption.grounded:
-            return caption
-        bodies = [*dict.fromkeys(body for subtask in self._subtasks for body in subtask.grounds[:1])][:_NUM_WATCHED]
-        points = [] if any(map(self.physics.is_parked, bodies)) else self._project(bodies)
-        there = ", ".join(f"<{y}, {x}>" for y, x in points)
-        return replace(caption, grounded=f"{caption.grounded} at {there}") if points else caption
 
     def _snapshot(self, *, look: bool = True) -> Snapshot:
         assert self._caption is not None

@@ -14,7 +14,7 @@ import importlib.util
 import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, TypeVar
 
 import mujoco
@@ -51,8 +51,6 @@ class Subtask:
     failure: Callable[[Physics, Any], str | None] = never  # the reason, or None while there is none
     grounds: tuple[str, ...] = ()  # bodies whose pixels fill the template's coordinates, in order
     carries: tuple[str, ...] = ()  # the cube that must be in the hand for it, and others that will do
-    way: str = ""  # what `located` adds to the text; nothing in most tasks, whose texts tell places anyway
-    way_grounds: tuple[str, ...] = ()  # bodies whose pixels fill its coordinates, in order
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,33 +60,8 @@ class Shown:
     text: str  # template, see `captions`
     motion: Callable[[Motions], Iterator[NDArray[np.float32]]]
     grounds: tuple[str, ...] = ()  # as in a subtask
-    way: str = ""  # as in a subtask
-    way_grounds: tuple[str, ...] = ()
     is_recorded: bool = True  # False: it happens, but the video leaves it out
     afterwards: Callable[[Physics], None] | None = None  # what is moved in the scene when the part is over
-
-
-StepT = TypeVar("StepT", Subtask, Shown)
-
-
-def located(step: StepT) -> StepT:
-    """Returns the step with the places of its way in its grounded text, where upstream tells none.
-
-    "move left to <102, 101>, then <83, 103>" for "move left". Which target that is can be seen; a learner from scratch
-    is told, and since it acts for a while on what it heard last, also where it goes on from there.
-    """
-    if not step.way:
-        return step
-    return replace(step, text=step.text + step.way, grounds=step.way_grounds)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Thing:
-    """Something that stands in a scene and has a name; two may share one."""
-
-    name: str
-    body: str
-    is_movable: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -164,57 +137,6 @@ class Task(ABC, Generic[LayoutT, MemoryT]):
         for what motion leaves behind. The default is none.
         """
         return ()
-
-    def near_first(self, layout: LayoutT) -> LayoutT:
-        """Returns the same episode with an order that can be seen: what is nearest to the front camera comes first.
-
-        What counts as success is the same. Where a task asks for one order, or for one thing only, there is nothing to
-        choose: the default returns the layout. A drawn order nobody can foresee, so a learner can only guess at it.
-        """
-        return layout
-
-    def moving(self, layout: LayoutT, step: int) -> tuple[tuple[float, float, float], ...]:
-        """Returns where things are [m] that move by the step clock alone and must be followed, in the observation of
-        ``step``; those that have not begun to move count, too.
-
-        Empty when nothing moves any more. ``step`` counts from reset, a demonstration included. The default follows
-        nothing.
-        """
-        return ()
-
-    def underway(self, layout: LayoutT, step: int) -> tuple[int, int]:
-        """Returns when what is on its way (`moving`) in the observation of ``step`` left, and when it will be at rest,
-        were it for a moment.
-
-        ``step`` twice, and that is the default, where nothing is, or where it never rests.
-        """
-        return step, step
-
-    def laid_out(self, layout: LayoutT) -> tuple[tuple[tuple[float, float, float], ...], ...]:
-        """Returns where things lie [m] that are to be written down at the first look at a demonstration, the places of
-        one thing together and always in one order.
-
-        What is done with one of them hides it; written down before, its places can be copied. The default is nothing.
-        """
-        return ()
-
-    def due_step(self, layout: LayoutT) -> int | None:
-        """Returns when the arm is to begin with what must happen at one instant, in steps from reset on.
-
-        None, and that is the default, where nothing must.
-        """
-        return None
-
-    def things(self, layout: LayoutT, step: int, memory: MemoryT | None = None) -> tuple[Thing, ...]:
-        """Returns all that is to be named in the observation of ``step`` (`data.album`). The default names nothing."""
-        return ()
-
-    def imagined(self, rng: np.random.Generator, layout: LayoutT) -> MemoryT | None:
-        """Draws what may have happened, where a scene that stands still shows traces of it (`data.album`).
-
-        The default is None: nothing has.
-        """
-        return None
 
     @classmethod
     def can_be_forked(cls) -> bool:
