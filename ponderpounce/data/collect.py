@@ -20,18 +20,17 @@ from typing import Annotated, Any, Literal
 import tyro
 from tqdm import tqdm
 
-from ponderpounce.data.album import AlbumOptions, make_album, require_named
 from ponderpounce.data.dart import DART, NoiseKind
 from ponderpounce.data.episode import Package, Rejection, unpack
 from ponderpounce.data.errors import DatasetError
 from ponderpounce.data.jobs import DIFFICULTY_CYCLE, RECOVERY_SHARE, Job, Look, jobs_of
-from ponderpounce.data.lerobot_v3 import ALBUM, COLLECTION_PATH, INFO_PATH, DatasetWriter
+from ponderpounce.data.lerobot_v3 import COLLECTION_PATH, INFO_PATH, DatasetWriter
 from ponderpounce.data.rollout import UNSOLVED, work_out
 from ponderpounce.data.seeds import TRAIN_SEED
 from ponderpounce.data.shove import SHOVES
 from ponderpounce.data.store import Store
 from ponderpounce.data.workers import LocalWorkers, RayWorkers, Workers
-from ponderpounce.tasks.difficulty import Difficulty, Order
+from ponderpounce.tasks.difficulty import Difficulty
 from ponderpounce.tasks.task import TaskError, chosen_tasks
 
 SCALES = {"1x": 1, "9x": 9}
@@ -69,9 +68,6 @@ class CollectOptions:
     """Of the episodes, those with a grasp that closes too high or aside before it is made right."""
     difficulties: tuple[Difficulty, ...] = DIFFICULTY_CYCLE
     """Of the episodes of a task in turn, again and again."""
-    order: Order = "drawn"
-    """Where a task leaves open what is done first: as the scene was drawn (upstream), or what is nearest to the front
-    camera first, which a learner can foresee."""
     texts: Literal["latched", "follow"] = "latched"
     """Coordinates in subgoals: as first seen (upstream), or corrected when their thing was pushed elsewhere."""
     shove_share: float = 0.0
@@ -79,9 +75,6 @@ class CollectOptions:
     follow."""
     max_steps: int = 1300
     """An episode that takes longer is not kept."""
-    album: int = 0
-    """Also that many pictures of still scenes of every task, as pp-album makes them, into OUT/album/TASK: what opens
-    the eyes of a PONDER from scratch."""
     workers: int = os.cpu_count() or 1
     """Processes of this computer."""
     ray: str | None = None
@@ -96,26 +89,14 @@ class CollectOptions:
             raise DatasetError("--episodes and --workers must be at least 1")
         if self.first_episode < 0:
             raise DatasetError(f"--first-episode {self.first_episode}: episodes count from 0")
-        if self.album < 0:
-            raise DatasetError(f"--album {self.album}: a number of pictures, or 0 for no album")
         if self.image_px < 16 or self.image_px % 2:
             raise DatasetError(f"--image-px {self.image_px}: videos need an even number of at least 16")
         if not 0 <= self.recovery_share <= 1:
             raise DatasetError(f"--recovery-share {self.recovery_share} is not a share, in [0, 1]")
-
         if not 0 <= self.shove_share <= 1:
             raise DatasetError(f"--shove-share {self.shove_share} is not a share, in [0, 1]")
         if self.shove_share and self.texts != "follow":
             raise DatasetError("--shove-share would make every told place wrong; give --texts follow with it")
-
-    @property
-    def albums(self) -> tuple[AlbumOptions, ...]:
-        """What --album asks for."""
-        folders = {task: self.out / ALBUM / task for task in self.task_names()} if self.album else {}
-        return tuple(
-            AlbumOptions(out=out, task=task, pictures=self.album, image_px=self.image_px, progress=self.progress)
-            for task, out in folders.items()
-        )
 
     @property
     def look(self) -> Look:
@@ -139,7 +120,6 @@ class CollectOptions:
             noise=self.noise,
             recovery_share=self.recovery_share,
             difficulties=self.difficulties,
-            order=self.order,
             texts_follow=self.texts == "follow",
             shove_share=self.shove_share,
             first_slot=self.first_episode,
@@ -162,8 +142,6 @@ class CollectOptions:
             settings["recovery_share"] = self.recovery_share
         if self.difficulties != DIFFICULTY_CYCLE:
             settings["difficulties"] = list(self.difficulties)
-        if self.order != "drawn":
-            settings["order"] = self.order
         if self.texts != "latched":
             settings["texts"] = self.texts
         if self.shove_share:
@@ -184,12 +162,7 @@ class Report:
 def main(argv: list[str] | None = None) -> int:
     try:
         options = tyro.cli(CollectOptions, args=argv, prog="pp-collect", description=CollectOptions.__doc__)
-        for album in options.albums:
-            require_named(album.task)
         report = collect(options, _workers(options), say=print_line)
-        for album in options.albums:
-            if not (album.out / INFO_PATH).exists():
-                make_album(album)
     except (DatasetError, TaskError, OSError) as error:
         sys.stderr.write(f"pp-collect: {error}\n")
         return REFUSED

@@ -31,7 +31,6 @@ from ponderpounce.data.jobs import Look
 from ponderpounce.data.lerobot_v3 import INFO_PATH, DatasetWriter
 from ponderpounce.data.rollout import Scribe, UnsolvedError, asked, check_solved, kept_environment
 from ponderpounce.data.workers import LocalWorkers, Workers
-from ponderpounce.tasks.difficulty import Order
 from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import Environment, Snapshot
 from ponderpounce.tasks.kinematics import UnreachableError
@@ -54,8 +53,6 @@ class CorrectOptions:
     """Folder of the new dataset."""
     per_episode: int = 2
     """Episodes made of each log, each taken over elsewhere."""
-    order: Order = "drawn"
-    """With which the logs were played (pp-eval --order)."""
     look_hz: Literal[1, 2, 4, 5, 10, 20] = 5
     """How often pictures are rendered."""
     image_px: int = 256
@@ -156,7 +153,7 @@ def work_out(job: Job) -> Outcome:
     actions = _actions(job.path, record)
     options = job.options
     environment = kept_environment(  # coordinates follow what is pushed, as for the hand that pushed it
-        record.info.task, options.image_px, options.max_steps, options.order, texts_follow=True
+        record.info.task, options.image_px, options.max_steps, texts_follow=True
     )
     writer = EpisodeWriter(options.image_px)
     scribe = Scribe(environment, writer.add, Look(execution_hz=options.look_hz))
@@ -227,7 +224,7 @@ def _acted_out(
     if text != snapshot.simple_subgoal:
         raise DatasetError(
             f"{path}: after {len(actions)} ticks the subgoal is {snapshot.simple_subgoal!r} here and {text!r} in the "
-            "log; correct it with the --order that it was played in"
+            f"log, which was made with {record.info.versions}; correct it with those versions"
         )
     return snapshot
 

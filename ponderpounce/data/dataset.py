@@ -36,7 +36,6 @@ class Entry:
     num_rows: int
     num_demonstration_rows: int
     corrected_from: int  # see `About`
-    unreached: tuple[str, ...]
     first_row: int  # its number among all rows of the dataset
 
 
@@ -96,7 +95,6 @@ def _entry(listed: dict[str, Any]) -> Entry:
         first_row=listed["dataset_from_index"],
         noise_rad=listed.get("noise_rad", 0.0),
         corrected_from=listed.get("corrected_from", 0),
-        unreached=tuple(listed.get("unreached", ())),
         **{name: listed[name] for name in same},
     )
 

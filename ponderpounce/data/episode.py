@@ -24,10 +24,9 @@ from ponderpounce.data.video import FPS, Frame, VideoWriter
 
 CAMERAS = ("front", "wrist")
 ROWS, ABOUT = "rows.parquet", "episode.json"
-WANDERING = "wandering things"  # the origin of what pp-wander made
-EXECUTED, SAID = "executed_action", "said"
-OPTIONAL = (EXECUTED, SAID)
-"""Columns that only some datasets have: those collected under noise, those of a policy's own play."""
+EXECUTED = "executed_action"
+OPTIONAL = (EXECUTED,)
+"""Columns that only some datasets have: those collected under noise."""
 
 Package = dict[str, bytes]  # file name -> content
 Recovery = Literal["none", "z", "xy"]
@@ -46,7 +45,6 @@ class Row:
     is_transition: bool = False  # the first row of a new subgoal that the robot itself is to reach
     demonstration_reasoning: str = ""  # only in the first row after a demonstration
     executed_action: NDArray[np.float32] | None = None  # (8,): what was carried out in place of `action`, under noise
-    said: str | None = None  # the policy's own new words about this row, "" for none; None: nobody was listened to
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,7 +71,6 @@ class About:
     rejected: tuple[Rejection, ...] = ()
     noise_rad: float = 0.0  # standard deviation of the joint targets' noise, far from everything; see `dart`
     corrected_from: int = 0  # the first row after the demonstration that POUNCE imitates; see `correct`
-    unreached: tuple[str, ...] = ()  # grounded subgoals that were still to come when it ended; see `export`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -90,7 +87,6 @@ class Rows:
     grounded_subgoal: tuple[str, ...]
     demonstration_reasoning: tuple[str, ...]
     executed_action: NDArray[np.float32] | None = None  # (N, 8); None: every action was carried out as it is
-    said: tuple[str, ...] | None = None  # as the policy told places, [x, y] in thousandths; None: not recorded
 
     def __len__(self) -> int:
         return len(self.state)
@@ -129,7 +125,6 @@ class EpisodeWriter:
             grounded_subgoal=tuple(row.grounded_subgoal for row in rows),
             demonstration_reasoning=tuple(row.demonstration_reasoning for row in rows),
             executed_action=_executed(rows),
-            said=None if all(row.said is None for row in rows) else tuple(row.said or "" for row in rows),
         )
         pixels = {camera: [each.num_frames, each.counts.tolist()] for camera, each in self._pixels.items()}
         sink = io.BytesIO()
@@ -159,7 +154,6 @@ def unpack(package: Package) -> Episode:
         for camera, (num_frames, counts) in values.pop("pixels").items()
     }
     values["rejected"] = tuple(Rejection(**each) for each in values["rejected"])
-    values["unreached"] = tuple(values["unreached"])
     return Episode(
         about=About(**values),
         rows=from_table(pq.read_table(io.BytesIO(package[ROWS]))),

@@ -22,8 +22,6 @@ from ponderpounce.data.errors import DatasetError
 from ponderpounce.data.lerobot_v3 import INFO_PATH, DatasetWriter
 from ponderpounce.data.rollout import Narrator
 from ponderpounce.data.video import FPS, Frame
-from ponderpounce.tasks.difficulty import Order
-from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
 from ponderpounce.tasks.task import TaskError
 from protocol import images
@@ -46,8 +44,6 @@ class ExportOptions:
     """"follow": every action is played again, and told is what is to be done as things then stand. What was dropped is
     to be picked up again, what was pushed lies elsewhere, of cubes that will all do the next is one that is left, and
     what is still to come at the end is told, too. For a PONDER that learns from what it played."""
-    order: Order = "drawn"
-    """The one that was played in; for "follow"."""
     demonstration_hz: Literal[1, 2, 4, 5, 10, 20] = 20
     """How often demonstrations are looked at as they are acted out again. Training reads a picture a second."""
     only_success: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -83,9 +79,7 @@ def export(options: ExportOptions) -> int:
         record = read_log(path)
         if options.only_success and not (record.result and record.result.is_success):
             continue
-        episode = read_episode(
-            path, record, texts=options.texts, order=options.order, demonstration_hz=options.demonstration_hz
-        )
+        episode = read_episode(path, record, texts=options.texts, demonstration_hz=options.demonstration_hz)
         writer.add(episode)
         num_episodes += 1
     if not num_episodes:
@@ -99,7 +93,6 @@ def read_episode(
     record: EpisodeRecord,
     *,
     texts: Literal["logged", "follow"] = "logged",
-    order: Order = "drawn",
     demonstration_hz: int = FPS,
 ) -> Episode:
     """Joins a log's messages, and acts its demonstration out again, with pictures so many times a second.
@@ -116,20 +109,17 @@ def read_episode(
     writer = EpisodeWriter(height_px)
     follows = texts == "follow"
     max_steps = len(actions) + 1  # it ended as it did
-    with make_environment(
-        info.task, image_px=height_px, max_steps=max_steps, texts_follow=follows, order=order
-    ) as environment:
+    with make_environment(info.task, image_px=height_px, max_steps=max_steps, texts_follow=follows) as environment:
         narrator, first = _again(path, environment, info, observations[0])
         for row, frames in narrator.demonstration(demonstration_hz):
             writer.add(row, frames)
         reasoning = narrator.reasoning()
         if follows:
-            told, unreached = _played_again(path, environment, first, observations, actions)
+            told = _played_again(path, environment, first, observations, actions)
         else:
-            told, unreached = texts_by_tick(record.subgoals, len(actions)), ()
-        said = said_by_tick(record.subgoals, len(actions))
-        for observation, action, (plain, grounded, is_new), own, seen in zip(
-            observations, actions, told, said, _pictures(path, observations), strict=True
+            told = texts_by_tick(record.subgoals, len(actions))
+        for observation, action, (plain, grounded, is_new), seen in zip(
+            observations, actions, told, _pictures(path, observations), strict=True
         ):
             is_first = observation is observations[0]
             row = Row(
@@ -140,7 +130,6 @@ def read_episode(
                 grounded_subgoal=grounded,
                 is_transition=is_new,
                 demonstration_reasoning=reasoning if is_first else "",
-                said=own,
             )
             writer.add(row, seen)
     about = About(
@@ -151,7 +140,6 @@ def read_episode(
         origin=info.policy,
         is_success=record.result is not None and record.result.is_success,
         image_px=height_px,
-        unreached=unreached,
     )
     return unpack(writer.pack(about))
 
@@ -162,8 +150,8 @@ def _played_again(
     snapshot: Snapshot,
     observations: Sequence[m.Observation],
     actions: Sequence[m.Floats],
-) -> tuple[list[tuple[str, str, bool]], tuple[str, ...]]:
-    """What is told at every tick, as `texts_by_tick` has it, and what is still to come at the end.
+) -> list[tuple[str, str, bool]]:
+    """Returns the texts of every tick as `texts_by_tick` has them, made anew as the scene then stands.
 
     Raises DatasetError where the robot comes to stand elsewhere than in the log.
     """
@@ -177,7 +165,7 @@ def _played_again(
         told.append((snapshot.simple_subgoal, snapshot.grounded_subgoal, snapshot.subgoal_index != index))
         index = snapshot.subgoal_index
         snapshot = environment.step(action, look=False)
-    return told, () if snapshot.status is Status.SUCCESS else environment.to_come()
+    return told
 
 
 def _again(
@@ -220,12 +208,6 @@ def texts_by_tick(subgoals: Sequence[m.Subgoal], num_ticks: int) -> list[tuple[s
         now = (plain.get(tick, now[0]), grounded.get(tick, now[1]))
         said.append((*now, tick in plain))
     return said
-
-
-def said_by_tick(subgoals: Sequence[m.Subgoal], num_ticks: int) -> list[str]:
-    """What the policy itself said about each tick's observation, as it told it; empty where it said nothing."""
-    own = {each.tick: each.text for each in subgoals if each.kind == m.SubgoalKind.SUBGOAL}
-    return [own.get(tick, "") for tick in range(num_ticks)]
 
 
 def _pictures(path: Path, observations: Sequence[m.Observation]) -> Iterator[dict[str, Frame]]:

@@ -18,7 +18,7 @@ from ponderpounce.data.dart import NoiseKind
 from ponderpounce.data.episode import Recovery
 from ponderpounce.data.seeds import TRAIN_SEED
 from ponderpounce.data.video import FPS
-from ponderpounce.tasks.difficulty import Difficulty, Order
+from ponderpounce.tasks.difficulty import Difficulty
 from ponderpounce.tasks.oracle import FailedGrasp
 
 ATTEMPTS = 100
@@ -49,7 +49,6 @@ class Job:
     noise: NoiseKind = "none"
     recovery_share: float = RECOVERY_SHARE
     difficulties: tuple[Difficulty, ...] = DIFFICULTY_CYCLE
-    order: Order = "drawn"
     texts_follow: bool = False
     shove_share: float = 0.0
 
@@ -83,7 +82,6 @@ def jobs_of(
     noise: NoiseKind = "none",
     recovery_share: float = RECOVERY_SHARE,
     difficulties: tuple[Difficulty, ...] = DIFFICULTY_CYCLE,
-    order: Order = "drawn",
     texts_follow: bool = False,
     shove_share: float = 0.0,
     first_slot: int = 0,
@@ -100,7 +98,6 @@ def jobs_of(
                 noise=noise,
                 recovery_share=recovery_share,
                 difficulties=difficulties,
-                order=order,
                 texts_follow=texts_follow,
                 shove_share=shove_share,
             )

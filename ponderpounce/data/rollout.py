@@ -17,7 +17,6 @@ from ponderpounce.data.episode import About, EpisodeWriter, Package, Rejection, 
 from ponderpounce.data.jobs import ATTEMPTS, Job, Look, failed_grasp
 from ponderpounce.data.shove import Shoves, is_shoved
 from ponderpounce.data.video import FPS, Frame
-from ponderpounce.tasks.difficulty import Order
 from ponderpounce.tasks.engine import Status
 from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
 from ponderpounce.tasks.geometry import pose_of
@@ -105,7 +104,7 @@ class Scribe:
 
 def work_out(job: Job) -> Package:
     """Tries the job's seeds in turn; returns the first solved episode, or why there is none."""
-    environment = kept_environment(job.task, job.image_px, job.max_steps, job.order, job.texts_follow)
+    environment = kept_environment(job.task, job.image_px, job.max_steps, texts_follow=job.texts_follow)
     rejected: list[Rejection] = []
     for attempt in range(ATTEMPTS):
         seed = job.seed(attempt)
@@ -178,9 +177,9 @@ def check_solved(snapshot: Snapshot) -> None:
 
 
 @functools.lru_cache(maxsize=1)  # building a scene takes seconds, and jobs come task by task
-def kept_environment(task: str, image_px: int, max_steps: int, order: Order, texts_follow: bool = False) -> Environment:
+def kept_environment(task: str, image_px: int, max_steps: int, *, texts_follow: bool = False) -> Environment:
     """This process's own, until it needs another one or ends. See `make_environment`."""
-    environment = make_environment(task, image_px=image_px, max_steps=max_steps, order=order, texts_follow=texts_follow)
+    environment = make_environment(task, image_px=image_px, max_steps=max_steps, texts_follow=texts_follow)
     atexit.unregister(kept_environment.cache_clear)
     atexit.register(
         kept_environment.cache_clear
