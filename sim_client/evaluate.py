@@ -28,7 +28,7 @@ import ponderpounce.tasks.headless  # noqa: F401 - before anything that imports 
 from ponderpounce.data.errors import DatasetError
 from ponderpounce.data.seeds import TRAIN_SEED
 from ponderpounce.data.workers import LocalWorkers, RayWorkers, Workers
-from ponderpounce.tasks.difficulty import Difficulty, Order
+from ponderpounce.tasks.difficulty import Difficulty
 from ponderpounce.tasks.environment import Environment, make_environment
 from ponderpounce.tasks.task import TaskError, chosen_tasks
 from protocol.bus import Bus
@@ -36,18 +36,16 @@ from protocol.errors import TransportError
 from protocol.link import Link
 from protocol.process import set_up_logging
 from sim_client.config import SimOptions
-from sim_client.donor import DonorError, DonorPonder, donors_in
+from sim_client.harness import BuildServer, ServerStep, open_harness
 from sim_client.launch import Daemons
 from sim_client.ledger import Ledger, LedgerError, write_json
-from sim_client.silent import SilentPonder
-from sim_client.station import Build, Party, open_station
+from sim_client.null_ponder import NullPonder, cognition_shape
 from sim_client.suite import Suite, as_json, versions
-from sim_client.told_cognition import ToldPonder, cognition_shape
+from sim_client.swapped_ponder import DonorError, SwappedPonder, donors_in
 
 DONE, REFUSED, INTERRUPTED = 0, 2, 130
 Line = dict[str, Any]  # one episode's entry in results.json
 
-_PUPPETS = ("other-episode", "stand-in")
 _HOW_MANY = ("tasks", "episodes", "runs")  # a folder may be given more of them later
 _HOW = ("out", "patience_s", "progress")  # and these change no result
 
@@ -72,9 +70,6 @@ class EvalOptions:
     """Of the first scene; all lie below 2,000,000, where the training seeds begin."""
     difficulty: Difficulty | None = None
     """None: by seed, as the benchmark does."""
-    order: Order = "drawn"
-    """Of the simulator's own subgoals, where a task leaves it open: see pp-collect. What counts as success is the
-    same."""
     policy: Literal["servers", "oracle"] = "servers"
     """oracle: the tasks' own scripts, to test the machine."""
     ponder_checkpoint: Path | None = None
@@ -88,16 +83,9 @@ class EvalOptions:
     video_end: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Show a demonstration's last frame, too, although the --ponder-checkpoint does not say that it has learned so."""
 
-    cognition: Literal["real", "null", "other-episode", "stand-in"] = "real"
-    """null: POUNCE gets the learned null cognition. other-episode: what PONDER said in another episode of the task.
-    stand-in: the simulator's own subgoal, in the form that stage `motor` of the recipe `small` teaches; if its thing is
-    pushed elsewhere, its coordinates follow."""
-    stand_in_noise_px: float = 0.0
-    """With --cognition stand-in: how wrong the told places are (standard deviation); a PONDER's are by some pixels."""
-    stand_in_onward: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """With --cognition stand-in: also told where the next subgoal will be, as recipe small_imitating learned it."""
-    stand_in_waits_longer: int = 0
-    """With --cognition stand-in: control steps that are added to a wait which it is told (StopCube)."""
+    cognition: Literal["real", "null", "other-episode"] = "real"
+    """What POUNCE is conditioned on. null: the learned null cognition; other-episode: PONDER's cognition in another
+    episode of the task."""
     donors: Path | None = None
     """With --cognition other-episode: the --out of a recorded evaluation with real cognition, of the same scenes."""
     subgoal_text: Literal["ponder", "oracle"] | None = None
@@ -142,16 +130,8 @@ class EvalOptions:
             raise EvaluationError("--cognition null delivers nothing, so nothing is held; leave --deliver out")
         if (self.cognition == "other-episode") != (self.donors is not None):
             raise EvaluationError("--cognition other-episode and --donors go together: record the real one first")
-        if self.cognition in _PUPPETS and (self.servers, self.policy) != ("in-process", "servers"):
-            raise EvaluationError(f"--cognition {self.cognition} replaces PONDER: use --servers in-process")
-        if self.stand_in_onward and self.cognition != "stand-in":
-            raise EvaluationError("--stand-in-onward is of --cognition stand-in; leave it out")
-        if self.stand_in_waits_longer and self.cognition != "stand-in":
-            raise EvaluationError("--stand-in-waits-longer is of --cognition stand-in; leave it out")
-        if self.stand_in_noise_px < 0 or (self.stand_in_noise_px and self.cognition != "stand-in"):
-            raise EvaluationError("--stand-in-noise-px is for --cognition stand-in, and at least 0")
-        if self.cognition == "stand-in" and self.pounce_checkpoint is None:
-            raise EvaluationError("--cognition stand-in is for a --pounce-checkpoint that has learned from stand-ins")
+        if self.cognition == "other-episode" and (self.servers, self.policy) != ("in-process", "servers"):
+            raise EvaluationError("--cognition other-episode replaces PONDER: use --servers in-process")
         if self.subgoal_text is not None and (self.servers, self.cognition) != ("in-process", "real"):
             raise EvaluationError(
                 "--subgoal-text is for --servers in-process, and POUNCE then reads no cognition: leave --cognition out"
@@ -218,14 +198,6 @@ class EvalOptions:
         own = {"tasks": self.task_names(), "runs": self.runs, "cognition": self.cognition, "donors": self.donors}
         if self.subgoal_text is not None:
             own["subgoal_text"] = self.subgoal_text
-        if self.stand_in_noise_px:
-            own["stand_in_noise_px"] = self.stand_in_noise_px
-        if self.stand_in_onward:
-            own["stand_in_onward"] = True
-        if self.stand_in_waits_longer:
-            own["stand_in_waits_longer"] = self.stand_in_waits_longer
-        if self.order != "drawn":
-            own["order"] = self.order
         return config | {name: as_json(value) for name, value in own.items()}
 
 
@@ -302,29 +274,29 @@ def play(job: Job) -> Line:
         EvaluationError: it was not begun: servers that do not fit, refuse or died. That says nothing of a policy, and
             the same command tries again. Whatever ends an episode later is its result.
     """
-    return _station(job.options).play(job)
+    return _harness(job.options).play(job)
 
 
 @cache
-def _station(options: EvalOptions) -> EvaluationStation:
+def _harness(options: EvalOptions) -> EvaluationHarness:
     """This process's own, with its servers loaded; it lasts as long as the process."""
-    station = EvaluationStation(options)
-    Finalize(None, station.close, exitpriority=0)  # a worker's end, while GL and other threads are still there
-    return station
+    harness = EvaluationHarness(options)
+    Finalize(None, harness.close, exitpriority=0)  # a worker's end, while GL and other threads are still there
+    return harness
 
 
-class EvaluationStation:
+class EvaluationHarness:
     """One worker's servers, and the scene of the task it is at."""
 
     def __init__(self, options: EvalOptions) -> None:
         sim = options.sim()
         self._options = options
-        self._donor: DonorPonder | None = None
+        self._donor: SwappedPonder | None = None
         self._open = contextlib.ExitStack()
         daemons = self._open.enter_context(Daemons(options.out / "servers" / str(os.getpid())))
-        station = open_station(sim, daemons, self._replacement(), options.subgoal_text)
-        self._open.callback(station.bus.close)
-        self._suite = Suite(sim, station.link, station.clock, daemons.dead)
+        harness = open_harness(sim, daemons, self._replacement(), options.subgoal_text)
+        self._open.callback(harness.bus.close)
+        self._suite = Suite(sim, harness.link, harness.clock, daemons.dead)
         self._task = ""
         self._environment: Environment | None = None
 
@@ -355,46 +327,25 @@ class EvaluationStation:
                 task,
                 max_steps=self._options.max_steps,
                 render=has_eyes,
-                texts_follow=self._options.cognition == "stand-in",
-                order=self._options.order,
             )
             self._task = task
         return self._environment
 
-    def _replacement(self) -> Build | None:
+    def _replacement(self) -> BuildServer | None:
         """What stands in PONDER's place, if it is not to be asked."""
         options = self._options
         if options.cognition == "other-episode":
             return self._build_donor
-        if options.cognition == "stand-in":
-            return self._build_told
         is_unheard = options.cognition == "null" and options.servers == "in-process" and not options.record
         if is_unheard and options.pounce_checkpoint is not None:
             with contextlib.suppress(ValueError):  # a public folder does not say K and H: PONDER does
                 shape = cognition_shape(options.pounce_checkpoint)
-                return lambda bus, robot, _: SilentPonder(Link(bus, robot=robot, proc="ponder"), *shape).step
+                return lambda bus, robot, _: NullPonder(Link(bus, robot=robot, proc="ponder"), *shape).step
         return None
 
-    def _build_donor(self, bus: Bus, robot: str, checkpoint: Path | None) -> Party:
-        self._donor = DonorPonder(Link(bus, robot=robot, proc="ponder"))
+    def _build_donor(self, bus: Bus, robot: str, checkpoint: Path | None) -> ServerStep:
+        self._donor = SwappedPonder(Link(bus, robot=robot, proc="ponder"))
         return self._donor.step
-
-    def _build_told(self, bus: Bus, robot: str, checkpoint: Path | None) -> Party:
-        pounce = self._options.pounce_checkpoint
-        assert pounce is not None  # the options said so
-        try:
-            shape = cognition_shape(pounce)
-        except ValueError as error:
-            raise EvaluationError(str(error)) from None
-        link, noise_px = Link(bus, robot=robot, proc="ponder"), self._options.stand_in_noise_px
-        onward = self._onward if self._options.stand_in_onward else None
-        return ToldPonder(link, *shape, noise_px, onward, self._due_step, self._options.stand_in_waits_longer).step
-
-    def _onward(self) -> str:
-        return "" if self._environment is None else self._environment.onward()
-
-    def _due_step(self) -> int | None:
-        return None if self._environment is None else self._environment.due_step()
 
 
 def _workers(options: EvalOptions) -> Workers[Job, Line]:

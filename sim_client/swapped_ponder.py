@@ -16,7 +16,7 @@ from protocol import messages as m
 from protocol.errors import ProtocolError
 from protocol.link import Link
 from protocol.mcap_log import EpisodeRecord, read_log
-from sim_client.puppet import Answer, PuppetPonder
+from sim_client.ponder_double import Answer, PonderDouble
 
 Key = tuple[str, int, int]  # task, run, seed
 
@@ -25,7 +25,7 @@ class DonorError(ValueError):
     """There is no cognition to give: the message says what is missing and the way out."""
 
 
-class DonorPonder(PuppetPonder):
+class SwappedPonder(PonderDouble):
     """Answers with what was recorded."""
 
     def __init__(self, link: Link) -> None:

@@ -25,12 +25,11 @@ class Answer:
     norm: float
 
 
-class PuppetPonder(ABC):
+class PonderDouble(ABC):
     """``step`` answers what is asked and says whether anything was."""
 
     def __init__(self, link: Link) -> None:
         self.link = link
-        self.instruction = ""
         self._heartbeat = Heartbeat(link, version(), host_clock_id())
         self._membership = Membership(link, self._heartbeat, self._open, self.end)
         self._queries = link.subscribe(topics.QUERY)
@@ -84,7 +83,6 @@ class PuppetPonder(ABC):
 
     def _open(self, request: m.OpenRequest) -> m.Contract:
         num_carriers, hidden_size = self.shape()
-        self.instruction = request.info.instruction
         return m.Contract(
             proc="ponder",
             num_carriers=num_carriers,

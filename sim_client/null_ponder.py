@@ -5,14 +5,17 @@ The schedule is kept as with a PONDER, so the episode is the same one, tick for 
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import numpy as np
 
 from protocol import messages as m
 from protocol.link import Link
-from sim_client.puppet import Answer, PuppetPonder
+from sim_client.ponder_double import Answer, PonderDouble
 
 
-class SilentPonder(PuppetPonder):
+class NullPonder(PonderDouble):
     """Answers every query at once, with zeros.
 
     Args:
@@ -40,3 +43,13 @@ class SilentPonder(PuppetPonder):
 
     def end(self) -> None:
         pass
+
+
+def cognition_shape(pounce: Path) -> tuple[int, int]:
+    """Returns (K, H) that a POUNCE folder reads. Raises ValueError if it is none of ours."""
+    path = pounce / "config.json"
+    try:
+        cognition = json.loads(path.read_text())["config"]["cognition"]
+        return int(cognition["num_carriers"]), int(cognition["cognition_size"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} does not say what cognition it reads ({error}); give a folder of pp-train") from None

@@ -8,7 +8,7 @@ from sim_client.gateway.exchange import Busy
 
 
 @dataclass(slots=True)
-class Seat:
+class Lease:
     """Held from a client's first request until it finishes or leaves; a client that falls silent loses it to the next.
 
     ``idle_ns``: how long a holder may be silent before another one is let in.

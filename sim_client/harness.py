@@ -16,13 +16,14 @@ from protocol.zenoh_bus import open_bus
 from sim_client.config import SimOptions
 from sim_client.launch import Daemons, local_link
 
-Party = Callable[[], bool]
-Build = Callable[[Bus, str, Path | None], Party]
+ServerStep = Callable[[], bool]
+"""One turn of a server that shares this thread; returns whether there was anything to do."""
+BuildServer = Callable[[Bus, str, Path | None], ServerStep]
 """Makes a warm server on a bus, for a robot and from a checkpoint; returns its step function."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Station:
+class Harness:
     """Where episodes are played, any number one after the other. Whoever opened it closes the bus."""
 
     bus: Bus
@@ -30,9 +31,9 @@ class Station:
     clock: ClockService | None
 
 
-def open_station(
-    options: SimOptions, daemons: Daemons, ponder: Build | None = None, subgoals: str | None = None
-) -> Station:
+def open_harness(
+    options: SimOptions, daemons: Daemons, ponder: BuildServer | None = None, subgoals: str | None = None
+) -> Harness:
     """Starts what the options ask for.
 
     Args:
@@ -50,15 +51,15 @@ def open_station(
             config = ServiceConfig(allow_starved=options.allow_starved, watches=not options.in_process)
             clock = ClockService(Link(bus, robot=options.link.robot, proc="clock"), config)
             add_party(clock.step)
-        return Station(bus=bus, link=Link(bus, robot=options.link.robot, proc="sim"), clock=clock)
+        return Harness(bus=bus, link=Link(bus, robot=options.link.robot, proc="sim"), clock=clock)
     except BaseException:
         bus.close()
         raise
 
 
 def _bus(
-    options: SimOptions, daemons: Daemons, ponder: Build | None, subgoals: str | None
-) -> tuple[Bus, Callable[[Party], None]]:
+    options: SimOptions, daemons: Daemons, ponder: BuildServer | None, subgoals: str | None
+) -> tuple[Bus, Callable[[ServerStep], None]]:
     """The bus, and how to add one more party to it if all share this thread."""
     link = options.link
     if options.policy == "oracle":
@@ -76,7 +77,7 @@ def _bus(
     return open_bus(link), lambda step: None
 
 
-def _builder(module: str) -> Build:
+def _builder(module: str) -> BuildServer:
     """By name: this package never imports torch, so a robot's computer can do without it."""
-    build: Build = importlib.import_module(module).build
+    build: BuildServer = importlib.import_module(module).build
     return build
