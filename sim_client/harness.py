@@ -1,4 +1,4 @@
-"""Everything that an episode needs around it, once: bus, servers, clock service, the robot's end."""
+"""Everything that episodes need around them, opened once: bus, servers, clock service, the robot's end."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ BuildServer = Callable[[Bus, str, Path | None], ServerStep]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Harness:
-    """Where episodes are played, any number one after the other. Whoever opened it closes the bus."""
+    """Plays any number of episodes, one after the other. The caller that opened it closes the bus."""
 
     bus: Bus
     link: Link
@@ -34,12 +34,12 @@ class Harness:
 def open_harness(
     options: SimOptions, daemons: Daemons, ponder: BuildServer | None = None, subgoals: str | None = None
 ) -> Harness:
-    """Starts what the options ask for.
+    """Starts the servers that the options ask for.
 
     Args:
-        daemons: what is started as processes is theirs to stop.
+        daemons: stops those that are started as processes.
         ponder: in process, a server in place of ``ponder-serve``'s.
-        subgoals: in process, whose texts a POUNCE that reads them is told, "ponder" or "oracle".
+        subgoals: in process, the source of texts for a POUNCE that reads subgoals, "ponder" or "oracle".
 
     Raises:
         TransportError: a bus that cannot be opened, or options that contradict each other.
@@ -60,7 +60,7 @@ def open_harness(
 def _bus(
     options: SimOptions, daemons: Daemons, ponder: BuildServer | None, subgoals: str | None
 ) -> tuple[Bus, Callable[[ServerStep], None]]:
-    """The bus, and how to add one more party to it if all share this thread."""
+    """Returns the bus, and how to add one more server to it if all share this thread."""
     link = options.link
     if options.policy == "oracle":
         return LocalBus(), lambda step: None

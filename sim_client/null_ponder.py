@@ -1,6 +1,6 @@
-"""Nobody in PONDER's place, for episodes in which no cognition is delivered.
+"""A PONDER for episodes with null cognition: it keeps the schedule and needs no model.
 
-The schedule is kept as with a PONDER, so the episode is the same one, tick for tick. What is answered reaches nobody.
+The episode is the same as with a real PONDER, tick for tick, because POUNCE receives none of the answers.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class NullPonder(PonderDouble):
 
     @property
     def is_fake(self) -> bool:
-        return False  # nobody acts on it, so there is nothing to warn of
+        return False  # POUNCE receives none of its vectors, so there is nothing to warn of
 
     def shape(self) -> tuple[int, int]:
         num_carriers, hidden_size = self._vector.shape
@@ -46,7 +46,7 @@ class NullPonder(PonderDouble):
 
 
 def cognition_shape(pounce: Path) -> tuple[int, int]:
-    """Returns (K, H) that a POUNCE folder reads. Raises ValueError if it is none of ours."""
+    """Returns (K, H) of the cognition that a POUNCE folder reads. Raises ValueError if it is none of ours."""
     path = pounce / "config.json"
     try:
         cognition = json.loads(path.read_text())["config"]["cognition"]

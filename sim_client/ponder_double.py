@@ -1,4 +1,4 @@
-"""A PONDER on a bus without a model: what a stand-in for it has in common, whatever it answers."""
+"""A PONDER on a bus without a model: the base class of those that replace it in an experiment."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from protocol.version import version
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answer:
-    """A cognition in the place of PONDER's."""
+    """A cognition in place of PONDER's."""
 
     vector: m.Floats
     """(K, H)."""
@@ -26,7 +26,7 @@ class Answer:
 
 
 class PonderDouble(ABC):
-    """``step`` answers what is asked and says whether anything was."""
+    """Joins episodes and answers queries as ``ponder-serve`` does; subclasses decide with what."""
 
     def __init__(self, link: Link) -> None:
         self.link = link
@@ -38,26 +38,27 @@ class PonderDouble(ABC):
     @property
     @abstractmethod
     def model_hash(self) -> str:
-        """Says in every log whose vectors these were."""
+        """Identifies the source of the vectors in every log."""
 
     @property
     @abstractmethod
     def is_fake(self) -> bool:
-        """Whether nothing that was trained gives these vectors."""
+        """Whether the vectors come from no trained model."""
 
     @abstractmethod
     def shape(self) -> tuple[int, int]:
-        """Returns (K, H) of the episode that is opened. Raises ValueError if there is nothing to answer with."""
+        """Returns (K, H) of the episode to be opened. Raises ValueError if there is nothing to answer with."""
 
     @abstractmethod
     def answer(self, query: m.Query) -> Answer:
-        """What PONDER would have to say now."""
+        """Returns the answer to a query."""
 
     @abstractmethod
     def end(self) -> None:
-        """An episode is over, or about to begin."""
+        """Called when an episode is over, or about to begin."""
 
     def step(self) -> bool:
+        """Answers pending queries; returns whether there was anything to do."""
         self._heartbeat.beat()
         worked = self._membership.step()
         for query in self._queries.drain():

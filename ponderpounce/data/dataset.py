@@ -32,7 +32,7 @@ class Entry:
     is_success: bool
     recovery: str
     num_rejected: int
-    noise_rad: float  # 0 where nobody added noise
+    noise_rad: float  # 0 without noise
     num_rows: int
     num_demonstration_rows: int
     corrected_from: int  # see `About`
@@ -100,7 +100,7 @@ def _entry(listed: dict[str, Any]) -> Entry:
 
 
 def _row_groups(listed: Sequence[dict[str, Any]]) -> list[int]:
-    """Which row group of its file each episode is: they were written one by one."""
+    """Returns each episode's row group within its file; episodes were written one by one."""
     seen: Counter[tuple[int, int]] = Counter()
     groups = []
     for each in listed:

@@ -1,8 +1,8 @@
-"""``pp-export``: recorded episodes as a dataset of the same format, every row an exact join by tick.
+"""``pp-export``: exports recorded episodes as a dataset of the same format, every row an exact join by tick.
 
-Row k is the observation of tick k, the texts that were in force then, what the policy said of it, and the action
-that was commanded for tick k. A log holds no demonstration; since a seed decides the scene, it is acted out again and
-put before the rows, and the first state of the log must then be the very one that follows it.
+Row k is the observation of tick k, the texts in force then, and the action that was commanded for tick k. A log holds
+no demonstration. Since a seed decides the scene, the demonstration is performed again and put before the rows; the
+state after it must equal the first state of the log.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ class ExportOptions:
     """Turns recorded episodes into a LeRobot v3 dataset, in the order they are named."""
 
     files: tyro.conf.Positional[tuple[Path, ...]]
-    """MCAP logs of sim-client."""
+    """MCAP logs of sim-client or pp-eval."""
     out: Path
     """Folder of the new dataset."""
     texts: Literal["logged", "follow"] = "logged"
-    """"follow": every action is played again, and told is what is to be done as things then stand. What was dropped is
-    to be picked up again, what was pushed lies elsewhere, of cubes that will all do the next is one that is left, and
-    what is still to come at the end is told, too. For a PONDER that learns from what it played."""
+    """Subgoal texts. logged: as recorded; follow: replay every action and write the texts as the scene then stands.
+    A dropped object is to be picked up again, coordinates follow pushed objects, and of several objects that all count
+    the next one is one that is left. Use follow to train PONDER on policy rollouts."""
     demonstration_hz: Literal[1, 2, 4, 5, 10, 20] = 20
-    """How often demonstrations are looked at as they are acted out again. Training reads a picture a second."""
+    """Rate of a demonstration's pictures in Hz; its last frame is always rendered. Training reads 1 Hz by default."""
     only_success: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Leave out episodes that did not succeed."""
     progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
-    """Show a progress bar."""
+    """Do not show a progress bar."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -95,10 +95,14 @@ def read_episode(
     texts: Literal["logged", "follow"] = "logged",
     demonstration_hz: int = FPS,
 ) -> Episode:
-    """Joins a log's messages, and acts its demonstration out again, with pictures so many times a second.
+    """Joins a log's messages, and performs its demonstration again.
+
+    Args:
+        texts: as in `ExportOptions`.
+        demonstration_hz: rate of the demonstration's pictures.
 
     Raises:
-        DatasetError: something is missing from the log, or the scene that its seed gives is another one here.
+        DatasetError: something is missing from the log, or its seed gives another scene here.
         TaskError: its task does not exist here.
     """
     info = record.info
@@ -153,7 +157,7 @@ def _played_again(
 ) -> list[tuple[str, str, bool]]:
     """Returns the texts of every tick as `texts_by_tick` has them, made anew as the scene then stands.
 
-    Raises DatasetError where the robot comes to stand elsewhere than in the log.
+    Raises DatasetError if a state differs from the log's.
     """
     told, index = [], -1
     for observation, action in zip(observations, actions, strict=True):
@@ -171,7 +175,7 @@ def _played_again(
 def _again(
     path: Path, environment: Environment, info: m.EpisodeInfo, first: m.Observation
 ) -> tuple[Narrator, Snapshot]:
-    """Resets the log's scene. Raises DatasetError unless the robot stands there as the log says."""
+    """Resets the log's scene. Raises DatasetError unless its first state is the log's."""
     snapshot = environment.reset(info.seed, info.difficulty)
     state = snapshot.state
     if not np.array_equal(state, first.proprio):
@@ -183,7 +187,7 @@ def _again(
 
 
 def _joined(path: Path, record: EpisodeRecord) -> tuple[list[m.Observation], list[m.Floats]]:
-    """Observations and actions of ticks 0, 1, 2 ...; what was seen after the last action is left out."""
+    """Returns observations and actions of ticks 0, 1, 2 ...; the observation after the last action is left out."""
     seen = {each.tick: each for each in record.observations}
     done = {each.tick: each.action for each in record.ticks}
     num_ticks = record.result.num_ticks if record.result else len(done)
@@ -197,23 +201,23 @@ def _joined(path: Path, record: EpisodeRecord) -> tuple[list[m.Observation], lis
 
 
 def texts_by_tick(subgoals: Sequence[m.Subgoal], num_ticks: int) -> list[tuple[str, str, bool]]:
-    """The simulator's plain and grounded text in force at each tick, and whether a subgoal is new there.
+    """Returns the simulator's plain and grounded text in force at each tick, and whether a subgoal begins there.
 
     Texts are logged when they change, and both whenever a subtask begins; a plain one changes at no other time.
     """
     plain = {each.tick: each.text for each in subgoals if each.kind == m.SubgoalKind.TASK_SIMPLE}
     grounded = {each.tick: each.text for each in subgoals if each.kind == m.SubgoalKind.TASK_GROUNDED}
-    said, now = [], ("", "")
+    found, now = [], ("", "")
     for tick in range(num_ticks):
         now = (plain.get(tick, now[0]), grounded.get(tick, now[1]))
-        said.append((*now, tick in plain))
-    return said
+        found.append((*now, tick in plain))
+    return found
 
 
 def _pictures(path: Path, observations: Sequence[m.Observation]) -> Iterator[dict[str, Frame]]:
     """Each observation's pictures: the exact pixels where the log has them, else what its cameras' channels hold.
 
-    None at ticks that nobody looked at (`--record-hz`).
+    Yields an empty dictionary at ticks without pictures (`--record-hz`).
     """
     logged = read_pictures(path)
     for observation in observations:
@@ -236,10 +240,10 @@ def _pictures(path: Path, observations: Sequence[m.Observation]) -> Iterator[dic
 
 
 def _pixels(picture: Picture, observation: m.Observation) -> Frame:
-    """A logged picture, which must have the size that the observation announced."""
-    (said,) = (image for image in observation.images if image.camera == picture.camera)
+    """Decodes a logged picture, which must have the size that the observation announced."""
+    (announced,) = (image for image in observation.images if image.camera == picture.camera)
     codec = m.ImageCodec[picture.format.upper()]
-    return images.unpack(replace(said, codec=codec, data=picture.data))
+    return images.unpack(replace(announced, codec=codec, data=picture.data))
 
 
 if __name__ == "__main__":

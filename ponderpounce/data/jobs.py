@@ -1,9 +1,8 @@
-"""What is to be collected: one job per kept episode, each with its own row of seeds.
+"""The jobs of a collection: one per kept episode, each with its own sequence of seeds.
 
-Jobs know nothing of each other, so any number of workers in any order make the same set: a job tries its seeds in turn
-until the oracle solves one. Unless told otherwise two of four episodes are easy, one is medium and one hard, as in
-RoboMME, and three of every hundred have a grasp that closes too high before it is made right, and three one that
-closes aside.
+Jobs are independent, so any number of workers in any order make the same set: a job tries its seeds in turn until the
+oracle solves one. By default two of four episodes are easy, one is medium and one hard, as in RoboMME, and six of every
+hundred have a failed grasp before the right one: three too high, three beside the object.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ _ASIDE = tuple((x, y, 0) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Look:
-    """How often pictures are rendered; rows are 20 Hz whatever is looked at. Rates divide 20 Hz."""
+    """Rates at which pictures are rendered; they divide 20 Hz, which is the rate of rows."""
 
     demonstration_hz: int = FPS
     execution_hz: int = FPS
@@ -54,7 +53,7 @@ class Job:
 
     @property
     def key(self) -> str:
-        """Where the episode lies: unique, and sorted as jobs are."""
+        """A unique name under which the episode is stored; keys sort as jobs do."""
         return f"{self.task}/{self.slot:06d}"
 
     @property
@@ -68,7 +67,7 @@ class Job:
         return "z" if place < num_each else "xy" if place < 2 * num_each else "none"
 
     def seed(self, attempt: int) -> int:
-        """The scene's seed of an attempt from 0 to 99; no two jobs of a task share one."""
+        """Returns the scene's seed of an attempt from 0 to 99; no two jobs of a task share a seed."""
         return TRAIN_SEED + ATTEMPTS * self.slot + attempt
 
 
@@ -104,7 +103,7 @@ def jobs_of(
 
 
 def failed_grasp(recovery: Recovery, seed: int, num_grasps: int) -> FailedGrasp | None:
-    """Returns which of a script's grasps fails first and where it is aimed; None if there is nothing to fail."""
+    """Returns which of a script's grasps fails first and where it is aimed; None if none is to fail."""
     if recovery == "none" or num_grasps == 0:
         return None
     rng = np.random.default_rng((seed, _RECOVERY_STREAM))

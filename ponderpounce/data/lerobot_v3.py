@@ -1,4 +1,4 @@
-"""A LeRobotDataset v3 folder, written by hand: parquet rows, joined videos, and the tables that find episodes there.
+"""Writes a LeRobotDataset v3 folder: parquet rows, joined videos, and the tables that locate episodes.
 
 Layout as lerobot 0.4.4 reads it (`codebase_version` v3.0): many episodes share a file, ``meta/episodes`` says where
 each lies. Nothing here depends on when or where it is written: equal episodes in equal order make equal bytes.
@@ -51,7 +51,7 @@ _COLUMNS: dict[str, dict[str, Any]] = {
 _OPTIONAL_COLUMNS = {EXECUTED: _COLUMNS["action"]}
 """Only in some datasets (`episode.OPTIONAL`)."""
 _POLICY = ("observation.state", "action", "tcp_pose", EXECUTED)
-"""Statistics of these are over the robot's own rows: they normalise a policy, and nobody acts in a demonstration."""
+"""Columns whose statistics leave demonstrations out: they normalise the policy."""
 
 
 def video_key(camera: str) -> str:
@@ -250,7 +250,7 @@ def _place(number: int) -> dict[str, int]:
 
 
 def _numbers(schema: pa.Schema) -> list[str]:
-    """The columns that statistics are made of."""
+    """Returns the names of the columns that have statistics."""
     return [column.name for column in schema if not pa.types.is_string(column.type)]
 
 

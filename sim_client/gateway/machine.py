@@ -137,7 +137,7 @@ class Machine:
             if self._is_closed:
                 raise Refused(_STOPPED)
             if isinstance(request, Step):
-                self._lease.take(client, time.monotonic_ns())
+                self._lease.acquire(client, time.monotonic_ns())
             self._jobs.put(job)
         return job.future
 
@@ -183,7 +183,7 @@ class Machine:
         if self._episode is not None and self._episode.client == client:
             self._end(request.status, request.reason)
         with self._lock:
-            self._lease.leave(client)
+            self._lease.release(client)
 
     def _step(self, job: _Job, step: Step) -> None:
         episode = self._episode
@@ -325,7 +325,7 @@ class Machine:
         except (TransportError, MalformedMessage) as error:
             self._end(m.TaskStatus.ABORTED, str(error))
             with self._lock:
-                self._lease.leave(client)
+                self._lease.release(client)
             if _UNREADABLE in str(error):  # the gateway can make them another size
                 raise Refused(f"{error}. See --image-px") from error
             raise
