@@ -304,7 +304,7 @@ class EvaluationHarness:
         self._environment: Environment | None = None
 
     def play(self, job: Job) -> Line:
-        """As the function of this name."""
+        """Like the function of this name."""
         if self._donor is not None and job.donor is not None:
             self._donor.load(job.donor)
         line = self._suite.play(self._scene(job.task), job.task, job.seed, run=job.run)

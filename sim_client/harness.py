@@ -78,6 +78,6 @@ def _bus(
 
 
 def _builder(module: str) -> BuildServer:
-    """By name: this package never imports torch, so a robot's computer can do without it."""
+    """Imports a server by name: this package never imports torch, so a robot's computer can do without it."""
     build: BuildServer = importlib.import_module(module).build
     return build

@@ -49,7 +49,7 @@ _COLUMNS: dict[str, dict[str, Any]] = {
     "task_index": {"dtype": "int64", "shape": [1], "names": None},
 }
 _OPTIONAL_COLUMNS = {EXECUTED: _COLUMNS["action"]}
-"""Only in some datasets (`episode.OPTIONAL`)."""
+"""Columns that only some datasets have (`episode.OPTIONAL`)."""
 _POLICY = ("observation.state", "action", "tcp_pose", EXECUTED)
 """Columns whose statistics leave demonstrations out: they normalise the policy."""
 
@@ -206,7 +206,7 @@ class _Rows:
             self._writer = None
 
     def statistics(self) -> dict[str, Statistics]:
-        """Of all rows, exactly; one column in memory at a time."""
+        """Returns exact statistics over all rows; it holds one column in memory at a time."""
         found = {}
         for name in _numbers(pq.read_schema(self._paths[0])):
             parts = [pq.read_table(path, columns=[*{name, "is_demonstration"}]) for path in self._paths]

@@ -1,7 +1,7 @@
-"""The conditioning video: what happens before the robot is asked to act, kept as states and rendered when looked at.
+"""The conditioning video: what happens before the robot may act, kept as states and rendered on demand.
 
-A frame is kept as the world's state and the text that goes with it, some kilobytes. Pictures are made on demand:
-PONDER reads one a second, and rendering them all would take longer than the whole episode.
+A frame is kept as the physics' state and its text, some kilobytes. PONDER reads one a second, and rendering all of them
+would take longer than the whole episode.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ class Row:
 
 
 def perform(task: Task[Any, Any], layout: Any, physics: Physics, look: Look) -> tuple[tuple[Row, ...], Array | None]:
-    """Acts out a demonstration in a freshly arranged scene.
+    """Performs a demonstration in a freshly arranged scene.
 
-    Returns its frames and the last action (8,), which is still in force; None if there was nothing to act out. A frame
-    is the world after an action, under the text of the part that the action belongs to: texts change when a motion
-    ends, not, as later, one step after a predicate.
+    Returns its frames and the last action (8,), which is still in force, or None without a demonstration. A frame is
+    the state after an action, with the text of the part that the action belongs to: texts change when a motion ends,
+    not, as later, one step after a predicate.
     """
     rows: list[Row] = []
     memory: Any = None

@@ -1,4 +1,4 @@
-"""The order of calls: reset, act for 50 ms, judge, look. One environment runs one task, one episode at a time."""
+"""The order of calls: reset, act for 50 ms, judge, render. One environment runs one task, one episode at a time."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ MAX_STEPS = 1300  # the paper's limit; upstream's own default is 10000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Snapshot:
-    """What the robot and its cameras say at one instant, before the next action. Its arrays belong to it alone."""
+    """The observation of one instant, before the next action, with outcome and texts. It owns its arrays."""
 
     step: int  # control steps since reset returned; in a demonstration, frames since it began
-    frames: Mapping[str, NDArray[np.uint8]]  # camera name -> (image_px, image_px, 3) RGB; empty if nobody looked
+    frames: Mapping[str, NDArray[np.uint8]]  # camera name -> (image_px, image_px, 3) RGB; empty if not rendered
     state: NDArray[np.float32]  # (8,): seven joints [rad], one finger's opening [m], 0 without fingers
     command: NDArray[np.float32]  # (8,): the action that led here: joint targets [rad], gripper in [-1, 1]
     tcp_pose: NDArray[np.float64]  # (7,): xyz [m], quaternion wxyz
@@ -43,7 +43,7 @@ class Snapshot:
     simple_subgoal: str
     grounded_subgoal: str
     subtask_index: int  # the engine's; the texts follow it one step later, as upstream delivers them
-    subgoal_index: int  # the subtask that the texts speak of; two in a row may have the same text
+    subgoal_index: int  # the subtask that the texts describe; two in a row may have the same text
     is_demonstration: bool = False  # a frame of the conditioning video; outcome and subtask are then those of a start
 
 
@@ -86,7 +86,8 @@ def make_environment(
 class Environment:
     """One task in its simulated world, stepped at 20 Hz. Use it as a context manager or close it.
 
-    Without rendering nothing touches GL; texts and physics are the same either way.
+    Without rendering it needs no GL; texts and physics are the same either way. The class is long because it is one
+    idea, the order of calls: judging, captions, sight and the demonstration's performance are modules of their own.
     """
 
     def __init__(
@@ -100,7 +101,7 @@ class Environment:
     ) -> None:
         self.task = task
         self._texts_follow = texts_follow
-        self._said_of: Array = np.zeros((0, 3))  # where the things of the grounded text were when it was made
+        self._grounded_at: Array = np.zeros((0, 3))  # where the grounded text's objects were when it was written
         spec = table_scene(task.robot)
         task.furnish(spec)
         self.physics = Physics(spec)
@@ -118,7 +119,7 @@ class Environment:
 
     @property
     def instruction(self) -> str:
-        """The sentence the robot is given in this episode."""
+        """The instruction of this episode."""
         self._require_episode()
         return self.task.instruction(self._layout)
 
@@ -135,12 +136,12 @@ class Environment:
         return self._subtasks
 
     def reset(self, seed: int, difficulty: str | None = None, *, layout: Any = None) -> Snapshot:
-        """Starts an episode and returns its first snapshot; a demonstration, if there is one, has been given by then.
+        """Starts an episode and returns its first snapshot, after the demonstration if there is one.
 
         The seed alone decides the scene. Without a difficulty it is the seed's remainder by three: easy, medium,
-        hard, as upstream. A scene in which the arm cannot act out the demonstration is drawn again, as upstream's are
-        until its planner solves one; a ``layout`` takes the place of the drawn ones. Raises TaskError for an unknown
-        difficulty, and UnreachableError if there is no such scene.
+        hard, as upstream. A scene in which the arm cannot perform the demonstration is drawn again, as upstream's are
+        until its planner solves one; a ``layout`` replaces the drawn ones. Raises TaskError for an unknown difficulty,
+        and UnreachableError if there is no such scene.
         """
         difficulty = DIFFICULTIES[seed % 3] if difficulty is None else difficulty
         if difficulty not in DIFFICULTIES:
@@ -161,9 +162,9 @@ class Environment:
         return self._observe()
 
     def begin_in(self, found: PhysicsState) -> Snapshot:
-        """Lets the robot find another world after the demonstration than that has left; returns the first snapshot.
+        """Replaces the state that the demonstration has left; returns the first snapshot.
 
-        This is how two videos come to lead to one present, see `forks`. Raises RuntimeError after the first step.
+        `forks` lets two videos lead to one present this way. Raises RuntimeError after the first step.
         """
         self._require_episode()
         if self._step:
@@ -173,11 +174,11 @@ class Environment:
         return self._observe(look=False)
 
     def demonstration(self, rate_hz: int = CONTROL_HZ, *, look_hz: int | None = None) -> Iterator[Snapshot]:
-        """Yields the conditioning video of this episode, the first frame and every so many after; nothing without one.
+        """Yields the conditioning video of this episode at ``rate_hz``, from its first frame on; nothing without one.
 
-        It can be watched at any time and as often as one likes: pictures are rendered as they are asked for, and the
-        episode itself stands still meanwhile. With ``look_hz`` only so many of its snapshots a second have pictures,
-        and the last one: a movement often ends between two looks. Raises ValueError unless the rates divide 20 Hz.
+        It can be read at any time and any number of times: pictures are rendered on demand, and the episode does not
+        change. With ``look_hz`` only snapshots at that rate have pictures, and the last one, because a movement often
+        ends between two of them. Raises ValueError unless the rates divide 20 Hz.
         """
         self._require_episode()
         every, look_every = _steps_between(rate_hz), _steps_between(look_hz or rate_hz)
@@ -186,7 +187,7 @@ class Environment:
         return (self._demonstrated(step, self._video[step], look=step in looked_at) for step in shown)
 
     def step(self, action: ArrayLike, *, look: bool = True) -> Snapshot:
-        """Applies an action (8,) for exactly 50 ms and returns what is seen then; without ``look``, no pictures.
+        """Applies an action (8,) for exactly 50 ms and returns the snapshot after it; without ``look``, no pictures.
 
         The action is seven absolute joint targets in rad and the gripper's command in [-1, 1], clipped there. Raises
         ValueError if it has another shape or is not finite, and RuntimeError if the episode is over or never began.
@@ -203,10 +204,10 @@ class Environment:
         return self._observe(look=look)
 
     def reasoning(self) -> str:
-        """Returns what the current subtask needs from the past, in words (paper, Table 6); empty where nothing does.
+        """Returns what the current subtask needs from the past, as text (paper, Table 6); empty if nothing.
 
-        Its coordinates are where things are seen now, or were last seen in the video if they are hidden now and have
-        not moved since; the grounded subgoal stands at its end.
+        Its coordinates are where objects are seen now, or were last seen in the video if they are hidden now and have
+        not moved since; it ends with the grounded subgoal.
         """
         self._require_episode()
         assert self._caption is not None
@@ -219,10 +220,10 @@ class Environment:
         return f"{text} Subgoal: {self._caption.grounded}."
 
     def oracle(self, motions: Motions | None = None) -> Iterator[NDArray[np.float32]]:
-        """Yields the actions (8,) that solve the episode, planned as the world is when each is asked for.
+        """Yields the actions (8,) that solve the episode, each planned from the state in which it is requested.
 
-        Take one, step with it, take the next; stop when the episode ends. ``motions`` are the arm's skills, fresh
-        ones by default; one's own may be made to fail a grasp, and tell afterwards what they did.
+        Take one, step with it, take the next; stop when the episode ends. ``motions`` are the arm's skills, new ones by
+        default; the caller's own may include a failed grasp, and count grasps.
         """
         self._require_episode()
         motions = Motions(self.physics) if motions is None else motions
@@ -232,7 +233,7 @@ class Environment:
             yield from subtask.motion(motions)
 
     def save(self) -> EpisodeState:
-        """Returns a copy of the whole episode as it stands."""
+        """Returns a copy of the current state of the whole episode."""
         self._require_episode()
         assert self._caption is not None
         return EpisodeState(
@@ -257,7 +258,7 @@ class Environment:
         self._step, self._memory = state.step, state.memory
         self._progress, self._caption, self._video = state.progress, state.caption, state.video
         self._actions = list(state.actions)
-        self._read_on()
+        self._reorder()
         return self._snapshot(look=look)
 
     def close(self) -> None:
@@ -283,18 +284,18 @@ class Environment:
         self.task.arrange(self.physics, layout)
         self.physics.refresh()
 
-    def _read_on(self) -> None:
-        """With ``texts_follow``: the list goes on from what has been done, in whatever order."""
+    def _reorder(self) -> None:
+        """Reorders the subtasks by what has been done, with ``texts_follow``."""
         if self._texts_follow:
             self._subtasks = self.task.subtasks_after(self._layout, self._memory)
 
     def _observe(self, *, look: bool = True) -> Snapshot:
-        """Stages, remembers, judges and captions the instant the physics is at."""
+        """Stages, remembers, judges and captions the current instant of the physics."""
         self.task.stage(self.physics, self._layout, self._memory, self.physics.elapsed_steps() - 1)
-        spoken_of = self._progress.index  # texts change one step after the engine does
+        described = self._progress.index  # texts change one step after the engine does
         before, self._memory = self._memory, self.task.remember(self._memory, self.physics, self._layout)
         if self._memory != before:
-            self._read_on()
+            self._reorder()
         self._progress = engine.judge(
             self._progress,
             self._subtasks,
@@ -305,10 +306,10 @@ class Environment:
         if self._progress.status is Status.ONGOING and self._step >= self._max_steps:
             reason = f"not done after {self._max_steps} steps"
             self._progress = Progress(index=self._progress.index, status=Status.TIMEOUT, reason=reason)
-        if self._progress.index == spoken_of and (again := self._to_pick_up_again()) is not None:
-            spoken_of = again
-        subtask = self._subtasks[spoken_of]
-        caption = captions.follow(self._caption, spoken_of, subtask.text, lambda: self._look_for(subtask.grounds))
+        if self._progress.index == described and (again := self._to_pick_up_again()) is not None:
+            described = again
+        subtask = self._subtasks[described]
+        caption = captions.follow(self._caption, described, subtask.text, lambda: self._look_for(subtask.grounds))
         if self._texts_follow:
             caption = self._following(caption, subtask)
         if self._progress.status is Status.SUCCESS:
@@ -317,9 +318,10 @@ class Environment:
         return self._snapshot(look=look)
 
     def _to_pick_up_again(self) -> int | None:
-        """With ``texts_follow``: the subtask that picked up what has to be carried now and was dropped on the way.
+        """Returns the subtask that picks up what has to be carried now and was dropped; None without ``texts_follow``.
 
-        From when it lies on the table until it is picked up again. The engine's subtask stays the one it is.
+        It holds from when the object lies on the table until it is picked up again. The engine's subtask does not
+        change.
         """
         index, physics = self._progress.index, self.physics
         cubes = self._subtasks[index].carries if self._texts_follow else ()
@@ -333,26 +335,23 @@ class Environment:
         return before if is_lost else None
 
     def _following(self, caption: captions.Caption, subtask: Subtask) -> captions.Caption:
-        """The caption with new coordinates, if its things were pushed elsewhere (not lifted) and can be seen."""
+        """Returns the caption, with new coordinates if its objects were pushed elsewhere (not lifted) and are seen."""
         now = np.array([self.physics.position_m(body) for body in subtask.grounds]).reshape(-1, 3)
         if caption is not self._caption:
-            self._said_of = now
+            self._grounded_at = now
             return caption
-        moved_m = np.abs(now - self._said_of).max(axis=0, initial=0.0)
+        moved_m = np.abs(now - self._grounded_at).max(axis=0, initial=0.0)
         was_pushed = moved_m[:2].max() >= _PUSHED_M and moved_m[2] < _PUSHED_M
         if not caption.is_latched or not was_pushed:
             return caption
         points = self._look_for(subtask.grounds)
         if points is None:
             return caption
-        self._said_of = now
+        self._grounded_at = now
         return replace(caption, grounded=captions.grounded(subtask.text, points))
 
     def _look_for(self, bodies: Sequence[str]) -> list[captions.Pixel] | None:
-        """Where the front camera sees bodies; None if one of them is hidden.
-
-        Texts speak of a 256 px image, whatever size is rendered.
-        """
+        """Returns where the front camera sees bodies, in a 256 px image at any rendered size; None if one is hidden."""
         points = []
         for body in bodies:
             pixels = sight.visible_pixels(self.physics, FRONT, body, IMAGE_PX)
@@ -363,7 +362,7 @@ class Environment:
         return points
 
     def _recall(self, body: str) -> list[captions.Pixel]:
-        """Where the video's frames, one a second, last show a body that still stands there; empty if they do not."""
+        """Returns where the video's frames, one a second, last show a body that has not moved since; else empty."""
         now, pose_7 = self.physics.save(), self.physics.pose(body)
         points: list[captions.Pixel] | None = None
         for row in reversed(self._video[::CONTROL_HZ]):
@@ -375,7 +374,7 @@ class Environment:
         return points or []
 
     def _demonstrated(self, step: int, row: Row, *, look: bool) -> Snapshot:
-        """A frame of the video, seen through a world that is put back as it was."""
+        """Returns a frame of the video; the episode's state is restored afterwards."""
         now = self.physics.save()
         self.physics.load(row.physics)
         snapshot = self._seen(step, Progress(), row.caption, look=look, is_demonstration=True)

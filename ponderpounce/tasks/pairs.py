@@ -1,8 +1,8 @@
-"""Counterfactual pairs: moments at which two episodes look the same, and their scripts go different ways.
+"""Counterfactual pairs: moments at which two episodes look the same, and their scripts act differently.
 
-A pair is found by playing. Of a task that can be retold, both tellings are played with the same actions until their
-scripts part; then the robot waits until nothing shown tells them apart, which after another video nothing does. Of a
-task that repeats itself, the script is played until a twin with a round less would do something else next.
+A pair is found by playing. For a task that can be retold, both episodes are played with the same actions until their
+scripts differ; then the robot waits until nothing shown tells them apart. For a task that repeats itself, the script is
+played until a twin with one round less would act differently.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ponderpounce.tasks.oracle import Motions
 from ponderpounce.tasks.physics import CONTROL_HZ
 from ponderpounce.tasks.task import make_task
 
-PAST_HZ = 1  # the rate at which PONDER looks
+PAST_HZ = 1  # PONDER's query rate
 ORACLE_STEPS = 20  # one chunk
 
 _PATIENCE_STEPS = 120
@@ -32,7 +32,7 @@ _PARTED = 0.02  # rad, or gripper command: actions that differ by less are the s
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Telling:
-    """One branch, as a researcher loads it. T frames of the past: the conditioning video first, if there is one."""
+    """One branch: T frames of the past, the conditioning video first if there is one, and what the script does next."""
 
     frames: dict[str, NDArray[np.uint8]]  # camera name -> (T, image_px, image_px, 3)
     states: NDArray[np.float32]  # (T, 8)
@@ -40,7 +40,7 @@ class Telling:
     is_demonstration: NDArray[np.bool_]  # (T,)
     oracle: NDArray[np.float32]  # (ORACLE_STEPS, 8): what the script does next
     subgoal: str  # grounded; this and the next are of the step after now, when they speak of what comes next
-    reasoning: str  # what is needed from the past, see `Environment.reasoning`
+    reasoning: str  # see `Environment.reasoning`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,13 +71,13 @@ def find_pair(
     demo_hz: int = PAST_HZ,
     video_end: bool = False,
 ) -> Pair | None:
-    """Plays one episode until its twin would go another way; None if there is no such moment in it.
+    """Plays one episode until its twin would act differently; returns None if there is no such moment in it.
 
-    Without a variant, those of `Task.retold` take turns by seed, and cuts are the latest. Conditioning videos are
-    looked at ``demo_hz`` times a second and, with ``video_end``, at their last frame.
+    Without a variant, those of `Task.retold` take turns by seed, and cuts are the latest. Frames of conditioning videos
+    are taken at ``demo_hz`` and, with ``video_end``, at the end.
 
-    Both environments must be of the task; only the first needs cameras. Raises RuntimeError if the two branches turn
-    out not to look the same, which would be a defect.
+    Both environments must be of the task; only the first needs cameras. Raises RuntimeError if the two branches do not
+    look the same, which would be a defect.
     """
     kind = make_task(task)
     own.reset(seed)

@@ -56,7 +56,7 @@ _NO_ID = re.compile(r"[^A-Za-z0-9_.-]+")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """What every episode of this gateway has in common."""
+    """The settings that all episodes of this gateway share."""
 
     schedule: Callable[[int], m.Schedule]  # from the episode's seed
     num_rows: int

@@ -76,7 +76,7 @@ class Layout:
 
     @property
     def color(self) -> str:
-        """Of the cube that is carried."""
+        """The color of the cube that is carried."""
         return self.cubes[self.carried].color
 
 
