@@ -16,11 +16,11 @@ import tyro
 from numpy.typing import NDArray
 from PIL import Image
 
-import ponderpounce.tasks.headless  # noqa: F401 - before anything that imports mujoco
+import dual_system.tasks.headless  # noqa: F401 - before anything that imports mujoco
 from benchmarks.recorded import Recording, layout_of, read, recorded_tasks
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, EpisodeState, make_environment
-from ponderpounce.tasks.scene import CAMERAS
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, EpisodeState, make_environment
+from dual_system.tasks.scene import CAMERAS
 
 _GAP_PX = 4
 _DEMO = 0  # frame_phase of the conditioning video

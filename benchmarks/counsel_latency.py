@@ -15,13 +15,13 @@ import numpy as np
 import tyro
 
 from benchmarks.report import Report, Row, show, spread
+from dual_system.models.ponder.checkpoint import load_ponder
 from ponder_server.__main__ import build_engine
 from ponder_server.config import PonderOptions
 from ponder_server.contract import BatchingEngine, Opening
 from ponder_server.council import Council
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
-from ponderpounce.models.ponder_checkpoint import load_ponder
 
 _SESSION = "measured"
 

@@ -18,14 +18,14 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-import ponderpounce.tasks.headless  # noqa: F401 - before anything that imports mujoco
+import dual_system.tasks.headless  # noqa: F401 - before anything that imports mujoco
 
 # isort: split
 
 from benchmarks.report import Report, Row, show, spread
 from benchmarks.rig import Rig
 from clock.report import num_starved
-from ponderpounce.tasks.environment import make_environment
+from dual_system.tasks.environment import make_environment
 from protocol import messages as m
 
 PERIOD_NS = 50_000_000

@@ -20,12 +20,12 @@ import tyro
 
 from benchmarks.report import Report, Row, show, spread
 from clock.membership import percentile_ns
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.network import Ponder
 from ponder_server.admission import Admission
 from ponder_server.contract import Frame, Opening, SessionError
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
 
 MAX_CONTEXT_TOKENS = 16_384
 LONG_CONTEXT_TOKENS = 14_000

@@ -31,16 +31,16 @@ import tyro
 from torch import Tensor, nn
 
 from benchmarks.report import Report, Row, show, spread
+from dual_system.models.ponder import configs as ponder_configs
+from dual_system.models.ponder.checkpoint import mtp_shapes
+from dual_system.models.ponder.context import Row as EpisodeRow
+from dual_system.models.ponder.network import Ponder
 from ponder_server.config import NUM_TORCH_THREADS
 from ponder_server.contract import Opening, WeightsName
 from ponder_server.draft import Draft, NoDraft, TrieDraft
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
 from ponder_server.mtp import MtpDraft
-from ponderpounce.models import ponder_configs
-from ponderpounce.models.context import Row as EpisodeRow
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_checkpoint import mtp_shapes
 
 SESSION = "bench"
 WAYS_TO_ENCODE = {"in forwards of 2048 tokens": 2048, "an instant a forward": 1}

@@ -26,11 +26,11 @@ import tyro
 from torch import Tensor
 
 from benchmarks.report import Report, Row, show, spread
+from dual_system.models.ponder import configs as ponder_configs
+from dual_system.models.ponder.network import Ponder
 from ponder_server.config import SizeName
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
-from ponderpounce.models import ponder_configs
-from ponderpounce.models.ponder import Ponder
 from protocol.mcap_log import read_log
 from sim_client.launch import Daemons, start_local
 

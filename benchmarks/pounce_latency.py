@@ -23,11 +23,12 @@ from torch import Tensor
 
 from benchmarks.report import Report, Row, show, spread
 from benchmarks.roofline import Ceilings, measure_ceilings, piece_of
-from ponderpounce.models import flow, groot_flow
-from ponderpounce.models.pounce import Pounce
-from ponderpounce.models.pounce_checkpoint import random_bundle
-from ponderpounce.models.pounce_configs import groot_n1_5, pi05_base, tiny_cpu, tiny_groot
-from ponderpounce.models.pounce_family import AnyPounce, AnyPounceConfig, Family, random_model
+from dual_system.models import flow
+from dual_system.models.groot import flow as groot_flow
+from dual_system.models.pi05.pounce import Pounce
+from dual_system.models.pounce.checkpoint import random_bundle
+from dual_system.models.pounce.configs import groot_n1_5, pi05_base, tiny_cpu, tiny_groot
+from dual_system.models.pounce.family import AnyPounce, AnyPounceConfig, Family, random_model
 from pounce_server.contract import DTypeName, example_request
 from pounce_server.engine import EagerEngine
 from pounce_server.fused import FusedPounce, fused_for

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ponderpounce.tasks.task import task_names
+from dual_system.tasks.task import task_names
 
 _SUFFIX = "_train006"
 _TESTS = Path(__file__).parents[1] / "tests" / "tasks"

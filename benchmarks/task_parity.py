@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from benchmarks.recorded import Recording, layout_of, read, recorded_tasks
 from benchmarks.report import Report, Row, show
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot, make_environment
 
 MAX_LENGTH_OFF, MAX_PX, MAX_M = 0.2, 4, 0.005
 

@@ -18,7 +18,7 @@ from typing import Any
 import tyro
 
 from benchmarks.report import Report, Row, show
-from ponderpounce.tasks.task import task_names
+from dual_system.tasks.task import task_names
 
 _PEER_KEYS = ("simulated_s", "wall_s", "cpu_s")
 _OUR_KEYS = ("stepped_s", "step_wall_s", "step_cpu_s")

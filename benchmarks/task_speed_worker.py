@@ -7,9 +7,9 @@ import os
 import sys
 import time
 
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import make_environment
-from ponderpounce.tasks.physics import CONTROL_HZ
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import make_environment
+from dual_system.tasks.physics import CONTROL_HZ
 
 
 def main(task: str, look_hz: int, image_px: int, seeds: list[int]) -> None:

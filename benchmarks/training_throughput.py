@@ -23,21 +23,21 @@ import tyro
 from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.report import Report, Row, show, spread
-from ponderpounce.models import ponder_configs
-from ponderpounce.models.eyes import readable_sizes
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.pounce import freeze
-from ponderpounce.models.pounce_checkpoint import PounceBundle, random_bundle
-from ponderpounce.models.pounce_configs import in_space
-from ponderpounce.models.pounce_family import action_loss, sample_times
-from ponderpounce.training.collate import collate_ponder, collate_pounce
-from ponderpounce.training.example import make_example
-from ponderpounce.training.joint import Draws, JointModel, PonderBatch, PounceBatch, encode_rows
-from ponderpounce.training.nudge import NO_NUDGE
-from ponderpounce.training.recipe import Recipe, stages_of
-from ponderpounce.training.recipes import recipe
-from ponderpounce.training.trainer import Trainer
-from ponderpounce.training.training_episode import TrainingEpisode
+from dual_system.models.eyes import readable_sizes
+from dual_system.models.pi05.pounce import freeze
+from dual_system.models.ponder import configs as ponder_configs
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.pounce.checkpoint import PounceBundle, random_bundle
+from dual_system.models.pounce.configs import in_space
+from dual_system.models.pounce.family import action_loss, sample_times
+from dual_system.training.collate import collate_ponder, collate_pounce
+from dual_system.training.example import make_example
+from dual_system.training.joint import Draws, JointModel, PonderBatch, PounceBatch, encode_rows
+from dual_system.training.nudge import NO_NUDGE
+from dual_system.training.recipe import Recipe, stages_of
+from dual_system.training.recipes import recipe
+from dual_system.training.trainer import Trainer
+from dual_system.training.training_episode import TrainingEpisode
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,7 +1,7 @@
 """How long does Muon take to turn a small PONDER's matrices, ours beside torch's own?
 
 Both update a copy of the same weights with the same gradients, in turns, each beginning every other one. What they
-differ in is told in `ponderpounce.training.muon`; the largest difference of the weights at the end is in the notes.
+differ in is told in `dual_system.training.muon`; the largest difference of the weights at the end is in the notes.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ import tyro
 from torch import Tensor, nn
 
 from benchmarks.report import Report, Row, show, spread
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.training.muon import Muon
-from ponderpounce.training.optim import is_turned
-from ponderpounce.training.recipe import stages_of
-from ponderpounce.training.recipes import recipe
+from dual_system.models.ponder.network import Ponder
+from dual_system.training.muon import Muon
+from dual_system.training.optim import is_turned
+from dual_system.training.recipe import stages_of
+from dual_system.training.recipes import recipe
 
 _RATE = 1e-3
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-import ponderpounce.tasks.headless  # noqa: F401 - before anything that imports mujoco
+import dual_system.tasks.headless  # noqa: F401 - before anything that imports mujoco
 from clock.service import ClockService, ServiceConfig
 from ponder_server import party as ponder
 from pounce_server import party as pounce

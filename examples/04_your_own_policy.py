@@ -81,7 +81,7 @@ def serve(endpoint: str) -> None:
 
 def episode(out: Path) -> None:
     """PONDER, the clock service and the simulated robot around it, all on one in-process bus."""
-    import ponderpounce.tasks.headless  # noqa: F401, I001 - before anything that imports mujoco
+    import dual_system.tasks.headless  # noqa: F401, I001 - before anything that imports mujoco
 
     from clock.service import ClockService, ServiceConfig
     from ponder_server import party as ponder

@@ -27,16 +27,16 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     """
     import torch  # here, so that --help and a mistyped option answer at once
 
+    from dual_system.models.bfloat16 import warn_of_slow
+    from dual_system.models.ponder import configs as ponder_configs
+    from dual_system.models.ponder.checkpoint import load_ponder
+    from dual_system.models.ponder.network import Ponder
     from ponder_server.council import Council
     from ponder_server.draft import Draft, FirstOf, TrieDraft
     from ponder_server.engine import QwenEngine
     from ponder_server.engine_config import EngineConfig
     from ponder_server.mtp import MtpDraft
     from ponder_server.threads import num_usable_cores
-    from ponderpounce.models import ponder_configs
-    from ponderpounce.models.bfloat16 import warn_of_slow
-    from ponderpounce.models.ponder import Ponder
-    from ponderpounce.models.ponder_checkpoint import load_ponder
 
     num_robots = 1 + len(options.other_robots)
     if options.max_sessions < num_robots:

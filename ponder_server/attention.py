@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from dual_system.models.bfloat16 import HAS_FAST_BFLOAT16
 from ponder_server.threads import ALONE, Threads
-from ponderpounce.models.bfloat16 import HAS_FAST_BFLOAT16
 
 # Internal, but the one CPU attention that returns its log-sum-exp; the tests compare it with the public function.
 _flash_cpu: Any = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu

@@ -21,9 +21,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from dual_system.models.graphs import Capture, Work
 from ponder_server.decoder import Place, decode, gated_delta, project
 from ponder_server.slots import AttentionMemory, SlotMemory
-from ponderpounce.models.graphs import Capture, Work
 
 LEAST_POSITIONS = 1024
 """That attention reads: what shorter contexts would save is no time on a GPU, and every further shape is a graph."""

@@ -11,7 +11,7 @@ from ponder_server.contract import WeightsName
 from protocol.options import LinkOptions
 
 SizeName = Literal["tiny_cpu", "qwen35_0p8b", "qwen35_2b", "qwen35_4b", "qwen35_9b"]
-"""Functions of ``ponderpounce.models.ponder_configs``."""
+"""Functions of ``dual_system.models.ponder.configs``."""
 
 NUM_TORCH_THREADS = 1  # on a CPU one thread per process beats two: a contended second one costs more than it gives
 

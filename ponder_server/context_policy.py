@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from ponderpounce.models.context import SegmentKind
+from dual_system.models.ponder.context import SegmentKind
 
 
 @dataclass(frozen=True, slots=True)

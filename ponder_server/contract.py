@@ -12,7 +12,7 @@ from typing import Generic, Literal, Protocol, TypeAlias, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from ponderpounce.models.eyes import Eyes
+from dual_system.models.eyes import Eyes
 
 Frame: TypeAlias = npt.NDArray[np.uint8]
 """One camera image, (h, w, 3) uint8 RGB."""

@@ -12,6 +12,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
+from dual_system.models.counsel import Counsel
+from dual_system.models.views import View
 from ponder_server.contract import (
     EngineSpec,
     Fire,
@@ -32,8 +34,6 @@ from ponder_server.engine import (
     WARM_UP_SESSION,
     QwenEngine,
 )
-from ponderpounce.models.counsel import Counsel
-from ponderpounce.models.views import View
 
 
 @dataclass(slots=True, kw_only=True)

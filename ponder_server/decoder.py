@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from dual_system.models.ponder import mixers as mixers
+from dual_system.models.ponder.gated_delta import gated_delta_rule
+from dual_system.models.ponder.kernels import DeltaRule, delta_rule_of_many, delta_rule_of_one, rotate
 from ponder_server.attention import attend
 from ponder_server.slots import AttentionMemory, RecurrentMemory, SlotMemory
 from ponder_server.threads import ALONE, Threads
-from ponderpounce.models import mixers
-from ponderpounce.models.gated_delta import gated_delta_rule
-from ponderpounce.models.ponder_kernels import DeltaRule, delta_rule_of_many, delta_rule_of_one, rotate
 
 LEAST_TOKENS = 4
 """Rows times tokens of a forward, at least. A CPU multiplies one to three rows of a matrix by other kernels than more,

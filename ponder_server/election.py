@@ -11,7 +11,7 @@ import re
 from collections.abc import Sequence
 from typing import TypeAlias
 
-from ponderpounce.models.ponder_coordinates import XY_1000
+from dual_system.models.ponder.coordinates import XY_1000
 
 Said: TypeAlias = tuple[str, ...]
 """The texts of one answer, the subgoal last; () for silence."""

@@ -20,6 +20,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dual_system.models.eyes import Pictures, check_cameras, readable_sizes, see
+from dual_system.models.graphs import Capture, graphs_for
+from dual_system.models.ponder.checkpoint import weights_hash
+from dual_system.models.ponder.context import SegmentKind
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.proprioception import NUM_PROPRIO
+from dual_system.models.views import AS_IT_IS, View
 from ponder_server.audible import audible
 from ponder_server.batching import Batch
 from ponder_server.context_policy import POLICIES, Span
@@ -48,13 +55,6 @@ from ponder_server.slots import slot_size
 from ponder_server.standing import Standing
 from ponder_server.threads import Threads
 from ponder_server.writer import MAX_CHECKED_TOKENS, Steps, TransitionWriter
-from ponderpounce.models.context import SegmentKind
-from ponderpounce.models.eyes import Pictures, check_cameras, readable_sizes, see
-from ponderpounce.models.graphs import Capture, graphs_for
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_checkpoint import weights_hash
-from ponderpounce.models.proprioception import NUM_PROPRIO
-from ponderpounce.models.views import AS_IT_IS, View
 
 WARM_UP_SESSION = "warm-up"
 WARM_UP_OPENING = Opening(instruction="warm up")

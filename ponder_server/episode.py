@@ -7,12 +7,12 @@ from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
+from dual_system.models.eyes import Pictures
+from dual_system.models.views import View
 from ponder_server.context_policy import Span
 from ponder_server.contract import Note, SessionError, Text
 from ponder_server.runner import SavedState, Session
 from ponder_server.standing import Standing
-from ponderpounce.models.eyes import Pictures
-from ponderpounce.models.views import View
 
 
 @dataclass(slots=True, kw_only=True)

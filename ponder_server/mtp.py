@@ -13,11 +13,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from dual_system.models.ponder.mtp import MtpHead
+from dual_system.models.ponder.network import Ponder
 from ponder_server.decoder import Place, decode
 from ponder_server.slots import SlotMemory
 from ponder_server.writer import MAX_CHECKED_TOKENS, ends_of_text, sayable
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_mtp import MtpHead
 
 WINDOW = 64
 """Tokens of the text that the head looks back over: they are read again for every proposal."""

@@ -8,11 +8,11 @@ from typing import Final
 
 import torch
 
+from dual_system.models.fp8 import Fp8Linear, missing_for
+from dual_system.models.int8 import Int8Linear
+from dual_system.models.narrow_linear import quantise_where
+from dual_system.models.ponder.network import Ponder
 from ponder_server.contract import WeightsName
-from ponderpounce.models.fp8 import Fp8Linear, missing_for
-from ponderpounce.models.int8 import Int8Linear
-from ponderpounce.models.narrow_linear import quantise_where
-from ponderpounce.models.ponder import Ponder
 
 _NARROW = ("model.language_model.layers.", "model.visual.blocks.", "model.visual.merger.")
 _KEPT = ("linear_attn.in_proj_a.weight", "linear_attn.in_proj_b.weight")

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from clock.rendezvous import Rendezvous
+from dual_system.models.eyes import unreadable
+from dual_system.models.proprioception import NUM_PROPRIO
 from ponder_server.contract import EngineSpec, Fire, Frame, Proprio
-from ponderpounce.models.eyes import unreadable
-from ponderpounce.models.proprioception import NUM_PROPRIO
 from protocol import images
 from protocol import messages as m
 from protocol.errors import MalformedMessage

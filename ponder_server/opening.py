@@ -7,15 +7,15 @@ from collections.abc import Callable, Sequence
 
 from torch import Tensor
 
+from dual_system.models.eyes import Pictures
+from dual_system.models.ponder.context import Segment, SegmentKind, in_groups
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.views import AS_IT_IS, View
 from ponder_server.context_policy import Span
 from ponder_server.contract import Note, Opening
 from ponder_server.prefixes import Opened, Prefixes
 from ponder_server.runner import Append, Session
 from ponder_server.writer import Steps, TransitionWriter
-from ponderpounce.models.context import Segment, SegmentKind, in_groups
-from ponderpounce.models.eyes import Pictures
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.views import AS_IT_IS, View
 
 
 class Opener:

@@ -19,13 +19,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dual_system.models.graphs import Capture
+from dual_system.models.ponder.network import Ponder
 from ponder_server.captured import CapturedDecoder, check_captured
 from ponder_server.contract import ContextFull, SessionError
 from ponder_server.decoder import LEAST_TOKENS, Place, decode
 from ponder_server.slots import SlotMemory
 from ponder_server.threads import ALONE, Threads
-from ponderpounce.models.graphs import Capture
-from ponderpounce.models.ponder import Ponder
 
 NUM_SAVED_STATES = 2
 """Per slot, allocated with it: before a query, and before a draft."""

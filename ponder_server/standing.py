@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ponderpounce.models.second_look import SecondLook
+from dual_system.models.second_look import SecondLook
 
 
 class Standing:

@@ -12,11 +12,11 @@ from typing import Literal, TypeAlias, TypeVar
 import torch
 from torch import Tensor
 
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.vocabulary import Vocabulary
 from ponder_server.contract import ContextFull, Text
 from ponder_server.draft import Draft
 from ponder_server.runner import Append, SavedState, Session
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.vocabulary import Vocabulary
 
 Result = TypeVar("Result")
 Steps: TypeAlias = Generator[Append, Tensor, Result]

@@ -23,11 +23,11 @@ def build_engine(options: PounceOptions) -> PounceEngine:
     """
     import torch
 
-    from ponderpounce.models.bfloat16 import warn_of_slow
-    from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
-    from ponderpounce.models.pounce_checkpoint import load_bundle, random_bundle
-    from ponderpounce.models.pounce_configs import tiny_cpu, tiny_groot
-    from ponderpounce.models.pounce_family import family_of_config
+    from dual_system.models.bfloat16 import warn_of_slow
+    from dual_system.models.ponder.configs import tiny_cpu as tiny_ponder
+    from dual_system.models.pounce.checkpoint import load_bundle, random_bundle
+    from dual_system.models.pounce.configs import tiny_cpu, tiny_groot
+    from dual_system.models.pounce.family import family_of_config
     from pounce_server.engine import EagerEngine
 
     torch.set_num_threads(NUM_TORCH_THREADS)

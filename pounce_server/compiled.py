@@ -14,10 +14,11 @@ from typing import Any, Final
 import torch
 from torch import Tensor
 
-from ponderpounce.models import flow, groot_flow
-from ponderpounce.models.flow import EulerStep
-from ponderpounce.models.pounce import Pounce
-from ponderpounce.models.pounce_family import AnyPounce
+from dual_system.models import flow
+from dual_system.models.flow import EulerStep
+from dual_system.models.groot import flow as groot_flow
+from dual_system.models.pi05.pounce import Pounce
+from dual_system.models.pounce.family import AnyPounce
 
 MODES: Final = {"compile": "reduce-overhead", "max-autotune": "max-autotune"}
 

@@ -12,8 +12,8 @@ from typing import Literal, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ponderpounce.models.action_space import ActionSpace
-from ponderpounce.models.arm import JOINT_HIGH_RAD, JOINT_LOW_RAD, NUM_ARM_JOINTS
+from dual_system.models.action_space import ActionSpace
+from dual_system.models.arm import JOINT_HIGH_RAD, JOINT_LOW_RAD, NUM_ARM_JOINTS
 from protocol.messages import Robot
 
 DTypeName: TypeAlias = Literal["float32", "bfloat16"]

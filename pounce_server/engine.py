@@ -13,18 +13,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ponderpounce.models import flow, rtc
-from ponderpounce.models.action_space import ROBOT_DIM
-from ponderpounce.models.committed import Committed
-from ponderpounce.models.flow import EulerStep
-from ponderpounce.models.groot_prompt import EagleTokenizer
-from ponderpounce.models.pounce import Pounce, PounceInputs
-from ponderpounce.models.pounce_batching import joined_groot, joined_pi05, of_equal_length
-from ponderpounce.models.pounce_checkpoint import PounceBundle
-from ponderpounce.models.pounce_family import AnyPounce, max_committed_rows
-from ponderpounce.models.pounce_groot import GrootInputs, GrootPounce
-from ponderpounce.models.pounce_reading import groot_inputs, pi05_inputs
-from ponderpounce.models.prompt import Tokenizer
+from dual_system.models import flow
+from dual_system.models.action_space import ROBOT_DIM
+from dual_system.models.flow import EulerStep
+from dual_system.models.groot.pounce import GrootInputs, GrootPounce
+from dual_system.models.groot.prompt import EagleTokenizer
+from dual_system.models.pi05 import rtc as rtc
+from dual_system.models.pi05.committed import Committed
+from dual_system.models.pi05.pounce import Pounce, PounceInputs
+from dual_system.models.pi05.prompt import Tokenizer
+from dual_system.models.pounce.batching import joined_groot, joined_pi05, of_equal_length
+from dual_system.models.pounce.checkpoint import PounceBundle
+from dual_system.models.pounce.family import AnyPounce, max_committed_rows
+from dual_system.models.pounce.reading import groot_inputs, pi05_inputs
 from pounce_server.compiled import compiled_sampler
 from pounce_server.contract import (
     Continuity,

@@ -14,11 +14,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ponderpounce.models.flow import EulerStep
-from ponderpounce.models.gemma import RmsNorm
-from ponderpounce.models.graphs import Capture, Work, cuda_graph, directly
-from ponderpounce.models.pi05 import Pi05, Prefix
-from ponderpounce.models.pounce import Pounce, PounceInputs
+from dual_system.models.flow import EulerStep
+from dual_system.models.graphs import Capture, Work, cuda_graph, directly
+from dual_system.models.pi05.gemma import RmsNorm
+from dual_system.models.pi05.network import Pi05, Prefix
+from dual_system.models.pi05.pounce import Pounce, PounceInputs
 from pounce_server.fused_stream import KERNELS, FusedStream, Norm, Operations, Run
 from pounce_server.kernels.choice import Choices, ChosenProduct, cuda_time_ms, default_cache, machine_name, preferring
 from pounce_server.kernels.launch import missing_for

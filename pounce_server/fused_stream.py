@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from ponderpounce.models.gemma import ExpertLayer, GemmaConfig, GemmaLayer, Rotation, attend
+from dual_system.models.pi05.gemma import ExpertLayer, GemmaConfig, GemmaLayer, Rotation, attend
 from pounce_server.kernels.choice import product
 from pounce_server.kernels.euler import euler_eager, euler_fused
 from pounce_server.kernels.geglu import geglu_eager, geglu_fused

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from ponderpounce.models import rtc
-from ponderpounce.models.committed import Committed, first_rows
-from ponderpounce.models.normalisation import Floats, RobotStatistics
-from ponderpounce.models.pounce import PounceConfig
+from dual_system.models.normalisation import Floats, RobotStatistics
+from dual_system.models.pi05 import rtc as rtc
+from dual_system.models.pi05.committed import Committed, first_rows
+from dual_system.models.pi05.pounce import PounceConfig
 from pounce_server.contract import Request
 
 

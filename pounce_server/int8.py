@@ -1,8 +1,8 @@
 """Which of POUNCE's matrices are int8: the streams'. Embeddings, norms, small projections stay, as in `precision`."""
 
-from ponderpounce.models.int8 import Int8Linear
-from ponderpounce.models.narrow_linear import quantise_where
-from ponderpounce.models.pounce_family import AnyPounce
+from dual_system.models.int8 import Int8Linear
+from dual_system.models.narrow_linear import quantise_where
+from dual_system.models.pounce.family import AnyPounce
 from pounce_server.precision import is_of_a_stream
 
 _KEPT = "groot.dit.proj_out_2.weight"  # tells GR00T's action stream in which type it runs

@@ -2,7 +2,7 @@
 
 import torch
 
-from ponderpounce.models.pounce_family import AnyPounce
+from dual_system.models.pounce.family import AnyPounce
 from pounce_server.contract import DTypeName
 
 _STREAMS = (

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ponderpounce.models.arm import NUM_ARM_JOINTS
+from dual_system.models.arm import NUM_ARM_JOINTS
 from pounce_server.contract import Request
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from ponderpounce.models.ponder_coordinates import normalised_text
+from dual_system.models.ponder.coordinates import normalised_text
 from protocol import messages as m
 
 Source = Literal["ponder", "oracle"]

@@ -8,11 +8,11 @@ from typing import Any
 import tyro
 from tqdm import tqdm
 
-import ponderpounce.tasks.headless  # noqa: F401 - before anything that imports mujoco
+import dual_system.tasks.headless  # noqa: F401 - before anything that imports mujoco
 
 # isort: split
 
-from ponderpounce.tasks.task import TaskError, make_task, task_names
+from dual_system.tasks.task import TaskError, make_task, task_names
 from protocol.errors import TransportError
 from protocol.process import set_up_logging
 from sim_client.config import SimOptions

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from ponderpounce.tasks.kinematics import Kinematics
+    from dual_system.tasks.kinematics import Kinematics
 
 ActionSpace = Literal["joint_angle", "ee_pose", "ee_delta"]
 Array = NDArray[np.float64]
@@ -76,7 +76,7 @@ class _ToolReader:
         self._solver: tuple[Any, Kinematics] | None = None
 
     def __call__(self, action: NDArray[Any], state: NDArray[Any], model: Any) -> Array:
-        from ponderpounce.tasks.kinematics import Kinematics, UnreachableError
+        from dual_system.tasks.kinematics import Kinematics, UnreachableError
 
         wanted = _checked(action, self._space)
         if self._solver is None or self._solver[0] is not model:
@@ -120,7 +120,7 @@ def _moved(here: Array, wanted: Array) -> Array:
 
 def _turn(rotation: Any) -> Array:
     """The rotation matrix (3, 3) of a rotation vector (3,) [rad]."""
-    from ponderpounce.tasks.geometry import screw_exp
+    from dual_system.tasks.geometry import screw_exp
 
     turned: Array = screw_exp(np.append(np.zeros(3), rotation))[:3, :3]
     return turned

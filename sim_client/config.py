@@ -10,8 +10,8 @@ import tyro
 
 from clock import schedules
 from clock.timebase import NS_PER_MS
-from ponderpounce.models.showing import Showing
-from ponderpounce.tasks.difficulty import Difficulty
+from dual_system.models.ponder.showing import Showing
+from dual_system.tasks.difficulty import Difficulty
 from protocol.messages import Delay, DelayKind, Delivery, DeliveryKind, Schedule, Seam, SeamKind, WaitKind
 from protocol.options import LinkOptions
 from sim_client.shown import how_shown

@@ -1,7 +1,7 @@
 """``pp-diagnose counterfactual``: does a trained pair act on its own past? Both models as served, on recorded pairs.
 
 For each pair of ``pp-collect pairs`` PONDER reads either past and the common present, and POUNCE acts on the cognition:
-twice on the same pictures, joints and noise. `ponderpounce.analysis.counterfactual` compares the actions with the
+twice on the same pictures, joints and noise. `dual_system.analysis.counterfactual` compares the actions with the
 script's in either branch. PONDER generates its own texts on the way, as in an episode.
 """
 
@@ -20,15 +20,15 @@ import tyro
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-import ponderpounce.tasks.headless  # noqa: F401 - before anything that imports mujoco
+import dual_system.tasks.headless  # noqa: F401 - before anything that imports mujoco
 
 # isort: split
 
 from clock.timebase import NS_PER_MS
-from ponderpounce.analysis.counterfactual import COUNTERFACTUAL, SCHEMA, follows_own_past
-from ponderpounce.models.showing import declared
-from ponderpounce.tasks.pair_files import how_shown_in, read_pairs
-from ponderpounce.tasks.pairs import Pair, Telling
+from dual_system.analysis.counterfactual import COUNTERFACTUAL, SCHEMA, follows_own_past
+from dual_system.models.ponder.showing import declared
+from dual_system.tasks.pair_files import how_shown_in, read_pairs
+from dual_system.tasks.pairs import Pair, Telling
 from sim_client.ledger import write_json
 from sim_client.robot import CAMERAS
 

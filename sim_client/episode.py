@@ -15,8 +15,8 @@ import numpy as np
 from clock.playback import deadline_ns
 from clock.report import CLOCK_LOST_EVENT
 from clock.timebase import NS_PER_MS
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot
 from protocol import images
 from protocol import messages as m
 from protocol.link import Link, is_of_episode

@@ -21,16 +21,16 @@ from typing import Annotated, Any, Literal
 import tyro
 from tqdm import tqdm
 
-import ponderpounce.tasks.headless  # noqa: F401 - before anything that imports mujoco
+import dual_system.tasks.headless  # noqa: F401 - before anything that imports mujoco
 
 # isort: split
 
-from ponderpounce.data.errors import DatasetError
-from ponderpounce.data.seeds import TRAIN_SEED
-from ponderpounce.data.workers import LocalWorkers, RayWorkers, Workers
-from ponderpounce.tasks.difficulty import Difficulty
-from ponderpounce.tasks.environment import Environment, make_environment
-from ponderpounce.tasks.task import TaskError, chosen_tasks
+from dual_system.data.errors import DatasetError
+from dual_system.data.seeds import TRAIN_SEED
+from dual_system.data.workers import LocalWorkers, RayWorkers, Workers
+from dual_system.tasks.difficulty import Difficulty
+from dual_system.tasks.environment import Environment, make_environment
+from dual_system.tasks.task import TaskError, chosen_tasks
 from protocol.bus import Bus
 from protocol.errors import TransportError
 from protocol.link import Link

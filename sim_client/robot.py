@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ponderpounce.models.showing import Showing
-from ponderpounce.tasks import panda
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import IMAGE_PX, Environment, Snapshot
+from dual_system.models.ponder.showing import Showing
+from dual_system.tasks import panda
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import IMAGE_PX, Environment, Snapshot
 from protocol import images
 from protocol.messages import DemoFrame, Image, ImageCodec, Observation, Robot, TaskStatus
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ponderpounce.models.showing import Showing, declared
+from dual_system.models.ponder.showing import Showing, declared
 from protocol.errors import TransportError
 
 

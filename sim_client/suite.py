@@ -18,8 +18,8 @@ import numpy as np
 
 from clock.report import statistics, stream_sha256
 from clock.service import ClockService
-from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
-from ponderpounce.tasks.physics import CONTROL_HZ
+from dual_system.tasks.environment import Environment, Snapshot, make_environment
+from dual_system.tasks.physics import CONTROL_HZ
 from protocol import images
 from protocol import messages as m
 from protocol.errors import CallFailed, TransportError

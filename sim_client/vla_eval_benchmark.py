@@ -20,7 +20,7 @@ from sim_client import action_spaces
 from sim_client.action_spaces import ActionSpace
 
 if TYPE_CHECKING:
-    from ponderpounce.tasks.environment import Environment, Snapshot
+    from dual_system.tasks.environment import Environment, Snapshot
 
 # MuJoCo chooses its renderer when it is first imported, and vla-eval says which one only after it has imported this
 # module: nothing above this line may import it.
@@ -57,7 +57,7 @@ class TableBenchmark(StepBenchmark):  # type: ignore[misc]  # untyped where vla-
         subgoal_mode: Literal["grounded", "simple"] = "grounded",
     ) -> None:
         super().__init__()
-        from ponderpounce.tasks.task import make_task, task_names
+        from dual_system.tasks.task import make_task, task_names
 
         self._names = tuple(tasks) if tasks is not None else task_names()
         for name in self._names:
@@ -81,7 +81,7 @@ class TableBenchmark(StepBenchmark):  # type: ignore[misc]  # untyped where vla-
         return [{"name": name, "env_id": name} for name in self._names]
 
     def reset(self, task: dict[str, Any]) -> Snapshot:
-        from ponderpounce.tasks.environment import make_environment
+        from dual_system.tasks.environment import make_environment
 
         if self._environment is None or task["name"] != self._name:  # a scene takes a second to build
             self.cleanup()
@@ -142,7 +142,7 @@ class TableBenchmark(StepBenchmark):  # type: ignore[misc]  # untyped where vla-
 
     def get_hold_action(self, last_action: dict[str, Any] | None) -> dict[str, Any]:
         """What a live runner commands when the model has nothing new: the last targets, or where the arm is."""
-        from ponderpounce.tasks.panda import HOME_QPOS
+        from dual_system.tasks.panda import HOME_QPOS
 
         snapshot: Snapshot | None = self._last_result.obs
         joints: NDArray[Any] = HOME_QPOS if snapshot is None else snapshot.state[:7]

@@ -16,16 +16,16 @@ import hypothesis
 import numpy as np
 import pytest
 
-import ponderpounce.tasks.headless  # noqa: F401 - before mujoco is imported
+import dual_system.tasks.headless  # noqa: F401 - before mujoco is imported
 
 # isort: split
 
 from clock import schedules
 from clock.service import ClockService, ServiceConfig
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Snapshot
 from ponder_server import contract as ponder
 from ponder_server.serve import PonderServer
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Snapshot
 from pounce_server import contract as pounce
 from pounce_server.serve import PounceServer
 from protocol import images

@@ -17,7 +17,7 @@ retell() {  # what was played in the folder FROM, told as things then stood, bec
 
 learn() {  # a PONDER goes on by a STAGE of RECIPE INTO a folder, beside POUNCE; the rest is pp-train's
     local recipe=$1 stage=$2 ponder=$3 pounce=$4 into=$5; shift 5
-    [ -d "$into/run/$stage/ponder" ] || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --weights whole \
+    [ -d "$into/run/$stage/ponder" ] || "$bin/torchrun" --nproc-per-node=2 -m dual_system.training.train --weights whole \
         --recipe "$recipe" --stage "$stage" --ponder "$ponder" --pounce "$pounce" --out "$into/run" "$@"
 }
 
@@ -65,8 +65,8 @@ stored = {"fovea": None, "demonstrations": {"hz": 2, "to_its_end": True}} | stor
 
 narrow_reader() {  # a PONDER's reader INTO another's folder, in its first LAYERS and in few BITS, as it has learned to be
     "$bin/python" -c 'import pathlib, sys
-from ponderpounce.models.ponder_checkpoint import READER_NAME, load_ponder
-from ponderpounce.models.reader_file import Narrowing, write_reader
+from dual_system.models.ponder.checkpoint import READER_NAME, load_ponder
+from dual_system.models.reader_file import Narrowing, write_reader
 ponder, narrowing = load_ponder(pathlib.Path(sys.argv[1])), Narrowing(num_layers=int(sys.argv[3]), bits=int(sys.argv[4]))
 write_reader(ponder.reader, ponder.qwen.model.language_model, pathlib.Path(sys.argv[2], READER_NAME), narrowing)' "$@"
 }
@@ -74,8 +74,8 @@ write_reader(ponder.reader, ponder.qwen.model.language_model, pathlib.Path(sys.a
 give_specialist() {  # a PONDER's NAMED specialist INTO another's folder, in its first LAYERS and in few BITS, as it has learned to be
     "$bin/python" -c 'import json, pathlib, sys
 from dataclasses import asdict
-from ponderpounce.models.ponder_checkpoint import load_ponder, specialist_name
-from ponderpounce.models.reader_file import Narrowing, write_reader
+from dual_system.models.ponder.checkpoint import load_ponder, specialist_name
+from dual_system.models.reader_file import Narrowing, write_reader
 ponder, path = load_ponder(pathlib.Path(sys.argv[1])), pathlib.Path(sys.argv[2], "ponder.json")
 (specialty,) = (each for each in ponder.format.specialties if each.name == sys.argv[3])
 narrowing = Narrowing(num_layers=int(sys.argv[4]), bits=int(sys.argv[5]))
@@ -98,8 +98,8 @@ ponder["proprioception"]["grip"] = pounce["statistics"]["grip"] = grip
 
 pack() {  # the weights of a PONDER's folder, without loss
     "$bin/python" -c 'import pathlib, sys
-from ponderpounce.models.packed import pack
-from ponderpounce.models.ponder_checkpoint import PACKED_NAME, SINGLE_NAME
+from dual_system.models.packed import pack
+from dual_system.models.ponder.checkpoint import PACKED_NAME, SINGLE_NAME
 path = pathlib.Path(sys.argv[1], SINGLE_NAME)
 path.with_name(PACKED_NAME).write_bytes(pack(path.read_bytes()))
 path.unlink()' "$@"

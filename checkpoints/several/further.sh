@@ -38,7 +38,7 @@ mapfile -t found < <(logs "$more/played")
 [ -d "$more/watched/meta" ] || "$bin/pp-export" "${found[@]}" --out "$more/watched"
 [ -d "$more/run/releasing/pounce" ] || "$bin/pp-train" "${how[@]}" --stage releasing
 wait $telling
-[ -d "$more/run/ponder" ] || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --weights whole "${how[@]}" \
+[ -d "$more/run/ponder" ] || "$bin/torchrun" --nproc-per-node=2 -m dual_system.training.train --weights whole "${how[@]}" \
     --stage finishing --watch "$more/watched" --watch-share 0.125
 
 pair="$more/pair"

@@ -41,7 +41,7 @@ for task in PatternLock RouteStick; do look 1500 $task; done
 
 how=(--recipe small_imitating --data "${data[@]}" --ponder "$more/wide/ponder" --pounce "$more/wide/pounce" --sights "$more/sights"
     --out "$more/run")
-train_on_both_cores() { "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --weights whole "${how[@]}" "$@"; }
+train_on_both_cores() { "$bin/torchrun" --nproc-per-node=2 -m dual_system.training.train --weights whole "${how[@]}" "$@"; }
 
 [ -d "$more/run/hand/pounce" ] || "$bin/pp-train" "${how[@]}" --stage hand & acting=$!
 [ -d "$more/run/binding/ponder" ] || "$bin/pp-train" "${how[@]}" --stage binding --no-progress

@@ -22,7 +22,7 @@ collect "$next/missed" --tasks InsertPeg --episodes 100 --first-episode 2000 --i
 
 data=("$next/pegs" "$next/more")
 act() {  # POUNCE goes on by a STAGE, from POUNCE; what else is to be learned from is the rest
-    [ -d "$next/run/$1/pounce" ] || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --weights whole \
+    [ -d "$next/run/$1/pounce" ] || "$bin/torchrun" --nproc-per-node=2 -m dual_system.training.train --weights whole \
         --recipe small_inserting --stage "$1" --ponder "$side/open/ponder" --pounce "$2" --out "$next/run" --data "${@:3}"
 }
 all=("${data[@]}" "${data[@]}" "${data[@]}" "$side/route" "$side/filled" "$side/filled")

@@ -27,7 +27,7 @@ watch 36 1950000 "$next/counted" PickXtimes SwingXtimes BinFill
 watch 16 1960000 "$next/driven" ButtonUnmask VideoUnmask VideoPlaceButton VideoPlaceOrder PickHighlight
 
 train() {  # on both cores
-    "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --weights whole --recipe small_mastering \
+    "$bin/torchrun" --nproc-per-node=2 -m dual_system.training.train --weights whole --recipe small_mastering \
         --ponder "$more/run/settling/ponder" --pounce "$more/run/waiting/pounce" --sights "$more/sights" --out "$next/run" "$@"
 }
 

@@ -34,7 +34,7 @@ told "$next/before" "$trial/counted-played" "$trial/driven-played"
 told "$next/told" "$more/played"
 
 pair="$next/pair"
-[ -d "$next/run/settling/ponder" ] || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --weights whole \
+[ -d "$next/run/settling/ponder" ] || "$bin/torchrun" --nproc-per-node=2 -m dual_system.training.train --weights whole \
     --recipe small_recovering --stage settling --data "${data[@]}" --watch "$next/own" "$next/before" "$next/told" --watch-share 0.35 \
     --ponder "$trial/run/settling/ponder" --pounce "$trial/run/waiting/pounce" --sights "$more/sights" --out "$next/run"
 [ -d "$pair/ponder" ] || halve "$next/run/settling/ponder" "$pair/ponder"

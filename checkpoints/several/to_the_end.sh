@@ -38,7 +38,7 @@ collect "$next/fill" --tasks BinFill --episodes 30 --first-episode 6000
 data=("$next/pegs" "$pegs/pegs" "$pegs/more" "$pegs/missed")
 hand=("${data[@]}" "${data[@]}" "$side/route" "$side/filled" "$side/filled")
 for kind in imitated shown old swaps repick timed filled filled highlight; do hand+=("$long/$kind" "$grown/$kind"); done
-[ -d "$next/hand/run/righting/pounce" ] || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --weights whole \
+[ -d "$next/hand/run/righting/pounce" ] || "$bin/torchrun" --nproc-per-node=2 -m dual_system.training.train --weights whole \
     --recipe small_inserting --stage righting --ponder "$side/open/ponder" --pounce "$pegs/run/righting/pounce" \
     --out "$next/hand/run" --data "${hand[@]}"
 

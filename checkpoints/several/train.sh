@@ -37,7 +37,7 @@ how=(--recipe small_several --data "${data[@]}" --ponder "$out/wide/ponder" --po
 [ -d "$out/run/hand/pounce" ] || "$bin/pp-train" "${how[@]}" --stage hand & acting=$!
 [ -d "$out/run/noticing/ponder" ] || "$bin/pp-train" "${how[@]}" --stage noticing --no-progress
 wait $acting
-[ -d "$out/run/ponder" ] || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --weights whole "${how[@]}"
+[ -d "$out/run/ponder" ] || "$bin/torchrun" --nproc-per-node=2 -m dual_system.training.train --weights whole "${how[@]}"
 
 pair="$out/pair"
 [ -d "$pair/ponder" ] || halve "$out/run/ponder" "$pair/ponder"

@@ -42,7 +42,7 @@ mended=("$more"/mended/*/)
 
 train() {  # the RECIPE from a PONDER and a POUNCE into OUT
     local recipe=$1 ponder=$2 pounce=$3 into=$4; shift 4
-    [ -d "$into/ponder" ] || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --weights whole \
+    [ -d "$into/ponder" ] || "$bin/torchrun" --nproc-per-node=2 -m dual_system.training.train --weights whole \
         --recipe "$recipe" --data "$more/data" "${mended[@]%/}" --ponder "$ponder" --pounce "$pounce" \
         --sights "$more/sights" --out "$into" "$@"
 }

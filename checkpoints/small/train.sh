@@ -20,7 +20,7 @@ how=(--recipe small --out "$out/run" --ponder "$out/eyes/ponder" --sights "$out/
 oracle=(--data "$out/data")
 train() { finished || "$bin/pp-train" "${how[@]}" "$@"; }
 train_on_both_cores() {
-    finished || "$bin/torchrun" --nproc-per-node=2 -m ponderpounce.training.train --weights whole "${how[@]}" "$@"
+    finished || "$bin/torchrun" --nproc-per-node=2 -m dual_system.training.train --weights whole "${how[@]}" "$@"
 }
 
 play() {  # records episodes of $out/played/NAME

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ponderpounce.models.gemma import RMS_NORM_EPS
+from dual_system.models.pi05.gemma import RMS_NORM_EPS
 from pounce_server.kernels.launch import Tolerance, block_size, check_tensor, kernel, tl
 
 TOLERANCE = {

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ponderpounce.models.gemma import Rotation
+from dual_system.models.pi05.gemma import Rotation
 from pounce_server.kernels.launch import Tolerance, block_size, check_tensor, kernel, tl
 
 TOLERANCE = {

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 
 import tyro
 
-import ponderpounce.tasks.headless  # noqa: F401 - before anything that imports mujoco
+import dual_system.tasks.headless  # noqa: F401 - before anything that imports mujoco
 
 # isort: split
 

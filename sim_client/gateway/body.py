@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ponderpounce.tasks.panda import PANDA_WRISTCAM
+from dual_system.tasks.panda import PANDA_WRISTCAM
 from protocol import checks
 from protocol.errors import MalformedMessage, TransportError
 from protocol.messages import Floats, Robot

@@ -22,7 +22,7 @@ from typing import Literal, TypeVar
 from clock.report import statistics, stream_sha256
 from clock.service import ClockService
 from clock.timebase import MonotonicClock
-from ponderpounce.models.showing import AS_IN_THE_PAPER, Showing
+from dual_system.models.ponder.showing import AS_IN_THE_PAPER, Showing
 from protocol import images
 from protocol import messages as m
 from protocol.errors import CallFailed, MalformedMessage, TransportError

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from clock.limits import within_limits
-from ponderpounce.models.showing import Showing
+from dual_system.models.ponder.showing import Showing
 from protocol.messages import Action, ActionChunk, Floats, Level, Robot
 from sim_client.gateway.exchange import Frames
 

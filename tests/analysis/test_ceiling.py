@@ -8,9 +8,9 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from ponderpounce.analysis.ceiling import NUM_CUBES_AND_TARGETS, ceiling_of, pick_highlight_ceiling
-from ponderpounce.tasks.difficulty import DIFFICULTIES
-from ponderpounce.tasks.task import make_task
+from dual_system.analysis.ceiling import NUM_CUBES_AND_TARGETS, ceiling_of, pick_highlight_ceiling
+from dual_system.tasks.difficulty import DIFFICULTIES
+from dual_system.tasks.task import make_task
 
 
 def test_over_the_benchmark_s_mix_it_is_eleven_sixtieths() -> None:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from ponderpounce.analysis.counterfactual import follows_own_past, p_own
+from dual_system.analysis.counterfactual import follows_own_past, p_own
 
 shapes = st.tuples(st.integers(1, 4), st.just(2), st.integers(1, 3), st.integers(1, 3))
 numbers = st.floats(-3, 3, width=32)

@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from ponderpounce.analysis import diagnosis, tables
-from ponderpounce.analysis.counterfactual import SCHEMA as COUNTERFACTUAL_SCHEMA
-from ponderpounce.analysis.diagnosis import CONDITIONS, Losses, absolute, ratio, read_diagnosis
-from ponderpounce.analysis.results import ResultsError
+from dual_system.analysis import diagnosis, tables
+from dual_system.analysis.counterfactual import SCHEMA as COUNTERFACTUAL_SCHEMA
+from dual_system.analysis.diagnosis import CONDITIONS, Losses, absolute, ratio, read_diagnosis
+from dual_system.analysis.results import ResultsError
 
 MODELS = {"ponder": {"is_untrained": False}, "pounce": {"is_untrained": False}}
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ponderpounce.analysis.statistics import bootstrap, paired, sign_test, success_rate, wilson
+from dual_system.analysis.statistics import bootstrap, paired, sign_test, success_rate, wilson
 
 FEW = 200  # resamples: laws hold for any number
 

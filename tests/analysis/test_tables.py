@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from ponderpounce.analysis import paper
-from ponderpounce.analysis.results import ResultsError, read_comparable, read_results
-from ponderpounce.analysis.tables import between_conditions, by_family, by_task, main, tables
-from ponderpounce.tasks.task import make_task, task_names
+from dual_system.analysis import paper
+from dual_system.analysis.results import ResultsError, read_comparable, read_results
+from dual_system.analysis.tables import between_conditions, by_family, by_task, main, tables
+from dual_system.tasks.task import make_task, task_names
 
 CONFIG = {"mode": "lockstep", "max_steps": 1300, "deliver": "every", "query_period_ms": 1000, "delay_ms": 300}
 

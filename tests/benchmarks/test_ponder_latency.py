@@ -16,10 +16,10 @@ from benchmarks.ponder_latency import (
     _texts,
     _untrained_prediction,
 )
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.network import Ponder
 from ponder_server.draft import Draft, NoDraft, TrieDraft
 from ponder_server.mtp import MtpDraft
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
 
 OPTIONS = LatencyOptions(contexts=(800, 900), texts=1)
 

@@ -16,11 +16,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.ponder_memory import made_by
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.network import Ponder
 from ponder_server.contract import Opening
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
 
 ROOT = Path(__file__).parents[2]
 SMALL = replace(tiny_cpu(), num_layers=4, vision_depth=1, image_px=(64, 64))

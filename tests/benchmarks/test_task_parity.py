@@ -11,7 +11,7 @@ from benchmarks.contact_sheets import sheet
 from benchmarks.recorded import layout_of, recorded_tasks
 from benchmarks.task_parity import apart
 from benchmarks.task_speed import row_of, step_row
-from ponderpounce.tasks.task import make_task
+from dual_system.tasks.task import make_task
 
 DATA = Path(__file__).parents[1] / "tasks" / "data"
 

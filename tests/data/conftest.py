@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ponderpounce.data.episode import CAMERAS, About, EpisodeWriter, Package, Row
-from ponderpounce.data.jobs import Job
+from dual_system.data.episode import CAMERAS, About, EpisodeWriter, Package, Row
+from dual_system.data.jobs import Job
 from protocol.bus import LocalBus
 from protocol.link import Link
 from sim_client.config import SimOptions

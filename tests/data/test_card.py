@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from ponderpounce.data.card import CARD, LABEL_PX, PICTURE_PX, PICTURES_PER_TASK, SHEET, main
-from ponderpounce.data.episode import Package, unpack
-from ponderpounce.data.lerobot_v3 import DatasetWriter
+from dual_system.data.card import CARD, LABEL_PX, PICTURE_PX, PICTURES_PER_TASK, SHEET, main
+from dual_system.data.episode import Package, unpack
+from dual_system.data.lerobot_v3 import DatasetWriter
 
 
 @pytest.fixture

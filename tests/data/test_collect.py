@@ -14,17 +14,17 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ponderpounce.data import collect as module
-from ponderpounce.data.card import card
-from ponderpounce.data.collect import COLLECTING, COLLECTION_PATH, CollectOptions, collect, disk_needed
-from ponderpounce.data.dart import DART
-from ponderpounce.data.dataset import Dataset
-from ponderpounce.data.episode import Package
-from ponderpounce.data.errors import DatasetError
-from ponderpounce.data.jobs import Job
-from ponderpounce.data.rollout import UNSOLVED
-from ponderpounce.data.shove import SHOVES
-from ponderpounce.data.store import Store
+from dual_system.data import collect as module
+from dual_system.data.card import card
+from dual_system.data.collect import COLLECTING, COLLECTION_PATH, CollectOptions, collect, disk_needed
+from dual_system.data.dart import DART
+from dual_system.data.dataset import Dataset
+from dual_system.data.episode import Package
+from dual_system.data.errors import DatasetError
+from dual_system.data.jobs import Job
+from dual_system.data.rollout import UNSOLVED
+from dual_system.data.shove import SHOVES
+from dual_system.data.store import Store
 
 TASKS, EPISODES = ("PickHighlight", "VideoUnmask"), 3  # names only: nothing is simulated here
 WorkOut = Callable[[Job], Package]

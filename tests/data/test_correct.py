@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from clock.sampling import ROBOMME
-from ponderpounce.data import correct as module
-from ponderpounce.data.correct import CorrectOptions, Job, Outcome, correct, main, work_out
-from ponderpounce.data.dataset import Dataset
-from ponderpounce.data.episode import unpack
-from ponderpounce.data.errors import DatasetError
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
-from ponderpounce.training.data import TrainingSet
-from ponderpounce.training.example import ExampleConfig, make_example
+from dual_system.data import correct as module
+from dual_system.data.correct import CorrectOptions, Job, Outcome, correct, main, work_out
+from dual_system.data.dataset import Dataset
+from dual_system.data.episode import unpack
+from dual_system.data.errors import DatasetError
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.network import Ponder
+from dual_system.training.data import TrainingSet
+from dual_system.training.example import ExampleConfig, make_example
 from protocol.mcap_log import EpisodeRecord, read_log
 
 PARTS = 4

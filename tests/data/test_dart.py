@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ponderpounce.data import rollout
-from ponderpounce.data.dart import DART, Dart, DartConfig, episode_std_rad
-from ponderpounce.data.episode import Row
-from ponderpounce.data.jobs import Job, Look
-from ponderpounce.data.rollout import play
-from ponderpounce.tasks.clearance import Clearance
-from ponderpounce.tasks.environment import Environment, make_environment
+from dual_system.data import rollout
+from dual_system.data.dart import DART, Dart, DartConfig, episode_std_rad
+from dual_system.data.episode import Row
+from dual_system.data.jobs import Job, Look
+from dual_system.data.rollout import play
+from dual_system.tasks.clearance import Clearance
+from dual_system.tasks.environment import Environment, make_environment
 
 TASK = "VideoUnmask"
 SEEDS = range(3, 40)

@@ -7,7 +7,7 @@ from dataclasses import fields
 
 import numpy as np
 
-from ponderpounce.data.episode import OPTIONAL, Package, Rejection, Rows, from_table, to_table, unpack
+from dual_system.data.episode import OPTIONAL, Package, Rejection, Rows, from_table, to_table, unpack
 
 
 def test_what_is_packed_is_unpacked(package: Callable[..., Package]) -> None:

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ponderpounce.data.dataset import Dataset
-from ponderpounce.data.episode import CAMERAS, Row
-from ponderpounce.data.errors import DatasetError
-from ponderpounce.data.export import ExportOptions, export, main, read_episode
-from ponderpounce.data.jobs import Job, Look
-from ponderpounce.data.rollout import play
-from ponderpounce.tasks.environment import make_environment
+from dual_system.data.dataset import Dataset
+from dual_system.data.episode import CAMERAS, Row
+from dual_system.data.errors import DatasetError
+from dual_system.data.export import ExportOptions, export, main, read_episode
+from dual_system.data.jobs import Job, Look
+from dual_system.data.rollout import play
+from dual_system.tasks.environment import make_environment
 from protocol.mcap_log import EpisodeRecord, read_log
 
 SEED, TASK = 3, "VideoUnmask"

@@ -8,8 +8,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ponderpounce.data.jobs import ATTEMPTS, Look, failed_grasp, jobs_of
-from ponderpounce.data.seeds import TRAIN_SEED
+from dual_system.data.jobs import ATTEMPTS, Look, failed_grasp, jobs_of
+from dual_system.data.seeds import TRAIN_SEED
 
 JOBS = list(jobs_of(("A", "B"), 900, image_px=256, max_steps=1300, look=Look()))
 

@@ -10,11 +10,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from ponderpounce.data import lerobot_v3 as v3
-from ponderpounce.data.dataset import Dataset
-from ponderpounce.data.episode import CAMERAS, EXECUTED, Episode, Package, unpack
-from ponderpounce.data.errors import DatasetError
-from ponderpounce.data.video import read_frames
+from dual_system.data import lerobot_v3 as v3
+from dual_system.data.dataset import Dataset
+from dual_system.data.episode import CAMERAS, EXECUTED, Episode, Package, unpack
+from dual_system.data.errors import DatasetError
+from dual_system.data.video import read_frames
 
 LENGTHS = (5, 9, 4)
 

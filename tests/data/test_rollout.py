@@ -10,15 +10,15 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from ponderpounce.data import rollout
-from ponderpounce.data.episode import CAMERAS, Row, unpack
-from ponderpounce.data.jobs import Job, Look
-from ponderpounce.data.rollout import UNSOLVED, UnsolvedError, play, work_out
-from ponderpounce.data.video import read_frames
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, make_environment
-from ponderpounce.tasks.oracle import FailedGrasp
-from ponderpounce.tasks.task import task_names
+from dual_system.data import rollout
+from dual_system.data.episode import CAMERAS, Row, unpack
+from dual_system.data.jobs import Job, Look
+from dual_system.data.rollout import UNSOLVED, UnsolvedError, play, work_out
+from dual_system.data.video import read_frames
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, make_environment
+from dual_system.tasks.oracle import FailedGrasp
+from dual_system.tasks.task import task_names
 
 
 def job(task: str, slot: int = 6, **changes: object) -> Job:

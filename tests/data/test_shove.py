@@ -9,14 +9,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from ponderpounce.data import rollout
-from ponderpounce.data.episode import Row
-from ponderpounce.data.jobs import Job, Look
-from ponderpounce.data.rollout import UnsolvedError, play
-from ponderpounce.data.shove import SHOVES, ShoveConfig, Shoves, is_shoved
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
-from ponderpounce.tasks.oracle import Motions
+from dual_system.data import rollout
+from dual_system.data.episode import Row
+from dual_system.data.jobs import Job, Look
+from dual_system.data.rollout import UnsolvedError, play
+from dual_system.data.shove import SHOVES, ShoveConfig, Shoves, is_shoved
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot, make_environment
+from dual_system.tasks.oracle import Motions
 
 TASK = "PickHighlight"
 SEEDS = range(2_000_000, 2_000_006)

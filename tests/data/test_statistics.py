@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ponderpounce.data.statistics import QUANTILES, PixelHistogram, of_vectors
+from dual_system.data.statistics import QUANTILES, PixelHistogram, of_vectors
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.integers(0, 3))

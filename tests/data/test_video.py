@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ponderpounce.data.video import FRAMES_PER_KEY, VideoJoiner, VideoWriter, read_frames
+from dual_system.data.video import FRAMES_PER_KEY, VideoJoiner, VideoWriter, read_frames
 
 PX, LENGTHS = 32, (25, 7, 31)
 

@@ -10,11 +10,11 @@ from concurrent.futures.process import BrokenProcessPool
 
 import pytest
 
-from ponderpounce.data.episode import Package
-from ponderpounce.data.errors import DatasetError
-from ponderpounce.data.jobs import Look, jobs_of
-from ponderpounce.data.rollout import work_out
-from ponderpounce.data.workers import LocalWorkers, RayWorkers
+from dual_system.data.episode import Package
+from dual_system.data.errors import DatasetError
+from dual_system.data.jobs import Look, jobs_of
+from dual_system.data.rollout import work_out
+from dual_system.data.workers import LocalWorkers, RayWorkers
 
 JOBS = list(jobs_of(("StopCube",), 4, image_px=16, max_steps=1300, look=Look(execution_hz=1)))
 

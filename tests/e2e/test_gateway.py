@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from clock.check import disagreements
-from ponderpounce.tasks.environment import make_environment
+from dual_system.tasks.environment import make_environment
 from protocol import messages as m
 from protocol.mcap_log import read_log
 from sim_client.launch import free_ports

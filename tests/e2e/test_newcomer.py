@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from ponderpounce.analysis import tables
-from ponderpounce.data import collect
-from ponderpounce.training import diagnose, train
+from dual_system.analysis import tables
+from dual_system.data import collect
+from dual_system.training import diagnose, train
 from sim_client import evaluate
 
 pytestmark = [pytest.mark.e2e, pytest.mark.sim, pytest.mark.slow]

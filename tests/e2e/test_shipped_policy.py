@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ponderpounce.models.ponder_checkpoint import load_ponder
-from ponderpounce.models.pounce_checkpoint import load_bundle
-from ponderpounce.models.specialty import specialist_for
-from ponderpounce.tasks.difficulty import DIFFICULTIES
-from ponderpounce.tasks.task import make_task, task_names
+from dual_system.models.ponder.checkpoint import load_ponder
+from dual_system.models.pounce.checkpoint import load_bundle
+from dual_system.models.specialty import specialist_for
+from dual_system.tasks.difficulty import DIFFICULTIES
+from dual_system.tasks.task import make_task, task_names
 from sim_client import evaluate
 
 CHECKPOINTS = Path(__file__).parents[2] / "checkpoints"

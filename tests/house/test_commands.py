@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
+from dual_system.commands import COMMANDS, REFUSED
 from ponderpounce import commands
-from ponderpounce.commands import COMMANDS, REFUSED
 
 ENTRIES = {"pp-collect": commands.collect, "pp-export": commands.export, "pp-diagnose": commands.diagnose}
 VERBS = [(name, verb) for name, command in COMMANDS.items() for verb in command.verbs]

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from ponderpounce.models.action_space import ActionSpace, actions_in, num_dims, states_in, targets_from
-from ponderpounce.models.arm import JOINT_HIGH_RAD, JOINT_LOW_RAD, NUM_ARM_JOINTS, rotations, tool_poses
-from ponderpounce.models.normalisation import ROBOMME, Quantiles, RobotStatistics
+from dual_system.models.action_space import ActionSpace, actions_in, num_dims, states_in, targets_from
+from dual_system.models.arm import JOINT_HIGH_RAD, JOINT_LOW_RAD, NUM_ARM_JOINTS, rotations, tool_poses
+from dual_system.models.normalisation import ROBOMME, Quantiles, RobotStatistics
 
 HOME = np.array([0.0, 0.0, 0.0, -np.pi / 2, 0.0, np.pi / 2, np.pi / 4, 0.04])
 SPACES: tuple[ActionSpace, ...] = ("joint_delta", "ee_delta")

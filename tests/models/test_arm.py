@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from ponderpounce.models import arm
-from ponderpounce.tasks import panda
-from ponderpounce.tasks.geometry import rotation_log
-from ponderpounce.tasks.kinematics import Kinematics
+from dual_system.models import arm
+from dual_system.tasks import panda
+from dual_system.tasks.geometry import rotation_log
+from dual_system.tasks.kinematics import Kinematics
 
 within_limits = arrays(np.float64, 7, elements=st.floats(0, 1)).map(
     lambda share: arm.JOINT_LOW_RAD + share * (arm.JOINT_HIGH_RAD - arm.JOINT_LOW_RAD)

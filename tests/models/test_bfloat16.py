@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from dual_system.models import bfloat16
+from dual_system.training import train
 from ponder_server.__main__ import build_engine as build_ponder
 from ponder_server.config import PonderOptions
-from ponderpounce.models import bfloat16
-from ponderpounce.training import train
 from pounce_server.__main__ import build_engine as build_pounce
 from pounce_server.config import PounceOptions
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from ponderpounce.models.bfloat16_products import Bfloat16Linear, multiply_in_bfloat16
+from dual_system.models.bfloat16_products import Bfloat16Linear, multiply_in_bfloat16
 
 _ROUNDING = 2**-8
 

@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from ponderpounce.models import flow
-from ponderpounce.models.committed import DONE, Committed, draw_counts, first_rows, row_styles
-from ponderpounce.models.pounce import Pounce
-from ponderpounce.models.pounce_configs import tiny_cpu
-from ponderpounce.models.pounce_init import random_pounce
+from dual_system.models import flow
+from dual_system.models.pi05.committed import DONE, Committed, draw_counts, first_rows, row_styles
+from dual_system.models.pi05.pounce import Pounce
+from dual_system.models.pounce.configs import tiny_cpu
+from dual_system.models.pounce.initialise import random_pounce
 
 B, N, A = 2, 6, 32
 

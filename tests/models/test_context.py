@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ponderpounce.models.context import IGNORE, ContextFormat, Segment, SegmentKind, Transition
-from ponderpounce.models.vocabulary import Vocabulary
+from dual_system.models.ponder.context import IGNORE, ContextFormat, Segment, SegmentKind, Transition
+from dual_system.models.ponder.vocabulary import Vocabulary
 
 VOCABULARY = Vocabulary.tiny()
 FORMAT = ContextFormat(vocabulary=VOCABULARY, num_carriers=3, first_carrier_id=440, image_grid=(8, 8))

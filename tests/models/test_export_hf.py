@@ -10,15 +10,15 @@ import torch
 from safetensors.torch import load_file
 from transformers.models.qwen3_5 import Qwen3_5ForConditionalGeneration
 
-from ponderpounce.models.export_hf import PREFIX_FILE, ExportOptions, export_folder, main
-from ponderpounce.models.pi05_weights import unused_shapes
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_checkpoint import load_ponder, save_ponder, weights_hash
-from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
-from ponderpounce.models.pounce import PounceConfig
-from ponderpounce.models.pounce_checkpoint import PounceBundle, load_bundle, random_bundle, save_bundle
-from ponderpounce.models.pounce_configs import tiny_cpu, tiny_groot
-from ponderpounce.models.pounce_family import AnyPounceConfig
+from dual_system.models.pi05.pounce import PounceConfig
+from dual_system.models.pi05.weights import unused_shapes
+from dual_system.models.ponder.checkpoint import load_ponder, save_ponder, weights_hash
+from dual_system.models.ponder.configs import tiny_cpu as tiny_ponder
+from dual_system.models.ponder.export_hf import PREFIX_FILE, ExportOptions, export_folder, main
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.pounce.checkpoint import PounceBundle, load_bundle, random_bundle, save_bundle
+from dual_system.models.pounce.configs import tiny_cpu, tiny_groot
+from dual_system.models.pounce.family import AnyPounceConfig
 
 
 def nvidia_like() -> AnyPounceConfig:

@@ -11,11 +11,11 @@ import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from ponderpounce.models.context import ContextFormat
-from ponderpounce.models.eyes import Eye, check_cameras, readable_sizes, see
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
-from ponderpounce.models.vocabulary import Vocabulary
+from dual_system.models.eyes import Eye, check_cameras, readable_sizes, see
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.context import ContextFormat
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.vocabulary import Vocabulary
 
 WORKSPACE = Eye(camera=0, box=(0.375, 0.25, 0.875, 0.75))  # 64 x 64 of 128 px
 WRIST = Eye(camera=1)

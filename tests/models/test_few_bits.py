@@ -5,7 +5,7 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from ponderpounce.models.few_bits import STEP_OF_STD, narrowed, rounded, shape_of_codes, widened
+from dual_system.models.few_bits import STEP_OF_STD, narrowed, rounded, shape_of_codes, widened
 
 BITS = sorted(STEP_OF_STD)
 SHAPES = st.one_of(

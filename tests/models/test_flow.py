@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from ponderpounce.models import flow
+from dual_system.models import flow
 
 SHAPE = (2, 4, 6)
 

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from ponderpounce.models import fp8
-from ponderpounce.models.fp8 import Fp8Linear, has_products, missing_for
-from ponderpounce.models.narrow_linear import quantise_where
+from dual_system.models import fp8
+from dual_system.models.fp8 import Fp8Linear, has_products, missing_for
+from dual_system.models.narrow_linear import quantise_where
 
 MODEL_TYPE = torch.bfloat16
 

@@ -6,9 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from ponderpounce.models.pounce import freeze
-from ponderpounce.models.pounce_configs import tiny_cpu, tiny_groot
-from ponderpounce.models.pounce_family import AnyPounce, random_model
+from dual_system.models.pi05.pounce import freeze
+from dual_system.models.pounce.configs import tiny_cpu, tiny_groot
+from dual_system.models.pounce.family import AnyPounce, random_model
 
 MODES: dict[str, Callable[[], AnyPounce]] = {
     "pi05 full": lambda: random_model(tiny_cpu(num_carriers=2), 0),

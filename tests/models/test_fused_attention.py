@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 
-from ponderpounce.models import ponder_configs
-from ponderpounce.models.fused_attention import NAME, fuse_attention
-from ponderpounce.models.ponder import Ponder
+from dual_system.models.ponder import configs as ponder_configs
+from dual_system.models.ponder.fused_attention import NAME, fuse_attention
+from dual_system.models.ponder.network import Ponder
 
 
 def hidden_and_gradient(ponder: Ponder) -> tuple[torch.Tensor, torch.Tensor]:

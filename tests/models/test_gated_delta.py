@@ -10,7 +10,7 @@ from transformers.models.qwen3_5.modeling_qwen3_5 import (
     torch_recurrent_gated_delta_rule,
 )
 
-from ponderpounce.models.gated_delta import gated_delta_rule
+from dual_system.models.ponder.gated_delta import gated_delta_rule
 
 
 def inputs(seed: int, length: int, heads: tuple[int, int], dims: tuple[int, int]) -> dict[str, Tensor]:

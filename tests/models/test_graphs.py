@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from ponderpounce.models import graphs
+from dual_system.models import graphs
 
 
 def test_work_is_captured_on_a_gpu_alone(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,15 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from ponderpounce.models import pounce_configs
-from ponderpounce.models.grip import Grip, as_told
-from ponderpounce.models.normalisation import ROBOMME
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_checkpoint import load_ponder, save_ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
-from ponderpounce.models.pounce_checkpoint import load_bundle, random_bundle, save_bundle
-from ponderpounce.models.proprioception import Proprioception
-from ponderpounce.models.vocabulary import Vocabulary
+from dual_system.models.grip import Grip, as_told
+from dual_system.models.normalisation import ROBOMME
+from dual_system.models.ponder.checkpoint import load_ponder, save_ponder
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.vocabulary import Vocabulary
+from dual_system.models.pounce import configs as pounce_configs
+from dual_system.models.pounce.checkpoint import load_bundle, random_bundle, save_bundle
+from dual_system.models.proprioception import Proprioception
 
 GRIP = Grip(straight_m=0.0205, askew_m=0.0295)
 HELD_ASKEW, HELD = 0.0283, GRIP.straight_m

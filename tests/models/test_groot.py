@@ -6,12 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from ponderpounce.models import groot_flow
-from ponderpounce.models.groot import GrootCache
-from ponderpounce.models.pounce_configs import groot_n1_5, tiny_groot
-from ponderpounce.models.pounce_groot import GrootInputs, GrootPounce, GrootPounceConfig
-from ponderpounce.models.pounce_init import initialise_groot, initialise_prefix, random_groot_pounce
-from ponderpounce.models.qwen3 import causal_bias
+from dual_system.models.groot import flow as groot_flow
+from dual_system.models.groot.network import GrootCache
+from dual_system.models.groot.pounce import GrootInputs, GrootPounce, GrootPounceConfig
+from dual_system.models.groot.qwen3 import causal_bias
+from dual_system.models.pounce.configs import groot_n1_5, tiny_groot
+from dual_system.models.pounce.initialise import initialise_groot, initialise_prefix, random_groot_pounce
 
 SLOTS = ("features", "embeddings")
 

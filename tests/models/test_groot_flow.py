@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from ponderpounce.models import flow, groot_flow
+from dual_system.models import flow
+from dual_system.models.groot import flow as groot_flow
 
 SHAPE = (2, 4, 6)
 

@@ -8,15 +8,15 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from ponderpounce.models.groot_prompt import tiny_eagle_tokenizer_for_random_weights
-from ponderpounce.models.groot_weights import load_weights, public_name, save_weights, unused_shapes
-from ponderpounce.models.pi05_weights import save_weights as save_pi05
-from ponderpounce.models.pounce_checkpoint import load_bundle, random_bundle, save_bundle
-from ponderpounce.models.pounce_configs import groot_n1_5, tiny_cpu, tiny_groot
-from ponderpounce.models.pounce_family import family_of, tensor_shapes
-from ponderpounce.models.pounce_groot import GrootPounce, GrootPounceConfig
-from ponderpounce.models.pounce_init import random_groot_pounce, random_pounce
-from ponderpounce.models.public_layout import WeightsError
+from dual_system.models.groot.pounce import GrootPounce, GrootPounceConfig
+from dual_system.models.groot.prompt import tiny_eagle_tokenizer_for_random_weights
+from dual_system.models.groot.weights import load_weights, public_name, save_weights, unused_shapes
+from dual_system.models.pi05.weights import save_weights as save_pi05
+from dual_system.models.pounce.checkpoint import load_bundle, random_bundle, save_bundle
+from dual_system.models.pounce.configs import groot_n1_5, tiny_cpu, tiny_groot
+from dual_system.models.pounce.family import family_of, tensor_shapes
+from dual_system.models.pounce.initialise import random_groot_pounce, random_pounce
+from dual_system.models.public_layout import WeightsError
 
 VISION = "backbone.eagle_model.vision_model.vision_model."
 LANGUAGE = "backbone.eagle_model.language_model."

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from ponderpounce.models.images import PADDING, camera_batch, resize_with_pad
+from dual_system.models.images import PADDING, camera_batch, resize_with_pad
 
 SIZE_PX = 56
 

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from ponderpounce.models.int8 import Int8Linear
-from ponderpounce.models.narrow_linear import quantise_where
+from dual_system.models.int8 import Int8Linear
+from dual_system.models.narrow_linear import quantise_where
 
 
 @given(seed=st.integers(0, 2**31), rows=st.integers(1, 9), columns=st.integers(1, 9), scale=st.floats(1e-6, 1e6))

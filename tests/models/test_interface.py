@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from ponderpounce.models.interface import CognitionConfig, CognitionPrefix, scale_gradient
-from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features
+from dual_system.models.interface import CognitionConfig, CognitionPrefix, scale_gradient
+from dual_system.models.place_code import NUM_PLACE_FEATURES, place_features
 
 WIDTH = 32
 SIZE = 24

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from ponderpounce.models.arm import NUM_ARM_JOINTS
-from ponderpounce.models.normalisation import ROBOMME, Quantiles
+from dual_system.models.arm import NUM_ARM_JOINTS
+from dual_system.models.normalisation import ROBOMME, Quantiles
 
 rows = arrays(np.float32, (5, 8), elements=st.floats(-3, 3, width=32))
 states = arrays(np.float32, 8, elements=st.floats(-3, 3, width=32))

@@ -9,15 +9,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from ponderpounce.models.interface import CognitionConfig
-from ponderpounce.models.openpi_jax import public_tensors, read_params
-from ponderpounce.models.pi05_weights import public_name
-from ponderpounce.models.pounce import Pounce
-from ponderpounce.models.pounce_checkpoint import load_bundle
-from ponderpounce.models.pounce_configs import tiny_cpu, tiny_groot
-from ponderpounce.models.pounce_init import random_pounce
-from ponderpounce.models.prompt import tiny_tokenizer_for_random_weights
-from ponderpounce.models.public_layout import WeightsError, assign
+from dual_system.models.interface import CognitionConfig
+from dual_system.models.pi05.openpi_jax import public_tensors, read_params
+from dual_system.models.pi05.pounce import Pounce
+from dual_system.models.pi05.prompt import tiny_tokenizer_for_random_weights
+from dual_system.models.pi05.weights import public_name
+from dual_system.models.pounce.checkpoint import load_bundle
+from dual_system.models.pounce.configs import tiny_cpu, tiny_groot
+from dual_system.models.pounce.initialise import random_pounce
+from dual_system.models.public_layout import WeightsError, assign
 
 LAYERS = "PaliGemma/llm/layers/"
 BLOCKS = "PaliGemma/img/Transformer/encoderblock/"

@@ -7,9 +7,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ponderpounce.models.packed import pack, unpack
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_checkpoint import (
+from dual_system.models.packed import pack, unpack
+from dual_system.models.ponder.checkpoint import (
     PACKED_NAME,
     SINGLE_NAME,
     CheckpointError,
@@ -17,6 +16,7 @@ from ponderpounce.models.ponder_checkpoint import (
     save_ponder,
     weights_hash,
 )
+from dual_system.models.ponder.network import Ponder
 from sim_client import doctor_probes
 from sim_client.doctor_probes import Level
 from tests.models.test_reader import CONFIG, VOCABULARY

@@ -11,16 +11,17 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from ponderpounce.models import flow, groot_flow
-from ponderpounce.models.golden import GoldenError, read_golden
-from ponderpounce.models.groot_weights import save_weights as save_groot
-from ponderpounce.models.parity import main, max_abs_errors
-from ponderpounce.models.pi05_weights import save_weights as save_pi05
-from ponderpounce.models.pounce import PounceInputs
-from ponderpounce.models.pounce_configs import tiny_cpu, tiny_groot
-from ponderpounce.models.pounce_groot import GrootInputs
-from ponderpounce.models.pounce_init import random_groot_pounce, random_pounce
-from ponderpounce.models.public_layout import WeightsError
+from dual_system.models import flow
+from dual_system.models.golden import GoldenError, read_golden
+from dual_system.models.groot import flow as groot_flow
+from dual_system.models.groot.pounce import GrootInputs
+from dual_system.models.groot.weights import save_weights as save_groot
+from dual_system.models.parity import main, max_abs_errors
+from dual_system.models.pi05.pounce import PounceInputs
+from dual_system.models.pi05.weights import save_weights as save_pi05
+from dual_system.models.pounce.configs import tiny_cpu, tiny_groot
+from dual_system.models.pounce.initialise import random_groot_pounce, random_pounce
+from dual_system.models.public_layout import WeightsError
 
 COMMITTED = Path(__file__).parent / "data" / "goldens"
 SHARED = Path(__file__).parents[3] / "shared" / "goldens"

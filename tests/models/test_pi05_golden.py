@@ -8,12 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from ponderpounce.models import flow
-from ponderpounce.models.golden import read_golden
-from ponderpounce.models.interface import CognitionConfig
-from ponderpounce.models.pi05 import Prefix
-from ponderpounce.models.pounce import Pounce, PounceInputs
-from ponderpounce.models.pounce_init import random_pounce
+from dual_system.models import flow
+from dual_system.models.golden import read_golden
+from dual_system.models.interface import CognitionConfig
+from dual_system.models.pi05.network import Prefix
+from dual_system.models.pi05.pounce import Pounce, PounceInputs
+from dual_system.models.pounce.initialise import random_pounce
 
 TOLERANCE = 1e-4
 COMMITTED = Path(__file__).parent / "data" / "goldens"

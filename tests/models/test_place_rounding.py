@@ -7,8 +7,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features
-from ponderpounce.models.place_rounding import nearest_code
+from dual_system.models.place_code import NUM_PLACE_FEATURES, place_features
+from dual_system.models.place_rounding import nearest_code
 
 HALF_PX = st.integers(0, 511).map(lambda number: number / 2)
 PLACES = st.tuples(HALF_PX, HALF_PX)

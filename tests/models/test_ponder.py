@@ -8,12 +8,12 @@ import torch
 from PIL import Image
 from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
-from ponderpounce.models.context import ContextFormat, Row, Transition
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_checkpoint import weights_hash
-from ponderpounce.models.ponder_configs import tiny_cpu
-from ponderpounce.models.ponder_images import patchify
-from ponderpounce.models.vocabulary import Vocabulary
+from dual_system.models.ponder.checkpoint import weights_hash
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.context import ContextFormat, Row, Transition
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.patches import patchify
+from dual_system.models.ponder.vocabulary import Vocabulary
 
 VOCABULARY = Vocabulary.tiny()
 CONFIG = replace(tiny_cpu(), image_px=(64, 96), num_carriers=2)

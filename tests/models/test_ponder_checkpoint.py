@@ -11,9 +11,8 @@ import torch
 from safetensors.torch import load_file, save_file
 from transformers.models.qwen3_5 import Qwen3_5ForConditionalGeneration
 
-from ponderpounce.models.eyes import Eye
-from ponderpounce.models.ponder import FLOAT32_PARAMETERS, Ponder, skeleton
-from ponderpounce.models.ponder_checkpoint import (
+from dual_system.models.eyes import Eye
+from dual_system.models.ponder.checkpoint import (
     INDEX_NAME,
     SINGLE_NAME,
     CheckpointError,
@@ -22,11 +21,12 @@ from ponderpounce.models.ponder_checkpoint import (
     save_ponder,
     weights_hash,
 )
-from ponderpounce.models.ponder_configs import PonderConfig, qwen35_0p8b, qwen35_2b, qwen35_4b, qwen35_9b, tiny_cpu
-from ponderpounce.models.proprioception import Proprioception
-from ponderpounce.models.second_look import SecondLook
-from ponderpounce.models.showing import Showing, declared
-from ponderpounce.models.vocabulary import Vocabulary
+from dual_system.models.ponder.configs import PonderConfig, qwen35_0p8b, qwen35_2b, qwen35_4b, qwen35_9b, tiny_cpu
+from dual_system.models.ponder.network import FLOAT32_PARAMETERS, Ponder, skeleton
+from dual_system.models.ponder.showing import Showing, declared
+from dual_system.models.ponder.vocabulary import Vocabulary
+from dual_system.models.proprioception import Proprioception
+from dual_system.models.second_look import SecondLook
 
 VOCABULARY = Vocabulary.tiny()
 CONFIG = replace(tiny_cpu(), num_layers=4, vision_depth=1, image_px=(64, 64), num_carriers=2)

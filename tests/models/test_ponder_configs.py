@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from ponderpounce.models.ponder import skeleton
-from ponderpounce.models.ponder_configs import (
+from dual_system.models.ponder.configs import (
     PonderConfig,
     qwen35_0p8b,
     qwen35_2b,
@@ -14,6 +13,7 @@ from ponderpounce.models.ponder_configs import (
     qwen35_9b,
     tiny_cpu,
 )
+from dual_system.models.ponder.network import skeleton
 
 
 @pytest.mark.parametrize(

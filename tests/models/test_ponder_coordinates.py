@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ponderpounce.models.ponder_coordinates import (
+from dual_system.models.ponder.coordinates import (
     normalised_text,
     pixel_text,
     xy_1000_from_yx_px,

@@ -9,9 +9,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ponderpounce.models import ponder_configs
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_images import patchify
+from dual_system.models.ponder import configs as ponder_configs
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.patches import patchify
 
 
 def tower(num_positions: int) -> Ponder:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tokenizers import Tokenizer, models
 
-from ponderpounce.models.vocabulary import CONTROL_TOKENS, Vocabulary
+from dual_system.models.ponder.vocabulary import CONTROL_TOKENS, Vocabulary
 
 TINY = Vocabulary.tiny()
 

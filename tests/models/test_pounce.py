@@ -6,11 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from ponderpounce.models import flow
-from ponderpounce.models.pi05 import Prefix
-from ponderpounce.models.pounce import Pounce, PounceConfig, PounceInputs, freeze
-from ponderpounce.models.pounce_configs import pi05_base, tiny_cpu
-from ponderpounce.models.pounce_init import initialise_pi05, initialise_prefix, random_pounce
+from dual_system.models import flow
+from dual_system.models.pi05.network import Prefix
+from dual_system.models.pi05.pounce import Pounce, PounceConfig, PounceInputs, freeze
+from dual_system.models.pounce.configs import pi05_base, tiny_cpu
+from dual_system.models.pounce.initialise import initialise_pi05, initialise_prefix, random_pounce
 
 
 def _isolated(config: PounceConfig) -> PounceConfig:

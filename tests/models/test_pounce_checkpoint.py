@@ -9,13 +9,13 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from ponderpounce.models.config_json import from_json
-from ponderpounce.models.interface import CognitionConfig
-from ponderpounce.models.normalisation import ROBOMME, Quantiles, RobotStatistics
-from ponderpounce.models.pi05_weights import WeightsError
-from ponderpounce.models.pounce_checkpoint import PounceBundle, load_bundle, random_bundle, save_bundle
-from ponderpounce.models.pounce_configs import in_space, tiny_cpu, tiny_groot
-from ponderpounce.models.pounce_family import AnyPounceConfig
+from dual_system.models.config_json import from_json
+from dual_system.models.interface import CognitionConfig
+from dual_system.models.normalisation import ROBOMME, Quantiles, RobotStatistics
+from dual_system.models.pi05.weights import WeightsError
+from dual_system.models.pounce.checkpoint import PounceBundle, load_bundle, random_bundle, save_bundle
+from dual_system.models.pounce.configs import in_space, tiny_cpu, tiny_groot
+from dual_system.models.pounce.family import AnyPounceConfig
 
 
 @pytest.fixture(scope="module")

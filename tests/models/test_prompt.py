@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ponderpounce.models.prompt import (
+from dual_system.models.pi05.prompt import (
     TINY_VOCAB_SIZE,
     Tokenizer,
     prompt_text,

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ponderpounce.models.arm import tool_poses
-from ponderpounce.models.context import IGNORE, ContextFormat, SegmentKind
-from ponderpounce.models.ponder_configs import tiny_cpu
-from ponderpounce.models.proprioception import MAX_FINGER_M, MAX_HEIGHT_M, NUM_PROPRIO, Proprioception
-from ponderpounce.models.vocabulary import Vocabulary
+from dual_system.models.arm import tool_poses
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.context import IGNORE, ContextFormat, SegmentKind
+from dual_system.models.ponder.vocabulary import Vocabulary
+from dual_system.models.proprioception import MAX_FINGER_M, MAX_HEIGHT_M, NUM_PROPRIO, Proprioception
 
 TOLD = Proprioception(first_id=456)
 HOME = np.array([0.0, 0.0, 0.0, -np.pi / 2, 0.0, np.pi / 2, np.pi / 4])

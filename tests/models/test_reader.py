@@ -9,17 +9,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import load_file, save_file
 
-from ponderpounce.models.bfloat16_products import multiply_in_bfloat16
-from ponderpounce.models.context import Row, Transition
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_checkpoint import READER_NAME, CheckpointError, load_ponder, save_ponder, weights_hash
-from ponderpounce.models.ponder_configs import tiny_cpu
-from ponderpounce.models.reader_file import Narrowing, as_stored, confine, write_reader
-from ponderpounce.models.recompute import recompute_layers
-from ponderpounce.models.vocabulary import Vocabulary
-from ponderpounce.training.blind import without_pictures
-from ponderpounce.training.growing import grown
-from ponderpounce.training.joint import PonderBatch, encode_rows
+from dual_system.models.bfloat16_products import multiply_in_bfloat16
+from dual_system.models.ponder.checkpoint import READER_NAME, CheckpointError, load_ponder, save_ponder, weights_hash
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.context import Row, Transition
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.recompute import recompute_layers
+from dual_system.models.ponder.vocabulary import Vocabulary
+from dual_system.models.reader_file import Narrowing, as_stored, confine, write_reader
+from dual_system.training.blind import without_pictures
+from dual_system.training.growing import grown
+from dual_system.training.joint import PonderBatch, encode_rows
 
 TOLERANCE = 1e-4  # float32, hidden states of size 4
 VOCABULARY = Vocabulary.tiny()

@@ -10,9 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from ponderpounce.models import flow, rtc
-from ponderpounce.models.pounce_configs import tiny_cpu
-from ponderpounce.models.pounce_init import random_pounce
+from dual_system.models import flow
+from dual_system.models.pi05 import rtc as rtc
+from dual_system.models.pounce.configs import tiny_cpu
+from dual_system.models.pounce.initialise import random_pounce
 
 N, A, STEPS = 20, 32, 10
 Velocity = Callable[[int, Tensor], Tensor]

@@ -8,17 +8,17 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_checkpoint import (
+from dual_system.models.ponder.checkpoint import (
     CheckpointError,
     load_ponder,
     save_ponder,
     specialist_name,
     weights_hash,
 )
-from ponderpounce.models.reader_file import Narrowing, write_reader
-from ponderpounce.models.specialty import Specialty, specialist_for
-from ponderpounce.training.growing import grown
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.reader_file import Narrowing, write_reader
+from dual_system.models.specialty import Specialty, specialist_for
+from dual_system.training.growing import grown
 from tests.models.test_reader import CONFIG, VOCABULARY
 
 COUNTING = Specialty(name="counting", instructions="(then|finally) press the button to stop$")

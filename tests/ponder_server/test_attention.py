@@ -8,6 +8,7 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from dual_system.models.bfloat16 import HAS_FAST_BFLOAT16
 from ponder_server.attention import (
     attend,
     attend_in_parts,
@@ -15,7 +16,6 @@ from ponder_server.attention import (
     attend_masked,
 )
 from ponder_server.threads import Piece, Threads
-from ponderpounce.models.bfloat16 import HAS_FAST_BFLOAT16
 
 needs_fast_bfloat16 = pytest.mark.skipif(not HAS_FAST_BFLOAT16, reason="torch has no fast bfloat16 on this CPU")
 

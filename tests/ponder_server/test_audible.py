@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.network import Ponder
 from ponder_server.contract import Opening
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
 
 CONFIG = replace(tiny_cpu(), num_layers=8, vision_depth=2, image_px=(64, 64))
 NUM_PARTS = CONFIG.num_layers + CONFIG.vision_depth

@@ -8,12 +8,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.vocabulary import Vocabulary
 from ponder_server.contract import ContextFull, Fire, Frame, Opening, SessionError
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
-from ponderpounce.models.vocabulary import Vocabulary
 
 PONDER = Ponder.random(replace(tiny_cpu(), image_px=(64, 64)), Vocabulary.tiny(), seed=1)
 CONFIG = EngineConfig(num_cameras=2, max_context_tokens=300, max_sessions=4, buckets=(1, 16, 64))

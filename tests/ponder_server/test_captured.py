@@ -17,6 +17,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from dual_system.models import fp8
+from dual_system.models.graphs import Capture, Work, directly
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.kernels import delta_rule_of_many
+from dual_system.models.ponder.network import Ponder
 from ponder_server import decoder
 from ponder_server.captured import CapturedDecoder, position_buckets
 from ponder_server.contract import WeightsName
@@ -24,11 +29,6 @@ from ponder_server.decoder import Place, decode
 from ponder_server.narrow import quantise
 from ponder_server.runner import Append, Runner, Session
 from ponder_server.slots import SlotMemory
-from ponderpounce.models import fp8
-from ponderpounce.models.graphs import Capture, Work, directly
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
-from ponderpounce.models.ponder_kernels import delta_rule_of_many
 
 TOLERANCE = 1e-4  # float32, hidden states of size 4
 SMALL = replace(tiny_cpu(), hidden_size=48, ffn_size=64, image_px=(32, 32))

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import torch
 
+from dual_system.models.graphs import Capture, Work, directly
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.network import Ponder
 from ponder_server.__main__ import build_engine
 from ponder_server.config import PonderOptions
 from ponder_server.contract import Fire, Frame, Opening, WeightsName
 from ponder_server.draft import TrieDraft
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
-from ponderpounce.models.graphs import Capture, Work, directly
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
 
 TOLERANCE = 1e-4
 MODEL = replace(tiny_cpu(), num_layers=4, hidden_size=48, ffn_size=96, image_px=(96, 96), num_carriers=2)

@@ -9,14 +9,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.context import SegmentKind
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.vocabulary import Vocabulary
 from ponder_server.context_policy import POLICIES, PolicyName, Span, carriers_only, pin_and_slide, refuse
 from ponder_server.contract import ContextFull, Frame, Opening
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
-from ponderpounce.models.context import SegmentKind
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
-from ponderpounce.models.vocabulary import Vocabulary
 
 TOLERANCE = 1e-4
 NUM_QUERIES = 12

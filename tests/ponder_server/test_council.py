@@ -12,17 +12,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dual_system.models.counsel import Counsel, Otherwise
+from dual_system.models.eyes import Eye
+from dual_system.models.ponder.checkpoint import load_ponder, save_ponder
+from dual_system.models.ponder.coordinates import normalised_text
+from dual_system.models.views import AS_IT_IS, View
 from ponder_server.__main__ import build_engine
 from ponder_server.config import PonderOptions
 from ponder_server.contract import Fire, Opening, Outcome, SessionError, Text
 from ponder_server.council import Council
 from ponder_server.engine import QwenEngine
 from ponder_server.writer import ends_of_text
-from ponderpounce.models.counsel import Counsel, Otherwise
-from ponderpounce.models.eyes import Eye
-from ponderpounce.models.ponder_checkpoint import load_ponder, save_ponder
-from ponderpounce.models.ponder_coordinates import normalised_text
-from ponderpounce.models.views import AS_IT_IS, View
 from tests.ponder_server.test_engine import (
     CONFIG,
     SCRIPT,

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 import torch
 
+from dual_system.models.ponder import configs as ponder_configs
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.context import Row, Transition
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.vocabulary import Vocabulary
 from ponder_server.__main__ import build_engine
 from ponder_server.config import PonderOptions, SizeName
 from ponder_server.contract import ContextFull, Frame, Opening, SessionError
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
 from ponder_server.runner import Append, Runner, Session
-from ponderpounce.models import ponder_configs
-from ponderpounce.models.context import Row, Transition
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
-from ponderpounce.models.vocabulary import Vocabulary
 
 TOLERANCE = 1e-4
 VOCABULARY = Vocabulary.tiny()

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.network import Ponder
 from ponder_server import contract
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
 from ponder_server.fleet import PonderFleet
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
 from protocol import codec, images, topics
 from protocol import messages as m
 from protocol.bus import LocalBus

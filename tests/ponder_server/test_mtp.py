@@ -18,6 +18,11 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn import functional as F
 
+from dual_system.models.ponder.checkpoint import load_ponder, mtp_shapes, save_ponder
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.mtp import MtpHead
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.vocabulary import Vocabulary
 from ponder_server.__main__ import build_engine
 from ponder_server.config import PonderOptions
 from ponder_server.contract import Fire, Opening, Outcome
@@ -26,11 +31,6 @@ from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
 from ponder_server.mtp import MAX_DRAFT_TOKENS, WINDOW, MtpDraft
 from ponder_server.writer import TransitionWriter, sayable
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_checkpoint import load_ponder, mtp_shapes, save_ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
-from ponderpounce.models.ponder_mtp import MtpHead
-from ponderpounce.models.vocabulary import Vocabulary
 
 VOCABULARY = Vocabulary.tiny()
 MODEL = replace(tiny_cpu(), num_layers=4, hidden_size=48, ffn_size=96, image_px=(64, 64))

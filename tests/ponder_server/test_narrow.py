@@ -11,6 +11,11 @@ import numpy as np
 import pytest
 import torch
 
+from dual_system.models.fp8 import Fp8Linear
+from dual_system.models.int8 import Int8Linear
+from dual_system.models.ponder.checkpoint import save_ponder
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.network import Ponder
 from ponder_server.__main__ import build_engine
 from ponder_server.config import PonderOptions
 from ponder_server.contract import Opening, WeightsName
@@ -18,11 +23,6 @@ from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
 from ponder_server.narrow import quantise
 from ponder_server.serve import PonderServer
-from ponderpounce.models.fp8 import Fp8Linear
-from ponderpounce.models.int8 import Int8Linear
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_checkpoint import save_ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
 from protocol.heartbeat import Heartbeat
 
 MODEL = replace(tiny_cpu(), num_layers=4, hidden_size=48, ffn_size=96, image_px=(32, 32), num_carriers=2)

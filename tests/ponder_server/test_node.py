@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dual_system.models.eyes import Eye
 from ponder_server.contract import EngineSpec, Fire, Note, Text
 from ponder_server.node import KEEP_QUERIES, PonderNode, check_robot
-from ponderpounce.models.eyes import Eye
 from protocol import images
 from protocol import messages as m
 from protocol.errors import MalformedMessage

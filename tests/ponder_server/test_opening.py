@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from dual_system.models.ponder.context import SegmentKind, Transition
 from ponder_server.contract import ContextFull
 from ponder_server.engine import QwenEngine
-from ponderpounce.models.context import SegmentKind, Transition
 from tests.ponder_server.test_engine import (
     CONFIG,
     INSTRUCTION,

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from dual_system.models.int8 import Int8Linear
+from dual_system.models.ponder.context import Transition
+from dual_system.models.ponder.network import Ponder
 from ponder_server.engine import QwenEngine
-from ponderpounce.models.context import Transition
-from ponderpounce.models.int8 import Int8Linear
-from ponderpounce.models.ponder import Ponder
 from tests.ponder_server.test_engine import (
     CONFIG,
     SUBGOAL,

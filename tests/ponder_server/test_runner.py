@@ -9,13 +9,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dual_system.models.ponder.configs import qwen35_9b, tiny_cpu
+from dual_system.models.ponder.context import Row, Transition
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.vocabulary import Vocabulary
 from ponder_server.contract import ContextFull, SessionError
 from ponder_server.runner import BUCKETS, Append, Runner, Session, fitted
 from ponder_server.slots import slot_size
-from ponderpounce.models.context import Row, Transition
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import qwen35_9b, tiny_cpu
-from ponderpounce.models.vocabulary import Vocabulary
 
 TOLERANCE = 1e-4  # float32, hidden states of size 4
 

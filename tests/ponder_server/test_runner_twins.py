@@ -11,12 +11,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dual_system.models.ponder.configs import PonderConfig, tiny_cpu
+from dual_system.models.ponder.context import Row, Transition
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.vocabulary import Vocabulary
 from ponder_server.decoder import Place, decode
 from ponder_server.runner import Append, Runner, Session
-from ponderpounce.models.context import Row, Transition
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import PonderConfig, tiny_cpu
-from ponderpounce.models.vocabulary import Vocabulary
 
 TOLERANCE = 1e-4  # float32, hidden states of size 4
 NUM_ROWS = 3

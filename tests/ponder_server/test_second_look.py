@@ -10,11 +10,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dual_system.models.ponder.context import Transition
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.second_look import SecondLook
 from ponder_server.engine import QwenEngine
 from ponder_server.standing import Standing
-from ponderpounce.models.context import Transition
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.second_look import SecondLook
 from tests.ponder_server.test_engine import (
     CONFIG,
     INSTRUCTION,

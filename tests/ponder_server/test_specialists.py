@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 
+from dual_system.models.int8 import Int8Linear
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.second_look import SecondLook
+from dual_system.models.specialty import Specialty
 from ponder_server.contract import Opening
 from ponder_server.engine import QwenEngine
 from ponder_server.runner import Session
-from ponderpounce.models.int8 import Int8Linear
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.second_look import SecondLook
-from ponderpounce.models.specialty import Specialty
 from tests.ponder_server.test_engine import CONFIG, TOLERANCE, WITH_DEMO, WITHOUT_DEMO, observation, untrained
 
 COUNTING = Specialty(name="counting", instructions="count")

@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.vocabulary import Vocabulary
 from ponder_server.contract import Fire, Opening
 from ponder_server.draft import NoDraft, TrieDraft
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
-from ponderpounce.models.vocabulary import Vocabulary
 
 VOCABULARY = Vocabulary.tiny()
 NUM_TEXT_TOKENS = 12

@@ -13,14 +13,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.network import Ponder
 from ponder_server.__main__ import build_engine
 from ponder_server.config import PonderOptions
 from ponder_server.contract import Opening
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
 from ponder_server.threads import ALONE, Piece, Threads
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
 
 PATIENCE_S = 20.0
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ponderpounce.models.pounce_checkpoint import random_bundle
-from ponderpounce.models.pounce_configs import tiny_cpu
-from ponderpounce.tasks import panda
+from dual_system.models.pounce.checkpoint import random_bundle
+from dual_system.models.pounce.configs import tiny_cpu
+from dual_system.tasks import panda
 from pounce_server.contract import Request, check_robot
 from pounce_server.engine import EagerEngine
 from sim_client.robot import simulated_robot

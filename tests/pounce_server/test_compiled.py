@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ponderpounce.models.pounce import PounceConfig
-from ponderpounce.models.pounce_checkpoint import random_bundle
-from ponderpounce.models.pounce_configs import tiny_cpu, tiny_groot
+from dual_system.models.pi05.pounce import PounceConfig
+from dual_system.models.pounce.checkpoint import random_bundle
+from dual_system.models.pounce.configs import tiny_cpu, tiny_groot
 from pounce_server.contract import example_request
 from pounce_server.engine import EagerEngine
 

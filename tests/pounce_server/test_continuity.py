@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ponderpounce.models.pounce_checkpoint import random_bundle
-from ponderpounce.models.pounce_configs import tiny_cpu, tiny_groot
+from dual_system.models.pounce.checkpoint import random_bundle
+from dual_system.models.pounce.configs import tiny_cpu, tiny_groot
 from pounce_server.contract import Continuity, Request, example_request
 from pounce_server.engine import EagerEngine
 from protocol import messages as m

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ponderpounce.models.normalisation import ROBOMME
-from ponderpounce.models.pounce_checkpoint import load_bundle, random_bundle, save_bundle
-from ponderpounce.models.pounce_configs import tiny_cpu
+from dual_system.models.normalisation import ROBOMME
+from dual_system.models.pounce.checkpoint import load_bundle, random_bundle, save_bundle
+from dual_system.models.pounce.configs import tiny_cpu
 from pounce_server.contract import PounceEngine, Request, example_request
 from pounce_server.engine import EagerEngine
 

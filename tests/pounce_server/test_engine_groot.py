@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ponderpounce.models.groot_prompt import prompt_text
-from ponderpounce.models.pounce_checkpoint import random_bundle, save_bundle
-from ponderpounce.models.pounce_configs import tiny_groot
+from dual_system.models.groot.prompt import prompt_text
+from dual_system.models.pounce.checkpoint import random_bundle, save_bundle
+from dual_system.models.pounce.configs import tiny_groot
 from pounce_server.__main__ import build_engine
 from pounce_server.config import PounceOptions
 from pounce_server.contract import PounceEngine, Request, example_request

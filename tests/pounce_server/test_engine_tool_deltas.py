@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from ponderpounce.models.action_space import targets_from
-from ponderpounce.models.arm import JOINT_HIGH_RAD, JOINT_LOW_RAD, rotation_vectors, tool_poses
-from ponderpounce.models.normalisation import Quantiles, RobotStatistics
-from ponderpounce.models.pounce_checkpoint import PounceBundle, random_bundle
-from ponderpounce.models.pounce_configs import in_space, tiny_cpu, tiny_groot
-from ponderpounce.models.pounce_family import AnyPounceConfig
+from dual_system.models.action_space import targets_from
+from dual_system.models.arm import JOINT_HIGH_RAD, JOINT_LOW_RAD, rotation_vectors, tool_poses
+from dual_system.models.normalisation import Quantiles, RobotStatistics
+from dual_system.models.pounce.checkpoint import PounceBundle, random_bundle
+from dual_system.models.pounce.configs import in_space, tiny_cpu, tiny_groot
+from dual_system.models.pounce.family import AnyPounceConfig
 from pounce_server.contract import Continuity, Request, example_request
 from pounce_server.engine import EagerEngine
 from pounce_server.guidance import guide

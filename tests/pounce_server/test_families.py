@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from clock.check import disagreements
-from ponderpounce.models.action_space import ActionSpace
-from ponderpounce.models.normalisation import Quantiles, RobotStatistics
-from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
-from ponderpounce.models.pounce_checkpoint import random_bundle, save_bundle
-from ponderpounce.models.pounce_configs import in_space, tiny_cpu, tiny_groot
-from ponderpounce.tasks import panda
+from dual_system.models.action_space import ActionSpace
+from dual_system.models.normalisation import Quantiles, RobotStatistics
+from dual_system.models.ponder.configs import tiny_cpu as tiny_ponder
+from dual_system.models.pounce.checkpoint import random_bundle, save_bundle
+from dual_system.models.pounce.configs import in_space, tiny_cpu, tiny_groot
+from dual_system.tasks import panda
 from pounce_server.contract import EngineSpec, check_robot
 from pounce_server.engine import EagerEngine
 from protocol import messages as m

@@ -9,12 +9,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from ponderpounce.models.gemma import GemmaConfig
-from ponderpounce.models.graphs import Capture, Work, directly
-from ponderpounce.models.pounce import Pounce, PounceConfig, PounceInputs
-from ponderpounce.models.pounce_checkpoint import random_bundle
-from ponderpounce.models.pounce_configs import tiny_cpu, tiny_groot
-from ponderpounce.models.siglip import VisionConfig
+from dual_system.models.graphs import Capture, Work, directly
+from dual_system.models.pi05.gemma import GemmaConfig
+from dual_system.models.pi05.pounce import Pounce, PounceConfig, PounceInputs
+from dual_system.models.pounce.checkpoint import random_bundle
+from dual_system.models.pounce.configs import tiny_cpu, tiny_groot
+from dual_system.models.siglip import VisionConfig
 from pounce_server.contract import DTypeName, example_request
 from pounce_server.engine import EagerEngine
 from pounce_server.fused import BUCKET_TOKENS, FusedPounce, fused_for

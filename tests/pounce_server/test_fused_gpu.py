@@ -5,8 +5,8 @@ import os
 import pytest
 import torch
 
-from ponderpounce.models.pounce_checkpoint import random_bundle
-from ponderpounce.models.pounce_configs import tiny_cpu
+from dual_system.models.pounce.checkpoint import random_bundle
+from dual_system.models.pounce.configs import tiny_cpu
 from pounce_server.contract import DTypeName, example_request
 from pounce_server.engine import EagerEngine
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from ponderpounce.models.pounce_checkpoint import random_bundle
-from ponderpounce.models.pounce_configs import tiny_cpu, tiny_groot
-from ponderpounce.models.pounce_init import random_pounce
+from dual_system.models.pounce.checkpoint import random_bundle
+from dual_system.models.pounce.configs import tiny_cpu, tiny_groot
+from dual_system.models.pounce.initialise import random_pounce
 from pounce_server.contract import DTypeName, example_request
 from pounce_server.engine import EagerEngine
 from pounce_server.int8 import quantise

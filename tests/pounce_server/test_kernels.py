@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from ponderpounce.models.gemma import AdaRmsNorm, GeGlu, GemmaConfig, RmsNorm, Rotation
+from dual_system.models.pi05.gemma import AdaRmsNorm, GeGlu, GemmaConfig, RmsNorm, Rotation
 from pounce_server.kernels import euler, geglu, rms_norm, rope
 from pounce_server.kernels.launch import Tolerance, block_size, missing_for
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ponderpounce.tasks import panda
-from ponderpounce.tasks.environment import make_environment
-from ponderpounce.tasks.geometry import rotation_log
-from ponderpounce.tasks.kinematics import Kinematics
+from dual_system.tasks import panda
+from dual_system.tasks.environment import make_environment
+from dual_system.tasks.geometry import rotation_log
+from dual_system.tasks.kinematics import Kinematics
 from sim_client.action_spaces import DELTA_M, DELTA_RAD, NUM_NUMBERS, hold, reader, row_of
 
 HOME = np.append(panda.HOME_QPOS, 0.04)

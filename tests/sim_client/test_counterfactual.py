@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ponderpounce.analysis import tables
-from ponderpounce.analysis.counterfactual import read_counterfactual
-from ponderpounce.models.showing import OWN_NAME
-from ponderpounce.tasks.pair_files import write_index, write_pair
-from ponderpounce.tasks.pairs import Pair, Telling
+from dual_system.analysis import tables
+from dual_system.analysis.counterfactual import read_counterfactual
+from dual_system.models.ponder.showing import OWN_NAME
+from dual_system.tasks.pair_files import write_index, write_pair
+from dual_system.tasks.pairs import Pair, Telling
 from sim_client import counterfactual
 from sim_client.counterfactual import CounterfactualOptions, scored
 

@@ -17,14 +17,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ponderpounce.analysis import tables
-from ponderpounce.analysis.results import read_results
-from ponderpounce.data.dataset import Dataset
-from ponderpounce.data.export import ExportOptions, export
-from ponderpounce.data.seeds import TRAIN_SEED
-from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
-from ponderpounce.models.pounce_checkpoint import random_bundle, save_bundle
-from ponderpounce.models.pounce_configs import tiny_cpu
+from dual_system.analysis import tables
+from dual_system.analysis.results import read_results
+from dual_system.data.dataset import Dataset
+from dual_system.data.export import ExportOptions, export
+from dual_system.data.seeds import TRAIN_SEED
+from dual_system.models.ponder.configs import tiny_cpu as tiny_ponder
+from dual_system.models.pounce.checkpoint import random_bundle, save_bundle
+from dual_system.models.pounce.configs import tiny_cpu
 from protocol import messages as m
 from protocol.mcap_log import read_log
 from sim_client import evaluate as module

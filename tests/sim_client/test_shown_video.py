@@ -10,8 +10,8 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from ponderpounce.models.showing import Showing
-from ponderpounce.tasks.environment import make_environment
+from dual_system.models.ponder.showing import Showing
+from dual_system.tasks.environment import make_environment
 from protocol import images
 from protocol.errors import TransportError
 from sim_client.evaluate import EvalOptions

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ponderpounce.tasks.task import TaskError, task_names
+from dual_system.tasks.task import TaskError, task_names
 
 pytest.importorskip("vla_eval", reason="pip install vla-eval==0.8.0")
 

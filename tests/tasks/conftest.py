@@ -14,14 +14,14 @@ os.environ.setdefault("MUJOCO_GL", "egl")  # before anything imports mujoco
 import numpy as np
 import pytest
 
-from ponderpounce.tasks import panda
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
-from ponderpounce.tasks.geometry import pose
-from ponderpounce.tasks.physics import Physics
-from ponderpounce.tasks.placing import PlacedCube
-from ponderpounce.tasks.reference.pick_highlight import Layout
-from ponderpounce.tasks.scene import add_button, add_cube, add_disc, table_scene
+from dual_system.tasks import panda
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot, make_environment
+from dual_system.tasks.geometry import pose
+from dual_system.tasks.physics import Physics
+from dual_system.tasks.placing import PlacedCube
+from dual_system.tasks.reference.pick_highlight import Layout
+from dual_system.tasks.scene import add_button, add_cube, add_disc, table_scene
 
 
 @pytest.fixture(scope="session")

@@ -9,15 +9,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ponderpounce.tasks import panda
-from ponderpounce.tasks.captions import ORDINALS
-from ponderpounce.tasks.counting.bin_fill import BinFill, Layout, Memory
-from ponderpounce.tasks.difficulty import DIFFICULTIES
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
-from ponderpounce.tasks.geometry import Footprint, is_clear
-from ponderpounce.tasks.oracle import Motions
-from ponderpounce.tasks.scene import BUTTON_HALF_M, CUBE_COLORS
+from dual_system.tasks import panda
+from dual_system.tasks.captions import ORDINALS
+from dual_system.tasks.counting.bin_fill import BinFill, Layout, Memory
+from dual_system.tasks.difficulty import DIFFICULTIES
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot, make_environment
+from dual_system.tasks.geometry import Footprint, is_clear
+from dual_system.tasks.oracle import Motions
+from dual_system.tasks.scene import BUTTON_HALF_M, CUBE_COLORS
 
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]
 HOME = np.append(panda.HOME_QPOS, 1.0)

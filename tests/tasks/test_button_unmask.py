@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ponderpounce.tasks import panda
-from ponderpounce.tasks.containers import EMPTY_Z_M, HIDDEN_HALF_M, HIDING_Z_M
-from ponderpounce.tasks.difficulty import DIFFICULTIES
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot
-from ponderpounce.tasks.oracle import Motions
-from ponderpounce.tasks.permanence.button_unmask import ButtonUnmask
-from ponderpounce.tasks.scene import CUBE_COLORS
+from dual_system.tasks import panda
+from dual_system.tasks.containers import EMPTY_Z_M, HIDDEN_HALF_M, HIDING_Z_M
+from dual_system.tasks.difficulty import DIFFICULTIES
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot
+from dual_system.tasks.oracle import Motions
+from dual_system.tasks.permanence.button_unmask import ButtonUnmask
+from dual_system.tasks.scene import CUBE_COLORS
 
 Until = Callable[[Environment, int], Snapshot]
 Hoist = Callable[[Environment, str], Snapshot]

@@ -7,14 +7,14 @@ from collections.abc import Callable, Iterable
 import numpy as np
 import pytest
 
-from ponderpounce.tasks import panda, swaps
-from ponderpounce.tasks.containers import EMPTY_Z_M, HIDING_Z_M
-from ponderpounce.tasks.difficulty import DIFFICULTIES
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot
-from ponderpounce.tasks.oracle import Motions
-from ponderpounce.tasks.permanence.button_unmask_swap import ButtonUnmaskSwap
-from ponderpounce.tasks.permanence.scenes import LANE_M
+from dual_system.tasks import panda, swaps
+from dual_system.tasks.containers import EMPTY_Z_M, HIDING_Z_M
+from dual_system.tasks.difficulty import DIFFICULTIES
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot
+from dual_system.tasks.oracle import Motions
+from dual_system.tasks.permanence.button_unmask_swap import ButtonUnmaskSwap
+from dual_system.tasks.permanence.scenes import LANE_M
 
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]
 Until = Callable[[Environment, int], Snapshot]

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ponderpounce.tasks.captions import ALL_DONE, Caption, completed, follow, grounded, letter, num_coordinates, simple
+from dual_system.tasks.captions import ALL_DONE, Caption, completed, follow, grounded, letter, num_coordinates, simple
 
 HOOK = "Hook the cube[ at <>] to the target[ at <>] with the peg"
 pixels = st.tuples(st.integers(0, 255), st.integers(0, 255))

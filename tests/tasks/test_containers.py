@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ponderpounce.tasks import panda
-from ponderpounce.tasks.containers import EMPTY_Z_M, HIDDEN_HALF_M, HIDING_Z_M, add_container, draw_spots
-from ponderpounce.tasks.geometry import Footprint, Spot, is_clear, pose
-from ponderpounce.tasks.oracle import Motions
-from ponderpounce.tasks.physics import Physics
-from ponderpounce.tasks.scene import add_cube, table_scene
+from dual_system.tasks import panda
+from dual_system.tasks.containers import EMPTY_Z_M, HIDDEN_HALF_M, HIDING_Z_M, add_container, draw_spots
+from dual_system.tasks.geometry import Footprint, Spot, is_clear, pose
+from dual_system.tasks.oracle import Motions
+from dual_system.tasks.physics import Physics
+from dual_system.tasks.scene import add_cube, table_scene
 
 HOME = np.append(panda.HOME_QPOS, 1.0)
 

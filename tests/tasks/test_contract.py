@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ponderpounce.tasks import panda, sight
-from ponderpounce.tasks.difficulty import DIFFICULTIES
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import (
+from dual_system.tasks import panda, sight
+from dual_system.tasks.difficulty import DIFFICULTIES
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import (
     IMAGE_PX,
     MAX_STEPS,
     Environment,
@@ -26,8 +26,8 @@ from ponderpounce.tasks.environment import (
     Snapshot,
     make_environment,
 )
-from ponderpounce.tasks.scene import CAMERAS, FRONT
-from ponderpounce.tasks.task import TaskError, make_task, task_names
+from dual_system.tasks.scene import CAMERAS, FRONT
+from dual_system.tasks.task import TaskError, make_task, task_names
 
 EnvironmentOf = Callable[[str], Environment]
 HOME = np.append(panda.HOME_QPOS, 1.0)
@@ -351,7 +351,7 @@ def test_a_video_has_no_frames_between_its_frames(environment: EnvironmentOf, na
 def test_another_process_walks_the_same_trajectory(environment: EnvironmentOf, name: str) -> None:
     script = f"""
 import hashlib, itertools
-from ponderpounce.tasks.environment import make_environment
+from dual_system.tasks.environment import make_environment
 env = make_environment({name!r}, render=False)
 env.reset({SEED}, "hard")
 digest = hashlib.sha256()

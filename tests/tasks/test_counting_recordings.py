@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ponderpounce.tasks.counting import bin_fill, pick_x_times, stop_cube, swing_x_times
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot
-from ponderpounce.tasks.geometry import Footprint
-from ponderpounce.tasks.placing import PlacedCube
+from dual_system.tasks.counting import bin_fill, pick_x_times, stop_cube, swing_x_times
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot
+from dual_system.tasks.geometry import Footprint
+from dual_system.tasks.placing import PlacedCube
 
 EnvironmentOf = Callable[[str], Environment]
 Recording = dict[str, Any]

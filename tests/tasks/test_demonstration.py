@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ponderpounce.tasks import panda
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot
-from ponderpounce.tasks.reference.pick_highlight import Layout, Memory, PickHighlight
-from ponderpounce.tasks.task import Shown
+from dual_system.tasks import panda
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot
+from dual_system.tasks.reference.pick_highlight import Layout, Memory, PickHighlight
+from dual_system.tasks.task import Shown
 
 HOME = np.append(panda.HOME_QPOS, 1.0)
 

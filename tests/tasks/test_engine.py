@@ -6,9 +6,9 @@ from typing import Any, cast
 
 import pytest
 
-from ponderpounce.tasks.engine import Progress, Status, judge
-from ponderpounce.tasks.physics import Physics
-from ponderpounce.tasks.task import Subtask
+from dual_system.tasks.engine import Progress, Status, judge
+from dual_system.tasks.physics import Physics
+from dual_system.tasks.task import Subtask
 
 NO_PHYSICS = cast(Physics, None)  # judging only hands it on
 

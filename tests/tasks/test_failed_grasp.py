@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable
 import numpy as np
 import pytest
 
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot
-from ponderpounce.tasks.oracle import FailedGrasp, Motions
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot
+from dual_system.tasks.oracle import FailedGrasp, Motions
 
 SEED = 6
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]

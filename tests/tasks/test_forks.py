@@ -10,11 +10,11 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from ponderpounce.tasks.difficulty import DIFFICULTIES
-from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
-from ponderpounce.tasks.forks import MAX_SEAM, ForkError, fork
-from ponderpounce.tasks.pairs import Pair, find_pair, oracle_chunk
-from ponderpounce.tasks.task import make_task, task_names
+from dual_system.tasks.difficulty import DIFFICULTIES
+from dual_system.tasks.environment import Environment, Snapshot, make_environment
+from dual_system.tasks.forks import MAX_SEAM, ForkError, fork
+from dual_system.tasks.pairs import Pair, find_pair, oracle_chunk
+from dual_system.tasks.task import make_task, task_names
 
 EnvironmentOf = Callable[[str], Environment]
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]

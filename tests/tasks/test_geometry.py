@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from ponderpounce.tasks.geometry import (
+from dual_system.tasks.geometry import (
     Footprint,
     is_clear,
     pose,

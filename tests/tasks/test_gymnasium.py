@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from ponderpounce.tasks import gymnasium_env, panda
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment
-from ponderpounce.tasks.gymnasium_env import TaskEnv, environment_id
-from ponderpounce.tasks.task import TaskError, task_names
+from dual_system.tasks import gymnasium_env, panda
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment
+from dual_system.tasks.gymnasium_env import TaskEnv, environment_id
+from dual_system.tasks.task import TaskError, task_names
 
 EnvironmentOf = Callable[[str], Environment]
 SEED = 7

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot
-from ponderpounce.tasks.geometry import Spot
-from ponderpounce.tasks.imitation import insert_peg, move_cube
-from ponderpounce.tasks.placing import PlacedCube
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot
+from dual_system.tasks.geometry import Spot
+from dual_system.tasks.imitation import insert_peg, move_cube
+from dual_system.tasks.placing import PlacedCube
 
 EnvironmentOf = Callable[[str], Environment]
 Recording = dict[str, Any]

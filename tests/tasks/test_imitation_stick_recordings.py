@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ponderpounce.tasks import panda
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot
-from ponderpounce.tasks.imitation import pattern_lock, route_stick
-from ponderpounce.tasks.kinematics import Kinematics
+from dual_system.tasks import panda
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot
+from dual_system.tasks.imitation import pattern_lock, route_stick
+from dual_system.tasks.kinematics import Kinematics
 
 EnvironmentOf = Callable[[str], Environment]
 Recording = dict[str, Any]

@@ -10,14 +10,14 @@ from itertools import product
 import numpy as np
 import pytest
 
-from ponderpounce.tasks import panda, predicates
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot
-from ponderpounce.tasks.geometry import Spot, is_clear
-from ponderpounce.tasks.imitation.insert_peg import ENDS, LIT_STEPS, SIDES, InsertPeg, Layout
-from ponderpounce.tasks.oracle import Motions
-from ponderpounce.tasks.pegs import peg_footprint
-from ponderpounce.tasks.props import RED
+from dual_system.tasks import panda, predicates
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot
+from dual_system.tasks.geometry import Spot, is_clear
+from dual_system.tasks.imitation.insert_peg import ENDS, LIT_STEPS, SIDES, InsertPeg, Layout
+from dual_system.tasks.oracle import Motions
+from dual_system.tasks.pegs import peg_footprint
+from dual_system.tasks.props import RED
 
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]
 Until = Callable[[Environment, int], Snapshot]

@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from ponderpounce.tasks import panda
-from ponderpounce.tasks.geometry import rotation_log, screw_log
-from ponderpounce.tasks.kinematics import Kinematics, UnreachableError
-from ponderpounce.tasks.physics import Physics
-from ponderpounce.tasks.scene import table_scene
+from dual_system.tasks import panda
+from dual_system.tasks.geometry import rotation_log, screw_log
+from dual_system.tasks.kinematics import Kinematics, UnreachableError
+from dual_system.tasks.physics import Physics
+from dual_system.tasks.scene import table_scene
 
 
 @pytest.fixture(scope="module")

@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ponderpounce.tasks import predicates
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot
-from ponderpounce.tasks.geometry import is_clear
-from ponderpounce.tasks.imitation.move_cube import MANNERS, MoveCube, Scene
-from ponderpounce.tasks.kinematics import UnreachableError
-from ponderpounce.tasks.oracle import Motions
-from ponderpounce.tasks.pegs import peg_footprint
+from dual_system.tasks import predicates
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot
+from dual_system.tasks.geometry import is_clear
+from dual_system.tasks.imitation.move_cube import MANNERS, MoveCube, Scene
+from dual_system.tasks.kinematics import UnreachableError
+from dual_system.tasks.oracle import Motions
+from dual_system.tasks.pegs import peg_footprint
 
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]
 Deed = Callable[[Motions], Iterator[np.ndarray]]

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ponderpounce.analysis.counterfactual import p_own
-from ponderpounce.tasks.pair_files import INDEX, how_shown_in, main, read_pairs, write_index, write_pair
-from ponderpounce.tasks.pairs import Pair, Telling
-from ponderpounce.tasks.task import Task
+from dual_system.analysis.counterfactual import p_own
+from dual_system.tasks.pair_files import INDEX, how_shown_in, main, read_pairs, write_index, write_pair
+from dual_system.tasks.pairs import Pair, Telling
+from dual_system.tasks.task import Task
 
 rng = np.random.default_rng(0)
 

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from ponderpounce.tasks import panda
-from ponderpounce.tasks.physics import Physics
+from dual_system.tasks import panda
+from dual_system.tasks.physics import Physics
 
 
 @given(hnp.arrays(np.float64, (30, 3), elements=st.floats(-0.1, 0.1)))

@@ -8,14 +8,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from ponderpounce.tasks import panda, predicates
-from ponderpounce.tasks.difficulty import DIFFICULTIES
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
-from ponderpounce.tasks.imitation.pattern_lock import Layout, PatternLock
-from ponderpounce.tasks.imitation.traces import RED_STEPS, TRAIL_STEPS
-from ponderpounce.tasks.oracle import Motions
-from ponderpounce.tasks.scene import FRONT, WRIST
+from dual_system.tasks import panda, predicates
+from dual_system.tasks.difficulty import DIFFICULTIES
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot, make_environment
+from dual_system.tasks.imitation.pattern_lock import Layout, PatternLock
+from dual_system.tasks.imitation.traces import RED_STEPS, TRAIL_STEPS
+from dual_system.tasks.oracle import Motions
+from dual_system.tasks.scene import FRONT, WRIST
 
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]
 SIDE = {"easy": 3, "medium": 4, "hard": 5}

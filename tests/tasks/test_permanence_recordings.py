@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot
-from ponderpounce.tasks.geometry import Spot
-from ponderpounce.tasks.permanence.scenes import Hidden, Layout
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot
+from dual_system.tasks.geometry import Spot
+from dual_system.tasks.permanence.scenes import Hidden, Layout
 
 EnvironmentOf = Callable[[str], Environment]
 Recording = dict[str, Any]

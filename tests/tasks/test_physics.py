@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ponderpounce.tasks import panda
-from ponderpounce.tasks.geometry import pose
-from ponderpounce.tasks.physics import CONTROL_HZ, Physics, whole_substeps
-from ponderpounce.tasks.predicates import is_dropped, is_picked, is_pressed
+from dual_system.tasks import panda
+from dual_system.tasks.geometry import pose
+from dual_system.tasks.physics import CONTROL_HZ, Physics, whole_substeps
+from dual_system.tasks.predicates import is_dropped, is_picked, is_pressed
 
 HOME = np.append(panda.HOME_QPOS, 1.0)
 

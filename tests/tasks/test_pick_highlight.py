@@ -7,14 +7,14 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 
-from ponderpounce.tasks import panda
-from ponderpounce.tasks.difficulty import DIFFICULTIES
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot
-from ponderpounce.tasks.geometry import Footprint, is_clear
-from ponderpounce.tasks.oracle import Motions
-from ponderpounce.tasks.reference.pick_highlight import Layout, PickHighlight
-from ponderpounce.tasks.scene import BUTTON_HALF_M, CUBE_COLORS, CUBE_HALF_M
+from dual_system.tasks import panda
+from dual_system.tasks.difficulty import DIFFICULTIES
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot
+from dual_system.tasks.geometry import Footprint, is_clear
+from dual_system.tasks.oracle import Motions
+from dual_system.tasks.reference.pick_highlight import Layout, PickHighlight
+from dual_system.tasks.scene import BUTTON_HALF_M, CUBE_COLORS, CUBE_HALF_M
 
 HOME = np.append(panda.HOME_QPOS, 1.0)
 NUM_CUBES = {"easy": 3, "medium": 4, "hard": 6}

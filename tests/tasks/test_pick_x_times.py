@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ponderpounce.tasks.counting.pick_x_times import PickXtimes
-from ponderpounce.tasks.difficulty import DIFFICULTIES
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot
-from ponderpounce.tasks.geometry import Footprint, distance_m, is_clear
-from ponderpounce.tasks.oracle import Motions
-from ponderpounce.tasks.scene import BUTTON_HALF_M, CUBE_COLORS
+from dual_system.tasks.counting.pick_x_times import PickXtimes
+from dual_system.tasks.difficulty import DIFFICULTIES
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot
+from dual_system.tasks.geometry import Footprint, distance_m, is_clear
+from dual_system.tasks.oracle import Motions
+from dual_system.tasks.scene import BUTTON_HALF_M, CUBE_COLORS
 
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]
 NUM_CUBES = {"easy": 1, "medium": 3, "hard": 3}

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ponderpounce.tasks.geometry import Footprint, distance_m, smoothstep
-from ponderpounce.tasks.placing import (
+from dual_system.tasks.geometry import Footprint, distance_m, smoothstep
+from dual_system.tasks.placing import (
     PlacedCube,
     draw_disc,
     has_finger_room,
@@ -14,7 +14,7 @@ from ponderpounce.tasks.placing import (
     turned_at_random,
     until_it_fits,
 )
-from ponderpounce.tasks.scene import SceneFullError
+from dual_system.tasks.scene import SceneFullError
 
 BLOCK = Footprint(center_m=(0.0, 0.0), half_m=(0.1, 0.05), yaw_rad=np.pi / 2)  # 0.1 m wide along y
 

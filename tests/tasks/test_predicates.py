@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ponderpounce.tasks import panda, predicates
-from ponderpounce.tasks.geometry import pose
-from ponderpounce.tasks.physics import Physics
+from dual_system.tasks import panda, predicates
+from dual_system.tasks.geometry import pose
+from dual_system.tasks.physics import Physics
 
 HOME_XY_M = (-0.0605, 0.0)  # where the tool is at home
 

@@ -8,10 +8,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from ponderpounce.tasks import captions
-from ponderpounce.tasks.difficulty import DIFFICULTIES
-from ponderpounce.tasks.environment import Environment
-from ponderpounce.tasks.task import make_task, task_names
+from dual_system.tasks import captions
+from dual_system.tasks.difficulty import DIFFICULTIES
+from dual_system.tasks.environment import Environment
+from dual_system.tasks.task import make_task, task_names
 
 EnvironmentOf = Callable[[str], Environment]
 

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ponderpounce.tasks import panda, sight
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot
-from ponderpounce.tasks.reference.pick_highlight import Layout
-from ponderpounce.tasks.scene import FRONT, WRIST
+from dual_system.tasks import panda, sight
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot
+from dual_system.tasks.reference.pick_highlight import Layout
+from dual_system.tasks.scene import FRONT, WRIST
 
 
 def texts(snapshots: list[Snapshot]) -> list[dict[str, Any]]:

@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ponderpounce.tasks.demonstration import perform
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot
-from ponderpounce.tasks.geometry import transform
-from ponderpounce.tasks.placing import PlacedCube
-from ponderpounce.tasks.reference import video_place, video_repick
-from ponderpounce.tasks.reference.video_repick import VideoRepick
-from ponderpounce.tasks.task import Shown, make_task
+from dual_system.tasks.demonstration import perform
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot
+from dual_system.tasks.geometry import transform
+from dual_system.tasks.placing import PlacedCube
+from dual_system.tasks.reference import video_place, video_repick
+from dual_system.tasks.reference.video_repick import VideoRepick
+from dual_system.tasks.task import Shown, make_task
 
 EnvironmentOf = Callable[[str], Environment]
 Recording = dict[str, Any]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from ponderpounce.tasks.task import FAMILIES, Task, TaskError, make_task, task, task_names
+from dual_system.tasks.task import FAMILIES, Task, TaskError, make_task, task, task_names
 
 
 def test_every_listed_task_can_be_made() -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ponderpounce.tasks import panda, sight
-from ponderpounce.tasks.environment import Environment
-from ponderpounce.tasks.reference.pick_highlight import Layout
-from ponderpounce.tasks.rendering import Cameras
-from ponderpounce.tasks.scene import CAMERAS, FRONT, WRIST
+from dual_system.tasks import panda, sight
+from dual_system.tasks.environment import Environment
+from dual_system.tasks.reference.pick_highlight import Layout
+from dual_system.tasks.rendering import Cameras
+from dual_system.tasks.scene import CAMERAS, FRONT, WRIST
 
 pytestmark = pytest.mark.sim
 HOME = np.append(panda.HOME_QPOS, 1.0)
@@ -97,7 +97,7 @@ def test_highlights_are_clearly_white_and_only_when_due(rendered: Environment, r
 
 
 def test_a_picture_of_another_size_is_another_size() -> None:
-    from ponderpounce.tasks.environment import make_environment
+    from dual_system.tasks.environment import make_environment
 
     with make_environment("PickHighlight", image_px=64) as env:
         snapshot = env.reset(12600, "medium")

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment
-from ponderpounce.tasks.oracle import FailedGrasp, Motions
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment
+from dual_system.tasks.oracle import FailedGrasp, Motions
 
 SEED = 6
 LOW_M, HIGH_M = 0.06, 0.13

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ponderpounce.tasks.difficulty import DIFFICULTIES
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
-from ponderpounce.tasks.imitation.route_stick import CLOCKWISE, COUNTERCLOCKWISE, Layout, Memory, RouteStick
-from ponderpounce.tasks.oracle import Motions
-from ponderpounce.tasks.scene import FRONT, WRIST
+from dual_system.tasks.difficulty import DIFFICULTIES
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot, make_environment
+from dual_system.tasks.imitation.route_stick import CLOCKWISE, COUNTERCLOCKWISE, Layout, Memory, RouteStick
+from dual_system.tasks.oracle import Motions
+from dual_system.tasks.scene import FRONT, WRIST
 
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]
 NUM_MOVES = {"easy": {2, 3}, "medium": {4, 5}, "hard": {4, 5, 6, 7}}

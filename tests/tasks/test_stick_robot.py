@@ -11,14 +11,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ponderpounce.tasks import panda, predicates
-from ponderpounce.tasks.geometry import pose
-from ponderpounce.tasks.kinematics import UnreachableError
-from ponderpounce.tasks.oracle import Actions, Motions
-from ponderpounce.tasks.panda import PANDA_STICK, PANDA_WRISTCAM, Robot
-from ponderpounce.tasks.physics import Physics
-from ponderpounce.tasks.props import add_block, add_dot
-from ponderpounce.tasks.scene import table_scene
+from dual_system.tasks import panda, predicates
+from dual_system.tasks.geometry import pose
+from dual_system.tasks.kinematics import UnreachableError
+from dual_system.tasks.oracle import Actions, Motions
+from dual_system.tasks.panda import PANDA_STICK, PANDA_WRISTCAM, Robot
+from dual_system.tasks.physics import Physics
+from dual_system.tasks.props import add_block, add_dot
+from dual_system.tasks.scene import table_scene
 from sim_client.robot import simulated_robot
 
 HOME = np.append(panda.HOME_QPOS, -1.0)

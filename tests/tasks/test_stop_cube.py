@@ -9,11 +9,11 @@ from itertools import chain
 import numpy as np
 import pytest
 
-from ponderpounce.tasks import panda
-from ponderpounce.tasks.counting.stop_cube import Layout, StopCube
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot
-from ponderpounce.tasks.oracle import Motions
+from dual_system.tasks import panda
+from dual_system.tasks.counting.stop_cube import Layout, StopCube
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot
+from dual_system.tasks.oracle import Motions
 
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]
 HOME = np.append(panda.HOME_QPOS, 1.0)

@@ -8,12 +8,12 @@ from itertools import product
 import numpy as np
 import pytest
 
-from ponderpounce.tasks.environment import make_environment
-from ponderpounce.tasks.geometry import Spot
-from ponderpounce.tasks.physics import Physics
-from ponderpounce.tasks.scene import FRONT
-from ponderpounce.tasks.sight import extrinsic, intrinsic, project
-from ponderpounce.tasks.swaps import SWAP_STEPS, Swap, nearest, spots_after
+from dual_system.tasks.environment import make_environment
+from dual_system.tasks.geometry import Spot
+from dual_system.tasks.physics import Physics
+from dual_system.tasks.scene import FRONT
+from dual_system.tasks.sight import extrinsic, intrinsic, project
+from dual_system.tasks.swaps import SWAP_STEPS, Swap, nearest, spots_after
 
 SPOTS = (
     Spot(x_m=0.0, y_m=0.0, yaw_rad=0.1),

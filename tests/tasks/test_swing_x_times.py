@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ponderpounce.tasks import panda
-from ponderpounce.tasks.counting.swing_x_times import SwingXtimes
-from ponderpounce.tasks.difficulty import DIFFICULTIES
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot
-from ponderpounce.tasks.geometry import Footprint, distance_m, is_clear, pose
-from ponderpounce.tasks.oracle import Motions
-from ponderpounce.tasks.scene import BUTTON_HALF_M, CUBE_COLORS
+from dual_system.tasks import panda
+from dual_system.tasks.counting.swing_x_times import SwingXtimes
+from dual_system.tasks.difficulty import DIFFICULTIES
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot
+from dual_system.tasks.geometry import Footprint, distance_m, is_clear, pose
+from dual_system.tasks.oracle import Motions
+from dual_system.tasks.scene import BUTTON_HALF_M, CUBE_COLORS
 
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]
 HOME = np.append(panda.HOME_QPOS, 1.0)

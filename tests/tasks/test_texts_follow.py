@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot, make_environment
 
 SEED = 3
 

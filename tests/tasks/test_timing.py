@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ponderpounce.tasks.timing import fastest, sample
+from dual_system.tasks.timing import fastest, sample
 
 LIMIT = 0.9
 

@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from ponderpounce.models.action_space import actions_in, targets_from
-from ponderpounce.models.arm import tool_poses
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment
+from dual_system.models.action_space import actions_in, targets_from
+from dual_system.models.arm import tool_poses
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment
 
 ROWS = 20  # of a chunk, played whole
 

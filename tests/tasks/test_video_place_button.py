@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ponderpounce.tasks.difficulty import DIFFICULTIES
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
-from ponderpounce.tasks.geometry import Footprint, distance_m, is_clear, pose
-from ponderpounce.tasks.oracle import Motions
-from ponderpounce.tasks.placing import BUTTON_ROOM_HALF_M
-from ponderpounce.tasks.reference.video_place import Layout
-from ponderpounce.tasks.reference.video_place_button import VideoPlaceButton
-from ponderpounce.tasks.scene import FRONT
+from dual_system.tasks.difficulty import DIFFICULTIES
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot, make_environment
+from dual_system.tasks.geometry import Footprint, distance_m, is_clear, pose
+from dual_system.tasks.oracle import Motions
+from dual_system.tasks.placing import BUTTON_ROOM_HALF_M
+from dual_system.tasks.reference.video_place import Layout
+from dual_system.tasks.reference.video_place_button import VideoPlaceButton
+from dual_system.tasks.scene import FRONT
 
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]
 Until = Callable[[Environment, int], Snapshot]

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ponderpounce.tasks.difficulty import DIFFICULTIES
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot
-from ponderpounce.tasks.oracle import Motions
-from ponderpounce.tasks.reference.video_place import Layout
-from ponderpounce.tasks.reference.video_place_order import VideoPlaceOrder
+from dual_system.tasks.difficulty import DIFFICULTIES
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot
+from dual_system.tasks.oracle import Motions
+from dual_system.tasks.reference.video_place import Layout
+from dual_system.tasks.reference.video_place_order import VideoPlaceOrder
 
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]
 Until = Callable[[Environment, int], Snapshot]

@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ponderpounce.tasks import panda, swaps
-from ponderpounce.tasks.difficulty import DIFFICULTIES
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot
-from ponderpounce.tasks.geometry import Footprint, Spot, is_clear
-from ponderpounce.tasks.oracle import Motions
-from ponderpounce.tasks.placing import BUTTON_ROOM_HALF_M, has_finger_room
-from ponderpounce.tasks.reference.video_repick import LANE_M, Layout, VideoRepick
+from dual_system.tasks import panda, swaps
+from dual_system.tasks.difficulty import DIFFICULTIES
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot
+from dual_system.tasks.geometry import Footprint, Spot, is_clear
+from dual_system.tasks.oracle import Motions
+from dual_system.tasks.placing import BUTTON_ROOM_HALF_M, has_finger_room
+from dual_system.tasks.reference.video_repick import LANE_M, Layout, VideoRepick
 
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]
 Until = Callable[[Environment, int], Snapshot]

@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterable
 import numpy as np
 import pytest
 
-from ponderpounce.tasks.difficulty import DIFFICULTIES
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot, make_environment
-from ponderpounce.tasks.oracle import Motions
-from ponderpounce.tasks.permanence.scenes import Hidden, Layout
-from ponderpounce.tasks.permanence.video_unmask import VideoUnmask
-from ponderpounce.tasks.scene import FRONT
+from dual_system.tasks.difficulty import DIFFICULTIES
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot, make_environment
+from dual_system.tasks.oracle import Motions
+from dual_system.tasks.permanence.scenes import Hidden, Layout
+from dual_system.tasks.permanence.video_unmask import VideoUnmask
+from dual_system.tasks.scene import FRONT
 
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]
 Until = Callable[[Environment, int], Snapshot]

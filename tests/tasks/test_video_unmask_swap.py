@@ -7,15 +7,15 @@ from collections.abc import Callable, Iterable
 import numpy as np
 import pytest
 
-from ponderpounce.tasks import swaps
-from ponderpounce.tasks.containers import HIDING_Z_M
-from ponderpounce.tasks.difficulty import DIFFICULTIES
-from ponderpounce.tasks.engine import Status
-from ponderpounce.tasks.environment import Environment, Snapshot
-from ponderpounce.tasks.geometry import Spot
-from ponderpounce.tasks.oracle import Motions
-from ponderpounce.tasks.permanence.scenes import LANE_M, Layout
-from ponderpounce.tasks.permanence.video_unmask_swap import VideoUnmaskSwap
+from dual_system.tasks import swaps
+from dual_system.tasks.containers import HIDING_Z_M
+from dual_system.tasks.difficulty import DIFFICULTIES
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, Snapshot
+from dual_system.tasks.geometry import Spot
+from dual_system.tasks.oracle import Motions
+from dual_system.tasks.permanence.scenes import LANE_M, Layout
+from dual_system.tasks.permanence.video_unmask_swap import VideoUnmaskSwap
 
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]
 Until = Callable[[Environment, int], Snapshot]

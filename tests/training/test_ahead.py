@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from ponderpounce.models.context import Row
-from ponderpounce.models.pounce_configs import tiny_cpu
-from ponderpounce.models.pounce_init import random_pounce
-from ponderpounce.training.ahead import Ahead
-from ponderpounce.training.joint import PonderBatch, PounceBatch
-from ponderpounce.training.place_lessons import PlaceLessons
+from dual_system.models.ponder.context import Row
+from dual_system.models.pounce.configs import tiny_cpu
+from dual_system.models.pounce.initialise import random_pounce
+from dual_system.training.ahead import Ahead
+from dual_system.training.joint import PonderBatch, PounceBatch
+from dual_system.training.place_lessons import PlaceLessons
 
 POUNCE = random_pounce(tiny_cpu(), seed=0)
 

@@ -12,15 +12,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from clock.sampling import EVALUATION, ROBOMME, sample_schedule
-from ponderpounce.data.episode import About, EpisodeWriter, Row, unpack
-from ponderpounce.data.lerobot_v3 import DatasetWriter
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
-from ponderpounce.models.proprioception import Proprioception
-from ponderpounce.training.data import Sight, TrainingSet
-from ponderpounce.training.example import ExampleConfig, episode_row, make_example
-from ponderpounce.training.stand_in import stand_in
-from ponderpounce.training.training_episode import TrainingEpisode
+from dual_system.data.episode import About, EpisodeWriter, Row, unpack
+from dual_system.data.lerobot_v3 import DatasetWriter
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.proprioception import Proprioception
+from dual_system.training.data import Sight, TrainingSet
+from dual_system.training.example import ExampleConfig, episode_row, make_example
+from dual_system.training.stand_in import stand_in
+from dual_system.training.training_episode import TrainingEpisode
 
 FORM = Ponder.random(
     replace(tiny_cpu(), image_px=(32, 32), num_layers=4, proprioception=Proprioception(first_id=460)), seed=1

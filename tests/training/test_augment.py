@@ -10,10 +10,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ponderpounce.models.context import ContextFormat
-from ponderpounce.models.eyes import Eye
-from ponderpounce.models.vocabulary import Vocabulary
-from ponderpounce.training.augment import AS_IT_IS, NOT_AUGMENTED, Augmentation, View, draw_view
+from dual_system.models.eyes import Eye
+from dual_system.models.ponder.context import ContextFormat
+from dual_system.models.ponder.vocabulary import Vocabulary
+from dual_system.training.augment import AS_IT_IS, NOT_AUGMENTED, Augmentation, View, draw_view
 
 PX = 32
 EYE = Eye(camera=0, box=(0.0, 0.25, 0.5, 0.75))

@@ -12,14 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clock.sampling import EVALUATION
-from ponderpounce.models.context import IGNORE
-from ponderpounce.training.blind import without_pictures
-from ponderpounce.training.collate import collate_ponder
-from ponderpounce.training.example import Example, ExampleConfig, make_example
-from ponderpounce.training.joint import encode_rows
-from ponderpounce.training.places import PLACE, TEXT_PX, scattered
-from ponderpounce.training.training_episode import TrainingEpisode
-from ponderpounce.training.ways import shows_a_way
+from dual_system.models.ponder.context import IGNORE
+from dual_system.training.blind import without_pictures
+from dual_system.training.collate import collate_ponder
+from dual_system.training.example import Example, ExampleConfig, make_example
+from dual_system.training.joint import encode_rows
+from dual_system.training.places import PLACE, TEXT_PX, scattered
+from dual_system.training.training_episode import TrainingEpisode
+from dual_system.training.ways import shows_a_way
 from tests.training.test_example import FORM, PONDER, episode
 from tests.training.test_ways import demonstrated_way
 

@@ -9,14 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from clock.sampling import EVALUATION, ROBOMME
-from ponderpounce.models.context import IGNORE
-from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
-from ponderpounce.models.ponder_coordinates import normalised_text
-from ponderpounce.tasks.captions import ORDINALS
-from ponderpounce.tasks.counting.stop_cube import StopCube
-from ponderpounce.training.countdown import (
+from dual_system.models.place_code import NUM_PLACE_FEATURES, place_features
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.context import IGNORE
+from dual_system.models.ponder.coordinates import normalised_text
+from dual_system.models.ponder.network import Ponder
+from dual_system.tasks.captions import ORDINALS
+from dual_system.tasks.counting.stop_cube import StopCube
+from dual_system.training.countdown import (
     as_place,
     counted,
     misjudged,
@@ -26,11 +26,11 @@ from ponderpounce.training.countdown import (
     waits,
     waits_unplaced,
 )
-from ponderpounce.training.example import ExampleConfig, make_example
-from ponderpounce.training.lapses import Words
-from ponderpounce.training.nudge import Nudge
-from ponderpounce.training.stand_in import stand_in
-from ponderpounce.training.training_episode import TrainingEpisode
+from dual_system.training.example import ExampleConfig, make_example
+from dual_system.training.lapses import Words
+from dual_system.training.nudge import Nudge
+from dual_system.training.stand_in import stand_in
+from dual_system.training.training_episode import TrainingEpisode
 
 HOVER, STILL, PRESS = (
     "move to the top of the button at <60, 90> to prepare",

@@ -10,14 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clock.sampling import ROBOMME
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
-from ponderpounce.models.ponder_coordinates import normalised_text
-from ponderpounce.tasks.environment import make_environment
-from ponderpounce.training.cut_short import Cut, cuts
-from ponderpounce.training.events import EVENT_ROWS
-from ponderpounce.training.example import ExampleConfig, make_example
-from ponderpounce.training.training_episode import TrainingEpisode
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.coordinates import normalised_text
+from dual_system.models.ponder.network import Ponder
+from dual_system.tasks.environment import make_environment
+from dual_system.training.cut_short import Cut, cuts
+from dual_system.training.events import EVENT_ROWS
+from dual_system.training.example import ExampleConfig, make_example
+from dual_system.training.training_episode import TrainingEpisode
 
 FORM = Ponder.random(replace(tiny_cpu(), image_px=(32, 32)), seed=1).format
 STINT = 40  # ticks of each subgoal

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ponderpounce.training.augment import View
-from ponderpounce.training.deeds import deeds, narration, passing_side
+from dual_system.training.augment import View
+from dual_system.training.deeds import deeds, narration, passing_side
 
 DONE = st.lists(st.tuples(st.sampled_from(["pick at", "put onto a target at", "move left to"]), st.integers(0, 3)))
 

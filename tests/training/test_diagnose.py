@@ -12,18 +12,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from clock.timebase import NS_PER_S
-from ponderpounce.analysis import tables
-from ponderpounce.analysis.diagnosis import read_diagnosis
-from ponderpounce.data.episode import About, EpisodeWriter, Row, unpack
-from ponderpounce.data.lerobot_v3 import DatasetWriter
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_checkpoint import save_ponder
-from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
-from ponderpounce.models.pounce_checkpoint import random_bundle, save_bundle
-from ponderpounce.models.pounce_configs import tiny_cpu, tiny_groot
-from ponderpounce.training import diagnose
-from ponderpounce.training.collate import collate_pounce
-from ponderpounce.training.diagnose import (
+from dual_system.analysis import tables
+from dual_system.analysis.diagnosis import read_diagnosis
+from dual_system.data.episode import About, EpisodeWriter, Row, unpack
+from dual_system.data.lerobot_v3 import DatasetWriter
+from dual_system.models.ponder.checkpoint import save_ponder
+from dual_system.models.ponder.configs import tiny_cpu as tiny_ponder
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.pounce.checkpoint import random_bundle, save_bundle
+from dual_system.models.pounce.configs import tiny_cpu, tiny_groot
+from dual_system.training import diagnose
+from dual_system.training.collate import collate_pounce
+from dual_system.training.diagnose import (
     EVERY_INVOCATION,
     STALE_BY,
     cognition_conditions,
@@ -33,8 +33,8 @@ from ponderpounce.training.diagnose import (
     next_alike,
     stale,
 )
-from ponderpounce.training.example import Example, make_example
-from ponderpounce.training.training_episode import TrainingEpisode
+from dual_system.training.example import Example, make_example
+from dual_system.training.training_episode import TrainingEpisode
 
 PX, NUM_TICKS = 64, 150
 PONDER = Ponder.random(replace(tiny_ponder(), image_px=(PX, PX), num_layers=4), seed=1)

@@ -12,13 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from clock.sampling import ROBOMME
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
-from ponderpounce.training import recipes, train
-from ponderpounce.training.events import EVENT_ROWS, draw_near, event_ticks
-from ponderpounce.training.example import ExampleConfig, make_example
-from ponderpounce.training.train import TrainOptions
-from ponderpounce.training.training_episode import TrainingEpisode
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.network import Ponder
+from dual_system.training import recipes, train
+from dual_system.training.events import EVENT_ROWS, draw_near, event_ticks
+from dual_system.training.example import ExampleConfig, make_example
+from dual_system.training.train import TrainOptions
+from dual_system.training.training_episode import TrainingEpisode
 
 ticks_of = st.lists(st.integers(0, 300), min_size=1, unique=True).map(sorted)
 

@@ -12,22 +12,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clock.sampling import EVALUATION, ROBOMME, sample_schedule
-from ponderpounce.models.groot_prompt import tiny_eagle_tokenizer_for_random_weights
-from ponderpounce.models.normalisation import ROBOMME as STATISTICS
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
-from ponderpounce.models.ponder_coordinates import normalised_text
-from ponderpounce.models.pounce_configs import tiny_cpu as tiny_pounce
-from ponderpounce.models.pounce_configs import tiny_groot
-from ponderpounce.models.pounce_groot import GrootInputs
-from ponderpounce.models.pounce_reading import groot_inputs, pi05_inputs
-from ponderpounce.models.prompt import tiny_tokenizer_for_random_weights
-from ponderpounce.training.chunks import target_rows
-from ponderpounce.training.collate import collate_ponder, collate_pounce
-from ponderpounce.training.example import ExampleConfig, episode_row, make_example, row_frames
-from ponderpounce.training.places import misplaced
-from ponderpounce.training.stand_in import stand_in
-from ponderpounce.training.training_episode import TrainingEpisode
+from dual_system.models.groot.pounce import GrootInputs
+from dual_system.models.groot.prompt import tiny_eagle_tokenizer_for_random_weights
+from dual_system.models.normalisation import ROBOMME as STATISTICS
+from dual_system.models.pi05.prompt import tiny_tokenizer_for_random_weights
+from dual_system.models.ponder.configs import tiny_cpu as tiny_ponder
+from dual_system.models.ponder.coordinates import normalised_text
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.pounce.configs import tiny_cpu as tiny_pounce
+from dual_system.models.pounce.configs import tiny_groot
+from dual_system.models.pounce.reading import groot_inputs, pi05_inputs
+from dual_system.training.chunks import target_rows
+from dual_system.training.collate import collate_ponder, collate_pounce
+from dual_system.training.example import ExampleConfig, episode_row, make_example, row_frames
+from dual_system.training.places import misplaced
+from dual_system.training.stand_in import stand_in
+from dual_system.training.training_episode import TrainingEpisode
 from pounce_server.contract import Request
 
 PONDER = Ponder.random(replace(tiny_ponder(), image_px=(64, 64), num_layers=4), seed=1)

@@ -12,13 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from ponderpounce.data import album, wander
-from ponderpounce.models import ponder_configs
-from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features, wave_columns
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_checkpoint import load_ponder, save_ponder
-from ponderpounce.training.data import Sight, TrainingSet
-from ponderpounce.training.following import REFUSED, Samples, lay_out, main, samples_of
+from dual_system.data import album, wander
+from dual_system.models.place_code import NUM_PLACE_FEATURES, place_features, wave_columns
+from dual_system.models.ponder import configs as ponder_configs
+from dual_system.models.ponder.checkpoint import load_ponder, save_ponder
+from dual_system.models.ponder.network import Ponder
+from dual_system.training.data import Sight, TrainingSet
+from dual_system.training.following import REFUSED, Samples, lay_out, main, samples_of
 
 SIZE = 128
 RMS = 10.0

@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from ponderpounce.models import pounce_configs
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
-from ponderpounce.models.pounce_checkpoint import random_bundle
-from ponderpounce.training.growing import broadened, grown, reading_more, seeing_deeper
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.pounce import configs as pounce_configs
+from dual_system.models.pounce.checkpoint import random_bundle
+from dual_system.training.growing import broadened, grown, reading_more, seeing_deeper
 
 IDS = [5, 17, 200, 31, 8, 90, 44]
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from ponderpounce.models import pounce_configs
-from ponderpounce.models.pounce_checkpoint import PounceBundle, load_bundle, random_bundle, save_bundle
-from ponderpounce.models.pounce_configs import tiny_groot
-from ponderpounce.models.prompt import tiny_tokenizer_for_random_weights, tokenizer_of_instructions, with_subgoal
-from ponderpounce.training.in_words import told_in_words
+from dual_system.models.pi05.prompt import tiny_tokenizer_for_random_weights, tokenizer_of_instructions, with_subgoal
+from dual_system.models.pounce import configs as pounce_configs
+from dual_system.models.pounce.checkpoint import PounceBundle, load_bundle, random_bundle, save_bundle
+from dual_system.models.pounce.configs import tiny_groot
+from dual_system.training.in_words import told_in_words
 
 TOLD = with_subgoal("press the button", "pick up the cube at [401, 387]")
 

@@ -11,16 +11,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from clock.sampling import EVALUATION
-from ponderpounce.models.place_code import NUM_PLACE_FEATURES
-from ponderpounce.tasks.environment import make_environment
-from ponderpounce.training.augment import Augmentation, draw_view
-from ponderpounce.training.deeds import deeds, narration, told_deeds
-from ponderpounce.training.example import ExampleConfig, make_example
-from ponderpounce.training.insertions import ends, inserted_otherwise, manner, shows_an_insertion
-from ponderpounce.training.notes import demo_notes, laid_out_places
-from ponderpounce.training.places import PLACE
-from ponderpounce.training.stand_in import skill_of, stand_in
-from ponderpounce.training.training_episode import TrainingEpisode
+from dual_system.models.place_code import NUM_PLACE_FEATURES
+from dual_system.tasks.environment import make_environment
+from dual_system.training.augment import Augmentation, draw_view
+from dual_system.training.deeds import deeds, narration, told_deeds
+from dual_system.training.example import ExampleConfig, make_example
+from dual_system.training.insertions import ends, inserted_otherwise, manner, shows_an_insertion
+from dual_system.training.notes import demo_notes, laid_out_places
+from dual_system.training.places import PLACE
+from dual_system.training.stand_in import skill_of, stand_in
+from dual_system.training.training_episode import TrainingEpisode
 from tests.training.test_augment import FORM
 from tests.training.test_blind import NOTING, TOLD, blind
 from tests.training.test_example import episode

@@ -10,17 +10,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from ponderpounce.models import flow
-from ponderpounce.models.context import Row, Transition
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_checkpoint import READER_NAME, load_ponder, save_ponder
-from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
-from ponderpounce.models.pounce import Pounce, freeze
-from ponderpounce.models.pounce_configs import tiny_cpu as tiny_pounce
-from ponderpounce.models.pounce_init import random_pounce
-from ponderpounce.models.reader_file import Narrowing, write_reader
-from ponderpounce.models.specialty import Specialty
-from ponderpounce.training.joint import NO_QUERY, Draws, JointModel, PonderBatch, PounceBatch, encode_rows
+from dual_system.models import flow
+from dual_system.models.pi05.pounce import Pounce, freeze
+from dual_system.models.ponder.checkpoint import READER_NAME, load_ponder, save_ponder
+from dual_system.models.ponder.configs import tiny_cpu as tiny_ponder
+from dual_system.models.ponder.context import Row, Transition
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.pounce.configs import tiny_cpu as tiny_pounce
+from dual_system.models.pounce.initialise import random_pounce
+from dual_system.models.reader_file import Narrowing, write_reader
+from dual_system.models.specialty import Specialty
+from dual_system.training.joint import NO_QUERY, Draws, JointModel, PonderBatch, PounceBatch, encode_rows
 
 CONFIG = replace(tiny_ponder(), image_px=(32, 32), num_carriers=2, num_layers=4)
 

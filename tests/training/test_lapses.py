@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from clock.sampling import EVALUATION
-from ponderpounce.models.context import IGNORE
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
-from ponderpounce.models.ponder_coordinates import normalised_text
-from ponderpounce.training.example import ExampleConfig, make_example
-from ponderpounce.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses, without_lapses
-from ponderpounce.training.places import PLACE
-from ponderpounce.training.training_episode import TrainingEpisode
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.context import IGNORE
+from dual_system.models.ponder.coordinates import normalised_text
+from dual_system.models.ponder.network import Ponder
+from dual_system.training.example import ExampleConfig, make_example
+from dual_system.training.lapses import NO_LAPSES, Lapses, Words, drawn_lapses, without_lapses
+from dual_system.training.places import PLACE
+from dual_system.training.training_episode import TrainingEpisode
 
 FORM = Ponder.random(replace(tiny_cpu(), image_px=(32, 32), num_layers=4), seed=1).format
 OFTEN = Lapses(rows=1.0, missed=0.5, wrong=0.3, longest=3)

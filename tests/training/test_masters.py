@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from ponderpounce.training.optim import OptimConfig, Optimiser
-from ponderpounce.training.parallel import World
-from ponderpounce.training.shards import RowReader, write_rows
+from dual_system.training.optim import OptimConfig, Optimiser
+from dual_system.training.parallel import World
+from dual_system.training.shards import RowReader, write_rows
 
 CONFIG = OptimConfig(learning_rate=1e-5, warmup_steps=0, ema_decay=0.9)
 """A rate at which no update of one step is half of the last bit of a weight near 1."""

@@ -11,16 +11,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from clock.sampling import EVALUATION
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
-from ponderpounce.models.pounce_configs import tiny_cpu as tiny_pounce
-from ponderpounce.models.pounce_init import random_pounce
-from ponderpounce.training.collate import collate_ponder
-from ponderpounce.training.example import Example, ExampleConfig, make_example
-from ponderpounce.training.joint import Draws, JointModel, PounceBatch, encode_rows
-from ponderpounce.training.places import PLACE
-from ponderpounce.training.stand_in import number_weights
-from ponderpounce.training.training_episode import TrainingEpisode
+from dual_system.models.ponder.configs import tiny_cpu as tiny_ponder
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.pounce.configs import tiny_cpu as tiny_pounce
+from dual_system.models.pounce.initialise import random_pounce
+from dual_system.training.collate import collate_ponder
+from dual_system.training.example import Example, ExampleConfig, make_example
+from dual_system.training.joint import Draws, JointModel, PounceBatch, encode_rows
+from dual_system.training.places import PLACE
+from dual_system.training.stand_in import number_weights
+from dual_system.training.training_episode import TrainingEpisode
 
 PONDER = Ponder.random(replace(tiny_ponder(), image_px=(32, 32), num_layers=4), seed=1)
 FORM, SIZE = PONDER.format, PONDER.hidden_size

@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from ponderpounce.training import optim
-from ponderpounce.training.muon import Muon
-from ponderpounce.training.optim import OptimConfig, Optimiser
-from ponderpounce.training.parallel import World
-from ponderpounce.training.shards import RowReader, write_rows
+from dual_system.training import optim
+from dual_system.training.muon import Muon
+from dual_system.training.optim import OptimConfig, Optimiser
+from dual_system.training.parallel import World
+from dual_system.training.shards import RowReader, write_rows
 
 CONFIG = OptimConfig(learning_rate=1e-3, warmup_steps=0, weight_decay=0.0, matrices="muon", ema_decay=0.9)
 

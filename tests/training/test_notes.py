@@ -10,22 +10,22 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from dual_system.tasks.front_view import front_pixels
+from dual_system.tasks.paces import PASS_STEPS
 from hypothesis import given
 from hypothesis import strategies as st
 
 from clock.sampling import EVALUATION
-from ponderpounce.models.context import IGNORE, Row
-from ponderpounce.models.eyes import Eye
-from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features
-from ponderpounce.models.ponder_coordinates import normalised_text
-from ponderpounce.tasks.counting.stop_cube import StopCube
-from ponderpounce.tasks.environment import make_environment
-from ponderpounce.tasks.front_view import front_pixels
-from ponderpounce.tasks.paces import PASS_STEPS
-from ponderpounce.tasks.swaps import SWAP_STEPS
-from ponderpounce.training.countdown import as_place, stood_at, waits
-from ponderpounce.training.example import ExampleConfig, Slip, make_example
-from ponderpounce.training.notes import (
+from dual_system.models.eyes import Eye
+from dual_system.models.place_code import NUM_PLACE_FEATURES, place_features
+from dual_system.models.ponder.context import IGNORE, Row
+from dual_system.models.ponder.coordinates import normalised_text
+from dual_system.tasks.counting.stop_cube import StopCube
+from dual_system.tasks.environment import make_environment
+from dual_system.tasks.swaps import SWAP_STEPS
+from dual_system.training.countdown import as_place, stood_at, waits
+from dual_system.training.example import ExampleConfig, Slip, make_example
+from dual_system.training.notes import (
     demo_notes,
     ends_of_moves,
     heeded,
@@ -35,9 +35,9 @@ from ponderpounce.training.notes import (
     noted,
     told_wait,
 )
-from ponderpounce.training.places import PARTS, PLACE, TEXT_PX, apart_px
-from ponderpounce.training.stand_in import stand_in, text_code
-from ponderpounce.training.training_episode import TrainingEpisode
+from dual_system.training.places import PARTS, PLACE, TEXT_PX, apart_px
+from dual_system.training.stand_in import stand_in, text_code
+from dual_system.training.training_episode import TrainingEpisode
 from tests.training.test_countdown import FORM, HOVER, PRESS, STILL, waiting_episode
 
 ASKED = "press the button to stop the cube just as it reaches the target for the third time"
@@ -134,8 +134,8 @@ def test_a_machine_without_mujoco_trains_and_follows_nothing() -> None:
     program = """
 import sys
 sys.modules["mujoco"] = None
-from ponderpounce.training import recipes, train
-from ponderpounce.training.notes import moving_places
+from dual_system.training import recipes, train
+from dual_system.training.notes import moving_places
 assert moving_places("StopCube", 3, "easy", 2) == ["", ""]
 try:
     train.build(recipes.recipe("small_noting").stages[-1], None, None)

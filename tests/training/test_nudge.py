@@ -8,9 +8,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ponderpounce.models.action_space import actions_in, states_in
-from ponderpounce.models.normalisation import ROBOMME, Quantiles, RobotStatistics
-from ponderpounce.training.nudge import NO_NUDGE, Nudge, apply_nudges, draw_nudges
+from dual_system.models.action_space import actions_in, states_in
+from dual_system.models.normalisation import ROBOMME, Quantiles, RobotStatistics
+from dual_system.training.nudge import NO_NUDGE, Nudge, apply_nudges, draw_nudges
 
 HOME = np.array([0.0, 0.2, 0.0, -2.2, 0.0, 2.4, 0.8, 0.04], np.float32)
 N = 12

@@ -10,15 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from clock.sampling import EVALUATION
-from ponderpounce.models.context import IGNORE
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
-from ponderpounce.models.ponder_coordinates import normalised_text
-from ponderpounce.training.cut_short import cuts
-from ponderpounce.training.example import ExampleConfig, make_example
-from ponderpounce.training.lapses import without_lapses
-from ponderpounce.training.own_words import as_recorded, own_words, speaks_of
-from ponderpounce.training.training_episode import TrainingEpisode
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.context import IGNORE
+from dual_system.models.ponder.coordinates import normalised_text
+from dual_system.models.ponder.network import Ponder
+from dual_system.training.cut_short import cuts
+from dual_system.training.example import ExampleConfig, make_example
+from dual_system.training.lapses import without_lapses
+from dual_system.training.own_words import as_recorded, own_words, speaks_of
+from dual_system.training.training_episode import TrainingEpisode
 
 FORM = Ponder.random(replace(tiny_cpu(), image_px=(32, 32), num_layers=4), seed=1).format
 TEXTS = ["pick up the red cube at <40, 40>", "put it into the bin at <90, 90>", "press the button at <20, 160>"]

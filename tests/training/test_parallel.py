@@ -19,18 +19,18 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.distributed.tensor import DTensor
 
-from ponderpounce.models.context import Transition
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
-from ponderpounce.models.pounce import freeze
-from ponderpounce.models.pounce_configs import tiny_cpu as tiny_pounce
-from ponderpounce.models.pounce_init import random_pounce
-from ponderpounce.training import parallel
-from ponderpounce.training.joint import NO_QUERY, JointModel, PonderBatch, PounceBatch
-from ponderpounce.training.optim import OptimConfig
-from ponderpounce.training.parallel import World, checksum, gather, joined, require_alike, shard
-from ponderpounce.training.place_lessons import place_lessons
-from ponderpounce.training.trainer import TrainConfig, Trainer
+from dual_system.models.pi05.pounce import freeze
+from dual_system.models.ponder.configs import tiny_cpu as tiny_ponder
+from dual_system.models.ponder.context import Transition
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.pounce.configs import tiny_cpu as tiny_pounce
+from dual_system.models.pounce.initialise import random_pounce
+from dual_system.training import parallel
+from dual_system.training.joint import NO_QUERY, JointModel, PonderBatch, PounceBatch
+from dual_system.training.optim import OptimConfig
+from dual_system.training.parallel import World, checksum, gather, joined, require_alike, shard
+from dual_system.training.place_lessons import place_lessons
+from dual_system.training.trainer import TrainConfig, Trainer
 
 CONFIG = replace(tiny_ponder(), image_px=(32, 32), num_layers=4)
 TRAIN = TrainConfig(seed=1, dropout=0.3, optim=OptimConfig(learning_rate=1e-3, warmup_steps=3, ema_decay=0.9))

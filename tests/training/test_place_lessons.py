@@ -9,18 +9,18 @@ import pytest
 import torch
 
 from clock.sampling import EVALUATION
-from ponderpounce.models.context import IGNORE
-from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
-from ponderpounce.models.ponder_coordinates import normalised_text
-from ponderpounce.training.collate import collate_ponder
-from ponderpounce.training.example import Example, ExampleConfig, make_example
-from ponderpounce.training.joint import encode_rows
-from ponderpounce.training.lapses import Lapses
-from ponderpounce.training.place_lessons import PlaceLessons
-from ponderpounce.training.stand_in import text_code
-from ponderpounce.training.training_episode import TrainingEpisode
+from dual_system.models.place_code import NUM_PLACE_FEATURES, place_features
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.context import IGNORE
+from dual_system.models.ponder.coordinates import normalised_text
+from dual_system.models.ponder.network import Ponder
+from dual_system.training.collate import collate_ponder
+from dual_system.training.example import Example, ExampleConfig, make_example
+from dual_system.training.joint import encode_rows
+from dual_system.training.lapses import Lapses
+from dual_system.training.place_lessons import PlaceLessons
+from dual_system.training.stand_in import text_code
+from dual_system.training.training_episode import TrainingEpisode
 
 PONDER = Ponder.random(replace(tiny_cpu(), image_px=(32, 32), num_layers=4), seed=1)
 FORM, SIZE = PONDER.format, PONDER.hidden_size

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from ponderpounce.training.recipe import stages_of
-from ponderpounce.training.recipes import RECIPES, recipe
+from dual_system.training.recipe import stages_of
+from dual_system.training.recipes import RECIPES, recipe
 
 
 def test_robomme_is_the_papers() -> None:

@@ -10,11 +10,11 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from ponderpounce.models.context import Transition
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
-from ponderpounce.models.recompute import recompute_layers
-from ponderpounce.training.joint import PonderBatch, encode_rows
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.context import Transition
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.recompute import recompute_layers
+from dual_system.training.joint import PonderBatch, encode_rows
 
 CONFIG = replace(tiny_cpu(), image_px=(32, 32), num_layers=8)
 

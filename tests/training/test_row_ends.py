@@ -10,14 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clock.sampling import EVALUATION, sample_schedule
-from ponderpounce.models.context import IGNORE, Row
-from ponderpounce.training.collate import collate_ponder
-from ponderpounce.training.example import Example, ExampleConfig, make_example
-from ponderpounce.training.joint import encode_rows
-from ponderpounce.training.lapses import Lapses
-from ponderpounce.training.places import PLACE
-from ponderpounce.training.row_ends import is_noted_at_once, shortened
-from ponderpounce.training.training_episode import TrainingEpisode
+from dual_system.models.ponder.context import IGNORE, Row
+from dual_system.training.collate import collate_ponder
+from dual_system.training.example import Example, ExampleConfig, make_example
+from dual_system.training.joint import encode_rows
+from dual_system.training.lapses import Lapses
+from dual_system.training.places import PLACE
+from dual_system.training.row_ends import is_noted_at_once, shortened
+from dual_system.training.training_episode import TrainingEpisode
 from tests.training.test_blind import NOTING
 from tests.training.test_example import PONDER
 from tests.training.test_insertions import inserted_episode

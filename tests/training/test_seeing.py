@@ -11,15 +11,15 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ponderpounce.data import album
-from ponderpounce.data.dataset import Dataset
-from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_checkpoint import load_ponder, save_ponder
-from ponderpounce.models.ponder_configs import small
-from ponderpounce.models.vocabulary import Vocabulary
-from ponderpounce.training.seeing import REFUSED, Album, answers_of, draw, loss_of, main, read_album, unlikeness
-from ponderpounce.training.wide_eyes import wide_eyed
+from dual_system.data import album
+from dual_system.data.dataset import Dataset
+from dual_system.models.place_code import NUM_PLACE_FEATURES, place_features
+from dual_system.models.ponder.checkpoint import load_ponder, save_ponder
+from dual_system.models.ponder.configs import small
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.vocabulary import Vocabulary
+from dual_system.training.seeing import REFUSED, Album, answers_of, draw, loss_of, main, read_album, unlikeness
+from dual_system.training.wide_eyes import wide_eyed
 
 PONDER = Ponder.random(small(), seed=0)
 FORM = PONDER.format

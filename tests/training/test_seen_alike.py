@@ -9,17 +9,17 @@ import pytest
 import torch
 
 from clock.sampling import EVALUATION, sample_schedule
+from dual_system.models.counsel import Counsel, Otherwise
+from dual_system.models.eyes import Eye, see
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.proprioception import Proprioception
+from dual_system.training.example import episode_row, row_frames
+from dual_system.training.training_episode import TrainingEpisode
 from ponder_server.contract import Opening
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
 from ponder_server.writer import TransitionWriter
-from ponderpounce.models.counsel import Counsel, Otherwise
-from ponderpounce.models.eyes import Eye, see
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
-from ponderpounce.models.proprioception import Proprioception
-from ponderpounce.training.example import episode_row, row_frames
-from ponderpounce.training.training_episode import TrainingEpisode
 
 EYES = (Eye(camera=1), Eye(camera=0, box=(0.25, 0.5, 0.75, 1.0)))
 PONDER = Ponder.random(

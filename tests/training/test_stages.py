@@ -11,24 +11,24 @@ import numpy as np
 import pytest
 import torch
 
-from ponderpounce.data.dataset import Dataset
-from ponderpounce.data.episode import About, EpisodeWriter, Row, unpack
-from ponderpounce.data.lerobot_v3 import DatasetWriter
-from ponderpounce.models import flow
-from ponderpounce.models.arm import tool_poses
-from ponderpounce.models.eyes import Eye
-from ponderpounce.models.ponder_checkpoint import load_ponder
-from ponderpounce.models.pounce_checkpoint import load_bundle
-from ponderpounce.training import recipes, train
-from ponderpounce.training.augment import AS_IT_IS, Augmentation
-from ponderpounce.training.data import Sight, TrainingSet
-from ponderpounce.training.example import ExampleConfig, make_example, row_frames
-from ponderpounce.training.joint import Draws, JointModel
-from ponderpounce.training.parallel import World
-from ponderpounce.training.recipe import Curriculum, Recipe, stages_of
-from ponderpounce.training.train import Batches, TrainOptions, build
-from ponderpounce.training.trainer import Trainer
-from ponderpounce.training.training_episode import TrainingEpisode
+from dual_system.data.dataset import Dataset
+from dual_system.data.episode import About, EpisodeWriter, Row, unpack
+from dual_system.data.lerobot_v3 import DatasetWriter
+from dual_system.models import flow
+from dual_system.models.arm import tool_poses
+from dual_system.models.eyes import Eye
+from dual_system.models.ponder.checkpoint import load_ponder
+from dual_system.models.pounce.checkpoint import load_bundle
+from dual_system.training import recipes, train
+from dual_system.training.augment import AS_IT_IS, Augmentation
+from dual_system.training.data import Sight, TrainingSet
+from dual_system.training.example import ExampleConfig, make_example, row_frames
+from dual_system.training.joint import Draws, JointModel
+from dual_system.training.parallel import World
+from dual_system.training.recipe import Curriculum, Recipe, stages_of
+from dual_system.training.train import Batches, TrainOptions, build
+from dual_system.training.trainer import Trainer
+from dual_system.training.training_episode import TrainingEpisode
 
 PX, NUM_EPISODES, NUM_ROWS = 64, 2, 50
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ponderpounce.models.place_code import NUM_PLACE_FEATURES, place_features, wave_columns
-from ponderpounce.training.stand_in import MOST_NUMBERS, number_weights, skill_of, stand_in, text_code
+from dual_system.models.place_code import NUM_PLACE_FEATURES, place_features, wave_columns
+from dual_system.training.stand_in import MOST_NUMBERS, number_weights, skill_of, stand_in, text_code
 
 PIXELS = st.integers(0, 255)
 PICK = "pick up the {nth} highlighted cube at <{y}, {x}>, which is {colour}"

@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 import torch
 
-from ponderpounce.data.episode import About, EpisodeWriter, Row, unpack
-from ponderpounce.data.lerobot_v3 import ALBUM, DatasetWriter
-from ponderpounce.models.eyes import Eye
-from ponderpounce.models.ponder_checkpoint import load_ponder
-from ponderpounce.training import recipes, train
-from ponderpounce.training.recipe import Curriculum, Recipe, stages_of
-from ponderpounce.training.train import TrainOptions
+from dual_system.data.episode import About, EpisodeWriter, Row, unpack
+from dual_system.data.lerobot_v3 import ALBUM, DatasetWriter
+from dual_system.models.eyes import Eye
+from dual_system.models.ponder.checkpoint import load_ponder
+from dual_system.training import recipes, train
+from dual_system.training.recipe import Curriculum, Recipe, stages_of
+from dual_system.training.train import TrainOptions
 
 PX, NUM_ROWS = 64, 40
 PATIENCE_S = 120

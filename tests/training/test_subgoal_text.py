@@ -10,19 +10,19 @@ import pytest
 import torch
 
 from clock.sampling import EVALUATION, sample_schedule
-from ponderpounce.models import prompt
-from ponderpounce.models.groot_prompt import tiny_eagle_tokenizer_for_random_weights
-from ponderpounce.models.normalisation import ROBOMME as STATISTICS
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
-from ponderpounce.models.pounce_checkpoint import random_bundle
-from ponderpounce.models.pounce_configs import tiny_cpu, tiny_groot
-from ponderpounce.models.pounce_init import random_pounce
-from ponderpounce.models.pounce_reading import groot_inputs, pi05_inputs
-from ponderpounce.training.collate import collate_ponder, collate_pounce
-from ponderpounce.training.example import Example, ExampleConfig, make_example, said_by_query
-from ponderpounce.training.joint import Draws, JointModel
-from ponderpounce.training.training_episode import TrainingEpisode
+from dual_system.models.groot.prompt import tiny_eagle_tokenizer_for_random_weights
+from dual_system.models.normalisation import ROBOMME as STATISTICS
+from dual_system.models.pi05 import prompt as prompt
+from dual_system.models.ponder.configs import tiny_cpu as tiny_ponder
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.pounce.checkpoint import random_bundle
+from dual_system.models.pounce.configs import tiny_cpu, tiny_groot
+from dual_system.models.pounce.initialise import random_pounce
+from dual_system.models.pounce.reading import groot_inputs, pi05_inputs
+from dual_system.training.collate import collate_ponder, collate_pounce
+from dual_system.training.example import Example, ExampleConfig, make_example, said_by_query
+from dual_system.training.joint import Draws, JointModel
+from dual_system.training.training_episode import TrainingEpisode
 from pounce_server.contract import Request, example_request
 from pounce_server.engine import EagerEngine
 from protocol import messages as m

@@ -12,23 +12,23 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from ponderpounce.data.episode import About, EpisodeWriter, Row, unpack
-from ponderpounce.data.lerobot_v3 import DatasetWriter
-from ponderpounce.models.action_space import ActionSpace, num_dims
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_checkpoint import load_ponder
-from ponderpounce.models.pounce import PounceConfig
-from ponderpounce.models.pounce_checkpoint import load_bundle
-from ponderpounce.models.prompt import with_subgoal
-from ponderpounce.models.showing import Showing, declared
-from ponderpounce.training import recipes, train
-from ponderpounce.training.chunks import chunk_ticks
-from ponderpounce.training.data import Sight, TrainingSet
-from ponderpounce.training.example import make_example
-from ponderpounce.training.notes import moving_places
-from ponderpounce.training.parallel import World
-from ponderpounce.training.recipe import Recipe, stages_of
-from ponderpounce.training.train import TrainOptions
+from dual_system.data.episode import About, EpisodeWriter, Row, unpack
+from dual_system.data.lerobot_v3 import DatasetWriter
+from dual_system.models.action_space import ActionSpace, num_dims
+from dual_system.models.pi05.pounce import PounceConfig
+from dual_system.models.pi05.prompt import with_subgoal
+from dual_system.models.ponder.checkpoint import load_ponder
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.showing import Showing, declared
+from dual_system.models.pounce.checkpoint import load_bundle
+from dual_system.training import recipes, train
+from dual_system.training.chunks import chunk_ticks
+from dual_system.training.data import Sight, TrainingSet
+from dual_system.training.example import make_example
+from dual_system.training.notes import moving_places
+from dual_system.training.parallel import World
+from dual_system.training.recipe import Recipe, stages_of
+from dual_system.training.train import TrainOptions
 from pounce_server.contract import example_request
 from pounce_server.engine import EagerEngine
 

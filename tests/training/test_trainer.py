@@ -11,16 +11,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from ponderpounce.models.context import Transition
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu as tiny_ponder
-from ponderpounce.models.pounce_configs import tiny_cpu as tiny_pounce
-from ponderpounce.models.pounce_init import random_pounce
-from ponderpounce.training import trainer
-from ponderpounce.training.joint import JointModel, PonderBatch, PounceBatch
-from ponderpounce.training.optim import OptimConfig, Optimiser, learning_rate
-from ponderpounce.training.shards import write_rows
-from ponderpounce.training.trainer import CheckpointError, SaveError, TrainConfig, Trainer
+from dual_system.models.ponder.configs import tiny_cpu as tiny_ponder
+from dual_system.models.ponder.context import Transition
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.pounce.configs import tiny_cpu as tiny_pounce
+from dual_system.models.pounce.initialise import random_pounce
+from dual_system.training import trainer
+from dual_system.training.joint import JointModel, PonderBatch, PounceBatch
+from dual_system.training.optim import OptimConfig, Optimiser, learning_rate
+from dual_system.training.shards import write_rows
+from dual_system.training.trainer import CheckpointError, SaveError, TrainConfig, Trainer
 
 CONFIG = replace(tiny_ponder(), image_px=(32, 32), num_layers=4)
 TRAIN = TrainConfig(seed=1, dropout=0.3, optim=OptimConfig(learning_rate=1e-3, warmup_steps=3, ema_decay=0.9))

@@ -14,13 +14,13 @@ import pytest
 import torch
 from PIL import Image
 
-from ponderpounce.models.context import IGNORE, ContextFormat, Transition
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import tiny_cpu
-from ponderpounce.training.joint import PonderBatch
-from ponderpounce.training.plot import PANEL_PX, WIDTH_PX, plot_log, smoothed
-from ponderpounce.training.trainer import StepReport
-from ponderpounce.training.watch import Watch, samples_of
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.context import IGNORE, ContextFormat, Transition
+from dual_system.models.ponder.network import Ponder
+from dual_system.training.joint import PonderBatch
+from dual_system.training.plot import PANEL_PX, WIDTH_PX, plot_log, smoothed
+from dual_system.training.trainer import StepReport
+from dual_system.training.watch import Watch, samples_of
 
 
 @pytest.fixture(scope="module")

@@ -12,12 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from clock.sampling import EVALUATION
-from ponderpounce.models.context import IGNORE
-from ponderpounce.training.deeds import course, narration, passing_side
-from ponderpounce.training.example import ExampleConfig, make_example
-from ponderpounce.training.places import PLACE
-from ponderpounce.training.training_episode import TrainingEpisode
-from ponderpounce.training.ways import by_sight, seen_side, stretch_numbers, without_numbers
+from dual_system.models.ponder.context import IGNORE
+from dual_system.training.deeds import course, narration, passing_side
+from dual_system.training.example import ExampleConfig, make_example
+from dual_system.training.places import PLACE
+from dual_system.training.training_episode import TrainingEpisode
+from dual_system.training.ways import by_sight, seen_side, stretch_numbers, without_numbers
 from tests.training.test_example import FORM, episode
 
 AROUND = "move to the nearest {} target by circling around the stick {}"

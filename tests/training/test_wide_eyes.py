@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from ponderpounce.models.eyes import Eye
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_configs import small, tiny_cpu
-from ponderpounce.models.ponder_vision import _position_embeddings
-from ponderpounce.training.wide_eyes import wide_eyed
+from dual_system.models.eyes import Eye
+from dual_system.models.ponder.configs import small, tiny_cpu
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.vision import _position_embeddings
+from dual_system.training.wide_eyes import wide_eyed
 
 PONDER = Ponder.random(small(), seed=1)
 (EYE,) = PONDER.format.eyes or ()

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 import torch
 
-from ponderpounce.data.episode import About, EpisodeWriter, Row, unpack
-from ponderpounce.data.lerobot_v3 import DatasetWriter
-from ponderpounce.models import pounce_configs
-from ponderpounce.models.ponder import Ponder
-from ponderpounce.models.ponder_checkpoint import load_ponder, save_ponder
-from ponderpounce.models.ponder_configs import small
-from ponderpounce.models.pounce_checkpoint import load_bundle, random_bundle, save_bundle
-from ponderpounce.models.prompt import stateless_prompt_text
-from ponderpounce.models.vocabulary import Vocabulary
-from ponderpounce.training.data import TrainingSet
-from ponderpounce.training.widening import REFUSED, main, widened, with_more_rows
+from dual_system.data.episode import About, EpisodeWriter, Row, unpack
+from dual_system.data.lerobot_v3 import DatasetWriter
+from dual_system.models.pi05.prompt import stateless_prompt_text
+from dual_system.models.ponder.checkpoint import load_ponder, save_ponder
+from dual_system.models.ponder.configs import small
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.vocabulary import Vocabulary
+from dual_system.models.pounce import configs as pounce_configs
+from dual_system.models.pounce.checkpoint import load_bundle, random_bundle, save_bundle
+from dual_system.training.data import TrainingSet
+from dual_system.training.widening import REFUSED, main, widened, with_more_rows
 
 OLD = ["press the button at [255, 470]", "pick up the first cube at [441, 430], which is blue"]
 NEW = [f"pick up the container at [{y}, {3 * y}] that hides the red cube" for y in range(100, 300, 7)]

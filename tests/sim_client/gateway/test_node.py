@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from clock import schedules
-from ponderpounce.models.showing import Showing
+from dual_system.models.ponder.showing import Showing
 from protocol import messages as m
 from sim_client.episode import STOPPED_TICKS
 from sim_client.gateway.node import LiveNode, LockstepNode, Shown

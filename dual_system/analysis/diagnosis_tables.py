@@ -1,0 +1,84 @@
+"""Tables of what ``pp-diagnose`` and ``pp-counterfactual`` wrote, the paper's Figure 4 in numbers among them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from dual_system.analysis import paper
+from dual_system.analysis.counterfactual import Counterfactual
+from dual_system.analysis.diagnosis import CONDITIONS, FRESH_AGE_S, Diagnosis, absolute, ratio
+from dual_system.analysis.markdown import markdown, percent
+from dual_system.analysis.statistics import Interval, bootstrap_mean
+
+DIAGNOSIS_NOTE = f"""\
+Offline and teacher-forced: flow-matching loss on recorded episodes, the same ticks, targets and flow draws in every
+condition; 95 % intervals in brackets by a bootstrap of episodes within tasks. No success rate. Rows marked
+"{paper.MARK}" are told in the paper's 5.2: another dataset and other models."""
+COUNTERFACTUAL_NOTE = """\
+Pairs of episodes that look the same now and had another past: how often the action is closer to what its own past asks
+for. Whoever does not use the past scores exactly 50. 95 % intervals by a bootstrap of pairs."""
+
+
+def diagnosis_tables(diagnoses: Sequence[Diagnosis]) -> str:
+    """Returns everything as markdown. Raises ValueError if a diagnosis has no ticks to measure on."""
+    untrained = [f"- `{each.label}`: **untrained weights.**" for each in diagnoses if each.is_untrained]
+    return "\n\n".join(
+        [
+            "# Diagnosis",
+            DIAGNOSIS_NOTE,
+            *(["\n".join(untrained)] if untrained else []),
+            "## Staleness (the paper's Figure 4)",
+            by_age(diagnoses),
+            "![loss over cognition's age](staleness.png)",
+            "## Whose cognition",
+            by_condition(diagnoses),
+        ]
+    )
+
+
+def by_age(diagnoses: Sequence[Diagnosis]) -> str:
+    """Returns a row for each diagnosis: the loss at every age over that at 0.3 s, and that one itself."""
+    ages_s = [f"{FRESH_AGE_S + float(name):.1f}" for name in diagnoses[0].parts["staleness"].names]
+    rows = []
+    for each in diagnoses:
+        losses = each.parts["staleness"]
+        fresh = losses.names[0]
+        row = [each.label, f"{losses.total_ticks} of {losses.num_episodes}", _loss(absolute(losses, fresh))]
+        rows.append(row + [_times(ratio(losses, name, fresh)) for name in losses.names])
+    for interval, told in paper.FIGURE_4.items():
+        known = [f"{told[float(age_s)]:.2f}x" if float(age_s) in told else "" for age_s in ages_s]
+        label = f"trained at {interval} ({paper.MARK})"
+        rows.append([label, "757 of 80", f"{paper.FIGURE_4_FRESH[interval]:.3f}", *known])
+    return markdown(["checkpoint", "ticks of episodes", "loss at 0.3 s", *(f"{age} s" for age in ages_s)], rows)
+
+
+def by_condition(diagnoses: Sequence[Diagnosis]) -> str:
+    """Returns two rows for each diagnosis: over all ticks, and at branch points."""
+    rows = []
+    for each in diagnoses:
+        for part, name in (("all", "all"), ("branch", "branch points")):
+            losses = each.parts["all"] if part == "all" else each.parts["branch"]
+            row = [each.label, name, f"{losses.total_ticks} of {losses.num_episodes}"]
+            row += [_loss(absolute(losses, condition)) for condition in CONDITIONS]
+            rows.append(row + [_times(ratio(losses, condition, "real")) for condition in CONDITIONS[1:]])
+    head = ["checkpoint", "where", "ticks of episodes", *CONDITIONS]
+    return markdown([*head, *(f"{condition} over real" for condition in CONDITIONS[1:])], rows)
+
+
+def counterfactual_table(found: Sequence[Counterfactual]) -> str:
+    """Returns a row for each file, task by task and over all pairs."""
+    rows = []
+    for each in found:
+        for task, scores_P in [*each.by_task.items(), ("all", each.scores_P)]:
+            row = [each.label, task, str(len(scores_P)), percent(bootstrap_mean(scores_P))]
+            rows.append([*row, "**untrained weights**" if each.is_untrained else ""])
+    table = markdown(["checkpoint", "task", "pairs", "P(own past)", ""], rows)
+    return "\n\n".join(["# Counterfactual history", COUNTERFACTUAL_NOTE, table])
+
+
+def _loss(interval: Interval) -> str:
+    return f"{interval.value:.3f} [{interval.low:.3f}, {interval.high:.3f}]"
+
+
+def _times(interval: Interval) -> str:
+    return f"{interval.value:.2f}x [{interval.low:.2f}, {interval.high:.2f}]"

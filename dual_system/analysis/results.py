@@ -1,0 +1,126 @@
+"""What ``sim-client`` and ``pp-eval`` write down, ``results.json``, as arrays to count with."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dual_system.analysis import paper
+
+Scene = tuple[int, str]  # seed, difficulty: the same scene whenever both are
+RESULTS = "results.json"
+
+
+class ResultsError(Exception):
+    """A results file that cannot be counted: the message says what was expected, what came, and the way out."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Results:
+    """One condition: the same scenes in one or several runs.
+
+    Attributes:
+        label: the folder as it was named.
+        config: the options it was made with.
+        outcomes: per task, in the paper's order, (R, E): 1 where the episode succeeded.
+        scenes: per task, the E scenes in ascending order.
+        num_carriers: K of PONDER, and ``is_untrained`` whether either model is random; None and False if nobody said.
+    """
+
+    label: str
+    config: Mapping[str, Any]
+    outcomes: Mapping[str, NDArray[np.int64]]
+    scenes: Mapping[str, tuple[Scene, ...]]
+    num_carriers: int | None = None
+    is_untrained: bool = False
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        return tuple(self.outcomes)
+
+    @property
+    def num_runs(self) -> int:
+        return len(next(iter(self.outcomes.values())))
+
+    def of(self, tasks: Sequence[str]) -> list[NDArray[np.int64]]:
+        """Returns the outcomes of some of the tasks, in their order."""
+        return [self.outcomes[task] for task in tasks]
+
+
+def read_results(path: Path) -> Results:
+    """Reads a results file, or that of a folder.
+
+    Raises:
+        ResultsError: no such file, no episodes, a task that the paper has not, a scene twice in one run, or runs that
+            are not of the same scenes, as when an evaluation was not finished.
+    """
+    file = path / RESULTS if path.is_dir() else path
+    try:
+        found = json.loads(file.read_text())
+        episodes, config = found["episodes"], found["config"]
+        cells = Counter((e["task"], e.get("run", 0), (e["seed"], e["difficulty"])) for e in episodes)
+        successes = {(e["task"], e.get("run", 0), (e["seed"], e["difficulty"])): e["success"] for e in episodes}
+    except OSError as error:
+        raise ResultsError(f"{file} cannot be read ({error.strerror}); give folders that pp-eval wrote") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise ResultsError(f"{file} is no results file of pp-eval or sim-client: {error!r}") from error
+    _require(bool(episodes), f"{file}: no episode is finished yet; let pp-eval go on")
+    for (task, run, (seed, _)), count in cells.items():
+        _require(task in paper.TASKS, f"{file}: {task!r} is none of the sixteen tasks of the paper's Table 7")
+        _require(count == 1, f"{file}: {task} seed {seed} is there {count} times in run {run}; count each scene once")
+    runs = sorted({run for _, run, _ in cells})
+    scenes = {
+        task: tuple(sorted({scene for name, _, scene in cells if name == task}))
+        for task in paper.TASKS
+        if any(name == task for name, _, _ in cells)
+    }
+    missing = [(task, run, seed) for task in scenes for run in runs for seed, d in scenes[task]
+               if (task, run, (seed, d)) not in cells]  # fmt: skip
+    if missing:
+        task, run, seed = missing[0]
+        raise ResultsError(
+            f"{file}: {len(missing)} episodes are missing, the first is {task} seed {seed} of run {run}; start the "
+            "same pp-eval again, it goes on where it was"
+        )
+    models = [model for episode in episodes for model in episode.get("models", {}).items()]
+    return Results(
+        label=str(path.parent if path.name == RESULTS else path),
+        config=config,
+        outcomes={
+            task: np.array([[int(successes[task, run, scene]) for scene in of_task] for run in runs])
+            for task, of_task in scenes.items()
+        },
+        scenes=scenes,
+        num_carriers=next((model["num_carriers"] for proc, model in models if proc == "ponder"), None),
+        is_untrained=any(model["is_untrained"] for _, model in models),
+    )
+
+
+def read_comparable(paths: Sequence[Path]) -> list[Results]:
+    """Reads several conditions over the same tasks.
+
+    Raises ResultsError as `read_results` does, or if one has other tasks than the first, or a label is there twice.
+    """
+    results = [read_results(path) for path in paths]
+    _require(bool(results), "no results were given")
+    first = results[0]
+    for i, other in enumerate(results[1:], 1):
+        _require(
+            other.tasks == first.tasks,
+            f"{other.label} has the tasks {', '.join(other.tasks)}, and {first.label} has {', '.join(first.tasks)}: "
+            "means over other tasks cannot stand side by side; make tables of each by itself",
+        )
+        _require(other.label not in [each.label for each in results[:i]], f"{other.label} was given twice")
+    return results
+
+
+def _require(holds: bool, sentence: str) -> None:
+    if not holds:
+        raise ResultsError(sentence)

@@ -1,0 +1,211 @@
+"""``pp-tables``: results files as tables and plots in the form of the paper's, with intervals, beside its own figures.
+
+What is printed follows from the files alone, to the last digit: the bootstrap's seed is fixed.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from dual_system.analysis import paper
+from dual_system.analysis.ceiling import ceiling_of
+from dual_system.analysis.counterfactual import COUNTERFACTUAL, read_counterfactual
+from dual_system.analysis.diagnosis import DIAGNOSIS, read_diagnosis
+from dual_system.analysis.diagnosis_tables import counterfactual_table, diagnosis_tables
+from dual_system.analysis.markdown import markdown, percent
+from dual_system.analysis.results import Results, ResultsError, read_comparable
+from dual_system.analysis.statistics import bootstrap, paired, wilson
+
+TABLES = "tables.md"
+NOTE = f"""\
+Success in per cent, 95 % intervals in brackets: of a task Wilson's over its scenes, of means a task-stratified
+bootstrap over scenes and runs. Columns and rows marked "{paper.MARK}" are the paper's figures, over the same
+tasks: other scenes, other pictures, other physics. They are no baseline of ours."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TablesOptions:
+    """Makes the paper's tables and plots of whatever evaluations and diagnoses wrote."""
+
+    results: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Folders of pp-eval, sim-client, pp-diagnose or pp-counterfactual, or their files; conditions of an evaluation are
+    compared with the first."""
+    out: Path
+    """Folder for tables.md, and of diagnoses staleness.png."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    options = tyro.cli(TablesOptions, args=argv, prog="pp-tables", description=TablesOptions.__doc__)
+    of_kind = {name: [p for p in options.results if _holds(p, name)] for name in (DIAGNOSIS, COUNTERFACTUAL)}
+    evaluations = [p for p in options.results if not any(p in paths for paths in of_kind.values())]
+    diagnoses, parts = [], []
+    try:
+        if evaluations:
+            parts.append(tables(read_comparable(evaluations)).rstrip("\n"))
+        if of_kind[DIAGNOSIS]:
+            diagnoses = [read_diagnosis(path) for path in of_kind[DIAGNOSIS]]
+            parts.append(diagnosis_tables(diagnoses))
+        if of_kind[COUNTERFACTUAL]:
+            parts.append(counterfactual_table([read_counterfactual(path) for path in of_kind[COUNTERFACTUAL]]))
+    except (ResultsError, ValueError) as error:
+        sys.stderr.write(f"pp-tables: {error}\n")
+        return 2
+    options.out.mkdir(parents=True, exist_ok=True)
+    if diagnoses:
+        from dual_system.analysis.staleness_plot import plot_staleness  # needs Pillow, and tables alone do not
+
+        plot_staleness(diagnoses, options.out / "staleness.png")
+    (options.out / TABLES).write_text("\n\n".join(parts) + "\n")
+    sys.stdout.write(f"{options.out / TABLES}\n")
+    return 0
+
+
+def _holds(path: Path, name: str) -> bool:
+    return path.name == name or (path / name).is_file()
+
+
+def tables(results: Sequence[Results]) -> str:
+    """Returns everything as markdown. Raises ResultsError if two conditions were run on other scenes."""
+    parts = ["# Evaluation", NOTE, "\n".join(_about(each) for each in results)]
+    parts += ["## By family (form of the paper's Table 1)", by_family(results)]
+    parts += ["## By task (form of the paper's Table 7)", by_task(results), *_ceilings(results)]
+    if len(results) > 1:
+        parts += ["## Between conditions (form of the paper's Tables 3 and 4)", between_conditions(results)]
+    return "\n\n".join(parts) + "\n"
+
+
+def by_family(results: Sequence[Results]) -> str:
+    """Returns a row for each family and the average, a column for each condition, then the paper's."""
+    families = _families(results[0].tasks)
+    rows = [[_of_family(name, tasks), *_means(results, tasks), *_papers(tasks)] for name, tasks in families.items()]
+    every = results[0].tasks
+    rows.append([f"**Average** of {_count(len(every), 'task')}", *_means(results, every), *_papers(every)])
+    return markdown(["family", *_columns(results)], rows)
+
+
+def by_task(results: Sequence[Results]) -> str:
+    """Returns a row for each task, family by family."""
+    rows = []
+    for task in results[0].tasks:
+        ours = [wilson(float(each.outcomes[task].mean()), len(each.scenes[task])) for each in results]
+        rows.append([task, *map(percent, ours), *_papers((task,))])
+    return markdown(["task", *_columns(results)], rows)
+
+
+def _ceilings(results: Sequence[Results]) -> list[str]:
+    """A sentence for each task of which it is known what can be reached without memory, over each one's scenes."""
+    sentences = []
+    for task in results[0].tasks:
+        exact = [ceiling_of(task, (difficulty for _, difficulty in each.scenes[task])) for each in results]
+        shares = [f"{100 * float(share):.2f} over the scenes of `{each.label}`"
+                  for share, each in zip(exact, results, strict=True) if share is not None]  # fmt: skip
+        if shares:
+            sentences.append(
+                f"{task} without memory and with perfect motion, exactly: {', '.join(shares)}. Without cognition no "
+                "more than that is to be expected."
+            )
+    return sentences
+
+
+def between_conditions(results: Sequence[Results]) -> str:
+    """Returns a row for each condition with its difference from the first, scene by scene, and the paper's rows.
+
+    Raises ResultsError if one was run on other scenes than the first.
+    """
+    first, families = results[0], _families(results[0].tasks)
+    head = ["condition", "POUNCE gets", "refresh", "delay", "K", *map(str.capitalize, families), "Average"]
+    head += ["minus the first", "scenes better, worse", "sign test p"]
+    rows = []
+    for each in results:
+        if each.scenes != first.scenes:
+            raise ResultsError(
+                f"{each.label} was not run on the scenes of {first.label}: differences are between the same scenes; "
+                "give both evaluations the same --seed, --episodes and --difficulty"
+            )
+        means = [bootstrap(each.of(tasks)) for tasks in (*families.values(), each.tasks)]
+        row = [each.label, *_condition(each), *map(percent, means)]
+        if each is first:
+            row += ["", "", ""]
+        else:
+            gain = paired(first.of(first.tasks), each.of(first.tasks))
+            row += [percent(gain.difference, "+"), f"{gain.num_better}, {gain.num_worse}", f"{gain.p_value:.2g}"]
+        rows.append(row)
+    if set(first.tasks) == set(paper.TASKS):
+        for number, table in ((3, paper.TABLE_3), (4, paper.TABLE_4)):
+            for name, meanspercent in table.items():
+                figures = [f"{mean:.2f}" for mean in meanspercent]
+                rows.append([f"Table {number}: {name} ({paper.MARK})", "", "", "", "", *figures, "", "", ""])
+    return markdown(head, rows)
+
+
+_GIVEN = {
+    "null": "the null cognition",
+    "other-episode": "another episode's cognition",
+    "stand-in": "the task's own subgoal",
+}
+
+
+def _condition(results: Results) -> tuple[str, str, str, str]:
+    """What POUNCE got, how often PONDER looked, its delay and K; as far as the file says."""
+    config = results.config
+    if config.get("policy") == "oracle":
+        return "nothing: the oracle played", "", "", ""
+    gets = _GIVEN.get(_cognition(config), "C_t")
+    if config.get("subgoal_text") is not None:
+        gets = {"ponder": "PONDER's subgoal text", "oracle": "the oracle's subgoal text"}[config["subgoal_text"]]
+    if config.get("deliver") == "held-transition":
+        told = config.get("held_age_ms", 0)
+        gets += f" held at transitions, told {f'{told} ms' if told else 'its true age'}"
+    carriers = "" if results.num_carriers is None else str(results.num_carriers)
+    return gets, _ms(config.get("query_period_ms")), _ms(config.get("delay_ms")), carriers
+
+
+def _cognition(config: Any) -> str:
+    return "null" if config.get("deliver") == "null" else config.get("cognition", "real")
+
+
+def _about(results: Results) -> str:
+    scenes = sum(len(of_task) for of_task in results.scenes.values())
+    size = [_count(len(results.tasks), "task"), _count(scenes, "scene"), _count(results.num_runs, "run")]
+    mode, steps = results.config.get("mode", "unknown mode"), results.config.get("max_steps", "?")
+    untrained = " **Untrained weights: motion, not skill.**" if results.is_untrained else ""
+    if _cognition(results.config) == "stand-in":
+        untrained = " **In PONDER's place: the task's own subgoals.**"
+    return f"- `{results.label}`: {', '.join(size)}; {mode}, at most {steps} steps.{untrained}"
+
+
+def _families(tasks: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """The families that have any of the tasks, and which."""
+    found = {name: tuple(task for task in of if task in tasks) for name, of in paper.FAMILIES.items()}
+    return {name: of for name, of in found.items() if of}
+
+
+def _of_family(name: str, tasks: Sequence[str]) -> str:
+    full = len(paper.FAMILIES[name])
+    return name.capitalize() + ("" if len(tasks) == full else f" ({len(tasks)} of {full} tasks)")
+
+
+def _means(results: Sequence[Results], tasks: Sequence[str]) -> list[str]:
+    return [percent(bootstrap(each.of(tasks))) for each in results]
+
+
+def _papers(tasks: Sequence[str]) -> list[str]:
+    return [f"{paper.mean_of(method, tasks):.2f}" for method in paper.SHOWN]
+
+
+def _columns(results: Sequence[Results]) -> list[str]:
+    return [*(each.label for each in results), *(f"{method} ({paper.MARK})" for method in paper.SHOWN)]
+
+
+def _ms(value: int | None) -> str:
+    return "" if value is None else f"{value} ms"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"

@@ -1,0 +1,98 @@
+"""What POUNCE's numbers mean on the arm. Outside, a chunk is always absolute joint targets; the model may learn better.
+
+- ``joint_delta`` (the paper's): the seven joints relative to the chunk's first state, then the gripper. 8 numbers;
+  the network reads the state as it is: seven joints [rad], finger opening [m].
+- ``ee_delta``: the tool pose at the commanded joints relative to the tool pose at the chunk's first state:
+  translation [m], rotation vector [rad], then the gripper. 7 numbers. Both parts are in the table's frame, not in the
+  tool's, and apart (no screw): a tool that moves straight and turns about a fixed axis draws straight lines of numbers.
+  The network reads, also as 7, the tool's position [m], its rotation vector [rad] away from pointing straight down
+  (for an upright tool (0, 0, yaw)), and the finger opening [m].
+
+The gripper is absolute everywhere, -1 closed to 1 open. A robot without one has finger 0 and command -1, and is
+otherwise the same arm: the tool point is the gripper's for it too, 47 mm above the tip of RoboMME's stick.
+"""
+
+# T targets, M chunks, N rows of a chunk, 8 = 7 arm joints (rad) + gripper, D numbers of the space
+
+from __future__ import annotations
+
+from typing import Literal, TypeAlias, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dual_system.models.arm import (
+    NUM_ARM_JOINTS,
+    TOOL_DOWN,
+    Array,
+    Poses,
+    joints_near,
+    rotation_vectors,
+    rotations,
+    tool_poses,
+)
+
+ActionSpace: TypeAlias = Literal["joint_delta", "ee_delta"]
+
+ROBOT_DIM = NUM_ARM_JOINTS + 1
+"""Of a robot's state and of a command, whatever the space."""
+GRIPPER_MIN, GRIPPER_MAX = -1.0, 1.0  # closed, open
+_NUM_DIMS: dict[ActionSpace, int] = {"joint_delta": ROBOT_DIM, "ee_delta": 7}
+
+
+def num_dims(space: ActionSpace) -> int:
+    """Returns how many numbers an action has, and a state as the network reads it.
+
+    Raises:
+        ValueError: no such space.
+    """
+    if space not in _NUM_DIMS:
+        raise ValueError(f"expected an action space of {', '.join(get_args(ActionSpace))}, came {space!r}")
+    return _NUM_DIMS[space]
+
+
+def states_in(space: ActionSpace, states_8: ArrayLike) -> Array:
+    """States (..., 8) of the robot -> (..., D) as the network reads them, not yet normalised."""
+    states = np.asarray(states_8, dtype=np.float64)
+    if space == "joint_delta":
+        return states
+    tool = tool_poses(states[..., :NUM_ARM_JOINTS])
+    turn = rotation_vectors(tool.rotation @ TOOL_DOWN.T)
+    return np.concatenate([tool.position_m, turn, states[..., NUM_ARM_JOINTS:]], axis=-1)
+
+
+def actions_in(space: ActionSpace, targets_T8: ArrayLike, states_M8: ArrayLike, rows_MN: NDArray[np.integer]) -> Array:
+    """Whole episodes at once: chunk m starts at state m, and its row n commands target ``rows_MN[m, n]``.
+
+    Returns (M, N, D), not yet normalised. Forward kinematics runs once per target and state, not once per row.
+    """
+    targets, states = np.asarray(targets_T8, dtype=np.float64), np.asarray(states_M8, dtype=np.float64)
+    arm, gripper_MN1 = targets[:, :NUM_ARM_JOINTS], targets[rows_MN, NUM_ARM_JOINTS:]
+    if space == "joint_delta":
+        moves = arm[rows_MN] - states[:, None, :NUM_ARM_JOINTS]
+        return np.concatenate([moves, gripper_MN1], axis=-1)
+    there, here = tool_poses(arm), tool_poses(states[:, :NUM_ARM_JOINTS])
+    moves = there.position_m[rows_MN] - here.position_m[:, None]
+    turns = rotation_vectors(there.rotation[rows_MN] @ here.rotation[:, None].swapaxes(-1, -2))
+    return np.concatenate([moves, turns, gripper_MN1], axis=-1)
+
+
+def targets_from(space: ActionSpace, actions_ND: ArrayLike, state_8: ArrayLike) -> Array:
+    """One chunk's actions (N, D) -> absolute joint targets and gripper (N, 8); the gripper is clipped to [-1, 1].
+
+    From ``ee_delta`` the joints are within the arm's limits. The arm has a joint more than a pose needs; each row takes
+    the joints nearest to the row before, the first those nearest to the state.
+    """
+    actions, state = np.asarray(actions_ND, dtype=np.float64), np.asarray(state_8, dtype=np.float64)
+    targets = np.empty((len(actions), ROBOT_DIM))
+    targets[:, NUM_ARM_JOINTS] = actions[:, -1].clip(GRIPPER_MIN, GRIPPER_MAX)
+    if space == "joint_delta":
+        targets[:, :NUM_ARM_JOINTS] = actions[:, :NUM_ARM_JOINTS] + state[:NUM_ARM_JOINTS]
+        return targets
+    joints = state[:NUM_ARM_JOINTS]
+    here = tool_poses(joints)
+    wanted = Poses(here.position_m + actions[:, :3], rotations(actions[:, 3:6]) @ here.rotation)
+    for row, pose in enumerate(zip(wanted.position_m, wanted.rotation, strict=True)):
+        joints = joints_near(Poses(*pose), joints)
+        targets[row, :NUM_ARM_JOINTS] = joints
+    return targets

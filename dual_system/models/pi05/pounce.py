@@ -1,0 +1,257 @@
+"""POUNCE, System 1: pi0.5 with the cognition prefix in front of what it sees (paper 3.1)."""
+
+# B batch, V views, T text tokens, K carriers, H carrier size, N horizon, A padded action dim
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from dual_system.models import flow
+from dual_system.models.interface import CognitionConfig, CognitionPrefix, check_channel
+from dual_system.models.pi05.committed import Committed, first_rows
+from dual_system.models.pi05.network import Pi05, Pi05Config, Prefix, PrefixCache, StepTable
+
+Freeze = Literal["none", "vision", "vlm"]
+StateInput = Literal["prompt", "token"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PounceInputs:
+    """One batch as the network takes it: resized, normalised, tokenised."""
+
+    images: Tensor
+    """(B, V, 3, px, px) float32 in [-1, 1]; a missing camera is all -1."""
+    has_view: Tensor
+    """(B, V) bool"""
+    token_ids: Tensor
+    """(B, T) int64"""
+    is_token: Tensor
+    """(B, T) bool; False for padding"""
+    age_ns: Tensor
+    """(B,) int64 age of the cognition; 0 where null"""
+    cognition: Tensor | None = None
+    """(B, K, H) float32; None means null cognition everywhere, or K = 0"""
+    is_null: Tensor | None = None
+    """(B,) bool; samples of ``cognition`` to replace by the learned null"""
+    state: Tensor | None = None
+    """(B, S) float32, normalised; where the config's ``state_input`` is "token"."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PounceConfig:
+    """Everything that fixes POUNCE's shapes. Named complete ones are in `pounce_configs`."""
+
+    pi05: Pi05Config
+    cognition: CognitionConfig
+    robot_action_dim: int = 8
+    """The first dims of the padded action: 7 arm joints and the gripper."""
+    num_cameras: int = 2
+    """front, wrist. 0: it acts on state and cognition alone, and takes any robot's cameras."""
+    num_steps: int = 10
+    """Euler steps per chunk."""
+    max_prompt_tokens: int = 200
+    state_input: StateInput = "prompt"
+    """prompt: 256 bins written as digits, as pi0.5 does. token: one linear token of the numbers, as pi0 has in its
+    action stream; here it ends the prefix, so that its keys are computed once. A network that starts from nothing
+    would first have to learn to read digits."""
+    robot_state_dim: int = 8
+    """S, with ``state_input`` "token"; a prompt takes any."""
+    max_committed_rows: int = 0
+    """The most rows that training gives a chunk to continue (`committed`); 0: it was never trained to."""
+    reads_subgoal: bool = False
+    """The newest subgoal's text stands in the prompt instead of cognition: the paper's subgoal-text reference (3.1)."""
+
+    def __post_init__(self) -> None:
+        check_channel(self.cognition, self.reads_subgoal)
+        if not 0 <= self.max_committed_rows < self.pi05.horizon:
+            raise ValueError(f"max_committed_rows must be 0..{self.pi05.horizon - 1}, came {self.max_committed_rows}")
+        if not 0 < self.robot_action_dim <= self.pi05.action_dim:
+            raise ValueError(f"robot_action_dim must be 1..{self.pi05.action_dim}, came {self.robot_action_dim}")
+        for name, least in (("num_cameras", 0), ("num_steps", 1), ("max_prompt_tokens", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}, came {getattr(self, name)}")
+
+    @property
+    def horizon(self) -> int:
+        return self.pi05.horizon
+
+    @property
+    def padded_action_dim(self) -> int:
+        return self.pi05.action_dim
+
+    @property
+    def image_px(self) -> int:
+        return self.pi05.vision.image_px
+
+    @property
+    def vocab_size(self) -> int:
+        return self.pi05.vocab_size
+
+    def example_inputs(self, batch_size: int, *, num_tokens: int = 12, seed: int = 0) -> PounceInputs:
+        """Fabricates a valid batch for tests and benchmarks: all views present, cognition 300 ms old."""
+        generator = torch.Generator().manual_seed(seed)
+        px = self.pi05.vision.image_px
+        cognition, has_token = self.cognition, self.state_input == "token"
+        image_shape = (batch_size, self.num_cameras, 3, px, px)
+        token_shape = (batch_size, num_tokens)
+        cognition_BKH = torch.randn((batch_size, cognition.num_carriers, cognition.cognition_size), generator=generator)
+        return PounceInputs(
+            images=torch.rand(image_shape, generator=generator) * 2 - 1,
+            has_view=torch.ones(batch_size, self.num_cameras, dtype=torch.bool),
+            token_ids=torch.randint(self.pi05.vocab_size, token_shape, generator=generator),
+            is_token=torch.ones(token_shape, dtype=torch.bool),
+            age_ns=torch.full((batch_size,), 300_000_000),
+            cognition=cognition_BKH if cognition.num_carriers else None,
+            state=torch.rand(batch_size, self.robot_state_dim, generator=generator) * 2 - 1 if has_token else None,
+        )
+
+    def example_actions(self, batch_size: int, *, seed: int = 0) -> Tensor:
+        """Fabricates normalised training targets, (B, N, A) float32, zero beyond the robot's dims."""
+        generator = torch.Generator().manual_seed(seed)
+        actions = torch.zeros(batch_size, self.pi05.horizon, self.pi05.action_dim)
+        actions[..., : self.robot_action_dim].uniform_(-1, 1, generator=generator)
+        return actions
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Backbone:
+    """The pretrained parts that a recipe may freeze."""
+
+    vision: tuple[nn.Module, ...]
+    """Image tower and its projector."""
+    language: nn.Module
+
+
+class Freezable(Protocol):
+    """A POUNCE of either family, as `freeze` sees it."""
+
+    @property
+    def backbone(self) -> Backbone: ...
+
+    def requires_grad_(self, requires_grad: bool = True) -> Any: ...
+
+
+class Pounce(nn.Module):
+    """pi0.5 plus, for K >= 1, the cognition prefix."""
+
+    def __init__(self, config: PounceConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.pi05 = Pi05(config.pi05)
+        has_prefix = config.cognition.num_carriers > 0
+        width = config.pi05.language.width
+        self.cognition_prefix = CognitionPrefix(config.cognition, width) if has_prefix else None
+        has_token = config.state_input == "token"
+        self.state_projector = nn.Linear(config.robot_state_dim, width) if has_token else None
+
+    @property
+    def backbone(self) -> Backbone:
+        return Backbone(vision=(self.pi05.vision, self.pi05.projector), language=self.pi05.language)
+
+    def embed_prefix(self, inputs: PounceInputs) -> Prefix:
+        """Embeds [P][images][text][state].
+
+        Raises:
+            ValueError: the state is missing where it is a token.
+        """
+        cognition_BPW = None
+        if self.cognition_prefix is not None:
+            cognition_BPW = self.cognition_prefix(inputs.cognition, inputs.age_ns, inputs.is_null)
+        state_B1W = None
+        if self.state_projector is not None:
+            if inputs.state is None:
+                raise ValueError("state_input is 'token' and the inputs hold no state")
+            state_B1W = self.state_projector(inputs.state)[:, None]
+        return self.pi05.embed_prefix(
+            inputs.images,
+            inputs.has_view,
+            inputs.token_ids,
+            inputs.is_token,
+            cognition_BPW=cognition_BPW,
+            state_B1W=state_B1W,
+            is_isolated=self.config.cognition.attention == "isolated",
+        )
+
+    def prefill(self, inputs: PounceInputs) -> PrefixCache:
+        """Embeds [P][images][text][state] and runs it through the language layers once."""
+        return self.pi05.prefill(self.embed_prefix(inputs))
+
+    def loss(
+        self,
+        inputs: PounceInputs,
+        actions_BNA: Tensor,
+        noise_BNA: Tensor,
+        time_B: Tensor,
+        *,
+        over: flow.LossDims = "real",
+        num_committed_B: Tensor | None = None,
+    ) -> Tensor:
+        """Returns the scalar L_fm, by default over the robot's action dims only (`flow.mean_loss`).
+
+        ``actions_BNA`` are normalised and zero beyond the robot's dims; noise fills all of A, as in sampling. The
+        first ``num_committed_B`` rows of each sample are given and do not count (`committed`).
+        """
+        unreduced_BNA = self.unreduced_loss(inputs, actions_BNA, noise_BNA, time_B, num_committed_B=num_committed_B)
+        if num_committed_B is not None:
+            unreduced_BNA = unreduced_BNA[~first_rows(num_committed_B, self.config.horizon)]
+        return flow.mean_loss(unreduced_BNA, self.config.robot_action_dim, over)
+
+    def unreduced_loss(
+        self,
+        inputs: PounceInputs,
+        actions_BNA: Tensor,
+        noise_BNA: Tensor,
+        time_B: Tensor,
+        *,
+        num_committed_B: Tensor | None = None,
+    ) -> Tensor:
+        """Returns the squared error of the velocity, (S, N, A); of a row that is given it says nothing.
+
+        Noise, times and counts may be several for each sample, the whole batch over and over (S = D * B): what is
+        read is then computed once, for D flow samples.
+        """
+        num_draws = len(noise_BNA) // len(actions_BNA)
+        actions_BNA = actions_BNA.repeat(num_draws, 1, 1)
+        x_BNA = flow.noised(actions_BNA, noise_BNA, time_B)
+        is_given_BN = None
+        if num_committed_B is not None:
+            is_given_BN = first_rows(num_committed_B, self.config.horizon)
+            x_BNA = Committed(rows=actions_BNA, is_given=is_given_BN).over(x_BNA)
+        cache = self.prefill(inputs).repeated(num_draws)
+        velocity_BNA = self.pi05.velocity_at(x_BNA, time_B, cache, is_given_BN=is_given_BN)
+        return (flow.target_velocity(actions_BNA, noise_BNA) - velocity_BNA).square()
+
+    def step_table(self) -> StepTable:
+        return self.pi05.step_table(self.config.num_steps)
+
+    def sample(
+        self, inputs: PounceInputs, noise_BNA: Tensor, table: StepTable, *, given: Committed | None = None
+    ) -> Iterator[flow.EulerStep]:
+        """Yields the sampler's steps; the actions of the last are the normalised chunk."""
+        return self.pi05.sample(noise_BNA, self.prefill(inputs), table, given=given)
+
+
+def freeze(model: Freezable, what: Freeze = "vlm") -> None:
+    """Sets ``requires_grad`` of every parameter. Gradients still pass *through* frozen layers to C.
+
+    - ``vlm`` (the paper, B.1: "including the PaliGemma backbone"; GR00T's own recipe keeps its language frozen
+      too): vision, projector and language are frozen.
+    - ``vision`` (RoboMME's released pi0.5 recipe; the paper's wording differs): vision and projector are.
+    - ``none``: everything trains.
+
+    Never run the prefix under ``no_grad`` or ``detach`` it to save memory: that is the path to PONDER.
+    """
+    backbone = model.backbone
+    frozen: dict[Freeze, tuple[nn.Module, ...]] = {
+        "none": (),
+        "vision": backbone.vision,
+        "vlm": (*backbone.vision, backbone.language),
+    }
+    if what not in frozen:
+        raise ValueError(f"freeze must be one of {', '.join(frozen)}, came {what!r}")
+    model.requires_grad_(True)
+    for part in frozen[what]:
+        part.requires_grad_(False)

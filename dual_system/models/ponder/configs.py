@@ -1,0 +1,239 @@
+"""Complete, named sizes of PONDER: one tiny enough for a laptop core, and Qwen3.5's four.
+
+The four real sizes build exactly the published number of parameters (without the multi-token-prediction
+block, which transformers does not have). Sources: Qwen3.5 model cards; checked on the meta device in
+tests/models.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+from transformers.models.qwen3_5 import Qwen3_5Config
+
+from dual_system.models.eyes import Eye, Eyes, check_eyes
+from dual_system.models.ponder.vocabulary import Vocabulary
+from dual_system.models.proprioception import Proprioception
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PonderConfig:
+    """Sizes of one PONDER. GDN is Gated DeltaNet, the linear attention of three layers in four."""
+
+    hidden_size: int
+    ffn_size: int
+    num_layers: int
+    num_query_heads: int
+    num_kv_heads: int
+    head_dim: int = 256
+    num_gdn_key_heads: int = 16
+    num_gdn_value_heads: int
+    gdn_head_dim: int = 128
+    full_attention_every: int = 4
+    """The last of so many layers attends, the others are GDN."""
+    tied_embeddings: bool
+    vocab_size: int = 248_320
+    """Rows of the embedding table; a multiple of 128 beyond the tokenizer's last id."""
+
+    vision_depth: int
+    vision_hidden_size: int
+    vision_ffn_size: int
+    vision_num_heads: int
+    vision_num_positions: int = 2304
+    """A square number: the learned positions' grid, interpolated to the picture's."""
+    vision_patch_px: int = 16
+    """Side of a patch; 2 x 2 of them become one token."""
+
+    mrope_section: tuple[int, int, int] = (11, 11, 10)
+    """Rotary frequencies for t, h, w; they sum to an eighth of ``head_dim``."""
+    rope_theta: float = 1e7
+
+    num_carriers: int = 1
+    """K: carriers per query, each giving one row of C_t."""
+    first_carrier_id: int = 248_077
+    """First unused row of the embedding table; the K carriers live there."""
+    image_px: tuple[int, int] = (256, 256)
+    """Height and width of every picture that the network reads, in pixels."""
+    eyes: Eyes = None
+    """What it looks at; None: every camera's whole picture, which must then be of ``image_px``."""
+    proprioception: Proprioception | None = None
+    """What it is told of the robot's state; None, as in the paper: nothing."""
+
+    def __post_init__(self) -> None:
+        if self.first_carrier_id + self.num_carriers > self.vocab_size:
+            raise ValueError(
+                f"{self.num_carriers} carriers from row {self.first_carrier_id} do not fit into vocab_size "
+                f"{self.vocab_size}; lower first_carrier_id or num_carriers."
+            )
+        if self.proprioception is not None and self.proprioception.rows.stop > self.vocab_size:
+            raise ValueError(
+                f"proprioception takes rows up to {self.proprioception.rows.stop}, vocab_size is {self.vocab_size}; "
+                "lower first_id or its numbers of bins."
+            )
+        if 8 * sum(self.mrope_section) != self.head_dim:
+            raise ValueError(f"mrope_section {self.mrope_section} must sum to head_dim / 8 = {self.head_dim / 8}")
+        check_eyes(self.eyes, self.image_px)
+
+    def qwen(self, vocabulary: Vocabulary | None = None) -> Qwen3_5Config:
+        """The transformers configuration; token ids come from ``vocabulary`` when there is one."""
+        token_ids: dict[str, Any] = {}
+        if vocabulary is not None:
+            token_ids = {
+                "image_token_id": vocabulary.image_pad,
+                "video_token_id": vocabulary.video_pad,
+                "vision_start_token_id": vocabulary.vision_start,
+                "vision_end_token_id": vocabulary.vision_end,
+            }
+        return Qwen3_5Config(
+            tie_word_embeddings=self.tied_embeddings,
+            text_config={
+                "vocab_size": self.vocab_size,
+                "hidden_size": self.hidden_size,
+                "intermediate_size": self.ffn_size,
+                "num_hidden_layers": self.num_layers,
+                "num_attention_heads": self.num_query_heads,
+                "num_key_value_heads": self.num_kv_heads,
+                "head_dim": self.head_dim,
+                "full_attention_interval": self.full_attention_every,
+                "linear_num_key_heads": self.num_gdn_key_heads,
+                "linear_num_value_heads": self.num_gdn_value_heads,
+                "linear_key_head_dim": self.gdn_head_dim,
+                "linear_value_head_dim": self.gdn_head_dim,
+                "max_position_embeddings": 262_144,
+                "tie_word_embeddings": self.tied_embeddings,
+                "rope_parameters": {
+                    "rope_type": "default",
+                    "rope_theta": self.rope_theta,
+                    "partial_rotary_factor": 0.25,
+                    "mrope_section": list(self.mrope_section),
+                    "mrope_interleaved": True,
+                },
+            },
+            vision_config={
+                "depth": self.vision_depth,
+                "hidden_size": self.vision_hidden_size,
+                "intermediate_size": self.vision_ffn_size,
+                "num_heads": self.vision_num_heads,
+                "out_hidden_size": self.hidden_size,
+                "num_position_embeddings": self.vision_num_positions,
+                "patch_size": self.vision_patch_px,
+            },
+            **token_ids,
+        )
+
+
+def tiny_cpu() -> PonderConfig:
+    """Every kind of layer (6 GDN, 2 attention, 2 vision), small enough to think on one laptop core."""
+    return PonderConfig(
+        hidden_size=96,
+        ffn_size=192,
+        num_layers=8,
+        num_query_heads=4,
+        num_kv_heads=2,
+        head_dim=32,
+        num_gdn_key_heads=2,
+        num_gdn_value_heads=4,
+        gdn_head_dim=32,
+        tied_embeddings=False,
+        vocab_size=512,
+        vision_depth=2,
+        vision_hidden_size=64,
+        vision_ffn_size=128,
+        vision_num_heads=4,
+        vision_num_positions=256,
+        mrope_section=(2, 1, 1),
+        first_carrier_id=448,
+    )
+
+
+def small() -> PonderConfig:
+    """1.2 M weights, to be trained from scratch on CPU cores: one eye on the workspace in the front camera."""
+    return PonderConfig(
+        hidden_size=128,
+        ffn_size=256,
+        num_layers=4,
+        full_attention_every=2,
+        num_query_heads=4,
+        num_kv_heads=2,
+        head_dim=32,
+        num_gdn_key_heads=4,
+        num_gdn_value_heads=4,
+        gdn_head_dim=32,
+        tied_embeddings=False,
+        vocab_size=512,
+        vision_depth=3,
+        vision_hidden_size=96,
+        vision_ffn_size=192,
+        vision_num_heads=3,
+        vision_num_positions=64,
+        vision_patch_px=8,
+        mrope_section=(2, 1, 1),
+        first_carrier_id=448,
+        image_px=(64, 64),
+        eyes=(Eye(camera=0, box=(8 / 256, 64 / 256, 136 / 256, 192 / 256)),),
+        proprioception=Proprioception(first_id=464),
+    )
+
+
+def qwen35_0p8b() -> PonderConfig:
+    return PonderConfig(
+        hidden_size=1024,
+        ffn_size=3584,
+        num_layers=24,
+        num_query_heads=8,
+        num_kv_heads=2,
+        num_gdn_value_heads=16,
+        tied_embeddings=True,
+        vision_depth=12,
+        vision_hidden_size=768,
+        vision_ffn_size=3072,
+        vision_num_heads=12,
+    )
+
+
+def qwen35_2b() -> PonderConfig:
+    return PonderConfig(
+        hidden_size=2048,
+        ffn_size=6144,
+        num_layers=24,
+        num_query_heads=8,
+        num_kv_heads=2,
+        num_gdn_value_heads=16,
+        tied_embeddings=True,
+        vision_depth=24,
+        vision_hidden_size=1024,
+        vision_ffn_size=4096,
+        vision_num_heads=16,
+    )
+
+
+def qwen35_4b() -> PonderConfig:
+    return PonderConfig(
+        hidden_size=2560,
+        ffn_size=9216,
+        num_layers=32,
+        num_query_heads=16,
+        num_kv_heads=4,
+        num_gdn_value_heads=32,
+        tied_embeddings=True,
+        vision_depth=24,
+        vision_hidden_size=1024,
+        vision_ffn_size=4096,
+        vision_num_heads=16,
+    )
+
+
+def qwen35_9b() -> PonderConfig:
+    """The paper's PONDER."""
+    return PonderConfig(
+        hidden_size=4096,
+        ffn_size=12288,
+        num_layers=32,
+        num_query_heads=16,
+        num_kv_heads=4,
+        num_gdn_value_heads=32,
+        tied_embeddings=False,
+        vision_depth=27,
+        vision_hidden_size=1152,
+        vision_ffn_size=4304,
+        vision_num_heads=16,
+    )

@@ -1,0 +1,160 @@
+"""``pp-export hf``: trained models as the public folders that they came from, read back before they count as written.
+
+    PONDER          transformers' Qwen3.5 folder; ponder.json beside it, which others leave alone, says what PONDER adds
+    POUNCE, pi0.5   openpi's PyTorch names, or lerobot's; float32
+    POUNCE, GR00T   NVIDIA's folder: its names, and the config.json with what sizes do not tell
+
+No public layout has a place for the cognition prefix: it goes into ``pounce_prefix.safetensors``, which others leave
+alone. What a robot's numbers mean (statistics) is no part of these folders either: it stays with the checkpoint.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+import tyro
+from torch import Tensor
+
+from dual_system.models.groot import weights as groot_weights
+from dual_system.models.groot.folder import groot_config_of, nvidia_config
+from dual_system.models.groot.pounce import GrootPounce
+from dual_system.models.pi05 import weights as pi05_weights
+from dual_system.models.pi05.pounce import Pounce
+from dual_system.models.ponder.checkpoint import load_ponder, save_ponder, weights_hash
+from dual_system.models.pounce.checkpoint import (
+    CONFIG_FILE,
+    EAGLE_TOKENIZER_FILE,
+    TOKENIZER_FILE,
+    WEIGHTS_FILE,
+    PounceBundle,
+    load_bundle,
+)
+from dual_system.models.pounce.family import tensor_shapes
+from dual_system.models.public_layout import COGNITION, read_tensors, write_tensors
+
+PREFIX_FILE = "pounce_prefix.safetensors"
+Layout = Literal["openpi", "lerobot"]
+_STATE_TOKEN = "state_proj."
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExportOptions:
+    """Writes a trained model as a public folder: Qwen3.5's, pi0.5's or GR00T N1.5's."""
+
+    ponder: Path | None = None
+    """PONDER's checkpoint; or"""
+    pounce: Path | None = None
+    """POUNCE's."""
+    out: Path
+    """A folder that is not there yet."""
+    layout: Layout = "openpi"
+    """Of pi0.5's names: lerobot's have a leading `model.`."""
+
+
+def main(argv: list[str] | None = None, prog: str = "pp-export hf") -> int:
+    options = tyro.cli(ExportOptions, args=argv, prog=prog, description=ExportOptions.__doc__)
+    try:
+        export_folder(options)
+    except (OSError, ValueError) as error:
+        sys.stderr.write(f"{prog}: {error}\n")
+        return 2
+    sys.stdout.write(f"{options.out}: read back, equal to the last bit\n")
+    return 0
+
+
+def export_folder(options: ExportOptions) -> None:
+    """Writes the folder; nothing is left of one that cannot be read back.
+
+    Raises:
+        ValueError: neither or both models are given, or the model has parts that the layout has no place for.
+        FileNotFoundError, FileExistsError: no checkpoint there, or a folder that is there already.
+    """
+    if (options.ponder is None) == (options.pounce is None):
+        raise ValueError("give one of --ponder and --pounce; each is a folder of its own")
+    if options.out.exists():
+        raise FileExistsError(f"{options.out} is there already; export to a new folder")
+    try:
+        if options.ponder is not None:
+            _export_ponder(options.ponder, options.out)
+        elif options.pounce is not None:
+            _export_pounce(load_bundle(options.pounce), options.out, options.layout)
+    except BaseException:
+        shutil.rmtree(options.out, ignore_errors=True)
+        raise
+
+
+def _export_ponder(folder: Path, out: Path) -> None:
+    ponder = load_ponder(folder)
+    save_ponder(ponder, out)
+    if weights_hash(load_ponder(out)) != weights_hash(ponder):
+        raise ValueError(f"{out}: read back, the weights are others than those of {folder}")
+
+
+def _export_pounce(bundle: PounceBundle, out: Path, layout: Layout) -> None:
+    model = bundle.model
+    out.mkdir(parents=True)
+    path = out / WEIGHTS_FILE
+    if isinstance(model, Pounce):
+        pi05_weights.save_weights(model, path)
+        (out / TOKENIZER_FILE).write_bytes(bundle.tokenizer.model_bytes)
+    else:
+        groot_weights.save_weights(model, path)
+        (out / EAGLE_TOKENIZER_FILE).write_bytes(bundle.tokenizer.model_bytes)
+        (out / CONFIG_FILE).write_text(json.dumps(nvidia_config(model.config.groot, model.config.num_steps), indent=1))
+    _set_prefix_apart(path, out / PREFIX_FILE, "model." if layout == "lerobot" and isinstance(model, Pounce) else "")
+    if isinstance(model, GrootPounce):
+        _check_groot(model, out)
+    _check_tensors(model, path)
+
+
+def _set_prefix_apart(path: Path, prefix_path: Path, leading: str) -> None:
+    """Only public names stay in ``path``, behind ``leading``.
+
+    Raises:
+        ValueError: the state enters as a token, which public pi0.5 does not know.
+    """
+    tensors = read_tensors(path)
+    ours = {name: tensor for name, tensor in tensors.items() if name.startswith(COGNITION)}
+    if any(name.startswith(_STATE_TOKEN) for name in tensors):
+        raise ValueError(
+            "this checkpoint reads the state as a token (state_input 'token'); public pi0.5 reads it in the prompt and "
+            "has no such weights, so it cannot be exported"
+        )
+    write_tensors({leading + name: tensor for name, tensor in tensors.items() if name not in ours}, path)
+    if ours:
+        write_tensors(ours, prefix_path)
+
+
+def _check_groot(model: GrootPounce, out: Path) -> None:
+    """Raises ValueError unless the folder tells the network: SigLIP's head count, for one, stands nowhere in it."""
+    shapes, values = tensor_shapes(out / WEIGHTS_FILE), json.loads((out / CONFIG_FILE).read_text())
+    found = groot_config_of(shapes, values, str(out))
+    if found != (model.config.groot, model.config.num_steps):
+        raise ValueError(
+            "NVIDIA's folder cannot tell this network: read back it would be another one. Its vision tower must have "
+            "as many heads as the published one, and its image token the published place in the vocabulary."
+        )
+
+
+def _check_tensors(model: Pounce | GrootPounce, path: Path) -> None:
+    """Raises ValueError unless every public tensor reads back as it is in the model."""
+    if isinstance(model, Pounce):
+        found, public_name = pi05_weights.read_weights(path), pi05_weights.public_name
+    else:
+        found, public_name = groot_weights.read_weights(path), groot_weights.public_name
+    wanted: dict[str, Tensor] = {public_name(name): tensor for name, tensor in model.state_dict().items()}
+    wanted = {name: tensor for name, tensor in wanted.items() if not name.startswith(COGNITION)}
+    differing = found.keys() ^ wanted.keys()
+    differing |= {name for name in found.keys() & wanted.keys() if not torch.equal(found[name], wanted[name])}
+    if differing:
+        raise ValueError(f"{path}: read back, {len(differing)} tensors differ, {sorted(differing)[:5]} among them")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

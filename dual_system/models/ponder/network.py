@@ -1,0 +1,314 @@
+"""PONDER: Qwen3.5 read as a context engine; its hidden states at the carrier positions are the cognition C_t.
+
+Paper, section 3.1. The network is transformers' ``Qwen3_5ForConditionalGeneration`` (Gated DeltaNet and
+attention layers, vision tower); this file only decides how it is called: explicit positions, whole rows,
+and the LM head at asked positions only (at 248,320 rows, logits of a whole episode are gigabytes). Serving runs
+the same modules over a few tokens at a time; how is the daemon's business (``ponder_server/decoder.py``).
+
+# B batch, T tokens, H hidden, N positions asked for, V vocabulary
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from importlib.util import find_spec
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+from transformers.models.qwen3_5 import Qwen3_5Config, Qwen3_5ForConditionalGeneration
+from transformers.models.qwen3_5.modeling_qwen3_5 import (
+    Qwen3_5TextRotaryEmbedding,
+    Qwen3_5VisionRotaryEmbedding,
+)
+
+from dual_system.models.ponder.configs import PonderConfig
+from dual_system.models.ponder.context import ContextFormat, Row
+from dual_system.models.ponder.gated_delta import GatedDelta
+from dual_system.models.ponder.patches import patchify
+from dual_system.models.ponder.vision import image_tokens
+from dual_system.models.ponder.vocabulary import Vocabulary
+from dual_system.models.reader import Reader, read_apart
+from dual_system.models.specialty import Specialty, specialist_for
+
+FLOAT32_PARAMETERS = ("linear_attn.A_log", "linear_attn.norm.weight")
+"""Ends of the names of what stays float32 in every dtype, as in public Qwen3.5 checkpoints: A_log is the decay, which
+accumulates over thousands of tokens."""
+
+
+class Ponder(nn.Module):
+    """System 2. Build it with :meth:`random`, or with ``ponder_checkpoint.load_ponder``."""
+
+    def __init__(
+        self,
+        qwen_config: Qwen3_5Config,
+        context_format: ContextFormat,
+        *,
+        image_px: tuple[int, int],
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        """Allocates the network and leaves its weights undefined, for :meth:`random` or a checkpoint to fill.
+
+        Raises ValueError if the carriers do not fit into the embedding table, or if ``image_px`` is not what
+        ``context_format`` says.
+        """
+        super().__init__()
+        text: Any = qwen_config.text_config
+        vision: Any = qwen_config.vision_config
+        last_carrier_id = context_format.carrier_ids[-1]
+        if last_carrier_id >= text.vocab_size:
+            raise ValueError(
+                f"carrier id {last_carrier_id} is outside the embedding table of {text.vocab_size} rows; "
+                "lower first_carrier_id or num_carriers."
+            )
+        needed_px = token_px(qwen_config)
+        if image_px != context_format.image_px or needed_px != context_format.token_px:
+            raise ValueError(
+                f"image_px {image_px} does not give an image grid of {context_format.image_grid} tokens of "
+                f"{needed_px} px; height and width must be multiples of {needed_px}."
+            )
+        self.format = context_format
+        self.image_px = image_px
+        self.is_random = True
+        """The carriers were never trained: cognition is noise. A trainer sets it False, checkpoints keep it."""
+        self.mtp: dict[str, Tensor] = {}
+        """The checkpoint's multi-token prediction block, by name: a draft for serving, and written back as it came."""
+        qwen: Any = skeleton(qwen_config).to(dtype=dtype)
+        for name, parameter in qwen.named_parameters():
+            if name.endswith(FLOAT32_PARAMETERS):
+                parameter.data = parameter.data.float()
+        qwen.to_empty(device=device)
+        qwen.tie_weights()  # to_empty makes a separate tensor of every name
+        # Frequencies are buffers that no checkpoint holds; to_empty left them undefined.
+        qwen.model.language_model.rotary_emb = Qwen3_5TextRotaryEmbedding(text).to(device)
+        qwen.model.visual.rotary_pos_emb = Qwen3_5VisionRotaryEmbedding(vision).to(device)
+        self.qwen: Any = qwen.eval()
+        self.reader: Reader | None = None
+        """Reads demonstrations, if there is one (:meth:`add_reader`); None: there is one set of weights, as in the
+        paper."""
+        self.specialists = nn.ModuleDict().eval()
+        """By name, `Reader`s of whole episodes (:meth:`add_specialist`)."""
+
+    @classmethod
+    def random(
+        cls,
+        config: PonderConfig,
+        vocabulary: Vocabulary | None = None,
+        *,
+        seed: int,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
+    ) -> Self:
+        """A network whose weights depend on ``config`` and ``seed`` alone; no global random state moves.
+
+        Without a ``vocabulary`` it speaks the tiny one.
+        """
+        if vocabulary is None:
+            vocabulary = Vocabulary.tiny()
+        qwen_config = config.qwen(vocabulary)
+        context_format = ContextFormat(
+            vocabulary=vocabulary,
+            num_carriers=config.num_carriers,
+            first_carrier_id=config.first_carrier_id,
+            image_grid=image_grid(qwen_config, config.image_px),
+            token_px=token_px(qwen_config),
+            eyes=config.eyes,
+            proprioception=config.proprioception,
+        )
+        ponder = cls(qwen_config, context_format, image_px=config.image_px, device=device, dtype=dtype)
+        fill_randomly(ponder.qwen, seed=seed)
+        return ponder
+
+    def reshaped(
+        self, qwen_config: Qwen3_5Config, *, form: ContextFormat | None = None, image_px: tuple[int, int] | None = None
+    ) -> Self:
+        """One of another shape on the same device, its weights undefined; the caller fills them from this one's.
+
+        Raises ValueError if this one has a reader or specialists, which would be lost: reshape what it was made from.
+        """
+        if self.reader is not None or self.specialists:
+            raise ValueError(
+                "a PONDER with a reader of demonstrations or specialists keeps its shape; reshape one without them"
+            )
+        image_px = image_px or self.image_px
+        return type(self)(qwen_config, form or self.format, image_px=image_px, device=self.device, dtype=self.dtype)
+
+    @property
+    def hidden_size(self) -> int:
+        return int(self.qwen.config.text_config.hidden_size)
+
+    @property
+    def vocab_size(self) -> int:
+        """Rows of the embedding table."""
+        return int(self.qwen.config.text_config.vocab_size)
+
+    @property
+    def layers(self) -> list[Any]:
+        """Of the vision tower, the language model, the reader and the specialists."""
+        model = self.qwen.model
+        beside: Any = [*([] if self.reader is None else [self.reader]), *self.specialists.values()]
+        others = [layer for each in beside for layer in each.layers]
+        return [*model.visual.blocks, *model.language_model.layers, *others]
+
+    @property
+    def device(self) -> torch.device:
+        weight: Tensor = self.qwen.lm_head.weight
+        return weight.device
+
+    @property
+    def dtype(self) -> torch.dtype:
+        weight: Tensor = self.qwen.lm_head.weight
+        return weight.dtype
+
+    def image_features(self, frames_NHW3: Tensor) -> Tensor:
+        """Vision tokens (N * tokens per image, H) of N frames (N, height, width, 3) uint8, in their ``token_order``."""
+        vision = self.qwen.config.vision_config
+        _, height, width, _ = frames_NHW3.shape
+        patches = patchify(
+            frames_NHW3,
+            patch_px=vision.patch_size,
+            merge=vision.spatial_merge_size,
+            temporal=vision.temporal_patch_size,
+        )
+        grid = (height // vision.patch_size, width // vision.patch_size)
+        tokens = image_tokens(self.qwen.model.visual, patches.to(self.dtype), grid)
+        if self.format.fovea is None:
+            return tokens
+        return tokens.unflatten(0, (len(frames_NHW3), -1))[:, self.format.token_order].flatten(0, 1)
+
+    def embed(self, ids_T: Sequence[int] | npt.NDArray[np.integer], frames_NHW3: Tensor | None = None) -> Tensor:
+        """Input embeddings (T, H): rows of the table, with the frames' vision tokens at the image positions.
+
+        Raises ValueError if the frames have another number of tokens than ``ids`` has image positions.
+        """
+        ids = np.asarray(ids_T, np.int64)
+        index_T = torch.from_numpy(ids).to(self.device)
+        embeds_TH: Tensor = self.qwen.model.language_model.embed_tokens(index_T)
+        is_image_T = index_T == self.format.vocabulary.image_pad
+        num_places = int((ids == self.format.vocabulary.image_pad).sum())
+        num_features = 0 if frames_NHW3 is None else len(frames_NHW3) * self.format.num_image_tokens
+        if num_places != num_features:
+            raise ValueError(f"tokens hold {num_places} image positions, the frames bring {num_features}")
+        if frames_NHW3 is None:
+            return embeds_TH
+        features = self.image_features(frames_NHW3).to(embeds_TH.dtype)
+        return embeds_TH.masked_scatter(is_image_T[:, None], features)
+
+    def add_reader(self) -> Reader:
+        """Demonstrations have weights of their own from now on, which begin as the others; nothing changes yet."""
+        self.reader = Reader.like(self.qwen.model.language_model)
+        return self.reader
+
+    def add_specialist(self, specialty: Specialty) -> Reader:
+        """Such episodes have weights of their own from now on, which begin as the others; nothing changes yet.
+
+        Raises ValueError if there is one of that name.
+        """
+        self.format = replace(self.format, specialties=(*self.format.specialties, specialty))
+        specialist = Reader.like(self.qwen.model.language_model)
+        self.specialists[specialty.name] = specialist
+        return specialist
+
+    def readers(self, instruction: str, *, has_demo: bool) -> tuple[Any, Any]:
+        """Who reads an episode to the end of its first query, and from then on: text models, as a `Reader` is."""
+        everybody = self.qwen.model.language_model
+        name = specialist_for(self.format.specialties, instruction)
+        acts = everybody if name is None else self.specialists[name]
+        return acts if self.reader is None or not has_demo else self.reader, acts
+
+    def forward(
+        self,
+        embeds_BTH: Tensor,
+        positions_4BT: Tensor,
+        num_shown_B: Sequence[int] = (),
+        specialist: Reader | None = None,
+    ) -> Tensor:
+        """Final hidden states (B, T, H), after the last norm, of whole contexts; causal.
+
+        Rows may be padded on the right, where nothing follows. ``num_shown_B``: `Row.num_shown` of each, which a
+        reader needs; () if there are no demonstrations. ``specialist``: whose these rows are, None: everybody's.
+        """
+        acts = self.qwen.model.language_model if specialist is None else specialist
+        if self.reader is not None and any(num_shown_B):
+            return read_apart(acts, self.reader, embeds_BTH, positions_4BT, num_shown_B)
+        if specialist is not None:
+            return read_apart(acts, specialist, embeds_BTH, positions_4BT, [embeds_BTH.shape[1]] * len(embeds_BTH))
+        output = self.qwen.model.language_model(
+            inputs_embeds=embeds_BTH,
+            position_ids=positions_4BT,
+            use_cache=False,
+            # A dict goes to the layers as it is: transformers neither builds a mask nor guesses that rows are packed.
+            attention_mask={"full_attention": None, "linear_attention": None},
+        )
+        hidden_BTH: Tensor = output.last_hidden_state
+        return hidden_BTH
+
+    def logits(self, hidden_NH: Tensor) -> Tensor:
+        """LM logits (N, V) at the positions whose hidden states are given."""
+        logits_NV: Tensor = self.qwen.lm_head(hidden_NH)
+        return logits_NV
+
+    def encode_row(self, row: Row, frames_NHW3: Tensor | None) -> Tensor:
+        """Final hidden states (T, H) of a whole row in one cacheless pass: how training sees an episode."""
+        positions_4T, _ = self.format.positions(row.ids)
+        positions_4BT = torch.from_numpy(positions_4T)[:, None].to(self.device)
+        hidden_BTH: Tensor = self(self.embed(row.ids, frames_NHW3)[None], positions_4BT, [row.num_shown])
+        return hidden_BTH[0]
+
+
+def token_px(qwen_config: Qwen3_5Config) -> int:
+    """Side in pixels of what one image token covers."""
+    vision: Any = qwen_config.vision_config
+    return int(vision.patch_size * vision.spatial_merge_size)
+
+
+def image_grid(qwen_config: Qwen3_5Config, image_px: tuple[int, int]) -> tuple[int, int]:
+    """Tokens of one frame as (rows, columns). ValueError if they do not come out even."""
+    side_px = token_px(qwen_config)
+    height, width = image_px
+    if height < side_px or width < side_px or height % side_px or width % side_px:
+        raise ValueError(f"image_px {image_px}: height and width must be multiples of {side_px} px")
+    return height // side_px, width // side_px
+
+
+def skeleton(qwen_config: Qwen3_5Config) -> nn.Module:
+    """The network on the meta device: names, shapes and parameter counts, no memory."""
+    build: Any = Qwen3_5ForConditionalGeneration._from_config
+    with torch.device("meta"):
+        model: Any = build(qwen_config, attn_implementation="sdpa")
+        if find_spec("fla") is None:  # whose kernels transformers' own layer calls
+            text: Any = qwen_config.text_config
+            for index, layer in enumerate(model.model.language_model.layers):
+                if text.layer_types[index] == "linear_attention":
+                    layer.linear_attn = GatedDelta(text, index)
+    return model
+
+
+@torch.no_grad()
+def fill_randomly(qwen: nn.Module, *, seed: int) -> None:
+    """Fills every parameter from one generator: a network that has no training but a working memory.
+
+    Unlike the usual std of 0.02, activations keep their size through the layers, and the recurrent layers get
+    decays from "hardly ever" to "within a few tokens", so that hidden states depend on images and on the past
+    and a wrong cache shows. Drawn on the CPU in float32, in order of name: the same weights on any device.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    for name, parameter in sorted(qwen.named_parameters()):
+        value = torch.empty(parameter.shape)
+        leaf = name.rsplit(".", 1)[-1]
+        if leaf == "A_log":
+            value.uniform_(-4.0, 0.5, generator=generator)
+        elif leaf == "dt_bias":
+            value.uniform_(-3.0, 1.0, generator=generator)
+        elif leaf == "bias":
+            value.normal_(0.0, 0.1, generator=generator)
+        elif value.ndim == 1:  # norms: Qwen3.5's RMSNorm scales by 1 + w, the gated and the vision norms by w
+            is_offset = "language_model" in name and "linear_attn.norm" not in name
+            value.normal_(0.0 if is_offset else 1.0, 0.1, generator=generator)
+        elif "embed" in name and "patch" not in name:
+            value.normal_(0.0, 1.0, generator=generator)
+        else:
+            value.normal_(0.0, value[0].numel() ** -0.5, generator=generator)
+        parameter.copy_(value)

@@ -1,0 +1,265 @@
+"""A POUNCE checkpoint folder: config.json, model.safetensors and a tokenizer, all that acting needs.
+
+The format in config.json says which family is inside; a public folder is told by its tensor names.
+"""
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Final, Literal, TypeAlias
+
+import torch
+
+from dual_system.models.config_json import from_json
+from dual_system.models.groot.folder import groot_config_of
+from dual_system.models.groot.pounce import GrootPounceConfig
+from dual_system.models.groot.prompt import EagleTokenizer, tiny_eagle_tokenizer_for_random_weights
+from dual_system.models.normalisation import ROBOMME, Quantiles, RobotStatistics
+from dual_system.models.pi05.openpi_jax import METADATA_FILE, load_jax_weights
+from dual_system.models.pi05.pounce import Pounce, PounceConfig
+from dual_system.models.pi05.prompt import Tokenizer, tiny_tokenizer_for_random_weights
+from dual_system.models.pounce.configs import groot_n1_5, pi05_base
+from dual_system.models.pounce.family import (
+    AnyPounce,
+    AnyPounceConfig,
+    blank_model,
+    family_of,
+    load_weights,
+    random_model,
+    save_weights,
+    tensor_shapes,
+)
+from dual_system.models.pounce.initialise import initialise_prefix
+from dual_system.models.public_layout import weights_files
+
+AnyTokenizer: TypeAlias = Tokenizer | EagleTokenizer
+
+FORMAT: Final = "ponderpounce.pounce/1"
+GROOT_FORMAT: Final = "ponderpounce.pounce-groot/1"
+CONFIG_FILE = "config.json"
+JAX_FOLDER = "params"
+WEIGHTS_FILE = "model.safetensors"
+_LATER_STATISTICS: dict[str, Any] = {"space": "joint_delta", "reach": [], "grip": None}
+_LATER_FIELDS: dict[str, Any] = {
+    "max_committed_rows": 0,
+    "reads_subgoal": False,
+    "state_input": "prompt",
+    "robot_state_dim": 8,
+}
+"""Of pi0.5's config: what it meant where a folder was written before there was such a field."""
+_LATER_GROOT_FIELDS: dict[str, Any] = {"reads_subgoal": False}
+_LATER_COGNITION_FIELDS = {"rounds_places": False}
+TOKENIZER_FILE = "tokenizer.model"
+EAGLE_TOKENIZER_FILE = "tokenizer.json"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredConfig:
+    """Contents of config.json with pi0.5 inside."""
+
+    format: Literal["ponderpounce.pounce/1"] = FORMAT
+    is_random: bool
+    has_fresh_prefix: bool
+    config: PounceConfig
+    statistics: RobotStatistics
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredGrootConfig:
+    """Contents of config.json with GR00T inside."""
+
+    format: Literal["ponderpounce.pounce-groot/1"] = GROOT_FORMAT
+    is_random: bool
+    has_fresh_prefix: bool
+    config: GrootPounceConfig
+    statistics: RobotStatistics
+
+
+AnyStoredConfig: TypeAlias = StoredConfig | StoredGrootConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PounceBundle:
+    """A model with what surrounds it: how to read text, and what its numbers mean on the robot."""
+
+    model: AnyPounce
+    tokenizer: AnyTokenizer
+    statistics: RobotStatistics = ROBOMME
+    is_random: bool
+    """True where the weights were drawn, not trained: nothing it does is skill."""
+    has_fresh_prefix: bool
+    """True where the cognition prefix is untrained, though pi0.5 itself may be."""
+
+    def __post_init__(self) -> None:
+        config = self.model.config
+        expected = Tokenizer if isinstance(config, PounceConfig) else EagleTokenizer
+        if not isinstance(self.tokenizer, expected):
+            raise ValueError(f"the model reads with {expected.__name__}, came {type(self.tokenizer).__name__}")
+        if self.tokenizer.vocab_size > config.vocab_size:
+            raise ValueError(f"tokenizer has {self.tokenizer.vocab_size} ids, the model embeds {config.vocab_size}")
+        if isinstance(config, GrootPounceConfig) and isinstance(self.tokenizer, EagleTokenizer):
+            image_token_id = config.groot.eagle.image_token_id
+            if self.tokenizer.image_token_id != image_token_id:
+                raise ValueError(
+                    f"the tokenizer's image token is {self.tokenizer.image_token_id}, the model's {image_token_id}"
+                )
+        if not isinstance(config, PounceConfig) or config.state_input == "token":
+            self._check_dims("state", self.statistics.state, config.robot_state_dim)
+        self._check_dims("action", self.statistics.action, config.robot_action_dim)
+
+    def _check_dims(self, what: str, table: Quantiles, expected: int) -> None:
+        if table.num_dims != expected:
+            raise ValueError(
+                f"statistics describe {table.num_dims} {what} dims, the config {expected}; with their action space "
+                f"{self.statistics.space!r} its robot_{what}_dim must be {table.num_dims} (pounce_configs.in_space)"
+            )
+
+    def stored_config(self) -> AnyStoredConfig:
+        config = self.model.config
+        facts: dict[str, Any] = {
+            "is_random": self.is_random,
+            "has_fresh_prefix": self.has_fresh_prefix,
+            "statistics": self.statistics,
+        }
+        if isinstance(config, PounceConfig):
+            return StoredConfig(config=config, **facts)
+        return StoredGrootConfig(config=config, **facts)
+
+    def digest(self) -> str:
+        """Returns 16 hex digits over weights, config, statistics and tokenizer: equal digests act equally."""
+        digest = hashlib.blake2b(digest_size=8)
+        stored = asdict(self.stored_config())
+        if stored["statistics"]["grip"] is None:
+            del stored["statistics"]["grip"]  # what was recorded before there was such a field names these digests
+        digest.update(json.dumps(stored, sort_keys=True).encode())
+        digest.update(self.tokenizer.model_bytes)
+        for name, tensor in sorted(self.model.state_dict().items()):
+            digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+            digest.update(tensor.contiguous().cpu().view(torch.uint8).numpy())
+        return digest.hexdigest()
+
+
+def random_bundle(
+    config: AnyPounceConfig,
+    seed: int,
+    *,
+    statistics: RobotStatistics = ROBOMME,
+    tokenizer: AnyTokenizer | None = None,
+) -> PounceBundle:
+    """A bundle that needs no file: seeded random weights and a tiny tokenizer, unless another is given."""
+    if tokenizer is None:
+        is_pi05 = isinstance(config, PounceConfig)
+        tokenizer = tiny_tokenizer_for_random_weights() if is_pi05 else tiny_eagle_tokenizer_for_random_weights()
+    return PounceBundle(
+        model=random_model(config, seed),
+        tokenizer=tokenizer,
+        statistics=statistics,
+        is_random=True,
+        has_fresh_prefix=config.cognition.num_carriers > 0,
+    )
+
+
+def save_bundle(bundle: PounceBundle, folder: Path) -> None:
+    """Writes the folder that `load_bundle` reads; its weights are in the family's public layout."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / CONFIG_FILE).write_text(json.dumps(asdict(bundle.stored_config()), indent=1) + "\n")
+    (folder / _tokenizer_file(bundle.model.config)).write_bytes(bundle.tokenizer.model_bytes)
+    save_weights(bundle.model, folder / WEIGHTS_FILE)
+
+
+def load_bundle(
+    folder: Path,
+    *,
+    config: AnyPounceConfig | None = None,
+    statistics: RobotStatistics | None = None,
+    tokenizer: Path | None = None,
+    prefix_seed: int = 0,
+) -> PounceBundle:
+    """Reads our own folder, or a public one, which acts with RoboMME's statistics unless others are given.
+
+    Public folders: openpi's pi0.5 (PyTorch, or JAX in ``params/``) and lerobot's; NVIDIA's GR00T N1.5, in shards or
+    not, and lerobot's ``groot``.
+
+    Args:
+        config: for a public folder; default `pi05_base()`, or for GR00T what the folder itself says.
+        statistics: for a public folder; ``config`` must be in their action space.
+        tokenizer: its file; default the folder's tokenizer.model (pi0.5) or tokenizer.json (GR00T).
+        prefix_seed: draws the cognition prefix where the folder has none.
+
+    Raises:
+        FileNotFoundError: no weights, or no tokenizer anywhere.
+        WeightsError: the tensors do not fit the configuration.
+        ValueError: our config.json does not parse, or ``config`` or ``statistics`` is given although the folder has
+            its own.
+    """
+    is_jax = (folder / JAX_FOLDER / METADATA_FILE).is_file()
+    if not is_jax:
+        weights_files(folder / WEIGHTS_FILE)  # a folder without any is told so before anything else of it is judged
+    stored = _read_config(folder / CONFIG_FILE)
+    if stored is not None:
+        for name, given in (("config", config), ("statistics", statistics)):
+            if given is not None:
+                raise ValueError(f"checkpoint {folder} has its own {CONFIG_FILE}; leave the {name} argument out")
+        config, statistics = stored.config, stored.statistics
+    model = blank_model(config or (pi05_base() if is_jax else _public_config(folder)))
+    has_prefix = _load_jax(model, folder) if is_jax else load_weights(model, folder / WEIGHTS_FILE)
+    if not has_prefix:
+        initialise_prefix(model, torch.Generator().manual_seed(prefix_seed))
+    is_prefix_trained = has_prefix and not (stored is not None and stored.has_fresh_prefix)
+    return PounceBundle(
+        model=model,
+        tokenizer=_read_tokenizer(model.config, tokenizer or folder / _tokenizer_file(model.config)),
+        statistics=statistics or ROBOMME,
+        is_random=stored is not None and stored.is_random,
+        has_fresh_prefix=model.cognition_prefix is not None and not is_prefix_trained,
+    )
+
+
+def _load_jax(model: AnyPounce, folder: Path) -> bool:
+    """Returns False: openpi knows no cognition prefix."""
+    if not isinstance(model, Pounce):
+        raise ValueError(f"checkpoint {folder} is openpi's JAX pi0.5, its config is GR00T's")
+    load_jax_weights(model, folder / JAX_FOLDER)
+    return False
+
+
+def _public_config(folder: Path) -> AnyPounceConfig:
+    weights_path = folder / WEIGHTS_FILE
+    if family_of(weights_path) == "pi05":
+        return pi05_base()
+    groot, num_steps = groot_config_of(tensor_shapes(weights_path), _json_of(folder / CONFIG_FILE), str(folder))
+    return replace(groot_n1_5(), groot=groot, num_steps=num_steps)
+
+
+def _tokenizer_file(config: AnyPounceConfig) -> str:
+    return TOKENIZER_FILE if isinstance(config, PounceConfig) else EAGLE_TOKENIZER_FILE
+
+
+def _read_tokenizer(config: AnyPounceConfig, path: Path) -> AnyTokenizer:
+    return Tokenizer.from_file(path) if isinstance(config, PounceConfig) else EagleTokenizer.from_file(path)
+
+
+def _json_of(path: Path) -> dict[str, Any] | None:
+    if not path.is_file():
+        return None
+    values = json.loads(path.read_text())
+    return values if isinstance(values, dict) else None
+
+
+def _read_config(path: Path) -> AnyStoredConfig | None:
+    """Returns None for a public folder: no config.json, or one that is not in our format."""
+    values = _json_of(path)
+    if values is None or values.get("format") not in (FORMAT, GROOT_FORMAT):
+        return None
+    if isinstance(values.get("statistics"), dict):
+        values["statistics"] = _LATER_STATISTICS | values["statistics"]
+    is_pi05 = values["format"] == FORMAT
+    config = values.get("config")
+    if isinstance(config, dict):
+        values["config"] = config = (_LATER_FIELDS if is_pi05 else _LATER_GROOT_FIELDS) | config
+        if isinstance(config.get("cognition"), dict):
+            config["cognition"] = _LATER_COGNITION_FIELDS | config["cognition"]
+    if is_pi05:
+        return from_json(StoredConfig, values, path.name)
+    return from_json(StoredGrootConfig, values, path.name)

@@ -1,0 +1,114 @@
+"""The action models behind one set of names: built, drawn, loaded and saved by what their config is."""
+
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import torch
+from safetensors import SafetensorError, safe_open
+
+from dual_system.models import flow
+from dual_system.models.groot import flow as groot_flow
+from dual_system.models.groot import weights as groot_weights
+from dual_system.models.groot.pounce import GrootInputs, GrootPounce, GrootPounceConfig
+from dual_system.models.pi05 import weights as pi05_weights
+from dual_system.models.pi05.pounce import Pounce, PounceConfig, PounceInputs
+from dual_system.models.pounce.initialise import random_groot_pounce, random_pounce
+from dual_system.models.public_layout import WeightsError, weights_files
+
+Family: TypeAlias = Literal["pi05", "groot"]
+AnyPounce: TypeAlias = Pounce | GrootPounce
+AnyPounceConfig: TypeAlias = PounceConfig | GrootPounceConfig
+
+# Part of a name that every file of the family holds, whatever policy class wrote it.
+_MARKS: dict[Family, str] = {"pi05": "paligemma_with_expert.", "groot": "backbone.eagle_model."}
+
+
+def family_of_config(config: AnyPounceConfig) -> Family:
+    return "pi05" if isinstance(config, PounceConfig) else "groot"
+
+
+def blank_model(config: AnyPounceConfig) -> AnyPounce:
+    """Returns the model on the meta device, to be loaded into."""
+    with torch.device("meta"):
+        return Pounce(config) if isinstance(config, PounceConfig) else GrootPounce(config)
+
+
+def random_model(config: AnyPounceConfig, seed: int) -> AnyPounce:
+    return random_pounce(config, seed) if isinstance(config, PounceConfig) else random_groot_pounce(config, seed)
+
+
+def action_loss(
+    model: AnyPounce,
+    inputs: PounceInputs | GrootInputs,
+    actions_BNA: torch.Tensor,
+    noise_BNA: torch.Tensor,
+    time_B: torch.Tensor,
+    num_committed_B: torch.Tensor | None = None,
+) -> torch.Tensor:
+    """Returns the scalar L_fm over the robot's action dims. Raises TypeError for the other family's inputs.
+
+    ``num_committed_B``: how many of the first rows are given (`committed`); pi0.5 only.
+    """
+    if isinstance(model, Pounce) and isinstance(inputs, PounceInputs):
+        return model.loss(inputs, actions_BNA, noise_BNA, time_B, num_committed_B=num_committed_B)
+    if isinstance(model, GrootPounce) and isinstance(inputs, GrootInputs) and num_committed_B is None:
+        return model.loss(inputs, actions_BNA, noise_BNA, time_B)
+    raise TypeError(f"{type(model).__name__} does not read {type(inputs).__name__}")
+
+
+def sample_times(model: AnyPounce, count: int, generator: torch.Generator) -> torch.Tensor:
+    """Draws training times, (count,) float32, as the family was pretrained with; their directions are opposite."""
+    draw = flow.sample_times if isinstance(model, Pounce) else groot_flow.sample_times
+    return draw(count, generator)
+
+
+def max_committed_rows(config: AnyPounceConfig) -> int:
+    """The most rows that a chunk is given to continue, in training and by ``--continuity trained``; 0 for GR00T."""
+    return config.max_committed_rows if isinstance(config, PounceConfig) else 0
+
+
+def load_weights(model: AnyPounce, path: Path) -> bool:
+    """Loads a public file; returns whether it held a cognition prefix. See `pi05_weights` and `groot_weights`."""
+    if isinstance(model, Pounce):
+        return pi05_weights.load_weights(model, path)
+    return groot_weights.load_weights(model, path)
+
+
+def save_weights(model: AnyPounce, path: Path) -> None:
+    if isinstance(model, Pounce):
+        pi05_weights.save_weights(model, path)
+    else:
+        groot_weights.save_weights(model, path)
+
+
+def tensor_shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    """Returns the shapes in a file or its shards, without reading their numbers.
+
+    Raises:
+        FileNotFoundError: neither the file nor an index of shards is there.
+        WeightsError: a file does not parse.
+    """
+    shapes: dict[str, tuple[int, ...]] = {}
+    for file_path in weights_files(path):
+        try:
+            with safe_open(file_path, framework="pt") as file:
+                names = list(file.keys())
+                shapes |= {name: tuple(file.get_slice(name).get_shape()) for name in names}
+        except SafetensorError as error:
+            raise WeightsError(str(file_path), {"unreadable": [str(error)]}) from error
+    return shapes
+
+
+def family_of(path: Path) -> Family:
+    """Tells from its tensor names which model a file holds.
+
+    Raises:
+        WeightsError: neither.
+    """
+    names = list(tensor_shapes(path))
+    for family, mark in _MARKS.items():
+        if any(mark in name for name in names):
+            return family
+    raise WeightsError(
+        str(path), {f"tensors, none of them pi0.5's ({_MARKS['pi05']}*) or GR00T N1.5's ({_MARKS['groot']}*)": names}
+    )

@@ -1,0 +1,104 @@
+"""POUNCE from a seed: every parameter drawn from one generator in a fixed order, no global random state."""
+
+import torch
+from torch import nn
+
+from dual_system.models.groot.blocks import EmbodimentLinear
+from dual_system.models.groot.network import Groot
+from dual_system.models.groot.pounce import GrootPounce, GrootPounceConfig
+from dual_system.models.groot.qwen3 import PlainRmsNorm
+from dual_system.models.pi05.gemma import AdaRmsNorm, RmsNorm
+from dual_system.models.pi05.network import Pi05
+from dual_system.models.pi05.pounce import Pounce, PounceConfig
+
+_FAINT = 0.1
+
+
+def random_pounce(config: PounceConfig, seed: int) -> Pounce:
+    """Returns a CPU float32 model with seeded random weights: moves the arm, knows nothing.
+
+    Built on the meta device first, because the constructors of torch.nn draw from the global generator.
+    """
+    with torch.device("meta"):
+        model = Pounce(config)
+    model.to_empty(device="cpu")
+    generator = torch.Generator().manual_seed(seed)
+    initialise_pi05(model.pi05, generator)
+    initialise_prefix(model, generator)
+    if model.state_projector is not None:
+        _draw(model.state_projector, generator)
+    return model
+
+
+@torch.no_grad()
+def open_gates(model: Pounce | GrootPounce) -> None:
+    """For training from scratch: every adaRMS norm of pi0.5's expert begins as a plain one with its residual let
+    through, and hardly listens to the time. Drawn like the rest, gates are as often negative as positive."""
+    if not isinstance(model, Pounce):
+        return
+    for module in model.pi05.expert.modules():
+        if isinstance(module, AdaRmsNorm):
+            module.dense.weight.mul_(_FAINT)
+            _scale, _shift, gate = module.dense.bias.chunk(3)
+            gate.fill_(1.0)
+
+
+def random_groot_pounce(config: GrootPounceConfig, seed: int) -> GrootPounce:
+    """`random_pounce` with GR00T inside."""
+    with torch.device("meta"):
+        model = GrootPounce(config)
+    model.to_empty(device="cpu")
+    generator = torch.Generator().manual_seed(seed)
+    initialise_groot(model.groot, generator)
+    initialise_prefix(model, generator)
+    return model
+
+
+def initialise_prefix(model: Pounce | GrootPounce, generator: torch.Generator) -> None:
+    """Draws a fresh cognition prefix to the scale of the model's text embeddings; nothing to do at K = 0."""
+    if model.cognition_prefix is None:
+        return
+    if isinstance(model, Pounce):
+        embedding = model.pi05.language.embed_tokens.weight.detach()
+        scale = embedding.shape[1] ** 0.5  # pi0.5 multiplies its text embeddings
+    else:
+        embedding = model.groot.eagle.language.embed_tokens.weight.detach()
+        scale = 1.0
+    text_rms = embedding.float().square().mean().sqrt().item() * scale
+    model.cognition_prefix.to_empty(device=embedding.device)
+    model.cognition_prefix.initialise(text_rms, generator)
+
+
+def initialise_pi05(pi05: Pi05, generator: torch.Generator) -> None:
+    """Keeps the variance of activations: weights N(0, 1 / fan-in), biases 0, norms the identity.
+
+    The adaRMS layers are drawn like the rest. Public training starts them at zero, which shuts every gate:
+    such a model does not look at its images, and a test on it would show nothing.
+    """
+    _draw(pi05, generator)
+
+
+def initialise_groot(groot: Groot, generator: torch.Generator) -> None:
+    """As `initialise_pi05`; every embodiment gets weights of its own."""
+    _draw(groot, generator)
+
+
+@torch.no_grad()
+def _draw(network: nn.Module, generator: torch.Generator) -> None:
+    for module in network.modules():
+        if isinstance(module, nn.Linear | nn.Conv2d):
+            module.weight.normal_(std=module.weight[0].numel() ** -0.5, generator=generator)
+            if module.bias is not None:
+                module.bias.zero_()
+        elif isinstance(module, EmbodimentLinear):
+            module.W.normal_(std=module.W.shape[1] ** -0.5, generator=generator)
+            module.b.zero_()
+        elif isinstance(module, nn.Embedding):
+            module.weight.normal_(std=module.embedding_dim**-0.5, generator=generator)
+        elif isinstance(module, nn.LayerNorm):
+            module.weight.fill_(1.0)
+            module.bias.zero_()
+        elif isinstance(module, PlainRmsNorm):
+            module.weight.fill_(1.0)
+        elif isinstance(module, RmsNorm):
+            module.weight.zero_()

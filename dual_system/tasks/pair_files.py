@@ -1,0 +1,194 @@
+"""``pp-collect pairs``: collects a dataset of counterfactual pairs; and its reader.
+
+A folder holds ``pairs.json`` and one ``.npz`` file per pair. The index has the rate of the videos' frames and one entry
+per pair: everything of `Pair` that is not an array, and the name of its file. The file has these arrays, where a camera
+is ``front`` or ``wrist``:
+
+    now/<camera>                  (image_px, image_px, 3) uint8   the present, the same for both branches
+    now/state                     (8,) float32
+    <branch>/<camera>             (T, image_px, image_px, 3) uint8   the past at 1 Hz; before it the conditioning video
+    <branch>/state                (T, 8) float32
+    <branch>/step                 (T,) int64   control steps since reset, or frames since the video began
+    <branch>/is_demonstration     (T,) bool
+    <branch>/oracle               (20, 8) float32   what the task's script does next; the answer
+
+where a branch is ``own`` or ``twin``. `dual_system.analysis.counterfactual` scores a policy's answers.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import sys
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from dual_system.tasks.environment import IMAGE_PX, make_environment
+from dual_system.tasks.pairs import Pair, Telling, find_pair
+from dual_system.tasks.task import make_task, task_names
+
+INDEX = "pairs.json"
+SCHEMA = "ponderpounce-pairs/1"
+
+_BRANCHES = ("own", "twin")
+_ARRAYS = {"frames", "state"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairsOptions:
+    """Collects counterfactual pairs: two pasts of one present, after which the oracle acts differently."""
+
+    family: Literal["counting", "permanence", "reference", "imitation"]
+    """Family of tasks; its tasks take turns."""
+    out: Path
+    """Folder of the new dataset."""
+    pairs: int = 100
+    """Number of pairs."""
+    task: tuple[str, ...] = ()
+    """Names of tasks of the family. Empty: all that can be forked."""
+    seed: int = 0
+    """Seed of the first scene of every task."""
+    image_px: int = IMAGE_PX
+    """Side of the pictures in pixels (paper and benchmark: 256)."""
+    demo_hz: Literal[1, 2, 4, 5, 10, 20] = 1
+    """Rate in Hz of the conditioning video's frames, as the PONDER to be scored was trained on."""
+    video_end: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Add the video's last frame."""
+    max_seeds: int = 300
+    """Number of seeds in a row without a pair after which a task is left out, and named."""
+
+
+def write_pair(pair: Pair, folder: Path) -> dict[str, Any]:
+    """Writes a pair's arrays and returns its entry of the index."""
+    file = f"{pair.task}_{pair.seed:06d}_{pair.variant}.npz"
+    arrays: dict[str, NDArray[Any]] = {f"now/{camera}": frame for camera, frame in pair.frames.items()}
+    arrays["now/state"] = pair.state
+    entry = {"file": file} | {
+        field.name: getattr(pair, field.name)
+        for field in dataclasses.fields(Pair)
+        if field.name not in {*_ARRAYS, *_BRANCHES}
+    }
+    for branch in _BRANCHES:
+        telling: Telling = getattr(pair, branch)
+        arrays |= {f"{branch}/{camera}": frames for camera, frames in telling.frames.items()}
+        arrays[f"{branch}/state"], arrays[f"{branch}/step"] = telling.states, telling.steps
+        arrays[f"{branch}/is_demonstration"], arrays[f"{branch}/oracle"] = telling.is_demonstration, telling.oracle
+        entry[branch] = {"subgoal": telling.subgoal, "reasoning": telling.reasoning}
+    np.savez_compressed(folder / file, **arrays)  # type: ignore[arg-type]  # numpy's stubs take allow_pickle for one
+    return entry
+
+
+def write_index(entries: list[dict[str, Any]], folder: Path, *, demo_hz: int = 1, video_end: bool = False) -> None:
+    """Replaces the index in one go."""
+    partial = folder / f"{INDEX}.partial"
+    index = {"schema": SCHEMA, "demo_hz": demo_hz, "video_end": video_end, "pairs": entries}
+    partial.write_text(json.dumps(index, indent=1) + "\n")
+    partial.replace(folder / INDEX)
+
+
+def read_pairs(folder: Path) -> Iterator[Pair]:
+    """Yields the pairs of a folder in the index's order, read as they are asked for.
+
+    Raises FileNotFoundError without an index, and ValueError for another schema.
+    """
+    return (_read_pair(entry, folder) for entry in _index(folder)["pairs"])
+
+
+def how_shown_in(folder: Path) -> tuple[int, bool]:
+    """Returns the rate in Hz of a folder's video frames, and whether the last one is added. Raises as `read_pairs`."""
+    index = _index(folder)
+    return index.get("demo_hz", 1), index.get("video_end", False)  # older folders have neither
+
+
+def _index(folder: Path) -> dict[str, Any]:
+    index: dict[str, Any] = json.loads((folder / INDEX).read_text())
+    if index.get("schema") != SCHEMA:
+        raise ValueError(f"{folder / INDEX} has schema {index.get('schema')!r}; expected {SCHEMA!r}")
+    return index
+
+
+def _read_pair(entry: dict[str, Any], folder: Path) -> Pair:
+    with np.load(folder / entry["file"]) as file:
+        arrays = {name: file[name] for name in file.files}
+    told: dict[str, Any] = {branch: _telling(branch, entry[branch], arrays) for branch in _BRANCHES}
+    plain = {name: value for name, value in entry.items() if name not in {"file", *_BRANCHES}}
+    return Pair(**plain, frames=_pictures("now", arrays), state=arrays["now/state"], **told)
+
+
+def _telling(branch: str, texts: dict[str, str], arrays: dict[str, NDArray[Any]]) -> Telling:
+    return Telling(
+        frames=_pictures(branch, arrays),
+        states=arrays[f"{branch}/state"],
+        steps=arrays[f"{branch}/step"],
+        is_demonstration=arrays[f"{branch}/is_demonstration"],
+        oracle=arrays[f"{branch}/oracle"],
+        **texts,
+    )
+
+
+def _pictures(part: str, arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[np.uint8]]:
+    named = ((name.removeprefix(f"{part}/"), array) for name, array in arrays.items() if name.startswith(f"{part}/"))
+    return {camera: array for camera, array in named if array.dtype == np.uint8}
+
+
+def _pairs_of(task: str, options: PairsOptions) -> Generator[Pair]:
+    """Yields the pairs of one task, seed by seed, until ``max_seeds`` in a row have none."""
+    with (
+        make_environment(task, image_px=options.image_px) as own,
+        make_environment(task, render=False) as other,
+    ):
+        num_barren = 0
+        for seed in itertools.count(options.seed):
+            pair = find_pair(own, other, task, seed, demo_hz=options.demo_hz, video_end=options.video_end)
+            num_barren = 0 if pair else num_barren + 1
+            if pair:
+                yield pair
+            if num_barren >= options.max_seeds:
+                return
+
+
+def main(argv: list[str] | None = None, prog: str = "pp-collect pairs") -> int:
+    options = tyro.cli(PairsOptions, args=argv, prog=prog, description=PairsOptions.__doc__)
+    if (options.out / INDEX).exists():
+        sys.stderr.write(f"{prog}: {options.out} holds pairs already; give another --out\n")
+        return 2
+    tasks = options.task or tuple(
+        name for name in task_names() if make_task(name).family == options.family and make_task(name).can_be_forked()
+    )
+    strangers = [name for name in tasks if make_task(name).family != options.family]
+    if strangers:
+        sys.stderr.write(f"{prog}: {', '.join(strangers)}: not of the {options.family} family\n")
+        return 2
+    if not tasks:
+        sys.stderr.write(f"{prog}: no task of the {options.family} family can be forked yet; see docs/tasks.md\n")
+        return 2
+    options.out.mkdir(parents=True, exist_ok=True)
+    entries: list[dict[str, Any]] = []
+    sources = {task: _pairs_of(task, options) for task in tasks}
+    with tqdm(total=options.pairs, unit="pair", disable=None) as bar:
+        while sources and len(entries) < options.pairs:
+            for task in list(sources)[: options.pairs - len(entries)]:
+                pair = next(sources[task], None)
+                if pair is None:
+                    del sources[task]
+                    sys.stderr.write(f"{prog}: {task} has no pair in {options.max_seeds} seeds; left out\n")
+                    continue
+                entries.append(write_pair(pair, options.out))
+                bar.update()
+    for source in sources.values():
+        source.close()  # frees its cameras
+    write_index(entries, options.out, demo_hz=options.demo_hz, video_end=options.video_end)
+    sys.stdout.write(f"{len(entries)} pairs of {options.family}: {options.out / INDEX}\n")
+    return 0 if len(entries) == options.pairs else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,53 @@
+"""Pictures of the world: both cameras through one renderer."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from dual_system.tasks.physics import Physics
+from dual_system.tasks.scene import CAMERAS
+
+_UNSEEN_GROUPS = (0, 3, 4, 5)  # 0 holds the arm's collision shapes
+
+
+class Cameras:
+    """Renders one physics at one size. Needs a GL context (MUJOCO_GL=egl without a display); close it after use.
+
+    Reflections, shadows and the sky are off: together with antialiasing (off in the scene) they are most of the
+    cost of a software-rendered frame.
+    """
+
+    def __init__(self, physics: Physics, image_px: int) -> None:
+        self._physics = physics
+        self._renderer = mujoco.Renderer(physics.model, height=image_px, width=image_px, max_geom=1000)
+        self._options = mujoco.MjvOption()
+        for group in _UNSEEN_GROUPS:
+            self._options.geomgroup[group] = 0
+        self._options.sitegroup[:] = 0
+        for flag in (
+            mujoco.mjtRndFlag.mjRND_SHADOW,
+            mujoco.mjtRndFlag.mjRND_REFLECTION,
+            mujoco.mjtRndFlag.mjRND_SKYBOX,
+        ):
+            self._renderer.scene.flags[flag] = 0
+
+    def frames(self) -> dict[str, NDArray[np.uint8]]:
+        """Returns a new (image_px, image_px, 3) RGB picture per camera name."""
+        return {camera: self._render(camera) for camera in CAMERAS}
+
+    def segmentation(self, camera: str) -> NDArray[np.int32]:
+        """Returns the id of the geom seen in each pixel (image_px, image_px), -1 where there is none."""
+        self._renderer.enable_segmentation_rendering()
+        picture = self._render(camera)
+        self._renderer.disable_segmentation_rendering()
+        return np.where(picture[..., 1] == mujoco.mjtObj.mjOBJ_GEOM, picture[..., 0], -1)
+
+    def close(self) -> None:
+        """Frees the GL context. May be called twice."""
+        self._renderer.close()
+
+    def _render(self, camera: str) -> NDArray[np.uint8]:
+        self._renderer.update_scene(self._physics.data, camera=camera, scene_option=self._options)
+        return self._renderer.render().copy()

@@ -1,0 +1,124 @@
+"""Batches made ahead by other processes: one process lays out rows slower than a GPU learns from them.
+
+A batch is a pure function of its step, so who makes it changes nothing but the time. The processes are forked from a
+trainer that may already use a GPU: they touch numpy and CPU tensors only, and nobody else's threads hold a lock that
+they need, since torch's own are not used there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import fields, is_dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from dual_system.training.joint import PonderBatch, PounceBatch
+from dual_system.training.trainer import Batches
+
+_Batch = tuple[PonderBatch, PounceBatch]
+_AHEAD = 2  # batches each process may have ready
+
+
+class Ahead:
+    """`Batches` for steps that are asked for one after the other, made by other processes."""
+
+    def __init__(self, make: Batches, device: torch.device | str, num_workers: int) -> None:
+        """``make`` gives a step's batch on the CPU. Raises ValueError if there is nobody to make it."""
+        if num_workers < 1:
+            raise ValueError(f"expected at least one process that makes batches, came {num_workers}")
+        self._make, self._device, self._num_workers = make, device, num_workers
+        self._made: Iterator[_Batch] = iter(())
+        self._step = -1
+        self._next: Future[_Batch] | None = None
+        self._moving = ThreadPoolExecutor(1, "batches")
+
+    def __call__(self, step: int) -> _Batch:
+        """The batch of ``step``, on the device. Of another step than the next one what was made ahead is thrown away.
+
+        Raises:
+            Exception: what making it raised.
+        """
+        if self._next is None or step != self._step:
+            self._begin(step)
+        assert self._next is not None
+        batch = self._next.result()
+        self._step += 1
+        self._next = self._moving.submit(self._fetch)
+        return batch
+
+    def close(self) -> None:
+        """Ends the processes."""
+        self._moving.shutdown(wait=True, cancel_futures=True)
+        self._made = iter(())
+
+    def _begin(self, step: int) -> None:
+        if self._next is not None:
+            self._next.exception()  # of a step that nobody wants any more
+        loader = DataLoader(
+            _Steps(self._make, step),
+            batch_size=None,
+            num_workers=self._num_workers,
+            prefetch_factor=_AHEAD,
+            collate_fn=_as_it_is,
+            multiprocessing_context="fork",
+        )
+        self._made, self._step = iter(loader), step
+        self._next = self._moving.submit(self._fetch)
+
+    def _fetch(self) -> _Batch:
+        episodes, invocations = _with_tensors(next(self._made))
+        return episodes.to(self._device), invocations.to(self._device)
+
+
+class _Steps(Dataset[Any]):
+    """What the loader's processes run: item n is the batch of step ``first`` + n, with arrays for tensors.
+
+    torch hands every tensor over by a file descriptor of its own, and a batch holds hundreds.
+    """
+
+    def __init__(self, make: Batches, first: int) -> None:
+        self._make, self._first = make, first
+
+    def __len__(self) -> int:
+        return 1 << 40  # without end
+
+    def __getitem__(self, index: int) -> _Batch:
+        made: _Batch = _with_arrays(self._make(self._first + index))
+        return made
+
+
+def _as_it_is(batch: Any) -> Any:
+    return batch
+
+
+def _with_arrays(value: Any) -> Any:
+    """The same, every tensor an array."""
+    return _mapped(value, Tensor, lambda tensor: _Array(tensor.numpy()))
+
+
+def _with_tensors(value: Any) -> Any:
+    return _mapped(value, _Array, lambda wrapped: torch.from_numpy(wrapped.array))
+
+
+class _Array:
+    """An array that was a tensor; rows have arrays of their own that stay."""
+
+    def __init__(self, array: Any) -> None:
+        self.array = array
+
+
+def _mapped(value: Any, kind: type, change: Any) -> Any:
+    if isinstance(value, kind):
+        return change(value)
+    if isinstance(value, tuple):
+        made = [_mapped(each, kind, change) for each in value]
+        return type(value)(*made) if hasattr(value, "_fields") else tuple(made)
+    if is_dataclass(value) and not isinstance(value, type):
+        held = {each.name: getattr(value, each.name) for each in fields(value)}
+        changed = {name: _mapped(each, kind, change) for name, each in held.items()}
+        return replace(value, **{name: each for name, each in changed.items() if each is not held[name]})
+    return value

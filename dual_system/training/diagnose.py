@@ -1,0 +1,258 @@
+"""``pp-diagnose``: what POUNCE takes from cognition, teacher-forced on recorded episodes, without a robot.
+
+Two questions, with the same ticks, targets, pictures and flow draws in every condition:
+
+- *Staleness* (paper, Figure 4): C_t is replaced by C_{t-k}, k = 0, 1, 2, 4 queries at 1 Hz, told its true age,
+  0.3 + k s.
+- *Cognition*: the real one, the learned null, or that of the next episode of the same task at the same query. Over all
+  ticks, and at branch points: the first invocation after each beginning of a subgoal, where the way parts and the
+  motion itself does not yet tell it. The mean over all ticks is no guide to success; this is.
+
+PONDER reads with the recorded texts in its row, as in training. ``pp-tables`` makes tables and a plot of the file.
+"""
+
+# Q queries of an episode, I its invocations, K carriers, H hidden, N horizon, A padded action dim
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import torch
+import tyro
+from torch import Tensor
+from tqdm import tqdm
+
+from clock.sampling import EVALUATION
+from dual_system.analysis.diagnosis import DIAGNOSIS, SCHEMA
+from dual_system.data.errors import DatasetError
+from dual_system.models.pi05.pounce import Pounce
+from dual_system.models.ponder.checkpoint import load_ponder, weights_hash
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.pounce.checkpoint import PounceBundle, load_bundle
+from dual_system.models.pounce.family import AnyPounce, sample_times
+from dual_system.training.collate import collate_ponder, collate_pounce
+from dual_system.training.data import Sight, TrainingSet
+from dual_system.training.example import Example, ExampleConfig, make_example
+from dual_system.training.joint import NO_QUERY, PounceBatch, encode_rows, gather_cognition
+
+STALE_BY = (0, 1, 2, 4)
+"""k of C_{t-k}: queries, which at 1 Hz are seconds."""
+EVERY_INVOCATION = ExampleConfig(clocks=EVALUATION, max_invocations=1 << 30)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DiagnoseOptions:
+    """Measures offline what POUNCE takes from cognition, on episodes that it was not trained on."""
+
+    ponder: Path
+    """PONDER's checkpoint."""
+    pounce: Path
+    """POUNCE's checkpoint, trained with it."""
+    data: Path
+    """A folder of pp-collect or pp-export, with other seeds than the training data's."""
+    out: Path
+    """Folder for diagnosis.json."""
+    tasks: tuple[str, ...] = ()
+    """Of the data; () for all."""
+    episodes: int = 80
+    """At most so many, the tasks taking turns (paper: 80)."""
+    draws: int = 8
+    """Flow noise and time of each tick; the same ones in every condition."""
+    seed: int = 0
+    """Of the flow draws."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Given:
+    """A condition: which cognition every invocation of an episode gets, and how old it is."""
+
+    cognition_IKH: Tensor
+    age_ns_I: Tensor
+    is_null_I: Tensor
+
+
+def main(argv: list[str] | None = None) -> int:
+    options = tyro.cli(DiagnoseOptions, args=argv, prog="pp-diagnose", description=DiagnoseOptions.__doc__)
+    try:
+        found = diagnose(options)
+    except (DatasetError, OSError, ValueError) as error:
+        sys.stderr.write(f"pp-diagnose: {error}\n")
+        return 2
+    options.out.mkdir(parents=True, exist_ok=True)
+    (options.out / DIAGNOSIS).write_text(json.dumps(found, indent=1) + "\n")
+    sys.stdout.write(f"{options.out / DIAGNOSIS}; tables: pp-tables {options.out} --out {options.out}\n")
+    return 0
+
+
+def diagnose(options: DiagnoseOptions) -> dict[str, Any]:
+    """Returns the contents of ``diagnosis.json``.
+
+    Raises:
+        DatasetError, FileNotFoundError, ValueError: what was given does not fit together; the message says why.
+    """
+    ponder = load_ponder(options.ponder, device=options.device)
+    bundle = load_bundle(options.pounce)
+    pounce = bundle.model.to(options.device).eval()
+    wanted = (pounce.config.cognition.num_carriers, pounce.config.cognition.cognition_size)
+    if wanted != (ponder.format.num_carriers, ponder.hidden_size):
+        given = (ponder.format.num_carriers, ponder.hidden_size)
+        raise ValueError(f"{options.pounce} reads (K, H) = {wanted}, {options.ponder} gives {given}: not a pair")
+    sight = Sight(form=ponder.format, pounce_px=pounce.config.image_px if pounce.config.num_cameras else None)
+    data = TrainingSet(options.data, tasks=options.tasks, sight=sight, demo_hz=ponder.format.demonstrations.hz)
+    numbers = in_turns([task for task, _ in data.names], options.episodes)
+    examples = [_example(data, number, ponder) for number in numbers]
+    shown = tqdm(examples, desc="PONDER", unit="episode", disable=not options.progress)
+    cognitions = [_cognition(ponder, example) for example in shown]
+    tasks = [data.names[number][0] for number in numbers]
+    episodes = []
+    places = tqdm(range(len(examples)), desc="POUNCE", unit="episode", disable=not options.progress)
+    for place in places:
+        task, seed = data.names[numbers[place]]
+        other = cognitions[next_alike(tasks, place)]
+        generator = torch.Generator().manual_seed(options.seed * 1_000_003 + place)
+        measured = measure(bundle, examples[place], cognitions[place], other, options.draws, generator)
+        episodes.append({"task": task, "seed": seed} | measured)
+    return {
+        "schema": SCHEMA,
+        "stale_by": STALE_BY,
+        "config": {name: _as_json(getattr(options, name)) for name in options.__slots__ if name != "progress"},
+        "data_hash": data.hash,
+        "models": {
+            "ponder": {"model_hash": weights_hash(ponder), "is_untrained": ponder.is_random},
+            "pounce": {"model_hash": bundle.digest(), "is_untrained": bundle.is_random},
+        },
+        "episodes": episodes,
+    }
+
+
+@torch.inference_mode()
+def measure(
+    bundle: PounceBundle,
+    example: Example,
+    own_QKH: Tensor,
+    others_QKH: Tensor,
+    num_draws: int,
+    generator: torch.Generator,
+) -> dict[str, Any]:
+    """One episode's mean losses per condition, and over how many ticks.
+
+    Args:
+        own_QKH: cognition of its queries.
+        others_QKH: that of another episode; beyond its end, its last one.
+    """
+    batch = collate_pounce([example], bundle.model.config, bundle.tokenizer, bundle.statistics).to(own_QKH.device)
+    noise_DINA = torch.randn(num_draws, *batch.actions_INA.shape, generator=generator)
+    time_DI = torch.stack([sample_times(bundle.model, len(batch.actions_INA), generator) for _ in range(num_draws)])
+
+    def losses(given: Given) -> Tensor:
+        return _losses(bundle.model, batch, given, noise_DINA, time_DI)
+
+    query_I = batch.query_I.cpu()
+    is_fed_I = query_I != NO_QUERY
+    is_old_I = query_I >= max(STALE_BY)
+    conditions = cognition_conditions(batch, own_QKH, others_QKH)
+    by_condition = {name: losses(given) for name, given in conditions.items()}
+    by_age = {str(k): losses(stale(example, batch, own_QKH, k)) for k in STALE_BY if k} | {"0": by_condition["real"]}
+    return {
+        "staleness": _means(by_age, is_old_I),
+        "all": _means(by_condition, is_fed_I),
+        "branch": _means(by_condition, is_fed_I & is_branch_point(example)),
+    }
+
+
+def cognition_conditions(batch: PounceBatch, own_QKH: Tensor, others_QKH: Tensor) -> dict[str, Given]:
+    """The same ages throughout; null counts as age 0."""
+    index_I = batch.query_I.clamp(min=0)
+    is_null_I = batch.query_I == NO_QUERY
+    age_ns_I = batch.inputs.age_ns
+    real = Given(cognition_IKH=own_QKH[index_I], age_ns_I=age_ns_I, is_null_I=is_null_I)
+    swapped = others_QKH[index_I.clamp(max=len(others_QKH) - 1)]
+    return {
+        "real": real,
+        "null": replace(real, is_null_I=torch.ones_like(is_null_I)),
+        "shuffled": replace(real, cognition_IKH=swapped),
+    }
+
+
+def stale(example: Example, batch: PounceBatch, own_QKH: Tensor, k: int) -> Given:
+    """C_{t-k} with its true age; where there is none so old, the first one."""
+    query_I = (batch.query_I - k).clamp(min=0)
+    source_ns_Q = torch.tensor([query.stamp.source_ns for query in example.schedule.queries], device=query_I.device)
+    now_ns_I = torch.tensor([invocation.now_ns for invocation in example.invocations], device=query_I.device)
+    return Given(
+        cognition_IKH=own_QKH[query_I],
+        age_ns_I=now_ns_I - source_ns_Q[query_I],
+        is_null_I=torch.zeros_like(query_I, dtype=torch.bool),
+    )
+
+
+def is_branch_point(example: Example) -> Tensor:
+    """(I,) bool: the first invocation at or after each tick at which a subgoal begins."""
+    ticks_I = np.array([invocation.tick for invocation in example.invocations])
+    first = {int(np.searchsorted(ticks_I, tick)) for tick in example.episode.transition_ticks}
+    return torch.tensor([place in first for place in range(len(ticks_I))])
+
+
+def in_turns(tasks: Sequence[str], count: int) -> list[int]:
+    """Which of the episodes, given by their tasks: at most ``count``, as evenly over tasks as they allow, in order."""
+    rounds: list[tuple[int, int]] = []
+    seen: dict[str, int] = {}
+    for number, task in enumerate(tasks):
+        rounds.append((seen.get(task, 0), number))
+        seen[task] = seen.get(task, 0) + 1
+    return sorted(number for _, number in sorted(rounds)[:count])
+
+
+def next_alike(tasks: Sequence[str], place: int) -> int:
+    """The next episode of the same task, cyclically.
+
+    Raises:
+        ValueError: there is no other one.
+    """
+    alike = [(each <= place, each) for each, task in enumerate(tasks) if task == tasks[place] and each != place]
+    if not alike:
+        raise ValueError(f"only one episode of {tasks[place]}: another's cognition needs at least two of every task")
+    return min(alike)[1]
+
+
+def _example(data: TrainingSet, number: int, ponder: Ponder) -> Example:
+    return make_example(data[number], ponder.format, EVERY_INVOCATION, np.random.default_rng(0))
+
+
+@torch.inference_mode()
+def _cognition(ponder: Ponder, example: Example) -> Tensor:
+    row = collate_ponder([example]).to(ponder.device)
+    cognition_QKH, _ = gather_cognition(row.rows, encode_rows(ponder, row))
+    return cognition_QKH.float()
+
+
+def _losses(model: AnyPounce, batch: PounceBatch, given: Given, noise_DINA: Tensor, time_DI: Tensor) -> Tensor:
+    """(I,): the flow loss of every invocation over the robot's own dims, a mean over D flow draws."""
+    device = given.cognition_IKH.device
+    noise_DINA, time_DI = noise_DINA.to(device), time_DI.to(device)
+    inputs: Any = replace(batch.inputs, cognition=given.cognition_IKH, age_ns=given.age_ns_I, is_null=given.is_null_I)
+    if isinstance(model, Pounce):  # what is read is computed once for all draws
+        flat = model.unreduced_loss(inputs, batch.actions_INA, noise_DINA.flatten(0, 1), time_DI.flatten())
+        squared_DINA = flat.unflatten(0, time_DI.shape)
+    else:
+        draws = zip(noise_DINA, time_DI, strict=True)
+        squared_DINA = torch.stack([model.unreduced_loss(inputs, batch.actions_INA, *draw) for draw in draws])
+    return squared_DINA[..., : model.config.robot_action_dim].mean(dim=(0, 2, 3)).cpu()
+
+
+def _means(losses: Mapping[str, Tensor], counts_I: Tensor) -> dict[str, Any]:
+    count = int(counts_I.sum())
+    means = {name: float(each[counts_I].double().mean()) for name, each in losses.items()} if count else {}
+    return {"num_ticks": count, "loss": means}
+
+
+def _as_json(value: Any) -> Any:
+    return str(value) if isinstance(value, Path) else value

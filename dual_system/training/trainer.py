@@ -1,0 +1,259 @@
+"""The loop: steps that repeat exactly, checkpoints that survive a kill, and a resume that continues bit for bit.
+
+Everything random in a step follows from (seed, step), so a checkpoint holds no random state: what a step does depends
+on the weights, the optimiser and its number alone.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from torch import Tensor
+
+from dual_system.models.pounce.family import max_committed_rows, sample_times
+from dual_system.training.joint import Draws, JointModel, PonderBatch, PounceBatch
+from dual_system.training.optim import OptimConfig, Optimiser
+from dual_system.training.parallel import World, average_gradients, local
+from dual_system.training.shards import RowReader, write_rows
+from protocol import disk
+
+Batches = Callable[[int], tuple[PonderBatch, PounceBatch]]
+"""This process's share of the batch of a step (``World.share``); a pure function of the step's number."""
+
+_WEIGHTS, _OPTIMISER, _FACTS = "weights", "optimiser", "facts.json"
+_DRAW_STREAM = 11  # of a step's random numbers: noise, flow times, cognition dropout
+
+
+class CheckpointError(ValueError):
+    """A checkpoint cannot be continued from."""
+
+
+class SaveError(RuntimeError):
+    """A checkpoint could not be written; the one before is whole."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StepReport:
+    """What one update did."""
+
+    step: int
+    total: float
+    flow_matching: float
+    grounding: float
+    alignment: float
+    placing: float
+    gradient_norm: float
+    num_supervised: int
+    num_null: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainConfig:
+    """What a step depends on besides model and data."""
+
+    seed: int = 42
+    dropout: float = 0.0
+    """Share of invocations that see the null cognition instead (paper: 0 for RoboMME, 0.15 for RoboCasa-DC)."""
+    flow_samples: int = 1
+    """Noise and flow time drawn so often for each invocation, over one reading of it. pi0.5 only if above 1."""
+    optim: OptimConfig = field(default_factory=OptimConfig)
+
+
+class Trainer:
+    """Updates a joint model, one batch at a time; alone, or as one of several processes with a share of each batch."""
+
+    def __init__(
+        self,
+        model: JointModel,
+        batches: Batches,
+        config: TrainConfig,
+        *,
+        data_hash: str = "",
+        world: World | None = None,
+    ) -> None:
+        """``data_hash`` names the data: a checkpoint made with other data is refused.
+
+        Where there are several processes, ``model`` is sharded already or the same on all of them.
+        """
+        self.model = model
+        self.config = config
+        self.step = 0
+        self._batches = batches
+        self._data_hash = data_hash
+        self._world = world or World()
+        self._optimiser = Optimiser(model, config.optim)
+        self._latest: tuple[PonderBatch, Tensor] | None = None
+
+    def run(self, until: int) -> Iterator[StepReport]:
+        """Updates until ``step`` is ``until``; yields after each.
+
+        Raises:
+            FloatingPointError: the loss or its gradients are not finite; the weights are those of the step before.
+        """
+        while self.step < until:
+            yield self._update()
+
+    def _update(self) -> StepReport:
+        world, model = self._world, self.model
+        episodes, invocations = self._batches(self.step)
+        loss = model(episodes, invocations, self._draws(episodes.num_episodes, invocations))
+        # The parts are means over the whole batch: a process's own weigh as much as it has of what they count.
+        counts = (loss.num_rows, loss.num_supervised, loss.num_queries, loss.num_placed, loss.num_null)
+        num_rows, num_supervised, num_queries, num_placed, num_null = (int(number) for number in world.sums(counts))
+        matching = loss.flow_matching * (loss.num_rows / max(1, num_rows))
+        grounding = loss.grounding * (loss.num_supervised / max(1, num_supervised))
+        alignment = loss.alignment * (loss.num_queries / max(1, num_queries))
+        placing = loss.placing * (loss.num_placed / max(1, num_placed))
+        part = model.weigh(matching, grounding, alignment, placing)
+        total, flow_matching, text, aligned, placed = world.sums(
+            [each.detach() for each in (part, matching, grounding, alignment, placing)]
+        )
+        if not np.isfinite(total):
+            raise FloatingPointError(
+                f"step {self.step}: the loss is {total} (flow matching {flow_matching}, grounding {text}). Look at "
+                "that batch's data, or lower learning_rate; the last checkpoint is untouched."
+            )
+        (part * world.size).backward()  # the average over processes divides by their number
+        average_gradients(model, world)
+        norm = self._optimiser.update(self.step)
+        report = StepReport(
+            step=self.step,
+            total=total,
+            flow_matching=flow_matching,
+            grounding=text,
+            alignment=aligned,
+            placing=placed,
+            gradient_norm=norm,
+            num_supervised=num_supervised,
+            num_null=num_null,
+        )
+        self.step += 1
+        self._latest = episodes, loss.said_N
+        return report
+
+    @property
+    def latest(self) -> tuple[PonderBatch, Tensor]:
+        """This process's episodes of the last update, and what PONDER would have said in them (``JointLoss.said_N``).
+
+        Raises:
+            RuntimeError: there was no update yet.
+        """
+        if self._latest is None:
+            raise RuntimeError("no step was done yet; latest is of the last one")
+        return self._latest
+
+    def _draws(self, num_episodes: int, invocations: PounceBatch) -> Draws:
+        """The chance of this step, episode by episode: the same for an episode whichever process has it."""
+        generators = []
+        for index in range(num_episodes):
+            place = self._world.rank + index * self._world.size
+            sequence = np.random.SeedSequence([self.config.seed, _DRAW_STREAM, self.step, place])
+            generators.append(torch.Generator().manual_seed(int(sequence.generate_state(1, np.uint64)[0] >> 1)))
+        return Draws.draw(
+            invocations,
+            partial(sample_times, self.model.pounce),
+            self.config.dropout,
+            generators,
+            num_samples=self.config.flow_samples,
+            max_committed_rows=max_committed_rows(self.model.pounce.config),
+        )
+
+    def take_average(self) -> None:
+        """Puts the averaged weights in place of the last ones, at the end of a run; nothing where none are kept."""
+        self._optimiser.take_average()
+
+    def save(self, folder: Path) -> None:
+        """Writes a checkpoint; a kill at any instant leaves the old one or the new one, whole.
+
+        Every process writes its own rows (``shards``), so all of them must see ``folder``.
+
+        Raises:
+            SaveError: a process could not write (a full disk); the old checkpoint is kept, the new one's rest removed.
+        """
+        fresh, old = (folder.with_name(folder.name + suffix) for suffix in (".tmp", ".old"))
+        world = self._world
+        if world.is_first:
+            shutil.rmtree(fresh, ignore_errors=True)
+            fresh.mkdir(parents=True)
+        world.wait()
+        failure: Exception | None = None
+        try:
+            write_rows(_weights(self.model), fresh, _WEIGHTS, world)
+            write_rows(self._optimiser.tensors(), fresh, _OPTIMISER, world)
+            if world.is_first:
+                facts = {"step": self.step, "config": asdict(self.config), "data_hash": self._data_hash}
+                (fresh / _FACTS).write_text(json.dumps(facts, indent=1) + "\n")
+                disk.sync(fresh / _FACTS)
+        except (OSError, SafetensorError) as error:
+            failure = error
+        (num_failed,) = world.sums([failure is not None])
+        if world.is_first and num_failed:
+            shutil.rmtree(fresh, ignore_errors=True)
+        if num_failed:
+            raise SaveError(_why_not_saved(folder, self.step, failure)) from failure
+        if world.is_first:
+            _replace(folder, fresh, old)
+        world.wait()
+
+    def resume(self, folder: Path) -> bool:
+        """Continues from a checkpoint, whatever number of processes wrote it; False if there is none yet.
+
+        Raises:
+            CheckpointError: it was made with another configuration, other data, or another model.
+        """
+        old = folder.with_name(folder.name + ".old")
+        if self._world.is_first and not folder.exists() and old.exists():  # killed between the two renames
+            old.rename(folder)
+        self._world.wait()
+        if not folder.exists():
+            return False
+        facts = json.loads((folder / _FACTS).read_text())
+        for name, now in (("config", json.loads(json.dumps(asdict(self.config)))), ("data_hash", self._data_hash)):
+            if facts[name] != now:
+                raise CheckpointError(
+                    f"{folder}: made with {name} {facts[name]}, this run has {now}. Use another folder, or the same "
+                    "data and recipe."
+                )
+        mine = _weights(self.model)
+        with RowReader(folder, _WEIGHTS, self._world) as stored, torch.no_grad():
+            shapes = {name: stored.shape(name) for name in stored.names()}
+            wanted = {name: tuple(tensor.shape) for name, tensor in mine.items()}
+            if shapes != wanted:
+                differs = sorted(name for name, _ in shapes.items() ^ wanted.items())
+                raise CheckpointError(f"{folder}: of another model; differs in {differs[:5]}")
+            for name, tensor in mine.items():
+                local(tensor).copy_(stored.read(name, tensor))
+        with RowReader(folder, _OPTIMISER, self._world) as stored:
+            self._optimiser.load(stored)
+        self.step = facts["step"]
+        return True
+
+
+def _weights(model: JointModel) -> dict[str, Tensor]:
+    """Every parameter once, tied ones under their first name."""
+    return {name: parameter.detach() for name, parameter in model.named_parameters()}
+
+
+def _replace(folder: Path, fresh: Path, old: Path) -> None:
+    if folder.exists():
+        shutil.rmtree(old, ignore_errors=True)
+        folder.rename(old)
+    fresh.rename(folder)
+    disk.sync(folder.parent)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _why_not_saved(folder: Path, step: int, failure: Exception | None) -> str:
+    free_gb = shutil.disk_usage(folder.parent).free / 1e9
+    return (
+        f"step {step}: {folder} could not be written ({failure or 'another process says why'}); "
+        f"{free_gb:.1f} GB are free there. The one before is kept: make room, and the same command goes on from it."
+    )
