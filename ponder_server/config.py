@@ -35,7 +35,8 @@ class ContextOptions:
     max_context_tokens: int = 16_384
     """Most tokens of one session (paper, section 3.4)."""
     when_full: PolicyName = "refuse"
-    """Refuse the query; forget the oldest queries but not the demonstration; or forget old pictures and keep carriers."""
+    """Refuse the query; forget the oldest queries but not the demonstration; or forget old pictures and keep
+    carriers."""
     max_text_tokens: int = 256
     """Most tokens of one subgoal or demonstration reasoning."""
     demo_hz: Literal[1, 2, 4, 5, 10, 20] | None = None

@@ -16,8 +16,8 @@ from dual_system.tasks.task import TaskError, make_task, task_names
 from protocol.errors import TransportError
 from protocol.process import set_up_logging
 from sim_client.config import SimOptions
+from sim_client.harness import open_harness
 from sim_client.launch import Daemons
-from sim_client.station import open_station
 from sim_client.suite import Suite
 
 
@@ -47,9 +47,9 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(options: SimOptions, daemons: Daemons) -> dict[str, Any]:
-    station = open_station(options, daemons)
+    harness = open_harness(options, daemons)
     try:
-        suite = Suite(options, station.link, station.clock, daemons.dead)
+        suite = Suite(options, harness.link, harness.clock, daemons.dead)
         with tqdm(total=options.episodes * options.max_steps, unit="tick", disable=not options.progress) as bar:
 
             def on_tick(episode: int, tick: int) -> None:
@@ -58,7 +58,7 @@ def _run(options: SimOptions, daemons: Daemons) -> dict[str, Any]:
 
             return suite.run(on_tick)
     finally:
-        station.bus.close()
+        harness.bus.close()
 
 
 if __name__ == "__main__":

@@ -22,59 +22,62 @@ class SimOptions:
     """Drives MuJoCo episodes with the PONDER and POUNCE servers, and logs every tick."""
 
     task: str = "PickHighlight"
-    """--list-tasks shows all."""
+    """Name of the task; --list-tasks shows all."""
     list_tasks: bool = False
-    """Print the tasks and leave."""
+    """Print the names of the tasks and exit."""
     episodes: int = 1
+    """Number of episodes."""
     seed: int = 0
-    """Of the first episode; the i-th one (from 0) uses seed + i."""
+    """Seed of the first episode; the i-th one (from 0) uses seed + i."""
     difficulty: Difficulty | None = None
-    """None: by seed, as the benchmark does."""
+    """Difficulty of every scene. None: by seed, as the benchmark does."""
     mode: Literal["lockstep", "realtime"] = "lockstep"
-    """lockstep: simulated time waits for results, delays are modelled, bit-reproducible. realtime: nobody waits."""
+    """Clock. lockstep: simulated time waits for results, delays are modelled, bit-reproducible. realtime: no wait."""
     policy: Literal["servers", "oracle"] = "servers"
-    """oracle: the task's own script instead of the servers."""
+    """Source of actions: the servers, or the task's own script (oracle)."""
     out: Path = Path("out")
     """Folder for results.json and one MCAP per episode."""
 
     local: bool = False
     """Start ponder-serve, pounce-serve (and in real time clock-serve) on this machine, and stop them at the end."""
     in_process: bool = False
-    """Lockstep only: everything in this one process and thread, without zenoh."""
+    """Run everything in this process and thread, without zenoh; lockstep only."""
     clock: Literal["auto", "embedded", "daemon"] = "auto"
-    """Where the clock service runs. auto: its own process in real time, inside this one in lockstep."""
+    """Place of the clock service. auto: a process of its own in real time, this process in lockstep."""
     link: LinkOptions = field(
         default_factory=lambda: LinkOptions(connect=("tcp/127.0.0.1:7447", "tcp/127.0.0.1:7448", "tcp/127.0.0.1:7449"))
     )
     ponder_checkpoint: Path | None = None
-    """With --local or --in-process: weights of PONDER; none are random."""
+    """PONDER's checkpoint, with --local or --in-process. None: random weights."""
     pounce_checkpoint: Path | None = None
+    """POUNCE's checkpoint, with --local or --in-process. None: random weights."""
     patience_s: float = 120.0
-    """How long to wait for servers to be ready, and in lockstep for any answer."""
+    """Longest wait in seconds for servers to be ready, and in lockstep for any answer."""
 
     query_period_ms: int = 1000
-    """Between PONDER's looks (paper: 1 Hz)."""
+    """Period of PONDER's queries in ms (paper: 1 Hz)."""
     invoke_every_ticks: int | None = None
-    """Between POUNCE's invocations, in 50 ms ticks. None: 20 in lockstep (the paper's 1 Hz), 10 in real time."""
+    """Period of POUNCE's invocations in 50 ms ticks. None: 20 in lockstep (the paper's 1 Hz), 10 in real time."""
     delay: Literal["default", "measured", "fixed", "log-normal"] = "default"
     """PONDER's delay. default: fixed in lockstep, measured in real time."""
     delay_ms: int = 300
-    """Mean of a modelled delay (paper: 300 ms)."""
+    """Mean of a modelled delay in ms (paper: 300)."""
     deliver: Literal["every", "held-transition", "null"] = "every"
-    """Which cognition POUNCE gets (paper, 5.2)."""
+    """Cognition that POUNCE is conditioned on (paper, 5.2)."""
     held_age_ms: int = 0
-    """With held-transition: the age POUNCE is told; 0 is the true one. The paper froze it at 300."""
+    """Age in ms given to POUNCE with --deliver held-transition; 0 is the true age. The paper fixes it at 300."""
     seam: Literal["switch", "offset-fade", "ensemble"] = "switch"
-    """How chunks are joined."""
+    """Transition from one action chunk to the next."""
     wait: Literal["stand-still", "hold"] = "stand-still"
-    """Until the first chunk: simulated time stands still, or runs while the arm holds."""
+    """Behaviour until the first chunk: simulated time stands still, or runs while the arm holds."""
     max_age_ms: int = 2000
-    """Cognition older than this is called stale (an alarm; its rows are still played)."""
+    """Age in ms from which a cognition is called stale (an alarm; its rows are still played)."""
     stale_limit_ms: int = 10_000
-    """Rows made with a cognition older than this are not played: hold, then stop."""
+    """Age in ms from which a cognition's rows are not played: the robot holds, then stops."""
     allow_starved: bool = False
     """Start although the schedule leaves ticks without a row."""
     max_steps: int = 1300
+    """Limit of control steps per episode (paper: 1300)."""
     demo_hz: Literal[1, 2, 4, 5, 10, 20] | None = None
     """How many frames of a demonstration are shown a second. None: as many as the --ponder-checkpoint says that it has
     learned from; without one, the paper's 1."""
@@ -84,11 +87,11 @@ class SimOptions:
     record: bool = True
     """Write one MCAP per episode."""
     record_hz: Literal[1, 2, 4, 5, 10, 20] = 20
-    """In lockstep: how often the log has pictures, beside those that the models look at."""
+    """Rate of logged pictures in Hz in lockstep; those that the models observe are logged as well."""
     pixels: Literal["jpeg", "exact"] = "jpeg"
-    """jpeg: raw frames are logged as JPEG; exact: also bit for bit as the models saw them (8 MB/s)."""
+    """Form of logged raw frames. jpeg: as JPEG; exact: also bit for bit as the models saw them (8 MB/s)."""
     progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
-    """Show a progress bar."""
+    """Do not show a progress bar."""
 
     @property
     def showing(self) -> Showing:

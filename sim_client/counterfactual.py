@@ -1,8 +1,8 @@
-"""``pp-counterfactual``: does a trained pair act on its own past? Both models as served, on the pairs of ``pp-pairs``.
+"""``pp-diagnose counterfactual``: does a trained pair act on its own past? Both models as served, on recorded pairs.
 
-Of each pair PONDER reads either past and the common present, and POUNCE acts on what it then thinks: twice on the same
-pictures, joints and noise. `dual_system.analysis.counterfactual` compares with what the script does in either branch.
-PONDER writes its own texts on the way, as in an episode.
+For each pair of ``pp-collect pairs`` PONDER reads either past and the common present, and POUNCE acts on the cognition:
+twice on the same pictures, joints and noise. `dual_system.analysis.counterfactual` compares the actions with the
+script's in either branch. PONDER generates its own texts on the way, as in an episode.
 """
 
 from __future__ import annotations
@@ -48,23 +48,21 @@ class CounterfactualOptions:
     ponder: Path
     """PONDER's checkpoint."""
     pounce: Path
-    """POUNCE's checkpoint, trained with it."""
+    """POUNCE's checkpoint, trained with that PONDER."""
     pairs: Path
-    """A folder of pp-pairs, of pictures as large as the cameras that PONDER was trained on, and of videos shown as it
-    has learned from them."""
+    """Folder of pp-collect pairs, with pictures and demonstrations as PONDER was trained on."""
     out: Path
     """Folder for counterfactual.json."""
     draws: int = 4
-    """Flow noise; each draw is given to both branches."""
+    """Number of draws of flow noise per pair; each is used in both branches."""
     age_ms: int = 300
-    """The age that POUNCE is told of what PONDER thinks of the present, which stands still: as when an episode runs."""
+    """Age of the present's cognition in ms, given to POUNCE; in an episode it is PONDER's delay (paper: 300)."""
     progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
+    """Do not show a progress bar."""
 
 
-def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(
-        CounterfactualOptions, args=argv, prog="pp-counterfactual", description=CounterfactualOptions.__doc__
-    )
+def main(argv: list[str] | None = None, prog: str = "pp-diagnose counterfactual") -> int:
+    options = tyro.cli(CounterfactualOptions, args=argv, prog=prog, description=CounterfactualOptions.__doc__)
     try:
         pairs = read_pairs(options.pairs)
         _require_shown_so(options)
@@ -72,7 +70,7 @@ def main(argv: list[str] | None = None) -> int:
         act, pounce = importlib.import_module("pounce_server.party").build_actor(options.pounce)
         entries = scored(tqdm(pairs, unit="pair", disable=not options.progress), read, act, options)
     except (OSError, ValueError) as error:
-        sys.stderr.write(f"pp-counterfactual: {error}\n")
+        sys.stderr.write(f"{prog}: {error}\n")
         return 2
     options.out.mkdir(parents=True, exist_ok=True)
     models = {
@@ -92,12 +90,12 @@ def _require_shown_so(options: CounterfactualOptions) -> None:
         way = f"--demo-hz {learned.hz}" + (" --video-end" if learned.to_its_end else "")
         raise ValueError(
             f"{options.pairs} shows videos {demo_hz} times a second{' and at their end' if video_end else ''}; "
-            f"{options.ponder} has learned from others. Make pairs with pp-pairs {way}."
+            f"{options.ponder} has learned from others. Make pairs with pp-collect pairs {way}."
         )
 
 
 def scored(pairs: Iterable[Pair], read: Read, act: Act, options: CounterfactualOptions) -> list[dict[str, Any]]:
-    """One entry per pair: which, and its mean score over draws and branches, in [0, 1].
+    """Returns one entry per pair: which it is, and its mean score over draws and branches, in [0, 1].
 
     Differences of joints and gripper are weighed by their standard deviation over all pairs' scripts.
 
@@ -122,7 +120,7 @@ def scored(pairs: Iterable[Pair], read: Read, act: Act, options: CounterfactualO
 def _answers(
     pair: Pair, telling: Telling, read: Read, act: Act, options: CounterfactualOptions, index: int
 ) -> NDArray[np.float32]:
-    """What POUNCE does after this past, (draws, H, A)."""
+    """Returns POUNCE's actions after this past, (draws, H, A)."""
     past = [tuple(telling.frames[camera][row] for camera in CAMERAS) for row in range(len(telling.steps))]
     demo = [views for views, is_shown in zip(past, telling.is_demonstration, strict=True) if is_shown]
     seen = [views for views, is_shown in zip(past, telling.is_demonstration, strict=True) if not is_shown]

@@ -48,11 +48,11 @@ class ReplayConfig:
     file: tyro.conf.Positional[Path]
     """Episode log (.mcap, or .mcap.partial of a killed process)."""
     save: Path | None = None
-    """Write the episode and its layout into this .rrd; open it with ``rerun FILE``."""
+    """File (.rrd) to write the episode and its layout to; open it with ``rerun FILE``."""
     screenshot: Path | None = None
-    """Draw without a window into this .png; needs a Vulkan driver (mesa-vulkan-drivers has a software one)."""
+    """File (.png) to draw to without a window; needs a Vulkan driver (mesa-vulkan-drivers has a software one)."""
     at: float = 0.0
-    """Episode time of the screenshot, in seconds."""
+    """Episode time of the screenshot in seconds."""
 
 
 def main(argv: list[str] | None = None) -> int:

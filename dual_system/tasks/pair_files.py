@@ -1,8 +1,8 @@
-"""``pp-pairs``: a dataset of counterfactual pairs, and how to read it.
+"""``pp-collect pairs``: collects a dataset of counterfactual pairs; and its reader.
 
-A folder holds ``pairs.json``, an index that says how videos are shown and has one entry per pair (everything of `Pair`
-that is not an array, and the name of its file), and one ``.npz`` file per pair with these arrays; cameras are ``front``
-and ``wrist``:
+A folder holds ``pairs.json`` and one ``.npz`` file per pair. The index has the rate of the videos' frames and one entry
+per pair: everything of `Pair` that is not an array, and the name of its file. The file has these arrays, where a camera
+is ``front`` or ``wrist``:
 
     now/<camera>                  (image_px, image_px, 3) uint8   the present, the same for both branches
     now/state                     (8,) float32
@@ -24,7 +24,7 @@ import sys
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -44,24 +44,26 @@ _ARRAYS = {"frames", "state"}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairsOptions:
-    """Counterfactual pairs: two pasts of one present."""
+    """Collects counterfactual pairs: two pasts of one present, after which the oracle acts differently."""
 
     family: Literal["counting", "permanence", "reference", "imitation"]
-    """Tasks of this family take turns."""
+    """Family of tasks; its tasks take turns."""
     out: Path
-    """Folder to write to; must not hold pairs yet."""
+    """Folder of the new dataset."""
     pairs: int = 100
+    """Number of pairs."""
     task: tuple[str, ...] = ()
-    """Only these of the family's tasks; by default all that can be forked."""
+    """Names of tasks of the family. Empty: all that can be forked."""
     seed: int = 0
-    """The first to be tried."""
+    """Seed of the first scene of every task."""
     image_px: int = IMAGE_PX
+    """Side of the pictures in pixels (paper and benchmark: 256)."""
     demo_hz: Literal[1, 2, 4, 5, 10, 20] = 1
-    """How often a second conditioning videos are looked at: as the PONDER to be scored has learned from them."""
-    video_end: bool = False
-    """Their last frame, too."""
+    """Rate in Hz of the conditioning video's frames, as the PONDER to be scored was trained on."""
+    video_end: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Add the video's last frame."""
     max_seeds: int = 300
-    """A task that shows no pair in so many seeds is left out, and named."""
+    """Number of seeds in a row without a pair after which a task is left out, and named."""
 
 
 def write_pair(pair: Pair, folder: Path) -> dict[str, Any]:
@@ -101,12 +103,9 @@ def read_pairs(folder: Path) -> Iterator[Pair]:
 
 
 def how_shown_in(folder: Path) -> tuple[int, bool]:
-    """How often a second a folder's videos are looked at, and whether at their last frame, too.
-
-    Raises as `read_pairs`.
-    """
+    """Returns the rate in Hz of a folder's video frames, and whether the last one is added. Raises as `read_pairs`."""
     index = _index(folder)
-    return index.get("demo_hz", 1), index.get("video_end", False)  # folders of before say neither
+    return index.get("demo_hz", 1), index.get("video_end", False)  # older folders have neither
 
 
 def _index(folder: Path) -> dict[str, Any]:
@@ -141,7 +140,7 @@ def _pictures(part: str, arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[n
 
 
 def _pairs_of(task: str, options: PairsOptions) -> Generator[Pair]:
-    """All pairs of one task, seed by seed, until no seed shows any for a long time."""
+    """Yields the pairs of one task, seed by seed, until ``max_seeds`` in a row have none."""
     with (
         make_environment(task, image_px=options.image_px) as own,
         make_environment(task, render=False) as other,
@@ -156,20 +155,20 @@ def _pairs_of(task: str, options: PairsOptions) -> Generator[Pair]:
                 return
 
 
-def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(PairsOptions, args=argv, prog="pp-pairs")
+def main(argv: list[str] | None = None, prog: str = "pp-collect pairs") -> int:
+    options = tyro.cli(PairsOptions, args=argv, prog=prog, description=PairsOptions.__doc__)
     if (options.out / INDEX).exists():
-        sys.stderr.write(f"pp-pairs: {options.out} holds pairs already; give another --out\n")
+        sys.stderr.write(f"{prog}: {options.out} holds pairs already; give another --out\n")
         return 2
     tasks = options.task or tuple(
         name for name in task_names() if make_task(name).family == options.family and make_task(name).can_be_forked()
     )
     strangers = [name for name in tasks if make_task(name).family != options.family]
     if strangers:
-        sys.stderr.write(f"pp-pairs: {', '.join(strangers)}: not of the {options.family} family\n")
+        sys.stderr.write(f"{prog}: {', '.join(strangers)}: not of the {options.family} family\n")
         return 2
     if not tasks:
-        sys.stderr.write(f"pp-pairs: no task of the {options.family} family can be forked yet; see docs/tasks.md\n")
+        sys.stderr.write(f"{prog}: no task of the {options.family} family can be forked yet; see docs/tasks.md\n")
         return 2
     options.out.mkdir(parents=True, exist_ok=True)
     entries: list[dict[str, Any]] = []
@@ -180,7 +179,7 @@ def main(argv: list[str] | None = None) -> int:
                 pair = next(sources[task], None)
                 if pair is None:
                     del sources[task]
-                    sys.stderr.write(f"pp-pairs: {task} shows no pair in {options.max_seeds} seeds; left out\n")
+                    sys.stderr.write(f"{prog}: {task} has no pair in {options.max_seeds} seeds; left out\n")
                     continue
                 entries.append(write_pair(pair, options.out))
                 bar.update()

@@ -31,10 +31,10 @@ from protocol.topics import ACTION, CHUNK, CLOSE, HEALTH, OBSERVATION, OPEN, TIC
 from sim_client.episode import CLOCK_SILENCE_NS
 from sim_client.gateway.body import Body
 from sim_client.gateway.exchange import Answer, Finish, Frames, Refused, Step
+from sim_client.gateway.lease import Lease
 from sim_client.gateway.node import LiveNode, LockstepNode, Node, Shown
 from sim_client.gateway.pictures import resized
 from sim_client.gateway.rule import as_shown
-from sim_client.gateway.seat import Seat
 from sim_client.recorder import Recorder
 from sim_client.suite import versions
 
@@ -56,7 +56,7 @@ _NO_ID = re.compile(r"[^A-Za-z0-9_.-]+")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """What every episode of this gateway has in common."""
+    """The settings that all episodes of this gateway share."""
 
     schedule: Callable[[int], m.Schedule]  # from the episode's seed
     num_rows: int
@@ -90,7 +90,7 @@ class _Episode:
 
 
 class Machine:
-    """One robot for whoever has the seat.
+    """One robot, for the client that holds the lease.
 
     Args:
         link: the robot's end of the bus.
@@ -116,8 +116,8 @@ class Machine:
         self._episode: _Episode | None = None
         self._waiting: list[Future[Answer | None]] = []  # live: asked before the first command
         self._jobs: queue.SimpleQueue[_Job] = queue.SimpleQueue()
-        self._seat = Seat(plan.idle_ns)
-        self._lock = threading.Lock()  # of the seat and the next line: network threads read them
+        self._lease = Lease(plan.idle_ns)
+        self._lock = threading.Lock()  # of the lease and the next line: network threads read them
         self._is_closed = False
         self._should_stop: Callable[[], bool] = lambda: False
         link.bus.declare_alive(alive_key(link.robot, link.proc))
@@ -137,7 +137,7 @@ class Machine:
             if self._is_closed:
                 raise Refused(_STOPPED)
             if isinstance(request, Step):
-                self._seat.take(client, time.monotonic_ns())
+                self._lease.acquire(client, time.monotonic_ns())
             self._jobs.put(job)
         return job.future
 
@@ -183,7 +183,7 @@ class Machine:
         if self._episode is not None and self._episode.client == client:
             self._end(request.status, request.reason)
         with self._lock:
-            self._seat.leave(client)
+            self._lease.release(client)
 
     def _step(self, job: _Job, step: Step) -> None:
         episode = self._episode
@@ -325,7 +325,7 @@ class Machine:
         except (TransportError, MalformedMessage) as error:
             self._end(m.TaskStatus.ABORTED, str(error))
             with self._lock:
-                self._seat.leave(client)
+                self._lease.release(client)
             if _UNREADABLE in str(error):  # the gateway can make them another size
                 raise Refused(f"{error}. See --image-px") from error
             raise

@@ -34,71 +34,74 @@ class GatewayOptions:
     """Lets clients of other protocols drive PONDER and POUNCE: openpi's, the RoboMME challenge's, vla-eval's."""
 
     dialect: DialectName
-    """What the clients speak."""
+    """Protocol of the clients."""
     listen: str = "127.0.0.1:8000"
-    """HOST:PORT for them. Beyond loopback it needs --api-key-file or --open-to-anyone."""
+    """HOST:PORT for the clients. Beyond loopback it needs --api-key-file or --open-to-anyone."""
     api_key_file: Path | None = None
-    """Clients must send the word in this file as "Authorization: Api-Key WORD", as openpi-client's api_key does."""
+    """File with a word that clients must send as "Authorization: Api-Key WORD", as openpi-client's api_key does."""
     open_to_anyone: bool = False
-    """Listen beyond loopback without a key: whoever reaches the port drives the robot."""
+    """Listen beyond loopback without a key: any host that reaches the port drives the robot."""
     mode: Literal["lockstep", "realtime"] = "lockstep"
-    """lockstep: a request is --rows ticks of virtual time, and models may take what they need. realtime: the schedule
-    runs by itself, and a request is answered at once with what is commanded at that moment."""
+    """Clock. lockstep: a request is --rows ticks of virtual time, and models may take their time. realtime: the
+    schedule runs by itself, and a request is answered immediately with the action commanded at that moment."""
     rows: int | None = None
-    """Rows in an answer: what the client plays before it asks again. None: 1, and 20 for the challenge."""
+    """Number of rows in an answer, played by the client before its next request. None: 1, and 20 for the challenge."""
     cameras: tuple[str, ...] = ()
-    """NAME=KEY for each camera of ours, e.g. front=observation/image wrist=observation/wrist_image. Empty: the
+    """Pairs NAME=KEY, one per camera of ours, e.g. front=observation/image wrist=observation/wrist_image. Empty: the
     dialect's usual keys; in vla-eval the first picture is the front camera's and the second the wrist's."""
     state_key: str | None = None
-    """Where the measured joints are. None: the dialect's usual key."""
+    """Key of the measured joints. None: the dialect's usual key."""
     image_px: int | None = None
-    """Resize pictures to squares of this side. None: as they come, and PONDER says if it wants another size."""
+    """Side in pixels of the squares that pictures are resized to. None: no resizing; PONDER refuses a wrong size."""
     robot_file: Path | None = None
     """TOML description of the robot, see docs/gateway.md. None: the Panda of our tasks and of RoboMME."""
     task: str = "gateway"
-    """Name of the task in logs, where the client does not tell it."""
+    """Name of the task in logs if the client does not give one."""
     seed: int = 0
-    """Of the first episode; each further one uses the next."""
+    """Seed of the first episode; each further one uses the next."""
 
     local: bool = False
     """Start ponder-serve, pounce-serve (and in real time clock-serve) on this machine, and stop them at the end."""
     clock: Literal["auto", "embedded", "daemon"] = "auto"
-    """Where the clock service runs. auto: its own process in real time, inside this one in lockstep."""
+    """Place of the clock service. auto: a process of its own in real time, this process in lockstep."""
     link: LinkOptions = field(
         default_factory=lambda: LinkOptions(connect=("tcp/127.0.0.1:7447", "tcp/127.0.0.1:7448", "tcp/127.0.0.1:7449"))
     )
     ponder_checkpoint: Path | None = None
-    """With --local: weights of PONDER; none are random."""
+    """PONDER's checkpoint, with --local. None: random weights."""
     pounce_checkpoint: Path | None = None
+    """POUNCE's checkpoint, with --local. None: random weights."""
     query_period_ms: int = 1000
-    """Between PONDER's looks (paper: 1 Hz)."""
+    """Period of PONDER's queries in ms (paper: 1 Hz)."""
     invoke_every_ticks: int | None = None
-    """Between POUNCE's invocations. None: with every request of several rows; else 20 in lockstep, 10 in real time."""
+    """Period of POUNCE's invocations in 50 ms ticks. None: --rows in lockstep if several; else 20 in lockstep, 10 in
+    real time."""
     demo_hz: Literal[1, 2, 4, 5, 10, 20] | None = None
     """How many frames of a video are shown a second. None: as many as the --ponder-checkpoint says that it has learned
     from; without one, the paper's 1."""
     video_end: bool = False
     """Show a video's last frame, too, although the --ponder-checkpoint does not say that it has learned so."""
     delay_ms: int = 300
-    """Lockstep: PONDER's modelled delay (paper: 300 ms)."""
+    """PONDER's modelled delay in ms, in lockstep (paper: 300)."""
     max_age_ms: int = 2000
-    """Cognition older than this is called stale (an alarm; its rows are still played)."""
+    """Age in ms from which a cognition is called stale (an alarm; its rows are still played)."""
     stale_limit_ms: int = 10_000
-    """Rows made with a cognition older than this are not played: hold, then stop."""
+    """Age in ms from which a cognition's rows are not played: the robot holds, then stops."""
     allow_starved: bool = False
     """Start although the schedule leaves ticks without a row."""
 
     out: Path = Path("out")
     """Folder for one MCAP per episode."""
     record: bool = True
+    """Write one MCAP per episode."""
     pixels: Literal["jpeg", "exact"] = "jpeg"
-    """jpeg: raw frames are logged as JPEG; exact: also bit for bit as the models saw them."""
+    """Form of logged raw frames. jpeg: as JPEG; exact: also bit for bit as the models saw them."""
     patience_s: float = 120.0
-    """How long to wait for servers to be ready, and in lockstep for any command."""
+    """Longest wait in seconds for servers to be ready, and in lockstep for any command."""
     idle_s: float = 300.0
-    """A client that has been silent for so long loses the robot to the next one that asks."""
+    """Time in seconds without a request after which a client loses the robot to the next one that asks."""
     max_message_mb: int = 1024
-    """Larger messages are refused. Two raw 256 px views of a 48 s video are 380 MB."""
+    """Size in MB above which messages are refused. Two raw 256 px views of a 48 s video are 380 MB."""
 
     def check(self) -> None:
         """Raises TransportError for what cannot work together."""

@@ -119,4 +119,4 @@ def test_pairs_whose_videos_are_shown_otherwise_than_ponder_learned_are_refused(
     arguments = ["--ponder", str(ponder), "--pounce", "any", "--pairs", str(pairs), "--out", str(tmp_path / "out")]
     assert counterfactual.main(arguments) == 2
     assert "shows videos 1 times a second; " in (told := capsys.readouterr().err)
-    assert "Make pairs with pp-pairs --demo-hz 2 --video-end." in told
+    assert "Make pairs with pp-collect pairs --demo-hz 2 --video-end." in told

@@ -1,4 +1,4 @@
-"""Everything that an episode needs around it, once: bus, servers, clock service, the robot's end."""
+"""Everything that episodes need around them, opened once: bus, servers, clock service, the robot's end."""
 
 from __future__ import annotations
 
@@ -16,29 +16,30 @@ from protocol.zenoh_bus import open_bus
 from sim_client.config import SimOptions
 from sim_client.launch import Daemons, local_link
 
-Party = Callable[[], bool]
-Build = Callable[[Bus, str, Path | None], Party]
+ServerStep = Callable[[], bool]
+"""One turn of a server that shares this thread; returns whether there was anything to do."""
+BuildServer = Callable[[Bus, str, Path | None], ServerStep]
 """Makes a warm server on a bus, for a robot and from a checkpoint; returns its step function."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Station:
-    """Where episodes are played, any number one after the other. Whoever opened it closes the bus."""
+class Harness:
+    """Plays any number of episodes, one after the other. The caller that opened it closes the bus."""
 
     bus: Bus
     link: Link
     clock: ClockService | None
 
 
-def open_station(
-    options: SimOptions, daemons: Daemons, ponder: Build | None = None, subgoals: str | None = None
-) -> Station:
-    """Starts what the options ask for.
+def open_harness(
+    options: SimOptions, daemons: Daemons, ponder: BuildServer | None = None, subgoals: str | None = None
+) -> Harness:
+    """Starts the servers that the options ask for.
 
     Args:
-        daemons: what is started as processes is theirs to stop.
+        daemons: stops those that are started as processes.
         ponder: in process, a server in place of ``ponder-serve``'s.
-        subgoals: in process, whose texts a POUNCE that reads them is told, "ponder" or "oracle".
+        subgoals: in process, the source of texts for a POUNCE that reads subgoals, "ponder" or "oracle".
 
     Raises:
         TransportError: a bus that cannot be opened, or options that contradict each other.
@@ -50,16 +51,16 @@ def open_station(
             config = ServiceConfig(allow_starved=options.allow_starved, watches=not options.in_process)
             clock = ClockService(Link(bus, robot=options.link.robot, proc="clock"), config)
             add_party(clock.step)
-        return Station(bus=bus, link=Link(bus, robot=options.link.robot, proc="sim"), clock=clock)
+        return Harness(bus=bus, link=Link(bus, robot=options.link.robot, proc="sim"), clock=clock)
     except BaseException:
         bus.close()
         raise
 
 
 def _bus(
-    options: SimOptions, daemons: Daemons, ponder: Build | None, subgoals: str | None
-) -> tuple[Bus, Callable[[Party], None]]:
-    """The bus, and how to add one more party to it if all share this thread."""
+    options: SimOptions, daemons: Daemons, ponder: BuildServer | None, subgoals: str | None
+) -> tuple[Bus, Callable[[ServerStep], None]]:
+    """Returns the bus, and how to add one more server to it if all share this thread."""
     link = options.link
     if options.policy == "oracle":
         return LocalBus(), lambda step: None
@@ -76,7 +77,7 @@ def _bus(
     return open_bus(link), lambda step: None
 
 
-def _builder(module: str) -> Build:
-    """By name: this package never imports torch, so a robot's computer can do without it."""
-    build: Build = importlib.import_module(module).build
+def _builder(module: str) -> BuildServer:
+    """Imports a server by name: this package never imports torch, so a robot's computer can do without it."""
+    build: BuildServer = importlib.import_module(module).build
     return build
