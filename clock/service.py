@@ -73,7 +73,7 @@ class ServiceConfig:
     journal_limit_bytes: int = 2 << 30
     """Observations kept for a PONDER that restarts; beyond it, a restarted PONDER is refused and the ladder acts."""
     watches: bool = True
-    """False when all parties share one thread and none can die alone."""
+    """False when all participants share one thread and none can die alone."""
 
 
 @dataclass(slots=True)

@@ -31,7 +31,7 @@ class Membership:
     """Keeps one server in the episode that the clock service runs.
 
     Args:
-        contract: what the server promises in any episode.
+        contract: what the server promises in any episode; raises ValueError if it cannot promise anything yet.
         open_episode: starts the episode in the engine and promises a contract; raises ValueError to refuse.
         close_episode: forgets the episode; called also before a new one.
     """
@@ -116,7 +116,10 @@ class Membership:
         return m.OpenReply(contract=contract)
 
     def _on_contract(self, request: m.ContractRequest) -> m.ContractReply:
-        return m.ContractReply(contract=self._contract())
+        try:
+            return m.ContractReply(contract=self._contract())
+        except ValueError as error:
+            return m.ContractReply(error=str(error))
 
     def _on_close(self, request: m.CloseRequest) -> m.CloseReply:
         if request.header.episode != self._link.episode:

@@ -6,13 +6,12 @@ import logging
 import sys
 from dataclasses import replace
 
-import tyro
-
 from model_server.daemon import serve_model
 from ponder_server.config import NUM_TORCH_THREADS, PonderOptions
 from ponder_server.contract import BatchingEngine
 from ponder_server.fleet import PonderFleet
 from ponder_server.serve import PonderServer
+from protocol.command_line import parse
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
 
@@ -30,8 +29,8 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     from dual_system.models.bfloat16 import warn_of_slow
     from dual_system.models.ponder import configs
     from dual_system.models.ponder.checkpoint import load_ponder
+    from dual_system.models.ponder.demo_sampling import DemoSampling
     from dual_system.models.ponder.network import Ponder
-    from dual_system.models.ponder.showing import Showing
     from ponder_server.draft import Draft, FirstOf, TrieDraft
     from ponder_server.engine import QwenEngine
     from ponder_server.engine_config import EngineConfig
@@ -55,7 +54,7 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
         size = getattr(configs, options.random.size)()
         ponder = Ponder.random(size, seed=options.random.seed, device=options.device, dtype=dtype)
     trained = ponder.format.demonstrations
-    wanted = Showing(hz=context.demo_hz or trained.hz, to_its_end=context.demo_to_its_end or trained.to_its_end)
+    wanted = DemoSampling(hz=context.demo_hz or trained.hz, to_its_end=context.demo_to_its_end or trained.to_its_end)
     ponder.format = replace(ponder.format, demonstrations=wanted)
     config = EngineConfig(
         max_context_tokens=context.max_context_tokens,
@@ -79,7 +78,7 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(PonderOptions, args=argv, prog="ponder-serve", description=PonderOptions.__doc__)
+    options = parse(PonderOptions, argv, prog="ponder-serve")
     weights = str(options.checkpoint or f"random weights ({options.random.size})")
 
     def make(link: Link, engine: BatchingEngine, heartbeat: Heartbeat, version: str) -> PonderServer | PonderFleet:

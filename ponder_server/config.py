@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import tyro
 
@@ -41,7 +41,7 @@ class ContextOptions:
     """Most tokens of one subgoal or demonstration reasoning."""
     demo_hz: Literal[1, 2, 4, 5, 10, 20] | None = None
     """Frames a second of demonstrations that PONDER asks for. None: as in its training (paper: 1)."""
-    demo_to_its_end: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    demo_to_its_end: bool = False
     """Ask for the last frame of demonstrations as well, although training does not say so."""
 
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 import logging
 import sys
 
-import tyro
-
 from model_server.daemon import serve_model
 from pounce_server.config import NUM_TORCH_THREADS, PounceOptions
 from pounce_server.contract import PounceEngine
 from pounce_server.serve import PounceServer
+from protocol.command_line import parse
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +58,7 @@ def build_engine(options: PounceOptions) -> PounceEngine:
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(PounceOptions, args=argv, prog="pounce-serve", description=PounceOptions.__doc__)
+    options = parse(PounceOptions, argv, prog="pounce-serve")
     weights = str(options.checkpoint or "random weights")
     return serve_model("pounce", options.link, weights, lambda: build_engine(options), PounceServer)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import tyro
 
@@ -34,7 +34,7 @@ class SpeedOptions:
     path: Literal["eager", "compile", "max-autotune", "fused"] = "eager"
     """compile, max-autotune: torch.compile, for either family, a minute at start. fused: Triton kernels, static buffers
     and CUDA graphs for pi0.5; needs a GPU and Triton."""
-    autotune: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    autotune: bool = False
     """With --path fused: time cuBLAS against cuBLASLt for every product, once per GPU; the choice is kept in the user's
     cache folder."""
     weights: Literal["float", "int8"] = "float"
@@ -49,7 +49,7 @@ class ContinuityOptions:
     continuity: Literal["none", "rtc", "trained"] = "none"
     """Whether pi0.5 continues the rows being played. rtc: real-time chunking, at the cost of a backward pass per flow
     step; trained: at no cost, by a checkpoint that learned to (`pp-train --max-committed-rows`)."""
-    roll_forward: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    roll_forward: bool = False
     """Plan from the state that the committed rows lead to instead of the measured one."""
 
 

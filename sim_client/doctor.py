@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import tyro
-
+from protocol.command_line import parse
 from sim_client import doctor_probes as look
 from sim_client.doctor_probes import Finding, Level, Role
 
@@ -101,7 +100,7 @@ def table(findings: Sequence[Finding]) -> str:
 
 
 def main(argv: list[str] | None = None) -> int:
-    config = tyro.cli(DoctorConfig, args=argv, prog="pp-doctor", description=DoctorConfig.__doc__)
+    config = parse(DoctorConfig, argv, prog="pp-doctor")
     findings = list(examine(probes(config)))
     is_fit = not any(finding.level is Level.FAILED for finding in findings)
     if config.json:

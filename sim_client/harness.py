@@ -44,13 +44,13 @@ def open_harness(
     Raises:
         TransportError: a bus that cannot be opened, or options that contradict each other.
     """
-    bus, add_party = _bus(options, daemons, ponder, subgoals)
+    bus, add_participant = _bus(options, daemons, ponder, subgoals)
     try:
         clock = None
         if not options.runs_clock_daemon and options.policy == "servers":
-            config = ServiceConfig(allow_starved=options.allow_starved, watches=not options.in_process)
+            config = ServiceConfig(allow_starved=options.schedule.allow_starved, watches=not options.in_process)
             clock = ClockService(Link(bus, robot=options.link.robot, proc="clock"), config)
-            add_party(clock.step)
+            add_participant(clock.step)
         return Harness(bus=bus, link=Link(bus, robot=options.link.robot, proc="sim"), clock=clock)
     except BaseException:
         bus.close()
@@ -68,12 +68,21 @@ def _bus(
         if options.mode != "lockstep":
             raise TransportError("--in-process shares one thread: use --mode lockstep, or --local")
         bus = LocalBus()
-        bus.add_party((ponder or _builder("ponder_server.party"))(bus, link.robot, options.ponder_checkpoint))
-        pounce = partial(_builder("pounce_server.party"), **({} if subgoals is None else {"subgoals": subgoals}))
-        bus.add_party(pounce(bus, link.robot, options.pounce_checkpoint))
-        return bus, bus.add_party
+        bus.add_participant(
+            (ponder or _builder("ponder_server.in_process"))(bus, link.robot, options.ponder_checkpoint)
+        )
+        pounce = partial(_builder("pounce_server.in_process"), **({} if subgoals is None else {"subgoals": subgoals}))
+        bus.add_participant(pounce(bus, link.robot, options.pounce_checkpoint))
+        return bus, bus.add_participant
     if options.local:
-        link = local_link(options, daemons)
+        link = local_link(
+            daemons,
+            robot=link.robot,
+            with_clock=options.runs_clock_daemon,
+            allow_starved=options.schedule.allow_starved,
+            ponder_checkpoint=options.ponder_checkpoint,
+            pounce_checkpoint=options.pounce_checkpoint,
+        )
     return open_bus(link), lambda step: None
 
 

@@ -28,7 +28,7 @@ class NullPonder(PonderDouble):
 
     @property
     def model_hash(self) -> str:
-        return "silent"
+        return "null"
 
     @property
     def is_fake(self) -> bool:

@@ -6,8 +6,7 @@ import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-from clock.membership import Membership
-
+from model_server.membership import Membership
 from protocol import messages as m
 from protocol import topics
 from protocol.heartbeat import Heartbeat
@@ -32,7 +31,7 @@ class PonderDouble(ABC):
     def __init__(self, link: Link) -> None:
         self.link = link
         self._heartbeat = Heartbeat(link, version(), host_clock_id())
-        self._membership = Membership(link, self._heartbeat, self._open, self.end)
+        self._membership = Membership(link, self._heartbeat, self._contract, self._open, self.end)
         self._queries = link.subscribe(topics.QUERY)
         self._heartbeat.set(state=m.ServingState.READY, progress=1.0)
 
@@ -84,6 +83,9 @@ class PonderDouble(ABC):
         self.link.publish(topics.COGNITION, cognition, at_ns=now_ns, clock_id=host_clock_id())
 
     def _open(self, request: m.OpenRequest) -> m.Contract:
+        return self._contract()
+
+    def _contract(self) -> m.Contract:
         num_carriers, hidden_size = self.shape()
         return m.Contract(
             proc="ponder",

@@ -25,6 +25,7 @@ import tyro
 from rerun.chunk import McapReader
 from rerun.experimental import ViewerClient
 
+from protocol.command_line import parse
 from protocol.errors import ProtocolError
 from protocol.mcap_log import read_log
 from sim_client.blueprint import TIMELINE, episode_blueprint
@@ -56,7 +57,7 @@ class ReplayConfig:
 
 
 def main(argv: list[str] | None = None) -> int:
-    config = tyro.cli(ReplayConfig, args=argv, prog="pp-replay")
+    config = parse(ReplayConfig, argv, prog="pp-replay")
     try:
         with tempfile.TemporaryDirectory(prefix="ponderpounce-replay-") as folder:
             rrd = config.save or Path(folder) / "episode.rrd"

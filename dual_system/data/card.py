@@ -18,6 +18,7 @@ from dual_system.data.dataset import Dataset, Entry
 from dual_system.data.errors import DatasetError
 from dual_system.data.lerobot_v3 import COLLECTION_PATH
 from dual_system.data.video import FPS
+from protocol.command_line import parse
 
 CARD, SHEET = "README.md", "contact_sheet.jpg"
 PICTURES_PER_TASK, PICTURE_PX, LABEL_PX = 8, 128, 14
@@ -33,7 +34,7 @@ class CardOptions:
 
 
 def main(argv: list[str] | None = None, prog: str = "pp-collect card") -> int:
-    options = tyro.cli(CardOptions, args=argv, prog=prog, description=CardOptions.__doc__)
+    options = parse(CardOptions, argv, prog=prog)
     try:
         write_card(options.folder)
     except DatasetError as error:

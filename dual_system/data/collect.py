@@ -15,9 +15,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-import tyro
 from tqdm import tqdm
 
 from dual_system.data.dart import DART, NoiseKind
@@ -32,6 +31,7 @@ from dual_system.data.store import Store
 from dual_system.data.workers import LocalWorkers, RayWorkers, Workers
 from dual_system.tasks.difficulty import Difficulty
 from dual_system.tasks.task import TaskError, chosen_tasks
+from protocol.command_line import parse
 
 SCALES = {"1x": 1, "9x": 9}
 COLLECTING, JOINED = ".collecting", "joined"
@@ -78,9 +78,9 @@ class CollectOptions:
     """Number of worker processes on this computer."""
     ray: str | None = None
     """Address of a Ray cluster to work on instead, or `auto`, or `local`."""
-    keep_episodes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    keep_episodes: bool = False
     """Keep OUT/.collecting, so that more --episodes can be added to the same folder."""
-    progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
+    progress: bool = True
     """Do not show a progress bar."""
 
     def __post_init__(self) -> None:
@@ -160,7 +160,7 @@ class Report:
 
 def main(argv: list[str] | None = None) -> int:
     try:
-        options = tyro.cli(CollectOptions, args=argv, prog="pp-collect", description=CollectOptions.__doc__)
+        options = parse(CollectOptions, argv, prog="pp-collect")
         report = collect(options, _workers(options), say=print_line)
     except (DatasetError, TaskError, OSError) as error:
         sys.stderr.write(f"pp-collect: {error}\n")

@@ -17,7 +17,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 import tyro
@@ -36,6 +36,7 @@ from dual_system.tasks.environment import Environment, Snapshot
 from dual_system.tasks.kinematics import UnreachableError
 from dual_system.tasks.oracle import Motions
 from dual_system.tasks.task import TaskError
+from protocol.command_line import parse
 from protocol.errors import ProtocolError
 from protocol.mcap_log import EpisodeRecord, read_log
 
@@ -61,7 +62,7 @@ class CorrectOptions:
     """Limit of control steps per episode; longer episodes are not kept."""
     workers: int = os.cpu_count() or 1
     """Number of worker processes on this computer."""
-    progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
+    progress: bool = True
     """Do not show a progress bar."""
 
     def __post_init__(self) -> None:
@@ -94,7 +95,7 @@ class Outcome:
 
 def main(argv: list[str] | None = None, prog: str = "pp-collect correct") -> int:
     try:
-        options = tyro.cli(CorrectOptions, args=argv, prog=prog, description=CorrectOptions.__doc__)
+        options = parse(CorrectOptions, argv, prog=prog)
         reasons = correct(options, LocalWorkers(options.workers, work_out))
     except (DatasetError, ProtocolError, TaskError, OSError, ValueError) as error:
         sys.stderr.write(f"{prog}: {error}\n")

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 import tyro
@@ -26,6 +26,7 @@ from dual_system.tasks.environment import Environment, Snapshot, make_environmen
 from dual_system.tasks.task import TaskError
 from protocol import images
 from protocol import messages as m
+from protocol.command_line import parse
 from protocol.errors import ProtocolError
 from protocol.mcap_log import EpisodeRecord, Picture, read_log, read_pictures
 
@@ -46,14 +47,14 @@ class ExportOptions:
     the next one is one that is left. Use follow to train PONDER on policy rollouts."""
     demonstration_hz: Literal[1, 2, 4, 5, 10, 20] = 20
     """Rate of a demonstration's pictures in Hz; its last frame is always rendered. Training reads 1 Hz by default."""
-    only_success: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    only_success: bool = False
     """Leave out episodes that did not succeed."""
-    progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
+    progress: bool = True
     """Do not show a progress bar."""
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(ExportOptions, args=argv, prog="pp-export", description=ExportOptions.__doc__)
+    options = parse(ExportOptions, argv, prog="pp-export")
     try:
         num_episodes = export(options)
     except (DatasetError, ProtocolError, TaskError, OSError) as error:

@@ -52,8 +52,7 @@ class Narrator:
 
     def reasoning(self) -> str:
         """Returns the demonstration reasoning, empty without a demonstration; call it when that has just ended."""
-        has_demonstration = next(self._environment.demonstration(1, look_hz=1), None) is not None
-        return self._environment.reasoning() if has_demonstration else ""
+        return self._environment.reasoning() if self._environment.has_demonstration else ""
 
     def row(self, snapshot: Snapshot, action: Action) -> Row:
         """Returns the row of a snapshot and the action that follows it."""

@@ -135,6 +135,12 @@ class Environment:
         self._require_episode()
         return self._subtasks
 
+    @property
+    def has_demonstration(self) -> bool:
+        """Whether this episode begins with a conditioning video."""
+        self._require_episode()
+        return bool(self._video)
+
     def reset(self, seed: int, difficulty: str | None = None, *, layout: Any = None) -> Snapshot:
         """Starts an episode and returns its first snapshot, after the demonstration if there is one.
 

@@ -24,16 +24,16 @@ import sys
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-import tyro
 from numpy.typing import NDArray
 from tqdm import tqdm
 
 from dual_system.tasks.environment import IMAGE_PX, make_environment
 from dual_system.tasks.pairs import Pair, Telling, find_pair
 from dual_system.tasks.task import make_task, task_names
+from protocol.command_line import parse
 
 INDEX = "pairs.json"
 SCHEMA = "ponderpounce-pairs/1"
@@ -60,8 +60,8 @@ class PairsOptions:
     """Side of the pictures in pixels (paper and benchmark: 256)."""
     demo_hz: Literal[1, 2, 4, 5, 10, 20] = 1
     """Rate in Hz of the conditioning video's frames, as the PONDER to be scored was trained on."""
-    video_end: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Add the video's last frame."""
+    demo_to_its_end: bool = False
+    """Take the video's last frame as well."""
     max_seeds: int = 300
     """Number of seeds in a row without a pair after which a task is left out, and named."""
 
@@ -86,10 +86,12 @@ def write_pair(pair: Pair, folder: Path) -> dict[str, Any]:
     return entry
 
 
-def write_index(entries: list[dict[str, Any]], folder: Path, *, demo_hz: int = 1, video_end: bool = False) -> None:
+def write_index(
+    entries: list[dict[str, Any]], folder: Path, *, demo_hz: int = 1, demo_to_its_end: bool = False
+) -> None:
     """Replaces the index in one go."""
     partial = folder / f"{INDEX}.partial"
-    index = {"schema": SCHEMA, "demo_hz": demo_hz, "video_end": video_end, "pairs": entries}
+    index = {"schema": SCHEMA, "demo_hz": demo_hz, "demo_to_its_end": demo_to_its_end, "pairs": entries}
     partial.write_text(json.dumps(index, indent=1) + "\n")
     partial.replace(folder / INDEX)
 
@@ -102,10 +104,10 @@ def read_pairs(folder: Path) -> Iterator[Pair]:
     return (_read_pair(entry, folder) for entry in _index(folder)["pairs"])
 
 
-def how_shown_in(folder: Path) -> tuple[int, bool]:
+def demo_sampling_of(folder: Path) -> tuple[int, bool]:
     """Returns the rate in Hz of a folder's video frames, and whether the last one is added. Raises as `read_pairs`."""
     index = _index(folder)
-    return index.get("demo_hz", 1), index.get("video_end", False)  # older folders have neither
+    return index["demo_hz"], index["demo_to_its_end"]
 
 
 def _index(folder: Path) -> dict[str, Any]:
@@ -147,7 +149,7 @@ def _pairs_of(task: str, options: PairsOptions) -> Generator[Pair]:
     ):
         num_barren = 0
         for seed in itertools.count(options.seed):
-            pair = find_pair(own, other, task, seed, demo_hz=options.demo_hz, video_end=options.video_end)
+            pair = find_pair(own, other, task, seed, demo_hz=options.demo_hz, demo_to_its_end=options.demo_to_its_end)
             num_barren = 0 if pair else num_barren + 1
             if pair:
                 yield pair
@@ -156,7 +158,7 @@ def _pairs_of(task: str, options: PairsOptions) -> Generator[Pair]:
 
 
 def main(argv: list[str] | None = None, prog: str = "pp-collect pairs") -> int:
-    options = tyro.cli(PairsOptions, args=argv, prog=prog, description=PairsOptions.__doc__)
+    options = parse(PairsOptions, argv, prog=prog)
     if (options.out / INDEX).exists():
         sys.stderr.write(f"{prog}: {options.out} holds pairs already; give another --out\n")
         return 2
@@ -185,7 +187,7 @@ def main(argv: list[str] | None = None, prog: str = "pp-collect pairs") -> int:
                 bar.update()
     for source in sources.values():
         source.close()  # frees its cameras
-    write_index(entries, options.out, demo_hz=options.demo_hz, video_end=options.video_end)
+    write_index(entries, options.out, demo_hz=options.demo_hz, demo_to_its_end=options.demo_to_its_end)
     sys.stdout.write(f"{len(entries)} pairs of {options.family}: {options.out / INDEX}\n")
     return 0 if len(entries) == options.pairs else 1
 

@@ -69,12 +69,12 @@ def find_pair(
     variant: int | None = None,
     *,
     demo_hz: int = PAST_HZ,
-    video_end: bool = False,
+    demo_to_its_end: bool = False,
 ) -> Pair | None:
     """Plays one episode until its twin would act differently; returns None if there is no such moment in it.
 
     Without a variant, those of `Task.retold` take turns by seed, and cuts are the latest. Frames of conditioning videos
-    are taken at ``demo_hz`` and, with ``video_end``, at the end.
+    are taken at ``demo_hz`` and, with ``demo_to_its_end``, at the end.
 
     Both environments must be of the task; only the first needs cameras. Raises RuntimeError if the two branches do not
     look the same, which would be a defect.
@@ -105,8 +105,8 @@ def find_pair(
         instruction=own.instruction,
         frames=dict(now.frames),
         state=now.state,
-        own=_telling(own, found.own, demo_hz, video_end),
-        twin=_telling(own, found.twin, demo_hz, video_end),
+        own=_telling(own, found.own, demo_hz, demo_to_its_end),
+        twin=_telling(own, found.twin, demo_hz, demo_to_its_end),
     )
 
 
@@ -164,9 +164,9 @@ def _goes_apart(environment: Environment, found: Fork) -> bool:
     return bool(np.abs(own - twin).max() > _PARTED)
 
 
-def _telling(environment: Environment, branch: Branch, demo_hz: int, video_end: bool) -> Telling:
+def _telling(environment: Environment, branch: Branch, demo_hz: int, demo_to_its_end: bool) -> Telling:
     environment.restore(branch.now, look=False)
-    seen = [*_shown(environment, demo_hz, video_end), *_past(environment, branch)]
+    seen = [*_video(environment, demo_hz, demo_to_its_end), *_past(environment, branch)]
     oracle = oracle_chunk(environment, branch.now)
     environment.restore(branch.now, look=False)
     next_ = environment.step(oracle[0], look=False)  # texts follow by one step
@@ -182,8 +182,8 @@ def _telling(environment: Environment, branch: Branch, demo_hz: int, video_end: 
     )
 
 
-def _shown(environment: Environment, demo_hz: int, video_end: bool) -> list[Snapshot]:
-    if not video_end:
+def _video(environment: Environment, demo_hz: int, demo_to_its_end: bool) -> list[Snapshot]:
+    if not demo_to_its_end:
         return [*environment.demonstration(demo_hz)]
     every = CONTROL_HZ // demo_hz
     video = [*environment.demonstration(look_hz=demo_hz)]  # in between there are no pictures

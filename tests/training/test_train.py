@@ -19,8 +19,8 @@ from dual_system.models.action_space import ActionSpace, num_dims
 from dual_system.models.pi05.pounce import PounceConfig
 from dual_system.models.pi05.prompt import with_subgoal
 from dual_system.models.ponder.checkpoint import load_ponder
+from dual_system.models.ponder.demo_sampling import DemoSampling, declared
 from dual_system.models.ponder.network import Ponder
-from dual_system.models.ponder.showing import Showing, declared
 from dual_system.models.pounce.checkpoint import load_bundle
 from dual_system.training import recipes, train
 from dual_system.training.chunks import chunk_ticks
@@ -127,9 +127,9 @@ def test_a_trained_ponder_says_how_demonstrations_were_shown(tmp_path: Path, is_
     for seed, num_demo in ((1, 42), (2, 46), (3, 0)):
         writer.add(unpack(_episode(seed, num_demo, () if is_rendered else (num_demo - 1,))))
     writer.finish()
-    assert TrainingSet(tmp_path / "set").showing(2) == Showing(hz=2, to_its_end=is_rendered)
+    assert TrainingSet(tmp_path / "set").showing(2) == DemoSampling(hz=2, to_its_end=is_rendered)
     train.train(options(tmp_path / "set", tmp_path / "out"))
-    assert declared(tmp_path / "out" / "ponder") == Showing(hz=1, to_its_end=is_rendered)
+    assert declared(tmp_path / "out" / "ponder") == DemoSampling(hz=1, to_its_end=is_rendered)
 
 
 def test_without_demonstrations_nobody_says_how_they_are_shown(tmp_path: Path) -> None:

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-import tyro
 from torch import Tensor
 
 from dual_system.models.groot import weights as groot_weights
@@ -37,6 +36,7 @@ from dual_system.models.pounce.checkpoint import (
 )
 from dual_system.models.pounce.family import tensor_shapes
 from dual_system.models.public_layout import COGNITION, read_tensors, write_tensors
+from protocol.command_line import parse
 
 PREFIX_FILE = "pounce_prefix.safetensors"
 Layout = Literal["openpi", "lerobot"]
@@ -58,7 +58,7 @@ class ExportOptions:
 
 
 def main(argv: list[str] | None = None, prog: str = "pp-export hf") -> int:
-    options = tyro.cli(ExportOptions, args=argv, prog=prog, description=ExportOptions.__doc__)
+    options = parse(ExportOptions, argv, prog=prog)
     try:
         export_folder(options)
     except (OSError, ValueError) as error:
