@@ -24,7 +24,6 @@ from typing import Any
 
 import numpy as np
 import psutil
-import tyro
 from numpy.typing import NDArray
 
 from benchmarks.noop_policy import (
@@ -44,6 +43,7 @@ from benchmarks.report import Report, Row, show, spread
 from clock.schedules import realtime
 from protocol import images, topics
 from protocol import messages as m
+from protocol.command_line import parse
 from protocol.errors import CallFailed
 from protocol.link import Link
 from protocol.memory import keep_freed_memory
@@ -386,7 +386,7 @@ _NO_COGNITION: NDArray[np.float32] = np.zeros((0, 0), np.float32)
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(BusOptions, args=argv, prog="bus-latency")
+    options = parse(BusOptions, argv, prog="bus-latency")
     report = Report(
         name="bus_latency",
         question="How long does a policy call take when the policy costs nothing? Numpy arrays to numpy chunk.",

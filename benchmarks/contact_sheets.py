@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import simplejpeg
-import tyro
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -21,6 +20,7 @@ from benchmarks.recorded import Recording, layout_of, read, recorded_tasks
 from dual_system.tasks.engine import Status
 from dual_system.tasks.environment import Environment, EpisodeState, make_environment
 from dual_system.tasks.scene import CAMERAS
+from protocol.command_line import parse
 
 _GAP_PX = 4
 _DEMO = 0  # frame_phase of the conditioning video
@@ -85,7 +85,7 @@ def sheet(rows: list[list[NDArray[np.uint8]]]) -> NDArray[np.uint8]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(SheetsOptions, args=argv, prog="contact-sheets")
+    options = parse(SheetsOptions, argv, prog="contact-sheets")
     options.out.mkdir(parents=True, exist_ok=True)
     for task in options.tasks or recorded_tasks(options.recordings):
         recording, layout = read(task, options.recordings), layout_of(task)

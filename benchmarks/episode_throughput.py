@@ -16,9 +16,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
-import tyro
-
 from benchmarks.report import Report, Row, show, spread
+from protocol.command_line import parse
 
 CONTROL_HZ = 20
 
@@ -92,7 +91,7 @@ def row_of(name: str, episodes: list[Episode]) -> Row:
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(ThroughputOptions, args=argv, prog="episode-throughput")
+    options = parse(ThroughputOptions, argv, prog="episode-throughput")
     report = Report(
         name="episode_throughput",
         question="How many simulated seconds does one wall second give in lockstep?",

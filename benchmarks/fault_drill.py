@@ -21,13 +21,13 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import tyro
 
 from benchmarks.noop_policy import INSTRUCTION, NUM_PROPRIO
 from benchmarks.report import Report, Row, show
 from benchmarks.rig import Rig
 from clock.check import disagreements
 from protocol import messages as m
+from protocol.command_line import parse
 from protocol.errors import ProtocolError
 from protocol.mcap_log import read_log
 from sim_client.launch import free_ports
@@ -231,7 +231,7 @@ def timeline_row(name: str, blow: Blow, trials: list[Trial]) -> Row:
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(DrillOptions, args=argv, prog="fault-drill")
+    options = parse(DrillOptions, argv, prog="fault-drill")
     report = Report(
         name="fault_drill",
         question="What happens when a daemon dies or freezes in mid-episode?",

@@ -25,6 +25,7 @@ from pounce_server.contract import EngineSpec, Progress, Request, no_progress
 from pounce_server.serve import PounceServer
 from protocol import images, topics
 from protocol import messages as m
+from protocol.command_line import parse
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
 from protocol.process import host_clock_id, run, set_up_logging
@@ -188,7 +189,7 @@ class NoopOptions:
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(NoopOptions, args=argv, prog="noop-policy")
+    options = parse(NoopOptions, argv, prog="noop-policy")
     set_up_logging("ERROR")
     signal.signal(signal.SIGTERM, lambda number, frame: os._exit(0))
     if options.wire == "openpi":

@@ -16,7 +16,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-import tyro
 
 import dual_system.tasks.headless  # noqa: F401 - before anything that imports mujoco
 
@@ -27,6 +26,7 @@ from benchmarks.rig import Rig
 from clock.report import num_starved
 from dual_system.tasks.environment import make_environment
 from protocol import messages as m
+from protocol.command_line import parse
 
 PERIOD_NS = 50_000_000
 BINS_MS = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, np.inf)
@@ -139,7 +139,7 @@ def histogram(played: dict[str, Played]) -> list[Row]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(JitterOptions, args=argv, prog="playback-jitter")
+    options = parse(JitterOptions, argv, prog="playback-jitter")
     report = Report(
         name="playback_jitter",
         question="How late are the ticks of a real-time episode at 20 Hz, and are any missed?",

@@ -16,16 +16,16 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-import tyro
+from clock.membership import percentile_ns
 
 from benchmarks.report import Report, Row, show, spread
-from clock.membership import percentile_ns
 from dual_system.models.ponder.configs import tiny_cpu
 from dual_system.models.ponder.network import Ponder
 from ponder_server.admission import Admission
 from ponder_server.contract import Frame, Opening, SessionError
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
+from protocol.command_line import parse
 
 MAX_CONTEXT_TOKENS = 16_384
 LONG_CONTEXT_TOKENS = 14_000
@@ -65,7 +65,7 @@ class Robot:
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(ConcurrencyOptions, args=argv, prog="ponder-concurrency")
+    options = parse(ConcurrencyOptions, argv, prog="ponder-concurrency")
     torch.set_num_threads(options.threads)
     report = Report(
         name="ponder_concurrency",

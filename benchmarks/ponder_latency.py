@@ -27,7 +27,6 @@ from typing import Literal
 
 import numpy as np
 import torch
-import tyro
 from torch import Tensor, nn
 
 from benchmarks.report import Report, Row, show, spread
@@ -41,6 +40,7 @@ from ponder_server.draft import Draft, NoDraft, TrieDraft
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
 from ponder_server.mtp import MtpDraft
+from protocol.command_line import parse
 
 SESSION = "bench"
 WAYS_TO_ENCODE = {"in forwards of 2048 tokens": 2048, "an instant a forward": 1}
@@ -72,7 +72,7 @@ class LatencyOptions:
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(LatencyOptions, args=argv, prog="ponder-latency")
+    options = parse(LatencyOptions, argv, prog="ponder-latency")
     torch.set_num_threads(NUM_TORCH_THREADS)
     report = Report(
         name="ponder_latency",

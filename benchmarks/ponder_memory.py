@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Literal, TypeVar
 
 import torch
-import tyro
 from torch import Tensor
 
 from benchmarks.report import Report, Row, show, spread
@@ -31,6 +30,7 @@ from dual_system.models.ponder.network import Ponder
 from ponder_server.config import SizeName
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
+from protocol.command_line import parse
 from protocol.mcap_log import read_log
 from sim_client.launch import Daemons, start_local
 
@@ -58,7 +58,7 @@ class MemoryOptions:
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(MemoryOptions, args=argv, prog="ponder-memory")
+    options = parse(MemoryOptions, argv, prog="ponder-memory")
     torch.set_num_threads(1)
     report = Report(
         name=f"ponder_memory_{options.size}",

@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
-import tyro
 from torch import Tensor
 
 from benchmarks.report import Report, Row, show, spread
@@ -34,6 +33,7 @@ from pounce_server.engine import EagerEngine
 from pounce_server.fused import FusedPounce, fused_for
 from pounce_server.int8 import quantise
 from pounce_server.precision import cast_for_serving
+from protocol.command_line import parse
 
 CompileMode = Literal["default", "reduce-overhead", "max-autotune"]
 Call = Callable[[], Tensor | None]
@@ -156,7 +156,7 @@ class Ways:
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(LatencyOptions, args=argv, prog="pounce-latency")
+    options = parse(LatencyOptions, argv, prog="pounce-latency")
     torch.set_num_threads(options.threads)
     is_usual = (options.size, options.device, options.dtype) == ("tiny", "cpu", "float32")
     report = Report(

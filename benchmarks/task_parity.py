@@ -15,13 +15,13 @@ from itertools import groupby
 from pathlib import Path
 
 import numpy as np
-import tyro
 from numpy.typing import NDArray
 
 from benchmarks.recorded import Recording, layout_of, read, recorded_tasks
 from benchmarks.report import Report, Row, show
 from dual_system.tasks.engine import Status
 from dual_system.tasks.environment import Environment, Snapshot, make_environment
+from protocol.command_line import parse
 
 MAX_LENGTH_OFF, MAX_PX, MAX_M = 0.2, 4, 0.005
 
@@ -157,7 +157,7 @@ def farthest_m(env: Environment, names: Sequence[str], theirs: NDArray[np.float3
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(ParityOptions, args=argv, prog="task-parity")
+    options = parse(ParityOptions, argv, prog="task-parity")
     report = Report(
         name="task_parity",
         question="Are our tasks the public benchmark's? One recorded episode of each, in the same scene.",

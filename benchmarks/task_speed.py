@@ -15,10 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import tyro
-
 from benchmarks.report import Report, Row, show
 from dual_system.tasks.task import task_names
+from protocol.command_line import parse
 
 _PEER_KEYS = ("simulated_s", "wall_s", "cpu_s")
 _OUR_KEYS = ("stepped_s", "step_wall_s", "step_cpu_s")
@@ -82,7 +81,7 @@ def step_row(name: str, runs: list[dict[str, Any]], keys: tuple[str, str, str], 
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(SpeedOptions, args=argv, prog="task-speed")
+    options = parse(SpeedOptions, argv, prog="task-speed")
     tasks = options.tasks or task_names()
     report = Report(
         name="task_speed",

@@ -19,7 +19,6 @@ from typing import Literal
 
 import numpy as np
 import torch
-import tyro
 from dual_system.models.eyes import readable_sizes
 from dual_system.training.nudge import NO_NUDGE
 from dual_system.training.training_episode import TrainingEpisode
@@ -38,6 +37,7 @@ from dual_system.training.joint import Draws, JointModel, PonderBatch, PounceBat
 from dual_system.training.recipe import Recipe, stages_of
 from dual_system.training.recipes import recipe
 from dual_system.training.trainer import Trainer
+from protocol.command_line import parse
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,7 +62,7 @@ class ThroughputOptions:
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(ThroughputOptions, args=argv, prog="training-throughput")
+    options = parse(ThroughputOptions, argv, prog="training-throughput")
     torch.set_num_threads(options.threads)
     report = Report(
         name=f"training_throughput_{options.device}",

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-import tyro
 from dual_system.training.muon import Muon
 from torch import Tensor, nn
 
@@ -21,6 +20,7 @@ from dual_system.models.ponder.network import Ponder
 from dual_system.training.optim import is_turned
 from dual_system.training.recipe import stages_of
 from dual_system.training.recipes import recipe
+from protocol.command_line import parse
 
 _RATE = 1e-3
 
@@ -36,7 +36,7 @@ class UpdateOptions:
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(UpdateOptions, args=argv, prog="training-update")
+    options = parse(UpdateOptions, argv, prog="training-update")
     torch.set_num_threads(options.threads)
     report = Report(
         name="training_update_cpu",

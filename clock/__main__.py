@@ -5,10 +5,9 @@ from __future__ import annotations
 import logging
 import sys
 
-import tyro
-
 from clock.config import ClockOptions
 from clock.service import ClockService
+from protocol.command_line import parse
 from protocol.errors import TransportError
 from protocol.link import Link
 from protocol.process import IDLE_WAIT_NS, StopFlag, freeze_heap, set_up_logging
@@ -18,7 +17,7 @@ log = logging.getLogger("clock-serve")
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(ClockOptions, args=argv, prog="clock-serve", description=ClockOptions.__doc__)
+    options = parse(ClockOptions, argv, prog="clock-serve")
     set_up_logging()
     should_stop = StopFlag()
     try:

@@ -19,6 +19,7 @@ from clock.check_findings import Disagreement, compare
 from clock.check_ticks import check_deadlines, check_rows
 from clock.report import CLOCK_LOST_EVENT, statistics, stream_sha256
 from clock.residual import DEFAULT_LOADER, RESIDUAL_EVENT, ResidualHead, load_head
+from protocol.command_line import parse
 from protocol.errors import ProtocolError
 from protocol.mcap_log import EpisodeRecord, read_log, recover
 from protocol.messages import Mode
@@ -86,7 +87,7 @@ def check_result(record: EpisodeRecord) -> Iterator[Disagreement]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    config = tyro.cli(CheckConfig, args=argv, prog="pp-check")
+    config = parse(CheckConfig, argv, prog="pp-check")
     if not config.files or (config.recover is not None and len(config.files) != 1):
         sys.stderr.write("pp-check: name at least one log, and exactly one with --recover\n")
         return UNREADABLE

@@ -6,8 +6,7 @@ import getpass
 import sys
 from dataclasses import dataclass, field
 
-import tyro
-
+from protocol.command_line import parse
 from protocol.errors import TransportError
 from protocol.link import Link
 from protocol.messages import EngageRequest
@@ -27,7 +26,7 @@ class EngageOptions:
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(EngageOptions, args=argv, prog="pp-engage", description=EngageOptions.__doc__)
+    options = parse(EngageOptions, argv, prog="pp-engage")
     try:
         bus = open_bus(options.link)
         try:

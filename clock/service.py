@@ -19,7 +19,8 @@ from clock.residual import RESIDUAL_EVENT, ResidualHead, check_head
 from clock.timebase import MonotonicClock, VirtualClock
 from clock.watch import HEARTBEAT_TIMEOUT_NS, Watch
 from protocol import messages as m
-from protocol.errors import CallFailed, ProtocolError
+from protocol.drops import DropReason
+from protocol.errors import CallFailed, EpisodeRefused, ProtocolError
 from protocol.link import Link, Service, is_of_episode
 from protocol.process import host_clock_id
 from protocol.topics import (
@@ -72,7 +73,7 @@ class ServiceConfig:
     journal_limit_bytes: int = 2 << 30
     """Observations kept for a PONDER that restarts; beyond it, a restarted PONDER is refused and the ladder acts."""
     watches: bool = True
-    """False when all parties share one thread and none can die alone."""
+    """False when all participants share one thread and none can die alone."""
 
 
 @dataclass(slots=True)
@@ -172,12 +173,12 @@ class ClockService:
         if len(observation.proprio) != episode.request.info.robot.num_proprio:
             expected = episode.request.info.robot.num_proprio
             detail = f"expected {expected} joints, came {len(observation.proprio)}"
-            self._link.drop(observation.header.proc, "wrong_shape", detail)
+            self._link.drop(observation.header.proc, DropReason.WRONG_SHAPE, detail)
             return False
         if observation.header.clock_id != m.EPISODE_CLOCK:
             offset = self._offsets.get(observation.header.proc)
             if offset is None:
-                self._link.drop(observation.header.proc, "unknown_clock", observation.header.clock_id)
+                self._link.drop(observation.header.proc, DropReason.UNKNOWN_CLOCK, observation.header.clock_id)
                 return False
             zero_ns = episode.clock.zero_ns if isinstance(episode.clock, MonotonicClock) else self._host.now_ns()
             observation = replace(observation, source_ns=offset.to_ours(observation.source_ns) - zero_ns)
@@ -189,7 +190,7 @@ class ClockService:
         return True
 
     def _unasked(self, what: str, index: int, header: m.Header) -> bool:
-        self._link.drop(f"{header.proc}#{header.boot_id}", "unasked", f"{what} {index}")
+        self._link.drop(f"{header.proc}#{header.boot_id}", DropReason.UNASKED, f"{what} {index}")
         return False
 
     def _look_around(self) -> None:
@@ -260,18 +261,18 @@ class ClockService:
         header = info.header
         if header.epoch <= self._last_epoch.get(header.session, 0):
             last = self._last_epoch[header.session]
-            return m.OpenReply(error=f"epoch {header.epoch} of session {header.session} is not after {last}")
+            error = f"epoch {header.epoch} of session {header.session} is not after {last}"
+            return m.OpenReply(error=error, refusal=m.Refusal.REQUEST)
         if self._episode is not None and self._episode.request.info.header.session != header.session:
-            return m.OpenReply(
-                error=f"robot {self._link.robot} is busy with episode {self._link.episode}", try_again=True
-            )
+            error = f"robot {self._link.robot} is busy with episode {self._link.episode}"
+            return m.OpenReply(error=error, refusal=m.Refusal.BUSY, try_again=True)
         if self._episode is not None:
             self._finish(None)  # the same robot starts over: its old episode is abandoned
         if info.policy != "servers":
             return self._begin(request, contracts=(), warnings=(), committed_ticks=0)
         not_ready = self._not_ready() if self._config.watches else ""
         if not_ready:
-            return m.OpenReply(error=not_ready, try_again=True)
+            return m.OpenReply(error=not_ready, refusal=m.Refusal.NOT_READY, try_again=True)
         try:
             self._link.enter_episode(header.session, header.episode, header.epoch)
             self._measure_offsets(SERVERS if info.robot.is_simulated else (*SERVERS, "sim"))
@@ -280,7 +281,8 @@ class ClockService:
         except (CallFailed, ProtocolError) as error:
             self._close_servers(None)
             self._link.leave_episode()
-            return m.OpenReply(error=str(error))
+            refusal = error.refusal if isinstance(error, EpisodeRefused) else m.Refusal.UNSPECIFIED
+            return m.OpenReply(error=str(error), refusal=refusal)
         return self._begin(request, contracts, warnings, committed_ticks)
 
     def _begin(
@@ -338,17 +340,18 @@ class ClockService:
             self._offsets[proc] = offset
 
     def _open_at(self, proc: str, request: m.OpenRequest) -> m.Contract:
-        """Raises ProtocolError if the server refuses, CallFailed if it does not answer."""
+        """Raises EpisodeRefused if the server refuses, CallFailed if it does not answer."""
         reply = self._link.call(OPEN, proc, request, timeout_ns=_OPEN_NS)
         if reply.error or reply.contract is None:
-            raise ProtocolError(f"{proc} refuses the episode: {reply.error or 'it sent no contract'}")
+            why = reply.error or "it sent no contract"
+            raise EpisodeRefused(reply.refusal, f"{proc} refuses the episode: {why}")
         return reply.contract
 
     def _agree(self, info: m.EpisodeInfo, contracts: Sequence[m.Contract]) -> tuple[list[str], int]:
         """Warnings and the ticks an invocation takes.
 
         Raises:
-            ProtocolError: the parts do not fit, the schedule cannot be kept, or a fake model would drive a real robot.
+            EpisodeRefused: the parts do not fit, the schedule cannot be kept, or untrained weights would move a robot.
         """
         ponder, pounce = contracts
         fits = (
@@ -357,27 +360,31 @@ class ClockService:
         )
         for what, left, right in fits:
             if pounce.num_carriers and left != right:
-                raise ProtocolError(
-                    f"{what}: PONDER gives {left}, POUNCE expects {right}. Load checkpoints trained together."
+                raise EpisodeRefused(
+                    m.Refusal.MODELS,
+                    f"{what}: PONDER gives {left}, POUNCE expects {right}. Load checkpoints trained together.",
                 )
         if (pounce.horizon, pounce.action_dim) != (info.schedule.horizon, info.robot.action_dim):
-            raise ProtocolError(
+            raise EpisodeRefused(
+                m.Refusal.ROBOT,
                 f"POUNCE gives chunks of ({pounce.horizon}, {pounce.action_dim}), the episode was opened for "
-                f"({info.schedule.horizon}, {info.robot.action_dim}). Set --horizon, or load another checkpoint."
+                f"({info.schedule.horizon}, {info.robot.action_dim}). Set --horizon, or load another checkpoint.",
             )
         if self._config.residual is not None:
             try:
                 check_head(self._config.residual, info.robot)
             except ValueError as error:
-                raise ProtocolError(str(error)) from error
+                raise EpisodeRefused(m.Refusal.ROBOT, str(error)) from error
         fake = [c.proc for c in contracts if c.is_fake]
         if fake and not info.robot.is_simulated:
-            raise ProtocolError(f"{' and '.join(fake)} run untrained weights; a real robot is not theirs to move.")
+            raise EpisodeRefused(
+                m.Refusal.MODELS, f"{' and '.join(fake)} run untrained weights, which never move a real robot."
+            )
         warnings = [f"{proc} runs untrained weights: expect motion, not skill" for proc in fake]
         feasibility = check_feasible(info.schedule, pounce.infer_p99_ns)
         if not feasibility.is_feasible:
             if info.schedule.mode == m.Mode.REALTIME and not self._config.allow_starved:
-                raise ProtocolError(f"the schedule cannot be kept: {feasibility.sentence()}")
+                raise EpisodeRefused(m.Refusal.SCHEDULE, f"the schedule cannot be kept: {feasibility.sentence()}")
             warnings.append(feasibility.sentence())
         return warnings, feasibility.delay_ticks
 

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import dual_system.tasks.headless  # noqa: F401 - before anything that imports mujoco
 from clock.service import ClockService, ServiceConfig
-from ponder_server import party as ponder
-from pounce_server import party as pounce
+from ponder_server import in_process as ponder
+from pounce_server import in_process as pounce
 from protocol.bus import LocalBus
 from protocol.link import Link
 from protocol.mcap_log import read_log
@@ -24,12 +24,12 @@ from sim_client.suite import Suite
 def main(out: Path) -> None:
     options = SimOptions(in_process=True, max_steps=60, out=out)
 
-    # Four parties on one bus. Each has a step function; whoever waits for an answer lets the others take steps.
+    # Four participants on one bus. Each has a step function; whoever waits for an answer lets the others take steps.
     bus = LocalBus()
-    bus.add_party(ponder.build(bus, "r0", checkpoint=None))
-    bus.add_party(pounce.build(bus, "r0", checkpoint=None))
+    bus.add_participant(ponder.build(bus, "r0", checkpoint=None))
+    bus.add_participant(pounce.build(bus, "r0", checkpoint=None))
     clock = ClockService(Link(bus, robot="r0", proc="clock"), ServiceConfig(watches=False))
-    bus.add_party(clock.step)
+    bus.add_participant(clock.step)
     suite = Suite(options, Link(bus, robot="r0", proc="sim"), clock, check_servers=lambda: "")
 
     (episode,) = suite.run()["episodes"]

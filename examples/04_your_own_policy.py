@@ -84,16 +84,16 @@ def episode(out: Path) -> None:
     import dual_system.tasks.headless  # noqa: F401, I001 - before anything that imports mujoco
 
     from clock.service import ClockService, ServiceConfig
-    from ponder_server import party as ponder
+    from ponder_server import in_process as ponder
     from protocol.mcap_log import read_log
     from sim_client.config import SimOptions
     from sim_client.suite import Suite
 
     bus = LocalBus()
-    bus.add_party(ponder.build(bus, "r0", checkpoint=None))
-    bus.add_party(server_on(bus).step)
+    bus.add_participant(ponder.build(bus, "r0", checkpoint=None))
+    bus.add_participant(server_on(bus).step)
     clock = ClockService(Link(bus, robot="r0", proc="clock"), ServiceConfig(watches=False))
-    bus.add_party(clock.step)
+    bus.add_participant(clock.step)
     options = SimOptions(in_process=True, max_steps=40, out=out)
     suite = Suite(options, Link(bus, robot="r0", proc="sim"), clock, check_servers=lambda: "")
     (played,) = suite.run()["episodes"]

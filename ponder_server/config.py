@@ -1,10 +1,12 @@
-"""Options of ``ponder-serve``, and the engine that they describe."""
+"""Options of ``ponder-serve``."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
+
+import tyro
 
 from ponder_server.context_policy import PolicyName
 from ponder_server.contract import WeightsName
@@ -17,41 +19,78 @@ NUM_TORCH_THREADS = 1  # on a CPU one thread per process beats two: a contended 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RandomOptions:
+    """The network without --checkpoint: it moves a robot and knows nothing."""
+
+    size: SizeName = "tiny_cpu"
+    """Size of the random network. It has the tiny vocabulary at every size."""
+    seed: int = 0
+    """Seed of the random weights."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ContextOptions:
+    """What a session's context holds."""
+
+    max_context_tokens: int = 16_384
+    """Most tokens of one session (paper, section 3.4)."""
+    when_full: PolicyName = "refuse"
+    """Refuse the query; forget the oldest queries but not the demonstration; or forget old pictures and keep
+    carriers."""
+    max_text_tokens: int = 256
+    """Most tokens of one subgoal or demonstration reasoning."""
+    demo_hz: Literal[1, 2, 4, 5, 10, 20] | None = None
+    """Frames a second of demonstrations that PONDER asks for. None: as in its training (paper: 1)."""
+    demo_to_its_end: bool = False
+    """Ask for the last frame of demonstrations as well, although training does not say so."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpeedOptions:
+    """What a query costs; texts and cognitions stay the same up to rounding."""
+
+    weights: WeightsName = "float"
+    """Precision of the layers' weights. int8 (CPU) and fp8 (GPU of compute capability 8.9 or more) take one byte each;
+    the change of cognition is measured at start and logged."""
+    graphs: bool = True
+    """On a GPU, record forwards as CUDA graphs at start."""
+    attention_threads: int = 1
+    """Threads for long-context attention on a CPU; at most the number of usable cores. The answers stay the same. One
+    leaves the next core to POUNCE, whose deadlines are nearer."""
+    draft_texts: Path | None = None
+    """File of example texts, one a line: texts like them are decoded several tokens a forward."""
+    draft_tokens: int = 0
+    """Tokens that the checkpoint's multi-token prediction drafts at a time where the examples have no draft; at most
+    15."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RobotsOptions:
+    """Several robots, one network."""
+
+    other_robots: tuple[str, ...] = ()
+    """Further robots to serve; they share the weights with --link.robot and are batched together."""
+    max_sessions: int = 2
+    """Contexts held at once; their memory is allocated at start."""
+    max_batch_rows: int = 8
+    """Most robots in one forward. With 1, no robot's answer depends on the others in its last bits."""
+    latency_budget_ms: int = 1000
+    """With other robots: most time from a query to its cognition when all ask at once with full contexts. An episode
+    that would exceed it is refused."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PonderOptions:
     """PONDER (System 2): keeps the episode in Qwen3.5's causal context and answers queries with a cognition."""
 
-    link: LinkOptions = field(default_factory=lambda: LinkOptions(listen=("tcp/127.0.0.1:7448",)))
     checkpoint: Path | None = None
-    """Folder in the Hugging Face layout; none: random weights, which are no policy."""
-    size: SizeName = "tiny_cpu"
-    """Of the random network, if there is no checkpoint. It speaks the tiny vocabulary at every size."""
-    seed: int = 0
-    """Of the random weights, if there is no checkpoint."""
+    """Folder in the Hugging Face layout. None: random weights, which are no policy."""
     device: str = "cpu"
+    """Device of the network: cpu, cuda or cuda:N."""
     dtype: Literal["float32", "bfloat16"] = "float32"
-    attention_threads: int = 1
-    """That share a long context's attention on a CPU, as many as this process may use cores at most. The answers stay
-    the same. By default 1: the next core is POUNCE's, whose deadlines are nearer."""
-    max_context_tokens: int = 16_384
-    """Per session (paper, section 3.4)."""
-    when_full: PolicyName = "refuse"
-    """Refuse the query; forget the oldest queries but not the demonstration; or forget old pictures, keep carriers."""
-    max_sessions: int = 2
-    max_text_tokens: int = 256
-    other_robots: tuple[str, ...] = ()
-    """Robots to serve beside --link.robot, with the same weights and in common forwards."""
-    max_batch_rows: int = 8
-    """Robots that share a forward at most. With 1, no device's answers depend on other robots in their last bits."""
-    latency_budget_ms: int = 1000
-    """With other robots: from a query to its cognition when all ask at once, with full contexts; an episode that
-    breaks it is refused."""
-    draft_texts: Path | None = None
-    """File of example texts, one a line: texts like them are written several tokens a forward."""
-    draft_tokens: int = 0
-    """Tokens that the checkpoint's multi-token prediction guesses at a time where the examples have no guess, 15 at
-    most. The texts stay the same ones."""
-    weights: WeightsName = "float"
-    """int8, on a CPU, and fp8: a byte a weight of the layers, a quarter of float32's memory; the change of cognition is
-    measured at start and told. fp8 products are taken by GPUs that have them (compute capability 8.9), in bfloat16."""
-    graphs: bool = True
-    """On a GPU forwards are CUDA graphs, recorded at start. --no-graphs: as on a CPU, where there are none."""
+    """Number format of weights and activations."""
+    link: LinkOptions = field(default_factory=lambda: LinkOptions(listen=("tcp/127.0.0.1:7448",)))
+    context: tyro.conf.OmitArgPrefixes[ContextOptions] = field(default_factory=ContextOptions)
+    speed: tyro.conf.OmitArgPrefixes[SpeedOptions] = field(default_factory=SpeedOptions)
+    robots: tyro.conf.OmitArgPrefixes[RobotsOptions] = field(default_factory=RobotsOptions)
+    random: tyro.conf.OmitArgPrefixes[RandomOptions] = field(default_factory=RandomOptions)

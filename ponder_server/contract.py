@@ -12,8 +12,8 @@ from typing import Generic, Literal, Protocol, TypeAlias, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from dual_system.models.ponder.demo_sampling import PAPER_SAMPLING, DemoSampling
 from dual_system.models.ponder.observation import WHOLE_VIEWS, ObservationReader
-from dual_system.models.ponder.showing import AS_IN_THE_PAPER, Showing
 
 Frame: TypeAlias = npt.NDArray[np.uint8]
 """One camera image, (h, w, 3) uint8 RGB."""
@@ -70,13 +70,18 @@ class EngineSpec:
     """Of weights and activations, e.g. "float32"; cognition is float32 always."""
     reader: ObservationReader = WHOLE_VIEWS
     """What is read of the frames and of the robot's state."""
-    demonstrations: Showing = AS_IN_THE_PAPER
+    demonstrations: DemoSampling = PAPER_SAMPLING
     """How a demonstration is to be sampled."""
     session_bytes: int = 0
     """Memory of one session at its longest; that of all of them is allocated at start."""
     weights: WeightsName = "float"
     cognition_error: float = 0.0
     """Relative L2 change of C that ``weights`` cost, after one and the same short context (the warm-up's)."""
+
+    @property
+    def is_fake(self) -> bool:
+        """Something that was drawn, not trained, decides the answers."""
+        return self.is_random
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

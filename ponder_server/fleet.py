@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from clock.membership import percentile_ns
+from model_server.shell import percentile_ns
 from ponder_server.admission import Admission
 from ponder_server.contract import (
     BatchingEngine,
@@ -138,7 +138,7 @@ class RobotServer(PonderServer):
         except (SessionError, ValueError) as error:
             self._fail(work, error)
         else:
-            self._thinking = work, self._start()
+            self._thinking = work, self._begin_inference("fire")
         return True
 
     def _next_asked(self) -> Work | None:
@@ -163,7 +163,7 @@ class RobotServer(PonderServer):
             return False
         work, start_ns = self._thinking
         self._thinking = None
-        self._stop()
+        self._end_inference()
         if isinstance(outcome.error, ValueError):
             self._fail(work, outcome.error)
         else:
@@ -191,7 +191,7 @@ class RobotServer(PonderServer):
         self._waiting.clear()
         if self._thinking is not None:
             self._thinking = None
-            self._stop()
+            self._end_inference()
         self._admission.release(self._link.robot)
         super()._close()
 

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from clock.rendezvous import Rendezvous
 from dual_system.models.action_space import ROBOT_DIM
+from model_server.rendezvous import Rendezvous
 from ponder_server.contract import EngineSpec, Fire, Frame, Proprio
 from protocol import images
 from protocol import messages as m
-from protocol.errors import MalformedMessage
+from protocol.errors import EpisodeRefused, MalformedMessage
 
 KEEP_QUERIES = 8
 """All of them matter: a query skipped is a gap in the context."""
@@ -118,24 +118,27 @@ def _work(query: m.Query, observation: m.Observation) -> Work:
 
 
 def check_robot(robot: m.Robot, spec: EngineSpec) -> None:
-    """Raises ValueError unless the engine can read what this robot's cameras will give: no robot moves unseen."""
+    """Raises EpisodeRefused unless the engine can read what this robot's cameras will give: no robot moves unseen."""
     if len(robot.cameras) != spec.num_cameras:
-        raise ValueError(
+        raise EpisodeRefused(
+            m.Refusal.CAMERAS,
             f"robot {robot.name!r} has {len(robot.cameras)} cameras {list(robot.cameras)}; PONDER expects "
-            f"{spec.num_cameras}"
+            f"{spec.num_cameras}",
         )
     if spec.reader.state_rows and robot.num_proprio != ROBOT_DIM:
-        raise ValueError(
+        raise EpisodeRefused(
+            m.Refusal.ROBOT,
             f"robot {robot.name!r} has a state of {robot.num_proprio} numbers; this PONDER reads {ROBOT_DIM}, the "
-            "Panda's joints and a finger"
+            "Panda's joints and a finger",
         )
     size = (robot.image_height, robot.image_width)
     found = spec.reader.unreadable([size] * len(robot.cameras), spec.image_px)
     if found is not None:
         camera, wanted = found
-        raise ValueError(
+        raise EpisodeRefused(
+            m.Refusal.CAMERAS,
             f"robot {robot.name!r}: camera {robot.cameras[camera]!r} gives {size[0]} x {size[1]} px; "
-            f"PONDER reads {wanted}"
+            f"PONDER reads {wanted}",
         )
 
 

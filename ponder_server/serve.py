@@ -6,13 +6,15 @@ import contextlib
 import logging
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 
-from clock.membership import Membership, percentile_ns
+from model_server.shell import ModelShell
 from ponder_server.contract import ContextFull, Fire, Opening, PonderEngine, SessionError
 from ponder_server.node import PonderNode, Work, check_robot
 from protocol import codec, images, topics
 from protocol import messages as m
-from protocol.errors import CallFailed, MalformedMessage, ProtocolError
+from protocol.drops import DropReason
+from protocol.errors import CallFailed, EpisodeRefused, MalformedMessage, ProtocolError
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link, is_of_episode
 from protocol.process import host_clock_id
@@ -20,42 +22,20 @@ from protocol.process import host_clock_id
 log = logging.getLogger(__name__)
 
 
-class PonderServer:
-    """PONDER on a bus. ``step`` does one piece of work and says whether there was any."""
+class PonderServer(ModelShell):
+    """PONDER on a bus."""
 
     def __init__(self, link: Link, engine: PonderEngine, heartbeat: Heartbeat, version: str) -> None:
-        self._link = link
+        super().__init__(link, engine, heartbeat, version)
         self._engine = engine
-        self._heartbeat = heartbeat
-        self._version = version
         self._node = PonderNode(engine.spec)
-        self._membership = Membership(link, heartbeat, self._open, self._close)
-        self._observations = link.subscribe(topics.OBSERVATION, keep=8)
         self._queries = link.subscribe(topics.QUERY)
-        self._context_tokens = 0
 
-    def warm_up(self) -> None:
-        """Measures the engine before anybody relies on it; the first fires of a process are no measure."""
-        self._heartbeat.set(state=m.ServingState.WARMING)
-        durations_ns = self._engine.warm_up()
+    def _weights_note(self) -> str:
         spec = self._engine.spec
-        self._heartbeat.set(
-            infer_p50_ns=percentile_ns(durations_ns, 50),
-            infer_p99_ns=percentile_ns(durations_ns, 99),
-            model_hash=spec.model_hash,
-            is_fake=spec.is_random,
-            progress=1.0,
-        )
-        if spec.weights != "float":
-            told = f"{spec.weights} weights: relative L2 change of cognition {spec.cognition_error:.1e} at start"
-            self._heartbeat.set(detail=told)
-            log.info("%s", told)
-
-    def ready(self) -> None:
-        """Joins a running episode, if there is one, and only then says that it is ready."""
-        self.rejoin()
-        self._heartbeat.set(state=m.ServingState.READY)
-        log.info("ready infer_p50_ms=%.1f", self._heartbeat.health.infer_p50_ns / 1e6)
+        if spec.weights == "float":
+            return ""
+        return f"{spec.weights} weights: relative L2 change of cognition {spec.cognition_error:.1e} at start"
 
     def step(self) -> bool:
         worked = self._listen()
@@ -68,9 +48,7 @@ class PonderServer:
         """Takes in everything that came; whether there was a call among it."""
         self._heartbeat.beat()
         worked = self._membership.step()
-        for observation in self._observations.drain():
-            if is_of_episode(self._link, observation.header):
-                self._see(observation)
+        self._take_observations()
         for query in self._queries.drain():
             if query.header.episode != self._link.episode:
                 worked |= self.rejoin()  # restarted, or opened elsewhere: we are asked about an episode unknown to us
@@ -85,13 +63,10 @@ class PonderServer:
             try:
                 return self._node.next_work()
             except MalformedMessage as error:
-                self._link.drop("observation", "no_picture", str(error))
+                self._link.drop("observation", DropReason.NO_PICTURE, str(error))
 
-    def _see(self, observation: m.Observation) -> None:
-        try:
-            self._node.on_observation(observation)
-        except MalformedMessage as error:
-            self._link.drop(f"{observation.header.proc}#{observation.header.boot_id}", "wrong_shape", str(error))
+    def _on_observation(self, observation: m.Observation) -> None:
+        self._node.on_observation(observation)
 
     def rejoin(self) -> bool:
         """After a restart: asks for the episode and every observation that was queried, and thinks it all over."""
@@ -133,28 +108,16 @@ class PonderServer:
         self._link.leave_episode()
 
     def _fire(self, work: Work) -> None:
-        start_ns = self._start()
-        try:
-            fire = self._think(work)
-        except (ContextFull, SessionError, ValueError) as error:
-            self._refuse(work, error)
-        else:
-            self._answer(work, fire, start_ns)
-        finally:
-            self._stop()
+        with self._inferring("fire") as start_ns:
+            try:
+                fire = self._think(work)
+            except (ContextFull, SessionError, ValueError) as error:
+                self._refuse(work, error)
+            else:
+                self._answer(work, fire, start_ns)
 
     def _think(self, work: Work) -> Fire:
         return self._engine.fire(self._link.episode, work.frames, self._heartbeat.beat, proprio=work.proprio)
-
-    def _start(self) -> int:
-        """Says that a query is being thought about; since when."""
-        self._phase("fire")
-        self._heartbeat.set(is_inferring=True)
-        return time.monotonic_ns()
-
-    def _stop(self) -> None:
-        self._phase("idle")
-        self._heartbeat.set(is_inferring=False)
 
     def _refuse(self, work: Work, error: Exception) -> None:
         """The engine is as it was. The clock sees no answer, cognition ages, and the ladder acts."""
@@ -166,14 +129,9 @@ class PonderServer:
         self._link.publish(topics.COGNITION, cognition, at_ns=ready_ns, clock_id=host_clock_id())
         for subgoal in subgoals:
             self._link.publish(topics.SUBGOAL, subgoal, at_ns=ready_ns, clock_id=host_clock_id())
-        self._heartbeat.set(next_index=self._node.next_query, num_answered=self._heartbeat.health.num_answered + 1)
+        self._answered(self._node.next_query)
 
-    def _open(self, request: m.OpenRequest) -> m.Contract:
-        check_robot(request.info.robot, self._engine.spec)
-        demo = tuple(tuple(images.unpack(image) for image in frame.images) for frame in request.demo)
-        opening = Opening(instruction=request.info.instruction, demo_frames=demo)
-        self._context_tokens = self._engine.open(self._link.episode, opening, self._heartbeat.beat)
-        self._node.open()
+    def _contract(self) -> m.Contract:
         spec = self._engine.spec
         return m.Contract(
             proc="ponder",
@@ -183,22 +141,24 @@ class PonderServer:
             infer_p50_ns=self._heartbeat.health.infer_p50_ns,
             infer_p99_ns=self._heartbeat.health.infer_p99_ns,
             model_hash=spec.model_hash,
-            is_fake=spec.is_random,
+            is_fake=spec.is_fake,
             version=self._version,
-            context_tokens=self._context_tokens,
             max_context_tokens=spec.max_context_tokens,
+            demonstrations=m.DemoSampling(hz=spec.demonstrations.hz, to_its_end=spec.demonstrations.to_its_end),
         )
+
+    def _open(self, request: m.OpenRequest) -> m.Contract:
+        check_robot(request.info.robot, self._engine.spec)
+        demo = tuple(tuple(images.unpack(image) for image in frame.images) for frame in request.demo)
+        opening = Opening(instruction=request.info.instruction, demo_frames=demo)
+        try:
+            context_tokens = self._engine.open(self._link.episode, opening, self._heartbeat.beat)
+        except SessionError as error:
+            raise EpisodeRefused(m.Refusal.BUSY, str(error)) from error
+        self._node.open()
+        return replace(self._contract(), context_tokens=context_tokens)
 
     def _close(self) -> None:
         with contextlib.suppress(SessionError):  # the engine may have refused to open it
             self._engine.close(self._link.episode)
         self._node.open()
-
-    def _phase(self, state: str) -> None:
-        at_ns = time.monotonic_ns()
-        self._link.publish(topics.PHASE, m.Phase(state=state), at_ns=at_ns, clock_id=host_clock_id())
-
-    def _tell(self, severity: m.Severity, name: str, text: str) -> None:
-        log.log(logging.WARNING if severity > m.Severity.INFO else logging.INFO, "event name=%s %s", name, text)
-        event = m.Event(severity=severity, name=name, text=text)
-        self._link.publish(topics.EVENT, event, at_ns=time.monotonic_ns(), clock_id=host_clock_id())

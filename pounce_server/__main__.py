@@ -5,12 +5,11 @@ from __future__ import annotations
 import logging
 import sys
 
-import tyro
-
-from clock.daemon import serve_model
+from model_server.daemon import serve_model
 from pounce_server.config import NUM_TORCH_THREADS, PounceOptions
 from pounce_server.contract import PounceEngine
 from pounce_server.serve import PounceServer
+from protocol.command_line import parse
 
 log = logging.getLogger(__name__)
 
@@ -36,26 +35,30 @@ def build_engine(options: PounceOptions) -> PounceEngine:
     if options.checkpoint is not None:
         bundle = load_bundle(options.checkpoint, tokenizer=options.tokenizer)
         family = family_of_config(bundle.model.config)
-        if options.family not in (None, family):
-            raise ValueError(f"checkpoint {options.checkpoint} holds {family}; leave --family {options.family} out")
+        if options.random.family not in (None, family):
+            raise ValueError(
+                f"checkpoint {options.checkpoint} holds {family}; leave --family {options.random.family} out"
+            )
     else:
-        hidden_size = options.hidden_size or tiny_ponder().hidden_size
-        tiny = tiny_groot if options.family == "groot" else tiny_cpu
-        bundle = random_bundle(tiny(num_carriers=options.num_carriers, cognition_size=hidden_size), options.seed)
+        hidden_size = options.random.hidden_size or tiny_ponder().hidden_size
+        tiny = tiny_groot if options.random.family == "groot" else tiny_cpu
+        bundle = random_bundle(
+            tiny(num_carriers=options.random.num_carriers, cognition_size=hidden_size), options.random.seed
+        )
     return EagerEngine(
         bundle,
         device=options.device,
         dtype=options.dtype,
-        continuity=options.continuity,
-        path=options.path,
-        rolls_forward=options.roll_forward,
-        weights=options.weights,
-        autotune=options.autotune,
+        continuity=options.chunks.continuity,
+        path=options.speed.path,
+        rolls_forward=options.chunks.roll_forward,
+        weights=options.speed.weights,
+        autotune=options.speed.autotune,
     )
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(PounceOptions, args=argv, prog="pounce-serve", description=PounceOptions.__doc__)
+    options = parse(PounceOptions, argv, prog="pounce-serve")
     weights = str(options.checkpoint or "random weights")
     return serve_model("pounce", options.link, weights, lambda: build_engine(options), PounceServer)
 

@@ -6,40 +6,67 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+import tyro
+
 from protocol.options import LinkOptions
 
 NUM_TORCH_THREADS = 1  # on a CPU one thread per process beats two: a contended second one costs more than it gives
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PounceOptions:
-    """POUNCE (System 1): turns an observation, a cognition and its age into a chunk of 20 rows."""
+class RandomOptions:
+    """The network without --checkpoint: it moves a robot and knows nothing."""
 
-    link: LinkOptions = field(default_factory=lambda: LinkOptions(listen=("tcp/127.0.0.1:7449",)))
-    checkpoint: Path | None = None
-    """Folder with config.json and model.safetensors: ours, openpi's or lerobot's pi0.5, NVIDIA's or lerobot's GR00T
-    N1.5; none: random weights."""
     family: Literal["pi05", "groot"] | None = None
-    """Action model of the random weights, pi0.5 by default; a checkpoint knows its own, and must be this one."""
-    tokenizer: Path | None = None
-    """tokenizer.model (pi0.5) or tokenizer.json (GR00T), if the checkpoint folder has none."""
-    seed: int = 0
-    """Of the random weights, if there is no checkpoint."""
+    """Action model of the random weights; None: pi05. With --checkpoint, what the folder must hold."""
     num_carriers: int = 1
     """K of the random weights; must be PONDER's."""
     hidden_size: int | None = None
-    """H of the random weights; must be PONDER's. Default: the tiny PONDER's."""
-    device: str = "cpu"
+    """H of the random weights; must be PONDER's. None: the tiny PONDER's."""
+    seed: int = 0
+    """Seed of the random weights."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpeedOptions:
+    """How an invocation is computed."""
+
     path: Literal["eager", "compile", "max-autotune", "fused"] = "eager"
     """compile, max-autotune: torch.compile, for either family, a minute at start. fused: Triton kernels, static buffers
     and CUDA graphs for pi0.5; needs a GPU and Triton."""
     autotune: bool = False
-    """fused: time cuBLAS against cuBLASLt for every product, once for a GPU; kept in the user's cache folder."""
-    dtype: Literal["float32", "bfloat16"] = "float32"
+    """With --path fused: time cuBLAS against cuBLASLt for every product, once per GPU; the choice is kept in the user's
+    cache folder."""
     weights: Literal["float", "int8"] = "float"
-    """int8: a quarter of the memory on a CPU; the error of the actions is measured at start and told."""
+    """Precision of the weights. int8: a quarter of the memory on a CPU; the error of the actions is measured at start
+    and logged."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ContinuityOptions:
+    """How a chunk continues the one being played."""
+
     continuity: Literal["none", "rtc", "trained"] = "none"
-    """Whether pi0.5 continues the rows that are being played. rtc: real-time chunking, for a backward pass per flow
+    """Whether pi0.5 continues the rows being played. rtc: real-time chunking, at the cost of a backward pass per flow
     step; trained: at no cost, by a checkpoint that learned to (`pp-train --max-committed-rows`)."""
     roll_forward: bool = False
     """Plan from the state that the committed rows lead to instead of the measured one."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PounceOptions:
+    """POUNCE (System 1): turns an observation, a cognition and its age into a chunk of 20 rows."""
+
+    checkpoint: Path | None = None
+    """Folder with config.json and model.safetensors: ours, openpi's or lerobot's pi0.5, NVIDIA's or lerobot's GR00T
+    N1.5. None: random weights, which are no policy."""
+    tokenizer: Path | None = None
+    """tokenizer.model (pi0.5) or tokenizer.json (GR00T), if the checkpoint folder has none."""
+    device: str = "cpu"
+    """Device of the network: cpu, cuda or cuda:N."""
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """Number format of weights and activations."""
+    link: LinkOptions = field(default_factory=lambda: LinkOptions(listen=("tcp/127.0.0.1:7449",)))
+    speed: tyro.conf.OmitArgPrefixes[SpeedOptions] = field(default_factory=SpeedOptions)
+    chunks: tyro.conf.OmitArgPrefixes[ContinuityOptions] = field(default_factory=ContinuityOptions)
+    random: tyro.conf.OmitArgPrefixes[RandomOptions] = field(default_factory=RandomOptions)

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from dual_system.models.action_space import ActionSpace
 from dual_system.models.arm import JOINT_HIGH_RAD, JOINT_LOW_RAD, NUM_ARM_JOINTS
-from protocol.messages import Robot
+from protocol.errors import EpisodeRefused
+from protocol.messages import Refusal, Robot
 
 DTypeName: TypeAlias = Literal["float32", "bfloat16"]
 WeightsName: TypeAlias = Literal["float", "int8"]
@@ -64,6 +65,11 @@ class EngineSpec:
     reads_subgoal: bool = False
     """The engine reads PONDER's newest subgoal in place of cognition (then K = 0)."""
 
+    @property
+    def is_fake(self) -> bool:
+        """Something that was drawn, not trained, decides the answers."""
+        return self.is_random or self.has_fresh_prefix
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Request:
@@ -110,24 +116,30 @@ class PounceEngine(Protocol):
 
 
 def check_robot(robot: Robot, spec: EngineSpec) -> None:
-    """Raises ValueError, with the reason, if the engine cannot read this robot or its chunks are none for it.
+    """Raises EpisodeRefused if the engine cannot read this robot or its chunks are none for it.
 
     Horizon and row size are the clock's to compare: it knows the schedule.
     """
     if robot.num_proprio != spec.proprio_dim:
-        raise ValueError(f"POUNCE reads {spec.proprio_dim} joint values, the robot has {robot.num_proprio}")
+        raise EpisodeRefused(
+            Refusal.ROBOT, f"POUNCE reads {spec.proprio_dim} joint values, the robot has {robot.num_proprio}"
+        )
     if spec.num_cameras and len(robot.cameras) != spec.num_cameras:
         names = ", ".join(robot.cameras) or "none"
-        raise ValueError(f"POUNCE sees through {spec.num_cameras} cameras, the robot has {len(robot.cameras)}: {names}")
+        raise EpisodeRefused(
+            Refusal.CAMERAS,
+            f"POUNCE reads {spec.num_cameras} cameras, the robot has {len(robot.cameras)}: {names}",
+        )
     if spec.space == "joint_delta":
         return
     low, high = robot.command_low[:NUM_ARM_JOINTS], robot.command_high[:NUM_ARM_JOINTS]
     is_panda = len(low) == NUM_ARM_JOINTS and (low >= JOINT_LOW_RAD - _LIMIT_SLACK_RAD).all()
     if not (is_panda and (high <= JOINT_HIGH_RAD + _LIMIT_SLACK_RAD).all()):
-        raise ValueError(
+        raise EpisodeRefused(
+            Refusal.ROBOT,
             f"this checkpoint moves the tool ({spec.space}) and knows the Panda's arm only; {robot.name} has joint "
             f"limits {np.round(low, 2).tolist()} to {np.round(high, 2).tolist()} rad beyond it. Load a joint_delta "
-            "checkpoint."
+            "checkpoint.",
         )
 
 

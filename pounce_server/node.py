@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from clock.playback import tick_at
-from clock.rendezvous import Rendezvous
+from model_server.rendezvous import Rendezvous
 from pounce_server.contract import EngineSpec, Request
-from pounce_server.told import Told
+from pounce_server.subgoal_text import SubgoalText
 from protocol import images
 from protocol import messages as m
 from protocol.errors import MalformedMessage
@@ -31,9 +31,9 @@ class Work:
 
 
 class PounceNode:
-    def __init__(self, spec: EngineSpec, told: Told | None = None) -> None:
+    def __init__(self, spec: EngineSpec, texts: SubgoalText | None = None) -> None:
         self._spec = spec
-        self._told = told
+        self._texts = texts
         self._rendezvous: Rendezvous[m.Invocation] = Rendezvous(keep_requests=KEEP_INVOCATIONS)
         self._info: m.EpisodeInfo | None = None
 
@@ -45,8 +45,8 @@ class PounceNode:
         """Starts an episode, or with None forgets it."""
         self._rendezvous.clear()
         self._info = info
-        if self._told is not None:
-            self._told.clear()
+        if self._texts is not None:
+            self._texts.clear()
 
     def on_observation(self, observation: m.Observation) -> None:
         """Keeps what an invocation may name; one without any picture none does (`Conductor.will_look`).
@@ -64,8 +64,8 @@ class PounceNode:
         self._rendezvous.on_observation(observation)
 
     def on_subgoal(self, subgoal: m.Subgoal) -> None:
-        if self._told is not None:
-            self._told.hear(subgoal)
+        if self._texts is not None:
+            self._texts.on_subgoal(subgoal)
 
     def on_invocation(self, invocation: m.Invocation) -> None:
         self._rendezvous.on_request(invocation)
@@ -104,7 +104,7 @@ class PounceNode:
             previous_rows=previous_rows.reshape(-1, self._spec.action_dim) if previous_rows.size else None,
             previous_row0=max(0, late_ticks),
             committed_rows=invocation.committed_rows,
-            subgoal="" if self._told is None else self._told.at(invocation),
+            subgoal="" if self._texts is None else self._texts.at(invocation),
         )
         return Work(invocation=invocation, request=request)
 

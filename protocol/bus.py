@@ -106,11 +106,11 @@ class Bus(Protocol):
 
 
 class LocalBus:
-    """All parties in one process and one thread: a message is in its subscribers' rings when ``publish`` returns.
+    """All participants in one process and one thread: ``publish`` returns with a message in its subscribers' rings.
 
-    A call is answered by running the other parties' ``step`` functions (``add_party``) until one replies; a party that
-    waits for a call of its own is not stepped meanwhile, as it would not be over zenoh. Used by the in-process lockstep
-    mode and by tests; it is the whole difference between them and zenoh.
+    A call is answered by running the other participants' ``step`` functions until one replies; a participant that waits
+    for a call of its own is not stepped meanwhile, as it would not be over zenoh. Used by the in-process lockstep mode
+    and by tests; it is the whole difference between them and zenoh.
     """
 
     is_local = True
@@ -120,12 +120,12 @@ class LocalBus:
         self._inboxes: dict[str, Inbox] = {}
         self._alive: list[str] = []
         self._watchers: list[tuple[str, Subscription]] = []
-        self._parties: list[Callable[[], bool]] = []
+        self._participants: list[Callable[[], bool]] = []
         self._stepping: set[int] = set()
 
-    def add_party(self, step: Callable[[], bool]) -> None:
+    def add_participant(self, step: Callable[[], bool]) -> None:
         """``step`` does one piece of pending work and says whether there was any."""
-        self._parties.append(step)
+        self._participants.append(step)
 
     def publish(self, key: str, payload: bytes, *, encoding: str, attachment: bytes, priority: Priority) -> None:
         sample = Sample(key, payload, encoding, attachment)
@@ -148,20 +148,20 @@ class LocalBus:
         answers: list[bytes] = []
         inbox.put(Request(payload, answers.append))
         while not answers:
-            if not self.run_parties():
+            if not self.run_participants():
                 raise CallFailed(key, timeout_ns / 1e6, "its server has nothing to do and did not answer")
         return answers[0]
 
-    def run_parties(self) -> bool:
-        """Lets every party do one piece of work; False if nobody had any."""
-        return any([self._step(number) for number in range(len(self._parties))])  # a list: everybody gets a turn
+    def run_participants(self) -> bool:
+        """Lets every participant do one piece of work; False if nobody had any."""
+        return any([self._step(number) for number in range(len(self._participants))])  # a list: everybody gets a turn
 
     def _step(self, number: int) -> bool:
         if number in self._stepping:
             return False
         self._stepping.add(number)
         try:
-            return self._parties[number]()
+            return self._participants[number]()
         finally:
             self._stepping.discard(number)
 
@@ -188,7 +188,7 @@ class LocalBus:
         return subscription
 
     def wait(self, timeout_ns: int) -> None:
-        self.run_parties()
+        self.run_participants()
 
     def close(self) -> None:
         self._subscriptions.clear()

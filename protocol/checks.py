@@ -27,6 +27,7 @@ MAX_ID = 128
 MAX_INSTANT_NS = 10**18  # 31 years: more is a unit mistake
 MAX_INDEX = 2**53
 MAX_DEMO_FRAMES = 600
+MAX_DEMO_HZ = 1000
 MAX_DECAY = 10  # per chunk: exp(-10) is nothing
 MAX_JOURNAL_ENTRIES = 64
 
@@ -222,8 +223,7 @@ def check_tick(t: m.Tick) -> None:
     )
 
 
-def check_subgoal(s: m.Subgoal) -> None:
-    _chosen(s, "kind")
+def check_subgoal(s: m.Subgoal) -> None:  # of whatever kind: it is logged, and nobody acts on an unknown one
     _text(s, "text")
     _index(s, "tick")
     _require(len(s.token_ids) <= MAX_TEXT, s, "token_ids", f"at most {MAX_TEXT}", len(s.token_ids))
@@ -307,6 +307,15 @@ def check_open_request(r: m.OpenRequest) -> None:
 def check_contract(c: m.Contract) -> None:
     _text(c, "proc", "model_hash", "version", limit=MAX_ID)
     _duration(c, "infer_p50_ns", "infer_p99_ns")
+    if c.demonstrations is not None:
+        hz = c.demonstrations.hz
+        _require(1 <= hz <= MAX_DEMO_HZ, c, "demonstrations.hz", f"1..{MAX_DEMO_HZ}", hz)
+
+
+def check_contract_reply(r: m.ContractReply) -> None:
+    _text(r, "error")
+    if r.contract is not None:
+        check_contract(r.contract)
 
 
 def check_open_reply(r: m.OpenReply) -> None:
@@ -378,6 +387,7 @@ CHECKS: dict[type, Callable[[Any], None]] = {
     m.EpisodeResult: check_episode_result,
     m.OpenRequest: check_open_request,
     m.OpenReply: check_open_reply,
+    m.ContractReply: check_contract_reply,
     m.CloseRequest: check_close_request,
     m.CloseReply: check_error_reply,
     m.ActiveReply: check_active_reply,

@@ -209,8 +209,9 @@ def _kind(field: Any, default: Any) -> tuple[_Put | None, _Get | None]:
         is_floats = field.type == FieldDescriptor.TYPE_FLOAT
         return (_put_floats, lambda proto, value: _get_floats(value)) if is_floats else (None, _get_scalars)
     if field.type == FieldDescriptor.TYPE_ENUM:
-        members = {int(member): member for member in getattr(m, field.enum_type.name)}
-        return None, lambda proto, value: members[value]
+        cls = getattr(m, field.enum_type.name)
+        members = {int(member): member for member in cls}
+        return None, lambda proto, value: members.get(value, cls.UNSPECIFIED)  # a newer peer's, or a reserved one
     if field.has_presence:
         return None, lambda proto, value: value if proto.HasField(name) else None
     return (bytes, None) if field.type == FieldDescriptor.TYPE_BYTES else (None, None)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from protocol.messages import Refusal
+
 
 class ProtocolError(ValueError):
     """Bytes, shapes or identities that this process cannot accept."""
@@ -14,6 +16,14 @@ class MalformedMessage(ProtocolError):
         super().__init__(f"{message}.{field}: expected {expected}, came {came}")
         self.message = message
         self.field = field
+
+
+class EpisodeRefused(ProtocolError):
+    """An episode that cannot be opened: a code for programs and a sentence for people."""
+
+    def __init__(self, refusal: Refusal, sentence: str) -> None:
+        super().__init__(sentence)
+        self.refusal = refusal
 
 
 class TransportError(RuntimeError):

@@ -39,5 +39,5 @@ class Heartbeat:
         if now_ns < self._next_ns:
             return
         self._next_ns = now_ns + PERIOD_NS
-        health = replace(self.health, dropped=dict(self._link.dropped))
+        health = replace(self.health, dropped={reason.value: count for reason, count in self._link.dropped.items()})
         self._link.publish(HEALTH, health, at_ns=now_ns, clock_id=self._clock_id)

@@ -17,6 +17,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 from protocol import codec, topics
 from protocol.bus import Bus, Inbox, Sample, Subscription
+from protocol.drops import DropReason
 from protocol.errors import CallFailed, ProtocolError
 from protocol.messages import EPISODE_CLOCK, Header
 from protocol.topics import Call, Topic
@@ -49,7 +50,7 @@ class Link:
         self.session = ""
         self.episode = ""
         self.epoch = 0
-        self.dropped: Counter[str] = Counter()
+        self.dropped: Counter[DropReason] = Counter()
         self._seqs: Counter[str] = Counter()
         self._told: set[tuple[str, str]] = set()
 
@@ -122,7 +123,7 @@ class Link:
         except ProtocolError as error:
             raise CallFailed(key, timeout_ns / 1e6, f"unreadable answer: {error}") from None
 
-    def drop(self, source: str, reason: str, detail: str) -> None:
+    def drop(self, source: str, reason: DropReason, detail: str) -> None:
         """Counts a message that will not be used; the first of its kind from its source is logged."""
         self.dropped[reason] += 1
         if (source, reason) not in self._told and len(self._told) < 1000:
@@ -153,20 +154,26 @@ class Stream(Generic[T]):
 
     def _accept(self, sample: Sample) -> T | None:
         if sample.encoding != self._encoding:
-            self._link.drop(_source(sample), "wrong_encoding", f"expected {self._encoding}, came {sample.encoding}")
+            self._link.drop(
+                _source(sample), DropReason.WRONG_ENCODING, f"expected {self._encoding}, came {sample.encoding}"
+            )
             return None
         try:
             message = codec.decode(self._topic.cls, sample.payload)
         except ProtocolError as error:
-            self._link.drop(_source(sample), "malformed", str(error))
+            self._link.drop(_source(sample), DropReason.MALFORMED, str(error))
             return None
         header: Header = message.header  # type: ignore[attr-defined]
         episode = topics.episode_of(sample.key)
         if header.robot != self._link.robot:
-            self._link.drop(_source(sample), "wrong_robot", f"expected {self._link.robot}, came {header.robot}")
+            self._link.drop(
+                _source(sample), DropReason.WRONG_ROBOT, f"expected {self._link.robot}, came {header.robot}"
+            )
             return None
         if episode and header.episode != episode:
-            self._link.drop(_source(sample), "wrong_episode", f"key says {episode}, header says {header.episode}")
+            self._link.drop(
+                _source(sample), DropReason.WRONG_EPISODE, f"key says {episode}, header says {header.episode}"
+            )
             return None
         return message
 
@@ -203,7 +210,7 @@ class Service:
             try:
                 reply = handler(codec.decode(self._call.request, request.payload))
             except ProtocolError as error:
-                self._link.drop(f"call {self._call.name}", "refused_call", str(error))
+                self._link.drop(f"call {self._call.name}", DropReason.REFUSED_CALL, str(error))
                 reply = self._call.reply(error=str(error))
             request.reply(codec.encode(reply))
         return len(requests)
@@ -214,12 +221,12 @@ def is_of_episode(link: Link, header: Header) -> bool:
     if header.episode == link.episode and header.epoch == link.epoch:
         return True
     if not link.episode:  # between episodes: the tail of the last one, nobody's fault
-        link.dropped["no_episode"] += 1
+        link.dropped[DropReason.NO_EPISODE] += 1
         return False
     came = f"{header.episode} epoch {header.epoch}"
     link.drop(
         f"{header.proc}#{header.boot_id}",
-        "other_episode",
+        DropReason.OTHER_EPISODE,
         f"in {link.episode} epoch {link.epoch}, came {came}",
     )
     return False

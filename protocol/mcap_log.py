@@ -248,8 +248,7 @@ class _Writer:
         if isinstance(message, m.Event):
             self._say(header.proc, _LEVELS[message.severity], f"{message.name}: {message.text}", wall_ns)
         elif isinstance(message, m.Subgoal):
-            when = f" after frame {message.tick}" if message.kind is m.SubgoalKind.DEMO_NOTE else ""
-            self._say(header.proc, Log.INFO, f"{message.kind.name.lower()}{when}: {message.text}", wall_ns)
+            self._say(header.proc, Log.INFO, f"{message.kind.name.lower()}: {message.text}", wall_ns)
         if self._log_ns - self._flushed_ns >= FLUSH_NS:
             self.flush()
 

@@ -65,7 +65,6 @@ class SubgoalKind(IntEnum):
     DEMO_REASONING = 2
     TASK_SIMPLE = 3
     TASK_GROUNDED = 4
-    DEMO_NOTE = 5
 
 
 class Severity(IntEnum):
@@ -115,6 +114,19 @@ class SeamKind(IntEnum):
     SWITCH = 1
     OFFSET_FADE = 2
     ENSEMBLE = 3
+
+
+class Refusal(IntEnum):
+    """Why an episode was not opened, for programs."""
+
+    UNSPECIFIED = 0
+    NOT_READY = 1
+    BUSY = 2
+    CAMERAS = 3
+    ROBOT = 4
+    MODELS = 5
+    SCHEDULE = 6
+    REQUEST = 7
 
 
 def _no_floats() -> Floats:
@@ -406,6 +418,12 @@ class OpenRequest:
     demo: tuple[DemoFrame, ...] = ()
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DemoSampling:
+    hz: int = 1
+    to_its_end: bool = False
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Contract:
     proc: str
@@ -421,6 +439,18 @@ class Contract:
     version: str = ""
     context_tokens: int = 0
     max_context_tokens: int = 0
+    demonstrations: DemoSampling | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ContractRequest:
+    header: Header = Header()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ContractReply:
+    error: str = ""
+    contract: Contract | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -430,6 +460,7 @@ class OpenReply:
     contracts: tuple[Contract, ...] = ()
     warnings: tuple[str, ...] = ()
     try_again: bool = False
+    refusal: Refusal = Refusal.UNSPECIFIED
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

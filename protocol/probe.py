@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import tyro
 
+from protocol.command_line import parse
 from protocol.errors import ProtocolError, TransportError
 from protocol.link import Link
 from protocol.messages import Health, ServingState
@@ -64,7 +65,7 @@ def _why(proc: str, is_there: bool, health: Health | None) -> str:
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(ProbeOptions, args=argv, prog="python -m protocol.probe", description=ProbeOptions.__doc__)
+    options = parse(ProbeOptions, argv, prog="python -m protocol.probe")
     try:
         bus = open_bus(options.link)
         try:

@@ -75,6 +75,7 @@ class Call:
     reply: type
 
 
+CONTRACT = Call("contract", m.ContractRequest, m.ContractReply)
 OPEN = Call("open", m.OpenRequest, m.OpenReply)
 CLOSE = Call("close", m.CloseRequest, m.CloseReply)
 ACTIVE = Call("active", m.ActiveRequest, m.ActiveReply)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-import tyro
 from tqdm import tqdm
 
 import dual_system.tasks.headless  # noqa: F401 - before anything that imports mujoco
@@ -13,16 +12,17 @@ import dual_system.tasks.headless  # noqa: F401 - before anything that imports m
 # isort: split
 
 from dual_system.tasks.task import TaskError, make_task, task_names
+from protocol.command_line import parse
 from protocol.errors import TransportError
 from protocol.process import set_up_logging
 from sim_client.config import SimOptions
+from sim_client.harness import open_harness
 from sim_client.launch import Daemons
-from sim_client.station import open_station
 from sim_client.suite import Suite
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(SimOptions, args=argv, prog="sim-client", description=SimOptions.__doc__)
+    options = parse(SimOptions, argv, prog="sim-client")
     set_up_logging("WARNING")
     if options.list_tasks:
         print("\n".join(task_names()))
@@ -47,18 +47,23 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(options: SimOptions, daemons: Daemons) -> dict[str, Any]:
-    station = open_station(options, daemons)
-    try:
-        suite = Suite(options, station.link, station.clock, daemons.dead)
-        with tqdm(total=options.episodes * options.max_steps, unit="tick", disable=not options.progress) as bar:
+    most_ticks = options.schedule.max_steps
+    with tqdm(total=options.episodes * most_ticks, unit="tick", disable=not options.log.progress) as bar:
+        bar.bar_format = "{desc}"  # until there are ticks, a rate means nothing
+        bar.set_description_str("waiting for servers")
+        harness = open_harness(options, daemons)
 
-            def on_tick(episode: int, tick: int) -> None:
-                bar.set_description(f"episode {episode + 1}/{options.episodes}", refresh=False)
-                bar.update(episode * options.max_steps + tick - bar.n)
+        def on_tick(episode: int, tick: int) -> None:
+            if bar.bar_format is not None:
+                bar.bar_format = None
+                bar.unpause()
+            bar.set_description(f"episode {episode + 1}/{options.episodes}", refresh=False)
+            bar.update(episode * most_ticks + tick - bar.n)
 
-            return suite.run(on_tick)
-    finally:
-        station.bus.close()
+        try:
+            return Suite(options, harness.link, harness.clock, daemons.dead).run(on_tick)
+        finally:
+            harness.bus.close()
 
 
 if __name__ == "__main__":

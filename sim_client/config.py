@@ -4,104 +4,51 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import tyro
 
 from clock import schedules
 from clock.timebase import NS_PER_MS
-from dual_system.models.ponder.showing import Showing
 from dual_system.tasks.difficulty import Difficulty
 from protocol.messages import Delay, DelayKind, Delivery, DeliveryKind, Schedule, Seam, SeamKind, WaitKind
 from protocol.options import LinkOptions
-from sim_client.shown import how_shown
+
+ModeName = Literal["lockstep", "realtime"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SimOptions:
-    """Drives MuJoCo episodes with the PONDER and POUNCE servers, and logs every tick."""
-
-    task: str = "PickHighlight"
-    """--list-tasks shows all."""
-    list_tasks: bool = False
-    """Print the tasks and leave."""
-    episodes: int = 1
-    seed: int = 0
-    """Of the first episode; the i-th one (from 0) uses seed + i."""
-    difficulty: Difficulty | None = None
-    """None: by seed, as the benchmark does."""
-    mode: Literal["lockstep", "realtime"] = "lockstep"
-    """lockstep: simulated time waits for results, delays are modelled, bit-reproducible. realtime: nobody waits."""
-    policy: Literal["servers", "oracle"] = "servers"
-    """oracle: the task's own script instead of the servers."""
-    out: Path = Path("out")
-    """Folder for results.json and one MCAP per episode."""
-
-    local: bool = False
-    """Start ponder-serve, pounce-serve (and in real time clock-serve) on this machine, and stop them at the end."""
-    in_process: bool = False
-    """Lockstep only: everything in this one process and thread, without zenoh."""
-    clock: Literal["auto", "embedded", "daemon"] = "auto"
-    """Where the clock service runs. auto: its own process in real time, inside this one in lockstep."""
-    link: LinkOptions = field(
-        default_factory=lambda: LinkOptions(connect=("tcp/127.0.0.1:7447", "tcp/127.0.0.1:7448", "tcp/127.0.0.1:7449"))
-    )
-    ponder_checkpoint: Path | None = None
-    """With --local or --in-process: weights of PONDER; none are random."""
-    pounce_checkpoint: Path | None = None
-    patience_s: float = 120.0
-    """How long to wait for servers to be ready, and in lockstep for any answer."""
+class ScheduleOptions:
+    """When models are asked, and what the robot does with their answers."""
 
     query_period_ms: int = 1000
-    """Between PONDER's looks (paper: 1 Hz)."""
+    """Period of PONDER's queries in ms (paper: 1 Hz)."""
     invoke_every_ticks: int | None = None
-    """Between POUNCE's invocations, in 50 ms ticks. None: 20 in lockstep (the paper's 1 Hz), 10 in real time."""
+    """Period of POUNCE's invocations in 50 ms ticks. None: 20 in lockstep (the paper's 1 Hz), 10 in real time."""
     delay: Literal["default", "measured", "fixed", "log-normal"] = "default"
     """PONDER's delay. default: fixed in lockstep, measured in real time."""
     delay_ms: int = 300
-    """Mean of a modelled delay (paper: 300 ms)."""
+    """Mean of a modelled delay in ms (paper: 300)."""
     deliver: Literal["every", "held-transition", "null"] = "every"
-    """Which cognition POUNCE gets (paper, 5.2)."""
+    """Cognition that POUNCE is conditioned on (paper, 5.2)."""
     held_age_ms: int = 0
-    """With held-transition: the age POUNCE is told; 0 is the true one. The paper froze it at 300."""
+    """Age in ms given to POUNCE with --deliver held-transition; 0 is the true age. The paper fixes it at 300."""
     seam: Literal["switch", "offset-fade", "ensemble"] = "switch"
-    """How chunks are joined."""
+    """Transition from one action chunk to the next."""
     wait: Literal["stand-still", "hold"] = "stand-still"
-    """Until the first chunk: simulated time stands still, or runs while the arm holds."""
+    """Behaviour until the first chunk: simulated time stands still, or runs while the arm holds."""
     max_age_ms: int = 2000
-    """Cognition older than this is called stale (an alarm; its rows are still played)."""
+    """Age in ms from which a cognition is called stale (an alarm; its rows are still played)."""
     stale_limit_ms: int = 10_000
-    """Rows made with a cognition older than this are not played: hold, then stop."""
+    """Age in ms from which a cognition's rows are not played: the robot holds, then stops."""
     allow_starved: bool = False
     """Start although the schedule leaves ticks without a row."""
     max_steps: int = 1300
-    demo_hz: Literal[1, 2, 4, 5, 10, 20] | None = None
-    """How many frames of a demonstration are shown a second. None: as many as the --ponder-checkpoint says that it has
-    learned from; without one, the paper's 1."""
-    video_end: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Show a demonstration's last frame, too, although the --ponder-checkpoint does not say that it has learned so."""
+    """Limit of control steps per episode (paper: 1300)."""
 
-    record: bool = True
-    """Write one MCAP per episode."""
-    record_hz: Literal[1, 2, 4, 5, 10, 20] = 20
-    """In lockstep: how often the log has pictures, beside those that the models look at."""
-    pixels: Literal["jpeg", "exact"] = "jpeg"
-    """jpeg: raw frames are logged as JPEG; exact: also bit for bit as the models saw them (8 MB/s)."""
-    progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
-    """Show a progress bar."""
-
-    @property
-    def showing(self) -> Showing:
-        """How demonstrations are shown. Raises TransportError as `how_shown`."""
-        return how_shown(self.demo_hz, self.video_end, self.ponder_checkpoint)
-
-    @property
-    def runs_clock_daemon(self) -> bool:
-        return self.clock == "daemon" or (self.clock == "auto" and self.mode == "realtime" and not self.in_process)
-
-    def schedule(self, seed: int) -> Schedule:
-        """The schedule of the episode with this seed."""
-        base = schedules.realtime() if self.mode == "realtime" else schedules.paper()
+    def of_episode(self, mode: ModeName, seed: int) -> Schedule:
+        """Returns the schedule of the episode with this seed."""
+        base = schedules.realtime() if mode == "realtime" else schedules.paper()
         return replace(
             base,
             query_period_ns=self.query_period_ms * NS_PER_MS,
@@ -125,6 +72,71 @@ class SimOptions:
         if self.delay == "fixed" or default.kind == DelayKind.FIXED:
             return Delay(kind=DelayKind.FIXED, mean_ns=mean_ns)
         return default
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServersOptions:
+    """Where the clock service runs, and how long servers may take."""
+
+    clock: Literal["auto", "embedded", "daemon"] = "auto"
+    """Place of the clock service. auto: a process of its own in real time, this process in lockstep."""
+    patience_s: float = 120.0
+    """Longest wait in seconds for servers to be ready, and in lockstep for any answer."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LogOptions:
+    """What is written and shown."""
+
+    record: bool = True
+    """Do not write an MCAP per episode."""
+    record_hz: Literal[1, 2, 4, 5, 10, 20] = 20
+    """Rate of logged pictures in Hz in lockstep; those that the models observe are logged as well."""
+    pixels: Literal["jpeg", "exact"] = "jpeg"
+    """Form of logged raw frames. jpeg: as JPEG; exact: also bit for bit as the models saw them (8 MB/s)."""
+    progress: bool = True
+    """Do not show a progress bar."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SimOptions:
+    """Drives MuJoCo episodes with the PONDER and POUNCE servers, and logs every tick."""
+
+    task: str = "PickHighlight"
+    """Name of the task; --list-tasks shows all."""
+    episodes: int = 1
+    """Number of episodes."""
+    seed: int = 0
+    """Seed of the first episode; the i-th one (from 0) uses seed + i."""
+    difficulty: Difficulty | None = None
+    """Difficulty of every scene. None: by seed, as the benchmark does."""
+    mode: ModeName = "lockstep"
+    """Clock. lockstep: simulated time waits for results, delays are modelled, bit-reproducible. realtime: no wait."""
+    policy: Literal["servers", "oracle"] = "servers"
+    """Source of actions: the servers, or the task's own script (oracle)."""
+    local: bool = False
+    """Start ponder-serve, pounce-serve (and in real time clock-serve) on this machine, and stop them at the end."""
+    in_process: bool = False
+    """Run everything in this process and thread, without zenoh; lockstep only."""
+    ponder_checkpoint: Path | None = None
+    """PONDER's checkpoint, with --local or --in-process. None: random weights."""
+    pounce_checkpoint: Path | None = None
+    """POUNCE's checkpoint, with --local or --in-process. None: random weights."""
+    out: Path = Path("out")
+    """Folder for results.json and one MCAP per episode."""
+    list_tasks: bool = False
+    """Print the names of the tasks and exit."""
+    schedule: tyro.conf.OmitArgPrefixes[ScheduleOptions] = field(default_factory=ScheduleOptions)
+    servers: tyro.conf.OmitArgPrefixes[ServersOptions] = field(default_factory=ServersOptions)
+    log: tyro.conf.OmitArgPrefixes[LogOptions] = field(default_factory=LogOptions)
+    link: LinkOptions = field(
+        default_factory=lambda: LinkOptions(connect=("tcp/127.0.0.1:7447", "tcp/127.0.0.1:7448", "tcp/127.0.0.1:7449"))
+    )
+
+    @property
+    def runs_clock_daemon(self) -> bool:
+        place = self.servers.clock
+        return place == "daemon" or (place == "auto" and self.mode == "realtime" and not self.in_process)
 
 
 _DELIVERIES = {

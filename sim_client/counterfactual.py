@@ -1,22 +1,20 @@
-"""``pp-counterfactual``: does a trained pair act on its own past? Both models as served, on the pairs of ``pp-pairs``.
+"""``pp-diagnose counterfactual``: does a trained pair act on its own past? Both models as served, on recorded pairs.
 
-Of each pair PONDER reads either past and the common present, and POUNCE acts on what it then thinks: twice on the same
-pictures, joints and noise. `dual_system.analysis.counterfactual` compares with what the script does in either branch.
-PONDER writes its own texts on the way, as in an episode.
+For each pair of ``pp-collect pairs`` PONDER reads either past and the common present, and POUNCE acts on the cognition:
+twice on the same pictures, joints and noise. `dual_system.analysis.counterfactual` compares the actions with the
+script's in either branch. PONDER generates its own texts on the way, as in an episode.
 """
 
 from __future__ import annotations
 
 import importlib
-import json
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import tyro
 from numpy.typing import NDArray
 from tqdm import tqdm
 
@@ -26,18 +24,19 @@ import dual_system.tasks.headless  # noqa: F401 - before anything that imports m
 
 from clock.timebase import NS_PER_MS
 from dual_system.analysis.counterfactual import COUNTERFACTUAL, SCHEMA, follows_own_past
-from dual_system.models.ponder.showing import declared
-from dual_system.tasks.pair_files import how_shown_in, read_pairs
+from dual_system.models.ponder.demo_sampling import DemoSampling
+from dual_system.tasks.pair_files import demo_sampling_of, read_pairs
 from dual_system.tasks.pairs import Pair, Telling
+from protocol.command_line import flat, parse
 from sim_client.ledger import write_json
 from sim_client.robot import CAMERAS
 
 Views = tuple[NDArray[np.uint8], ...]
 Floats = NDArray[np.float32]
 Read = Callable[[str, Sequence[Views], Sequence[Views], NDArray[np.float32]], Floats]
-"""`ponder_server.party.build_reader`'s."""
+"""`ponder_server.in_process.build_reader`'s."""
 Act = Callable[[str, Views, Floats, Floats | None, int, int], Floats]
-"""`pounce_server.party.build_actor`'s."""
+"""`pounce_server.in_process.build_actor`'s."""
 _MIN_SCALE = 1e-3  # of a dimension that no script moves
 
 
@@ -48,56 +47,59 @@ class CounterfactualOptions:
     ponder: Path
     """PONDER's checkpoint."""
     pounce: Path
-    """POUNCE's checkpoint, trained with it."""
+    """POUNCE's checkpoint, trained with that PONDER."""
     pairs: Path
-    """A folder of pp-pairs, of pictures as large as the cameras that PONDER was trained on, and of videos shown as it
-    has learned from them."""
+    """Folder of pp-collect pairs, with pictures and demonstrations as PONDER was trained on."""
     out: Path
     """Folder for counterfactual.json."""
     draws: int = 4
-    """Flow noise; each draw is given to both branches."""
+    """Number of draws of flow noise per pair; each is used in both branches."""
     age_ms: int = 300
-    """The age that POUNCE is told of what PONDER thinks of the present, which stands still: as when an episode runs."""
-    progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
+    """Age of the present's cognition in ms, given to POUNCE; in an episode it is PONDER's delay (paper: 300)."""
+    progress: bool = True
+    """Do not show a progress bar."""
 
 
-def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(
-        CounterfactualOptions, args=argv, prog="pp-counterfactual", description=CounterfactualOptions.__doc__
-    )
+def main(argv: list[str] | None = None, prog: str = "pp-diagnose counterfactual") -> int:
+    options = parse(CounterfactualOptions, argv, prog=prog)
     try:
         pairs = read_pairs(options.pairs)
-        _require_shown_so(options)
-        read, ponder = importlib.import_module("ponder_server.party").build_reader(options.ponder)
-        act, pounce = importlib.import_module("pounce_server.party").build_actor(options.pounce)
+        read, ponder = importlib.import_module("ponder_server.in_process").build_reader(options.ponder)
+        _require_as_in_training(options.pairs, ponder.demonstrations)
+        act, pounce = importlib.import_module("pounce_server.in_process").build_actor(options.pounce)
         entries = scored(tqdm(pairs, unit="pair", disable=not options.progress), read, act, options)
     except (OSError, ValueError) as error:
-        sys.stderr.write(f"pp-counterfactual: {error}\n")
+        sys.stderr.write(f"{prog}: {error}\n")
         return 2
     options.out.mkdir(parents=True, exist_ok=True)
     models = {
-        name: {"model_hash": spec.model_hash, "is_untrained": spec.is_random}
+        name: {"model_hash": spec.model_hash, "is_untrained": spec.is_fake}
         for name, spec in (("ponder", ponder), ("pounce", pounce))
     }
-    config = {name: json.loads(json.dumps(getattr(options, name), default=str)) for name in options.__slots__}
-    write_json(options.out / COUNTERFACTUAL, {"schema": SCHEMA, "config": config, "models": models, "pairs": entries})
+    write_json(
+        options.out / COUNTERFACTUAL, {"schema": SCHEMA, "config": flat(options), "models": models, "pairs": entries}
+    )
     sys.stdout.write(f"{options.out / COUNTERFACTUAL}; tables: pp-tables {options.out} --out {options.out}\n")
     return 0
 
 
-def _require_shown_so(options: CounterfactualOptions) -> None:
-    learned = declared(options.ponder)
-    demo_hz, video_end = how_shown_in(options.pairs)
-    if (demo_hz, video_end) != (learned.hz, learned.to_its_end):
-        way = f"--demo-hz {learned.hz}" + (" --video-end" if learned.to_its_end else "")
+def _require_as_in_training(pairs: Path, learned: DemoSampling) -> None:
+    hz, to_its_end = demo_sampling_of(pairs)
+    found = DemoSampling(hz=hz, to_its_end=to_its_end)
+    if found != learned:
+        way = f"--demo-hz {learned.hz}" + (" --demo-to-its-end" if learned.to_its_end else "")
         raise ValueError(
-            f"{options.pairs} shows videos {demo_hz} times a second{' and at their end' if video_end else ''}; "
-            f"{options.ponder} has learned from others. Make pairs with pp-pairs {way}."
+            f"{pairs} samples demonstrations {_in_words(found)}, and this PONDER was trained on {_in_words(learned)}. "
+            f"Make pairs with pp-collect pairs {way}."
         )
 
 
+def _in_words(sampling: DemoSampling) -> str:
+    return f"{sampling.hz} times a second" + (" and at their end" if sampling.to_its_end else "")
+
+
 def scored(pairs: Iterable[Pair], read: Read, act: Act, options: CounterfactualOptions) -> list[dict[str, Any]]:
-    """One entry per pair: which, and its mean score over draws and branches, in [0, 1].
+    """Returns one entry per pair: which it is, and its mean score over draws and branches, in [0, 1].
 
     Differences of joints and gripper are weighed by their standard deviation over all pairs' scripts.
 
@@ -122,7 +124,7 @@ def scored(pairs: Iterable[Pair], read: Read, act: Act, options: CounterfactualO
 def _answers(
     pair: Pair, telling: Telling, read: Read, act: Act, options: CounterfactualOptions, index: int
 ) -> NDArray[np.float32]:
-    """What POUNCE does after this past, (draws, H, A)."""
+    """Returns POUNCE's actions after this past, (draws, H, A)."""
     past = [tuple(telling.frames[camera][row] for camera in CAMERAS) for row in range(len(telling.steps))]
     demo = [views for views, is_shown in zip(past, telling.is_demonstration, strict=True) if is_shown]
     seen = [views for views, is_shown in zip(past, telling.is_demonstration, strict=True) if not is_shown]

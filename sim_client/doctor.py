@@ -1,4 +1,4 @@
-"""``pp-doctor``: can this computer run what it is asked to, and if not, what to type."""
+"""``pp-doctor``: checks whether this computer can run the servers and the simulator, and says what to type if not."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import tyro
-
+from protocol.command_line import parse
 from sim_client import doctor_probes as look
 from sim_client.doctor_probes import Finding, Level, Role
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Probe:
-    """What is looked at, for which computer, and whether episodes run without it."""
+    """One check, the kinds of computer that need it, and whether episodes run without it."""
 
     name: str
     look: Callable[[], Finding]
@@ -28,23 +27,24 @@ class Probe:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DoctorConfig:
-    """Looks at this computer and says what is missing. Exit code 0: everything required is there, 1: it is not."""
+    """Checks this computer and reports what is missing. Exit code 0: everything required is there, 1: it is not."""
 
     role: Role = "all"
-    """robot: simulator and logs, no torch. models: PONDER and POUNCE, no MuJoCo. all: both, as --local needs."""
+    """Role of this computer. robot: simulator and logs, no torch; models: PONDER and POUNCE, no MuJoCo; all: both."""
     required_only: bool = False
-    """Leave out what no episode needs."""
+    """Check only what episodes need."""
     json: bool = False
-    """One JSON object instead of a table."""
+    """Print one JSON object instead of a table."""
     out: Path = Path("out")
-    """Folder that logs would go to."""
+    """Folder for logs, whose disk is checked."""
     ponder_checkpoint: Path | None = None
-    """Look whether this folder has the files of a PONDER checkpoint."""
+    """Folder of a PONDER checkpoint, whose files are checked."""
     pounce_checkpoint: Path | None = None
+    """Folder of a POUNCE checkpoint, whose files are checked."""
 
 
 def probes(config: DoctorConfig) -> list[Probe]:
-    """All that this configuration asks for."""
+    """Returns the checks that the configuration asks for."""
     backend = os.environ.get("MUJOCO_GL", "egl")
     other = "osmesa" if backend == "egl" else "egl"
     found = [
@@ -73,7 +73,7 @@ def probes(config: DoctorConfig) -> list[Probe]:
 
 
 def examine(probes: Sequence[Probe]) -> Iterator[Finding]:
-    """Looks, one probe after the other. What is not required cannot fail, and a probe that raises has failed."""
+    """Runs one probe after the other. An optional check cannot fail, and a probe that raises has failed."""
     for probe in probes:
         try:
             finding = probe.look()
@@ -87,7 +87,7 @@ def examine(probes: Sequence[Probe]) -> Iterator[Finding]:
 
 
 def table(findings: Sequence[Finding]) -> str:
-    """One line a finding, its way out beneath."""
+    """Returns one line per finding, its remedy beneath."""
     width = max((len(f.name) for f in findings), default=0)
     lines = []
     for finding in findings:
@@ -100,7 +100,7 @@ def table(findings: Sequence[Finding]) -> str:
 
 
 def main(argv: list[str] | None = None) -> int:
-    config = tyro.cli(DoctorConfig, args=argv, prog="pp-doctor", description=DoctorConfig.__doc__)
+    config = parse(DoctorConfig, argv, prog="pp-doctor")
     findings = list(examine(probes(config)))
     is_fit = not any(finding.level is Level.FAILED for finding in findings)
     if config.json:

@@ -27,7 +27,7 @@ from sim_client.robot import observation, status_of
 CLOCK_SILENCE_NS = 500 * NS_PER_MS
 """Real time: commands that stay away this long mean that the clock service is gone. The servos hold meanwhile."""
 HOLD_TICKS = 10
-"""What the robot still does then by itself: hold for half a second, and end the episode."""
+"""Ticks for which the robot then holds by itself, half a second, before it ends the episode."""
 STOPPED_TICKS = 60
 """An episode that the ladder stopped, and nobody engaged again for three seconds, is over."""
 
@@ -45,7 +45,7 @@ class Outcome:
 
 
 def always(tick: int) -> bool:
-    """Every tick is looked at."""
+    """Renders every tick."""
     return True
 
 
@@ -67,7 +67,7 @@ class RobotSide:
     _stopped_ticks: int = 0
 
     def run(self, info: m.EpisodeInfo, first: Snapshot, on_tick: Callable[[int], None]) -> Outcome:
-        """Until the task ends, or the machine does."""
+        """Plays until the task ends, or the servers do."""
         actions = self.link.subscribe(ACTION)
         snapshot = first
         self._command = info.robot.initial_command

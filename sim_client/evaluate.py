@@ -1,24 +1,21 @@
 """``pp-eval``: the paper's evaluation (B.1) of one condition: every task, the same scenes in several runs.
 
-An evaluation is a set of episodes that know nothing of each other. Each is played in lockstep by a worker that has
-loaded its servers once, and written down as soon as it ends (`Ledger`), so a killed evaluation is gone on with by the
-same command: nothing is played twice, nothing is lost, and ``results.json`` says what it would have said.
+An evaluation is a set of independent episodes. A worker that has loaded its servers once plays each in lockstep, and
+its result is written as soon as it ends (`Ledger`). The same command resumes a killed evaluation: no episode is played
+twice or lost, and ``results.json`` equals that of an undisturbed evaluation.
 """
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import os
 import sys
 from collections.abc import Iterable
-from dataclasses import dataclass
 from functools import cache
 from multiprocessing.util import Finalize
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-import tyro
 from tqdm import tqdm
 
 import dual_system.tasks.headless  # noqa: F401 - before anything that imports mujoco
@@ -26,234 +23,39 @@ import dual_system.tasks.headless  # noqa: F401 - before anything that imports m
 # isort: split
 
 from dual_system.data.errors import DatasetError
-from dual_system.data.seeds import TRAIN_SEED
 from dual_system.data.workers import LocalWorkers, RayWorkers, Workers
-from dual_system.tasks.difficulty import Difficulty, Order
 from dual_system.tasks.environment import Environment, make_environment
-from dual_system.tasks.task import TaskError, chosen_tasks
+from dual_system.tasks.task import TaskError
 from protocol.bus import Bus
+from protocol.command_line import parse
 from protocol.errors import TransportError
 from protocol.link import Link
 from protocol.process import set_up_logging
-from sim_client.config import SimOptions
-from sim_client.donor import DonorError, DonorPonder, donors_in
+from sim_client.condition import EvalOptions, EvaluationError, Job
+from sim_client.harness import BuildServer, ServerStep, open_harness
 from sim_client.launch import Daemons
 from sim_client.ledger import Ledger, LedgerError, write_json
-from sim_client.silent import SilentPonder
-from sim_client.station import Build, Party, open_station
-from sim_client.suite import Suite, as_json, versions
-from sim_client.told_cognition import ToldPonder, cognition_shape
+from sim_client.null_ponder import NullPonder, cognition_shape
+from sim_client.suite import Suite, versions
+from sim_client.swapped_ponder import DonorError, SwappedPonder
 
 DONE, REFUSED, INTERRUPTED = 0, 2, 130
 Line = dict[str, Any]  # one episode's entry in results.json
 
-_PUPPETS = ("other-episode", "stand-in")
 _HOW_MANY = ("tasks", "episodes", "runs")  # a folder may be given more of them later
 _HOW = ("out", "patience_s", "progress")  # and these change no result
-
-
-class EvaluationError(Exception):
-    """An evaluation that cannot be made: the message says what was expected, what came, and the way out."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EvalOptions:
-    """Evaluates a pair of checkpoints as the paper does. The same command again goes on with a killed evaluation."""
-
-    out: Path
-    """Folder of one condition: results.json, and with --record one MCAP per episode."""
-    tasks: tuple[str, ...] = ("all",)
-    """sim-client --list-tasks shows them."""
-    episodes: int = 50
-    """Scenes per task (paper: 50)."""
-    runs: int = 3
-    """How often every scene is played, each time with other flow noise (paper: 3)."""
-    seed: int = 0
-    """Of the first scene; all lie below 2,000,000, where the training seeds begin."""
-    difficulty: Difficulty | None = None
-    """None: by seed, as the benchmark does."""
-    order: Order = "drawn"
-    """Of the simulator's own subgoals, where a task leaves it open: see pp-collect. What counts as success is the
-    same."""
-    policy: Literal["servers", "oracle"] = "servers"
-    """oracle: the tasks' own scripts, to test the machine."""
-    ponder_checkpoint: Path | None = None
-    """Weights of PONDER; none are random."""
-    pounce_checkpoint: Path | None = None
-    max_steps: int = 1300
-    """Per episode (paper: 1300)."""
-    demo_hz: Literal[1, 2, 4, 5, 10, 20] | None = None
-    """How many frames of a demonstration are shown a second. None: as many as the --ponder-checkpoint says that it has
-    learned from; without one, the paper's 1."""
-    video_end: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Show a demonstration's last frame, too, although the --ponder-checkpoint does not say that it has learned so."""
-
-    cognition: Literal["real", "null", "other-episode", "stand-in"] = "real"
-    """null: POUNCE gets the learned null cognition. other-episode: what PONDER said in another episode of the task.
-    stand-in: the simulator's own subgoal, in the form that stage `motor` of the recipe `small` teaches; if its thing is
-    pushed elsewhere, its coordinates follow."""
-    stand_in_noise_px: float = 0.0
-    """With --cognition stand-in: how wrong the told places are (standard deviation); a PONDER's are by some pixels."""
-    stand_in_onward: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """With --cognition stand-in: also told where the next subgoal will be, as recipe small_imitating learned it."""
-    stand_in_waits_longer: int = 0
-    """With --cognition stand-in: control steps that are added to a wait which it is told (StopCube)."""
-    donors: Path | None = None
-    """With --cognition other-episode: the --out of a recorded evaluation with real cognition, of the same scenes."""
-    subgoal_text: Literal["ponder", "oracle"] | None = None
-    """For a POUNCE that reads subgoals in place of cognition: PONDER's own, or the task's. Refused by any other."""
-    deliver: Literal["every", "held-transition"] = "every"
-    """held-transition: the first cognition, then those at predicted transitions (paper, 5.2)."""
-    reported_age_ms: int = 0
-    """With held-transition: the age POUNCE is told; 0 is the true one. The paper froze it at 300."""
-    query_period_ms: int = 1000
-    """Between PONDER's looks (paper: 1 Hz)."""
-    delay_ms: int = 300
-    """Of PONDER (paper: fixed 300 ms)."""
-
-    servers: Literal["in-process", "local"] = "in-process"
-    """Each worker's own: in its thread, or two processes that it starts."""
-    workers: int = 1
-    """Processes of this computer; each loads the checkpoints."""
-    ray: str | None = None
-    """Work on a Ray cluster instead: its address, `auto`, or `local`. Logs then need an --out that its nodes share."""
-    gpus_per_worker: float = 0.0
-    """With --ray: what a worker asks for, 0.5 for two on each GPU."""
-    record: bool = False
-    """Write one MCAP per episode, some 10 MB a minute."""
-    record_hz: Literal[1, 2, 4, 5, 10, 20] = 20
-    """With --record: how often pictures are taken, beside those that the models look at."""
-    patience_s: float = 600.0
-    """How long to wait for servers to be ready, or for any answer."""
-    progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
-    """Show a progress bar."""
-
-    def __post_init__(self) -> None:
-        if min(self.episodes, self.runs, self.workers) < 1 or self.seed < 0:
-            raise EvaluationError("--episodes, --runs and --workers must be at least 1, and --seed at least 0")
-        if self.seed + self.episodes > TRAIN_SEED:
-            raise EvaluationError(
-                f"--seed {self.seed} with {self.episodes} episodes reaches into the training seeds, which begin at "
-                f"{TRAIN_SEED}; evaluate on seeds below"
-            )
-        if self.reported_age_ms and self.deliver != "held-transition":
-            raise EvaluationError("--reported-age-ms is for --deliver held-transition; otherwise ages are true")
-        if self.cognition == "null" and self.deliver != "every":
-            raise EvaluationError("--cognition null delivers nothing, so nothing is held; leave --deliver out")
-        if (self.cognition == "other-episode") != (self.donors is not None):
-            raise EvaluationError("--cognition other-episode and --donors go together: record the real one first")
-        if self.cognition in _PUPPETS and (self.servers, self.policy) != ("in-process", "servers"):
-            raise EvaluationError(f"--cognition {self.cognition} replaces PONDER: use --servers in-process")
-        if self.stand_in_onward and self.cognition != "stand-in":
-            raise EvaluationError("--stand-in-onward is of --cognition stand-in; leave it out")
-        if self.stand_in_waits_longer and self.cognition != "stand-in":
-            raise EvaluationError("--stand-in-waits-longer is of --cognition stand-in; leave it out")
-        if self.stand_in_noise_px < 0 or (self.stand_in_noise_px and self.cognition != "stand-in"):
-            raise EvaluationError("--stand-in-noise-px is for --cognition stand-in, and at least 0")
-        if self.cognition == "stand-in" and self.pounce_checkpoint is None:
-            raise EvaluationError("--cognition stand-in is for a --pounce-checkpoint that has learned from stand-ins")
-        if self.subgoal_text is not None and (self.servers, self.cognition) != ("in-process", "real"):
-            raise EvaluationError(
-                "--subgoal-text is for --servers in-process, and POUNCE then reads no cognition: leave --cognition out"
-            )
-
-    def task_names(self) -> tuple[str, ...]:
-        """The tasks in alphabetical order, each once. Raises TaskError for an unknown one."""
-        return chosen_tasks(self.tasks)
-
-    def jobs(self) -> list[Job]:
-        """Every episode, task by task: a worker keeps its scene, and finished tasks are whole.
-
-        Raises:
-            TaskError: an unknown task.
-            DonorError: an episode has no donor.
-        """
-        keys = [
-            (task, run, seed)
-            for task in self.task_names()
-            for run in range(self.runs)
-            for seed in range(self.seed, self.seed + self.episodes)
-        ]
-        donors = {} if self.donors is None else donors_in(self.donors, keys)
-        return [
-            Job(options=self, task=task, run=run, seed=seed, donor=donors.get((task, run, seed)))
-            for task, run, seed in keys
-        ]
-
-    def sim(self) -> SimOptions:
-        """The episodes' options: what `sim-client` would be told."""
-        return SimOptions(
-            task="evaluation",
-            episodes=self.episodes,
-            seed=self.seed,
-            difficulty=self.difficulty,
-            policy=self.policy,
-            out=self.out,
-            local=self.servers == "local",
-            in_process=self.servers == "in-process",
-            ponder_checkpoint=self.ponder_checkpoint,
-            pounce_checkpoint=self.pounce_checkpoint,
-            patience_s=self.patience_s,
-            query_period_ms=self.query_period_ms,
-            delay_ms=self.delay_ms,
-            deliver="null" if self.cognition == "null" else self.deliver,
-            held_age_ms=self.reported_age_ms,
-            max_steps=self.max_steps,
-            demo_hz=self.demo_hz,
-            video_end=self.video_end,
-            record=self.record,
-            record_hz=self.record_hz,
-            progress=False,
-        )
-
-    def config(self) -> dict[str, Any]:
-        """As in ``results.json``: sim-client's options, and those that make an evaluation of them."""
-        sim = self.sim()
-        config: dict[str, Any] = as_json(dataclasses.asdict(sim))
-        del config["task"], config["list_tasks"], config["demo_hz"], config["video_end"]
-        if sim.showing.hz != 1:
-            config["demo_hz"] = sim.showing.hz
-        if sim.showing.to_its_end:
-            config["video_end"] = True
-        own = {"tasks": self.task_names(), "runs": self.runs, "cognition": self.cognition, "donors": self.donors}
-        if self.subgoal_text is not None:
-            own["subgoal_text"] = self.subgoal_text
-        if self.stand_in_noise_px:
-            own["stand_in_noise_px"] = self.stand_in_noise_px
-        if self.stand_in_onward:
-            own["stand_in_onward"] = True
-        if self.stand_in_waits_longer:
-            own["stand_in_waits_longer"] = self.stand_in_waits_longer
-        if self.order != "drawn":
-            own["order"] = self.order
-        return config | {name: as_json(value) for name, value in own.items()}
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Job:
-    """One episode to play."""
-
-    options: EvalOptions
-    task: str
-    run: int
-    seed: int
-    donor: Path | None = None
-
-    @property
-    def key(self) -> str:
-        return f"{self.task}/{self.run}/{self.seed}"
 
 
 def main(argv: list[str] | None = None) -> int:
     set_up_logging("WARNING")
     try:
-        options = tyro.cli(EvalOptions, args=argv, prog="pp-eval", description=EvalOptions.__doc__)
+        options = parse(EvalOptions, argv, prog="pp-eval")
         episodes = evaluate(options, _workers(options))["episodes"]
     except (EvaluationError, LedgerError, DonorError, DatasetError, TaskError, TransportError) as error:
         sys.stderr.write(f"pp-eval: {error}\n")
         return REFUSED
     except KeyboardInterrupt:
-        sys.stderr.write("pp-eval: interrupted; finished episodes are kept, the same command goes on\n")
+        sys.stderr.write("pp-eval: interrupted; finished episodes are kept, the same command resumes\n")
         return INTERRUPTED
     for task in sorted({episode["task"] for episode in episodes}):
         successes = [episode["success"] for episode in episodes if episode["task"] == task]
@@ -263,10 +65,12 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def evaluate(options: EvalOptions, workers: Workers[Job, Line]) -> dict[str, Any]:
-    """Plays what is missing; returns what ``results.json`` then says of everything in the folder.
+    """Plays the missing episodes; returns the contents of ``results.json``, over everything in the folder.
+
+    Whatever is raised, finished episodes are kept.
 
     Raises:
-        EvaluationError: an episode could not be begun; those that were finished are kept, and so they are below.
+        EvaluationError: an episode could not be started.
         LedgerError: the folder holds another condition, or another process works in it.
         DatasetError: workers keep dying, or there is no Ray.
         TaskError, DonorError, TransportError: as their names say, before or at the first episode.
@@ -275,7 +79,7 @@ def evaluate(options: EvalOptions, workers: Workers[Job, Line]) -> dict[str, Any
     common = {name: value for name, value in options.config().items() if name not in (*_HOW_MANY, *_HOW)}
     with Ledger(options.out, common | {"versions": versions()}) as ledger:
         missing = [job for job in jobs if job.key not in ledger.lines]
-        bar = tqdm(total=len(jobs), initial=len(jobs) - len(missing), unit="episode", disable=not options.progress)
+        bar = tqdm(total=len(jobs), initial=len(jobs) - len(missing), unit="episode", disable=not options.log.progress)
         try:
             for job, line in workers.run(missing):
                 ledger.commit(job.key, line)
@@ -296,40 +100,40 @@ def _in_order(lines: Iterable[Line]) -> list[Line]:
 
 
 def play(job: Job) -> Line:
-    """Plays one episode, in whichever process this is.
+    """Plays one episode in this process.
 
     Raises:
-        EvaluationError: it was not begun: servers that do not fit, refuse or died. That says nothing of a policy, and
+        EvaluationError: it did not start, because servers do not fit, refuse or died. That is no result of the policy;
             the same command tries again. Whatever ends an episode later is its result.
     """
-    return _station(job.options).play(job)
+    return _harness(job.options).play(job)
 
 
 @cache
-def _station(options: EvalOptions) -> EvaluationStation:
-    """This process's own, with its servers loaded; it lasts as long as the process."""
-    station = EvaluationStation(options)
-    Finalize(None, station.close, exitpriority=0)  # a worker's end, while GL and other threads are still there
-    return station
+def _harness(options: EvalOptions) -> EvaluationHarness:
+    """Returns this process's harness, with its servers loaded; it lasts as long as the process."""
+    harness = EvaluationHarness(options)
+    Finalize(None, harness.close, exitpriority=0)  # a worker's end, while GL and other threads are still there
+    return harness
 
 
-class EvaluationStation:
-    """One worker's servers, and the scene of the task it is at."""
+class EvaluationHarness:
+    """One worker's servers, and the scene of its current task."""
 
     def __init__(self, options: EvalOptions) -> None:
         sim = options.sim()
         self._options = options
-        self._donor: DonorPonder | None = None
+        self._donor: SwappedPonder | None = None
         self._open = contextlib.ExitStack()
         daemons = self._open.enter_context(Daemons(options.out / "servers" / str(os.getpid())))
-        station = open_station(sim, daemons, self._replacement(), options.subgoal_text)
-        self._open.callback(station.bus.close)
-        self._suite = Suite(sim, station.link, station.clock, daemons.dead)
+        harness = open_harness(sim, daemons, self._replacement(), options.condition.subgoal_text)
+        self._open.callback(harness.bus.close)
+        self._suite = Suite(sim, harness.link, harness.clock, daemons.dead)
         self._task = ""
         self._environment: Environment | None = None
 
     def play(self, job: Job) -> Line:
-        """As the function of this name."""
+        """Like the function of this name."""
         if self._donor is not None and job.donor is not None:
             self._donor.load(job.donor)
         line = self._suite.play(self._scene(job.task), job.task, job.seed, run=job.run)
@@ -350,54 +154,31 @@ class EvaluationStation:
         if self._environment is None or task != self._task:
             if self._environment is not None:
                 self._environment.close()
-            has_eyes = self._options.policy == "servers" or self._options.record  # the oracle alone needs none
-            self._environment = make_environment(
-                task,
-                max_steps=self._options.max_steps,
-                render=has_eyes,
-                texts_follow=self._options.cognition == "stand-in",
-                order=self._options.order,
-            )
+            needs_frames = self._options.policy == "servers" or self._options.log.record  # the oracle alone needs none
+            self._environment = make_environment(task, max_steps=self._options.condition.max_steps, render=needs_frames)
             self._task = task
         return self._environment
 
-    def _replacement(self) -> Build | None:
-        """What stands in PONDER's place, if it is not to be asked."""
+    def _replacement(self) -> BuildServer | None:
+        """Returns what replaces PONDER, or None if PONDER itself is queried."""
         options = self._options
-        if options.cognition == "other-episode":
+        if options.condition.cognition == "other-episode":
             return self._build_donor
-        if options.cognition == "stand-in":
-            return self._build_told
-        is_unheard = options.cognition == "null" and options.servers == "in-process" and not options.record
+        is_null = options.condition.cognition == "null"
+        is_unheard = is_null and options.workers.servers == "in-process" and not options.log.record
         if is_unheard and options.pounce_checkpoint is not None:
-            with contextlib.suppress(ValueError):  # a public folder does not say K and H: PONDER does
+            with contextlib.suppress(ValueError):  # a public folder does not hold K and H: PONDER has to be loaded
                 shape = cognition_shape(options.pounce_checkpoint)
-                return lambda bus, robot, _: SilentPonder(Link(bus, robot=robot, proc="ponder"), *shape).step
+                return lambda bus, robot, _: NullPonder(Link(bus, robot=robot, proc="ponder"), *shape).step
         return None
 
-    def _build_donor(self, bus: Bus, robot: str, checkpoint: Path | None) -> Party:
-        self._donor = DonorPonder(Link(bus, robot=robot, proc="ponder"))
+    def _build_donor(self, bus: Bus, robot: str, checkpoint: Path | None) -> ServerStep:
+        self._donor = SwappedPonder(Link(bus, robot=robot, proc="ponder"))
         return self._donor.step
-
-    def _build_told(self, bus: Bus, robot: str, checkpoint: Path | None) -> Party:
-        pounce = self._options.pounce_checkpoint
-        assert pounce is not None  # the options said so
-        try:
-            shape = cognition_shape(pounce)
-        except ValueError as error:
-            raise EvaluationError(str(error)) from None
-        link, noise_px = Link(bus, robot=robot, proc="ponder"), self._options.stand_in_noise_px
-        onward = self._onward if self._options.stand_in_onward else None
-        return ToldPonder(link, *shape, noise_px, onward, self._due_step, self._options.stand_in_waits_longer).step
-
-    def _onward(self) -> str:
-        return "" if self._environment is None else self._environment.onward()
-
-    def _due_step(self) -> int | None:
-        return None if self._environment is None else self._environment.due_step()
 
 
 def _workers(options: EvalOptions) -> Workers[Job, Line]:
-    if options.ray is not None:
-        return RayWorkers(options.ray, play, num_gpus=options.gpus_per_worker)
-    return LocalWorkers(options.workers, play)
+    chosen = options.workers
+    if chosen.ray is not None:
+        return RayWorkers(chosen.ray, play, num_gpus=chosen.gpus_per_worker)
+    return LocalWorkers(chosen.workers, play)

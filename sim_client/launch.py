@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Protocol
+from typing import IO
 
 from protocol.options import LinkOptions
 from protocol.process import PARENT_VARIABLE
@@ -108,32 +108,25 @@ def start_local(
     return at_clock, at_ponder, at_pounce
 
 
-class LocalOptions(Protocol):
-    """What a program's options say of the servers that it starts."""
-
-    @property
-    def link(self) -> LinkOptions: ...
-    @property
-    def runs_clock_daemon(self) -> bool: ...
-    @property
-    def allow_starved(self) -> bool: ...
-    @property
-    def ponder_checkpoint(self) -> Path | None: ...
-    @property
-    def pounce_checkpoint(self) -> Path | None: ...
-
-
-def local_link(options: LocalOptions, daemons: Daemons) -> LinkOptions:
+def local_link(
+    daemons: Daemons,
+    *,
+    robot: str,
+    with_clock: bool,
+    allow_starved: bool,
+    ponder_checkpoint: Path | None,
+    pounce_checkpoint: Path | None,
+) -> LinkOptions:
     """Starts the servers of ``--local``; returns how to reach them."""
     endpoints = start_local(
         daemons,
-        robot=options.link.robot,
-        with_clock=options.runs_clock_daemon,
-        allow_starved=options.allow_starved,
-        ponder=_checkpoint(options.ponder_checkpoint),
-        pounce=_checkpoint(options.pounce_checkpoint),
+        robot=robot,
+        with_clock=with_clock,
+        allow_starved=allow_starved,
+        ponder=_checkpoint(ponder_checkpoint),
+        pounce=_checkpoint(pounce_checkpoint),
     )
-    return LinkOptions(robot=options.link.robot, connect=endpoints)
+    return LinkOptions(robot=robot, connect=endpoints)
 
 
 def _checkpoint(folder: Path | None) -> list[str]:

@@ -25,6 +25,7 @@ import tyro
 from rerun.chunk import McapReader
 from rerun.experimental import ViewerClient
 
+from protocol.command_line import parse
 from protocol.errors import ProtocolError
 from protocol.mcap_log import read_log
 from sim_client.blueprint import TIMELINE, episode_blueprint
@@ -48,15 +49,15 @@ class ReplayConfig:
     file: tyro.conf.Positional[Path]
     """Episode log (.mcap, or .mcap.partial of a killed process)."""
     save: Path | None = None
-    """Write the episode and its layout into this .rrd; open it with ``rerun FILE``."""
+    """File (.rrd) to write the episode and its layout to; open it with ``rerun FILE``."""
     screenshot: Path | None = None
-    """Draw without a window into this .png; needs a Vulkan driver (mesa-vulkan-drivers has a software one)."""
+    """File (.png) to draw to without a window; needs a Vulkan driver (mesa-vulkan-drivers has a software one)."""
     at: float = 0.0
-    """Episode time of the screenshot, in seconds."""
+    """Episode time of the screenshot in seconds."""
 
 
 def main(argv: list[str] | None = None) -> int:
-    config = tyro.cli(ReplayConfig, args=argv, prog="pp-replay")
+    config = parse(ReplayConfig, argv, prog="pp-replay")
     try:
         with tempfile.TemporaryDirectory(prefix="ponderpounce-replay-") as folder:
             rrd = config.save or Path(folder) / "episode.rrd"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dual_system.models.ponder.showing import Showing
+from dual_system.models.ponder.demo_sampling import DemoSampling
 from dual_system.tasks import panda
 from dual_system.tasks.engine import Status
 from dual_system.tasks.environment import IMAGE_PX, Environment, Snapshot
@@ -42,11 +42,11 @@ def simulated_robot(robot: panda.Robot, initial_state: np.ndarray) -> Robot:
     )
 
 
-def demonstration(environment: Environment, codec: ImageCodec, showing: Showing) -> tuple[DemoFrame, ...]:
+def demonstration(environment: Environment, codec: ImageCodec, sampling: DemoSampling) -> tuple[DemoFrame, ...]:
     """The conditioning video as PONDER reads it, before the first query; () for tasks without one."""
-    rate_hz = CONTROL_HZ if showing.to_its_end else showing.hz
-    shown = environment.demonstration(rate_hz, look_hz=showing.hz)
-    return tuple(DemoFrame(images=_pictures(frame, codec)) for frame in shown if frame.frames or not showing.to_its_end)
+    rate_hz = CONTROL_HZ if sampling.to_its_end else sampling.hz
+    video = environment.demonstration(rate_hz, look_hz=sampling.hz)
+    return tuple(DemoFrame(images=_pictures(each, codec)) for each in video if each.frames or not sampling.to_its_end)
 
 
 def observation(snapshot: Snapshot, tick: int, source_ns: int, codec: ImageCodec) -> Observation:

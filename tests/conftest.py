@@ -231,10 +231,10 @@ class Rig:
         self.clock = ClockService(self.links["clock"], self.config)
         self.ponder = self.start_ponder(self.links["ponder"], self.ponder_engine)
         self.pounce = self.start_pounce(self.links["pounce"], self.pounce_engine)
-        self.bus.add_party(self.clock.step)
-        self.bus.add_party(lambda: self.ponder.step())  # looked up each time: a test may put another in its place
-        self.bus.add_party(lambda: self.pounce.step())
-        self.bus.run_parties()
+        self.bus.add_participant(self.clock.step)
+        self.bus.add_participant(lambda: self.ponder.step())  # looked up each time: a test may put another in its place
+        self.bus.add_participant(lambda: self.pounce.step())
+        self.bus.run_participants()
 
     def start_ponder(self, link: Link, engine: FakePonder) -> PonderServer:
         server = PonderServer(link, engine, Heartbeat(link, "test", "host/monotonic"), "test")
@@ -260,7 +260,7 @@ class Rig:
 
     def settle(self) -> None:
         """Until nobody has anything to do."""
-        while self.bus.run_parties():
+        while self.bus.run_participants():
             pass
 
     def open(self, info: m.EpisodeInfo, demo: tuple[m.DemoFrame, ...] = ()) -> m.OpenReply:
@@ -283,7 +283,7 @@ class Rig:
 
         def let_others(longest_ns: int) -> None:
             self.meanwhile()
-            self.bus.run_parties()
+            self.bus.run_participants()
 
         side = RobotSide(self.links["sim"], world, NoRecorder(), let_others, 20_000_000_000, looks)  # type: ignore[arg-type]
         outcome = side.run(info, world.look(), lambda tick: None)

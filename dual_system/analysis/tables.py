@@ -21,6 +21,7 @@ from dual_system.analysis.diagnosis_tables import counterfactual_table, diagnosi
 from dual_system.analysis.markdown import markdown, percent
 from dual_system.analysis.results import Results, ResultsError, read_comparable
 from dual_system.analysis.statistics import bootstrap, paired, wilson
+from protocol.command_line import parse
 
 TABLES = "tables.md"
 NOTE = f"""\
@@ -41,7 +42,7 @@ class TablesOptions:
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(TablesOptions, args=argv, prog="pp-tables", description=TablesOptions.__doc__)
+    options = parse(TablesOptions, argv, prog="pp-tables")
     of_kind = {name: [p for p in options.results if _holds(p, name)] for name in (DIAGNOSIS, COUNTERFACTUAL)}
     evaluations = [p for p in options.results if not any(p in paths for paths in of_kind.values())]
     diagnoses, parts = [], []

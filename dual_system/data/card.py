@@ -1,4 +1,4 @@
-"""``pp-card``: the dataset card, ``README.md`` with statistics per task, and a contact sheet to see what is in it."""
+"""``pp-collect card``: writes the dataset card, ``README.md`` with statistics per task, and a contact sheet."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from dual_system.data.dataset import Dataset, Entry
 from dual_system.data.errors import DatasetError
 from dual_system.data.lerobot_v3 import COLLECTION_PATH
 from dual_system.data.video import FPS
+from protocol.command_line import parse
 
 CARD, SHEET = "README.md", "contact_sheet.jpg"
 PICTURES_PER_TASK, PICTURE_PX, LABEL_PX = 8, 128, 14
@@ -29,15 +30,15 @@ class CardOptions:
     """Writes README.md and contact_sheet.jpg into the folder of a dataset."""
 
     folder: tyro.conf.Positional[Path]
-    """What pp-collect or pp-export made."""
+    """Folder of a dataset of pp-collect or pp-export."""
 
 
-def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(CardOptions, args=argv, prog="pp-card", description=CardOptions.__doc__)
+def main(argv: list[str] | None = None, prog: str = "pp-collect card") -> int:
+    options = parse(CardOptions, argv, prog=prog)
     try:
         write_card(options.folder)
     except DatasetError as error:
-        sys.stderr.write(f"pp-card: {error}\n")
+        sys.stderr.write(f"{prog}: {error}\n")
         return REFUSED
     sys.stdout.write(f"{options.folder / CARD}, {options.folder / SHEET}\n")
     return DONE
@@ -51,7 +52,7 @@ def write_card(folder: Path) -> None:
 
 
 def card(dataset: Dataset) -> str:
-    """Returns the card: what Hugging Face reads on top, then what is in the dataset, counted."""
+    """Returns the card: Hugging Face's header, then the dataset's statistics."""
     entries = dataset.episodes
     num_rows = sum(each.num_rows for each in entries)
     lines = [
@@ -78,7 +79,7 @@ def card(dataset: Dataset) -> str:
 
 
 def contact_sheet(dataset: Dataset) -> Image.Image:
-    """Returns one line of pictures per task: moments evenly spread over its first episode, as the front camera saw."""
+    """Returns one line of front-camera pictures per task, evenly spread over its first episode."""
     tasks = _by_task(dataset.episodes)
     height_px = PICTURE_PX + LABEL_PX
     sheet = Image.new("RGB", (PICTURES_PER_TASK * PICTURE_PX, len(tasks) * height_px), "white")
@@ -102,7 +103,7 @@ def _table(dataset: Dataset) -> list[str]:
     """Statistics per task, as lines of Markdown."""
     lines = [
         "| task | episodes | easy / medium / hard | demonstration rows | execution rows, mean (min to max) "
-        "| subgoals, mean | recovering | seeds in vain |",
+        "| subgoals, mean | recovering | seeds rejected |",
         "| --- | --: | --: | --: | --: | --: | --: | --: |",
     ]
     for task, entries in _by_task(dataset.episodes).items():
@@ -120,7 +121,7 @@ def _table(dataset: Dataset) -> list[str]:
 
 
 def _origin(dataset: Dataset) -> list[str]:
-    """Who made it, and with what."""
+    """Returns sentences on who made the dataset, and with what settings."""
     origins = Counter(each.origin for each in dataset.episodes)
     lines = ["Origin: " + ", ".join(f"{count} episodes by {origin}" for origin, count in sorted(origins.items())) + "."]
     path = dataset.root / COLLECTION_PATH
@@ -138,16 +139,16 @@ def _origin(dataset: Dataset) -> list[str]:
             lines.append(_noise(noise, dataset.episodes))
         if (shoves := settings.get("shoves")) is not None:
             lines.append(
-                f"In {round(100 * shoves['share'])} % of the episodes things may be moved aside by "
-                f"{shoves['least_m'] * 100:g} to {shoves['most_m'] * 100:g} cm while the hand is on its way."
+                f"In {round(100 * shoves['share'])} % of the episodes objects may be pushed aside by "
+                f"{shoves['least_m'] * 100:g} to {shoves['most_m'] * 100:g} cm while the hand approaches."
             )
         if settings.get("texts") == "follow":
-            lines.append("Coordinates in subgoals follow what was pushed.")
+            lines.append("Coordinates in subgoals follow pushed objects.")
     return lines
 
 
 def _noise(settings: dict[str, Any], entries: Sequence[Entry]) -> str:
-    """What was done to the actions."""
+    """Returns sentences on the noise of the executed actions."""
     num_clean = sum(each.noise_rad == 0.0 for each in entries)
     low, high = (settings["std_rad"] * settings[name] for name in ("least_factor", "most_factor"))
     return (

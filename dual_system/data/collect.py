@@ -1,8 +1,8 @@
-"""``pp-collect``: oracle episodes of any number of tasks, as a dataset to train on.
+"""``pp-collect``: collects oracle episodes of any number of tasks as a training dataset.
 
-A collection is a set of jobs that know nothing of each other. Finished episodes lie in ``OUT/.collecting`` until the
-last one is there; then they are joined in the jobs' order into the dataset, aside, and moved to their places,
-``meta`` last. So a killed run is resumed by the same command, and leaves the same bytes as one that was not killed.
+A collection is a set of independent jobs. Finished episodes lie in ``OUT/.collecting`` until the last one is there;
+then they are joined aside in the jobs' order and moved into place, ``meta`` last. The same command resumes a killed
+run, and the result is byte for byte that of an undisturbed run.
 """
 
 from __future__ import annotations
@@ -15,24 +15,23 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-import tyro
 from tqdm import tqdm
 
-from dual_system.data.album import AlbumOptions, make_album, require_named
 from dual_system.data.dart import DART, NoiseKind
 from dual_system.data.episode import Package, Rejection, unpack
 from dual_system.data.errors import DatasetError
 from dual_system.data.jobs import DIFFICULTY_CYCLE, RECOVERY_SHARE, Job, Look, jobs_of
-from dual_system.data.lerobot_v3 import ALBUM, COLLECTION_PATH, INFO_PATH, DatasetWriter
+from dual_system.data.lerobot_v3 import COLLECTION_PATH, INFO_PATH, DatasetWriter
 from dual_system.data.rollout import UNSOLVED, work_out
 from dual_system.data.seeds import TRAIN_SEED
 from dual_system.data.shove import SHOVES
 from dual_system.data.store import Store
 from dual_system.data.workers import LocalWorkers, RayWorkers, Workers
-from dual_system.tasks.difficulty import Difficulty, Order
+from dual_system.tasks.difficulty import Difficulty
 from dual_system.tasks.task import TaskError, chosen_tasks
+from protocol.command_line import parse
 
 SCALES = {"1x": 1, "9x": 9}
 COLLECTING, JOINED = ".collecting", "joined"
@@ -48,74 +47,55 @@ class CollectOptions:
     out: Path
     """Folder of the dataset."""
     tasks: tuple[str, ...] = ("all",)
-    """sim-client --list-tasks shows them."""
+    """Names of the tasks, or `all`. sim-client --list-tasks shows them."""
     episodes: int = 100
-    """Per task, times the scale."""
+    """Number of episodes per task, before --scale."""
     first_episode: int = 0
-    """Leave out so many of each task: a second folder then holds other scenes than the first, and other seeds."""
+    """Number of episodes of each task to skip: a second folder then holds other scenes and seeds than the first."""
     scale: Literal["1x", "9x"] = "1x"
-    """Paper: 100 episodes a task, or 900."""
+    """Multiple of --episodes to collect (paper: 100 episodes per task, or 900)."""
     frames: Literal["all", "training"] = "all"
-    """Pictures at 20 Hz; or only those that training reads, of demonstrations and POUNCE's invocations."""
+    """Pictures to render: all at 20 Hz, or only those that training reads (demonstrations, POUNCE's invocations)."""
     invocation_hz: Literal[1, 2, 4, 5, 10, 20] = 10
-    """With --frames training: how often POUNCE looks (paper: every 100 ms in training)."""
+    """Rate of POUNCE's invocations in Hz, with --frames training (paper: every 100 ms in training)."""
     demonstration_hz: Literal[1, 2, 4, 5, 10, 20] = 1
-    """With --frames training: how often demonstrations are looked at (paper: once a second)."""
+    """Rate of demonstration pictures in Hz, with --frames training; the last frame is always rendered (paper: 1)."""
     image_px: int = 256
-    """Even; the paper's and the benchmark's is 256."""
+    """Side of the pictures in pixels, an even number (paper and benchmark: 256)."""
     noise: NoiseKind = "none"
-    """dart: nudge the executed joint targets off the oracle's way; `action` stays the way, the label."""
+    """Noise on the executed joint targets. dart: perturb the oracle's path; `action` stays the oracle's, the label."""
     recovery_share: float = RECOVERY_SHARE
-    """Of the episodes, those with a grasp that closes too high or aside before it is made right."""
+    """Share of episodes in [0, 1] with a failed grasp, too high or beside the object, before the right one."""
     difficulties: tuple[Difficulty, ...] = DIFFICULTY_CYCLE
-    """Of the episodes of a task in turn, again and again."""
-    order: Order = "drawn"
-    """Where a task leaves open what is done first: as the scene was drawn (upstream), or what is nearest to the front
-    camera first, which a learner can foresee."""
+    """Difficulties of a task's episodes, taken in turn."""
     texts: Literal["latched", "follow"] = "latched"
-    """Coordinates in subgoals: as first seen (upstream), or corrected when their thing was pushed elsewhere."""
+    """Coordinates in subgoals. latched: as first seen (upstream); follow: corrected when the object was pushed."""
     shove_share: float = 0.0
-    """Of the episodes, those in which things are moved aside while the hand is on its way to them; with --texts
-    follow."""
+    """Share of episodes in [0, 1] in which objects are pushed aside while the hand approaches; needs --texts follow."""
     max_steps: int = 1300
-    """An episode that takes longer is not kept."""
-    album: int = 0
-    """Also that many pictures of still scenes of every task, as pp-album makes them, into OUT/album/TASK: what opens
-    the eyes of a PONDER from scratch."""
+    """Limit of control steps per episode; longer episodes are not kept."""
     workers: int = os.cpu_count() or 1
-    """Processes of this computer."""
+    """Number of worker processes on this computer."""
     ray: str | None = None
-    """Work on a Ray cluster instead: its address, `auto`, or `local`."""
-    keep_episodes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Keep OUT/.collecting afterwards: more --episodes can then be added to the same folder."""
-    progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
-    """Show a progress bar."""
+    """Address of a Ray cluster to work on instead, or `auto`, or `local`."""
+    keep_episodes: bool = False
+    """Keep OUT/.collecting, so that more --episodes can be added to the same folder."""
+    progress: bool = True
+    """Do not show a progress bar."""
 
     def __post_init__(self) -> None:
         if self.episodes < 1 or self.workers < 1:
             raise DatasetError("--episodes and --workers must be at least 1")
         if self.first_episode < 0:
             raise DatasetError(f"--first-episode {self.first_episode}: episodes count from 0")
-        if self.album < 0:
-            raise DatasetError(f"--album {self.album}: a number of pictures, or 0 for no album")
         if self.image_px < 16 or self.image_px % 2:
             raise DatasetError(f"--image-px {self.image_px}: videos need an even number of at least 16")
         if not 0 <= self.recovery_share <= 1:
             raise DatasetError(f"--recovery-share {self.recovery_share} is not a share, in [0, 1]")
-
         if not 0 <= self.shove_share <= 1:
             raise DatasetError(f"--shove-share {self.shove_share} is not a share, in [0, 1]")
         if self.shove_share and self.texts != "follow":
-            raise DatasetError("--shove-share would make every told place wrong; give --texts follow with it")
-
-    @property
-    def albums(self) -> tuple[AlbumOptions, ...]:
-        """What --album asks for."""
-        folders = {task: self.out / ALBUM / task for task in self.task_names()} if self.album else {}
-        return tuple(
-            AlbumOptions(out=out, task=task, pictures=self.album, image_px=self.image_px, progress=self.progress)
-            for task, out in folders.items()
-        )
+            raise DatasetError("--shove-share would make latched coordinates wrong; give --texts follow with it")
 
     @property
     def look(self) -> Look:
@@ -128,7 +108,7 @@ class CollectOptions:
         return chosen_tasks(self.tasks)
 
     def jobs(self) -> list[Job]:
-        """Everything that is to be collected, in the dataset's order."""
+        """Returns one job per episode, in the dataset's order."""
         num_episodes = self.episodes * SCALES[self.scale]
         jobs = jobs_of(
             self.task_names(),
@@ -139,7 +119,6 @@ class CollectOptions:
             noise=self.noise,
             recovery_share=self.recovery_share,
             difficulties=self.difficulties,
-            order=self.order,
             texts_follow=self.texts == "follow",
             shove_share=self.shove_share,
             first_slot=self.first_episode,
@@ -147,7 +126,7 @@ class CollectOptions:
         return list(jobs)
 
     def settings(self) -> dict[str, Any]:
-        """What all episodes of one dataset have in common; how many there are and who made them is not part of it."""
+        """Returns what all episodes of a dataset have in common; their number and the workers are no part of it."""
         versions = {name: metadata.version(name) for name in ("ponderpounce", "mujoco", "numpy", "av", "pyarrow")}
         settings = {
             "first_seed": TRAIN_SEED,
@@ -162,8 +141,6 @@ class CollectOptions:
             settings["recovery_share"] = self.recovery_share
         if self.difficulties != DIFFICULTY_CYCLE:
             settings["difficulties"] = list(self.difficulties)
-        if self.order != "drawn":
-            settings["order"] = self.order
         if self.texts != "latched":
             settings["texts"] = self.texts
         if self.shove_share:
@@ -173,7 +150,7 @@ class CollectOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Report:
-    """What a collection has come to."""
+    """The result of a collection."""
 
     num_episodes: int
     num_rejected: int
@@ -183,13 +160,8 @@ class Report:
 
 def main(argv: list[str] | None = None) -> int:
     try:
-        options = tyro.cli(CollectOptions, args=argv, prog="pp-collect", description=CollectOptions.__doc__)
-        for album in options.albums:
-            require_named(album.task)
+        options = parse(CollectOptions, argv, prog="pp-collect")
         report = collect(options, _workers(options), say=print_line)
-        for album in options.albums:
-            if not (album.out / INFO_PATH).exists():
-                make_album(album)
     except (DatasetError, TaskError, OSError) as error:
         sys.stderr.write(f"pp-collect: {error}\n")
         return REFUSED
@@ -197,8 +169,7 @@ def main(argv: list[str] | None = None) -> int:
         sys.stderr.write("pp-collect: interrupted; finished episodes are kept, the same command goes on\n")
         return INTERRUPTED
     noisy = "" if options.noise == "none" else f", {report.num_rejected_noisy} of them under noise"
-    vain = f"{report.num_rejected} seeds were tried in vain{noisy}"
-    print_line(f"{report.num_episodes} episodes in {options.out} ({vain})")
+    print_line(f"{report.num_episodes} episodes in {options.out} ({report.num_rejected} seeds rejected{noisy})")
     for key in report.unsolved:
         sys.stderr.write(f"pp-collect: no episode for {key}: the oracle solved none of its seeds\n")
     return INCOMPLETE if report.unsolved else DONE
@@ -245,9 +216,10 @@ def collect(
 
 
 def disk_needed(num_missing: int, sizes: Sequence[int], image_px: int) -> int:
-    """Returns how many bytes a collection will still take: what is missing, and everything again when it is joined.
+    """Returns how many bytes a collection still needs: the missing episodes, and everything again when it is joined.
 
-    The mean of ``sizes``, of the episodes that are there, speaks for the missing ones; before there are five, a table.
+    A missing episode is estimated by the mean of ``sizes``, those that are there, or by a constant before there are
+    five.
     """
     if len(sizes) >= MEASURED_EPISODES:
         mean = sum(sizes) / len(sizes)
@@ -285,7 +257,7 @@ def _present(store: Store, jobs: Sequence[Job]) -> list[Job]:
 
 
 def _claim(path: Path, settings: dict[str, Any]) -> None:
-    """Writes down with what settings a folder was begun. Raises DatasetError if they are others now."""
+    """Records the settings that a folder was begun with. Raises DatasetError if they differ now."""
     if path.exists():
         _require_equal(json.loads(path.read_text()), settings, path.parent.parent)
         return
@@ -297,12 +269,12 @@ def _claim(path: Path, settings: dict[str, Any]) -> None:
 def _require_equal(there: dict[str, Any], wanted: dict[str, Any], out: Path) -> None:
     differing = [name for name in {**wanted, **there} if there.get(name) != wanted.get(name)]
     if differing:
-        said = "; ".join(f"{name} was {there.get(name)} and is {wanted.get(name)}" for name in differing)
-        raise DatasetError(f"{out} was begun otherwise: {said}. Use the same, or another --out")
+        changes = "; ".join(f"{name} was {there.get(name)} and is {wanted.get(name)}" for name in differing)
+        raise DatasetError(f"{out} was begun with other settings: {changes}. Use the same, or another --out")
 
 
 def _finished(out: Path, wanted: dict[str, Any]) -> Report | None:
-    """The report of a dataset that is there and is the one wanted; None if there is none yet, or it is to be extended.
+    """Returns the report of a finished dataset; None if there is none yet, or if it is to be extended.
 
     Raises DatasetError if the folder holds another dataset that cannot be extended.
     """
@@ -328,7 +300,7 @@ def _finished(out: Path, wanted: dict[str, Any]) -> Report | None:
 
 
 def _join(out: Path, store: Store, jobs: Sequence[Job], wanted: dict[str, Any]) -> Report:
-    """Joins all episodes in the jobs' order into the dataset, aside, and moves it to its place, ``meta`` last."""
+    """Joins all episodes aside, in the jobs' order, and moves the dataset into place, ``meta`` last."""
     aside = out / COLLECTING / JOINED
     shutil.rmtree(aside, ignore_errors=True)
     writer = DatasetWriter(aside)

@@ -1,13 +1,13 @@
-"""``pp-correct``: recorded episodes, acted out again up to some tick, from which the oracle goes on.
+"""``pp-collect correct``: policy rollouts, replayed up to a tick, from which the oracle takes over (DAgger).
 
-What a policy gets itself into, with what should be done there (DAgger, Ross et al. 2011; the expert keeps the arm once
-it has it, as in HG-DAgger, Kelly et al. 2019). A seed decides the scene and the physics repeats itself bit for bit, so
-a log of actions is all that is needed: no server runs. Rows before `About.corrected_from` are the policy's doing, for
-PONDER to follow; POUNCE imitates the others.
+The dataset holds the states that a policy visits and the oracle's actions from there on (Ross et al. 2011; as in
+HG-DAgger, Kelly et al. 2019, the expert keeps control once it has it). A seed decides the scene and the physics repeats
+bit for bit, so a log of actions is enough and no server runs. Rows before `About.corrected_from` are the policy's own:
+PONDER reads them, POUNCE imitates only the others.
 
-A log is corrected at several ticks, one drawn from each equal part of it, so a policy that was stuck for long is
-corrected often where it was stuck. Grasps go on from where the tool is (`Motions`, ``resumes``). Whatever else the
-oracle was called into it begins anew, which nobody should imitate: there corrected rows begin with the next subtask.
+A log is corrected at several ticks, one drawn from each of its equal parts, so a policy that was stuck for long is
+corrected often where it was stuck. Grasps resume from where the tool is (`Motions`, ``resumes``). Any other motion the
+oracle restarts from its beginning, which should not be imitated: there the corrected rows begin with the next subtask.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 import tyro
@@ -31,12 +31,12 @@ from dual_system.data.jobs import Look
 from dual_system.data.lerobot_v3 import INFO_PATH, DatasetWriter
 from dual_system.data.rollout import Scribe, UnsolvedError, asked, check_solved, kept_environment
 from dual_system.data.workers import LocalWorkers, Workers
-from dual_system.tasks.difficulty import Order
 from dual_system.tasks.engine import Status
 from dual_system.tasks.environment import Environment, Snapshot
 from dual_system.tasks.kinematics import UnreachableError
 from dual_system.tasks.oracle import Motions
 from dual_system.tasks.task import TaskError
+from protocol.command_line import parse
 from protocol.errors import ProtocolError
 from protocol.mcap_log import EpisodeRecord, read_log
 
@@ -49,23 +49,21 @@ class CorrectOptions:
     """Makes a dataset of recorded episodes that the oracle takes over. The same command gives the same dataset."""
 
     files: tyro.conf.Positional[tuple[Path, ...]]
-    """MCAP logs of sim-client or pp-eval, of lockstep episodes; pictures need not be in them."""
+    """MCAP logs of lockstep episodes, made by sim-client or pp-eval; they need no pictures."""
     out: Path
     """Folder of the new dataset."""
     per_episode: int = 2
-    """Episodes made of each log, each taken over elsewhere."""
-    order: Order = "drawn"
-    """With which the logs were played (pp-eval --order)."""
+    """Number of corrected episodes per log, each taken over at another tick."""
     look_hz: Literal[1, 2, 4, 5, 10, 20] = 5
-    """How often pictures are rendered."""
+    """Rate of rendered pictures in Hz."""
     image_px: int = 256
-    """Even; the paper's and the benchmark's is 256."""
+    """Side of the pictures in pixels, an even number (paper and benchmark: 256)."""
     max_steps: int = 1300
-    """An episode that takes longer is not kept."""
+    """Limit of control steps per episode; longer episodes are not kept."""
     workers: int = os.cpu_count() or 1
-    """Processes of this computer."""
-    progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
-    """Show a progress bar."""
+    """Number of worker processes on this computer."""
+    progress: bool = True
+    """Do not show a progress bar."""
 
     def __post_init__(self) -> None:
         if self.per_episode < 1 or self.workers < 1:
@@ -78,7 +76,7 @@ class Job:
 
     path: Path
     part: int
-    """Of the log, from 0: which of ``per_episode`` equal parts it is taken over in."""
+    """Index, from 0, of the one of ``per_episode`` equal parts of the log in which the oracle takes over."""
     options: CorrectOptions
 
     @property
@@ -88,19 +86,19 @@ class Job:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
-    """What became of a job."""
+    """The result of a job."""
 
     package: Package | None
     reason: str = ""
-    """Why there is no package."""
+    """The reason if there is no package."""
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str] | None = None, prog: str = "pp-collect correct") -> int:
     try:
-        options = tyro.cli(CorrectOptions, args=argv, prog="pp-correct", description=CorrectOptions.__doc__)
+        options = parse(CorrectOptions, argv, prog=prog)
         reasons = correct(options, LocalWorkers(options.workers, work_out))
     except (DatasetError, ProtocolError, TaskError, OSError, ValueError) as error:
-        sys.stderr.write(f"pp-correct: {error}\n")
+        sys.stderr.write(f"{prog}: {error}\n")
         return REFUSED
     num_jobs = len(options.files) * options.per_episode
     sys.stdout.write(f"{num_jobs - len(reasons)} episodes of {len(options.files)} logs in {options.out}\n")
@@ -139,7 +137,7 @@ def correct(options: CorrectOptions, workers: Workers[Job, Outcome]) -> list[str
 
 
 def _in_order(jobs: Sequence[Job], workers: Workers[Job, Outcome]) -> Iterator[Outcome]:
-    """Outcomes in the jobs' order, whatever order they come in."""
+    """Yields outcomes in the jobs' order, as workers finish them in any order."""
     early: dict[str, Outcome] = {}
     expected = iter(jobs)
     awaited = next(expected, None)
@@ -155,8 +153,8 @@ def work_out(job: Job) -> Outcome:
     record = read_log(job.path)
     actions = _actions(job.path, record)
     options = job.options
-    environment = kept_environment(  # coordinates follow what is pushed, as for the hand that pushed it
-        record.info.task, options.image_px, options.max_steps, options.order, texts_follow=True
+    environment = kept_environment(  # the policy may have pushed objects: coordinates follow them
+        record.info.task, options.image_px, options.max_steps, texts_follow=True
     )
     writer = EpisodeWriter(options.image_px)
     scribe = Scribe(environment, writer.add, Look(execution_hz=options.look_hz))
@@ -184,7 +182,7 @@ def work_out(job: Job) -> Outcome:
 
 
 def _actions(path: Path, record: EpisodeRecord) -> list[np.ndarray]:
-    """What was commanded at ticks 0, 1, 2 ...; raises DatasetError if one is missing."""
+    """Returns the actions of ticks 0, 1, 2 ...; raises DatasetError if one is missing."""
     done = {each.tick: each.action for each in record.ticks}
     missing = next((tick for tick in range(len(done)) if tick not in done), None)
     if missing is not None or not done:
@@ -195,7 +193,7 @@ def _actions(path: Path, record: EpisodeRecord) -> list[np.ndarray]:
 
 
 def _taken_over_at(seed: int, part: int, num_parts: int, num_ticks: int) -> int:
-    """A tick of one of the equal parts of an episode."""
+    """Draws a tick from one of the equal parts of an episode."""
     drawn = np.random.default_rng((seed, _TAKE_OVER_STREAM, part)).random()
     return int((part + drawn) / num_parts * num_ticks)
 
@@ -203,11 +201,11 @@ def _taken_over_at(seed: int, part: int, num_parts: int, num_ticks: int) -> int:
 def _acted_out(
     path: Path, record: EpisodeRecord, scribe: Scribe, first: Snapshot, actions: Sequence[np.ndarray]
 ) -> Snapshot:
-    """The world after these actions.
+    """Replays these actions and returns what is seen afterwards.
 
     Raises:
-        DatasetError: it is not the one that the log tells of, or something else is to be done in it.
-        UnsolvedError: no time is left there.
+        DatasetError: the state or the subgoal differs from the log's.
+        UnsolvedError: no time is left.
     """
     snapshot = first
     for action in actions:
@@ -227,7 +225,7 @@ def _acted_out(
     if text != snapshot.simple_subgoal:
         raise DatasetError(
             f"{path}: after {len(actions)} ticks the subgoal is {snapshot.simple_subgoal!r} here and {text!r} in the "
-            "log; correct it with the --order that it was played in"
+            f"log, which was made with {record.info.versions}; correct it with those versions"
         )
     return snapshot
 
@@ -251,7 +249,7 @@ def _take_over(environment: Environment, scribe: Scribe, snapshot: Snapshot) -> 
 
 
 def _without_numbers(reason: str) -> str:
-    """So that reasons of one kind are counted together."""
+    """Drops words with digits, so that reasons of one kind are counted together."""
     return " ".join(word for word in reason.split() if not any(letter.isdigit() for letter in word))
 
 

@@ -1,10 +1,10 @@
-"""DART: the arm is nudged off the oracle's way while the labels stay on it, so that data show how to come back.
+"""DART: noise moves the arm off the oracle's path while the labels stay on it, so that data show how to come back.
 
-Laskey et al., "DART: Noise Injection for Robust Imitation Learning" (2017): what is executed is the clean action plus
-noise, what is learned is the clean one. Here the noise on the seven joint targets is an Ornstein-Uhlenbeck process; how
-strong it is differs from episode to episode, some episodes have none. It fades as the tool nears anything that it could
-touch, and as the oracle comes to a stop: a script that stands still tells the arm to stay where it is, and would wander
-off with the noise. An episode's noise is a function of its seed alone; the gripper has none.
+Laskey et al., "DART: Noise Injection for Robust Imitation Learning" (2017): the clean action plus noise is executed,
+the clean action is learned. Here the noise on the seven joint targets is an Ornstein-Uhlenbeck process; its strength
+differs between episodes, and some have none. It fades as the tool nears anything that it could touch, and as the oracle
+comes to a stop: a waiting script commands the arm to stay where it is, and would drift off with the noise. An episode's
+noise is a function of its seed alone; the gripper has none.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ class DartConfig:
     """How strong the noise is, and where."""
 
     std_rad: float = 0.025
-    """Of every joint target, before the episode's factor."""
+    """Standard deviation on every joint target, before the episode's factor."""
     least_factor: float = 0.3
     most_factor: float = 1.7
-    """An episode's factor is drawn evenly between the two."""
+    """Bounds of an episode's factor, drawn uniformly."""
     clean_share: float = 0.15
-    """Of the episodes, those without noise."""
+    """Share of episodes without noise."""
     correlation_s: float = 0.5
-    """The time in which a nudge decays to 1/e."""
+    """Time in which the noise decays to 1/e."""
     touch_m: float = 0.03
-    """Up to this clearance of the tool there is no noise: the fingers reach beyond it."""
+    """Clearance of the tool up to which there is no noise: the fingers reach beyond it."""
     free_m: float = 0.13
-    """From this clearance on noise is whole; in between it grows in proportion."""
+    """Clearance from which on the noise is full; in between it grows linearly."""
     moving_rad_s: float = 0.2
-    """From this speed of the fastest joint's target on noise is whole; below it is less in proportion."""
+    """Speed of the fastest joint's target from which on the noise is full; below it is reduced linearly."""
 
     def share(self, clearance_m: float, speed_rad_s: float) -> float:
         """Returns how much of the noise is left, in [0, 1], at a clearance of the tool and a speed of the plan."""
@@ -49,7 +49,7 @@ class DartConfig:
         return freedom * min(1.0, speed_rad_s / self.moving_rad_s)
 
     def settings(self) -> dict[str, Any]:
-        """What a dataset says of it."""
+        """Returns what a dataset records of it."""
         return {"kind": "dart", **asdict(self)}
 
 
@@ -62,7 +62,7 @@ def episode_std_rad(kind: NoiseKind, seed: int, config: DartConfig = DART) -> fl
 
 
 class Dart:
-    """The noise of one episode. Ask it once per control step, before the step."""
+    """The noise of one episode. Call `executed` once per control step, before the step."""
 
     def __init__(self, physics: Physics, seed: int, config: DartConfig = DART) -> None:
         self._rng = np.random.default_rng((seed, _NOISE_STREAM))
@@ -73,7 +73,7 @@ class Dart:
         self._nudge = np.zeros(self._planned.size)  # of unit variance once it has forgotten that it began at rest
 
     def executed(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Returns the action (8,) that is carried out in place of a planned one, within the robot's limits."""
+        """Returns the action (8,) that is executed in place of a planned one, within the robot's limits."""
         fresh = self._rng.standard_normal(self._nudge.size)
         self._nudge = self._keeps * self._nudge + np.sqrt(1 - self._keeps**2) * fresh
         nudged = action.astype(np.float64)

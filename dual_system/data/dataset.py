@@ -32,11 +32,10 @@ class Entry:
     is_success: bool
     recovery: str
     num_rejected: int
-    noise_rad: float  # 0 where nobody added noise
+    noise_rad: float  # 0 without noise
     num_rows: int
     num_demonstration_rows: int
     corrected_from: int  # see `About`
-    unreached: tuple[str, ...]
     first_row: int  # its number among all rows of the dataset
 
 
@@ -96,13 +95,12 @@ def _entry(listed: dict[str, Any]) -> Entry:
         first_row=listed["dataset_from_index"],
         noise_rad=listed.get("noise_rad", 0.0),
         corrected_from=listed.get("corrected_from", 0),
-        unreached=tuple(listed.get("unreached", ())),
         **{name: listed[name] for name in same},
     )
 
 
 def _row_groups(listed: Sequence[dict[str, Any]]) -> list[int]:
-    """Which row group of its file each episode is: they were written one by one."""
+    """Returns each episode's row group within its file; episodes were written one by one."""
     seen: Counter[tuple[int, int]] = Counter()
     groups = []
     for each in listed:

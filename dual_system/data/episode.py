@@ -1,9 +1,8 @@
-"""One episode as it lies on disk: rows at 20 Hz, a video per camera, and what is known about the whole.
+"""One episode on disk: rows at 20 Hz, a video per camera, and a description of the whole; its writer and its reader.
 
-The writer and the reader of it, side by side. Row k holds what was seen *before* action k: state, pictures and texts of
-one instant, and the action that was then applied. A demonstration's rows come first; nobody acts in them, and their
-``action`` is the command that was in force when the picture was taken. An episode is a handful of files in memory
-(`Package`): a worker anywhere makes it, and one committer puts it on disk.
+Row k holds what was seen *before* action k: state, pictures and texts of one instant, and the action that was then
+applied. A demonstration's rows come first; their ``action`` is the command in force when the picture was taken. An
+episode is a handful of files in memory (`Package`): any worker makes it, and one committer writes it to disk.
 """
 
 from __future__ import annotations
@@ -24,10 +23,9 @@ from dual_system.data.video import FPS, Frame, VideoWriter
 
 CAMERAS = ("front", "wrist")
 ROWS, ABOUT = "rows.parquet", "episode.json"
-WANDERING = "wandering things"  # the origin of what pp-wander made
-EXECUTED, SAID = "executed_action", "said"
-OPTIONAL = (EXECUTED, SAID)
-"""Columns that only some datasets have: those collected under noise, those of a policy's own play."""
+EXECUTED = "executed_action"
+OPTIONAL = (EXECUTED,)
+"""Columns that only some datasets have: those collected under noise."""
 
 Package = dict[str, bytes]  # file name -> content
 Recovery = Literal["none", "z", "xy"]
@@ -45,13 +43,12 @@ class Row:
     is_demonstration: bool = False
     is_transition: bool = False  # the first row of a new subgoal that the robot itself is to reach
     demonstration_reasoning: str = ""  # only in the first row after a demonstration
-    executed_action: NDArray[np.float32] | None = None  # (8,): what was carried out in place of `action`, under noise
-    said: str | None = None  # the policy's own new words about this row, "" for none; None: nobody was listened to
+    executed_action: NDArray[np.float32] | None = None  # (8,): executed in place of `action`, under noise
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rejection:
-    """A seed that was tried and not kept."""
+    """A seed whose episode was not kept."""
 
     seed: int
     reason: str
@@ -60,7 +57,7 @@ class Rejection:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class About:
-    """What is known about a whole episode."""
+    """The description of a whole episode."""
 
     task: str
     instruction: str
@@ -73,7 +70,6 @@ class About:
     rejected: tuple[Rejection, ...] = ()
     noise_rad: float = 0.0  # standard deviation of the joint targets' noise, far from everything; see `dart`
     corrected_from: int = 0  # the first row after the demonstration that POUNCE imitates; see `correct`
-    unreached: tuple[str, ...] = ()  # grounded subgoals that were still to come when it ended; see `export`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -85,19 +81,18 @@ class Rows:
     tcp_pose: NDArray[np.float32]  # (N, 7)
     is_demonstration: NDArray[np.bool_]  # (N,)
     is_transition: NDArray[np.bool_]  # (N,)
-    is_rendered: NDArray[np.bool_]  # (N,): the pictures are this row's own, not repeated ones
+    is_rendered: NDArray[np.bool_]  # (N,): the pictures are this row's own, not repeats of an earlier row's
     subgoal: tuple[str, ...]
     grounded_subgoal: tuple[str, ...]
     demonstration_reasoning: tuple[str, ...]
-    executed_action: NDArray[np.float32] | None = None  # (N, 8); None: every action was carried out as it is
-    said: tuple[str, ...] | None = None  # as the policy told places, [x, y] in thousandths; None: not recorded
+    executed_action: NDArray[np.float32] | None = None  # (N, 8); None: every action was executed as it is
 
     def __len__(self) -> int:
         return len(self.state)
 
 
 class EpisodeWriter:
-    """Takes an episode row by row and encodes its pictures as they come; in memory it is some megabytes."""
+    """Takes an episode row by row and encodes its pictures as they come; it needs some megabytes of memory."""
 
     def __init__(self, image_px: int) -> None:
         self._rows: list[Row] = []
@@ -129,7 +124,6 @@ class EpisodeWriter:
             grounded_subgoal=tuple(row.grounded_subgoal for row in rows),
             demonstration_reasoning=tuple(row.demonstration_reasoning for row in rows),
             executed_action=_executed(rows),
-            said=None if all(row.said is None for row in rows) else tuple(row.said or "" for row in rows),
         )
         pixels = {camera: [each.num_frames, each.counts.tolist()] for camera, each in self._pixels.items()}
         sink = io.BytesIO()
@@ -159,7 +153,6 @@ def unpack(package: Package) -> Episode:
         for camera, (num_frames, counts) in values.pop("pixels").items()
     }
     values["rejected"] = tuple(Rejection(**each) for each in values["rejected"])
-    values["unreached"] = tuple(values["unreached"])
     return Episode(
         about=About(**values),
         rows=from_table(pq.read_table(io.BytesIO(package[ROWS]))),
@@ -169,19 +162,19 @@ def unpack(package: Package) -> Episode:
 
 
 def to_table(rows: Rows) -> pa.Table:
-    """The columns as an Arrow table."""
+    """Returns the rows as an Arrow table."""
     columns = {each.name: getattr(rows, each.name) for each in fields(Rows)}
     return pa.table({name: _to_arrow(column) for name, column in columns.items() if column is not None})
 
 
 def from_table(table: pa.Table) -> Rows:
-    """The columns of an Arrow table; those it has besides are left aside, and it may lack what is optional."""
+    """Returns the rows of an Arrow table; unknown columns are ignored, and optional ones may be missing."""
     names = [each.name for each in fields(Rows) if each.name not in OPTIONAL or each.name in table.column_names]
     return Rows(**{name: _from_arrow(table.column(name).combine_chunks()) for name in names})
 
 
 def _executed(rows: list[Row]) -> NDArray[np.float32] | None:
-    """What was carried out in each row (N, 8); None if that is not said of any."""
+    """Returns the executed actions (N, 8); None if no row has one."""
     if all(row.executed_action is None for row in rows):
         return None
     return np.stack([row.action if row.executed_action is None else row.executed_action for row in rows])

@@ -1,8 +1,8 @@
-"""``pp-export``: recorded episodes as a dataset of the same format, every row an exact join by tick.
+"""``pp-export``: exports recorded episodes as a dataset of the same format, every row an exact join by tick.
 
-Row k is the observation of tick k, the texts that were in force then, what the policy said of it, and the action
-that was commanded for tick k. A log holds no demonstration; since a seed decides the scene, it is acted out again and
-put before the rows, and the first state of the log must then be the very one that follows it.
+Row k is the observation of tick k, the texts in force then, and the action that was commanded for tick k. A log holds
+no demonstration. Since a seed decides the scene, the demonstration is performed again and put before the rows; the
+state after it must equal the first state of the log.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 import tyro
@@ -22,12 +22,11 @@ from dual_system.data.errors import DatasetError
 from dual_system.data.lerobot_v3 import INFO_PATH, DatasetWriter
 from dual_system.data.rollout import Narrator
 from dual_system.data.video import FPS, Frame
-from dual_system.tasks.difficulty import Order
-from dual_system.tasks.engine import Status
 from dual_system.tasks.environment import Environment, Snapshot, make_environment
 from dual_system.tasks.task import TaskError
 from protocol import images
 from protocol import messages as m
+from protocol.command_line import parse
 from protocol.errors import ProtocolError
 from protocol.mcap_log import EpisodeRecord, Picture, read_log, read_pictures
 
@@ -39,25 +38,23 @@ class ExportOptions:
     """Turns recorded episodes into a LeRobot v3 dataset, in the order they are named."""
 
     files: tyro.conf.Positional[tuple[Path, ...]]
-    """MCAP logs of sim-client."""
+    """MCAP logs of sim-client or pp-eval."""
     out: Path
     """Folder of the new dataset."""
     texts: Literal["logged", "follow"] = "logged"
-    """"follow": every action is played again, and told is what is to be done as things then stand. What was dropped is
-    to be picked up again, what was pushed lies elsewhere, of cubes that will all do the next is one that is left, and
-    what is still to come at the end is told, too. For a PONDER that learns from what it played."""
-    order: Order = "drawn"
-    """The one that was played in; for "follow"."""
+    """Subgoal texts. logged: as recorded; follow: replay every action and write the texts as the scene then stands.
+    A dropped object is to be picked up again, coordinates follow pushed objects, and of several objects that all count
+    the next one is one that is left. Use follow to train PONDER on policy rollouts."""
     demonstration_hz: Literal[1, 2, 4, 5, 10, 20] = 20
-    """How often demonstrations are looked at as they are acted out again. Training reads a picture a second."""
-    only_success: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Rate of a demonstration's pictures in Hz; its last frame is always rendered. Training reads 1 Hz by default."""
+    only_success: bool = False
     """Leave out episodes that did not succeed."""
-    progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
-    """Show a progress bar."""
+    progress: bool = True
+    """Do not show a progress bar."""
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(ExportOptions, args=argv, prog="pp-export", description=ExportOptions.__doc__)
+    options = parse(ExportOptions, argv, prog="pp-export")
     try:
         num_episodes = export(options)
     except (DatasetError, ProtocolError, TaskError, OSError) as error:
@@ -83,9 +80,7 @@ def export(options: ExportOptions) -> int:
         record = read_log(path)
         if options.only_success and not (record.result and record.result.is_success):
             continue
-        episode = read_episode(
-            path, record, texts=options.texts, order=options.order, demonstration_hz=options.demonstration_hz
-        )
+        episode = read_episode(path, record, texts=options.texts, demonstration_hz=options.demonstration_hz)
         writer.add(episode)
         num_episodes += 1
     if not num_episodes:
@@ -99,13 +94,16 @@ def read_episode(
     record: EpisodeRecord,
     *,
     texts: Literal["logged", "follow"] = "logged",
-    order: Order = "drawn",
     demonstration_hz: int = FPS,
 ) -> Episode:
-    """Joins a log's messages, and acts its demonstration out again, with pictures so many times a second.
+    """Joins a log's messages, and performs its demonstration again.
+
+    Args:
+        texts: as in `ExportOptions`.
+        demonstration_hz: rate of the demonstration's pictures.
 
     Raises:
-        DatasetError: something is missing from the log, or the scene that its seed gives is another one here.
+        DatasetError: something is missing from the log, or its seed gives another scene here.
         TaskError: its task does not exist here.
     """
     info = record.info
@@ -116,20 +114,17 @@ def read_episode(
     writer = EpisodeWriter(height_px)
     follows = texts == "follow"
     max_steps = len(actions) + 1  # it ended as it did
-    with make_environment(
-        info.task, image_px=height_px, max_steps=max_steps, texts_follow=follows, order=order
-    ) as environment:
+    with make_environment(info.task, image_px=height_px, max_steps=max_steps, texts_follow=follows) as environment:
         narrator, first = _again(path, environment, info, observations[0])
         for row, frames in narrator.demonstration(demonstration_hz):
             writer.add(row, frames)
         reasoning = narrator.reasoning()
         if follows:
-            told, unreached = _played_again(path, environment, first, observations, actions)
+            told = _played_again(path, environment, first, observations, actions)
         else:
-            told, unreached = texts_by_tick(record.subgoals, len(actions)), ()
-        said = said_by_tick(record.subgoals, len(actions))
-        for observation, action, (plain, grounded, is_new), own, seen in zip(
-            observations, actions, told, said, _pictures(path, observations), strict=True
+            told = texts_by_tick(record.subgoals, len(actions))
+        for observation, action, (plain, grounded, is_new), seen in zip(
+            observations, actions, told, _pictures(path, observations), strict=True
         ):
             is_first = observation is observations[0]
             row = Row(
@@ -140,7 +135,6 @@ def read_episode(
                 grounded_subgoal=grounded,
                 is_transition=is_new,
                 demonstration_reasoning=reasoning if is_first else "",
-                said=own,
             )
             writer.add(row, seen)
     about = About(
@@ -151,7 +145,6 @@ def read_episode(
         origin=info.policy,
         is_success=record.result is not None and record.result.is_success,
         image_px=height_px,
-        unreached=unreached,
     )
     return unpack(writer.pack(about))
 
@@ -162,10 +155,10 @@ def _played_again(
     snapshot: Snapshot,
     observations: Sequence[m.Observation],
     actions: Sequence[m.Floats],
-) -> tuple[list[tuple[str, str, bool]], tuple[str, ...]]:
-    """What is told at every tick, as `texts_by_tick` has it, and what is still to come at the end.
+) -> list[tuple[str, str, bool]]:
+    """Returns the texts of every tick as `texts_by_tick` has them, made anew as the scene then stands.
 
-    Raises DatasetError where the robot comes to stand elsewhere than in the log.
+    Raises DatasetError if a state differs from the log's.
     """
     told, index = [], -1
     for observation, action in zip(observations, actions, strict=True):
@@ -177,13 +170,13 @@ def _played_again(
         told.append((snapshot.simple_subgoal, snapshot.grounded_subgoal, snapshot.subgoal_index != index))
         index = snapshot.subgoal_index
         snapshot = environment.step(action, look=False)
-    return told, () if snapshot.status is Status.SUCCESS else environment.to_come()
+    return told
 
 
 def _again(
     path: Path, environment: Environment, info: m.EpisodeInfo, first: m.Observation
 ) -> tuple[Narrator, Snapshot]:
-    """Resets the log's scene. Raises DatasetError unless the robot stands there as the log says."""
+    """Resets the log's scene. Raises DatasetError unless its first state is the log's."""
     snapshot = environment.reset(info.seed, info.difficulty)
     state = snapshot.state
     if not np.array_equal(state, first.proprio):
@@ -195,7 +188,7 @@ def _again(
 
 
 def _joined(path: Path, record: EpisodeRecord) -> tuple[list[m.Observation], list[m.Floats]]:
-    """Observations and actions of ticks 0, 1, 2 ...; what was seen after the last action is left out."""
+    """Returns observations and actions of ticks 0, 1, 2 ...; the observation after the last action is left out."""
     seen = {each.tick: each for each in record.observations}
     done = {each.tick: each.action for each in record.ticks}
     num_ticks = record.result.num_ticks if record.result else len(done)
@@ -209,29 +202,23 @@ def _joined(path: Path, record: EpisodeRecord) -> tuple[list[m.Observation], lis
 
 
 def texts_by_tick(subgoals: Sequence[m.Subgoal], num_ticks: int) -> list[tuple[str, str, bool]]:
-    """The simulator's plain and grounded text in force at each tick, and whether a subgoal is new there.
+    """Returns the simulator's plain and grounded text in force at each tick, and whether a subgoal begins there.
 
     Texts are logged when they change, and both whenever a subtask begins; a plain one changes at no other time.
     """
     plain = {each.tick: each.text for each in subgoals if each.kind == m.SubgoalKind.TASK_SIMPLE}
     grounded = {each.tick: each.text for each in subgoals if each.kind == m.SubgoalKind.TASK_GROUNDED}
-    said, now = [], ("", "")
+    found, now = [], ("", "")
     for tick in range(num_ticks):
         now = (plain.get(tick, now[0]), grounded.get(tick, now[1]))
-        said.append((*now, tick in plain))
-    return said
-
-
-def said_by_tick(subgoals: Sequence[m.Subgoal], num_ticks: int) -> list[str]:
-    """What the policy itself said about each tick's observation, as it told it; empty where it said nothing."""
-    own = {each.tick: each.text for each in subgoals if each.kind == m.SubgoalKind.SUBGOAL}
-    return [own.get(tick, "") for tick in range(num_ticks)]
+        found.append((*now, tick in plain))
+    return found
 
 
 def _pictures(path: Path, observations: Sequence[m.Observation]) -> Iterator[dict[str, Frame]]:
     """Each observation's pictures: the exact pixels where the log has them, else what its cameras' channels hold.
 
-    None at ticks that nobody looked at (`--record-hz`).
+    Yields an empty dictionary at ticks without pictures (`--record-hz`).
     """
     logged = read_pictures(path)
     for observation in observations:
@@ -254,10 +241,10 @@ def _pictures(path: Path, observations: Sequence[m.Observation]) -> Iterator[dic
 
 
 def _pixels(picture: Picture, observation: m.Observation) -> Frame:
-    """A logged picture, which must have the size that the observation announced."""
-    (said,) = (image for image in observation.images if image.camera == picture.camera)
+    """Decodes a logged picture, which must have the size that the observation announced."""
+    (announced,) = (image for image in observation.images if image.camera == picture.camera)
     codec = m.ImageCodec[picture.format.upper()]
-    return images.unpack(replace(said, codec=codec, data=picture.data))
+    return images.unpack(replace(announced, codec=codec, data=picture.data))
 
 
 if __name__ == "__main__":

@@ -1,9 +1,8 @@
-"""What is to be collected: one job per kept episode, each with its own row of seeds.
+"""The jobs of a collection: one per kept episode, each with its own sequence of seeds.
 
-Jobs know nothing of each other, so any number of workers in any order make the same set: a job tries its seeds in turn
-until the oracle solves one. Unless told otherwise two of four episodes are easy, one is medium and one hard, as in
-RoboMME, and three of every hundred have a grasp that closes too high before it is made right, and three one that
-closes aside.
+Jobs are independent, so any number of workers in any order make the same set: a job tries its seeds in turn until the
+oracle solves one. By default two of four episodes are easy, one is medium and one hard, as in RoboMME, and six of every
+hundred have a failed grasp before the right one: three too high, three beside the object.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from dual_system.data.dart import NoiseKind
 from dual_system.data.episode import Recovery
 from dual_system.data.seeds import TRAIN_SEED
 from dual_system.data.video import FPS
-from dual_system.tasks.difficulty import Difficulty, Order
+from dual_system.tasks.difficulty import Difficulty
 from dual_system.tasks.oracle import FailedGrasp
 
 ATTEMPTS = 100
@@ -31,7 +30,7 @@ _ASIDE = tuple((x, y, 0) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Look:
-    """How often pictures are rendered; rows are 20 Hz whatever is looked at. Rates divide 20 Hz."""
+    """Rates at which pictures are rendered; they divide 20 Hz, which is the rate of rows."""
 
     demonstration_hz: int = FPS
     execution_hz: int = FPS
@@ -49,13 +48,12 @@ class Job:
     noise: NoiseKind = "none"
     recovery_share: float = RECOVERY_SHARE
     difficulties: tuple[Difficulty, ...] = DIFFICULTY_CYCLE
-    order: Order = "drawn"
     texts_follow: bool = False
     shove_share: float = 0.0
 
     @property
     def key(self) -> str:
-        """Where the episode lies: unique, and sorted as jobs are."""
+        """A unique name under which the episode is stored; keys sort as jobs do."""
         return f"{self.task}/{self.slot:06d}"
 
     @property
@@ -69,7 +67,7 @@ class Job:
         return "z" if place < num_each else "xy" if place < 2 * num_each else "none"
 
     def seed(self, attempt: int) -> int:
-        """The scene's seed of an attempt from 0 to 99; no two jobs of a task share one."""
+        """Returns the scene's seed of an attempt from 0 to 99; no two jobs of a task share a seed."""
         return TRAIN_SEED + ATTEMPTS * self.slot + attempt
 
 
@@ -83,7 +81,6 @@ def jobs_of(
     noise: NoiseKind = "none",
     recovery_share: float = RECOVERY_SHARE,
     difficulties: tuple[Difficulty, ...] = DIFFICULTY_CYCLE,
-    order: Order = "drawn",
     texts_follow: bool = False,
     shove_share: float = 0.0,
     first_slot: int = 0,
@@ -100,14 +97,13 @@ def jobs_of(
                 noise=noise,
                 recovery_share=recovery_share,
                 difficulties=difficulties,
-                order=order,
                 texts_follow=texts_follow,
                 shove_share=shove_share,
             )
 
 
 def failed_grasp(recovery: Recovery, seed: int, num_grasps: int) -> FailedGrasp | None:
-    """Returns which of a script's grasps fails first and where it is aimed; None if there is nothing to fail."""
+    """Returns which of a script's grasps fails first and where it is aimed; None if none is to fail."""
     if recovery == "none" or num_grasps == 0:
         return None
     rng = np.random.default_rng((seed, _RECOVERY_STREAM))

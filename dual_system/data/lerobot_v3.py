@@ -1,4 +1,4 @@
-"""A LeRobotDataset v3 folder, written by hand: parquet rows, joined videos, and the tables that find episodes there.
+"""Writes a LeRobotDataset v3 folder: parquet rows, joined videos, and the tables that locate episodes.
 
 Layout as lerobot 0.4.4 reads it (`codebase_version` v3.0): many episodes share a file, ``meta/episodes`` says where
 each lies. Nothing here depends on when or where it is written: equal episodes in equal order make equal bytes.
@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from dual_system.data.episode import CAMERAS, EXECUTED, OPTIONAL, SAID, Episode, to_table
+from dual_system.data.episode import CAMERAS, EXECUTED, OPTIONAL, Episode, to_table
 from dual_system.data.statistics import PixelHistogram, Statistics, of_vectors
 from dual_system.data.video import CODEC, FPS, PIXEL_FORMAT, VideoJoiner
 
@@ -28,8 +28,6 @@ EPISODES_PATH, TASKS_PATH = "meta/episodes/chunk-000/file-000.parquet", "meta/ta
 INFO_PATH, STATS_PATH = "meta/info.json", "meta/stats.json"
 COLLECTION_PATH = "meta/collection.json"
 """Ours: how `pp-collect` made the folder."""
-ALBUM = "album"
-"""Ours: the folder, inside, of a task's still scenes (`pp-collect --album`), each a dataset of its own."""
 
 _JOINTS = [f"joint_{number}" for number in range(1, 8)]
 _POSE = ["x", "y", "z", "qw", "qx", "qy", "qz"]
@@ -50,10 +48,10 @@ _COLUMNS: dict[str, dict[str, Any]] = {
     "index": {"dtype": "int64", "shape": [1], "names": None},
     "task_index": {"dtype": "int64", "shape": [1], "names": None},
 }
-_OPTIONAL_COLUMNS = {EXECUTED: _COLUMNS["action"], SAID: _COLUMNS["subgoal"]}
-"""Only in some datasets (`episode.OPTIONAL`)."""
+_OPTIONAL_COLUMNS = {EXECUTED: _COLUMNS["action"]}
+"""Columns that only some datasets have (`episode.OPTIONAL`)."""
 _POLICY = ("observation.state", "action", "tcp_pose", EXECUTED)
-"""Statistics of these are over the robot's own rows: they normalise a policy, and nobody acts in a demonstration."""
+"""Columns whose statistics leave demonstrations out: they normalise the policy."""
 
 
 def video_key(camera: str) -> str:
@@ -105,7 +103,6 @@ class DatasetWriter:
             "num_rejected": len(about.rejected),
             "num_demonstration_rows": int(episode.rows.is_demonstration.sum()),
             "corrected_from": about.corrected_from,
-            "unreached": list(about.unreached),
         }
         if EXECUTED in optional:
             placed["noise_rad"] = about.noise_rad
@@ -127,10 +124,7 @@ class DatasetWriter:
         self._data.close()
         for videos in self._videos.values():
             videos.close()
-        listed = pa.Table.from_pylist(self._episodes)
-        at = listed.schema.get_field_index("unreached")  # all may be empty, and Arrow then knows no type
-        listed = listed.set_column(at, "unreached", listed["unreached"].cast(pa.list_(pa.string())))
-        pq.write_table(listed, _made(self._root / EPISODES_PATH))
+        pq.write_table(pa.Table.from_pylist(self._episodes), _made(self._root / EPISODES_PATH))
         pq.write_table(_tasks(self._instructions), self._root / TASKS_PATH)
         statistics = self._data.statistics()
         statistics |= {video_key(camera): pixels.statistics() for camera, pixels in self._pixels.items()}
@@ -212,7 +206,7 @@ class _Rows:
             self._writer = None
 
     def statistics(self) -> dict[str, Statistics]:
-        """Of all rows, exactly; one column in memory at a time."""
+        """Returns exact statistics over all rows; it holds one column in memory at a time."""
         found = {}
         for name in _numbers(pq.read_schema(self._paths[0])):
             parts = [pq.read_table(path, columns=[*{name, "is_demonstration"}]) for path in self._paths]
@@ -256,7 +250,7 @@ def _place(number: int) -> dict[str, int]:
 
 
 def _numbers(schema: pa.Schema) -> list[str]:
-    """The columns that statistics are made of."""
+    """Returns the names of the columns that have statistics."""
     return [column.name for column in schema if not pa.types.is_string(column.type)]
 
 

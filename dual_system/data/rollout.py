@@ -1,4 +1,4 @@
-"""The oracle plays an episode and it is packed: what one worker does for one job."""
+"""What a worker does for one job: the oracle plays an episode, and it is packed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from dual_system.data.episode import About, EpisodeWriter, Package, Rejection, R
 from dual_system.data.jobs import ATTEMPTS, Job, Look, failed_grasp
 from dual_system.data.shove import Shoves, is_shoved
 from dual_system.data.video import FPS, Frame
-from dual_system.tasks.difficulty import Order
 from dual_system.tasks.engine import Status
 from dual_system.tasks.environment import Environment, Snapshot, make_environment
 from dual_system.tasks.geometry import pose_of
@@ -26,38 +25,37 @@ from dual_system.tasks.oracle import FailedGrasp, Motions
 from dual_system.tasks.scene import SceneFullError
 
 UNSOLVED = "unsolved.json"
-"""The only file of a package whose job found no seed that the oracle solves: the list of what was tried."""
+"""The only file of a package whose job found no seed that the oracle solves: the list of rejected seeds."""
 Action = NDArray[np.float32]
 Take = Callable[[Row, dict[str, Frame]], None]
 
 
 class UnsolvedError(Exception):
-    """The oracle did not solve this episode. The message says why."""
+    """The oracle did not solve this episode; the message gives the reason."""
 
 
 class Narrator:
-    """Turns what an environment shows into rows."""
+    """Turns an environment's snapshots into rows."""
 
     def __init__(self, environment: Environment) -> None:
         self._environment = environment
         self._kinematics = Kinematics(environment.physics.model)
 
     def tcp_pose(self, state: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The tool's pose (7,) at the joints of a state (8,)."""
+        """Returns the tool's pose (7,) at the joints of a state (8,)."""
         return pose_of(self._kinematics.tcp(state[:7].astype(np.float64))).astype(np.float32)
 
     def demonstration(self, look_hz: int) -> Iterator[tuple[Row, dict[str, Frame]]]:
-        """The rows of the conditioning video, with pictures ``look_hz`` times a second."""
+        """Yields the rows of the conditioning video, with pictures at ``look_hz``."""
         for snapshot in self._environment.demonstration(FPS, look_hz=look_hz):
             yield replace(self.row(snapshot, snapshot.command), is_demonstration=True), dict(snapshot.frames)
 
     def reasoning(self) -> str:
-        """What the demonstration has shown, in words; empty without one. Ask when it has just ended."""
-        has_demonstration = next(self._environment.demonstration(1, look_hz=1), None) is not None
-        return self._environment.reasoning() if has_demonstration else ""
+        """Returns the demonstration reasoning, empty without a demonstration; call it when that has just ended."""
+        return self._environment.reasoning() if self._environment.has_demonstration else ""
 
     def row(self, snapshot: Snapshot, action: Action) -> Row:
-        """What was seen, and what was done then."""
+        """Returns the row of a snapshot and the action that follows it."""
         return Row(
             state=snapshot.state,
             action=np.asarray(action, np.float32),
@@ -68,9 +66,9 @@ class Narrator:
 
 
 class Scribe:
-    """Plays and tells: hands every row on before its action is carried out, as `EpisodeWriter.add` takes it.
+    """Steps an environment and passes every row to ``take`` (as `EpisodeWriter.add`) before its action is executed.
 
-    ``take`` may be None: then nobody looks.
+    If ``take`` is None, nothing is rendered.
     """
 
     def __init__(self, environment: Environment, take: Take | None, look: Look) -> None:
@@ -79,7 +77,7 @@ class Scribe:
         self._subgoal_index, self._reasoning = -1, ""
 
     def begin(self) -> None:
-        """The conditioning video, if there is one. The environment has just been reset."""
+        """Passes on the rows of the conditioning video, if there is one; call it right after a reset."""
         if self._take is None:
             return
         for row, frames in self._narrator.demonstration(self._look.demonstration_hz):
@@ -87,7 +85,7 @@ class Scribe:
         self._reasoning = self._narrator.reasoning()
 
     def step(self, snapshot: Snapshot, action: Action, executed: Action | None = None) -> Snapshot:
-        """Carries ``executed`` out, or the action itself, which is what the row holds."""
+        """Executes ``executed``, or the action itself; the row holds the action."""
         done = action if executed is None else executed
         if self._take is None:
             return self._environment.step(done, look=False)
@@ -104,8 +102,8 @@ class Scribe:
 
 
 def work_out(job: Job) -> Package:
-    """Tries the job's seeds in turn; returns the first solved episode, or why there is none."""
-    environment = kept_environment(job.task, job.image_px, job.max_steps, job.order, job.texts_follow)
+    """Tries the job's seeds in turn; returns the first solved episode, or the rejections if there is none."""
+    environment = kept_environment(job.task, job.image_px, job.max_steps, texts_follow=job.texts_follow)
     rejected: list[Rejection] = []
     for attempt in range(ATTEMPTS):
         seed = job.seed(attempt)
@@ -145,7 +143,7 @@ def play(
 ) -> Motions:
     """Plays an episode with the oracle, under the job's noise and shoves, and hands its rows to ``take``.
 
-    Without ``take`` nobody looks. Returns what the arm did. Raises UnsolvedError unless it ends with success.
+    Without ``take`` nothing is rendered. Returns the motions made. Raises UnsolvedError unless it ends with success.
     """
     snapshot = environment.reset(seed, job.difficulty)
     scribe = Scribe(environment, take, job.look)
@@ -164,7 +162,7 @@ def play(
 
 
 def asked(script: Iterator[Action], snapshot: Snapshot) -> Action:
-    """The script's next action. Raises UnsolvedError if it has none."""
+    """Returns the script's next action. Raises UnsolvedError if it has none."""
     action = next(script, None)
     if action is None:
         raise UnsolvedError(f"the script ended after {snapshot.step} steps and the episode did not")
@@ -178,9 +176,9 @@ def check_solved(snapshot: Snapshot) -> None:
 
 
 @functools.lru_cache(maxsize=1)  # building a scene takes seconds, and jobs come task by task
-def kept_environment(task: str, image_px: int, max_steps: int, order: Order, texts_follow: bool = False) -> Environment:
-    """This process's own, until it needs another one or ends. See `make_environment`."""
-    environment = make_environment(task, image_px=image_px, max_steps=max_steps, order=order, texts_follow=texts_follow)
+def kept_environment(task: str, image_px: int, max_steps: int, *, texts_follow: bool = False) -> Environment:
+    """Returns this process's environment, kept until another one is needed or the process ends."""
+    environment = make_environment(task, image_px=image_px, max_steps=max_steps, texts_follow=texts_follow)
     atexit.unregister(kept_environment.cache_clear)
     atexit.register(
         kept_environment.cache_clear

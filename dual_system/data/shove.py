@@ -1,8 +1,8 @@
-"""Shoves: while the hand is on its way to a thing, the thing, or one that is wanted later, is moved aside.
+"""Shoves: while the hand approaches an object, that object, or one that is wanted later, is pushed aside.
 
-It is then not where it was said or remembered to be, as after a grasp that pushed it. A policy does that to itself in
-one episode of three, and an oracle's data hardly ever show it. The oracle has to watch (`Motions`, ``watches``), and
-texts to follow (`make_environment`, ``texts_follow``). What happens in an episode is a function of its seed alone.
+The object is then not where the subgoal or memory has it, as after a grasp that pushed it. Policies push objects in one
+episode of three; an oracle's data hardly ever show it. The oracle has to track objects (`Motions`, ``watches``), and
+texts to follow them (`make_environment`, ``texts_follow``). An episode's shoves are a function of its seed alone.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ _DRAWS = 20  # of a free place; none found: nothing is moved
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ShoveConfig:
-    """How often, how far, and when."""
+    """When and how far objects are pushed."""
 
     mean_wait_s: float = 1.5
-    """From when the hand sets out; a subtask has one shove at most, and one that is over sooner may have none."""
+    """Mean time from a subtask's begin to its shove; a subtask has at most one, and a short one may have none."""
     least_m: float = 0.015
     most_m: float = 0.07
-    """Every factor between the two is as likely."""
+    """Distances are drawn log-uniformly between the two."""
     most_turned_rad: float = 0.8
     free_m: float = 0.055
-    """From the middle of any other thing to where the moved one is put: cubes have a side of 4 cm."""
+    """Distance from the centre of any other object to the pushed one's new place; cubes have a side of 4 cm."""
     tool_above_m: float = 0.125
-    """Only while the tool is so high above the thing; a grasp waits at 0.13 m, and then comes down upon it."""
+    """Least height of the tool above the object; a grasp waits at 0.13 m before it comes down."""
     later_share: float = 0.25
-    """Of the shoves, those of a thing that is wanted later, if there is one."""
+    """Share of shoves that move an object wanted later, if there is one."""
 
     def settings(self, share: float) -> dict[str, Any]:
-        """What a dataset says of it."""
+        """Returns what a dataset records of it."""
         return {"share": share, **asdict(self)}
 
 
@@ -47,12 +47,12 @@ SHOVES = ShoveConfig()
 
 
 def is_shoved(seed: int, share: float) -> bool:
-    """Whether an episode is one of the share that has shoves."""
+    """Returns whether an episode is among the share that has shoves."""
     return bool(np.random.default_rng((seed, _SHOVE_STREAM)).random() < share)
 
 
 class Shoves:
-    """The shoves of one episode. Ask once per control step, before the step."""
+    """The shoves of one episode. Call `step` once per control step, before the step."""
 
     def __init__(self, physics: Physics, subtasks: Sequence[Subtask], seed: int, config: ShoveConfig = SHOVES) -> None:
         self._rng = np.random.default_rng((seed, _SHOVE_STREAM))
@@ -63,7 +63,7 @@ class Shoves:
         self.num_shoved = 0
 
     def step(self, index: int) -> None:
-        """Perhaps moves something, during the subtask of this index."""
+        """Pushes an object aside, or nothing, during the subtask of this index."""
         happens = self._rng.random() < 1 / (self._config.mean_wait_s * CONTROL_HZ)
         if not happens or index in self._done or not self._wanted[index]:
             return
@@ -87,7 +87,7 @@ class Shoves:
 
 
 def moved_aside(physics: Physics, body: str, rng: np.random.Generator, config: ShoveConfig = SHOVES) -> Array | None:
-    """A body's pose (7,), moved aside and turned, away from everything else; None if no room was found."""
+    """Returns a body's pose (7,) moved aside and turned, clear of all other objects; None if no room was found."""
     here = physics.pose(body)
     others_m = np.array([physics.position_m(each)[:2] for each in physics.props if each != body]).reshape(-1, 2)
     for _ in range(_DRAWS):
@@ -101,7 +101,7 @@ def moved_aside(physics: Physics, body: str, rng: np.random.Generator, config: S
 
 
 def _turned(wxyz: Array, by_rad: float) -> Array:
-    """A quaternion (4,) turned about the vertical."""
+    """Returns a quaternion (4,) turned about the vertical."""
     w, x, y, z = wxyz
     c, s = np.cos(by_rad / 2), np.sin(by_rad / 2)
     return np.array([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w])

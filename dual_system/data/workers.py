@@ -1,4 +1,4 @@
-"""Who works jobs out: processes of this computer, or a Ray cluster. Results come in any order, each job's once."""
+"""Workers: processes of this computer, or a Ray cluster. Results come in any order, one per job."""
 
 from __future__ import annotations
 

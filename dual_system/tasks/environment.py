@@ -1,4 +1,4 @@
-"""The order of calls: reset, act for 50 ms, judge, look. One environment runs one task, one episode at a time."""
+"""The order of calls: reset, act for 50 ms, judge, render. One environment runs one task, one episode at a time."""
 
 from __future__ import annotations
 
@@ -10,33 +10,31 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dual_system.tasks import captions, demonstration, engine, forks, panda, predicates, sight
+from dual_system.tasks import captions, demonstration, engine, panda, predicates, sight
 from dual_system.tasks.captions import Caption
 from dual_system.tasks.demonstration import Row
-from dual_system.tasks.difficulty import DIFFICULTIES, Order
+from dual_system.tasks.difficulty import DIFFICULTIES
 from dual_system.tasks.engine import Progress, Status
-from dual_system.tasks.forks import Fork
 from dual_system.tasks.geometry import Array, pose_of
 from dual_system.tasks.kinematics import UnreachableError
 from dual_system.tasks.oracle import Motions
 from dual_system.tasks.physics import CONTROL_HZ, Physics, PhysicsState
 from dual_system.tasks.rendering import Cameras
 from dual_system.tasks.scene import FRONT, table_scene
-from dual_system.tasks.task import Shown, StepT, Subtask, Task, TaskError, located, make_task
+from dual_system.tasks.task import Subtask, Task, TaskError, make_task
 
 IMAGE_PX = 256  # upstream's; grounded texts count in these pixels
 _MAX_DRAWS = 20
 _PUSHED_M = 0.01  # texts that follow are corrected from this distance on
-_NUM_WATCHED = 2  # as many as PONDER is taught to have in mind at a picture (`place_lessons`)
 MAX_STEPS = 1300  # the paper's limit; upstream's own default is 10000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Snapshot:
-    """What the robot and its cameras say at one instant, before the next action. Its arrays belong to it alone."""
+    """The observation of one instant, before the next action, with outcome and texts. It owns its arrays."""
 
     step: int  # control steps since reset returned; in a demonstration, frames since it began
-    frames: Mapping[str, NDArray[np.uint8]]  # camera name -> (image_px, image_px, 3) RGB; empty if nobody looked
+    frames: Mapping[str, NDArray[np.uint8]]  # camera name -> (image_px, image_px, 3) RGB; empty if not rendered
     state: NDArray[np.float32]  # (8,): seven joints [rad], one finger's opening [m], 0 without fingers
     command: NDArray[np.float32]  # (8,): the action that led here: joint targets [rad], gripper in [-1, 1]
     tcp_pose: NDArray[np.float64]  # (7,): xyz [m], quaternion wxyz
@@ -45,7 +43,7 @@ class Snapshot:
     simple_subgoal: str
     grounded_subgoal: str
     subtask_index: int  # the engine's; the texts follow it one step later, as upstream delivers them
-    subgoal_index: int  # the subtask that the texts speak of; two in a row may have the same text
+    subgoal_index: int  # the subtask that the texts describe; two in a row may have the same text
     is_demonstration: bool = False  # a frame of the conditioning video; outcome and subtask are then those of a start
 
 
@@ -72,25 +70,24 @@ def make_environment(
     render: bool = True,
     max_steps: int = MAX_STEPS,
     texts_follow: bool = False,
-    order: Order = "drawn",
 ) -> Environment:
     """Returns an environment of a registered task. Raises TaskError for an unknown name.
 
-    With ``texts_follow`` the coordinates of a grounded subgoal are corrected when its things have been pushed
-    elsewhere, there are some where upstream tells a way without its end (`located`) or a demonstration's text names no
-    place, what was dropped on its way is to be picked up again, and of things that will all do the next is one that is
-    left (`Task.subtasks_after`); upstream's stay where they were first seen, and go on. An ``order`` other than
-    upstream's changes the list of subtasks, and with it texts and oracle; scenes and what counts as success stay.
+    With ``texts_follow`` the texts follow the scene: a grounded subgoal's coordinates are corrected when its objects
+    have been pushed elsewhere, an object that was dropped on its way is to be picked up again, and of several objects
+    that all count the next subgoal names one that is left (`Task.subtasks_after`). Upstream's texts keep the
+    coordinates at which the objects were first seen, and go on down the list.
     """
     return Environment(
-        make_task(name), image_px=image_px, render=render, max_steps=max_steps, texts_follow=texts_follow, order=order
+        make_task(name), image_px=image_px, render=render, max_steps=max_steps, texts_follow=texts_follow
     )
 
 
 class Environment:
     """One task in its simulated world, stepped at 20 Hz. Use it as a context manager or close it.
 
-    Without rendering nothing touches GL; texts and physics are the same either way.
+    Without rendering it needs no GL; texts and physics are the same either way. The class is long because it is one
+    idea, the order of calls: judging, captions, sight and the demonstration's performance are modules of their own.
     """
 
     def __init__(
@@ -101,12 +98,10 @@ class Environment:
         render: bool,
         max_steps: int,
         texts_follow: bool = False,
-        order: Order = "drawn",
     ) -> None:
-        self._task = task
-        self._order = order
+        self.task = task
         self._texts_follow = texts_follow
-        self._said_of: Array = np.zeros((0, 3))  # where the things of the grounded text were when it was made
+        self._grounded_at: Array = np.zeros((0, 3))  # where the grounded text's objects were when it was written
         spec = table_scene(task.robot)
         task.furnish(spec)
         self.physics = Physics(spec)
@@ -124,9 +119,9 @@ class Environment:
 
     @property
     def instruction(self) -> str:
-        """The sentence the robot is given in this episode."""
+        """The instruction of this episode."""
         self._require_episode()
-        return self._task.instruction(self._layout)
+        return self.task.instruction(self._layout)
 
     @property
     def layout(self) -> Any:
@@ -140,25 +135,29 @@ class Environment:
         self._require_episode()
         return self._subtasks
 
+    @property
+    def has_demonstration(self) -> bool:
+        """Whether this episode begins with a conditioning video."""
+        self._require_episode()
+        return bool(self._video)
+
     def reset(self, seed: int, difficulty: str | None = None, *, layout: Any = None) -> Snapshot:
-        """Starts an episode and returns its first snapshot; a demonstration, if there is one, has been given by then.
+        """Starts an episode and returns its first snapshot, after the demonstration if there is one.
 
         The seed alone decides the scene. Without a difficulty it is the seed's remainder by three: easy, medium,
-        hard, as upstream. A scene in which the arm cannot act out the demonstration is drawn again, as upstream's are
-        until its planner solves one; a ``layout`` takes the place of the drawn ones. Raises TaskError for an unknown
-        difficulty, and UnreachableError if there is no such scene.
+        hard, as upstream. A scene in which the arm cannot perform the demonstration is drawn again, as upstream's are
+        until its planner solves one; a ``layout`` replaces the drawn ones. Raises TaskError for an unknown difficulty,
+        and UnreachableError if there is no such scene.
         """
         difficulty = DIFFICULTIES[seed % 3] if difficulty is None else difficulty
         if difficulty not in DIFFICULTIES:
             raise TaskError(f"unknown difficulty {difficulty!r}; expected one of {', '.join(DIFFICULTIES)}")
         rng, is_given = np.random.default_rng(seed), layout is not None
         for tries_left in reversed(range(_MAX_DRAWS)):
-            layout = layout if is_given else self._task.sample(rng, difficulty)
-            layout = self._task.near_first(layout) if self._order == "near-first" else layout
+            layout = layout if is_given else self.task.sample(rng, difficulty)
             self._begin(difficulty, layout)
-            parts = [self._told(part) for part in self._task.demonstration(layout)]
             try:
-                self._video, last_action = demonstration.perform(self._task, layout, parts, self.physics, self._look_at)
+                self._video, last_action = demonstration.perform(self.task, layout, self.physics, self._look_for)
                 break
             except UnreachableError:
                 if is_given or tries_left == 0:
@@ -169,9 +168,9 @@ class Environment:
         return self._observe()
 
     def begin_in(self, found: PhysicsState) -> Snapshot:
-        """Lets the robot find another world after the demonstration than that has left; returns the first snapshot.
+        """Replaces the state that the demonstration has left; returns the first snapshot.
 
-        This is how two videos come to lead to one present, see `forks`. Raises RuntimeError after the first step.
+        `forks` lets two videos lead to one present this way. Raises RuntimeError after the first step.
         """
         self._require_episode()
         if self._step:
@@ -181,11 +180,11 @@ class Environment:
         return self._observe(look=False)
 
     def demonstration(self, rate_hz: int = CONTROL_HZ, *, look_hz: int | None = None) -> Iterator[Snapshot]:
-        """Yields the conditioning video of this episode, the first frame and every so many after; nothing without one.
+        """Yields the conditioning video of this episode at ``rate_hz``, from its first frame on; nothing without one.
 
-        It can be watched at any time and as often as one likes: pictures are rendered as they are asked for, and the
-        episode itself stands still meanwhile. With ``look_hz`` only so many of its snapshots a second have pictures,
-        and the last one: a movement often ends between two looks. Raises ValueError unless the rates divide 20 Hz.
+        It can be read at any time and any number of times: pictures are rendered on demand, and the episode does not
+        change. With ``look_hz`` only snapshots at that rate have pictures, and the last one, because a movement often
+        ends between two of them. Raises ValueError unless the rates divide 20 Hz.
         """
         self._require_episode()
         every, look_every = _steps_between(rate_hz), _steps_between(look_hz or rate_hz)
@@ -194,7 +193,7 @@ class Environment:
         return (self._demonstrated(step, self._video[step], look=step in looked_at) for step in shown)
 
     def step(self, action: ArrayLike, *, look: bool = True) -> Snapshot:
-        """Applies an action (8,) for exactly 50 ms and returns what is seen then; without ``look``, no pictures.
+        """Applies an action (8,) for exactly 50 ms and returns the snapshot after it; without ``look``, no pictures.
 
         The action is seven absolute joint targets in rad and the gripper's command in [-1, 1], clipped there. Raises
         ValueError if it has another shape or is not finite, and RuntimeError if the episode is over or never began.
@@ -211,14 +210,14 @@ class Environment:
         return self._observe(look=look)
 
     def reasoning(self) -> str:
-        """Returns what the current subtask needs from the past, in words (paper, Table 6); empty where nothing does.
+        """Returns what the current subtask needs from the past, as text (paper, Table 6); empty if nothing.
 
-        Its coordinates are where things are seen now, or were last seen in the video if they are hidden now and have
-        not moved since; the grounded subgoal stands at its end.
+        Its coordinates are where objects are seen now, or were last seen in the video if they are hidden now and have
+        not moved since; it ends with the grounded subgoal.
         """
         self._require_episode()
         assert self._caption is not None
-        needed = self._task.reasoning(self._layout, self._caption.index)
+        needed = self.task.reasoning(self._layout, self._caption.index)
         if needed is None:
             return ""
         points = [point for body in needed.grounds for point in self._look_for([body]) or self._recall(body)]
@@ -227,10 +226,10 @@ class Environment:
         return f"{text} Subgoal: {self._caption.grounded}."
 
     def oracle(self, motions: Motions | None = None) -> Iterator[NDArray[np.float32]]:
-        """Yields the actions (8,) that solve the episode, planned as the world is when each is asked for.
+        """Yields the actions (8,) that solve the episode, each planned from the state in which it is requested.
 
-        Take one, step with it, take the next; stop when the episode ends. ``motions`` are the arm's skills, fresh
-        ones by default; one's own may be made to fail a grasp, and tell afterwards what they did.
+        Take one, step with it, take the next; stop when the episode ends. ``motions`` are the arm's skills, new ones by
+        default; the caller's own may include a failed grasp, and count grasps.
         """
         self._require_episode()
         motions = Motions(self.physics) if motions is None else motions
@@ -239,40 +238,12 @@ class Environment:
         for subtask in self._subtasks[self._progress.index :]:
             yield from subtask.motion(motions)
 
-    def onward(self) -> str:
-        """Returns where the next subgoal will be, ``<y, x>``: the first of its things as it stands; empty if none."""
-        self._require_episode()
-        assert self._caption is not None
-        is_lost = self._to_pick_up_again() is not None
-        following = self._subtasks[self._progress.index if is_lost else self._caption.index + 1 :][:1]
-        return "".join("<{}, {}>".format(*self._project(step.grounds[:1])[0]) for step in following if step.grounds)
-
-    def due_step(self) -> int | None:
-        """Returns when what must happen at one instant is to begin (`Task.due_step`), in steps from reset on."""
-        self._require_episode()
-        due: int | None = self._task.due_step(self._layout)
-        return due
-
-    def to_come(self) -> tuple[str, ...]:
-        """Returns the grounded texts of the subtasks after the one that is spoken of, with where their things stand.
-
-        What is not in the scene yet has no place.
-        """
-        self._require_episode()
-        assert self._caption is not None
-        texts = []
-        for step in self._subtasks[self._caption.index + 1 :]:
-            is_there = not any(map(self.physics.is_parked, step.grounds))
-            points = self._project(step.grounds) if is_there else []
-            texts.append(captions.grounded(step.text, points) if is_there else captions.simple(step.text))
-        return tuple(texts)
-
     def save(self) -> EpisodeState:
-        """Returns a copy of the whole episode as it stands."""
+        """Returns a copy of the current state of the whole episode."""
         self._require_episode()
         assert self._caption is not None
         return EpisodeState(
-            task=self._task.name,
+            task=self.task.name,
             difficulty=self.difficulty,
             layout=self._layout,
             step=self._step,
@@ -286,23 +257,15 @@ class Environment:
 
     def restore(self, state: EpisodeState, *, look: bool = True) -> Snapshot:
         """Continues a saved episode and returns its snapshot. Raises TaskError if it is another task's."""
-        if state.task != self._task.name:
-            raise TaskError(f"the saved episode is of task {state.task!r}; this environment runs {self._task.name!r}")
+        if state.task != self.task.name:
+            raise TaskError(f"the saved episode is of task {state.task!r}; this environment runs {self.task.name!r}")
         self._begin(state.difficulty, state.layout)
         self.physics.load(state.physics)
         self._step, self._memory = state.step, state.memory
         self._progress, self._caption, self._video = state.progress, state.caption, state.video
         self._actions = list(state.actions)
-        self._read_on()
+        self._reorder()
         return self._snapshot(look=look)
-
-    def fork(self, variant: int = 0) -> Fork:
-        """Returns this episode and a twin that looks the same now and had another past; see `forks`.
-
-        The episode itself stands still meanwhile. Raises ForkError where there is no such twin, or not so many.
-        """
-        self._require_episode()
-        return forks.fork(self, self._task, variant)
 
     def close(self) -> None:
         """Frees the renderer. May be called twice."""
@@ -320,43 +283,39 @@ class Environment:
 
     def _begin(self, difficulty: str, layout: Any) -> None:
         self.difficulty, self._layout = difficulty, layout
-        self._subtasks = tuple(self._told(subtask) for subtask in self._task.subtasks(layout))
+        self._subtasks = self.task.subtasks(layout)
         self._step, self._memory, self._caption, self._progress = 0, None, None, Progress()
         self._actions = []
         self.physics.reset()
-        self._task.arrange(self.physics, layout)
+        self.task.arrange(self.physics, layout)
         self.physics.refresh()
 
-    def _read_on(self) -> None:
-        """With ``texts_follow``: the list goes on from what has been done, in whatever order."""
+    def _reorder(self) -> None:
+        """Reorders the subtasks by what has been done, with ``texts_follow``."""
         if self._texts_follow:
-            done = self._task.subtasks_after(self._layout, self._memory)
-            self._subtasks = tuple(self._told(subtask) for subtask in done)
-
-    def _told(self, step: StepT) -> StepT:
-        return located(step) if self._texts_follow else step
+            self._subtasks = self.task.subtasks_after(self._layout, self._memory)
 
     def _observe(self, *, look: bool = True) -> Snapshot:
-        """Stages, remembers, judges and captions the instant the physics is at."""
-        self._task.stage(self.physics, self._layout, self._memory, self.physics.elapsed_steps() - 1)
-        spoken_of = self._progress.index  # texts change one step after the engine does
-        before, self._memory = self._memory, self._task.remember(self._memory, self.physics, self._layout)
+        """Stages, remembers, judges and captions the current instant of the physics."""
+        self.task.stage(self.physics, self._layout, self._memory, self.physics.elapsed_steps() - 1)
+        described = self._progress.index  # texts change one step after the engine does
+        before, self._memory = self._memory, self.task.remember(self._memory, self.physics, self._layout)
         if self._memory != before:
-            self._read_on()
+            self._reorder()
         self._progress = engine.judge(
             self._progress,
             self._subtasks,
             self.physics,
             self._memory,
-            is_accomplished=self._task.is_accomplished(self._memory, self._layout),
+            is_accomplished=self.task.is_accomplished(self._memory, self._layout),
         )
         if self._progress.status is Status.ONGOING and self._step >= self._max_steps:
             reason = f"not done after {self._max_steps} steps"
             self._progress = Progress(index=self._progress.index, status=Status.TIMEOUT, reason=reason)
-        if self._progress.index == spoken_of and (again := self._to_pick_up_again()) is not None:
-            spoken_of = again
-        subtask = self._subtasks[spoken_of]
-        caption = captions.follow(self._caption, spoken_of, subtask.text, lambda: self._look_at(subtask))
+        if self._progress.index == described and (again := self._to_pick_up_again()) is not None:
+            described = again
+        subtask = self._subtasks[described]
+        caption = captions.follow(self._caption, described, subtask.text, lambda: self._look_for(subtask.grounds))
         if self._texts_follow:
             caption = self._following(caption, subtask)
         if self._progress.status is Status.SUCCESS:
@@ -365,9 +324,10 @@ class Environment:
         return self._snapshot(look=look)
 
     def _to_pick_up_again(self) -> int | None:
-        """With ``texts_follow``: the subtask that picked up what has to be carried now and was dropped on the way.
+        """Returns the subtask that picks up what has to be carried now and was dropped; None without ``texts_follow``.
 
-        From when it lies on the table until it is picked up again. The engine's subtask stays the one it is.
+        It holds from when the object lies on the table until it is picked up again. The engine's subtask does not
+        change.
         """
         index, physics = self._progress.index, self.physics
         cubes = self._subtasks[index].carries if self._texts_follow else ()
@@ -381,41 +341,23 @@ class Environment:
         return before if is_lost else None
 
     def _following(self, caption: captions.Caption, subtask: Subtask) -> captions.Caption:
-        """The caption with new coordinates, if its things were pushed elsewhere (not lifted) and can be seen."""
+        """Returns the caption, with new coordinates if its objects were pushed elsewhere (not lifted) and are seen."""
         now = np.array([self.physics.position_m(body) for body in subtask.grounds]).reshape(-1, 3)
         if caption is not self._caption:
-            self._said_of = now
+            self._grounded_at = now
             return caption
-        moved_m = np.abs(now - self._said_of).max(axis=0, initial=0.0)
+        moved_m = np.abs(now - self._grounded_at).max(axis=0, initial=0.0)
         was_pushed = moved_m[:2].max() >= _PUSHED_M and moved_m[2] < _PUSHED_M
         if not caption.is_latched or not was_pushed:
             return caption
-        points = self._look_at(subtask)
+        points = self._look_for(subtask.grounds)
         if points is None:
             return caption
-        self._said_of = now
+        self._grounded_at = now
         return replace(caption, grounded=captions.grounded(subtask.text, points))
 
-    def _look_at(self, step: Subtask | Shown) -> list[captions.Pixel] | None:
-        """The coordinates of its text; None if one of its things is hidden.
-
-        Those of a way are where its ends stand, hidden or not: half a target's pixels would lead beside it.
-        """
-        if not (self._texts_follow and step.way):
-            return self._look_for(step.grounds)
-        return self._project(step.grounds)
-
-    def _project(self, bodies: Sequence[str]) -> list[captions.Pixel]:
-        """Where bodies stand in the front camera's picture, hidden or not."""
-        K, Rt = sight.intrinsic(self.physics, FRONT, IMAGE_PX), sight.extrinsic(self.physics, FRONT)
-        points_px = sight.project(K, Rt, np.array([self.physics.position_m(body) for body in bodies]).reshape(-1, 3))
-        return [(int(y), int(x)) for x, y in points_px.tolist()]
-
     def _look_for(self, bodies: Sequence[str]) -> list[captions.Pixel] | None:
-        """Where the front camera sees bodies; None if one of them is hidden.
-
-        Texts speak of a 256 px image, whatever size is rendered.
-        """
+        """Returns where the front camera sees bodies, in a 256 px image at any rendered size; None if one is hidden."""
         points = []
         for body in bodies:
             pixels = sight.visible_pixels(self.physics, FRONT, body, IMAGE_PX)
@@ -426,7 +368,7 @@ class Environment:
         return points
 
     def _recall(self, body: str) -> list[captions.Pixel]:
-        """Where the video's frames, one a second, last show a body that still stands there; empty if they do not."""
+        """Returns where the video's frames, one a second, last show a body that has not moved since; else empty."""
         now, pose_7 = self.physics.save(), self.physics.pose(body)
         points: list[captions.Pixel] | None = None
         for row in reversed(self._video[::CONTROL_HZ]):
@@ -438,23 +380,12 @@ class Environment:
         return points or []
 
     def _demonstrated(self, step: int, row: Row, *, look: bool) -> Snapshot:
-        """A frame of the video, seen through a world that is put back as it was."""
+        """Returns a frame of the video; the episode's state is restored afterwards."""
         now = self.physics.save()
         self.physics.load(row.physics)
-        snapshot = self._seen(step, Progress(), self._watching(row.caption), look=look, is_demonstration=True)
+        snapshot = self._seen(step, Progress(), row.caption, look=look, is_demonstration=True)
         self.physics.load(now)
         return snapshot
-
-    def _watching(self, caption: Caption) -> Caption:
-        """With ``texts_follow``: the caption of a frame that names no place, with where the first two things are that
-        the robot will be asked for. What changes places meanwhile is to be followed; nothing else says where to.
-        """
-        if not self._texts_follow or "<" in caption.grounded:
-            return caption
-        bodies = [*dict.fromkeys(body for subtask in self._subtasks for body in subtask.grounds[:1])][:_NUM_WATCHED]
-        points = [] if any(map(self.physics.is_parked, bodies)) else self._project(bodies)
-        there = ", ".join(f"<{y}, {x}>" for y, x in points)
-        return replace(caption, grounded=f"{caption.grounded} at {there}") if points else caption
 
     def _snapshot(self, *, look: bool = True) -> Snapshot:
         assert self._caption is not None

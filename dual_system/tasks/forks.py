@@ -1,36 +1,33 @@
-"""Two episodes that look the same now and had different pasts: what only memory can tell apart.
+"""Two episodes that look the same now and had different pasts: only memory can tell them apart.
 
-Both branches of a fork go on from one world: joints, speeds, things and motors are the same bits in both, and so is
-every frame. There are three ways to come by the other past, and a task uses one of them.
+Both branches of a fork continue from one state: joints, speeds, objects and motors are the same bits in both, and so is
+every frame. The other past is made in one of three ways, by the task:
 
-*Retold*: the same actions, played from reset under another layout of `Task.retold`. Only what was shown is different:
+*Retold*: the same actions, played from reset under another layout of `Task.retold`. Only what was shown differs:
 another cube was lit, other colours were covered. Nothing is cut and nothing jumps.
 
-*Another video*: retold too, where all that differs is what the conditioning video shows. Another motion leaves the arm
-and the things elsewhere by a hair, so after its own video the twin finds the world that the episode found, whose clock
-included; from there on the actions are the same. What leads from the video's last frame to the first observation is
-seen by nobody, and `Fork.seam` says by how much things jump there.
+*Another video*: retold too, where only the conditioning video differs. Another motion leaves the arm and the objects
+slightly elsewhere, so after its own video the twin starts from the episode's first state, its clock included; from
+there on the actions are the same. No frame shows the step from the video's last frame to the first observation, and
+`Fork.seam` is how far things jump there.
 
-*Cut*: where the past repeats itself, as in counting, there is an earlier moment at which the world looked like now, and
-everything since is taken out of the twin's past: it had one round less. The twin keeps the memory, the texts and the
-clock of that moment and gets the world of now. The present is exact; what is not is the way there, and `Fork.seam` says
-by how much things jump between the twin's last memory and now.
+*Cut*: where the past repeats itself, as in counting, there is an earlier moment that looked like now, and everything
+since is taken out of the twin's past: it had one round less. The twin keeps the memory, the texts and the clock of that
+moment and gets the state of now. The present is exact; `Fork.seam` is how far things jump between the twin's last
+memory and now.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from dual_system.tasks import sight
 from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Environment, EpisodeState
+from dual_system.tasks.physics import Physics, PhysicsState
 from dual_system.tasks.scene import CAMERAS
-from dual_system.tasks.task import Task
-
-if TYPE_CHECKING:
-    from dual_system.tasks.environment import Environment, EpisodeState
-    from dual_system.tasks.physics import Physics, PhysicsState
 
 MAX_SEAM = 0.005  # rad or m; about half a pixel of the front camera
 
@@ -63,13 +60,13 @@ class Fork:
     seam: float  # rad or m: how far things jump, on a cut twin's last step or after another video; 0 without either
 
 
-def fork(environment: Environment, task: Task[Any, Any], variant: int) -> Fork:
-    """Returns the episode that an environment is in, and a twin; the environment is left as it was.
+def fork(environment: Environment, variant: int = 0) -> Fork:
+    """Returns the episode that an environment is in, and a twin; the environment's state is restored.
 
     Variants count from 0: retold layouts in the task's order, cuts from the latest on. Raises ForkError if the episode
     is over, did not come here from its own reset, or has no such twin now.
     """
-    now = environment.save()
+    task, now = environment.task, environment.save()
     if now.progress.status is not Status.ONGOING:
         raise ForkError(f"the episode ended at step {now.step}; fork it before it does")
     try:
@@ -79,7 +76,7 @@ def fork(environment: Environment, task: Task[Any, Any], variant: int) -> Fork:
             raise ForkError("this episode did not come here from its own reset; fork the one that it was forked from")
         if not task.repeats_itself:
             layouts = task.retold(now.layout)
-            seam = retell(environment, task, _nth(layouts, variant, now.step), (*own.past, own.now)[0])
+            seam = retell(environment, _nth(layouts, variant, now.step), (*own.past, own.now)[0])
             told = _replayed(environment, now)
             if _is_another_world(environment.physics, told.now.physics, now.physics):
                 raise ForkError(f"at step {now.step} one still sees which past it was; step on until nothing is shown")
@@ -94,13 +91,13 @@ def fork(environment: Environment, task: Task[Any, Any], variant: int) -> Fork:
         environment.restore(now, look=False)
 
 
-def retell(environment: Environment, task: Task[Any, Any], layout: Any, first: EpisodeState) -> float:
-    """Begins the other telling of an episode whose first observation is given; returns the seam in rad or m.
+def retell(environment: Environment, layout: Any, first: EpisodeState) -> float:
+    """Starts an episode's retold twin, given the episode's first state; returns the seam in rad or m.
 
-    Raises ForkError if it has another video that leaves things too far from where the episode found them.
+    Raises ForkError if its video leaves objects too far from where the episode's video left them.
     """
     environment.reset(0, first.difficulty, layout=layout)
-    if not task.retells_video:
+    if not environment.task.retells_video:
         return 0.0
     seam = environment.physics.gap(environment.save().physics, first.physics, scripted=False)
     if seam > MAX_SEAM:
@@ -112,9 +109,9 @@ def retell(environment: Environment, task: Task[Any, Any], layout: Any, first: E
 
 
 def _is_another_world(physics: Physics, a: PhysicsState, b: PhysicsState) -> bool:
-    """True if one can see which of two states one is in, now or by what things do next; hidden paint does not count.
+    """Returns whether two states can be told apart, now or by how they continue; hidden paint does not count.
 
-    Rays are cast for it, not pictures rendered. It leaves the physics in one of the two.
+    It casts rays and renders no pictures, and leaves the physics in one of the two states.
     """
     if a.integration.tobytes() != b.integration.tobytes():
         return True
@@ -126,7 +123,7 @@ def _is_another_world(physics: Physics, a: PhysicsState, b: PhysicsState) -> boo
 
 
 def _was_shown_apart(physics: Physics, a: Branch, b: Branch) -> bool:
-    """True if two pasts, conditioning videos included, could be told apart while they lasted."""
+    """Returns whether two pasts, conditioning videos included, could be told apart while they lasted."""
     one, other = _shown(a), _shown(b)
     if len(one) != len(other):
         return True
@@ -143,8 +140,8 @@ def earlier_moments_like(
 ) -> tuple[tuple[int, float], ...]:
     """Returns the moments that looked like ``now`` at other subtasks, latest first, each with its seam.
 
-    The step before must look like the one before now, or things are on their way elsewhere; and in between they must
-    have been elsewhere, or nothing but waiting would be cut. Of the moments at one subtask, only the one most alike.
+    The step before must look like the one before now, else bodies move differently; and in between they must have been
+    elsewhere, else only waiting would be cut. Each subtask contributes its most similar moment.
     """
     gaps = [physics.gap(state.physics, now.physics) for state in past]
     best: dict[int, tuple[float, int]] = {}  # subtask -> its smallest gap, and when
@@ -158,7 +155,7 @@ def earlier_moments_like(
 
 
 def _replayed(environment: Environment, now: EpisodeState) -> Branch:
-    """The actions behind a state again, in an episode that has just begun. Raises ForkError if it is over too early."""
+    """Replays a state's actions in an episode that has just begun. Raises ForkError if it ends too early."""
     states = [environment.save()]
     for action in now.actions:
         if states[-1].progress.status is not Status.ONGOING:
@@ -169,7 +166,7 @@ def _replayed(environment: Environment, now: EpisodeState) -> Branch:
 
 
 def _in_the_world_of(now: EpisodeState, twin: EpisodeState) -> EpisodeState:
-    """The twin, where everything is as it is now; its clock and its hidden paint are its own."""
+    """Returns the twin in the state of now; its clock and its hidden paint are its own."""
     physics = replace(now.physics.at_the_time_of(twin.physics), geom_rgba=twin.physics.geom_rgba)
     return replace(twin, physics=physics)
 

@@ -1,8 +1,8 @@
-"""``pp-pairs``: a dataset of counterfactual pairs, and how to read it.
+"""``pp-collect pairs``: collects a dataset of counterfactual pairs; and its reader.
 
-A folder holds ``pairs.json``, an index that says how videos are shown and has one entry per pair (everything of `Pair`
-that is not an array, and the name of its file), and one ``.npz`` file per pair with these arrays; cameras are ``front``
-and ``wrist``:
+A folder holds ``pairs.json`` and one ``.npz`` file per pair. The index has the rate of the videos' frames and one entry
+per pair: everything of `Pair` that is not an array, and the name of its file. The file has these arrays, where a camera
+is ``front`` or ``wrist``:
 
     now/<camera>                  (image_px, image_px, 3) uint8   the present, the same for both branches
     now/state                     (8,) float32
@@ -27,13 +27,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import tyro
 from numpy.typing import NDArray
 from tqdm import tqdm
 
 from dual_system.tasks.environment import IMAGE_PX, make_environment
 from dual_system.tasks.pairs import Pair, Telling, find_pair
 from dual_system.tasks.task import make_task, task_names
+from protocol.command_line import parse
 
 INDEX = "pairs.json"
 SCHEMA = "ponderpounce-pairs/1"
@@ -44,24 +44,26 @@ _ARRAYS = {"frames", "state"}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairsOptions:
-    """Counterfactual pairs: two pasts of one present."""
+    """Collects counterfactual pairs: two pasts of one present, after which the oracle acts differently."""
 
     family: Literal["counting", "permanence", "reference", "imitation"]
-    """Tasks of this family take turns."""
+    """Family of tasks; its tasks take turns."""
     out: Path
-    """Folder to write to; must not hold pairs yet."""
+    """Folder of the new dataset."""
     pairs: int = 100
+    """Number of pairs."""
     task: tuple[str, ...] = ()
-    """Only these of the family's tasks; by default all that can be forked."""
+    """Names of tasks of the family. Empty: all that can be forked."""
     seed: int = 0
-    """The first to be tried."""
+    """Seed of the first scene of every task."""
     image_px: int = IMAGE_PX
+    """Side of the pictures in pixels (paper and benchmark: 256)."""
     demo_hz: Literal[1, 2, 4, 5, 10, 20] = 1
-    """How often a second conditioning videos are looked at: as the PONDER to be scored has learned from them."""
-    video_end: bool = False
-    """Their last frame, too."""
+    """Rate in Hz of the conditioning video's frames, as the PONDER to be scored was trained on."""
+    demo_to_its_end: bool = False
+    """Take the video's last frame as well."""
     max_seeds: int = 300
-    """A task that shows no pair in so many seeds is left out, and named."""
+    """Number of seeds in a row without a pair after which a task is left out, and named."""
 
 
 def write_pair(pair: Pair, folder: Path) -> dict[str, Any]:
@@ -84,10 +86,12 @@ def write_pair(pair: Pair, folder: Path) -> dict[str, Any]:
     return entry
 
 
-def write_index(entries: list[dict[str, Any]], folder: Path, *, demo_hz: int = 1, video_end: bool = False) -> None:
+def write_index(
+    entries: list[dict[str, Any]], folder: Path, *, demo_hz: int = 1, demo_to_its_end: bool = False
+) -> None:
     """Replaces the index in one go."""
     partial = folder / f"{INDEX}.partial"
-    index = {"schema": SCHEMA, "demo_hz": demo_hz, "video_end": video_end, "pairs": entries}
+    index = {"schema": SCHEMA, "demo_hz": demo_hz, "demo_to_its_end": demo_to_its_end, "pairs": entries}
     partial.write_text(json.dumps(index, indent=1) + "\n")
     partial.replace(folder / INDEX)
 
@@ -100,13 +104,10 @@ def read_pairs(folder: Path) -> Iterator[Pair]:
     return (_read_pair(entry, folder) for entry in _index(folder)["pairs"])
 
 
-def how_shown_in(folder: Path) -> tuple[int, bool]:
-    """How often a second a folder's videos are looked at, and whether at their last frame, too.
-
-    Raises as `read_pairs`.
-    """
+def demo_sampling_of(folder: Path) -> tuple[int, bool]:
+    """Returns the rate in Hz of a folder's video frames, and whether the last one is added. Raises as `read_pairs`."""
     index = _index(folder)
-    return index.get("demo_hz", 1), index.get("video_end", False)  # folders of before say neither
+    return index["demo_hz"], index["demo_to_its_end"]
 
 
 def _index(folder: Path) -> dict[str, Any]:
@@ -141,14 +142,14 @@ def _pictures(part: str, arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[n
 
 
 def _pairs_of(task: str, options: PairsOptions) -> Generator[Pair]:
-    """All pairs of one task, seed by seed, until no seed shows any for a long time."""
+    """Yields the pairs of one task, seed by seed, until ``max_seeds`` in a row have none."""
     with (
         make_environment(task, image_px=options.image_px) as own,
         make_environment(task, render=False) as other,
     ):
         num_barren = 0
         for seed in itertools.count(options.seed):
-            pair = find_pair(own, other, task, seed, demo_hz=options.demo_hz, video_end=options.video_end)
+            pair = find_pair(own, other, task, seed, demo_hz=options.demo_hz, demo_to_its_end=options.demo_to_its_end)
             num_barren = 0 if pair else num_barren + 1
             if pair:
                 yield pair
@@ -156,20 +157,20 @@ def _pairs_of(task: str, options: PairsOptions) -> Generator[Pair]:
                 return
 
 
-def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(PairsOptions, args=argv, prog="pp-pairs")
+def main(argv: list[str] | None = None, prog: str = "pp-collect pairs") -> int:
+    options = parse(PairsOptions, argv, prog=prog)
     if (options.out / INDEX).exists():
-        sys.stderr.write(f"pp-pairs: {options.out} holds pairs already; give another --out\n")
+        sys.stderr.write(f"{prog}: {options.out} holds pairs already; give another --out\n")
         return 2
     tasks = options.task or tuple(
         name for name in task_names() if make_task(name).family == options.family and make_task(name).can_be_forked()
     )
     strangers = [name for name in tasks if make_task(name).family != options.family]
     if strangers:
-        sys.stderr.write(f"pp-pairs: {', '.join(strangers)}: not of the {options.family} family\n")
+        sys.stderr.write(f"{prog}: {', '.join(strangers)}: not of the {options.family} family\n")
         return 2
     if not tasks:
-        sys.stderr.write(f"pp-pairs: no task of the {options.family} family can be forked yet; see docs/tasks.md\n")
+        sys.stderr.write(f"{prog}: no task of the {options.family} family can be forked yet; see docs/tasks.md\n")
         return 2
     options.out.mkdir(parents=True, exist_ok=True)
     entries: list[dict[str, Any]] = []
@@ -180,13 +181,13 @@ def main(argv: list[str] | None = None) -> int:
                 pair = next(sources[task], None)
                 if pair is None:
                     del sources[task]
-                    sys.stderr.write(f"pp-pairs: {task} shows no pair in {options.max_seeds} seeds; left out\n")
+                    sys.stderr.write(f"{prog}: {task} has no pair in {options.max_seeds} seeds; left out\n")
                     continue
                 entries.append(write_pair(pair, options.out))
                 bar.update()
     for source in sources.values():
         source.close()  # frees its cameras
-    write_index(entries, options.out, demo_hz=options.demo_hz, video_end=options.video_end)
+    write_index(entries, options.out, demo_hz=options.demo_hz, demo_to_its_end=options.demo_to_its_end)
     sys.stdout.write(f"{len(entries)} pairs of {options.family}: {options.out / INDEX}\n")
     return 0 if len(entries) == options.pairs else 1
 

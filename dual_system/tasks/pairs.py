@@ -1,8 +1,8 @@
-"""Counterfactual pairs: moments at which two episodes look the same, and their scripts go different ways.
+"""Counterfactual pairs: moments at which two episodes look the same, and their scripts act differently.
 
-A pair is found by playing. Of a task that can be retold, both tellings are played with the same actions until their
-scripts part; then the robot waits until nothing shown tells them apart, which after another video nothing does. Of a
-task that repeats itself, the script is played until a twin with a round less would do something else next.
+A pair is found by playing. For a task that can be retold, both episodes are played with the same actions until their
+scripts differ; then the robot waits until nothing shown tells them apart. For a task that repeats itself, the script is
+played until a twin with one round less would act differently.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from dual_system.tasks.difficulty import DIFFICULTIES
 from dual_system.tasks.engine import Status
 from dual_system.tasks.environment import Environment, EpisodeState, Snapshot
-from dual_system.tasks.forks import Branch, Fork, ForkError, retell
+from dual_system.tasks.forks import Branch, Fork, ForkError, fork, retell
 from dual_system.tasks.oracle import Motions
 from dual_system.tasks.physics import CONTROL_HZ
-from dual_system.tasks.task import Task, make_task
+from dual_system.tasks.task import make_task
 
-PAST_HZ = 1  # the rate at which PONDER looks
+PAST_HZ = 1  # PONDER's query rate
 ORACLE_STEPS = 20  # one chunk
 
 _PATIENCE_STEPS = 120
@@ -32,7 +32,7 @@ _PARTED = 0.02  # rad, or gripper command: actions that differ by less are the s
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Telling:
-    """One branch, as a researcher loads it. T frames of the past: the conditioning video first, if there is one."""
+    """One branch: T frames of the past, the conditioning video first if there is one, and what the script does next."""
 
     frames: dict[str, NDArray[np.uint8]]  # camera name -> (T, image_px, image_px, 3)
     states: NDArray[np.float32]  # (T, 8)
@@ -40,7 +40,7 @@ class Telling:
     is_demonstration: NDArray[np.bool_]  # (T,)
     oracle: NDArray[np.float32]  # (ORACLE_STEPS, 8): what the script does next
     subgoal: str  # grounded; this and the next are of the step after now, when they speak of what comes next
-    reasoning: str  # what is needed from the past, see `Environment.reasoning`
+    reasoning: str  # see `Environment.reasoning`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,44 +69,44 @@ def find_pair(
     variant: int | None = None,
     *,
     demo_hz: int = PAST_HZ,
-    video_end: bool = False,
+    demo_to_its_end: bool = False,
 ) -> Pair | None:
-    """Plays one episode until its twin would go another way; None if there is no such moment in it.
+    """Plays one episode until its twin would act differently; returns None if there is no such moment in it.
 
-    Without a variant, those of `Task.retold` take turns by seed, and cuts are the latest. Conditioning videos are
-    looked at ``demo_hz`` times a second and, with ``video_end``, at their last frame.
+    Without a variant, those of `Task.retold` take turns by seed, and cuts are the latest. Frames of conditioning videos
+    are taken at ``demo_hz`` and, with ``demo_to_its_end``, at the end.
 
-    Both environments must be of the task; only the first needs cameras. Raises RuntimeError if the two branches turn
-    out not to look the same, which would be a defect.
+    Both environments must be of the task; only the first needs cameras. Raises RuntimeError if the two branches do not
+    look the same, which would be a defect.
     """
     kind = make_task(task)
     own.reset(seed)
     if kind.repeats_itself:
         variant = variant or 0
-        fork = _cut(own, variant)
+        found = _cut(own, variant)
     else:
         told = kind.retold(own.layout)
         if variant is None:
             variant = seed // len(DIFFICULTIES) % max(len(told), 1)  # the remainder decides the difficulty
-        fork = _retold(own, other, kind, told[variant], variant) if variant < len(told) else None
-    if fork is None:
+        found = _retold(own, other, told[variant], variant) if variant < len(told) else None
+    if found is None:
         return None
-    now, twin_now = own.restore(fork.own.now), own.restore(fork.twin.now)
+    now, twin_now = own.restore(found.own.now), own.restore(found.twin.now)
     if _bytes(now) != _bytes(twin_now):
         raise RuntimeError(f"{task}, seed {seed}, variant {variant}: the branches do not look the same at {now.step}")
     return Pair(
         task=task,
         family=kind.family,
         seed=seed,
-        difficulty=fork.own.now.difficulty,
+        difficulty=found.own.now.difficulty,
         variant=variant,
-        is_cut=fork.is_cut,
-        seam=fork.seam,
+        is_cut=found.is_cut,
+        seam=found.seam,
         instruction=own.instruction,
         frames=dict(now.frames),
         state=now.state,
-        own=_telling(own, fork.own, demo_hz, video_end),
-        twin=_telling(own, fork.twin, demo_hz, video_end),
+        own=_telling(own, found.own, demo_hz, demo_to_its_end),
+        twin=_telling(own, found.twin, demo_hz, demo_to_its_end),
     )
 
 
@@ -121,9 +121,9 @@ def oracle_chunk(environment: Environment, state: EpisodeState, num_steps: int =
     return np.stack(rows + rows[-1:] * (num_steps - len(rows)))
 
 
-def _retold(own: Environment, other: Environment, kind: Task[Any, Any], layout: Any, variant: int) -> Fork | None:
+def _retold(own: Environment, other: Environment, layout: Any, variant: int) -> Fork | None:
     try:
-        retell(other, kind, layout, own.save())
+        retell(other, layout, own.save())
     except ForkError:
         return None
     for action, others_action in zip(own.oracle(), other.oracle(), strict=False):
@@ -134,12 +134,12 @@ def _retold(own: Environment, other: Environment, kind: Task[Any, Any], layout: 
         other.step(action, look=False)
     for _ in range(_PATIENCE_STEPS):
         try:
-            fork = own.fork(variant)
+            found = fork(own, variant)
         except ForkError:
             if own.step(own.physics.command(), look=False).status is not Status.ONGOING:
                 return None
             continue
-        return fork if _goes_apart(own, fork) else None
+        return found if _goes_apart(own, found) else None
     return None
 
 
@@ -150,23 +150,23 @@ def _cut(own: Environment, variant: int) -> Fork | None:
             if own.step(action, look=False).status is not Status.ONGOING:
                 return None
         try:
-            fork = own.fork(variant)
+            found = fork(own, variant)
         except ForkError:
             continue
-        if _goes_apart(own, fork):
-            return fork
-        own.restore(fork.own.now, look=False)
+        if _goes_apart(own, found):
+            return found
+        own.restore(found.own.now, look=False)
     return None
 
 
-def _goes_apart(environment: Environment, fork: Fork) -> bool:
-    own, twin = (oracle_chunk(environment, branch.now) for branch in (fork.own, fork.twin))
+def _goes_apart(environment: Environment, found: Fork) -> bool:
+    own, twin = (oracle_chunk(environment, branch.now) for branch in (found.own, found.twin))
     return bool(np.abs(own - twin).max() > _PARTED)
 
 
-def _telling(environment: Environment, branch: Branch, demo_hz: int, video_end: bool) -> Telling:
+def _telling(environment: Environment, branch: Branch, demo_hz: int, demo_to_its_end: bool) -> Telling:
     environment.restore(branch.now, look=False)
-    seen = [*_shown(environment, demo_hz, video_end), *_past(environment, branch)]
+    seen = [*_video(environment, demo_hz, demo_to_its_end), *_past(environment, branch)]
     oracle = oracle_chunk(environment, branch.now)
     environment.restore(branch.now, look=False)
     next_ = environment.step(oracle[0], look=False)  # texts follow by one step
@@ -182,8 +182,8 @@ def _telling(environment: Environment, branch: Branch, demo_hz: int, video_end: 
     )
 
 
-def _shown(environment: Environment, demo_hz: int, video_end: bool) -> list[Snapshot]:
-    if not video_end:
+def _video(environment: Environment, demo_hz: int, demo_to_its_end: bool) -> list[Snapshot]:
+    if not demo_to_its_end:
         return [*environment.demonstration(demo_hz)]
     every = CONTROL_HZ // demo_hz
     video = [*environment.demonstration(look_hz=demo_hz)]  # in between there are no pictures

@@ -15,7 +15,6 @@ from dual_system.tasks.scene import RGBA
 
 PEG_HALF_WIDTH_M = 0.01
 BOX_HALF_M = (0.05, 0.04)  # along the hole and across it
-MOUTHS = ("ahead", "behind")  # of the hole: towards the box's +x and -x
 BOX_Z_M = 0.04  # height of a standing box's origin, its centre
 BOX_RGBA: RGBA = (1, 210 / 255, 137 / 255, 1)
 
@@ -61,11 +60,8 @@ def add_box_with_hole(spec: mujoco.MjSpec, name: str) -> None:
     """Adds a box that nothing moves, with a hole through it along its own x axis; its origin is its centre.
 
     ``name/core`` is an upright cylinder within, only seen, which stands out at the top: the lamp that shows a peg in.
-    ``name/ahead`` and ``name/behind`` are nothing but places: the hole's mouths, towards +x and -x.
     """
     box = spec.worldbody.add_body(name=name, mocap=True)
-    for mouth, end in zip(MOUTHS, (1, -1), strict=True):
-        box.add_body(name=f"{name}/{mouth}", pos=[end * BOX_HALF_M[0], 0.0, 0.0])
     wall_half_m = (_OUTER_HALF_M - _HOLE_HALF_M) / 2
     offset_m = _HOLE_HALF_M + wall_half_m
     for side in (1, -1):

@@ -76,13 +76,6 @@ class Physics:
             self.park(name)
         self.refresh()
 
-    def pose_arm(self, qpos: Array, opening_m: float) -> None:
-        """Puts the arm elsewhere at once, at rest: joints (7,) in rad, and how far each finger is from closed."""
-        self.data.qpos[self._arm_qpos] = qpos
-        if self.robot.has_gripper:
-            self.data.qpos[self._finger_qpos] = opening_m * np.array([1.0, -1.0])
-        self.refresh()
-
     def place(self, name: str, pose_7: Array) -> None:
         """Puts a prop at a pose (7,), at rest. Call `refresh` after the last one."""
         self._set_pose(name, pose_7)
@@ -102,10 +95,6 @@ class Physics:
         if body.mocapid[0] < 0:
             # An upward push equal to its weight; unlike model.body_gravcomp it is part of the saved state.
             self.data.xfrc_applied[body.id, :3] = -self.model.body_subtreemass[body.id] * self.model.opt.gravity
-
-    def is_parked(self, name: str) -> bool:
-        """Whether a prop is out of sight where `park` puts it."""
-        return bool(np.array_equal(self.position_m(name)[1:], _PARK_XYZ_M[1:]))
 
     def paint(self, geom: str, rgba: RGBA) -> None:
         """Colours a geom until the next `reset`."""

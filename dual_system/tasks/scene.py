@@ -13,7 +13,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from dual_system.tasks.front_view import EYE_M, FOV_DEG, camera_axes
 from dual_system.tasks.geometry import Footprint, is_clear
 from dual_system.tasks.panda import (
     PANDA_WRISTCAM,
@@ -39,6 +38,10 @@ RGBA = tuple[float, float, float, float]
 # Pure colours read the same in linear and in display space; anything else goes through `display_rgba`.
 CUBE_COLORS: dict[str, RGBA] = {"red": (1, 0, 0, 1), "blue": (0, 0, 1, 1), "green": (0, 1, 0, 1)}
 WHITE: RGBA = (1, 1, 1, 1)
+
+_EYE_M, _AIM_M = (0.3, 0.0, 0.4), (0.0, 0.0, -0.2)  # the front camera's
+_RIGHT = (0.0, 1.0, 0.0)  # it faces the robot: image right is the robot's left
+_FOV_DEG = 90.0  # from top to bottom, and as wide
 
 _VISIBLE = 1  # geom group that the cameras see; group 0 holds the arm's collision shapes
 _GROUND_Z_M = -0.92
@@ -235,8 +238,9 @@ def _add_lights(spec: mujoco.MjSpec) -> None:
 
 
 def _add_cameras(spec: mujoco.MjSpec) -> None:
-    right, up, _ = camera_axes()
-    spec.worldbody.add_camera(name=FRONT, pos=EYE_M, xyaxes=[*right, *up], fovy=FOV_DEG)
+    eye = np.array(_EYE_M)
+    back = (eye - np.array(_AIM_M)) / np.linalg.norm(eye - np.array(_AIM_M))
+    spec.worldbody.add_camera(name=FRONT, pos=eye, xyaxes=[*_RIGHT, *np.cross(back, _RIGHT)], fovy=_FOV_DEG)
     # In the hand's frame +z leaves the palm and the fingers open along y. Image right is +y, image up is +x.
     spec.body("right_hand").add_camera(
         name=WRIST, pos=[0.0465, -0.02, 0.036], xyaxes=[0.0, 1.0, 0.0, 1.0, 0.0, 0.0], fovy=90.0

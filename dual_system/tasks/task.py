@@ -1,9 +1,9 @@
 """What a task is: a scene, a list of subtasks, and a registry of the tasks that exist.
 
-Task, physics and environment are three things. Physics knows numbers by name, a task knows what they mean, the
-environment knows the order of calls. A task never steps, physics never scores, predicates are pure readings. Task
-objects hold no state: what one episode asks is its layout, what has happened so far is its memory, and both are
-frozen values, so that an episode can be saved and restored.
+Physics knows numbers by name, a task knows what they mean, the environment knows the order of calls. A task never
+steps, physics never scores, predicates are pure readings. Task objects hold no state: what one episode asks is its
+layout, what has happened so far is its memory, and both are frozen values, so that an episode can be saved and
+restored.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import importlib.util
 import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, TypeVar
 
 import mujoco
@@ -43,7 +43,7 @@ def never(physics: Physics, memory: Any) -> str | None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Subtask:
-    """One entry of an episode's list."""
+    """One entry of an episode's list of subtasks."""
 
     text: str  # template, see `captions`
     is_done: Callable[[Physics, Any], bool]
@@ -51,49 +51,22 @@ class Subtask:
     failure: Callable[[Physics, Any], str | None] = never  # the reason, or None while there is none
     grounds: tuple[str, ...] = ()  # bodies whose pixels fill the template's coordinates, in order
     carries: tuple[str, ...] = ()  # the cube that must be in the hand for it, and others that will do
-    way: str = ""  # what `located` adds to the text; nothing in most tasks, whose texts tell places anyway
-    way_grounds: tuple[str, ...] = ()  # bodies whose pixels fill its coordinates, in order
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shown:
-    """One part of a demonstration: what the robot does in it, and the text that goes with it. It cannot fail."""
+    """One part of a demonstration: the robot's motion and its text. It cannot fail."""
 
     text: str  # template, see `captions`
     motion: Callable[[Motions], Iterator[NDArray[np.float32]]]
     grounds: tuple[str, ...] = ()  # as in a subtask
-    way: str = ""  # as in a subtask
-    way_grounds: tuple[str, ...] = ()
     is_recorded: bool = True  # False: it happens, but the video leaves it out
-    afterwards: Callable[[Physics], None] | None = None  # what is moved in the scene when the part is over
-
-
-StepT = TypeVar("StepT", Subtask, Shown)
-
-
-def located(step: StepT) -> StepT:
-    """Returns the step with the places of its way in its grounded text, where upstream tells none.
-
-    "move left to <102, 101>, then <83, 103>" for "move left". Which target that is can be seen; a learner from scratch
-    is told, and since it acts for a while on what it heard last, also where it goes on from there.
-    """
-    if not step.way:
-        return step
-    return replace(step, text=step.text + step.way, grounds=step.way_grounds)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Thing:
-    """Something that stands in a scene and has a name; two may share one."""
-
-    name: str
-    body: str
-    is_movable: bool = True
+    afterwards: Callable[[Physics], None] | None = None  # changes the scene when the part is over
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reasoning:
-    """What must be kept in mind at one point of an episode, in words (paper, Table 6)."""
+    """The text of what a subtask needs from the past (paper, Table 6)."""
 
     text: str  # template, see `captions`; the environment appends the current grounded subgoal
     grounds: tuple[str, ...] = ()  # bodies whose pixels, now, fill the template's coordinates, in order
@@ -102,15 +75,15 @@ class Reasoning:
 class Task(ABC, Generic[LayoutT, MemoryT]):
     """One kind of episode. Subclasses carry `@task(family=...)`, one file each.
 
-    All methods but `furnish`, `arrange` and `stage` are pure functions of their arguments. Of a demonstration's parts
-    only `Shown.afterwards` changes the physics.
+    All methods but `furnish`, `arrange` and `stage` are pure functions of their arguments. A demonstration changes the
+    physics only by `Shown.afterwards`.
     """
 
     name: ClassVar[str]
     family: ClassVar[str]
     robot: ClassVar[Robot] = PANDA_WRISTCAM
     repeats_itself: ClassVar[bool] = False  # its episodes have rounds that look alike, see `forks`
-    retells_video: ClassVar[bool] = False  # `retold` changes the video and nothing of the scene after it
+    retells_video: ClassVar[bool] = False  # `retold` changes only the video, not the scene after it
 
     @abstractmethod
     def furnish(self, spec: mujoco.MjSpec) -> None:
@@ -126,99 +99,48 @@ class Task(ABC, Generic[LayoutT, MemoryT]):
 
     @abstractmethod
     def instruction(self, layout: LayoutT) -> str:
-        """Returns the sentence the robot is given, upstream's first wording."""
+        """Returns the instruction, in upstream's first wording."""
 
     @abstractmethod
     def subtasks(self, layout: LayoutT) -> tuple[Subtask, ...]:
         """Returns the ordered list of subtasks."""
 
     def subtasks_after(self, layout: LayoutT, memory: MemoryT) -> tuple[Subtask, ...]:
-        """Returns the list as it should read after what has been done, where the list leaves open what comes first.
+        """Returns the subtasks reordered by what has been done, for tasks that leave the order open.
 
-        As long, and entry by entry with the same completion and failure: success is what it was. Of two cubes that are
-        both wanted either may come first; who followed the list from here on would otherwise be sent to the one that is
-        in the bin. The default is `subtasks`.
+        The list has the same length and, entry by entry, the same completion and failure, so success does not change.
+        If either of two cubes may come first, the original list would name one that is already in the bin. The default
+        is `subtasks`.
         """
         return self.subtasks(layout)
 
     def demonstration(self, layout: LayoutT) -> tuple[Shown, ...]:
-        """Returns what happens before the robot is asked to act. The default is nothing.
+        """Returns the parts of the conditioning video, performed before the robot may act. The default is none.
 
-        The clock of `stage` runs through it; the memory of it is gone when the episode proper begins.
+        The clock of `stage` runs through it; the memory begins anew when the episode proper begins.
         """
         return ()
 
     def reasoning(self, layout: LayoutT, index: int) -> Reasoning | None:
         """Returns what subtask ``index`` needs from the past, by its family's schema in the paper's Table 6.
 
-        PONDER is taught to write it once, at the first transition after a demonstration.
+        PONDER learns to generate it once, at the first transition after a demonstration.
         """
         return None
 
     def retold(self, layout: LayoutT) -> tuple[LayoutT, ...]:
-        """Returns layouts whose episodes show other things at first and look the same later; see `forks`.
+        """Returns layouts whose episodes show something else at first and look the same later; see `forks`.
 
-        The instruction is the same, and so is the physics under the same actions, bit for bit, but for things that are
-        only shown. Once nothing is shown any more only memory tells which of them one is in, and what must be done
-        next is wrong in the others. Where only the video is another, `retells_video`, the physics need be the same but
-        for what motion leaves behind. The default is none.
+        The instruction is the same, and so is the physics under the same actions, bit for bit, except for bodies that
+        are only shown. Once they are gone only memory tells the episodes apart, and the right next action of one is
+        wrong in the others. If only the video differs (`retells_video`), the physics may differ by what a motion leaves
+        behind. The default is none.
         """
         return ()
-
-    def near_first(self, layout: LayoutT) -> LayoutT:
-        """Returns the same episode with an order that can be seen: what is nearest to the front camera comes first.
-
-        What counts as success is the same. Where a task asks for one order, or for one thing only, there is nothing to
-        choose: the default returns the layout. A drawn order nobody can foresee, so a learner can only guess at it.
-        """
-        return layout
-
-    def moving(self, layout: LayoutT, step: int) -> tuple[tuple[float, float, float], ...]:
-        """Returns where things are [m] that move by the step clock alone and must be followed, in the observation of
-        ``step``; those that have not begun to move count, too.
-
-        Empty when nothing moves any more. ``step`` counts from reset, a demonstration included. The default follows
-        nothing.
-        """
-        return ()
-
-    def underway(self, layout: LayoutT, step: int) -> tuple[int, int]:
-        """Returns when what is on its way (`moving`) in the observation of ``step`` left, and when it will be at rest,
-        were it for a moment.
-
-        ``step`` twice, and that is the default, where nothing is, or where it never rests.
-        """
-        return step, step
-
-    def laid_out(self, layout: LayoutT) -> tuple[tuple[tuple[float, float, float], ...], ...]:
-        """Returns where things lie [m] that are to be written down at the first look at a demonstration, the places of
-        one thing together and always in one order.
-
-        What is done with one of them hides it; written down before, its places can be copied. The default is nothing.
-        """
-        return ()
-
-    def due_step(self, layout: LayoutT) -> int | None:
-        """Returns when the arm is to begin with what must happen at one instant, in steps from reset on.
-
-        None, and that is the default, where nothing must.
-        """
-        return None
-
-    def things(self, layout: LayoutT, step: int, memory: MemoryT | None = None) -> tuple[Thing, ...]:
-        """Returns all that is to be named in the observation of ``step`` (`data.album`). The default names nothing."""
-        return ()
-
-    def imagined(self, rng: np.random.Generator, layout: LayoutT) -> MemoryT | None:
-        """Draws what may have happened, where a scene that stands still shows traces of it (`data.album`).
-
-        The default is None: nothing has.
-        """
-        return None
 
     @classmethod
     def can_be_forked(cls) -> bool:
-        """True if there may be other pasts that lead to the same present."""
+        """Returns whether other pasts may lead to the same present."""
         return cls.repeats_itself or cls.retold is not Task.retold
 
     @abstractmethod
@@ -226,15 +148,15 @@ class Task(ABC, Generic[LayoutT, MemoryT]):
         """Returns the memory after one more observation; ``memory`` is None at the first."""
 
     def stage(self, physics: Physics, layout: LayoutT, memory: MemoryT | None, step: int) -> None:
-        """Moves scripted things to where the observation of ``step`` shall show them. The default moves nothing.
+        """Moves scripted bodies to where the observation of ``step`` shall show them. The default moves nothing.
 
-        Called after every control step with the number of control steps since reset, and at reset with 0. The memory
-        is that of the observation before: what is seen now can move things in the next one. It is None at reset.
+        It is called after every control step with the number of control steps since reset, and at reset with 0. The
+        memory is that of the observation before: what is seen now can move bodies in the next one. It is None at reset.
         """
         return
 
     def is_accomplished(self, memory: MemoryT, layout: LayoutT) -> bool:
-        """True if the whole task is done whatever the list says. The default leaves it to the list."""
+        """Returns whether the whole task is done regardless of the list. The default leaves it to the list."""
         return False
 
 

@@ -20,7 +20,7 @@ from dual_system.models.normalisation import Quantiles, RobotStatistics
 from dual_system.models.pi05.prompt import with_subgoal
 from dual_system.models.ponder.context import ContextFormat
 from dual_system.models.ponder.coordinates import normalised_text
-from dual_system.models.ponder.showing import Showing
+from dual_system.models.ponder.demo_sampling import DemoSampling
 from dual_system.training.chunks import chunk_ticks
 from dual_system.training.episode import Frame, TrainingEpisode
 from dual_system.training.picture_store import PictureStore, Views
@@ -140,7 +140,7 @@ class TrainingSet:
         """Length of an episode, its demonstration included, without reading it."""
         return self._sources[number].entry.num_rows
 
-    def showing(self) -> Showing | None:
+    def demo_sampling(self) -> DemoSampling | None:
         """How these demonstrations are sampled; None if there are none.
 
         To their end if most of those that end between two samples have their last frame rendered.
@@ -148,7 +148,7 @@ class TrainingSet:
         begins = [source.entry.num_demonstration_rows for source in self._sources]
         shown = [(source, begin - 1) for source, begin in zip(self._sources, begins, strict=True) if begin]
         ends = [bool(source.rows().is_rendered[last]) for source, last in shown if last % (FPS // self._demo_hz)]
-        return Showing(hz=self._demo_hz, to_its_end=2 * sum(ends) > len(ends)) if shown else None
+        return DemoSampling(hz=self._demo_hz, to_its_end=2 * sum(ends) > len(ends)) if shown else None
 
     def instructions(self) -> list[str]:
         """Every instruction once, in order."""
@@ -188,8 +188,8 @@ class TrainingSet:
         source = self._sources[number]
         entry, rows = source.entry, source.rows()
         start = entry.num_demonstration_rows
-        showing = Showing(hz=self._demo_hz, to_its_end=start > 0 and bool(rows.is_rendered[start - 1]))
-        demo = showing.looks(start, FPS)
+        sampling = DemoSampling(hz=self._demo_hz, to_its_end=start > 0 and bool(rows.is_rendered[start - 1]))
+        demo = sampling.indices(start, FPS)
         if blank := [row for row in demo if not rows.is_rendered[row]]:
             raise ValueError(
                 f"{source.dataset.root}: the demonstration of {entry.task} {entry.seed} is to be sampled "

@@ -20,11 +20,10 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
-import tyro
 from torch import Tensor
 from tqdm import tqdm
 
@@ -40,6 +39,7 @@ from dual_system.training.collate import collate_ponder, collate_pounce
 from dual_system.training.data import PictureSizes, TrainingSet
 from dual_system.training.example import Example, ExampleConfig, make_example
 from dual_system.training.joint import NO_QUERY, PounceBatch, encode_rows, gather_cognition
+from protocol.command_line import parse
 
 STALE_BY = (0, 1, 2, 4)
 """k of C_{t-k}: queries, which at 1 Hz are seconds."""
@@ -67,7 +67,7 @@ class DiagnoseOptions:
     seed: int = 0
     """Of the flow draws."""
     device: Literal["cpu", "cuda"] = "cpu"
-    progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
+    progress: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,7 +80,7 @@ class Given:
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(DiagnoseOptions, args=argv, prog="pp-diagnose", description=DiagnoseOptions.__doc__)
+    options = parse(DiagnoseOptions, argv, prog="pp-diagnose")
     try:
         found = diagnose(options)
     except (DatasetError, OSError, ValueError) as error:

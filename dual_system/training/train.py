@@ -17,7 +17,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -50,6 +50,7 @@ from dual_system.training.recipe import Recipe
 from dual_system.training.recipes import recipe
 from dual_system.training.trainer import CheckpointError, SaveError, Trainer
 from dual_system.training.watch import LOG_FILE, Watch
+from protocol.command_line import parse
 
 DONE, REFUSED, INTERRUPTED = 0, 2, 130
 _SYSTEMS = ("ponder", "pounce")
@@ -80,12 +81,12 @@ class MachineOptions:
     """Device of both systems."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Of PONDER's weights and of POUNCE's stream, when they are loaded; the optimiser keeps float32 masters."""
-    tf32: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    tf32: bool = False
     """Multiply float32 matrices in TF32 on a GPU that has it, which rounds to 1 in 2000."""
     weights: Literal["sharded", "whole"] = "sharded"
     """With several processes: each holds its rows of the weights (FSDP2), or all of them, which is faster where they
     fit many times over."""
-    recompute: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    recompute: bool = False
     """Recompute PONDER's activations in the backward pass: less memory for long rows, more time."""
     length_groups: int = 1
     """Groups of like length into which the rows of a batch are divided: fewer padding tokens, more calls."""
@@ -105,9 +106,9 @@ class LogOptions:
     """Updates between checkpoints."""
     sample_every: int = 20
     """Updates between samples of PONDER's texts (OUT/samples.jsonl)."""
-    tensorboard: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    tensorboard: bool = False
     """Write losses, pictures and samples to OUT/tensorboard as well."""
-    progress: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
+    progress: bool = True
     """Do not show a progress bar."""
 
 
@@ -177,7 +178,7 @@ class Batches:
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(TrainOptions, args=argv, prog="pp-train", description=TrainOptions.__doc__)
+    options = parse(TrainOptions, argv, prog="pp-train")
     if warning := warn_of_slow(options.machine.dtype, options.machine.device):
         sys.stderr.write(f"pp-train: {warning}\n")
     try:
@@ -327,7 +328,7 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
         ponder.format = replace(
             ponder.format,
             speaks=run.w2 > 0,
-            demonstrations=data.showing() or ponder.format.demonstrations,
+            demonstrations=data.demo_sampling() or ponder.format.demonstrations,
         )
     measured = partial(data.statistics, run.pounce.horizon, run.space, by_row=run.statistics_by_row)
     if options.pounce is None:

@@ -9,13 +9,12 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-import tyro
-
 import dual_system.tasks.headless  # noqa: F401 - before anything that imports mujoco
 
 # isort: split
 
 from clock.service import ClockService, ServiceConfig
+from protocol.command_line import parse
 from protocol.errors import TransportError
 from protocol.link import Link
 from protocol.process import StopFlag, set_up_logging
@@ -30,7 +29,7 @@ log = logging.getLogger("pp-gateway")
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(GatewayOptions, args=argv, prog="pp-gateway", description=GatewayOptions.__doc__)
+    options = parse(GatewayOptions, argv, prog="pp-gateway")
     set_up_logging()
     should_stop = StopFlag()
     try:
@@ -48,12 +47,19 @@ def main(argv: list[str] | None = None) -> int:
 def _machine(options: GatewayOptions, daemons: Daemons) -> Iterator[Machine]:
     plan, link = options.plan(), options.link
     if options.local:
-        link = local_link(options, daemons)
+        link = local_link(
+            daemons,
+            robot=link.robot,
+            with_clock=options.runs_clock_daemon,
+            allow_starved=options.timing.allow_starved,
+            ponder_checkpoint=options.ponder_checkpoint,
+            pounce_checkpoint=options.pounce_checkpoint,
+        )
     bus = open_bus(link)
     try:
         clock = None
         if not options.runs_clock_daemon:
-            config = ServiceConfig(allow_starved=options.allow_starved)
+            config = ServiceConfig(allow_starved=options.timing.allow_starved)
             clock = ClockService(Link(bus, robot=link.robot, proc="clock"), config)
         yield Machine(plan, Link(bus, robot=link.robot, proc="sim"), clock, daemons.dead)
     finally:
@@ -64,7 +70,7 @@ def _machine(options: GatewayOptions, daemons: Daemons) -> Iterator[Machine]:
 def _serving(options: GatewayOptions, machine: Machine) -> Iterator[None]:
     """Listens in a thread of its own for as long as the block lasts. Raises TransportError if it cannot."""
     host, port = options.address
-    max_bytes, terms, dialect = options.max_message_mb << 20, options.terms(), options.dialect_class()
+    max_bytes, terms, dialect = options.clients.max_message_mb << 20, options.terms(), options.dialect_class()
     if options.dialect == "challenge-http":
         http = HttpSide((host, port), machine, terms, dialect, max_bytes, options.api_key())
         with _in_thread(http.serve_forever, http.shutdown):

@@ -13,41 +13,35 @@ import re
 import secrets
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeVar
 
-from clock.report import statistics, stream_sha256
 from clock.service import ClockService
 from clock.timebase import MonotonicClock
-from dual_system.models.ponder.showing import AS_IN_THE_PAPER, Showing
 from protocol import images
 from protocol import messages as m
-from protocol.errors import CallFailed, MalformedMessage, TransportError
+from protocol.drops import DropReason
+from protocol.errors import EpisodeRefused, ProtocolError, TransportError
 from protocol.link import Link, Stream, is_of_episode
-from protocol.topics import ACTION, CHUNK, CLOSE, HEALTH, OBSERVATION, OPEN, TICK, alive_key
+from protocol.topics import ACTION, CHUNK, HEALTH, OBSERVATION, TICK
 from sim_client.episode import CLOCK_SILENCE_NS
 from sim_client.gateway.body import Body
 from sim_client.gateway.exchange import Answer, Finish, Frames, Refused, Step
+from sim_client.gateway.lease import Lease
 from sim_client.gateway.node import LiveNode, LockstepNode, Node, Shown
 from sim_client.gateway.pictures import resized
-from sim_client.gateway.rule import as_shown
-from sim_client.gateway.seat import Seat
+from sim_client.gateway.rule import sampled
 from sim_client.recorder import Recorder
+from sim_client.robot_end import RobotEnd
 from sim_client.suite import versions
 
 log = logging.getLogger("pp-gateway")
 
-_OPEN_NS = 130_000_000_000
-_CLOSE_NS = 5_000_000_000
-_ASK_AGAIN_NS = 200_000_000
-_LAST_TICKS_NS = 1_000_000_000
 _IDLE_NS = 20_000_000
 _LIVE_TURN_NS = 2_000_000  # a request cannot ring the bus's bell
-_UNREADABLE = "PONDER reads"  # of `ponder_server.node.check_robot`
-_MISSHAPEN = "wrong_shape"  # the servers' own word in Health.dropped
 _STOPPED = "the gateway was stopped"
 T = TypeVar("T")
 
@@ -56,7 +50,7 @@ _NO_ID = re.compile(r"[^A-Za-z0-9_.-]+")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """What every episode of this gateway has in common."""
+    """The settings that all episodes of this gateway share."""
 
     schedule: Callable[[int], m.Schedule]  # from the episode's seed
     num_rows: int
@@ -65,7 +59,6 @@ class Plan:
     task: str = "gateway"
     image_px: int | None = None  # side of the squares that pictures are resized to; None: as they come
     seed: int = 0
-    showing: Showing = AS_IN_THE_PAPER  # of a video
     out: Path | None = None  # None: no logs
     pixels: Literal["jpeg", "exact"] = "jpeg"
     patience_ns: int = 120_000_000_000
@@ -90,37 +83,43 @@ class _Episode:
 
 
 class Machine:
-    """One robot for whoever has the seat.
+    """One robot, for the client that holds the lease.
 
     Args:
         link: the robot's end of the bus.
         clock: the clock service, if it is embedded here; it is stepped by the working thread.
-        check_servers: a sentence if a server that we started is dead, else "".
+        dead_server: a sentence if a server that we started is dead, else "".
     """
 
     def __init__(
-        self, plan: Plan, link: Link, clock: ClockService | None, check_servers: Callable[[], str] = lambda: ""
+        self, plan: Plan, link: Link, clock: ClockService | None, dead_server: Callable[[], str] = lambda: ""
     ) -> None:
         self._plan = plan
         self._link = link
-        self._clock = clock
-        self._check_servers = check_servers
+        self._dead_server = dead_server
+        self._should_stop: Callable[[], bool] = lambda: False
         self._recorder = Recorder(link, plan.pixels)
+        self._robot_end = RobotEnd(
+            link,
+            clock,
+            self._recorder,
+            patience_ns=plan.patience_ns,
+            dead_server=dead_server,
+            gives_up=lambda: self._should_stop(),
+        )
         self._actions = link.subscribe(ACTION)
         self._accounts = link.subscribe(TICK)
         self._chunks = link.subscribe(CHUNK)
         self._healths = link.subscribe(HEALTH)
-        self._misshapen: dict[str, int] = {}  # by server: observations it had dropped for their shape at the beginning
+        self._misshapen: dict[str, int] = {}  # by server: observations it had dropped for their shape at the start
         self._session = f"{_id_of(plan.suite)}-{secrets.token_hex(4)}"
         self._num_episodes = 0
         self._episode: _Episode | None = None
         self._waiting: list[Future[Answer | None]] = []  # live: asked before the first command
         self._jobs: queue.SimpleQueue[_Job] = queue.SimpleQueue()
-        self._seat = Seat(plan.idle_ns)
-        self._lock = threading.Lock()  # of the seat and the next line: network threads read them
+        self._lease = Lease(plan.idle_ns)
+        self._lock = threading.Lock()  # of the lease and the next line: network threads read them
         self._is_closed = False
-        self._should_stop: Callable[[], bool] = lambda: False
-        link.bus.declare_alive(alive_key(link.robot, link.proc))
 
     # -- called by network threads
 
@@ -137,7 +136,7 @@ class Machine:
             if self._is_closed:
                 raise Refused(_STOPPED)
             if isinstance(request, Step):
-                self._seat.take(client, time.monotonic_ns())
+                self._lease.acquire(client, time.monotonic_ns())
             self._jobs.put(job)
         return job.future
 
@@ -172,7 +171,7 @@ class Machine:
                 job.future.set_result(None)
             else:
                 self._step(job, job.request)
-        except (Refused, TransportError, MalformedMessage) as error:
+        except (Refused, TransportError, ProtocolError) as error:
             log.warning("refused client=%r %s", job.client, error)
             _refuse(job.future, str(error))
         except Exception as error:
@@ -183,7 +182,7 @@ class Machine:
         if self._episode is not None and self._episode.client == client:
             self._end(request.status, request.reason)
         with self._lock:
-            self._seat.leave(client)
+            self._lease.release(client)
 
     def _step(self, job: _Job, step: Step) -> None:
         episode = self._episode
@@ -223,7 +222,7 @@ class Machine:
                 return answer
             if time.monotonic_ns() - asked_ns > self._plan.patience_ns:
                 self._give_up(episode, f"no command within {self._plan.patience_ns / 1e9:.0f} s")
-            if why := self._check_servers() or self._objection():
+            if why := self._dead_server() or self._objection():
                 self._give_up(episode, why)
             if self._should_stop():
                 raise Refused(_STOPPED)
@@ -262,7 +261,7 @@ class Machine:
     def _objection(self) -> str:
         """A sentence if a server drops what it is shown: it was built for other pictures or joints."""
         for health in self._healths.drain():
-            if health.dropped.get(_MISSHAPEN, 0) > self._misshapen.get(health.header.proc, 0):
+            if health.dropped.get(DropReason.WRONG_SHAPE, 0) > self._misshapen.get(health.header.proc, 0):
                 proc = health.header.proc
                 return f"{proc} was built for other pictures, and says in its log for which. See --image-px"
         return ""
@@ -278,13 +277,8 @@ class Machine:
         return [each for each in stream.drain() if is_of_episode(self._link, each.header)]  # type: ignore[attr-defined]
 
     def _turn(self, longest_ns: int) -> None:
-        """One turn for everybody else; with an embedded clock, no longer than until it has something to do."""
         self._recorder.step()
-        if self._clock is not None:
-            if self._clock.step():
-                return
-            longest_ns = self._clock.wait_ns(longest_ns)
-        self._link.bus.wait(longest_ns)
+        self._robot_end.take_turn(longest_ns)
 
     def _show(self, observation: m.Observation) -> None:
         self._link.publish(OBSERVATION, observation, at_ns=observation.source_ns)
@@ -298,10 +292,6 @@ class Machine:
         seed = self._plan.seed + self._num_episodes - 1
         task = _id_of(step.task) or self._plan.task
         self._link.enter_episode(self._session, f"{task}-{seed}-{secrets.token_hex(3)}", self._num_episodes)
-        demo = tuple(
-            m.DemoFrame(images=self._packed(resized(shown, self._plan.image_px)))
-            for shown in as_shown(step.demo, self._plan.schedule(seed).control_hz, self._plan.showing)
-        )
         image_px = next(iter(frames.values())).shape[:2]
         info = m.EpisodeInfo(
             header=self._link.header("info", 0),
@@ -314,30 +304,38 @@ class Machine:
             robot=self._plan.body.describe(step.state, (image_px[0], image_px[1])),
             t0_unix_ns=time.time_ns(),
             versions=versions(),
-            has_demo=bool(demo),
+            has_demo=bool(step.demo),
         )
         path = self._log_path(info)
         self._recorder.begin(info, path)
         episode = _Episode(client, info, self._node(info), MonotonicClock())
         self._episode = episode
         try:
-            warnings = self._open(m.OpenRequest(info=info, demo=demo))
-        except (TransportError, MalformedMessage) as error:
+            demo = self._demonstration(step.demo, info.schedule.control_hz)
+            opened = self._robot_end.open(m.OpenRequest(info=info, demo=demo))
+        except (TransportError, ProtocolError) as error:
             self._end(m.TaskStatus.ABORTED, str(error))
             with self._lock:
-                self._seat.leave(client)
-            if _UNREADABLE in str(error):  # the gateway can make them another size
-                raise Refused(f"{error}. See --image-px") from error
+                self._lease.release(client)
+            if isinstance(error, EpisodeRefused) and error.refusal == m.Refusal.CAMERAS:
+                raise Refused(f"{error}. See --image-px") from error  # the gateway can make them another size
             raise
         for stale in (self._actions, self._accounts, self._chunks):
             stale.drain()
         for health in self._healths.drain():
-            self._misshapen[health.header.proc] = health.dropped.get(_MISSHAPEN, 0)
+            self._misshapen[health.header.proc] = health.dropped.get(DropReason.WRONG_SHAPE, 0)
         episode.clock, episode.heard_ns = MonotonicClock(), 0
         log.info("episode=%s client=%r demo=%d log=%s", info.header.episode, client, len(demo), path)
-        for warning in warnings:
+        for warning in opened.warnings:
             log.warning("episode=%s %s", info.header.episode, warning)
         return episode
+
+    def _demonstration(self, video: Sequence[Frames], control_hz: int) -> tuple[m.DemoFrame, ...]:
+        """Raises TransportError, EpisodeRefused: PONDER does not say which frames it reads."""
+        if not video:
+            return ()
+        frames = sampled(video, control_hz, self._robot_end.demo_sampling())
+        return tuple(m.DemoFrame(images=self._packed(resized(each, self._plan.image_px))) for each in frames)
 
     def _packed(self, frames: Frames) -> tuple[m.Image, ...]:
         return images.pack(frames, images.wire_codec(self._link.bus.is_local))
@@ -352,62 +350,18 @@ class Machine:
         day = time.strftime("%Y-%m-%d", time.gmtime())
         return self._plan.out / day / info.task / f"{info.header.episode}.mcap"
 
-    def _open(self, request: m.OpenRequest) -> tuple[str, ...]:
-        """Asks the clock service until its servers are ready."""
-        deadline_ns = time.monotonic_ns() + self._plan.patience_ns
-        while True:
-            try:
-                if self._clock is not None:  # our own thread: a call over the bus would wait for itself
-                    reply = self._clock.open(request)
-                else:
-                    reply = self._link.call(OPEN, "clock", request, timeout_ns=_OPEN_NS)
-            except CallFailed as error:
-                reply = m.OpenReply(error=str(error), try_again=True)
-            if not reply.error:
-                return reply.warnings
-            dead = self._check_servers()
-            is_late = time.monotonic_ns() > deadline_ns or self._should_stop()
-            if dead or is_late or not reply.try_again:
-                raise TransportError(dead or reply.error)
-            self._turn(_ASK_AGAIN_NS)
-
     def _end(self, status: m.TaskStatus, reason: str, keep: _Episode | None = None) -> None:
         """Closes the log and the servers' episode. One that is kept stays known, to tell its client why it is over."""
         episode, self._episode = self._episode, keep
         if episode is None or not self._link.episode:
             return
-        num_ticks = self._await_last_ticks(episode)
-        ticks = [tick for tick in self._recorder.ticks if tick.tick < num_ticks]
-        result = m.EpisodeResult(
-            status=status,
-            is_success=status == m.TaskStatus.SUCCESS,
-            reason=reason,
-            num_ticks=num_ticks,
-            stream_sha256=stream_sha256(ticks),
-            statistics=statistics(ticks, self._recorder.stamps, self._recorder.invocations),
-        )
-        missing = self._recorder.end(result)
-        request = m.CloseRequest(header=self._link.header("close", 0), result=result)
-        if self._clock is not None:
-            self._clock.close(request)
-        else:
-            with contextlib.suppress(CallFailed):  # the log already says that the clock is lost
-                self._link.call(CLOSE, "clock", request, timeout_ns=_CLOSE_NS)
+        name, num_ticks = self._link.episode, episode.node.tick
+        _, missing = self._robot_end.end(status, reason, num_ticks)
         for future in self._waiting:
             future.set_exception(Refused(f"the episode is over: {reason}"))
         self._waiting = []
-        told = " ".join([f"status={status.name} ticks={num_ticks} {reason}", *missing])
-        log.info("episode=%s over %s", self._link.episode, told)
-        self._link.leave_episode()
-
-    def _await_last_ticks(self, episode: _Episode) -> int:
-        """Accounts of ticks travel behind their commands; the hash is over all of them. Returns how many there are."""
-        deadline_ns = time.monotonic_ns() + _LAST_TICKS_NS
-        self._recorder.step()
-        while len(self._recorder.ticks) < episode.node.tick and time.monotonic_ns() < deadline_ns:
-            self._turn(1_000_000)
-        self._recorder.step()
-        return episode.node.tick
+        outcome = " ".join([f"status={status.name} ticks={num_ticks} {reason}", *missing])
+        log.info("episode=%s over %s", name, outcome)
 
 
 def _refuse(future: Future[Answer | None], sentence: str) -> None:

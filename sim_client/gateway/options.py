@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+import tyro
+
 from clock import schedules
 from clock.timebase import NS_PER_MS
 from protocol.errors import TransportError
@@ -17,7 +19,6 @@ from protocol.version import version
 from sim_client.gateway import body, challenge, openpi, vla_eval
 from sim_client.gateway.exchange import Dialect, Terms
 from sim_client.gateway.machine import Plan
-from sim_client.shown import how_shown
 
 DialectName = Literal["openpi", "challenge", "challenge-http", "vla-eval"]
 _SPOKEN: dict[DialectName, tuple[type[Dialect], Mapping[str, str], str, int]] = {
@@ -30,75 +31,99 @@ _SPOKEN: dict[DialectName, tuple[type[Dialect], Mapping[str, str], str, int]] = 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ScheduleOptions:
+    """When models are asked, and what the robot does with their answers."""
+
+    query_period_ms: int = 1000
+    """Period of PONDER's queries in ms (paper: 1 Hz)."""
+    invoke_every_ticks: int | None = None
+    """Period of POUNCE's invocations in 50 ms ticks. None: --rows in lockstep if several; else 20 in lockstep, 10 in
+    real time."""
+    delay_ms: int = 300
+    """PONDER's modelled delay in ms, in lockstep (paper: 300)."""
+    max_age_ms: int = 2000
+    """Age in ms from which a cognition is called stale (an alarm; its rows are still played)."""
+    stale_limit_ms: int = 10_000
+    """Age in ms from which a cognition's rows are not played: the robot holds, then stops."""
+    allow_starved: bool = False
+    """Start although the schedule leaves ticks without a row."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClientsOptions:
+    """Who may connect, and what a request may be."""
+
+    api_key_file: Path | None = None
+    """File with a word that clients must send as "Authorization: Api-Key WORD", as openpi-client's api_key does."""
+    open_to_anyone: bool = False
+    """Listen beyond loopback without a key: any host that reaches the port drives the robot."""
+    idle_s: float = 300.0
+    """Time in seconds without a request after which a client loses the robot to the next one that asks."""
+    max_message_mb: int = 1024
+    """Size in MB above which messages are refused. Two raw 256 px views of a 48 s video are 380 MB."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServersOptions:
+    """Where the clock service runs, and how long servers may take."""
+
+    clock: Literal["auto", "embedded", "daemon"] = "auto"
+    """Place of the clock service. auto: a process of its own in real time, this process in lockstep."""
+    patience_s: float = 120.0
+    """Longest wait in seconds for servers to be ready, and in lockstep for any command."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LogOptions:
+    """What is written."""
+
+    record: bool = True
+    """Do not write an MCAP per episode."""
+    pixels: Literal["jpeg", "exact"] = "jpeg"
+    """Form of logged raw frames. jpeg: as JPEG; exact: also bit for bit as the models saw them."""
+    task: str = "gateway"
+    """Name of the task in logs if the client does not give one."""
+    seed: int = 0
+    """Seed of the first episode; each further one uses the next."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class GatewayOptions:
     """Lets clients of other protocols drive PONDER and POUNCE: openpi's, the RoboMME challenge's, vla-eval's."""
 
     dialect: DialectName
-    """What the clients speak."""
+    """Protocol of the clients."""
     listen: str = "127.0.0.1:8000"
-    """HOST:PORT for them. Beyond loopback it needs --api-key-file or --open-to-anyone."""
-    api_key_file: Path | None = None
-    """Clients must send the word in this file as "Authorization: Api-Key WORD", as openpi-client's api_key does."""
-    open_to_anyone: bool = False
-    """Listen beyond loopback without a key: whoever reaches the port drives the robot."""
+    """HOST:PORT for the clients. Beyond loopback it needs --api-key-file or --open-to-anyone."""
     mode: Literal["lockstep", "realtime"] = "lockstep"
-    """lockstep: a request is --rows ticks of virtual time, and models may take what they need. realtime: the schedule
-    runs by itself, and a request is answered at once with what is commanded at that moment."""
+    """Clock. lockstep: a request is --rows ticks of virtual time, and models may take their time. realtime: the
+    schedule runs by itself, and a request is answered immediately with the action commanded at that moment."""
     rows: int | None = None
-    """Rows in an answer: what the client plays before it asks again. None: 1, and 20 for the challenge."""
-    cameras: tuple[str, ...] = ()
-    """NAME=KEY for each camera of ours, e.g. front=observation/image wrist=observation/wrist_image. Empty: the
-    dialect's usual keys; in vla-eval the first picture is the front camera's and the second the wrist's."""
-    state_key: str | None = None
-    """Where the measured joints are. None: the dialect's usual key."""
-    image_px: int | None = None
-    """Resize pictures to squares of this side. None: as they come, and PONDER says if it wants another size."""
+    """Number of rows in an answer, played by the client before its next request. None: 1, and 20 for the challenge."""
     robot_file: Path | None = None
     """TOML description of the robot, see docs/gateway.md. None: the Panda of our tasks and of RoboMME."""
-    task: str = "gateway"
-    """Name of the task in logs, where the client does not tell it."""
-    seed: int = 0
-    """Of the first episode; each further one uses the next."""
-
+    cameras: tuple[str, ...] = ()
+    """Pairs NAME=KEY, one per camera of ours, e.g. front=observation/image wrist=observation/wrist_image. Empty: the
+    dialect's usual keys; in vla-eval the first picture is the front camera's and the second the wrist's."""
+    state_key: str | None = None
+    """Key of the measured joints. None: the dialect's usual key."""
+    image_px: int | None = None
+    """Side in pixels of the squares that pictures are resized to. None: no resizing; PONDER refuses a wrong size."""
     local: bool = False
     """Start ponder-serve, pounce-serve (and in real time clock-serve) on this machine, and stop them at the end."""
-    clock: Literal["auto", "embedded", "daemon"] = "auto"
-    """Where the clock service runs. auto: its own process in real time, inside this one in lockstep."""
+    ponder_checkpoint: Path | None = None
+    """PONDER's checkpoint, with --local. None: random weights."""
+    pounce_checkpoint: Path | None = None
+    """POUNCE's checkpoint, with --local. None: random weights."""
+    out: Path = Path("out")
+    """Folder for one MCAP per episode."""
+    clients: tyro.conf.OmitArgPrefixes[ClientsOptions] = field(default_factory=ClientsOptions)
+    timing: tyro.conf.OmitArgPrefixes[ScheduleOptions] = field(default_factory=ScheduleOptions)
+    servers: tyro.conf.OmitArgPrefixes[ServersOptions] = field(default_factory=ServersOptions)
+    log: tyro.conf.OmitArgPrefixes[LogOptions] = field(default_factory=LogOptions)
     link: LinkOptions = field(
         default_factory=lambda: LinkOptions(connect=("tcp/127.0.0.1:7447", "tcp/127.0.0.1:7448", "tcp/127.0.0.1:7449"))
     )
-    ponder_checkpoint: Path | None = None
-    """With --local: weights of PONDER; none are random."""
-    pounce_checkpoint: Path | None = None
-    query_period_ms: int = 1000
-    """Between PONDER's looks (paper: 1 Hz)."""
-    invoke_every_ticks: int | None = None
-    """Between POUNCE's invocations. None: with every request of several rows; else 20 in lockstep, 10 in real time."""
-    demo_hz: Literal[1, 2, 4, 5, 10, 20] | None = None
-    """How many frames of a video are shown a second. None: as many as the --ponder-checkpoint says that it has learned
-    from; without one, the paper's 1."""
-    video_end: bool = False
-    """Show a video's last frame, too, although the --ponder-checkpoint does not say that it has learned so."""
-    delay_ms: int = 300
-    """Lockstep: PONDER's modelled delay (paper: 300 ms)."""
-    max_age_ms: int = 2000
-    """Cognition older than this is called stale (an alarm; its rows are still played)."""
-    stale_limit_ms: int = 10_000
-    """Rows made with a cognition older than this are not played: hold, then stop."""
-    allow_starved: bool = False
-    """Start although the schedule leaves ticks without a row."""
-
-    out: Path = Path("out")
-    """Folder for one MCAP per episode."""
-    record: bool = True
-    pixels: Literal["jpeg", "exact"] = "jpeg"
-    """jpeg: raw frames are logged as JPEG; exact: also bit for bit as the models saw them."""
-    patience_s: float = 120.0
-    """How long to wait for servers to be ready, and in lockstep for any command."""
-    idle_s: float = 300.0
-    """A client that has been silent for so long loses the robot to the next one that asks."""
-    max_message_mb: int = 1024
-    """Larger messages are refused. Two raw 256 px views of a 48 s video are 380 MB."""
 
     def check(self) -> None:
         """Raises TransportError for what cannot work together."""
@@ -114,11 +139,11 @@ class GatewayOptions:
                 f"--invoke-every-ticks {every_ticks} is no multiple of --rows {rows}: a new chunk would break the "
                 "promise of rows that the client is still playing"
             )
-        if not self.api_key_file and not self.open_to_anyone and not _is_loopback(host):
+        if not self.clients.api_key_file and not self.clients.open_to_anyone and not _is_loopback(host):
             raise TransportError(
                 f"--listen {self.listen} can be reached from other hosts: give --api-key-file, or say --open-to-anyone"
             )
-        if self.api_key_file and self.dialect == "vla-eval":
+        if self.clients.api_key_file and self.dialect == "vla-eval":
             raise TransportError("--api-key-file: vla-eval sends no key; use --open-to-anyone, or a tunnel")
 
     @property
@@ -131,18 +156,20 @@ class GatewayOptions:
 
     @property
     def runs_clock_daemon(self) -> bool:
-        return self.clock == "daemon" or (self.clock == "auto" and self.mode == "realtime")
+        place = self.servers.clock
+        return place == "daemon" or (place == "auto" and self.mode == "realtime")
 
     def api_key(self) -> str:
         """The word that clients must know; "" if none. Raises TransportError if the file has none."""
-        if self.api_key_file is None:
+        file = self.clients.api_key_file
+        if file is None:
             return ""
         try:
-            word = self.api_key_file.read_text(encoding="utf-8").strip()
+            word = file.read_text(encoding="utf-8").strip()
         except (OSError, UnicodeDecodeError) as error:
-            raise TransportError(f"--api-key-file {self.api_key_file}: {error}") from None
+            raise TransportError(f"--api-key-file {file}: {error}") from None
         if not word:
-            raise TransportError(f"--api-key-file {self.api_key_file} is empty: expected one word")
+            raise TransportError(f"--api-key-file {file} is empty: expected one word")
         return word
 
     def dialect_class(self) -> type[Dialect]:
@@ -169,15 +196,15 @@ class GatewayOptions:
         base = schedules.realtime() if self.mode == "realtime" else schedules.paper()
         rows = self.rows or _SPOKEN[self.dialect][3]
         every_ticks = rows if self.mode == "lockstep" and rows > 1 else base.invoke_period_ticks
-        fixed = Delay(kind=DelayKind.FIXED, mean_ns=self.delay_ms * NS_PER_MS)
+        fixed = Delay(kind=DelayKind.FIXED, mean_ns=self.timing.delay_ms * NS_PER_MS)
         return replace(
             base,
-            query_period_ns=self.query_period_ms * NS_PER_MS,
-            invoke_period_ticks=self.invoke_every_ticks or every_ticks,
+            query_period_ns=self.timing.query_period_ms * NS_PER_MS,
+            invoke_period_ticks=self.timing.invoke_every_ticks or every_ticks,
             query_delay=base.query_delay if self.mode == "realtime" else fixed,
             wait=WaitKind.STAND_STILL,
-            max_age_ns=self.max_age_ms * NS_PER_MS,
-            stale_limit_ns=self.stale_limit_ms * NS_PER_MS,
+            max_age_ns=self.timing.max_age_ms * NS_PER_MS,
+            stale_limit_ns=self.timing.stale_limit_ms * NS_PER_MS,
             seed=seed,
         )
 
@@ -186,20 +213,19 @@ class GatewayOptions:
         return body.read_body(self.robot_file) if self.robot_file else body.PANDA
 
     def plan(self) -> Plan:
-        """What all episodes have in common. Raises TransportError as ``body`` and `how_shown`."""
+        """What all episodes have in common. Raises TransportError as ``body``."""
         return Plan(
             schedule=self.schedule,
             num_rows=self.terms().rows,
             body=self.body(),
             suite=self.dialect,
-            task=self.task,
+            task=self.log.task,
             image_px=self.image_px,
-            seed=self.seed,
-            showing=how_shown(self.demo_hz, self.video_end, self.ponder_checkpoint),
-            out=self.out if self.record else None,
-            pixels=self.pixels,
-            patience_ns=round(self.patience_s * 1e9),
-            idle_ns=round(self.idle_s * 1e9),
+            seed=self.log.seed,
+            out=self.out if self.log.record else None,
+            pixels=self.log.pixels,
+            patience_ns=round(self.servers.patience_s * 1e9),
+            idle_ns=round(self.clients.idle_s * 1e9),
         )
 
 

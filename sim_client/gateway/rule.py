@@ -7,15 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from clock.limits import within_limits
-from dual_system.models.ponder.showing import Showing
+from dual_system.models.ponder.demo_sampling import DemoSampling
 from protocol.messages import Action, ActionChunk, Floats, Level, Robot
 from sim_client.gateway.exchange import Frames
 
 
-def as_shown(video: Sequence[Frames], control_hz: int, showing: Showing) -> Sequence[Frames]:
-    """The frames of a video at the control rate that PONDER reads: the first and so many a second after it, and the
-    last one if it is shown to its end."""
-    return [video[look] for look in showing.looks(len(video), control_hz)]
+def sampled(video: Sequence[Frames], control_hz: int, sampling: DemoSampling) -> Sequence[Frames]:
+    """The frames of a video at the control rate that PONDER reads."""
+    return [video[index] for index in sampling.indices(len(video), control_hz)]
 
 
 def ahead(command: Action, chunk: ActionChunk | None, robot: Robot, num_rows: int) -> tuple[Floats, tuple[Level, ...]]:

@@ -209,7 +209,7 @@ def test_malformed_messages_change_nothing_and_are_all_counted(
         """All of it within the episode, while the robot still moves."""
         for _ in range(-(-count // (2 * (num_steps - 20)))):
             throw()
-            rig.bus.run_parties()
+            rig.bus.run_participants()
 
     rig.meanwhile = throw_often
     outcome, disturbed = rig.run(info, num_steps)
@@ -319,7 +319,7 @@ def test_malformed_calls_change_nothing_and_are_all_refused(
     def throw_often() -> None:
         for _ in range(-(-count // (20 * (num_steps - 20)))):
             throw()
-            rig.bus.run_parties()
+            rig.bus.run_participants()
 
     rig.meanwhile = throw_often
     outcome, disturbed = rig.run(info, num_steps)

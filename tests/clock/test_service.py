@@ -71,7 +71,7 @@ def serve_time(rig: Any, skew_ns: int = 0, clock_id: str = "robot/monotonic") ->
         now_ns = time.monotonic_ns() + skew_ns
         return m.TimeReply(clock_id=clock_id, t1_ns=now_ns, t2_ns=now_ns)
 
-    rig.bus.add_party(lambda: service.answer(tell) > 0)
+    rig.bus.add_participant(lambda: service.answer(tell) > 0)
 
 
 # -- what is refused
@@ -311,7 +311,7 @@ def test_a_clock_that_cannot_be_is_refused(
     rig: Any, monotonic: Monotonic, episode_info: Info, robot_with: Callable[..., m.Robot], paper: m.Schedule
 ) -> None:
     service = rig.links["sim"].serve(topics.TIME)
-    rig.bus.add_party(lambda: service.answer(lambda request: m.TimeReply(clock_id="x", t2_ns=10**12)) > 0)
+    rig.bus.add_participant(lambda: service.answer(lambda request: m.TimeReply(clock_id="x", t2_ns=10**12)) > 0)
     reply = rig.open(episode_info(paper, robot=robot_with(is_simulated=False)))
     assert reply.error.startswith("the clock of sim (x): impossible exchange")
 

@@ -6,7 +6,6 @@ import contextlib
 import json
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,7 +15,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from dual_system.data import collect as module
-from dual_system.data.album import AlbumOptions
 from dual_system.data.card import card
 from dual_system.data.collect import COLLECTING, COLLECTION_PATH, CollectOptions, collect, disk_needed
 from dual_system.data.dart import DART
@@ -24,12 +22,9 @@ from dual_system.data.dataset import Dataset
 from dual_system.data.episode import Package
 from dual_system.data.errors import DatasetError
 from dual_system.data.jobs import Job
-from dual_system.data.lerobot_v3 import ALBUM
 from dual_system.data.rollout import UNSOLVED
 from dual_system.data.shove import SHOVES
 from dual_system.data.store import Store
-from dual_system.tasks.imitation.insert_peg import InsertPeg
-from dual_system.tasks.task import Task
 
 TASKS, EPISODES = ("PickHighlight", "VideoUnmask"), 3  # names only: nothing is simulated here
 WorkOut = Callable[[Job], Package]
@@ -139,16 +134,14 @@ def test_noise_is_told_and_counted_and_never_mixed_with_none(tmp_path: Path, pre
         collect(options(tmp_path, noise="none"), InOrder(pretend))
 
 
-def test_orders_and_difficulties_are_told_and_never_mixed(tmp_path: Path, pretend: WorkOut) -> None:
-    ours = options(tmp_path, order="near-first", difficulties=("hard", "easy"))
+def test_difficulties_are_recorded_and_never_mixed(tmp_path: Path, pretend: WorkOut) -> None:
+    ours = options(tmp_path, difficulties=("hard", "easy"))
     collect(ours, InOrder(pretend))
     told = json.loads((tmp_path / COLLECTION_PATH).read_text())["settings"]
-    assert told["order"] == "near-first"
     assert told["difficulties"] == ["hard", "easy"]
     assert not {"texts", "shoves"} & set(told)
-    for other in ({"order": "near-first"}, {"difficulties": ("hard", "easy")}):
-        with pytest.raises(DatasetError, match="another --out"):
-            collect(options(tmp_path, **other), InOrder(pretend))
+    with pytest.raises(DatasetError, match="another --out"):
+        collect(options(tmp_path, difficulties=("easy", "hard")), InOrder(pretend))
 
 
 def test_shoves_and_texts_that_follow_are_told_and_never_mixed(tmp_path: Path, pretend: WorkOut) -> None:
@@ -252,7 +245,6 @@ def test_the_estimate_is_what_was_measured_as_soon_as_something_was() -> None:
         {"image_px": 65},
         {"episodes": 0},
         {"workers": 0},
-        {"album": -1},
         {"texts": "follow", "shove_share": 1.1},
         {"shove_share": 0.5},
     ],
@@ -260,53 +252,3 @@ def test_the_estimate_is_what_was_measured_as_soon_as_something_was() -> None:
 def test_options_that_make_no_sense_are_refused(tmp_path: Path, changes: dict[str, Any]) -> None:
     with pytest.raises(DatasetError):
         options(tmp_path, **changes)
-
-
-def test_albums_lie_in_the_dataset_one_for_each_task(
-    tmp_path: Path, pretend: WorkOut, whole: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """They are made once, and the dataset itself is as without."""
-    made: list[tuple[str, int]] = []
-    make = module.make_album
-
-    def pretended(album: AlbumOptions) -> None:
-        made.append((album.task, album.pictures))
-        make(replace(album, task="PickHighlight", pictures=1, image_px=32))
-
-    monkeypatch.setattr(module, "make_album", pretended)
-    monkeypatch.setattr(module, "_workers", lambda _: InOrder(pretend))
-    arguments = ["--out", str(tmp_path), "--tasks", *TASKS, "--episodes", str(EPISODES), "--album", "300"]
-    assert module.main([*arguments, "--no-progress"]) == module.DONE
-    assert made == [(task, 300) for task in TASKS]
-    assert {name: data for name, data in files(tmp_path).items() if not name.startswith(ALBUM)} == whole
-    for task in TASKS:
-        assert len(Dataset(tmp_path / ALBUM / task).episodes) == 1
-    shutil.rmtree(tmp_path / ALBUM / TASKS[0])
-    assert module.main([*arguments, "--no-progress"]) == module.DONE
-    assert made[2:] == [(TASKS[0], 300)], "what is there is left alone"
-
-
-def test_a_disk_that_is_full_of_album_is_said_and_the_episodes_are_kept(
-    tmp_path: Path, pretend: WorkOut, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def full(album: AlbumOptions) -> None:
-        raise OSError(28, "No space left on device", str(album.out))
-
-    monkeypatch.setattr(module, "make_album", full)
-    monkeypatch.setattr(module, "_workers", lambda _: InOrder(pretend))
-    arguments = ["--out", str(tmp_path), "--tasks", *TASKS, "--episodes", "1", "--album", "100", "--no-progress"]
-    assert module.main(arguments) == module.REFUSED
-    assert "No space left on device" in capsys.readouterr().err
-    assert len(Dataset(tmp_path).episodes) == len(TASKS)
-
-
-def test_an_album_of_a_task_that_names_nothing_is_refused_before_anything_starts(
-    tmp_path: Path, pretend: WorkOut, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    idle = InOrder(pretend)
-    monkeypatch.setattr(module, "_workers", lambda _: idle)
-    monkeypatch.setattr(InsertPeg, "things", Task.things)
-    arguments = ["--out", str(tmp_path), "--tasks", "PickHighlight", "InsertPeg", "--episodes", "1"]
-    assert module.main([*arguments, "--album", "100", "--no-progress"]) == module.REFUSED
-    assert "'InsertPeg' does not name its things" in capsys.readouterr().err
-    assert idle.done == []

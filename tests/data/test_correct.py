@@ -109,10 +109,10 @@ def test_another_scene_is_refused(log: Path, record: EpisodeRecord, monkeypatch:
         work_out(Job(path=log, part=1, options=options(log, log.parent)))
 
 
-def test_another_order_is_refused(log: Path, record: EpisodeRecord, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_subgoal_is_refused(log: Path, record: EpisodeRecord, monkeypatch: pytest.MonkeyPatch) -> None:
     other = [dataclasses.replace(each, text="pick up the second cube") for each in record.subgoals]
     monkeypatch.setattr(module, "read_log", lambda path: dataclasses.replace(record, subgoals=other))
-    with pytest.raises(DatasetError, match="--order that it was played in"):
+    with pytest.raises(DatasetError, match=r"the subgoal is .* here and 'pick up the second cube' in the log"):
         work_out(Job(path=log, part=1, options=options(log, log.parent)))
 
 

@@ -180,7 +180,7 @@ def test_a_rejection_says_whether_there_was_noise(monkeypatch: pytest.MonkeyPatc
             raise rollout.UnsolvedError("the cube fell")
         return {"rejected": repr([each.noise_rad for each in rejected]).encode()}  # type: ignore[attr-defined]
 
-    monkeypatch.setattr(rollout, "kept_environment", lambda *args: None)
+    monkeypatch.setattr(rollout, "kept_environment", lambda *args, **options: None)
     monkeypatch.setattr(rollout, "_solve", solve)
     expected = [episode_std_rad("dart", job().seed(attempt)) for attempt in range(3)]
     assert rollout.work_out(job())["rejected"] == repr(expected).encode()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,12 +12,10 @@ import pytest
 from dual_system.data.dataset import Dataset
 from dual_system.data.episode import CAMERAS, Row
 from dual_system.data.errors import DatasetError
-from dual_system.data.export import ExportOptions, export, main, read_episode, said_by_tick
+from dual_system.data.export import ExportOptions, export, main, read_episode
 from dual_system.data.jobs import Job, Look
 from dual_system.data.rollout import play
-from dual_system.tasks.captions import ALL_DONE
 from dual_system.tasks.environment import make_environment
-from protocol import messages as m
 from protocol.mcap_log import EpisodeRecord, read_log
 
 SEED, TASK = 3, "VideoUnmask"
@@ -63,26 +60,6 @@ def test_every_row_is_the_collected_one(exported: Dataset, collected: list[Row])
     assert rows.is_rendered.all()
 
 
-def test_an_oracle_says_nothing_and_reaches_all(exported: Dataset) -> None:
-    said = exported.rows(0).said
-    assert said is not None
-    assert set(said) == {""}
-    assert exported.episodes[0].unreached == ()
-
-
-def test_what_a_policy_said_is_of_the_tick_that_it_had_seen() -> None:
-    def said(kind: m.SubgoalKind, tick: int, text: str) -> m.Subgoal:
-        return m.Subgoal(kind=kind, text=text, tick=tick)
-
-    log = [
-        said(m.SubgoalKind.DEMO_REASONING, 0, "it was the second one"),
-        said(m.SubgoalKind.SUBGOAL, 0, "pick at [500, 20]"),
-        said(m.SubgoalKind.TASK_GROUNDED, 1, "press at <1, 2>"),
-        said(m.SubgoalKind.SUBGOAL, 3, "press"),
-    ]
-    assert said_by_tick(log, 5) == ["pick at [500, 20]", "", "", "press", ""]
-
-
 @pytest.fixture(scope="module")
 def rounds(recorded: Callable[..., Path]) -> Path:
     """Of a task with several subgoals."""
@@ -101,22 +78,16 @@ def test_played_again_its_texts_are_those_that_collecting_tells(name: str, reque
     assert again.rows.grounded_subgoal == tuple(row.grounded_subgoal for row in rows)
     assert again.rows.subgoal == tuple(row.subgoal for row in rows)
     assert again.rows.is_transition.tolist() == [row.is_transition for row in rows]
-    assert again.about.unreached == ()
 
 
-def test_of_an_episode_that_ends_early_the_rest_is_told(rounds: Path) -> None:
-    """As if it had failed there."""
+def test_an_episode_that_ends_early_is_exported_up_to_its_end(rounds: Path) -> None:
     record, at = read_log(rounds), 40
     begun = dataclasses.replace(record, ticks=record.ticks[:at], result=None)
     cut = read_episode(rounds, begun, texts="follow")
     assert not cut.about.is_success
     assert len(cut.rows) == at
-    told = dict.fromkeys(each.text for each in record.subgoals if each.kind == m.SubgoalKind.TASK_SIMPLE)
-    (now,) = set(cut.rows.subgoal)
-    assert [now, *(re.sub(r" at <\d+, \d+>", "", text) for text in cut.about.unreached)] == [
-        text for text in told if text != ALL_DONE
-    ]
-    assert all("<" in text for text in cut.about.unreached)
+    whole = read_episode(rounds, record, texts="follow")
+    assert cut.rows.grounded_subgoal == whole.rows.grounded_subgoal[:at]
 
 
 def test_demonstrations_are_looked_at_as_often_as_asked_for(log: Path, record: EpisodeRecord) -> None:

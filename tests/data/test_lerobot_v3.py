@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from dual_system.data import lerobot_v3 as v3
 from dual_system.data.dataset import Dataset
-from dual_system.data.episode import CAMERAS, EXECUTED, SAID, Episode, Package, unpack
+from dual_system.data.episode import CAMERAS, EXECUTED, Episode, Package, unpack
 from dual_system.data.errors import DatasetError
 from dual_system.data.video import read_frames
 
@@ -141,33 +139,6 @@ def test_all_episodes_say_what_was_executed_or_none_does(package: Callable[..., 
     writer.add(unpack(package(1)))
     with pytest.raises(ValueError, match="all have executed_action, or none has"):
         writer.add(unpack(package(2, nudge_rad=0.25)))
-
-
-def test_what_a_policy_said_and_did_not_reach_is_kept(package: Callable[..., Package], tmp_path: Path) -> None:
-    episodes = [unpack(package(seed, unreached=unreached)) for seed, unreached in ((1, ("press", "put")), (2, ()))]
-    words = ("", "", "pick at [500, 20]", "", "press")
-    writer = v3.DatasetWriter(tmp_path)
-    for episode in episodes:
-        writer.add(replace(episode, rows=replace(episode.rows, said=words)))
-    writer.finish()
-    dataset = Dataset(tmp_path)
-    assert [each.unreached for each in dataset.episodes] == [("press", "put"), ()]
-    assert [dataset.rows(index).said for index in range(2)] == [words, words]
-    assert dataset.described["features"][SAID] == dataset.described["features"]["subgoal"]
-
-
-def test_where_all_was_reached_and_nobody_spoke_nothing_is_said_of_it(dataset: Dataset) -> None:
-    assert {each.unreached for each in dataset.episodes} == {()}
-    assert pq.read_table(dataset.root / v3.EPISODES_PATH).schema.field("unreached").type == pa.list_(pa.string())
-    assert SAID not in dataset.described["features"]
-    assert dataset.rows(0).said is None
-
-
-def test_all_episodes_say_what_was_said_or_none_does(package: Callable[..., Package], tmp_path: Path) -> None:
-    writer, episode = v3.DatasetWriter(tmp_path), unpack(package(2))
-    writer.add(unpack(package(1)))
-    with pytest.raises(ValueError, match="all have said, or none has"):
-        writer.add(replace(episode, rows=replace(episode.rows, said=("",) * len(episode.rows))))
 
 
 def test_one_dataset_has_one_picture_size(package: Callable[..., Package], tmp_path: Path) -> None:

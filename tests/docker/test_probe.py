@@ -31,7 +31,7 @@ def beating(bus: LocalBus, proc: str, state: ServingState) -> None:
         heartbeat.set(state=state)
         return True
 
-    bus.add_party(step)
+    bus.add_participant(step)
 
 
 @pytest.mark.parametrize("proc", ["ponder", "pounce", "clock", "sim"])

@@ -24,8 +24,8 @@ from dual_system.models.ponder.checkpoint import (
     weights_hash,
 )
 from dual_system.models.ponder.configs import PonderConfig, qwen35_0p8b, qwen35_2b, qwen35_4b, qwen35_9b, tiny_cpu
+from dual_system.models.ponder.demo_sampling import DemoSampling, declared
 from dual_system.models.ponder.network import FLOAT32_PARAMETERS, Ponder, skeleton
-from dual_system.models.ponder.showing import Showing, declared
 from dual_system.models.ponder.vocabulary import Vocabulary
 
 VOCABULARY = Vocabulary.tiny()
@@ -270,9 +270,9 @@ def test_how_demonstrations_were_shown_is_read_back_and_told_to_who_asks_for_it_
 ) -> None:
     watching = Ponder(ponder.qwen.config, ponder.format, image_px=ponder.image_px)
     watching.qwen = ponder.qwen
-    watching.format = replace(watching.format, demonstrations=Showing(hz=2, to_its_end=True))
+    watching.format = replace(watching.format, demonstrations=DemoSampling(hz=2, to_its_end=True))
     save_ponder(watching, tmp_path)
-    assert load_ponder(tmp_path).format.demonstrations == Showing(hz=2, to_its_end=True) == declared(tmp_path)
+    assert load_ponder(tmp_path).format.demonstrations == DemoSampling(hz=2, to_its_end=True) == declared(tmp_path)
 
 
 @pytest.mark.parametrize("version", [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11])
@@ -290,7 +290,7 @@ def test_a_folder_from_before_there_were_eyes_proprioception_or_notes_has_none_a
     assert not loaded.format.takes_notes
     assert loaded.format.second_look is None
     assert (loaded.format.counsel, loaded.format.fovea) == (None, None)
-    assert loaded.format.demonstrations == Showing()
+    assert loaded.format.demonstrations == DemoSampling()
     assert loaded.image_px == (64, 64)
     assert weights_hash(loaded) == weights_hash(ponder)
 

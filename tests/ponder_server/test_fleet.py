@@ -84,13 +84,13 @@ class Hall:
         )
         self.fleet.warm_up()
         self.fleet.ready()
-        self.bus.add_party(self.fleet.step)
+        self.bus.add_participant(self.fleet.step)
         self.requests: dict[str, m.OpenRequest] = {}
         self.journals: dict[str, list[m.JournalEntry]] = {robot: [] for robot in ROBOTS}
         self.calls = [
             (robot, clock.serve(topics.ACTIVE), clock.serve(topics.JOURNAL)) for robot, clock in self.clocks.items()
         ]
-        self.bus.add_party(self.answer)
+        self.bus.add_participant(self.answer)
 
     def answer(self) -> bool:
         """What the clock services answer to a PONDER that knows nothing."""
@@ -128,7 +128,7 @@ class Hall:
         server._membership._ask_again_ns = 0
 
     def settle(self) -> None:
-        while self.bus.run_parties():
+        while self.bus.run_participants():
             pass
 
     def said(self, robot: str, cls: type) -> list[Any]:
@@ -226,7 +226,7 @@ def test_while_one_context_is_rebuilt_the_others_take_turns_with_it(
         for robot in ("r0", "r2"):
             hall.ask(robot, query)
         for _ in range(5):
-            hall.bus.run_parties()
+            hall.bus.run_participants()
         assert [len(hall.said(robot, m.Cognition)) for robot in ("r0", "r2")] == [1, 1]
         assert hall.said("r1", m.Event) == []
     hall.settle()
@@ -246,7 +246,7 @@ def test_a_rebuilt_context_is_the_lost_one_and_what_was_asked_meanwhile_is_answe
                 hall.settle()
             if query == 3 and is_lost:
                 hall.forget("r1")
-            hall.bus.run_parties()
+            hall.bus.run_participants()
         events = [event.name for event in hall.said("r1", m.Event)]
         assert events == ["context_rebuilt"] * is_lost
         vectors.append({c.query: c.vector.tobytes() for c in hall.said("r1", m.Cognition)})
@@ -287,7 +287,7 @@ def test_the_loss_of_one_context_changes_no_bit_of_the_others(episode_info: Info
                 hall.forget("r1")
             for robot in ROBOTS:
                 hall.ask(robot, query)
-            hall.bus.run_parties()  # a loss is still being made good when the others ask again
+            hall.bus.run_participants()  # a loss is still being made good when the others ask again
         hall.settle()
         for robot in ROBOTS:
             said += [(robot, c.query, c.vector.tobytes()) for c in hall.said(robot, m.Cognition)]

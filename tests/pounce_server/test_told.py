@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pounce_server.told import Source, Told
 
 from pounce_server.serve import PounceServer
-from pounce_server.told import Source, Told
 from protocol import messages as m
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link

@@ -94,7 +94,7 @@ def test_a_call_is_answered_by_the_party_that_serves_it() -> None:
             request.reply(request.payload * 2)
         return bool(requests)
 
-    bus.add_party(party)
+    bus.add_participant(party)
     assert bus.call("twice", b"ab", timeout_ns=1) == b"abab"
 
 
@@ -110,7 +110,7 @@ def test_a_call_waits_for_a_party_that_needs_several_steps() -> None:
             request.reply(b"done")
         return True
 
-    bus.add_party(party)
+    bus.add_participant(party)
     assert bus.call("slow", b"", timeout_ns=1) == b"done"
 
 
@@ -122,7 +122,7 @@ def test_a_call_that_nobody_serves_fails() -> None:
 def test_a_call_whose_server_is_idle_fails() -> None:
     bus = LocalBus()
     bus.serve("mute")
-    bus.add_party(lambda: False)
+    bus.add_participant(lambda: False)
     with pytest.raises(CallFailed, match="has nothing to do and did not answer"):
         bus.call("mute", b"", timeout_ns=1)
 
@@ -141,16 +141,16 @@ def test_a_party_that_waits_for_an_answer_is_not_stepped_meanwhile() -> None:
             request.reply(b"done")
         return bool(requests)
 
-    bus.add_party(asking)
-    bus.add_party(answering)
-    bus.run_parties()
+    bus.add_participant(asking)
+    bus.add_participant(answering)
+    bus.run_participants()
     assert steps == ["asking"]
 
 
 def test_every_party_gets_its_turn_whoever_was_busy() -> None:
     bus, turns = LocalBus(), []
     for name in "abc":
-        bus.add_party(lambda name=name: turns.append(name) is None)  # type: ignore[misc]
+        bus.add_participant(lambda name=name: turns.append(name) is None)  # type: ignore[misc]
     bus.wait(0)
     assert turns == ["a", "b", "c"]
 

@@ -241,7 +241,7 @@ def serve_time(bus: LocalBus, receiver: Link) -> Callable[[Callable[[Any], Any]]
 
     def start(handler: Callable[[Any], Any]) -> None:
         service = receiver.serve(topics.TIME)
-        bus.add_party(lambda: service.answer(handler) > 0)
+        bus.add_participant(lambda: service.answer(handler) > 0)
 
     return start
 
@@ -272,7 +272,7 @@ def test_a_call_that_does_not_decode_is_answered_and_counted(
 
 def test_an_unreadable_answer_is_a_failed_call(bus: LocalBus, sender: Link) -> None:
     inbox = bus.serve(topics.call_key(topics.TIME, "r0", "ponder"))
-    bus.add_party(lambda: any([request.reply(b"\xff") is None for request in inbox.drain()]))
+    bus.add_participant(lambda: any([request.reply(b"\xff") is None for request in inbox.drain()]))
     with pytest.raises(CallFailed, match="unreadable answer: TimeReply"):
         sender.call(topics.TIME, "ponder", m.TimeRequest(t0_ns=6), timeout_ns=1)
 

@@ -10,7 +10,7 @@ import pytest
 
 from dual_system.analysis import tables
 from dual_system.analysis.counterfactual import read_counterfactual
-from dual_system.models.ponder.showing import OWN_NAME
+from dual_system.models.ponder.demo_sampling import OWN_NAME
 from dual_system.tasks.pair_files import write_index, write_pair
 from dual_system.tasks.pairs import Pair, Telling
 from sim_client import counterfactual
@@ -92,8 +92,8 @@ def test_the_served_models_answer_and_the_table_says_that_they_are_untrained(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The tiny random pair: from files of pairs to a table."""
-    from ponder_server import party as ponder_party
-    from pounce_server import party as pounce_party
+    from ponder_server import in_process as ponder_party
+    from pounce_server import in_process as pounce_party
 
     models = ponder_party.build_reader(None), pounce_party.build_actor(None)
     monkeypatch.setattr(ponder_party, "build_reader", lambda checkpoint: models[0])
@@ -119,4 +119,4 @@ def test_pairs_whose_videos_are_shown_otherwise_than_ponder_learned_are_refused(
     arguments = ["--ponder", str(ponder), "--pounce", "any", "--pairs", str(pairs), "--out", str(tmp_path / "out")]
     assert counterfactual.main(arguments) == 2
     assert "shows videos 1 times a second; " in (told := capsys.readouterr().err)
-    assert "Make pairs with pp-pairs --demo-hz 2 --video-end." in told
+    assert "Make pairs with pp-collect pairs --demo-hz 2 --video-end." in told

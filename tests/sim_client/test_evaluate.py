@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import json
 import os
-import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -15,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from dual_system.training.stand_in import stand_in
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -30,10 +28,10 @@ from dual_system.models.pounce.configs import tiny_cpu
 from protocol import messages as m
 from protocol.mcap_log import read_log
 from sim_client import evaluate as module
-from sim_client.evaluate import EvalOptions, EvaluationError, EvaluationStation, Job, Line, evaluate, play
+from sim_client.evaluate import EvalOptions, EvaluationError, EvaluationHarness, Job, Line, evaluate, play
 from sim_client.ledger import LedgerError
+from sim_client.null_ponder import cognition_shape
 from sim_client.suite import run_seed
-from sim_client.told_cognition import cognition_shape, mistold
 
 TASKS, EPISODES, RUNS = ("PickXtimes", "StopCube"), 2, 2
 NUM_JOBS = len(TASKS) * EPISODES * RUNS
@@ -120,8 +118,6 @@ def test_one_folder_holds_one_condition(tmp_path: Path) -> None:
     evaluate(options(tmp_path), InOrder(pretended))
     with pytest.raises(LedgerError, match="delay_ms = 300, and this is 1000"):
         evaluate(options(tmp_path, delay_ms=1000), InOrder(pretended))
-    with pytest.raises(LedgerError, match="near-first"):
-        evaluate(options(tmp_path, order="near-first"), InOrder(pretended))
 
 
 @pytest.mark.parametrize(
@@ -194,9 +190,9 @@ def test_what_was_not_begun_is_no_result(tmp_path: Path, monkeypatch: pytest.Mon
 def test_oracle_episodes_of_two_tasks_end_to_end(tmp_path: Path) -> None:
     """Played in this thread, as a worker would, and made into tables."""
     chosen = options(tmp_path, runs=1, max_steps=30)
-    with contextlib.closing(EvaluationStation(chosen)) as station:
-        found = evaluate(chosen, InOrder(station.play))
-        again = station.play(chosen.jobs()[0])
+    with contextlib.closing(EvaluationHarness(chosen)) as harness:
+        found = evaluate(chosen, InOrder(harness.play))
+        again = harness.play(chosen.jobs()[0])
     assert [(e["task"], e["seed"], e["run"]) for e in found["episodes"]] == [
         (task, seed, 0) for task in TASKS for seed in range(EPISODES)
     ]
@@ -208,32 +204,16 @@ def test_oracle_episodes_of_two_tasks_end_to_end(tmp_path: Path) -> None:
 
 
 @pytest.mark.sim
-def test_an_order_reaches_the_task(tmp_path: Path) -> None:
-    rows = {}
-    for order in ("drawn", "near-first"):
-        shared: dict[str, Any] = {"tasks": ("PickHighlight",), "episodes": 1, "runs": 1, "difficulty": "hard"}
-        chosen = options(tmp_path / order, order=order, record=True, record_hz=1, **shared)
-        with contextlib.closing(EvaluationStation(chosen)) as station:
-            (played,) = evaluate(chosen, InOrder(station.play))["episodes"]
-        assert played["success"]
-        log = read_log(tmp_path / order / played["mcap"])
-        seen = [re.search(r"pick up the (\w+) .*<(\d+), ", subgoal.text) for subgoal in log.subgoals]
-        picked = {match[1]: int(match[2]) for match in reversed(seen) if match}  # the first time that each is told
-        rows[order] = [picked[ordinal] for ordinal in ("first", "second", "third")]
-    assert rows["near-first"] == sorted(rows["near-first"], reverse=True) != rows["drawn"]
-
-
-@pytest.mark.sim
 def test_another_episode_s_cognition_reaches_the_servers(tmp_path: Path) -> None:
     """Two recorded episodes of the tiny models; then the first again, with what PONDER said in the second."""
     shared: dict[str, Any] = {"tasks": ("StopCube",), "runs": 1, "policy": "servers", "difficulty": "easy"}
     shared |= {"max_steps": 25, "record": True}
     real = options(tmp_path / "real", **shared)
-    with contextlib.closing(EvaluationStation(real)) as station:
-        own, donor = evaluate(real, InOrder(station.play))["episodes"]
+    with contextlib.closing(EvaluationHarness(real)) as harness:
+        own, donor = evaluate(real, InOrder(harness.play))["episodes"]
     other = options(tmp_path / "other", cognition="other-episode", donors=tmp_path / "real", **shared)
-    with contextlib.closing(EvaluationStation(other)) as station:
-        given = station.play(other.jobs()[0])
+    with contextlib.closing(EvaluationHarness(other)) as harness:
+        given = harness.play(other.jobs()[0])
     assert given["donor"] == Path(donor["mcap"]).name
     assert given["stream_sha256"] != own["stream_sha256"]
     vectors = [
@@ -250,8 +230,8 @@ def test_an_episode_that_is_not_recorded_is_the_same_with_fewer_pictures(tmp_pat
     lines = []
     for name, record in (("seen", True), ("unseen", False)):
         chosen = options(tmp_path / name, record=record, **shared)
-        with contextlib.closing(EvaluationStation(chosen)) as station:
-            lines.append(station.play(chosen.jobs()[0]) | {"mcap": None})
+        with contextlib.closing(EvaluationHarness(chosen)) as harness:
+            lines.append(harness.play(chosen.jobs()[0]) | {"mcap": None})
     assert lines[0] == lines[1]
     assert lines[0]["stream_sha256"]
 
@@ -264,15 +244,15 @@ def test_subgoal_text_reaches_a_pounce_that_reads_it_and_is_refused_by_another(t
     streams = {}
     for source in ("ponder", "oracle"):
         chosen = options(tmp_path / source, subgoal_text=source, pounce_checkpoint=tmp_path / "pounce", **shared)
-        with contextlib.closing(EvaluationStation(chosen)) as station:
-            streams[source] = station.play(chosen.jobs()[0])["stream_sha256"]
+        with contextlib.closing(EvaluationHarness(chosen)) as harness:
+            streams[source] = harness.play(chosen.jobs()[0])["stream_sha256"]
     assert streams["ponder"] != streams["oracle"]
     other = options(tmp_path / "other", subgoal_text="oracle", **shared)
     with (
-        contextlib.closing(EvaluationStation(other)) as station,
+        contextlib.closing(EvaluationHarness(other)) as harness,
         pytest.raises(EvaluationError, match="reads cognition and no subgoals"),
     ):
-        station.play(other.jobs()[0])
+        harness.play(other.jobs()[0])
 
 
 @pytest.mark.sim
@@ -286,27 +266,21 @@ def test_a_worker_s_process_plays_what_this_one_does(tmp_path: Path) -> None:
 
 
 @pytest.mark.sim
-def test_the_hand_alone_is_told_the_task_s_own_subgoals_and_what_it_did_can_be_watched(tmp_path: Path) -> None:
-    save_bundle(random_bundle(tiny_cpu(num_carriers=2), seed=0), tmp_path / "pounce")
+def test_a_log_with_few_pictures_has_those_of_every_query_and_is_exported_with_them(tmp_path: Path) -> None:
     chosen = options(
-        tmp_path / "told", tasks=("PickHighlight",), runs=1, policy="servers", max_steps=65, record=True, record_hz=5,
-        cognition="stand-in", pounce_checkpoint=tmp_path / "pounce",
+        tmp_path / "played", tasks=("PickHighlight",), runs=1, policy="servers", max_steps=65, record=True, record_hz=5
     )  # fmt: skip
-    with contextlib.closing(EvaluationStation(chosen)) as station:
-        lines = [station.play(job) for job in chosen.jobs()[:2]]
-    paths = tuple(tmp_path / "told" / line["mcap"] for line in lines)
+    with contextlib.closing(EvaluationHarness(chosen)) as harness:
+        lines = [harness.play(job) for job in chosen.jobs()[:2]]
+    paths = tuple(tmp_path / "played" / line["mcap"] for line in lines)
     for path in paths:
         record = read_log(path)
-        (text,) = {each.text for each in record.subgoals if each.kind == m.SubgoalKind.TASK_GROUNDED}
-        wanted = np.tile(stand_in(text, 64), (2, 1))
-        assert [cognition.is_transition for cognition in record.cognitions] == [True, False, False, False]
-        assert all(np.array_equal(cognition.vector, wanted) for cognition in record.cognitions)
-        looks = {stamp.tick for stamp in record.cognitions} | set(range(0, 66, 4))
-        assert {each.tick: len(each.images) for each in record.observations} == {k: 2 * (k in looks) for k in range(66)}
+        shown = {stamp.tick for stamp in record.cognitions} | set(range(0, 66, 4))
+        assert {each.tick: len(each.images) for each in record.observations} == {k: 2 * (k in shown) for k in range(66)}
     export(ExportOptions(files=paths, out=tmp_path / "set", progress=False))
     assert {entry.origin for entry in Dataset(tmp_path / "set").episodes} == {"servers"}
     rows = Dataset(tmp_path / "set").rows(1)
-    assert set(np.flatnonzero(rows.is_rendered)) == looks - {65}  # what was seen after the last action is left out
+    assert set(np.flatnonzero(rows.is_rendered)) == shown - {65}  # what was seen after the last action is left out
 
 
 @pytest.mark.sim
@@ -314,17 +288,17 @@ def test_null_cognition_needs_no_ponder(tmp_path: Path) -> None:
     """What is commanded is the same whether a PONDER is asked, as where its answers are recorded, or nobody is."""
     save_bundle(random_bundle(tiny_cpu(cognition_size=tiny_ponder().hidden_size), seed=0), tmp_path / "pounce")
     streams, models = {}, {}
-    for name, record in (("asked", True), ("silent", False)):
+    for name, record in (("asked", True), ("nobody", False)):
         chosen = options(
             tmp_path / name, tasks=("PickHighlight",), episodes=1, runs=1, policy="servers", max_steps=65,
             record=record, record_hz=1, cognition="null", pounce_checkpoint=tmp_path / "pounce",
         )  # fmt: skip
-        with contextlib.closing(EvaluationStation(chosen)) as station:
-            line = station.play(chosen.jobs()[0])
+        with contextlib.closing(EvaluationHarness(chosen)) as harness:
+            line = harness.play(chosen.jobs()[0])
         assert line["schedule"]["null_invocations"] == line["schedule"]["num_invocations"] == 4
         streams[name], models[name] = line["stream_sha256"], line["models"]["ponder"]["model_hash"]
-    assert streams["asked"] == streams["silent"]
-    assert models["silent"] == "silent" != models["asked"]
+    assert streams["asked"] == streams["nobody"]
+    assert models["nobody"] == "silent" != models["asked"]
 
 
 def test_sums_are_rounded_alike_whichever_server_a_process_has() -> None:
@@ -338,31 +312,6 @@ def test_sums_are_rounded_alike_whichever_server_a_process_has() -> None:
         for name in ("ponder_server", "pounce_server")
     }  # fmt: skip
     assert len(said) == 1
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({}, "is for a --pounce-checkpoint"),
-        ({"pounce_checkpoint": Path("nowhere"), "servers": "local"}, "use --servers in-process"),
-        ({"pounce_checkpoint": Path("nowhere"), "stand_in_noise_px": -1.0}, "and at least 0"),
-        ({"cognition": "null", "stand_in_noise_px": 1.0}, "is for --cognition stand-in"),
-        ({"cognition": "null", "stand_in_waits_longer": 1}, "is of --cognition stand-in"),
-    ],
-)
-def test_stand_ins_where_they_mean_nothing_are_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(EvaluationError, match=message):
-        options(tmp_path, **{"policy": "servers", "cognition": "stand-in"} | changes)
-
-
-def test_told_places_are_wrong_by_what_was_asked_for_and_stay_so() -> None:
-    text = "pick up cube 2 at <100, 120>, which is red"
-    told = [mistold(text, 3.0, draw) for draw in range(400)]
-    assert told == [mistold(text, 3.0, draw) for draw in range(400)]
-    assert {re.sub(r"<.*>", "<100, 120>", each) for each in told} == {text}
-    errors = np.array([[int(n) for n in re.findall(r"\d+", each)[1:]] for each in told]) - (100, 120)
-    assert 2.7 < errors.std() < 3.3
-    assert abs(errors.mean()) < 0.5
 
 
 def test_a_folder_that_says_nothing_of_cognition_is_refused(tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ def _env() -> Environment:
 
 @pytest.fixture
 def env(_env: Environment) -> Environment:
-    _env._task.clock.clear()
+    _env.task.clock.clear()
     return _env
 
 
@@ -67,7 +67,7 @@ def test_the_scenes_clock_runs_through_and_the_step_count_starts_anew(env: Envir
     while snapshot.status is Status.ONGOING:
         snapshot = env.step(HOME)
     assert (snapshot.step, snapshot.status) == (4, Status.TIMEOUT)  # the video does not count against the limit
-    steps, memoryless = zip(*env._task.clock, strict=True)
+    steps, memoryless = zip(*env.task.clock, strict=True)
     assert list(steps) == list(range(8 + 6 + 5 + 1 + 4))
     assert [step for step, is_new in zip(steps, memoryless, strict=True) if is_new] == [0, 19]
 

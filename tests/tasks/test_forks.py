@@ -12,7 +12,7 @@ import pytest
 
 from dual_system.tasks.difficulty import DIFFICULTIES
 from dual_system.tasks.environment import Environment, Snapshot, make_environment
-from dual_system.tasks.forks import MAX_SEAM, ForkError
+from dual_system.tasks.forks import MAX_SEAM, ForkError, fork
 from dual_system.tasks.pairs import Pair, find_pair, oracle_chunk
 from dual_system.tasks.task import make_task, task_names
 
@@ -68,13 +68,13 @@ def test_retold_layouts_are_of_the_same_task_and_instruction(name: str) -> None:
 
 
 def test_the_twin_was_shown_other_things_under_the_same_actions(environment: EnvironmentOf) -> None:
-    fork = played(environment("PickHighlight"), 110).fork()
-    assert not fork.is_cut
-    assert fork.seam == 0
-    assert len(fork.own.past) == len(fork.twin.past) == 110
-    assert fork.own.now.physics.integration.tobytes() == fork.twin.now.physics.integration.tobytes()
-    assert set(fork.own.now.layout.targets).isdisjoint(fork.twin.now.layout.targets)
-    for own, twin in zip(fork.own.past, fork.twin.past, strict=True):
+    found = fork(played(environment("PickHighlight"), 110))
+    assert not found.is_cut
+    assert found.seam == 0
+    assert len(found.own.past) == len(found.twin.past) == 110
+    assert found.own.now.physics.integration.tobytes() == found.twin.now.physics.integration.tobytes()
+    assert set(found.own.now.layout.targets).isdisjoint(found.twin.now.layout.targets)
+    for own, twin in zip(found.own.past, found.twin.past, strict=True):
         is_lit = 10 <= own.step <= 100
         assert (own.physics.integration.tobytes() != twin.physics.integration.tobytes()) == is_lit
         np.testing.assert_array_equal(own.actions, twin.actions)
@@ -83,7 +83,7 @@ def test_the_twin_was_shown_other_things_under_the_same_actions(environment: Env
 def test_forking_changes_nothing(environment: EnvironmentOf) -> None:
     env = played(environment("PickHighlight"), 110)
     before = env.save()
-    env.fork()
+    fork(env)
     after = env.save()
     assert after.physics.integration.tobytes() == before.physics.integration.tobytes()
     for what in ("step", "layout", "memory", "progress", "caption"):
@@ -102,7 +102,7 @@ def test_forking_changes_nothing(environment: EnvironmentOf) -> None:
 )
 def test_there_is_no_twin(environment: EnvironmentOf, name: str, num_steps: int, variant: int, complaint: str) -> None:
     with pytest.raises(ForkError, match=complaint):
-        played(environment(name), num_steps).fork(variant)
+        fork(played(environment(name), num_steps), variant)
 
 
 def test_what_did_not_come_from_its_reset_is_not_forked(environment: EnvironmentOf) -> None:
@@ -110,7 +110,7 @@ def test_what_did_not_come_from_its_reset_is_not_forked(environment: Environment
     env.physics.place("cube_0", np.array([0.1, 0.1, 0.02, 1, 0, 0, 0]))
     env.physics.refresh()
     with pytest.raises(ForkError, match="did not come here from its own reset"):
-        env.fork()
+        fork(env)
 
 
 @every_kind
@@ -146,12 +146,12 @@ def test_after_either_video_the_robot_finds_the_same_world(environment: Environm
     env = environment(name)
     env.reset(VIDEO_SEEDS[name])
     scripted_m = env.physics.data.mocap_pos.copy()
-    fork = env.fork()
-    assert fork.own.now.physics.integration.tobytes() == fork.twin.now.physics.integration.tobytes()
-    env.reset(0, fork.twin.now.difficulty, layout=fork.twin.now.layout)
+    found = fork(env)
+    assert found.own.now.physics.integration.tobytes() == found.twin.now.physics.integration.tobytes()
+    env.reset(0, found.twin.now.difficulty, layout=found.twin.now.layout)
     gaps_m = np.linalg.norm(on_the_table(scripted_m)[:, None] - on_the_table(env.physics.data.mocap_pos), axis=-1)
     assert max(gaps_m.min(axis=0).max(), gaps_m.min(axis=1).max()) < 1e-5  # whichever of several dots lies where
-    for branch in (fork.own, fork.twin):
+    for branch in (found.own, found.twin):
         env.restore(branch.now)
         last = play(env, env.oracle())
         assert last.status.value == "success", last.reason
@@ -171,7 +171,7 @@ def test_a_video_that_leaves_things_elsewhere_has_no_twin(
     moved = replace(env.layout, asked=replace(asked, cube=replace(asked.cube, x_m=asked.cube.x_m + 0.01)))
     monkeypatch.setattr(type(make_task("MoveCube")), "retold", lambda task, layout: (moved,))
     with pytest.raises(ForkError, match=r"the other video leaves things 0\.010 rad or m elsewhere"):
-        env.fork()
+        fork(env)
 
 
 def test_another_world_is_found_only_at_first(environment: EnvironmentOf) -> None:
@@ -190,18 +190,18 @@ def test_a_cut_twin_has_a_whole_round_less_behind_it(pair_of: Callable[[str], Pa
 def test_each_branch_can_be_played_to_its_own_success(environment: EnvironmentOf, play: Play, name: str) -> None:
     env = environment(name)
     env.reset(0, "easy")
-    fork = None
+    found = None
     for action in env.oracle():
         if env.step(action).step % 10 == 0:
             try:
-                fork = env.fork()
+                found = fork(env)
             except ForkError:
                 continue
-            if not np.allclose(oracle_chunk(env, fork.own.now), oracle_chunk(env, fork.twin.now)):
+            if not np.allclose(oracle_chunk(env, found.own.now), oracle_chunk(env, found.twin.now)):
                 break
-            env.restore(fork.own.now)
-    assert fork is not None
-    for branch in (fork.own, fork.twin):
+            env.restore(found.own.now)
+    assert found is not None
+    for branch in (found.own, found.twin):
         env.restore(branch.now)
         last = play(env, env.oracle())
         assert last.status.value == "success", last.reason

@@ -138,7 +138,7 @@ def test_the_video_leaves_the_cubes_where_they_were_left(oracles: Callable[[str]
     np.testing.assert_allclose(oracles(name).start_xy_m, recording_of(name)["start_xy_m"], atol=TOLERANCE_CARRIED_M)
 
 
-def test_cubes_swap_as_recorded_at_every_step(environment: EnvironmentOf) -> None:
+def test_cubes_swap_as_recorded_at_every_step(environment: EnvironmentOf, monkeypatch: pytest.MonkeyPatch) -> None:
     env, recording = environment("VideoRepick"), recording_of("VideoRepick")
     env.reset(0, layout=layout_of("VideoRepick"))
     before = env.save()
@@ -146,7 +146,8 @@ def test_cubes_swap_as_recorded_at_every_step(environment: EnvironmentOf) -> Non
     task = VideoRepick()
     task.arrange(env.physics, env.layout)
     acted = Shown(text="as recorded", motion=lambda motions: map(np.float32, recording["demo_actions"]))
-    rows, _ = perform(task, env.layout, (acted,), env.physics, lambda part: None)
+    monkeypatch.setattr(task, "demonstration", lambda layout: (acted,))
+    rows, _ = perform(task, env.layout, env.physics, lambda bodies: None)
     for row, theirs in zip(rows[recording["track"]["first_row"] :], recording["track"]["poses"], strict=True):
         env.physics.load(row.physics)
         ours, theirs_m = cube_poses(env), np.multiply(theirs, 1e-4)

@@ -24,8 +24,8 @@ from dual_system.models.normalisation import RobotStatistics
 from dual_system.models.pi05.prompt import tiny_tokenizer_for_random_weights, with_subgoal
 from dual_system.models.ponder.configs import tiny_cpu
 from dual_system.models.ponder.context import ContextFormat
+from dual_system.models.ponder.demo_sampling import DemoSampling
 from dual_system.models.ponder.network import Ponder
-from dual_system.models.ponder.showing import Showing
 from dual_system.models.pounce.configs import tiny_cpu as tiny_pounce
 from dual_system.models.small_pair.reading import CropReader
 from dual_system.training.chunks import chunk_ticks
@@ -133,15 +133,15 @@ def test_the_set_knows_how_its_demonstrations_are_sampled(
         for seed, num_demo in ((1, 42), (2, 46), (3, 0))
     ]
     root = write_dataset(tmp_path / "set", packages)
-    assert TrainingSet(root, demo_hz=2).showing() == Showing(hz=2, to_its_end=is_rendered)
-    assert TrainingSet(root).showing() == Showing(hz=1, to_its_end=is_rendered)
+    assert TrainingSet(root, demo_hz=2).demo_sampling() == DemoSampling(hz=2, to_its_end=is_rendered)
+    assert TrainingSet(root).demo_sampling() == DemoSampling(hz=1, to_its_end=is_rendered)
 
 
 def test_without_demonstrations_nothing_is_known_of_their_sampling(
     tmp_path: Path, package_of_noise: MakePackage, write_dataset: WriteDataset
 ) -> None:
     root = write_dataset(tmp_path / "set", [package_of_noise(1, num_rows=2)])
-    assert TrainingSet(root, demo_hz=2).showing() is None
+    assert TrainingSet(root, demo_hz=2).demo_sampling() is None
 
 
 def test_a_demonstration_that_was_rendered_more_seldom_is_refused(

@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import tyro
 from safetensors.torch import load_file
 
 from dual_system.data.episode import Package
 from dual_system.models.pi05.pounce import PounceConfig
 from dual_system.models.ponder.checkpoint import load_ponder
-from dual_system.models.ponder.showing import Showing
+from dual_system.models.ponder.demo_sampling import DemoSampling
 from dual_system.models.pounce.checkpoint import load_bundle
 from dual_system.training import recipes, train
 from dual_system.training.data import TrainingSet
@@ -27,6 +26,7 @@ from dual_system.training.train import InsteadOptions, LogOptions, MachineOption
 from dual_system.training.trainer import Trainer
 from pounce_server.contract import example_request
 from pounce_server.engine import EagerEngine
+from protocol.command_line import parse
 
 PX = 64
 LOSSES = ((2.4438405, 7.0149617), (2.1602826, 6.9840045), (2.5076673, 6.8892617))
@@ -141,7 +141,7 @@ def test_the_program_says_what_is_wrong_and_returns_two(tmp_path: Path, capsys: 
 def test_options_are_flat_on_the_command_line() -> None:
     arguments = ["--recipe", "tiny", "--data", "a", "b", "--out", "c", "--tasks", "StopCube", "--steps", "7"]
     arguments += ["--device", "cuda", "--tf32", "--save-every", "3", "--no-progress"]
-    assert tyro.cli(TrainOptions, args=arguments) == TrainOptions(
+    assert parse(TrainOptions, arguments, prog="pp-train") == TrainOptions(
         recipe="tiny",
         data=(Path("a"), Path("b")),
         out=Path("c"),
@@ -260,4 +260,4 @@ def test_a_trained_ponder_says_how_demonstrations_were_sampled(
 ) -> None:
     packages = [package_of_noise(seed, num_demo) for seed, num_demo in ((1, 42), (2, 46))]
     train.train(options(write_dataset(tmp_path / "set", packages), tmp_path / "out"))
-    assert load_ponder(tmp_path / "out" / "ponder").format.demonstrations == Showing(hz=1, to_its_end=True)
+    assert load_ponder(tmp_path / "out" / "ponder").format.demonstrations == DemoSampling(hz=1, to_its_end=True)

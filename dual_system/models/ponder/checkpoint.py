@@ -24,9 +24,9 @@ from transformers.models.qwen3_5 import Qwen3_5Config
 
 from dual_system.models.config_json import from_json
 from dual_system.models.ponder.context import ContextFormat
+from dual_system.models.ponder.demo_sampling import PAPER_SAMPLING, DemoSampling
 from dual_system.models.ponder.network import Ponder, image_grid, skeleton, token_px
 from dual_system.models.ponder.observation import WHOLE_VIEWS, ObservationReader
-from dual_system.models.ponder.showing import AS_IN_THE_PAPER, Showing
 from dual_system.models.ponder.vocabulary import Vocabulary
 
 CONFIG_NAME = "config.json"
@@ -54,7 +54,7 @@ class StoredPonder:
     """None: the first row after the tokenizer's last id."""
     image_px: tuple[int, int] = (256, 256)
     speaks: bool = True
-    demonstrations: Showing = AS_IN_THE_PAPER
+    demonstrations: DemoSampling = PAPER_SAMPLING
     is_random: bool = True
     """The carriers were never trained."""
 

@@ -26,8 +26,8 @@ import numpy as np
 import numpy.typing as npt
 from numpy.typing import ArrayLike
 
+from dual_system.models.ponder.demo_sampling import PAPER_SAMPLING, DemoSampling
 from dual_system.models.ponder.observation import WHOLE_VIEWS, ObservationReader
-from dual_system.models.ponder.showing import AS_IN_THE_PAPER, Showing
 from dual_system.models.ponder.vocabulary import Vocabulary
 
 IGNORE = -100
@@ -95,7 +95,7 @@ class ContextFormat:
     """Which images and tokens an observation gives."""
     speaks: bool = True
     """False: trained without texts (RoboCasa-DC, w2 = 0), so its LM head knows none and serving asks it for none."""
-    demonstrations: Showing = AS_IN_THE_PAPER
+    demonstrations: DemoSampling = PAPER_SAMPLING
     """How demonstrations were sampled in training, and so how they are to be shown."""
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""``pp-export-hf``: trained models as the public folders that they came from, read back before they count as written.
+"""``pp-export hf``: trained models as the public folders that they came from, read back before they count as written.
 
     PONDER          transformers' Qwen3.5 folder; ponder.json beside it, which others leave alone, says what PONDER adds
     POUNCE, pi0.5   openpi's PyTorch names, or lerobot's; float32
@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-import tyro
 from torch import Tensor
 
 from dual_system.models.groot import weights as groot_weights
@@ -37,6 +36,7 @@ from dual_system.models.pounce.checkpoint import (
 )
 from dual_system.models.pounce.family import tensor_shapes
 from dual_system.models.public_layout import COGNITION, read_tensors, write_tensors
+from protocol.command_line import parse
 
 PREFIX_FILE = "pounce_prefix.safetensors"
 Layout = Literal["openpi", "lerobot"]
@@ -57,12 +57,12 @@ class ExportOptions:
     """Of pi0.5's names: lerobot's have a leading `model.`."""
 
 
-def main(argv: list[str] | None = None) -> int:
-    options = tyro.cli(ExportOptions, args=argv, prog="pp-export-hf", description=ExportOptions.__doc__)
+def main(argv: list[str] | None = None, prog: str = "pp-export hf") -> int:
+    options = parse(ExportOptions, argv, prog=prog)
     try:
         export_folder(options)
     except (OSError, ValueError) as error:
-        sys.stderr.write(f"pp-export-hf: {error}\n")
+        sys.stderr.write(f"{prog}: {error}\n")
         return 2
     sys.stdout.write(f"{options.out}: read back, equal to the last bit\n")
     return 0

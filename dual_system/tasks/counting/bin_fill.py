@@ -25,7 +25,7 @@ from dual_system.tasks.physics import Physics
 from dual_system.tasks.placing import PlacedCube, draw_button, draw_cube, until_it_fits
 from dual_system.tasks.props import BIN_HALF_M, BIN_HEIGHT_M, add_bin
 from dual_system.tasks.scene import CUBE_COLORS, add_button, add_cube
-from dual_system.tasks.task import Reasoning, Subtask, Task, Thing, task
+from dual_system.tasks.task import Reasoning, Subtask, Task, task
 
 APPEARANCE_STEPS = 50
 
@@ -124,25 +124,6 @@ class BinFill(Task[Layout, Memory]):
             return Reasoning(text=f"{count}. Next, press the button[ at <>].", grounds=(f"{_BUTTON}/cap",))
         text = f"{count}. Next, move a {layout.cubes[_CUBES.index(left[0])].color} cube[ at <>] to the bin[ at <>]."
         return Reasoning(text=text, grounds=(left[0], _BIN))
-
-    def near_first(self, layout: Layout) -> Layout:
-        """Colors come as they are spoken of; cubes of one color change their numbers, unless they appear one by one."""
-        layout = replace(layout, wanted=tuple(_in_order_of_speech(dict(layout.wanted))))
-        if layout.is_filling_up:
-            return layout
-        cubes = list(layout.cubes)
-        for color in CUBE_COLORS:
-            places = [index for index, cube in enumerate(cubes) if cube.color == color]
-            nearest = sorted((layout.cubes[index] for index in places), key=lambda cube: -cube.x_m)
-            for index, cube in zip(places, nearest, strict=True):
-                cubes[index] = cube
-        return replace(layout, cubes=tuple(cubes))
-
-    def things(self, layout: Layout, step: int, memory: object = None) -> tuple[Thing, ...]:
-        shown = [(n, c) for n, c in zip(_CUBES, layout.cubes, strict=False) if layout.appears_at_step(n) <= step]
-        cubes = (Thing(name=f"{cube.color} cube", body=name) for name, cube in shown)
-        fixed = {"button": f"{_BUTTON}/cap", "bin": _BIN}
-        return (*(Thing(name=name, body=body, is_movable=False) for name, body in fixed.items()), *cubes)
 
     def retold(self, layout: Layout) -> tuple[Layout, ...]:
         """The first cube that goes into the bin was of the other color, which is asked for once.

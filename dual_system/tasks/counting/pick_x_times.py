@@ -20,7 +20,7 @@ from dual_system.tasks.physics import Physics
 from dual_system.tasks.placing import PlacedCube, draw_button, draw_cube, draw_disc, until_it_fits
 from dual_system.tasks.props import PURPLE, TARGET_RADIUS_M, TARGET_THICKNESS_M, add_target
 from dual_system.tasks.scene import CUBE_COLORS, add_button, add_cube
-from dual_system.tasks.task import Reasoning, Subtask, Task, Thing, task
+from dual_system.tasks.task import Reasoning, Subtask, Task, task
 
 _NUM_CUBES = {"easy": 1, "medium": 3, "hard": 3}
 _REPEATS = {"easy": (1, 3), "medium": (1, 3), "hard": (4, 5)}  # both ends included
@@ -107,11 +107,6 @@ class PickXtimes(Task[Layout, None]):
             return Reasoning(text=count + "Next, press the button[ at <>].", grounds=(f"{_BUTTON}/cap",))
         text = count + f"Next, move the {color} cube[ at <>] to the target[ at <>]."
         return Reasoning(text=text, grounds=(_CUBES[layout.asked], _TARGET))
-
-    def things(self, layout: Layout, step: int, memory: object = None) -> tuple[Thing, ...]:
-        fixed = {"button": f"{_BUTTON}/cap", "target": _TARGET}
-        cubes = (Thing(name=f"{c.color} cube", body=name) for name, c in zip(_CUBES, layout.cubes, strict=False))
-        return (*(Thing(name=name, body=body, is_movable=False) for name, body in fixed.items()), *cubes)
 
     def remember(self, memory: None, physics: Physics, layout: Layout) -> None:
         return None

@@ -19,14 +19,15 @@ import numpy as np
 from dual_system.tasks import captions, predicates
 from dual_system.tasks.geometry import Array, pose, smoothstep
 from dual_system.tasks.oracle import Actions, Motions
-from dual_system.tasks.paces import PASS_STEPS, PRESS_STEPS
 from dual_system.tasks.physics import CONTROL_HZ, Physics
 from dual_system.tasks.placing import draw_button
 from dual_system.tasks.props import PURPLE, add_ghost_cube, add_target
 from dual_system.tasks.scene import CUBE_HALF_M, add_button, display_rgba
-from dual_system.tasks.task import Reasoning, Subtask, Task, Thing, task
+from dual_system.tasks.task import Reasoning, Subtask, Task, task
 
 NUM_PASSES = 5
+PASS_STEPS = (60, 80, 120)  # control steps of one pass of the running cube, whichever is drawn
+PRESS_STEPS = 30  # the oracle begins to press so long before the cube is on the target
 
 _TARGET_REACH_M, _TARGET_RADIUS_M, _TARGET_HALF_HEIGHT_M = 0.1, 0.036, 0.005
 _LINE_HALF_M, _LINE_TURN_RAD = 0.3, np.deg2rad(30.0)
@@ -164,17 +165,6 @@ class StopCube(Task[Layout, Memory]):
         )
         text = count + f"Next, stop the cube at the target[ at <>] on visit {layout.visit}."
         return Reasoning(text=text, grounds=(_TARGET,))
-
-    def moving(self, layout: Layout, step: int) -> tuple[tuple[float, float, float], ...]:
-        x_m, y_m, z_m = layout.cube_pose(step + 1)[:3].tolist()  # reset spends a control step
-        return ((x_m, y_m, z_m),)
-
-    def due_step(self, layout: Layout) -> int:
-        return layout.press_step
-
-    def things(self, layout: Layout, step: int, memory: object = None) -> tuple[Thing, ...]:
-        named = {"button": f"{_BUTTON}/cap", "target": _TARGET, "running cube": _CUBE}
-        return tuple(Thing(name=name, body=body, is_movable=False) for name, body in named.items())
 
     def remember(self, memory: Memory | None, physics: Physics, layout: Layout) -> Memory:
         is_near = predicates.is_near(physics, _CUBE, _TARGET, _STOPPED_M)

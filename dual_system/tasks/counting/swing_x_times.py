@@ -21,7 +21,7 @@ from dual_system.tasks.physics import Physics
 from dual_system.tasks.placing import PlacedCube, draw_button, draw_cube, draw_disc, until_it_fits
 from dual_system.tasks.props import GRAY, RED, TARGET_RADIUS_M, TARGET_THICKNESS_M, add_target
 from dual_system.tasks.scene import CUBE_COLORS, add_button, add_cube
-from dual_system.tasks.task import Reasoning, Subtask, Task, Thing, task
+from dual_system.tasks.task import Reasoning, Subtask, Task, task
 
 RED_STEPS = 20
 
@@ -167,11 +167,6 @@ class SwingXtimes(Task[Layout, Memory]):
         side = _SIDES[max(swings, 0) % 2]
         text = count + f"Next, move the {color} cube[ at <>] to the {side}-side target[ at <>]."
         return Reasoning(text=text, grounds=(_CUBES[layout.asked], _target(side)))
-
-    def things(self, layout: Layout, step: int, memory: object = None) -> tuple[Thing, ...]:
-        cubes = (Thing(name=f"{c.color} cube", body=name) for name, c in zip(_CUBES, layout.cubes, strict=False))
-        targets = (Thing(name="target", body=_target(side), is_movable=False) for side in _SIDES)
-        return (Thing(name="button", body=f"{_BUTTON}/cap", is_movable=False), *targets, *cubes)
 
     def remember(self, memory: Memory | None, physics: Physics, layout: Layout) -> Memory:
         before = memory or Memory(right=Visit(), left=Visit())

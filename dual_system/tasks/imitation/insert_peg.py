@@ -26,7 +26,6 @@ from dual_system.tasks.pegs import (
     BOX_HALF_M,
     BOX_RGBA,
     BOX_Z_M,
-    MOUTHS,
     PEG_HALF_WIDTH_M,
     add_box_with_hole,
     add_peg,
@@ -36,7 +35,7 @@ from dual_system.tasks.physics import Physics
 from dual_system.tasks.placing import Point, until_it_fits
 from dual_system.tasks.props import RED
 from dual_system.tasks.scene import SceneFullError, display_rgba
-from dual_system.tasks.task import Reasoning, Shown, Subtask, Task, Thing, task
+from dual_system.tasks.task import Reasoning, Shown, Subtask, Task, task
 
 NUM_PEGS = 3
 ENDS = {"head": "far", "tail": "near"}  # seen from the robot
@@ -84,13 +83,6 @@ class Layout:
         """Unit direction (3,) of the hole's axis, out of the box towards the side that the hand comes from."""
         axis = transform(self.box.pose(BOX_Z_M))[:3, 0]
         return axis if axis[1] * SIDES[self.side] > 0 else -axis
-
-    @property
-    def mouths(self) -> tuple[str, str]:
-        """The bodies that stand for the hole's mouths: the one where the peg goes in, and the other."""
-        ahead, behind = (f"{_BOX}/{mouth}" for mouth in MOUTHS)
-        axis = transform(self.box.pose(BOX_Z_M))[:3, 0]
-        return (ahead, behind) if axis @ self.outward > 0 else (behind, ahead)
 
     def approach(self, strays_by: int = 0) -> list[Array]:
         """Where (4, 4) the held end is carried: in front of the box and above, down, close, and in.
@@ -150,8 +142,6 @@ class InsertPeg(Task[Layout, Memory]):
 
     def subtasks(self, layout: Layout) -> tuple[Subtask, ...]:
         held, leading = layout.held_end, layout.leading_end
-        # Which end is held says which way to turn, and from where it goes in how to grasp: the wrist turns so far only.
-        end, side = f"{ENDS[layout.grasped]} end", f"{layout.side} side"
         return (
             Subtask(
                 text=f"Pick up the peg by grasping the {ENDS[layout.grasped]} end[ at <>]",
@@ -159,8 +149,6 @@ class InsertPeg(Task[Layout, Memory]):
                 is_done=lambda physics, memory: predicates.is_lifted_by(physics, held, leading),
                 failure=_wrong_grasp(layout),
                 motion=lambda motions: motions.pick_bar(held, onward=layout.approach()),
-                way=f"[, <>, {side}]",
-                way_grounds=(held, leading),
             ),
             Subtask(
                 text=f"Insert the peg from the {layout.side} side[ at <>]",
@@ -168,27 +156,17 @@ class InsertPeg(Task[Layout, Memory]):
                 is_done=lambda physics, memory: _is_in(layout, physics),
                 failure=_wrong_insertion(layout),
                 motion=lambda motions: motions.carry(held, layout.approach(motions.strays_by)),
-                way=f"[, <>, {end}]",
-                way_grounds=layout.mouths,
             ),
         )
 
     def demonstration(self, layout: Layout) -> tuple[Shown, ...]:
         pick, insert = self.subtasks(layout)
         return (
-            Shown(
-                text=pick.text,
-                grounds=pick.grounds,
-                motion=pick.motion,
-                way="[, <>]",
-                way_grounds=pick.way_grounds,
-            ),
+            Shown(text=pick.text, grounds=pick.grounds, motion=pick.motion),
             Shown(
                 text=f"Insert the peg from the {layout.side} side of the box[ at <>]",
                 grounds=insert.grounds,
                 motion=insert.motion,
-                way="[, <>]",
-                way_grounds=insert.way_grounds,
             ),
             # Straight home from there, as upstream goes, the hand would catch on the box.
             Shown(text="let go", motion=Motions.let_go, is_recorded=False),
@@ -203,15 +181,6 @@ class InsertPeg(Task[Layout, Memory]):
             f"Reproduce exactly; next is: {captions.simple(self.subtasks(layout)[index].text)}.",
             grounds=(layout.held_end, _BOX),
         )
-
-    def things(self, layout: Layout, step: int, memory: Memory | None = None) -> tuple[Thing, ...]:
-        """The box, and both ends of each peg as it lies: half a peg cannot be put anywhere by itself."""
-        ends = [(f"{end} end", f"{peg}/{half}") for peg in _PEGS for half, end in ENDS.items()]
-        return tuple(Thing(name=name, body=body, is_movable=False) for name, body in (("box", _BOX), *ends))
-
-    def laid_out(self, layout: Layout) -> tuple[tuple[tuple[float, float, float], ...], ...]:
-        """Of every peg the near end and the far one."""
-        return tuple((_end_m(peg, "tail"), _end_m(peg, "head")) for peg in layout.pegs)
 
     def retold(self, layout: Layout) -> tuple[Layout, ...]:
         """The peg was grasped at the other end, or inserted from the other side, or both, as far as there is room."""

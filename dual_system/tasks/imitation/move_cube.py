@@ -26,7 +26,7 @@ from dual_system.tasks.physics import Physics
 from dual_system.tasks.placing import PlacedCube, Point, draw_cube, draw_disc, until_it_fits
 from dual_system.tasks.props import PURPLE, TARGET_RADIUS_M, TARGET_THICKNESS_M, add_target
 from dual_system.tasks.scene import SceneFullError, add_cube
-from dual_system.tasks.task import Reasoning, Shown, Subtask, Task, Thing, task
+from dual_system.tasks.task import Reasoning, Shown, Subtask, Task, task
 
 MANNERS = {
     "hook": "hook it with the peg",
@@ -113,11 +113,6 @@ class MoveCube(Task[Layout, None]):
     def retold(self, layout: Layout) -> tuple[Layout, ...]:
         """The cube of the same video was moved in another manner."""
         return tuple(replace(layout, manner=manner) for manner in MANNERS if manner != layout.manner)
-
-    def things(self, layout: Layout, step: int, memory: object = None) -> tuple[Thing, ...]:
-        fixed = {"target": _TARGET, "peg": _TAIL}  # half a peg cannot be put anywhere by itself
-        cube = Thing(name=f"{layout.demonstrated.cube.color} cube", body=_CUBE)
-        return (*(Thing(name=name, body=body, is_movable=False) for name, body in fixed.items()), cube)
 
     def remember(self, memory: None, physics: Physics, layout: Layout) -> None:
         return None

@@ -15,7 +15,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise, product
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -27,7 +26,7 @@ from dual_system.tasks.imitation.traces import TARGET_Z_M, Touches
 from dual_system.tasks.oracle import Actions, Motions
 from dual_system.tasks.panda import PANDA_STICK
 from dual_system.tasks.physics import Physics
-from dual_system.tasks.task import Reasoning, Shown, Subtask, Task, Thing, task
+from dual_system.tasks.task import Reasoning, Shown, Subtask, Task, task
 
 _SIDE = {"easy": 3, "medium": 4, "hard": 5}  # buttons
 _LENGTH = {"easy": (2, 4), "medium": (3, 5), "hard": (4, 8)}  # buttons of a pattern, both ends included
@@ -103,11 +102,8 @@ class PatternLock(Task[Layout, Touches]):
                 is_done=partial(_has_come_to, end),
                 failure=partial(_wrong_touch, layout, (start, end)),
                 motion=_point_at(end),
-                **_way(layout, nth),
             )
-            for nth, (direction, (start, end)) in enumerate(
-                zip(layout.directions(), pairwise(layout.pattern), strict=True)
-            )
+            for direction, (start, end) in zip(layout.directions(), pairwise(layout.pattern), strict=True)
         )
 
     def demonstration(self, layout: Layout) -> tuple[Shown, ...]:
@@ -115,8 +111,8 @@ class PatternLock(Task[Layout, Touches]):
         return (
             Shown(text="NO RECORD", motion=_point_at(first), is_recorded=False),
             *(
-                Shown(text=f"move {direction}", motion=_point_at(button), **_way(layout, nth))
-                for nth, (direction, button) in enumerate(zip(layout.directions(), others, strict=True))
+                Shown(text=f"move {direction}", motion=_point_at(button))
+                for direction, button in zip(layout.directions(), others, strict=True)
             ),
             Shown(text="NO RECORD", motion=lambda motions: motions.go_home(), is_recorded=False),
             Shown(text="NO RECORD", motion=lambda motions: motions.point_at_once(_BUTTONS[first]), is_recorded=False),
@@ -140,14 +136,6 @@ class PatternLock(Task[Layout, Touches]):
             for shared in range(1, len(layout.pattern))
             for other in _turned_away(layout.side, layout.pattern, shared)
         )
-
-    def things(self, layout: Layout, step: int, memory: Touches | None = None) -> tuple[Thing, ...]:
-        touches = dict(zip(layout.pattern, memory, strict=True)) if memory else {}
-        buttons = range(layout.side**2)
-        return traces.named([_BUTTONS[at] for at in buttons], tuple(touches.get(at) for at in buttons))
-
-    def imagined(self, rng: np.random.Generator, layout: Layout) -> Touches:
-        return traces.imagined(rng, len(layout.pattern))
 
     def remember(self, memory: Touches | None, physics: Physics, layout: Layout) -> Touches:
         return traces.followed(memory, [_is_touched(physics, button) for button in layout.pattern])
@@ -188,11 +176,6 @@ def _neighbours(side: int, button: int) -> list[int]:
 
 def _named(layout: Layout) -> tuple[str, ...]:
     return tuple(_BUTTONS[button] for button in layout.pattern)
-
-
-def _way(layout: Layout, move: int) -> dict[str, Any]:
-    """Of a subtask or a part of the video."""
-    return traces.way([""] * len(layout.directions()), _named(layout)[1:], move)
 
 
 def _point_at(button: int) -> Callable[[Motions], Actions]:

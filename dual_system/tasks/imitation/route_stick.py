@@ -16,7 +16,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -30,7 +29,7 @@ from dual_system.tasks.panda import PANDA_STICK
 from dual_system.tasks.physics import Physics
 from dual_system.tasks.props import add_block
 from dual_system.tasks.scene import display_rgba
-from dual_system.tasks.task import Reasoning, Shown, Subtask, Task, Thing, task
+from dual_system.tasks.task import Reasoning, Shown, Subtask, Task, task
 
 CLOCKWISE, COUNTERCLOCKWISE = "clockwise", "counterclockwise"
 _OPPOSITE = {CLOCKWISE: COUNTERCLOCKWISE, COUNTERCLOCKWISE: CLOCKWISE}
@@ -132,7 +131,6 @@ class RouteStick(Task[Layout, Memory]):
                 is_done=lambda physics, memory: memory.has_arrived,
                 failure=partial(_mishap, layout, move),
                 motion=_sweep(end, side),
-                **_way(layout, move),
             )
             for move, (start, end, side) in enumerate(_moves(layout))
         )
@@ -141,10 +139,7 @@ class RouteStick(Task[Layout, Memory]):
         first = _TARGETS[layout.route[0]]
         return (
             Shown(text="NO RECORD", motion=lambda motions: motions.point_at(first), is_recorded=False),
-            *(
-                Shown(text=_text(start, end, side), motion=_sweep(end, side), **_way(layout, move))
-                for move, (start, end, side) in enumerate(_moves(layout))
-            ),
+            *(Shown(text=_text(start, end, side), motion=_sweep(end, side)) for start, end, side in _moves(layout)),
             Shown(text="NO RECORD", motion=lambda motions: motions.go_home(_HOMING_STEPS), is_recorded=False),
             Shown(text="NO RECORD", motion=lambda motions: motions.point_at_once(first), is_recorded=False),
         )
@@ -167,14 +162,6 @@ class RouteStick(Task[Layout, Memory]):
             replace(layout, sides=(*layout.sides[:move], _OPPOSITE[side], *layout.sides[move + 1 :]))
             for move, side in enumerate(layout.sides)
         )
-
-    def things(self, layout: Layout, step: int, memory: Memory | None = None) -> tuple[Thing, ...]:
-        posts = (Thing(name="post", body=post, is_movable=False) for post in _POSTS)
-        return (*traces.named(_TARGETS, memory.touches if memory else (None,) * len(_TARGETS)), *posts)
-
-    def imagined(self, rng: np.random.Generator, layout: Layout) -> Memory:
-        touches = traces.imagined(rng, len(_TARGETS))
-        return Memory(move=0, has_arrived=False, num_points=1, sum_xy_m=(0.0, 0.0), touches=touches)
 
     def remember(self, memory: Memory | None, physics: Physics, layout: Layout) -> Memory:
         x_m, y_m, _ = physics.tcp_transform()[:3, 3].tolist()
@@ -218,11 +205,6 @@ def _hand(start: int, end: int) -> str:
 
 def _text(start: int, end: int, side: str) -> str:
     return f"move to the nearest {_hand(start, end)} target by circling around the stick {side}"
-
-
-def _way(layout: Layout, move: int) -> dict[str, Any]:
-    """Of a subtask or a part of the video."""
-    return traces.way([f"{side} to " for side in layout.sides], [_TARGETS[at] for at in layout.route[1:]], move)
 
 
 def _sweep(target: int, side: str) -> Callable[[Motions], Actions]:

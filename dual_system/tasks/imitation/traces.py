@@ -7,16 +7,13 @@ upstream; a dot is seen at once, upstream one observation later.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import mujoco
-import numpy as np
 
 from dual_system.tasks.geometry import pose
 from dual_system.tasks.physics import Physics
 from dual_system.tasks.props import GRAY, NUM_RINGS, RED, add_dot, add_rings, add_target
 from dual_system.tasks.scene import RGBA, WHITE
-from dual_system.tasks.task import Thing
 
 TARGET_Z_M = 0.01  # of a target's centre
 RED_STEPS = 40  # a target stays red for so long after the last touch
@@ -55,22 +52,6 @@ def followed(before: Touches | None, is_touched: Sequence[bool]) -> Touches:
     return tuple(0 if now else None if then is None else then + 1 for now, then in zip(is_touched, since, strict=True))
 
 
-def imagined(rng: np.random.Generator, count: int) -> Touches:
-    """Touches of so many targets as they may be at some time: of up to three, most of them not long ago."""
-    touched = rng.permutation(count)[: rng.integers(4)].tolist()
-    since = rng.integers(2 * TRAIL_STEPS, size=count).tolist()
-    return tuple(since[index] if index in touched else None for index in range(count))
-
-
-def named(targets: Sequence[str], touches: Touches) -> tuple[Thing, ...]:
-    """The targets as things, by the colour that they show."""
-    colors = ("red" if _is_red(since) else "grey" for since in touches)
-    return tuple(
-        Thing(name=f"{color} target", body=target, is_movable=False)
-        for color, target in zip(colors, targets, strict=True)
-    )
-
-
 def show_touches(physics: Physics, targets: Sequence[str], touches: Touches) -> None:
     """Paints the targets that were touched red, and the others grey."""
     for target, since in zip(targets, touches, strict=True):
@@ -92,12 +73,6 @@ def leave_dot(physics: Physics, step: int) -> None:
 
 def _is_red(since: int | None) -> bool:
     return since is not None and since <= RED_STEPS
-
-
-def way(manners: Sequence[str], ends: Sequence[str], move: int) -> dict[str, Any]:
-    """The ``way`` and ``way_grounds`` of a move: where it ends, and how (in words) and where the next one does."""
-    following = f", then {manners[move + 1]}<>" if move + 1 < len(ends) else ""
-    return {"way": f"[ to <>{following}]", "way_grounds": tuple(ends[move : move + 2])}
 
 
 def _red(target: str) -> str:

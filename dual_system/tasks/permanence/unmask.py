@@ -27,13 +27,11 @@ from dual_system.tasks.oracle import Actions, Motions
 from dual_system.tasks.permanence.scenes import LANE_M, SWAP_STEP, Hidden, Layout
 from dual_system.tasks.physics import Physics
 from dual_system.tasks.scene import CUBE_COLORS, add_button, add_cube
-from dual_system.tasks.swaps import SWAP_STEPS
-from dual_system.tasks.task import Reasoning, Shown, Subtask, Task, Thing
+from dual_system.tasks.task import Reasoning, Shown, Subtask, Task
 
 COVER_STEP = 32  # the first observation that shows the containers
 
 _RELEASE_Z_M = 0.07
-_MIDDLE_Z_M = 0.038  # of what the front camera sees of a container
 
 Pressed = frozenset[str]
 
@@ -79,31 +77,6 @@ class Unmask(Task[Layout, Pressed]):
         else:
             return
         physics.refresh()
-
-    def moving(self, layout: Layout, step: int) -> tuple[tuple[float, float, float], ...]:
-        """The containers asked for, and their cubes before they are covered."""
-        if step > layout.last_event_step:
-            return ()
-        spots = swaps.spots_after(layout.containers, layout.swaps, step - SWAP_STEP, LANE_M)
-        wanted = (spots[cube.container] for cube in layout.hidden[: layout.num_picks])
-        z_m = HIDDEN_HALF_M if step < COVER_STEP else _MIDDLE_Z_M
-        return tuple((spot.x_m, spot.y_m, z_m) for spot in wanted)
-
-    def underway(self, layout: Layout, step: int) -> tuple[int, int]:
-        """When the swap that is going on began, and when it ends."""
-        if not SWAP_STEP < step < layout.last_event_step:
-            return step, step
-        began = step - (step - SWAP_STEP) % SWAP_STEPS
-        return (step, step) if began == step else (began, began + SWAP_STEPS)
-
-    def things(self, layout: Layout, step: int, memory: object = None) -> tuple[Thing, ...]:
-        """Cubes as long as they lie bare, then containers."""
-        caps = [f"{name}/cap" for name in button_names(self.num_buttons)]
-        buttons = [Thing(name="button", body=cap, is_movable=False) for cap in caps]
-        if step < COVER_STEP:
-            return (*buttons, *(Thing(name=f"{c.color} cube", body=cube_name(c.container)) for c in layout.hidden))
-        names = map(container_name, range(len(layout.containers)))
-        return (*buttons, *(Thing(name="container", body=name) for name in names))
 
     def instruction(self, layout: Layout) -> str:
         first, *others = (cube.color for cube in layout.hidden[: layout.num_picks])

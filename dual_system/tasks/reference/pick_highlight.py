@@ -23,7 +23,7 @@ from dual_system.tasks.oracle import Actions, Motions
 from dual_system.tasks.physics import Physics
 from dual_system.tasks.placing import PlacedCube, draw_button, draw_cube, until_it_fits
 from dual_system.tasks.scene import CUBE_COLORS, add_button, add_cube, add_disc
-from dual_system.tasks.task import Reasoning, Subtask, Task, Thing, task
+from dual_system.tasks.task import Reasoning, Subtask, Task, task
 
 HIGHLIGHT_STEPS = range(10, 101)  # the observations that show the discs
 
@@ -129,16 +129,6 @@ class PickHighlight(Task[Layout, Memory]):
         *marked, next_one = (f"the {layout.cubes[target].color} cube[ at <>]" for target in chosen)
         text = f"Highlighted: {', '.join(marked)}; after {num_chosen} of {len(marked)}, choose {next_one}."
         return Reasoning(text=text, grounds=tuple(_CUBES[target] for target in chosen))
-
-    def near_first(self, layout: Layout) -> Layout:
-        nearest = sorted(layout.targets, key=lambda target: -layout.cubes[target].x_m)
-        return replace(layout, targets=tuple(nearest))
-
-    def things(self, layout: Layout, step: int, memory: object = None) -> tuple[Thing, ...]:
-        lit = layout.targets if step in HIGHLIGHT_STEPS else ()
-        names = [f"{'highlighted ' * (i in lit)}{cube.color} cube" for i, cube in enumerate(layout.cubes)]
-        cubes = [Thing(name=name, body=body) for name, body in zip(names, _CUBES, strict=False)]
-        return (Thing(name="button", body=f"{_BUTTON}/cap", is_movable=False), *cubes)
 
     def retold(self, layout: Layout) -> tuple[Layout, ...]:
         others = [index for index in range(len(layout.cubes)) if index not in layout.targets]

@@ -37,7 +37,7 @@ from dual_system.tasks.reference import shuffle
 from dual_system.tasks.reference.shuffle import Rest
 from dual_system.tasks.scene import CUBE_COLORS, SceneFullError, add_button, add_cube
 from dual_system.tasks.swaps import Swap
-from dual_system.tasks.task import Reasoning, Shown, Subtask, Task, Thing
+from dual_system.tasks.task import Reasoning, Shown, Subtask, Task
 
 LANE_M = 0.1
 
@@ -76,7 +76,7 @@ class Layout:
 
     @property
     def color(self) -> str:
-        """Of the cube that is carried."""
+        """The color of the cube that is carried."""
         return self.cubes[self.carried].color
 
 
@@ -168,11 +168,6 @@ class VideoPlace(Task[Layout, Rest | None]):
             text += f"the {layout.color} cube[ at <>] for target {name}[ at <>]."
             return Reasoning(text=text, grounds=(cube, target))
         return Reasoning(text=text + f"target {name}[ at <>].", grounds=(target,))
-
-    def things(self, layout: Layout, step: int, memory: Rest | None = None) -> tuple[Thing, ...]:
-        cubes = (Thing(name=f"{cube.color} cube", body=name) for name, cube in zip(_CUBES, layout.cubes, strict=False))
-        targets = (Thing(name="target", body=target, is_movable=False) for target in _targets(layout))
-        return (Thing(name="button", body=f"{_BUTTON}/cap", is_movable=False), *targets, *cubes)
 
     def retold(self, layout: Layout) -> tuple[Layout, ...]:
         """The cube was placed on the same targets, beginning with another one of them."""

@@ -38,7 +38,7 @@ from dual_system.tasks.reference import shuffle
 from dual_system.tasks.reference.shuffle import Rest
 from dual_system.tasks.scene import CUBE_COLORS, CUBE_HALF_M, SceneFullError, add_button, add_cube
 from dual_system.tasks.swaps import SWAP_STEPS, Swap
-from dual_system.tasks.task import Reasoning, Shown, Subtask, Task, Thing, task
+from dual_system.tasks.task import Reasoning, Shown, Subtask, Task, task
 
 EARLY_STEPS = range(50, 501)  # how long ago the task must have been set for a press to be too early
 LANE_M = 0.07
@@ -161,10 +161,6 @@ class VideoRepick(Task[Layout, Memory]):
             verb = "put it down" if is_putting else "pick it up"
             then, ground = f"choose {name}[ at <>]: {verb}, time {nth + 1} of {layout.repeats}.", _CUBES[layout.asked]
         return Reasoning(text=shown + after + then, grounds=(ground,))
-
-    def things(self, layout: Layout, step: int, memory: Memory | None = None) -> tuple[Thing, ...]:
-        cubes = (Thing(name=f"{cube.color} cube", body=name) for name, cube in zip(_CUBES, layout.cubes, strict=False))
-        return (Thing(name="button", body=f"{_BUTTON}/cap", is_movable=False), *cubes)
 
     def retold(self, layout: Layout) -> tuple[Layout, ...]:
         """Another cube of the same colour was picked up. The same cubes changed places, in whichever order they did."""

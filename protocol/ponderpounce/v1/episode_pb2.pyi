@@ -40,6 +40,17 @@ class SeamKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     SEAM_KIND_SWITCH: _ClassVar[SeamKind]
     SEAM_KIND_OFFSET_FADE: _ClassVar[SeamKind]
     SEAM_KIND_ENSEMBLE: _ClassVar[SeamKind]
+
+class Refusal(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    REFUSAL_UNSPECIFIED: _ClassVar[Refusal]
+    REFUSAL_NOT_READY: _ClassVar[Refusal]
+    REFUSAL_BUSY: _ClassVar[Refusal]
+    REFUSAL_CAMERAS: _ClassVar[Refusal]
+    REFUSAL_ROBOT: _ClassVar[Refusal]
+    REFUSAL_MODELS: _ClassVar[Refusal]
+    REFUSAL_SCHEDULE: _ClassVar[Refusal]
+    REFUSAL_REQUEST: _ClassVar[Refusal]
 MODE_UNSPECIFIED: Mode
 MODE_REALTIME: Mode
 MODE_LOCKSTEP: Mode
@@ -58,6 +69,14 @@ SEAM_KIND_UNSPECIFIED: SeamKind
 SEAM_KIND_SWITCH: SeamKind
 SEAM_KIND_OFFSET_FADE: SeamKind
 SEAM_KIND_ENSEMBLE: SeamKind
+REFUSAL_UNSPECIFIED: Refusal
+REFUSAL_NOT_READY: Refusal
+REFUSAL_BUSY: Refusal
+REFUSAL_CAMERAS: Refusal
+REFUSAL_ROBOT: Refusal
+REFUSAL_MODELS: Refusal
+REFUSAL_SCHEDULE: Refusal
+REFUSAL_REQUEST: Refusal
 
 class Delay(_message.Message):
     __slots__ = ("kind", "mean_ns", "sigma")
@@ -221,8 +240,16 @@ class OpenRequest(_message.Message):
     demo: _containers.RepeatedCompositeFieldContainer[DemoFrame]
     def __init__(self, info: _Optional[_Union[EpisodeInfo, _Mapping]] = ..., demo: _Optional[_Iterable[_Union[DemoFrame, _Mapping]]] = ...) -> None: ...
 
+class DemoSampling(_message.Message):
+    __slots__ = ("hz", "to_its_end")
+    HZ_FIELD_NUMBER: _ClassVar[int]
+    TO_ITS_END_FIELD_NUMBER: _ClassVar[int]
+    hz: int
+    to_its_end: bool
+    def __init__(self, hz: _Optional[int] = ..., to_its_end: _Optional[bool] = ...) -> None: ...
+
 class Contract(_message.Message):
-    __slots__ = ("proc", "num_carriers", "hidden_size", "horizon", "action_dim", "preferred_codec", "infer_p50_ns", "infer_p99_ns", "model_hash", "is_fake", "version", "context_tokens", "max_context_tokens")
+    __slots__ = ("proc", "num_carriers", "hidden_size", "horizon", "action_dim", "preferred_codec", "infer_p50_ns", "infer_p99_ns", "model_hash", "is_fake", "version", "context_tokens", "max_context_tokens", "demonstrations")
     PROC_FIELD_NUMBER: _ClassVar[int]
     NUM_CARRIERS_FIELD_NUMBER: _ClassVar[int]
     HIDDEN_SIZE_FIELD_NUMBER: _ClassVar[int]
@@ -236,6 +263,7 @@ class Contract(_message.Message):
     VERSION_FIELD_NUMBER: _ClassVar[int]
     CONTEXT_TOKENS_FIELD_NUMBER: _ClassVar[int]
     MAX_CONTEXT_TOKENS_FIELD_NUMBER: _ClassVar[int]
+    DEMONSTRATIONS_FIELD_NUMBER: _ClassVar[int]
     proc: str
     num_carriers: int
     hidden_size: int
@@ -249,21 +277,38 @@ class Contract(_message.Message):
     version: str
     context_tokens: int
     max_context_tokens: int
-    def __init__(self, proc: _Optional[str] = ..., num_carriers: _Optional[int] = ..., hidden_size: _Optional[int] = ..., horizon: _Optional[int] = ..., action_dim: _Optional[int] = ..., preferred_codec: _Optional[_Union[_common_pb2.ImageCodec, str]] = ..., infer_p50_ns: _Optional[int] = ..., infer_p99_ns: _Optional[int] = ..., model_hash: _Optional[str] = ..., is_fake: _Optional[bool] = ..., version: _Optional[str] = ..., context_tokens: _Optional[int] = ..., max_context_tokens: _Optional[int] = ...) -> None: ...
+    demonstrations: DemoSampling
+    def __init__(self, proc: _Optional[str] = ..., num_carriers: _Optional[int] = ..., hidden_size: _Optional[int] = ..., horizon: _Optional[int] = ..., action_dim: _Optional[int] = ..., preferred_codec: _Optional[_Union[_common_pb2.ImageCodec, str]] = ..., infer_p50_ns: _Optional[int] = ..., infer_p99_ns: _Optional[int] = ..., model_hash: _Optional[str] = ..., is_fake: _Optional[bool] = ..., version: _Optional[str] = ..., context_tokens: _Optional[int] = ..., max_context_tokens: _Optional[int] = ..., demonstrations: _Optional[_Union[DemoSampling, _Mapping]] = ...) -> None: ...
+
+class ContractRequest(_message.Message):
+    __slots__ = ("header",)
+    HEADER_FIELD_NUMBER: _ClassVar[int]
+    header: _common_pb2.Header
+    def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ...) -> None: ...
+
+class ContractReply(_message.Message):
+    __slots__ = ("error", "contract")
+    ERROR_FIELD_NUMBER: _ClassVar[int]
+    CONTRACT_FIELD_NUMBER: _ClassVar[int]
+    error: str
+    contract: Contract
+    def __init__(self, error: _Optional[str] = ..., contract: _Optional[_Union[Contract, _Mapping]] = ...) -> None: ...
 
 class OpenReply(_message.Message):
-    __slots__ = ("error", "contract", "contracts", "warnings", "try_again")
+    __slots__ = ("error", "contract", "contracts", "warnings", "try_again", "refusal")
     ERROR_FIELD_NUMBER: _ClassVar[int]
     CONTRACT_FIELD_NUMBER: _ClassVar[int]
     CONTRACTS_FIELD_NUMBER: _ClassVar[int]
     WARNINGS_FIELD_NUMBER: _ClassVar[int]
     TRY_AGAIN_FIELD_NUMBER: _ClassVar[int]
+    REFUSAL_FIELD_NUMBER: _ClassVar[int]
     error: str
     contract: Contract
     contracts: _containers.RepeatedCompositeFieldContainer[Contract]
     warnings: _containers.RepeatedScalarFieldContainer[str]
     try_again: bool
-    def __init__(self, error: _Optional[str] = ..., contract: _Optional[_Union[Contract, _Mapping]] = ..., contracts: _Optional[_Iterable[_Union[Contract, _Mapping]]] = ..., warnings: _Optional[_Iterable[str]] = ..., try_again: _Optional[bool] = ...) -> None: ...
+    refusal: Refusal
+    def __init__(self, error: _Optional[str] = ..., contract: _Optional[_Union[Contract, _Mapping]] = ..., contracts: _Optional[_Iterable[_Union[Contract, _Mapping]]] = ..., warnings: _Optional[_Iterable[str]] = ..., try_again: _Optional[bool] = ..., refusal: _Optional[_Union[Refusal, str]] = ...) -> None: ...
 
 class CloseRequest(_message.Message):
     __slots__ = ("header", "result")

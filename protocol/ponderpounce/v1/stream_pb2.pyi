@@ -37,7 +37,6 @@ class SubgoalKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     SUBGOAL_KIND_DEMO_REASONING: _ClassVar[SubgoalKind]
     SUBGOAL_KIND_TASK_SIMPLE: _ClassVar[SubgoalKind]
     SUBGOAL_KIND_TASK_GROUNDED: _ClassVar[SubgoalKind]
-    SUBGOAL_KIND_DEMO_NOTE: _ClassVar[SubgoalKind]
 
 class Severity(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -72,7 +71,6 @@ SUBGOAL_KIND_SUBGOAL: SubgoalKind
 SUBGOAL_KIND_DEMO_REASONING: SubgoalKind
 SUBGOAL_KIND_TASK_SIMPLE: SubgoalKind
 SUBGOAL_KIND_TASK_GROUNDED: SubgoalKind
-SUBGOAL_KIND_DEMO_NOTE: SubgoalKind
 SEVERITY_UNSPECIFIED: Severity
 SEVERITY_INFO: Severity
 SEVERITY_WARNING: Severity

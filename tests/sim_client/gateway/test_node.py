@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from clock import schedules
-from dual_system.models.ponder.showing import Showing
+from dual_system.models.ponder.demo_sampling import DemoSampling
 from protocol import messages as m
 from sim_client.episode import STOPPED_TICKS
 from sim_client.gateway.node import LiveNode, LockstepNode, Shown
@@ -167,7 +167,7 @@ def test_rows_ahead_obey_the_limits(robot_with: Callable[..., m.Robot]) -> None:
 @pytest.mark.parametrize(("num_frames", "read"), [(0, []), (1, [0]), (20, [0]), (21, [0, 20]), (45, [0, 20, 40])])
 def test_of_a_video_ponder_reads_the_first_frame_and_one_a_second(num_frames: int, read: list[int]) -> None:
     video: Any = list(range(num_frames))
-    assert list(as_shown(video, 20, Showing())) == read
+    assert list(as_shown(video, 20, DemoSampling())) == read
 
 
 @pytest.mark.parametrize(
@@ -177,4 +177,4 @@ def test_of_a_video_that_is_shown_twice_a_second_and_to_its_end_ponder_reads_the
     num_frames: int, read: list[int]
 ) -> None:
     video: Any = list(range(num_frames))
-    assert list(as_shown(video, 20, Showing(hz=2, to_its_end=True))) == read
+    assert list(as_shown(video, 20, DemoSampling(hz=2, to_its_end=True))) == read

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from clock.rendezvous import KEEP_OBSERVATIONS, Rendezvous
+from model_server.rendezvous import KEEP_OBSERVATIONS, Rendezvous
 from protocol.messages import Observation, Query
 
 

@@ -15,7 +15,7 @@ from protocol import messages as m
 from protocol.bus import LocalBus
 from protocol.link import Link
 from protocol.topics import COGNITION, INVOCATION
-from sim_client.donor import DonorError, DonorPonder, donors_in
+from sim_client.swapped_ponder import DonorError, SwappedPonder, donors_in
 
 STEPS = 90
 
@@ -27,7 +27,7 @@ def played(new_rig: Callable[..., Any], episode_info: Callable[..., m.EpisodeInf
     def play(donor: list[m.Cognition] | None = None, steps: int = STEPS) -> dict[type, list[Any]]:
         class WithDonor(new_rig):  # type: ignore[misc, valid-type]
             def start_ponder(self, link: Link, engine: Any) -> Any:
-                stand_in = DonorPonder(link)
+                stand_in = SwappedPonder(link)
                 stand_in.take(SimpleNamespace(cognitions=donor), "a donor")  # type: ignore[arg-type]
                 return stand_in
 
@@ -72,7 +72,7 @@ def test_a_donor_s_vectors_come_query_by_query_and_its_last_one_stays(played: An
 
 
 def test_a_log_without_cognition_is_no_donor(tmp_path: Path) -> None:
-    stand_in = DonorPonder(Link(LocalBus(), robot="r0", proc="ponder"))
+    stand_in = SwappedPonder(Link(LocalBus(), robot="r0", proc="ponder"))
     with pytest.raises(DonorError, match="no cognition"):
         stand_in.take(SimpleNamespace(cognitions=[]), "oracle.mcap")  # type: ignore[arg-type]
     with pytest.raises(DonorError, match=r"absent\.mcap"):

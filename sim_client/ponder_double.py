@@ -1,4 +1,4 @@
-"""A PONDER on a bus without a model: what a stand-in for it has in common, whatever it answers."""
+"""A PONDER on a bus without a model: the base class of those that replace it in an experiment."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-from clock.membership import Membership
+from model_server.membership import Membership
 from protocol import messages as m
 from protocol import topics
 from protocol.heartbeat import Heartbeat
@@ -17,7 +17,7 @@ from protocol.version import version
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answer:
-    """A cognition in the place of PONDER's."""
+    """A cognition in place of PONDER's."""
 
     vector: m.Floats
     """(K, H)."""
@@ -25,40 +25,40 @@ class Answer:
     norm: float
 
 
-class PuppetPonder(ABC):
-    """``step`` answers what is asked and says whether anything was."""
+class PonderDouble(ABC):
+    """Joins episodes and answers queries as ``ponder-serve`` does; subclasses decide with what."""
 
     def __init__(self, link: Link) -> None:
         self.link = link
-        self.instruction = ""
         self._heartbeat = Heartbeat(link, version(), host_clock_id())
-        self._membership = Membership(link, self._heartbeat, self._open, self.end)
+        self._membership = Membership(link, self._heartbeat, self._contract, self._open, self.end)
         self._queries = link.subscribe(topics.QUERY)
         self._heartbeat.set(state=m.ServingState.READY, progress=1.0)
 
     @property
     @abstractmethod
     def model_hash(self) -> str:
-        """Says in every log whose vectors these were."""
+        """Identifies the source of the vectors in every log."""
 
     @property
     @abstractmethod
     def is_fake(self) -> bool:
-        """Whether nothing that was trained gives these vectors."""
+        """Whether the vectors come from no trained model."""
 
     @abstractmethod
     def shape(self) -> tuple[int, int]:
-        """Returns (K, H) of the episode that is opened. Raises ValueError if there is nothing to answer with."""
+        """Returns (K, H) of the episode to be opened. Raises ValueError if there is nothing to answer with."""
 
     @abstractmethod
     def answer(self, query: m.Query) -> Answer:
-        """What PONDER would have to say now."""
+        """Returns the answer to a query."""
 
     @abstractmethod
     def end(self) -> None:
-        """An episode is over, or about to begin."""
+        """Called when an episode is over, or about to begin."""
 
     def step(self) -> bool:
+        """Answers pending queries; returns whether there was anything to do."""
         self._heartbeat.beat()
         worked = self._membership.step()
         for query in self._queries.drain():
@@ -83,8 +83,10 @@ class PuppetPonder(ABC):
         self.link.publish(topics.COGNITION, cognition, at_ns=now_ns, clock_id=host_clock_id())
 
     def _open(self, request: m.OpenRequest) -> m.Contract:
+        return self._contract()
+
+    def _contract(self) -> m.Contract:
         num_carriers, hidden_size = self.shape()
-        self.instruction = request.info.instruction
         return m.Contract(
             proc="ponder",
             num_carriers=num_carriers,

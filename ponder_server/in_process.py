@@ -1,4 +1,4 @@
-"""PONDER in somebody else's process and thread: the same server on an in-process bus."""
+"""PONDER in the caller's process and thread: the same server on an in-process bus."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""PONDER's stand-in that gives the cognition of another episode: what did POUNCE take from the vectors themselves?
+"""A PONDER that answers with another episode's cognition: what does POUNCE take from the vectors themselves?
 
 Query t of this episode is answered with the vector, and the gate, that PONDER gave at query t of a recorded *donor*: an
 episode of the same task and difficulty, in another scene. Everything else is this episode's own: pictures, instruction,
-schedule, and the age, counted from this episode's query. Beyond the donor's last query its last vector is given again.
+schedule, and the age, counted from this episode's query. Beyond the donor's last query its last vector is repeated.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from protocol import messages as m
 from protocol.errors import ProtocolError
 from protocol.link import Link
 from protocol.mcap_log import EpisodeRecord, read_log
-from sim_client.puppet import Answer, PuppetPonder
+from sim_client.ponder_double import Answer, PonderDouble
 
 Key = tuple[str, int, int]  # task, run, seed
 
 
 class DonorError(ValueError):
-    """There is no cognition to give: the message says what is missing and the way out."""
+    """There is no cognition to answer with: the message says what is missing and the way out."""
 
 
-class DonorPonder(PuppetPonder):
-    """Answers with what was recorded."""
+class SwappedPonder(PonderDouble):
+    """Answers with recorded cognition."""
 
     def __init__(self, link: Link) -> None:
         self._donor: list[m.Cognition] = []
         super().__init__(link)
 
     def load(self, path: Path) -> None:
-        """Takes the donor of the next episode.
+        """Loads the donor of the next episode.
 
         Raises:
             DonorError: the log cannot be read, or there is no cognition in it.
@@ -45,7 +45,7 @@ class DonorPonder(PuppetPonder):
         self.take(record, str(path))
 
     def take(self, record: EpisodeRecord, name: str) -> None:
-        """As `load`, of a log that was read."""
+        """Like `load`, from a log that is already read."""
         self._donor = sorted(record.cognitions, key=lambda cognition: cognition.query)
         if not self._donor:
             raise DonorError(f"{name}: no cognition in it; donors are logs of the real PONDER, of pp-eval --record")
@@ -60,7 +60,7 @@ class DonorPonder(PuppetPonder):
         )
 
     def end(self) -> None:
-        """What was taken stays: it may be asked for again."""
+        """Keeps the donor: it may be queried again."""
 
     def shape(self) -> tuple[int, int]:
         if not self._donor:

@@ -1,7 +1,7 @@
-"""What a POUNCE that reads subgoals is told in words (paper, 3.1 and Table 3): PONDER's text, or the task's own.
+"""Which subgoal text an invocation gets, for a POUNCE that reads text in place of cognition (paper, 3.1 and Table 3).
 
-Evaluation only, with everybody in one thread: on a network nothing says that a text came before the invocation that it
-is for.
+The text is PONDER's newest one, or the task's own annotation. Evaluation only, with all servers in one thread: on a
+network nothing says that a text came before the invocation that it is for.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from protocol import messages as m
 Source = Literal["ponder", "oracle"]
 
 
-class Told:
-    """The texts of one episode, and which of them an invocation is given."""
+class SubgoalText:
+    """The texts of one episode."""
 
     def __init__(self, source: Source) -> None:
         self._source = source
@@ -24,7 +24,7 @@ class Told:
     def clear(self) -> None:
         self._texts.clear()
 
-    def hear(self, subgoal: m.Subgoal) -> None:
+    def on_subgoal(self, subgoal: m.Subgoal) -> None:
         """Keeps a text of this source, by the query it was written at, or by the tick from which it holds."""
         if self._source == "ponder" and subgoal.kind == m.SubgoalKind.SUBGOAL and subgoal.query is not None:
             self._texts.append((subgoal.query, subgoal.text))

@@ -1,4 +1,4 @@
-"""One robot, one client: who has it, and when somebody else may."""
+"""One robot, one client: which client holds the robot, and when another one may take over."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from sim_client.gateway.exchange import Busy
 
 
 @dataclass(slots=True)
-class Seat:
-    """Held from a client's first request until it finishes or leaves; a client that falls silent loses it to the next.
+class Lease:
+    """The right to drive the robot, held from a client's first request until it finishes, leaves or stays idle.
 
-    ``idle_ns``: how long a holder may be silent before another one is let in.
+    ``idle_ns``: time without a request after which another client may take the lease.
     """
 
     idle_ns: int
     holder: str = ""
     _heard_ns: int = 0
 
-    def take(self, client: str, now_ns: int) -> None:
+    def acquire(self, client: str, now_ns: int) -> None:
         """Raises Busy while another client holds it."""
         silent_ns = now_ns - self._heard_ns
         if self.holder not in ("", client) and silent_ns < self.idle_ns:
@@ -29,6 +29,7 @@ class Seat:
             )
         self.holder, self._heard_ns = client, now_ns
 
-    def leave(self, client: str) -> None:
+    def release(self, client: str) -> None:
+        """Gives it back if this client holds it."""
         if self.holder == client:
             self.holder = ""

@@ -1,4 +1,4 @@
-"""POUNCE in somebody else's process and thread: the same server on an in-process bus."""
+"""POUNCE in the caller's process and thread: the same server on an in-process bus."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pounce_server.__main__ import build_engine
 from pounce_server.config import PounceOptions
 from pounce_server.contract import EngineSpec, Request
 from pounce_server.serve import PounceServer
-from pounce_server.told import Source
+from pounce_server.subgoal_text import Source
 from protocol.bus import Bus
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
@@ -21,7 +21,7 @@ from protocol.version import version
 
 
 def build(bus: Bus, robot: str, checkpoint: Path | None, subgoals: Source | None = None) -> Callable[[], bool]:
-    """A warm server's step function. ``subgoals``: see `told`."""
+    """A warm server's step function. ``subgoals``: see `subgoal_text`."""
     link = Link(bus, robot=robot, proc="pounce")
     heartbeat = Heartbeat(link, version(), host_clock_id())
     engine = build_engine(PounceOptions(checkpoint=checkpoint))

@@ -1,6 +1,6 @@
 """A model server's part in an episode: the clock service opens and closes it, and tells a restarted one what it missed.
 
-Shared by both model servers; it calls two functions of theirs and keeps identity, heartbeat and refusals in one place.
+It calls three functions of the server and keeps identity, heartbeat and refusals in one place.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ import time
 from collections.abc import Callable, Iterator
 
 from protocol import messages as m
-from protocol.errors import CallFailed, ProtocolError
+from protocol.errors import CallFailed, EpisodeRefused, ProtocolError
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
 from protocol.process import host_clock_id
-from protocol.topics import ACTIVE, CLOSE, JOURNAL, OPEN, TIME
+from protocol.topics import ACTIVE, CLOSE, CONTRACT, JOURNAL, OPEN, TIME
 
 log = logging.getLogger(__name__)
 
@@ -22,6 +22,7 @@ JOURNAL_PAGE = 4  # observations per call: 1.6 MB of two raw 256 px views
 _CALL_NS = 2_000_000_000
 _ASK_AGAIN_NS = 1_000_000_000
 
+Describe = Callable[[], m.Contract]
 Open = Callable[[m.OpenRequest], m.Contract]
 Close = Callable[[], None]
 
@@ -30,15 +31,20 @@ class Membership:
     """Keeps one server in the episode that the clock service runs.
 
     Args:
+        contract: what the server promises in any episode; raises ValueError if it cannot promise anything yet.
         open_episode: starts the episode in the engine and promises a contract; raises ValueError to refuse.
         close_episode: forgets the episode; called also before a new one.
     """
 
-    def __init__(self, link: Link, heartbeat: Heartbeat, open_episode: Open, close_episode: Close) -> None:
+    def __init__(
+        self, link: Link, heartbeat: Heartbeat, contract: Describe, open_episode: Open, close_episode: Close
+    ) -> None:
         self._link = link
         self._heartbeat = heartbeat
+        self._contract = contract
         self._open_episode = open_episode
         self._close_episode = close_episode
+        self._asking = link.serve(CONTRACT)
         self._opening = link.serve(OPEN)
         self._closing = link.serve(CLOSE)
         self._timing = link.serve(TIME)
@@ -47,7 +53,7 @@ class Membership:
     def step(self) -> bool:
         """Answers waiting calls."""
         answered = self._opening.answer(self._on_open) + self._closing.answer(self._on_close)
-        return answered + self._timing.answer(_on_time) > 0
+        return answered + self._asking.answer(self._on_contract) + self._timing.answer(_on_time) > 0
 
     def rejoin(self) -> m.ActiveReply | None:
         """Asks the clock service which episode runs, at most once a second; opens it here.
@@ -103,10 +109,17 @@ class Membership:
             contract = self._open_episode(request)
         except ValueError as error:
             self._leave()
-            return m.OpenReply(error=str(error))
+            refusal = error.refusal if isinstance(error, EpisodeRefused) else m.Refusal.REQUEST
+            return m.OpenReply(error=str(error), refusal=refusal)
         if announce:
             self.announce()
         return m.OpenReply(contract=contract)
+
+    def _on_contract(self, request: m.ContractRequest) -> m.ContractReply:
+        try:
+            return m.ContractReply(contract=self._contract())
+        except ValueError as error:
+            return m.ContractReply(error=str(error))
 
     def _on_close(self, request: m.CloseRequest) -> m.CloseReply:
         if request.header.episode != self._link.episode:
@@ -124,11 +137,3 @@ class Membership:
 def _on_time(request: m.TimeRequest) -> m.TimeReply:
     now_ns = time.monotonic_ns()
     return m.TimeReply(clock_id=host_clock_id(), t1_ns=now_ns, t2_ns=now_ns)
-
-
-def percentile_ns(durations_ns: list[int], percent: float) -> int:
-    """Nearest-rank percentile; 0 of nothing."""
-    if not durations_ns:
-        return 0
-    rank = max(1, -(-len(durations_ns) * percent // 100))
-    return sorted(durations_ns)[int(rank) - 1]

@@ -1,0 +1,109 @@
+"""Commands with verbs: ``pp-collect``, ``pp-export`` and ``pp-diagnose``.
+
+``pp-collect --out DIR`` runs the command's default module, ``pp-collect correct LOG...`` the module of a verb. Modules
+are imported by name when they run, so each needs only its own dependencies: pp-collect runs without torch, pp-export hf
+without MuJoCo.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+REFUSED = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Verb:
+    """A verb's module, whose ``main(argv, prog=...)`` is called, and one line for ``--help``."""
+
+    module: str
+    summary: str
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """The module that runs without a verb, whose ``main(argv)`` is called, and the verbs."""
+
+    default: str
+    verbs: Mapping[str, Verb] = field(default_factory=dict)
+
+
+COMMANDS = {
+    "pp-collect": Command(
+        "dual_system.data.collect",
+        {
+            "correct": Verb("dual_system.data.correct", "Relabel recorded episodes with the oracle (DAgger)."),
+            "card": Verb("dual_system.data.card", "Write a dataset's README.md and contact sheet."),
+            "pairs": Verb("dual_system.tasks.pair_files", "Collect counterfactual pairs: two pasts of one present."),
+        },
+    ),
+    "pp-export": Command(
+        "dual_system.data.export",
+        {
+            "hf": Verb(
+                "dual_system.models.ponder.export_hf", "Export trained models as the public folders they came from."
+            )
+        },
+    ),
+    "pp-diagnose": Command(
+        "dual_system.training.diagnose",
+        {
+            "counterfactual": Verb(
+                "sim_client.counterfactual", "Score how often a trained pair's action follows its own past."
+            )
+        },
+    ),
+}
+
+
+def collect(argv: list[str] | None = None) -> int:
+    """``pp-collect``."""
+    return _run("pp-collect", sys.argv[1:] if argv is None else argv)
+
+
+def export(argv: list[str] | None = None) -> int:
+    """``pp-export``."""
+    return _run("pp-export", sys.argv[1:] if argv is None else argv)
+
+
+def diagnose(argv: list[str] | None = None) -> int:
+    """``pp-diagnose``."""
+    return _run("pp-diagnose", sys.argv[1:] if argv is None else argv)
+
+
+def _run(name: str, argv: list[str]) -> int:
+    command, first = COMMANDS[name], argv[0] if argv else ""
+    if first in command.verbs:
+        return _main(command.verbs[first].module, argv[1:], prog=f"{name} {first}")
+    if _is_mistyped(first):
+        close = difflib.get_close_matches(first, command.verbs, n=1)
+        hint = f"Did you mean {close[0]!r}? " if close else ""
+        sys.stderr.write(f"{name}: {first!r} is neither a verb nor a file. {hint}Verbs: {', '.join(command.verbs)}.\n")
+        return REFUSED
+    try:
+        return _main(command.default, argv)
+    finally:
+        if {"-h", "--help"} & set(argv):
+            sys.stdout.write(_listed(name, command.verbs))
+
+
+def _is_mistyped(first: str) -> bool:
+    """Whether a first argument can only be meant as a verb: it is a plain word and no file."""
+    return first.isalpha() and not Path(first).exists()
+
+
+def _listed(name: str, verbs: Mapping[str, Verb]) -> str:
+    width = max(map(len, verbs))
+    lines = [f"  {name} {verb:{width}}  {of.summary}" for verb, of in verbs.items()]
+    return "\n".join(["verbs, each with its own --help:", *lines, ""])
+
+
+def _main(module: str, argv: Sequence[str], **options: Any) -> int:
+    code: int = importlib.import_module(module).main(list(argv), **options)
+    return code

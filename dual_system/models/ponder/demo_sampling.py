@@ -1,0 +1,38 @@
+"""How a demonstration is sampled for PONDER: as in its training, so a part of its checkpoint.
+
+PONDER says it in its contract, and the robot's side samples the video accordingly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+FASTEST_HZ = 20
+"""Frame rate of demonstration videos."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DemoSampling:
+    """Which frames of a demonstration PONDER reads; the default is the paper's (B.1).
+
+    Raises:
+        ValueError: ``hz`` does not divide 20.
+    """
+
+    hz: int = 1
+    """Frames a second, from the first one on; a divisor of 20."""
+    to_its_end: bool = False
+    """Also the last frame, whenever it is: a movement often ends between two samples."""
+
+    def __post_init__(self) -> None:
+        if self.hz < 1 or FASTEST_HZ % self.hz:
+            raise ValueError(f"hz must divide {FASTEST_HZ}, came {self.hz}")
+
+    def indices(self, num_frames: int, video_hz: int = FASTEST_HZ) -> list[int]:
+        """Indices of the sampled frames of a video of ``num_frames``; ``hz`` divides ``video_hz``."""
+        every, last = video_hz // self.hz, num_frames - 1
+        sampled = [*range(0, num_frames, every)]
+        return [*sampled, last] if self.to_its_end and sampled and sampled[-1] != last else sampled
+
+
+PAPER_SAMPLING = DemoSampling()

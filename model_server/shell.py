@@ -1,0 +1,151 @@
+"""The shell that PONDER's and POUNCE's servers share: membership in an episode, warm-up, readiness, phases, events."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from typing import Protocol
+
+from model_server.membership import Membership
+from protocol import messages as m
+from protocol import topics
+from protocol.drops import DropReason
+from protocol.errors import MalformedMessage
+from protocol.heartbeat import Heartbeat
+from protocol.link import Link, is_of_episode
+from protocol.process import host_clock_id
+
+log = logging.getLogger(__name__)
+
+KEEP_OBSERVATIONS = 8
+
+
+class Spec(Protocol):
+    """What every engine says of itself."""
+
+    @property
+    def model_hash(self) -> str: ...
+    @property
+    def is_fake(self) -> bool:
+        """Something that was drawn, not trained, decides the answers."""
+        ...
+
+
+class Engine(Protocol):
+    """What the shell needs of an engine."""
+
+    @property
+    def spec(self) -> Spec: ...
+    def warm_up(self) -> list[int]:
+        """Durations in ns of at least 20 answers, the first few left unmeasured."""
+        ...
+
+
+class ModelShell(ABC):
+    """One model server on a bus. ``step`` does one piece of work and says whether there was any."""
+
+    def __init__(self, link: Link, engine: Engine, heartbeat: Heartbeat, version: str) -> None:
+        self._link = link
+        self._heartbeat = heartbeat
+        self._version = version
+        self._warmed_engine = engine
+        self._membership = Membership(link, heartbeat, self._contract, self._open, self._close)
+        self._observations = link.subscribe(topics.OBSERVATION, keep=KEEP_OBSERVATIONS)
+
+    @abstractmethod
+    def step(self) -> bool: ...
+
+    @abstractmethod
+    def rejoin(self) -> bool:
+        """After a restart: asks which episode runs, and enters it. Whether there was one."""
+
+    @abstractmethod
+    def _on_observation(self, observation: m.Observation) -> None:
+        """Raises MalformedMessage for one that the engine cannot read."""
+
+    @abstractmethod
+    def _contract(self) -> m.Contract:
+        """What this server promises in any episode."""
+
+    @abstractmethod
+    def _open(self, request: m.OpenRequest) -> m.Contract:
+        """Starts the episode in the engine. Raises ValueError to refuse, EpisodeRefused to say why in a code."""
+
+    @abstractmethod
+    def _close(self) -> None:
+        """Forgets the episode."""
+
+    def _weights_note(self) -> str:
+        """What narrow weights cost, for people; "" for float weights."""
+        return ""
+
+    def warm_up(self) -> None:
+        """Measures the engine before anybody relies on it; the first answers of a process are no measure."""
+        self._heartbeat.set(state=m.ServingState.WARMING)
+        durations_ns = self._warmed_engine.warm_up()
+        spec = self._warmed_engine.spec
+        self._heartbeat.set(
+            infer_p50_ns=percentile_ns(durations_ns, 50),
+            infer_p99_ns=percentile_ns(durations_ns, 99),
+            model_hash=spec.model_hash,
+            is_fake=spec.is_fake,
+            progress=1.0,
+        )
+        if note := self._weights_note():
+            self._heartbeat.set(detail=note)
+            log.info("%s", note)
+
+    def ready(self) -> None:
+        """Joins a running episode, if there is one, and only then says that it is ready."""
+        self.rejoin()
+        self._heartbeat.set(state=m.ServingState.READY)
+        log.info("ready infer_p50_ms=%.1f", self._heartbeat.health.infer_p50_ns / 1e6)
+
+    def _take_observations(self) -> None:
+        for observation in self._observations.drain():
+            if is_of_episode(self._link, observation.header):
+                try:
+                    self._on_observation(observation)
+                except MalformedMessage as error:
+                    source = f"{observation.header.proc}#{observation.header.boot_id}"
+                    self._link.drop(source, DropReason.WRONG_SHAPE, str(error))
+
+    def _begin_inference(self, phase: str) -> int:
+        """Says that an answer is being computed; returns since when (monotonic ns)."""
+        self._phase(phase)
+        self._heartbeat.set(is_inferring=True)
+        return time.monotonic_ns()
+
+    def _end_inference(self) -> None:
+        self._phase("idle")
+        self._heartbeat.set(is_inferring=False)
+
+    @contextlib.contextmanager
+    def _inferring(self, phase: str) -> Iterator[int]:
+        try:
+            yield self._begin_inference(phase)
+        finally:
+            self._end_inference()
+
+    def _answered(self, next_index: int) -> None:
+        self._heartbeat.set(next_index=next_index, num_answered=self._heartbeat.health.num_answered + 1)
+
+    def _phase(self, state: str) -> None:
+        at_ns = time.monotonic_ns()
+        self._link.publish(topics.PHASE, m.Phase(state=state), at_ns=at_ns, clock_id=host_clock_id())
+
+    def _tell(self, severity: m.Severity, name: str, text: str) -> None:
+        log.log(logging.WARNING if severity > m.Severity.INFO else logging.INFO, "event name=%s %s", name, text)
+        event = m.Event(severity=severity, name=name, text=text)
+        self._link.publish(topics.EVENT, event, at_ns=time.monotonic_ns(), clock_id=host_clock_id())
+
+
+def percentile_ns(durations_ns: list[int], percent: float) -> int:
+    """Nearest-rank percentile; 0 of nothing."""
+    if not durations_ns:
+        return 0
+    rank = max(1, -(-len(durations_ns) * percent // 100))
+    return sorted(durations_ns)[int(rank) - 1]

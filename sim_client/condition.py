@@ -1,0 +1,195 @@
+"""One condition to evaluate: the options of ``pp-eval``, and the episodes that they describe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+
+from dual_system.data.seeds import TRAIN_SEED
+from dual_system.tasks.difficulty import Difficulty
+from dual_system.tasks.task import chosen_tasks
+from protocol.command_line import flat
+from sim_client import config
+from sim_client.config import ScheduleOptions, ServersOptions, SimOptions
+from sim_client.swapped_ponder import donors_in
+
+
+class EvaluationError(Exception):
+    """An evaluation that cannot be made: the message says what was expected, what came, and the way out."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConditionOptions:
+    """The condition that is evaluated; the paper's by default."""
+
+    cognition: Literal["real", "null", "other-episode"] = "real"
+    """Cognition that POUNCE is conditioned on. real: PONDER's; null: the learned null; other-episode: PONDER's in
+    another episode of the task."""
+    donors: Path | None = None
+    """Folder (--out) of a recorded evaluation of the same scenes with real cognition, for --cognition other-episode."""
+    subgoal_text: Literal["ponder", "oracle"] | None = None
+    """Subgoal texts for a POUNCE that reads them in place of cognition: PONDER's, or the task's. Others refuse it."""
+    deliver: Literal["every", "held-transition"] = "every"
+    """Delivery of cognition. held-transition: only the first, then those at predicted transitions (paper, 5.2)."""
+    reported_age_ms: int = 0
+    """Age in ms given to POUNCE with --deliver held-transition; 0 is the true age. The paper fixes it at 300."""
+    query_period_ms: int = 1000
+    """Period of PONDER's queries in ms (paper: 1 Hz)."""
+    delay_ms: int = 300
+    """PONDER's delay in ms (paper: fixed 300 ms)."""
+    max_steps: int = 1300
+    """Limit of control steps per episode (paper: 1300)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorkersOptions:
+    """Who plays the episodes. The results do not depend on it."""
+
+    workers: int = 1
+    """Number of worker processes on this computer; each loads the checkpoints."""
+    servers: Literal["in-process", "local"] = "in-process"
+    """Place of each worker's servers: its own thread, or two processes that it starts."""
+    ray: str | None = None
+    """Address of a Ray cluster to work on instead, or `auto`, or `local`. Logs then need an --out that nodes share."""
+    gpus_per_worker: float = 0.0
+    """GPUs that a worker requests with --ray; 0.5 puts two workers on each GPU."""
+    patience_s: float = 600.0
+    """Longest wait in seconds for servers to be ready, or for any answer."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LogOptions:
+    """What is written and shown."""
+
+    record: bool = False
+    """Write one MCAP per episode, about 10 MB a minute."""
+    record_hz: Literal[1, 2, 4, 5, 10, 20] = 20
+    """Rate of logged pictures in Hz, with --record; those that the models observe are logged as well."""
+    progress: bool = True
+    """Do not show a progress bar."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvalOptions:
+    """Evaluates a pair of checkpoints as the paper does. The same command again resumes a killed evaluation."""
+
+    out: Path
+    """Folder of one condition: results.json, and with --record one MCAP per episode."""
+    tasks: tuple[str, ...] = ("all",)
+    """Names of the tasks, or `all`. sim-client --list-tasks shows them."""
+    ponder_checkpoint: Path | None = None
+    """PONDER's checkpoint. None: random weights."""
+    pounce_checkpoint: Path | None = None
+    """POUNCE's checkpoint. None: random weights."""
+    episodes: int = 50
+    """Number of scenes per task (paper: 50)."""
+    runs: int = 3
+    """Number of times that every scene is played, each with other flow noise (paper: 3)."""
+    seed: int = 0
+    """Seed of the first scene; all must lie below 2,000,000, where the training seeds begin."""
+    difficulty: Difficulty | None = None
+    """Difficulty of every scene. None: by seed, as the benchmark does."""
+    policy: Literal["servers", "oracle"] = "servers"
+    """Source of actions: the servers, or the tasks' own scripts (oracle), to test the machine."""
+    condition: tyro.conf.OmitArgPrefixes[ConditionOptions] = field(default_factory=ConditionOptions)
+    workers: tyro.conf.OmitArgPrefixes[WorkersOptions] = field(default_factory=WorkersOptions)
+    log: tyro.conf.OmitArgPrefixes[LogOptions] = field(default_factory=LogOptions)
+
+    def __post_init__(self) -> None:
+        condition, servers = self.condition, self.workers.servers
+        if min(self.episodes, self.runs, self.workers.workers) < 1 or self.seed < 0:
+            raise EvaluationError("--episodes, --runs and --workers must be at least 1, and --seed at least 0")
+        if self.seed + self.episodes > TRAIN_SEED:
+            raise EvaluationError(
+                f"--seed {self.seed} with {self.episodes} episodes reaches into the training seeds, which begin at "
+                f"{TRAIN_SEED}; evaluate on seeds below"
+            )
+        if condition.reported_age_ms and condition.deliver != "held-transition":
+            raise EvaluationError("--reported-age-ms is for --deliver held-transition; otherwise ages are true")
+        if condition.cognition == "null" and condition.deliver != "every":
+            raise EvaluationError("--cognition null delivers nothing, so nothing is held; leave --deliver out")
+        if (condition.cognition == "other-episode") != (condition.donors is not None):
+            raise EvaluationError("--cognition other-episode and --donors go together: record the real one first")
+        if condition.cognition == "other-episode" and (servers, self.policy) != ("in-process", "servers"):
+            raise EvaluationError("--cognition other-episode replaces PONDER: use --servers in-process")
+        if condition.subgoal_text is not None and (servers, condition.cognition) != ("in-process", "real"):
+            raise EvaluationError(
+                "--subgoal-text is for --servers in-process, and POUNCE then reads no cognition: leave --cognition out"
+            )
+
+    def task_names(self) -> tuple[str, ...]:
+        """The tasks in alphabetical order, each once. Raises TaskError for an unknown one."""
+        return chosen_tasks(self.tasks)
+
+    def jobs(self) -> list[Job]:
+        """Returns every episode, task by task: a worker keeps its scene, and finished tasks are complete.
+
+        Raises:
+            TaskError: an unknown task.
+            DonorError: an episode has no donor.
+        """
+        keys = [
+            (task, run, seed)
+            for task in self.task_names()
+            for run in range(self.runs)
+            for seed in range(self.seed, self.seed + self.episodes)
+        ]
+        folder = self.condition.donors
+        donors = {} if folder is None else donors_in(folder, keys)
+        return [
+            Job(options=self, task=task, run=run, seed=seed, donor=donors.get((task, run, seed)))
+            for task, run, seed in keys
+        ]
+
+    def sim(self) -> SimOptions:
+        """Returns the episodes' options, as of `sim-client`."""
+        condition = self.condition
+        return SimOptions(
+            task="evaluation",
+            episodes=self.episodes,
+            seed=self.seed,
+            difficulty=self.difficulty,
+            policy=self.policy,
+            out=self.out,
+            local=self.workers.servers == "local",
+            in_process=self.workers.servers == "in-process",
+            ponder_checkpoint=self.ponder_checkpoint,
+            pounce_checkpoint=self.pounce_checkpoint,
+            schedule=ScheduleOptions(
+                query_period_ms=condition.query_period_ms,
+                delay_ms=condition.delay_ms,
+                deliver="null" if condition.cognition == "null" else condition.deliver,
+                held_age_ms=condition.reported_age_ms,
+                max_steps=condition.max_steps,
+            ),
+            servers=ServersOptions(patience_s=self.workers.patience_s),
+            log=config.LogOptions(record=self.log.record, record_hz=self.log.record_hz, progress=False),
+        )
+
+    def config(self) -> dict[str, Any]:
+        """Returns the ``config`` of ``results.json``: sim-client's options, and those of the evaluation."""
+        known = flat(self.sim())
+        del known["task"], known["list_tasks"]
+        known |= {"tasks": list(self.task_names()), "runs": self.runs, "cognition": self.condition.cognition}
+        known["donors"] = None if self.condition.donors is None else str(self.condition.donors)
+        if self.condition.subgoal_text is not None:
+            known["subgoal_text"] = self.condition.subgoal_text
+        return known
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Job:
+    """One episode to play."""
+
+    options: EvalOptions
+    task: str
+    run: int
+    seed: int
+    donor: Path | None = None
+
+    @property
+    def key(self) -> str:
+        return f"{self.task}/{self.run}/{self.seed}"

@@ -1,0 +1,158 @@
+"""The robot's end of the bus, between and around episodes: it opens them with the servers, and closes them.
+
+What moves in between is the caller's: a simulated world (`suite`), or a client of another protocol (`gateway.machine`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+from clock.report import statistics, stream_sha256
+from clock.service import ClockService
+from dual_system.models.ponder.demo_sampling import PAPER_SAMPLING, DemoSampling
+from protocol import messages as m
+from protocol.errors import CallFailed, EpisodeRefused, TransportError
+from protocol.link import Link
+from protocol.topics import CLOSE, CONTRACT, OPEN, alive_key
+from sim_client.recorder import Recorder
+
+_CONTRACT_NS = 5_000_000_000
+_OPEN_NS = 130_000_000_000
+_CLOSE_NS = 5_000_000_000
+_ASK_AGAIN_NS = 200_000_000
+_LAST_TICKS_NS = 1_000_000_000
+_TURN_NS = 1_000_000
+
+Reply = TypeVar("Reply", m.ContractReply, m.OpenReply)
+
+
+class RobotEnd:
+    """One robot, for any number of episodes one after the other.
+
+    Args:
+        link: the robot's identity on the bus.
+        clock: the clock service, if it is embedded here; it is stepped while this thread waits.
+        recorder: takes off the bus what belongs into results and logs.
+        patience_ns: longest wait for servers to be ready.
+        dead_server: a sentence if a server that we started is dead, else "".
+        gives_up: whether to stop waiting before the patience is over.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        clock: ClockService | None,
+        recorder: Recorder,
+        *,
+        patience_ns: int,
+        dead_server: Callable[[], str],
+        gives_up: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self.clock = clock
+        self._link = link
+        self._recorder = recorder
+        self._patience_ns = patience_ns
+        self._dead_server = dead_server
+        self._gives_up = gives_up
+        link.bus.declare_alive(alive_key(link.robot, link.proc))
+
+    def demo_sampling(self) -> DemoSampling:
+        """Asks PONDER which frames of a demonstration it reads.
+
+        Raises:
+            EpisodeRefused: it cannot say.
+            TransportError: it is not ready within the patience.
+        """
+        reply = self._patiently(self._ask_ponder)
+        wanted = reply.contract.demonstrations if reply.contract is not None else None
+        return PAPER_SAMPLING if wanted is None else DemoSampling(hz=wanted.hz, to_its_end=wanted.to_its_end)
+
+    def open(self, request: m.OpenRequest) -> m.OpenReply:
+        """Opens the episode with every server, as soon as all are ready.
+
+        Raises:
+            EpisodeRefused: a server does not take it.
+            TransportError: not ready within the patience.
+        """
+        return self._patiently(lambda: self._ask_clock(request))
+
+    def take_turn(self, longest_ns: int) -> None:
+        """One turn for everybody else; with an embedded clock, no longer than until it has something to do."""
+        if self.clock is not None:
+            if self.clock.step():
+                return
+            longest_ns = self.clock.wait_ns(longest_ns)
+        self._link.bus.wait(longest_ns)
+
+    def end(
+        self, status: m.TaskStatus, reason: str, num_ticks: int, *, with_servers: bool = True
+    ) -> tuple[m.EpisodeResult, list[str]]:
+        """Ends the episode after ``num_ticks``: in the log, with the servers and here.
+
+        Returns the result, and what is missing from the log.
+        """
+        self._await_ticks(num_ticks)
+        ticks = [tick for tick in self._recorder.ticks if tick.tick < num_ticks]
+        result = m.EpisodeResult(
+            status=status,
+            is_success=status == m.TaskStatus.SUCCESS,
+            reason=reason,
+            num_ticks=num_ticks,
+            stream_sha256=stream_sha256(ticks),
+            statistics=statistics(ticks, self._recorder.stamps, self._recorder.invocations),
+        )
+        missing = self._recorder.end(result)
+        if with_servers:
+            self._close(m.CloseRequest(header=self._link.header("close", 0), result=result))
+        self._link.leave_episode()
+        return result, missing
+
+    def _patiently(self, ask: Callable[[], tuple[Reply, bool]]) -> Reply:
+        """Asks until there is an answer. ``ask`` returns a reply, and whether to ask again because of its error."""
+        deadline_ns = time.monotonic_ns() + self._patience_ns
+        while True:
+            reply, is_early = ask()
+            if not reply.error:
+                return reply
+            if dead := self._dead_server():
+                raise TransportError(dead)
+            if not is_early:
+                raise EpisodeRefused(getattr(reply, "refusal", m.Refusal.UNSPECIFIED), reply.error)
+            if time.monotonic_ns() > deadline_ns or self._gives_up():
+                raise TransportError(reply.error)
+            self._recorder.step()
+            self.take_turn(_ASK_AGAIN_NS)
+
+    def _ask_ponder(self) -> tuple[m.ContractReply, bool]:
+        try:
+            return self._link.call(CONTRACT, "ponder", m.ContractRequest(), timeout_ns=_CONTRACT_NS), False
+        except CallFailed as error:
+            return m.ContractReply(error=str(error)), True
+
+    def _ask_clock(self, request: m.OpenRequest) -> tuple[m.OpenReply, bool]:
+        try:
+            if self.clock is not None:  # our own thread: a call over the bus would wait for itself
+                reply = self.clock.open(request)
+            else:
+                reply = self._link.call(OPEN, "clock", request, timeout_ns=_OPEN_NS)
+        except CallFailed as error:
+            return m.OpenReply(error=str(error)), True
+        return reply, reply.try_again
+
+    def _close(self, request: m.CloseRequest) -> None:
+        if self.clock is not None:
+            self.clock.close(request)
+        else:
+            with contextlib.suppress(CallFailed):  # the log already says that the clock is lost
+                self._link.call(CLOSE, "clock", request, timeout_ns=_CLOSE_NS)
+
+    def _await_ticks(self, num_ticks: int) -> None:
+        """Accounts of ticks travel behind their actions; the hash is over all of them."""
+        deadline_ns = time.monotonic_ns() + _LAST_TICKS_NS
+        self._recorder.step()
+        while len(self._recorder.ticks) < num_ticks and time.monotonic_ns() < deadline_ns:
+            self.take_turn(_TURN_NS)
+            self._recorder.step()
