@@ -8,8 +8,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dual_system.models.ponder.context import IGNORE, ContextFormat, Segment, SegmentKind, Transition
+from dual_system.models.ponder.context import (
+    IGNORE,
+    ContextFormat,
+    Segment,
+    SegmentKind,
+    Transition,
+    in_groups,
+)
+from dual_system.models.ponder.observation import WHOLE_VIEWS, ObservationReader, Pictures, Size, check_cameras
 from dual_system.models.ponder.vocabulary import Vocabulary
+from dual_system.models.small_pair.reading import CropReader
 
 VOCABULARY = Vocabulary.tiny()
 FORMAT = ContextFormat(vocabulary=VOCABULARY, num_carriers=3, first_carrier_id=440, image_grid=(8, 8))
@@ -50,37 +59,6 @@ def test_a_shorter_episode_is_a_prefix_of_a_longer_one(episode: Episode, cut: in
     assert whole.targets[: len(part.targets)] == part.targets
 
 
-@given(episodes, st.lists(st.none() | transitions, min_size=3, max_size=3))
-def test_notes_stand_after_their_look_and_nothing_else_changes(
-    episode: Episode, notes: list[Transition | None]
-) -> None:
-    """Without them, and the labels that there are no more, the row is what it was."""
-    instruction, demo_views, _ = episode
-    bare = FORMAT.opening(instruction, demo_views)
-    noted = FORMAT.opening(instruction, demo_views, notes[: len(demo_views)])
-    assert [segment.ids for segment in noted if segment.kind is not SegmentKind.TEXT] == [each.ids for each in bare]
-    v, looks = VOCABULARY, 0
-    for segment, following in pairwise(noted):
-        if segment.kind is SegmentKind.DEMO:
-            note, looks = notes[looks], looks + 1
-            assert (following.kind is SegmentKind.TEXT) == (note is not None)
-            if note is None:
-                assert following.targets[0] == v.t_no
-            else:
-                assert following == FORMAT.text(note)
-        elif segment.kind is SegmentKind.TEXT:
-            assert following.targets[0] == v.t_no
-    assert looks == len(demo_views)
-    assert FORMAT.opening(instruction, demo_views, None) == bare
-    if not demo_views:
-        assert noted == bare
-
-
-def test_there_is_a_note_or_none_for_every_look() -> None:
-    with pytest.raises(ValueError, match="shorter"):
-        FORMAT.opening("watch", [1, 1], [None])
-
-
 @given(episodes)
 def test_t_no_is_only_ever_the_target_of_a_first_carrier(episode: Episode) -> None:
     row = FORMAT.row(segments_of(episode))
@@ -104,16 +82,14 @@ def test_every_decision_is_read_from_an_observation_or_a_text(episode: Episode) 
     assert not any(row.ids[i] in carriers for i in row.supervised_index)
 
 
-@given(episodes, st.integers(0, 40), st.sampled_from([None, (1, 2, 4, 3)]))
-def test_positions_in_pieces_are_the_positions_of_the_whole(
-    episode: Episode, cut: int, fovea: tuple[int, int, int, int] | None
-) -> None:
-    form, segments = replace(FORMAT, fovea=fovea), segments_of(episode)
+@given(episodes, st.integers(0, 40))
+def test_positions_in_pieces_are_the_positions_of_the_whole(episode: Episode, cut: int) -> None:
+    segments = segments_of(episode)
     head, whole = FORMAT.row(segments[:cut]).ids, FORMAT.row(segments).ids
-    head_positions, next_position = form.positions(head)
-    tail_positions, _ = form.positions(whole[len(head) :], first_index=len(head), first_position=next_position)
+    head_positions, next_position = FORMAT.positions(head)
+    tail_positions, _ = FORMAT.positions(whole[len(head) :], first_index=len(head), first_position=next_position)
     both = np.concatenate([head_positions, tail_positions], axis=1)
-    np.testing.assert_array_equal(both, form.positions(whole)[0])
+    np.testing.assert_array_equal(both, FORMAT.positions(whole)[0])
 
 
 @given(episodes)
@@ -134,36 +110,6 @@ def test_an_image_spreads_over_h_and_w_at_one_instant() -> None:
         [5, 6, 7, 8, 6, 7, 8, 9],
     ]
     assert next_position == 10
-
-
-def test_a_fovea_stands_where_an_image_of_its_size_would_and_the_rest_around_it() -> None:
-    """Of 2 x 3 tokens a narrow eye saw the 2 x 2 on the right: they come first, as they did then."""
-    form = replace(FORMAT, image_grid=(2, 3), fovea=(0, 1, 2, 2))
-    assert form.token_order.tolist() == [1, 2, 4, 5, 0, 3]
-    positions, next_position = form.positions(form.observation(1).ids, first_index=10, first_position=5)
-    assert positions[1:].tolist() == [
-        [5, 6, 6, 6, 6, 6, 6, 8],
-        [5, 6, 6, 7, 7, 6, 7, 8],
-        [5, 6, 7, 6, 7, 5, 5, 8],
-    ]
-    narrow = replace(FORMAT, image_grid=(2, 2))
-    before, next_before = narrow.positions(narrow.observation(1).ids, first_index=10, first_position=5)
-    np.testing.assert_array_equal(positions[1:, :5], before[1:, :5])
-    assert next_position == next_before, "and what follows is where it was"
-
-
-@given(st.integers(1, 5), st.integers(1, 5), st.data())
-def test_every_token_of_an_image_comes_once(rows: int, columns: int, data: st.DataObject) -> None:
-    row, column = data.draw(st.integers(0, rows - 1)), data.draw(st.integers(0, columns - 1))
-    sides = data.draw(st.integers(1, rows - row)), data.draw(st.integers(1, columns - column))
-    order = replace(FORMAT, image_grid=(rows, columns), fovea=(row, column, *sides)).token_order
-    assert sorted(order.tolist()) == [*range(rows * columns)]
-
-
-@pytest.mark.parametrize("fovea", [(0, 0, 3, 3), (1, 0, 2, 3), (-1, 0, 2, 3), (0, 0, 0, 1)])
-def test_a_fovea_lies_within_the_image(fovea: tuple[int, int, int, int]) -> None:
-    with pytest.raises(ValueError, match=r"must lie within the image grid \(2, 3\)"):
-        replace(FORMAT, image_grid=(2, 3), fovea=fovea)
 
 
 def test_first_execution_transition_reads_t_yes_reasoning_t_yes_subgoal() -> None:
@@ -192,6 +138,96 @@ def test_an_instruction_cannot_open_a_payload() -> None:
 def test_carriers_must_be_unused_rows() -> None:
     with pytest.raises(ValueError, match=f"unused rows start at {VOCABULARY.num_tokens}"):
         replace(FORMAT, first_carrier_id=VOCABULARY.num_tokens - 1)
+
+
+# -- the reader: which images and tokens an observation gives
+
+CROP = CropReader(camera=0, box=(0, 0, 1, 1), first_state_id=448, num_finger_bins=4, num_height_bins=8)
+SMALL = replace(FORMAT, image_grid=(1, 2))
+"""Images of 32 x 64 px."""
+readers = st.sampled_from([WHOLE_VIEWS, CROP])
+states = st.lists(st.floats(-0.5, 0.5), min_size=8, max_size=8)
+
+
+def noise(size: Size, seed: int = 0) -> Pictures:
+    return np.random.default_rng(seed).integers(0, 256, (*size, 3), np.uint8)
+
+
+@given(readers, st.integers(1, 3), states)
+def test_an_observation_is_the_readers_images_and_then_its_tokens(
+    reader: ObservationReader, num_views: int, state: list[float]
+) -> None:
+    form = replace(SMALL, reader=reader)
+    observed, shown = form.observation(num_views, state), form.demo(num_views)
+    size = reader.readable_sizes(form.image_px)[0]
+    num_images = len(reader.images([noise(size)] * num_views, form.image_px))
+    assert observed.num_images == shown.num_images == num_images == reader.num_images(num_views)
+    assert observed.ids.count(VOCABULARY.vision_start) == num_images
+    assert observed.ids.count(VOCABULARY.image_pad) == 2 * num_images
+    assert observed.ids == (*shown.ids, *reader.state_ids(state))
+    assert set(observed.ids) & set(reader.state_rows) == set(reader.state_ids(state))
+    assert set(observed.targets) == {IGNORE}
+
+
+@given(readers, st.integers(1, 3), states, states)
+def test_an_observation_is_always_as_long(
+    reader: ObservationReader, num_views: int, one: list[float], other: list[float]
+) -> None:
+    form = replace(SMALL, reader=reader)
+    assert len(form.observation(num_views, one)) == len(form.observation(num_views, other))
+
+
+@given(readers, st.integers(1, 3), st.integers(0, 99))
+def test_what_a_reader_gives_has_the_networks_size(reader: ObservationReader, num_views: int, seed: int) -> None:
+    for size in reader.readable_sizes(SMALL.image_px)[:3]:
+        views = [noise(size, seed + number) for number in range(num_views)]
+        images = reader.images(views, SMALL.image_px)
+        assert images.dtype == np.uint8
+        assert images.shape[1:] == (*SMALL.image_px, 3)
+        assert reader.unreadable([size] * num_views, SMALL.image_px) is None
+
+
+@given(st.integers(1, 3), st.integers(0, 99))
+def test_whole_views_are_the_pictures_unchanged_and_no_state(num_views: int, seed: int) -> None:
+    views = [noise(SMALL.image_px, seed + number) for number in range(num_views)]
+    assert np.array_equal(WHOLE_VIEWS.images(views, SMALL.image_px), np.stack(views))
+    assert WHOLE_VIEWS.state_ids(None) == WHOLE_VIEWS.state_ids(np.zeros(8)) == ()
+    assert FORMAT.reader == WHOLE_VIEWS
+
+
+@given(st.lists(st.sampled_from([(32, 64), (64, 32), (32, 32)]), min_size=1, max_size=3))
+def test_whole_views_have_exactly_the_networks_size(sizes: list[Size]) -> None:
+    wrong = [camera for camera, size in enumerate(sizes) if size != SMALL.image_px]
+    found = WHOLE_VIEWS.unreadable(sizes, SMALL.image_px)
+    assert (found is None) == (not wrong)
+    if found is not None:
+        assert found == (wrong[0], "32 x 64 px")
+        said = f"camera {wrong[0]} gives .* px pictures; PONDER reads 32 x 64 px"
+        with pytest.raises(ValueError, match=said):
+            check_cameras(sizes, WHOLE_VIEWS, SMALL.image_px)
+        with pytest.raises(ValueError, match=f"frame {wrong[0]}: uint8 of shape"):
+            WHOLE_VIEWS.images([noise(size) for size in sizes], SMALL.image_px)
+
+
+def test_a_view_that_is_no_picture_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"frame 0: float64 of shape \(32, 64, 3\); expected uint8"):
+        WHOLE_VIEWS.images([np.zeros((32, 64, 3))], SMALL.image_px)  # type: ignore[list-item]
+
+
+@pytest.mark.parametrize(("first_id", "whose"), [(400, "tokenizer"), (442, r"\[442\] are carriers"), (430, "carriers")])
+def test_rows_of_the_table_that_are_taken_are_refused(first_id: int, whose: str) -> None:
+    with pytest.raises(ValueError, match=whose):
+        replace(FORMAT, reader=replace(CROP, first_state_id=first_id))
+
+
+@given(episodes, st.integers(1, 200))
+def test_groups_are_the_segments_in_order_and_no_longer_than_asked_for(episode: Episode, max_tokens: int) -> None:
+    segments = segments_of(episode)
+    groups = in_groups(segments, max_tokens)
+    assert [segment for group in groups for segment in group] == segments
+    assert all(len(group) == 1 or sum(map(len, group)) <= max_tokens for group in groups)
+    for group, after in pairwise(groups):
+        assert sum(map(len, group)) + len(after[0]) > max_tokens  # as few groups as that allows
 
 
 @pytest.mark.parametrize("num_carriers", [0, 17])

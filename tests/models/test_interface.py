@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from dual_system.models.place_code import NUM_PLACE_FEATURES, place_features
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
 from dual_system.models.interface import CognitionConfig, CognitionPrefix, scale_gradient
+from dual_system.models.small_pair.place_code import NUM_PLACE_FEATURES, place_features
 
 WIDTH = 32
 SIZE = 24
@@ -128,7 +128,6 @@ def test_one_playback_tick_of_age_is_visible() -> None:
         ({"cognition_size": 0}, "at least 1, came 0"),
         ({"age_features": 7}, "even and at least 2, came 7"),
         ({"attention": "half"}, "'full' or 'isolated', came 'half'"),
-        ({"rounds_places": True, "cognition_size": 25}, "at least 26, came 25"),
     ],
 )
 def test_wrong_configurations_are_refused(wrong: dict, message: str) -> None:
@@ -147,11 +146,11 @@ def test_no_carriers_no_module() -> None:
         _prefix(num_carriers=0)
 
 
-def test_rounded_cognition_is_that_of_the_nearest_place_and_the_rest_is_left() -> None:
+def test_snapped_cognition_is_that_of_the_nearest_place() -> None:
     config = CognitionConfig(num_carriers=2, cognition_size=40)
-    plain, rounding = CognitionPrefix(config, WIDTH), CognitionPrefix(replace(config, rounds_places=True), WIDTH)
+    plain, snapping = CognitionPrefix(config, WIDTH), CognitionPrefix(replace(config, rounds_places=True), WIDTH)
     plain.initialise(1.0, torch.Generator().manual_seed(0))
-    rounding.load_state_dict(plain.state_dict())
+    snapping.load_state_dict(plain.state_dict())
     cognition = torch.randn(2, 2, 40, generator=torch.Generator().manual_seed(1))
     clean, places = cognition.clone(), ((10.0, 20.0), (100.5, 3.0), (255.0, 0.0), (128.0, 64.0))
     clean[..., :NUM_PLACE_FEATURES] = torch.from_numpy(np.stack([place_features(each) for each in places])).view(
@@ -159,6 +158,6 @@ def test_rounded_cognition_is_that_of_the_nearest_place_and_the_rest_is_left() -
     )
     blurred = clean.clone()
     blurred[..., :NUM_PLACE_FEATURES] += 0.02
-    torch.testing.assert_close(rounding(blurred, AGES_NS), plain(clean, AGES_NS))
+    torch.testing.assert_close(snapping(blurred, AGES_NS), plain(clean, AGES_NS))
     is_null = torch.tensor([True, True])
-    assert torch.equal(rounding(blurred, AGES_NS, is_null), plain(None, AGES_NS))
+    assert torch.equal(snapping(blurred, AGES_NS, is_null), plain(None, AGES_NS))

@@ -1,32 +1,38 @@
 """Checkpoints: what is written is what is read, by transformers too; every fault names its tensor."""
 
+import copy
 import json
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-from dual_system.models.eyes import Eye
-from dual_system.models.proprioception import Proprioception
-from dual_system.models.second_look import SecondLook
 from safetensors.torch import load_file, save_file
 from transformers.models.qwen3_5 import Qwen3_5ForConditionalGeneration
 
+from dual_system.models.config_json import from_json
 from dual_system.models.ponder.checkpoint import (
     INDEX_NAME,
+    OWN_NAME,
     SINGLE_NAME,
+    SMALL_PAIR,
     CheckpointError,
+    StoredPonder,
+    _read_stored,
     load_ponder,
     mtp_shapes,
     save_ponder,
     weights_hash,
 )
 from dual_system.models.ponder.configs import PonderConfig, qwen35_0p8b, qwen35_2b, qwen35_4b, qwen35_9b, tiny_cpu
-from dual_system.models.ponder.demo_sampling import DemoSampling, declared
+from dual_system.models.ponder.demo_sampling import DemoSampling
 from dual_system.models.ponder.network import FLOAT32_PARAMETERS, Ponder, skeleton
+from dual_system.models.ponder.observation import WHOLE_VIEWS
 from dual_system.models.ponder.vocabulary import Vocabulary
+from dual_system.models.small_pair.reading import CropReader
 
 VOCABULARY = Vocabulary.tiny()
 CONFIG = replace(tiny_cpu(), num_layers=4, vision_depth=1, image_px=(64, 64), num_carriers=2)
@@ -88,12 +94,98 @@ def test_a_checkpoint_remembers_whether_it_was_trained(tmp_path: Path, is_random
     assert load_ponder(tmp_path).is_random == is_random
 
 
-def test_a_public_checkpoint_without_our_file_gets_the_defaults(folder: Path) -> None:
-    (folder / "ponder.json").unlink()
-    loaded = load_ponder(folder)
-    assert loaded.format.carrier_ids == (VOCABULARY.num_tokens,)
-    assert loaded.image_px == (256, 256)
-    assert loaded.is_random
+# -- ponder.json: what PONDER adds
+
+CROP = CropReader(camera=1, box=(0.25, 0, 0.75, 0.5), first_state_id=460, num_finger_bins=4, num_height_bins=8)
+ADDED: dict[str, Any] = {"speaks": False, "demonstrations": DemoSampling(hz=2, to_its_end=True), "reader": CROP}
+
+
+def stored_in(folder: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((folder / OWN_NAME).read_text())
+    return found
+
+
+def declare(folder: Path, values: object) -> None:
+    (folder / OWN_NAME).write_text(json.dumps(values))
+
+
+@pytest.mark.parametrize("name", ADDED)
+def test_what_was_declared_is_read_back(ponder: Ponder, tmp_path: Path, name: str) -> None:
+    declaring = copy.copy(ponder)
+    declaring.format = replace(ponder.format, **{name: ADDED[name]})
+    assert declaring.format != ponder.format
+    save_ponder(declaring, tmp_path)
+    assert replace(load_ponder(tmp_path).format, vocabulary=VOCABULARY) == declaring.format
+
+
+def test_only_a_ponder_that_does_not_read_whole_views_says_how_it_reads(ponder: Ponder, folder: Path) -> None:
+    assert ponder.format.reader == WHOLE_VIEWS
+    assert SMALL_PAIR not in stored_in(folder)
+
+
+def test_a_public_checkpoint_without_our_file_is_one_with_an_empty_file(folder: Path) -> None:
+    (folder / OWN_NAME).unlink()
+    without = load_ponder(folder)
+    declare(folder, {})
+    empty = load_ponder(folder)
+    for loaded in (without, empty):
+        assert loaded.format.carrier_ids == (VOCABULARY.num_tokens,)
+        assert (loaded.format.speaks, loaded.format.reader) == (True, WHOLE_VIEWS)
+        assert loaded.format.demonstrations == DemoSampling()
+        assert loaded.image_px == (256, 256)
+        assert loaded.is_random
+
+
+@pytest.mark.parametrize("name", [each.name for each in fields(StoredPonder)])
+def test_an_absent_field_has_its_default(folder: Path, name: str) -> None:
+    stored = stored_in(folder)
+    del stored[name]
+    declare(folder, stored)
+    expected = replace(_declared(folder, stored_in(folder)), **{name: getattr(StoredPonder(), name)})
+    assert _read_stored(folder)[0] == expected
+    if name != "image_px":  # the weights do not depend on it, nothing else of the format does
+        load_ponder(folder)
+
+
+def _declared(folder: Path, values: dict[str, Any]) -> StoredPonder:
+    return from_json(StoredPonder, values, str(folder))
+
+
+@pytest.mark.parametrize(
+    ("edit", "said"),
+    [
+        (lambda stored: stored.update(num_carrier=2), r"ponder\.json: missing \[\], unknown \['num_carrier'\]"),
+        (lambda stored: stored.update(eyes=[]), r"ponder\.json: missing \[\], unknown \['eyes'\]"),
+        (lambda stored: stored.update(format="ponderpounce.ponder/9"), r"ponder\.json\.format: expected 'ponderpounce"),
+        (lambda stored: stored.update(speaks=1), r"ponder\.json\.speaks: expected bool, came 1"),
+        (lambda stored: stored["demonstrations"].update(hz=3), "hz must divide 20, came 3"),
+        (lambda stored: stored["demonstrations"].update(fps=3), r"demonstrations: missing \[\], unknown \['fps'\]"),
+        (lambda stored: stored.update(small_pair={}), r"ponder\.json: small_pair: missing \['box', 'camera', 'first"),
+        (
+            lambda stored: stored.update(small_pair=asdict(CROP) | {"box": [0, 0, 2, 1]}),
+            r"expected a camera from 0 and 0 <= top",
+        ),
+        (lambda stored: stored.update(small_pair=asdict(CROP) | {"first_state_id": 505}), "row 516 .* 512 rows"),
+    ],
+)
+def test_a_declaration_that_cannot_be_is_refused(
+    folder: Path, edit: Callable[[dict[str, Any]], None], said: str
+) -> None:
+    stored = stored_in(folder)
+    edit(stored)
+    declare(folder, stored)
+    with pytest.raises(ValueError, match=said):
+        load_ponder(folder)
+
+
+@pytest.mark.parametrize("values", [[], 7, "ponder"])
+def test_a_declaration_that_is_no_object_is_refused(folder: Path, values: object) -> None:
+    declare(folder, values)
+    with pytest.raises(ValueError, match=r"ponder\.json: expected an object"):
+        load_ponder(folder)
+
+
+# -- tensors
 
 
 def test_a_missing_tensor_is_named(folder: Path) -> None:
@@ -219,106 +311,6 @@ def test_a_tokenizer_of_another_checkpoint_is_noticed(folder: Path) -> None:
 def test_another_architecture_is_refused(folder: Path) -> None:
     (folder / "config.json").write_text(json.dumps({"model_type": "llama"}))
     with pytest.raises(CheckpointError, match="'llama'"):
-        load_ponder(folder)
-
-
-def test_a_checkpoint_remembers_its_eyes(tmp_path: Path) -> None:
-    eyes = (Eye(camera=1), Eye(camera=0, box=(0.25, 0, 0.75, 0.5)))
-    saved = Ponder.random(replace(CONFIG, vision_patch_px=8, eyes=eyes), VOCABULARY, seed=1)
-    save_ponder(saved, tmp_path)
-    loaded = load_ponder(tmp_path)
-    assert loaded.format.eyes == eyes
-    assert (loaded.format.image_grid, loaded.format.token_px, loaded.image_px) == ((4, 4), 16, (64, 64))
-
-
-def test_a_checkpoint_remembers_what_it_is_told_of_the_robot(tmp_path: Path) -> None:
-    told = Proprioception(first_id=460, num_finger_bins=4)
-    save_ponder(Ponder.random(replace(CONFIG, proprioception=told), VOCABULARY, seed=1), tmp_path)
-    assert load_ponder(tmp_path).format.proprioception == told
-
-
-def test_a_checkpoint_remembers_that_it_has_no_words(tmp_path: Path) -> None:
-    silent = Ponder.random(CONFIG, VOCABULARY, seed=1)
-    silent.format = replace(silent.format, speaks=False)
-    save_ponder(silent, tmp_path)
-    assert not load_ponder(tmp_path).format.speaks
-
-
-def test_a_checkpoint_remembers_that_it_takes_notes(tmp_path: Path) -> None:
-    noting = Ponder.random(CONFIG, VOCABULARY, seed=1)
-    noting.format = replace(noting.format, takes_notes=True)
-    save_ponder(noting, tmp_path)
-    assert load_ponder(tmp_path).format.takes_notes
-
-
-def test_a_checkpoint_remembers_when_it_looks_again(tmp_path: Path) -> None:
-    looking = Ponder.random(CONFIG, VOCABULARY, seed=1)
-    looking.format = replace(looking.format, second_look=SecondLook(after=6, least=8, unless="hides"))
-    save_ponder(looking, tmp_path)
-    assert load_ponder(tmp_path).format.second_look == SecondLook(after=6, least=8, unless="hides")
-
-
-def test_a_fovea_is_read_back(ponder: Ponder, tmp_path: Path) -> None:
-    staring = Ponder(ponder.qwen.config, replace(ponder.format, fovea=(0, 0, 1, 1)), image_px=ponder.image_px)
-    staring.qwen = ponder.qwen
-    save_ponder(staring, tmp_path)
-    assert load_ponder(tmp_path).format.fovea == (0, 0, 1, 1)
-
-
-def test_how_demonstrations_were_shown_is_read_back_and_told_to_who_asks_for_it_alone(
-    ponder: Ponder, tmp_path: Path
-) -> None:
-    watching = Ponder(ponder.qwen.config, ponder.format, image_px=ponder.image_px)
-    watching.qwen = ponder.qwen
-    watching.format = replace(watching.format, demonstrations=DemoSampling(hz=2, to_its_end=True))
-    save_ponder(watching, tmp_path)
-    assert load_ponder(tmp_path).format.demonstrations == DemoSampling(hz=2, to_its_end=True) == declared(tmp_path)
-
-
-@pytest.mark.parametrize("version", [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11])
-def test_a_folder_from_before_there_were_eyes_proprioception_or_notes_has_none_and_speaks(
-    ponder: Ponder, folder: Path, version: int
-) -> None:
-    stored = json.loads((folder / "ponder.json").read_text())
-    since_1 = ("eyes", "proprioception", "speaks", "takes_notes", "second_look", "counsel", "fovea", "demonstrations")
-    since_1 = (*since_1, "has_reader", "specialties")
-    for name in since_1[version - 1 :]:
-        del stored[name]
-    (folder / "ponder.json").write_text(json.dumps({**stored, "format": f"ponderpounce.ponder/{version}"}))
-    loaded = load_ponder(folder)
-    assert (loaded.format.eyes, loaded.format.proprioception, loaded.format.speaks) == (None, None, True)
-    assert not loaded.format.takes_notes
-    assert loaded.format.second_look is None
-    assert (loaded.format.counsel, loaded.format.fovea) == (None, None)
-    assert loaded.format.demonstrations == DemoSampling()
-    assert loaded.image_px == (64, 64)
-    assert weights_hash(loaded) == weights_hash(ponder)
-
-
-def test_who_took_counsel_before_one_could_choose_takes_it_on_all_episodes(folder: Path) -> None:
-    stored = json.loads((folder / "ponder.json").read_text())
-    del stored["has_reader"], stored["specialties"]
-    eyes = [{"camera": 0, "box": [0.25, 0.25, 0.75, 0.75]}]
-    counsel = {"others": [{"down_px": 2, "right_px": -3, "is_mirrored": False}], "near": 30}
-    before = {**stored, "eyes": eyes, "counsel": counsel, "format": "ponderpounce.ponder/9"}
-    (folder / "ponder.json").write_text(json.dumps(before))
-    taken = load_ponder(folder).format.counsel
-    assert taken is not None
-    assert taken.on_demonstrations
-
-
-@pytest.mark.parametrize("eyes", [[], [{"camera": 0}], [{"camera": 0, "box": [0, 0, 2, 1]}], 7])
-def test_eyes_that_are_none_are_refused(folder: Path, eyes: object) -> None:
-    stored = json.loads((folder / "ponder.json").read_text())
-    (folder / "ponder.json").write_text(json.dumps({**stored, "eyes": eyes}))
-    with pytest.raises(ValueError, match="eye"):
-        load_ponder(folder)
-
-
-def test_an_unknown_field_is_refused(folder: Path) -> None:
-    stored = json.loads((folder / "ponder.json").read_text())
-    (folder / "ponder.json").write_text(json.dumps({**stored, "num_carrier": 2}))
-    with pytest.raises(ValueError, match=r"ponder\.json: .*unknown \['num_carrier'\]"):
         load_ponder(folder)
 
 

@@ -48,17 +48,17 @@ class Ponder(nn.Module):
     ) -> None:
         """Allocates the network and leaves its weights undefined, for :meth:`random` or a checkpoint to fill.
 
-        Raises ValueError if the carriers do not fit into the embedding table, or if ``image_px`` is not what
-        ``context_format`` says.
+        Raises ValueError if the carriers or the state's tokens do not fit into the embedding table, or if ``image_px``
+        is not what ``context_format`` says.
         """
         super().__init__()
         text: Any = qwen_config.text_config
         vision: Any = qwen_config.vision_config
-        last_carrier_id = context_format.carrier_ids[-1]
-        if last_carrier_id >= text.vocab_size:
+        last_row = max([*context_format.carrier_ids, *context_format.reader.state_rows])
+        if last_row >= text.vocab_size:
             raise ValueError(
-                f"carrier id {last_carrier_id} is outside the embedding table of {text.vocab_size} rows; "
-                "lower first_carrier_id or num_carriers."
+                f"row {last_row} is outside the embedding table of {text.vocab_size} rows; lower first_carrier_id or "
+                "num_carriers, or move the state's tokens."
             )
         needed_px = token_px(qwen_config)
         if image_px != context_format.image_px or needed_px != context_format.token_px:

@@ -37,7 +37,12 @@ def snap_to_code(cognition: Tensor) -> Tensor:
     """Cognition (..., H) with its first NUM_PLACE_FEATURES numbers replaced by the nearest place's code.
 
     Places are half a pixel apart. Backwards it is the identity (straight through): a rounded code has no slope.
+
+    Raises:
+        ValueError: cognition has fewer numbers than a code.
     """
+    if cognition.shape[-1] < NUM_PLACE_FEATURES:
+        raise ValueError(f"a place's code is {NUM_PLACE_FEATURES} numbers, cognition has {cognition.shape[-1]}")
     numbers, rest = cognition.tensor_split([NUM_PLACE_FEATURES], dim=-1)
     codes_NF = _codes(numbers.device)
     found = torch.empty_like(numbers)
