@@ -32,6 +32,7 @@ from dual_system.data.workers import LocalWorkers, RayWorkers, Workers
 from dual_system.tasks.difficulty import Difficulty
 from dual_system.tasks.task import TaskError, chosen_tasks
 from protocol.command_line import parse
+from protocol.version import DISTRIBUTION
 
 SCALES = {"1x": 1, "9x": 9}
 COLLECTING, JOINED = ".collecting", "joined"
@@ -127,7 +128,7 @@ class CollectOptions:
 
     def settings(self) -> dict[str, Any]:
         """Returns what all episodes of a dataset have in common; their number and the workers are no part of it."""
-        versions = {name: metadata.version(name) for name in ("ponderpounce", "mujoco", "numpy", "av", "pyarrow")}
+        versions = {name: metadata.version(name) for name in (DISTRIBUTION, "mujoco", "numpy", "av", "pyarrow")}
         settings = {
             "first_seed": TRAIN_SEED,
             "image_px": self.image_px,
