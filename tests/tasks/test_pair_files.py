@@ -74,7 +74,7 @@ def test_another_schema_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.sim
 def test_the_program_writes_pairs_that_can_be_scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--family", "reference", "--task", "PickHighlight", "--out", str(tmp_path), "--image-px", "32"]
+    arguments = ["--family", "reference", "--tasks", "PickHighlight", "--out", str(tmp_path), "--image-px", "32"]
     assert main([*arguments, "--pairs", "2"]) == 0
     assert "2 pairs of reference" in capsys.readouterr().out
     found = list(read_pairs(tmp_path))
@@ -86,7 +86,7 @@ def test_the_program_writes_pairs_that_can_be_scored(tmp_path: Path, capsys: pyt
 
 
 def test_a_task_of_another_family_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--family", "counting", "--task", "PickHighlight", "--out", str(tmp_path)]
+    arguments = ["--family", "counting", "--tasks", "PickHighlight", "--out", str(tmp_path)]
     assert main(arguments) == 2
     assert "PickHighlight: not of the counting family" in capsys.readouterr().err
 
