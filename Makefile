@@ -11,7 +11,7 @@ export MUJOCO_GL ?= egl
 export OMP_NUM_THREADS ?= 1
 
 # `make help` lists the rest.
-.PHONY: help setup demo policy test unit accept lint types proto bench clean
+.PHONY: help setup demo test unit accept lint types proto bench clean
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
 
@@ -30,30 +30,28 @@ $(READY): requirements.txt pyproject.toml
 	$(BIN)/pip install --quiet --no-deps --no-build-isolation --editable .
 	touch $@
 
-## make demo    three processes drive a Panda through PickHighlight; logs, checks and a picture in out/demo
-SHIPPED := --ponder-checkpoint checkpoints/small/ponder --pounce-checkpoint checkpoints/small/pounce
+## make demo    a trained pair drives a Panda through PickHighlight, with memory and without; everything is in out/demo
+PAIR := --ponder-checkpoint checkpoints/small/ponder --pounce-checkpoint checkpoints/small/pounce
+SCENES := --tasks PickHighlight --difficulty easy --episodes 6 --runs 1 --max-steps 600
 
 demo: setup
 	$(BIN)/pp-doctor --required-only
 	rm -rf out/demo
-	@echo "--- real time: ponder-serve, pounce-serve and clock-serve over zenoh, with the small policy that was trained here"
-	$(BIN)/sim-client --local --mode realtime $(SHIPPED) --difficulty easy --episodes 1 --max-steps 400 --out out/demo/realtime
-	@echo "--- lockstep: the paper's schedule, both models at 1 Hz, 300 ms of delay"
-	$(BIN)/sim-client --local --mode lockstep $(SHIPPED) --difficulty easy --episodes 2 --max-steps 400 --out out/demo/lockstep
-	@echo "--- does it remember? the same scenes with its cognition, and with the learned null in its place"
-	$(BIN)/pp-eval $(SHIPPED) --tasks PickHighlight --difficulty easy --episodes 6 --runs 1 --max-steps 600 --out out/demo/real
-	$(BIN)/pp-eval $(SHIPPED) --tasks PickHighlight --difficulty easy --episodes 6 --runs 1 --max-steps 600 --cognition null --out out/demo/null
-	@echo "--- the task's own script, to see the task done"
-	$(BIN)/sim-client --policy oracle --episodes 3 --out out/demo/oracle
+	@echo "--- real time: ponder-serve, pounce-serve and clock-serve over zenoh"
+	$(BIN)/sim-client --local --mode realtime $(PAIR) --difficulty easy --max-steps 400 --out out/demo/realtime
+	@echo "--- lockstep: the paper's schedule, both models at 1 Hz, PONDER 300 ms late"
+	$(BIN)/sim-client --local $(PAIR) --difficulty easy --episodes 2 --max-steps 400 --out out/demo/lockstep
+	@echo "--- six scenes with PONDER's cognition, and the same six with the learned null in its place"
+	$(BIN)/pp-eval $(PAIR) $(SCENES) --out out/demo/real
+	$(BIN)/pp-eval $(PAIR) $(SCENES) --cognition null --out out/demo/null
 	@echo "--- every reference, age, row and deadline again, from the logs alone"
 	$(BIN)/pp-check $$(find out/demo -name '*.mcap')
 	$(BIN)/pp-replay $$(find out/demo/realtime -name '*.mcap') --save out/demo/realtime.rrd
-	@echo "Watch one: $(BIN)/pp-replay $$(find out/demo/lockstep -name '*.mcap' | head -1)"
-
-## make policy  train the demo's policy again from nothing, on two cores, and measure it; goes on after a kill
-policy: setup
-	BIN=$(BIN) checkpoints/small/train.sh out/small
-	BIN=$(BIN) checkpoints/small/follow.sh out/small
+	@echo "---------------------------------------------------------------------------"
+	@$(BIN)/python examples/05_worth_of_memory.py out/demo/real out/demo/null
+	@echo "                (this pair's POUNCE has no camera: its null is blind as well; see README.md)"
+	@echo "logs            all $$(find out/demo -name '*.mcap' | wc -l) agree with the schedule"
+	@echo "to watch one    $(BIN)/pp-replay $$(find out/demo/realtime -name '*.mcap')"
 
 ## make test    everything that needs no GPU; make unit: without processes and long runs
 # Files share the cores; a test that starts processes of its own has them all.

@@ -23,6 +23,7 @@ class EngageOptions:
 
     link: LinkOptions = field(default_factory=lambda: LinkOptions(connect=("tcp/127.0.0.1:7447",)))
     operator: str = field(default_factory=getpass.getuser)
+    """Name of the person who engages the robot; it is logged."""
 
 
 def main(argv: list[str] | None = None) -> int:

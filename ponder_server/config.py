@@ -53,7 +53,7 @@ class SpeedOptions:
     """Precision of the layers' weights. int8 (CPU) and fp8 (GPU of compute capability 8.9 or more) take one byte each;
     the change of cognition is measured at start and logged."""
     graphs: bool = True
-    """On a GPU, record forwards as CUDA graphs at start."""
+    """Do not record forwards as CUDA graphs at start, on a GPU."""
     attention_threads: int = 1
     """Threads for long-context attention on a CPU; at most the number of usable cores. The answers stay the same. One
     leaves the next core to POUNCE, whose deadlines are nearer."""

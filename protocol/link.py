@@ -223,6 +223,9 @@ def is_of_episode(link: Link, header: Header) -> bool:
     if not link.episode:  # between episodes: the tail of the last one, nobody's fault
         link.dropped[DropReason.NO_EPISODE] += 1
         return False
+    if header.session == link.session and header.epoch < link.epoch:  # the tail of an earlier one, nobody's fault
+        link.dropped[DropReason.OTHER_EPISODE] += 1
+        return False
     came = f"{header.episode} epoch {header.epoch}"
     link.drop(
         f"{header.proc}#{header.boot_id}",

@@ -19,10 +19,13 @@ class LinkOptions:
     connect: tuple[str, ...] = ()
     """Zenoh endpoints of the other processes; absent ones are tried again until they are there."""
     tls_ca: Path | None = None
+    """Certificate of the authority that signed everybody's certificates, in PEM."""
     tls_certificate: Path | None = None
+    """This process's certificate, in PEM."""
     tls_key: Path | None = None
+    """The key of that certificate, in PEM."""
     shared_memory: bool = True
-    """Raw frames between processes of one host go through shared memory."""
+    """Do not send raw frames through shared memory to processes of the same host."""
 
     def tls_files(self) -> tuple[Path, Path, Path] | None:
         """(ca, certificate, key), or None.

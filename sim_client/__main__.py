@@ -50,7 +50,7 @@ def _run(options: SimOptions, daemons: Daemons) -> dict[str, Any]:
     most_ticks = options.schedule.max_steps
     with tqdm(total=options.episodes * most_ticks, unit="tick", disable=not options.log.progress) as bar:
         bar.bar_format = "{desc}"  # until there are ticks, a rate means nothing
-        bar.set_description_str("waiting for servers")
+        bar.set_description_str("waiting for servers" if options.policy == "servers" else "drawing the scene")
         harness = open_harness(options, daemons)
 
         def on_tick(episode: int, tick: int) -> None:

@@ -20,6 +20,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+from protocol.version import DISTRIBUTION
+
 Role = Literal["all", "robot", "models"]
 
 GL_PACKAGES = {
@@ -103,13 +105,13 @@ def _installed(name: str) -> str | None:
 
 def packages(role: Role, version_of: Callable[[str], str | None] = _installed) -> Finding:
     """The bounds of our own distribution against what is installed."""
-    ours = version_of("ponderpounce")
+    ours = version_of(DISTRIBUTION)
     if ours is None:
         way_out = "make setup, or: pip install --no-deps -e ."
-        return Finding("packages", Level.FAILED, "ponderpounce is not installed", way_out)
+        return Finding("packages", Level.FAILED, f"{DISTRIBUTION} is not installed", way_out)
     extras = {"all": ("sim", "serve"), "robot": ("sim",), "models": ("serve",)}[role]
     wrong = []
-    bounds = list(_requirements(metadata.requires("ponderpounce") or [], extras))
+    bounds = list(_requirements(metadata.requires(DISTRIBUTION) or [], extras))
     for name, bound in bounds:
         version = version_of(name)
         if version is None:
@@ -119,7 +121,7 @@ def packages(role: Role, version_of: Callable[[str], str | None] = _installed) -
     if wrong:
         way_out = "make setup, or: pip install -r requirements.txt"
         return Finding("packages", Level.FAILED, "; ".join(wrong), way_out)
-    return Finding("packages", Level.OK, f"ponderpounce {ours} and the {len(bounds)} it needs")
+    return Finding("packages", Level.OK, f"{DISTRIBUTION} {ours} and the {len(bounds)} it needs")
 
 
 def _requirements(lines: Sequence[str], extras: Sequence[str]) -> Iterator[tuple[str, str]]:

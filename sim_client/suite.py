@@ -21,7 +21,7 @@ from protocol import messages as m
 from protocol.command_line import flat
 from protocol.errors import EpisodeRefused, TransportError
 from protocol.link import Link
-from protocol.version import version
+from protocol.version import DISTRIBUTION, version
 from sim_client.config import SimOptions
 from sim_client.episode import Outcome, RobotSide, play_oracle
 from sim_client.ledger import write_json
@@ -158,7 +158,7 @@ class Suite:
 
 def versions() -> dict[str, str]:
     """What ran: part of every log and result."""
-    found = {"ponderpounce": version(), "python": platform.python_version(), "machine": platform.machine()}
+    found = {DISTRIBUTION: version(), "python": platform.python_version(), "machine": platform.machine()}
     for name in ("mujoco", "numpy", "eclipse-zenoh", "protobuf", "mcap"):
         try:
             found[name] = metadata.version(name)

@@ -35,10 +35,10 @@ class TablesOptions:
     """Makes the paper's tables and plots of whatever evaluations and diagnoses wrote."""
 
     results: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Folders of pp-eval, sim-client, pp-diagnose or pp-counterfactual, or their files; conditions of an evaluation are
-    compared with the first."""
+    """Folders of pp-eval, sim-client, pp-diagnose or pp-diagnose counterfactual, or their files; conditions of an
+    evaluation are compared with the first."""
     out: Path
-    """Folder for tables.md, and of diagnoses staleness.png."""
+    """Folder for tables.md, and for staleness.png of a diagnosis."""
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -12,11 +12,12 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
+import tyro
 from tqdm import tqdm
 
 from dual_system.data.dart import DART, NoiseKind
@@ -32,12 +33,65 @@ from dual_system.data.workers import LocalWorkers, RayWorkers, Workers
 from dual_system.tasks.difficulty import Difficulty
 from dual_system.tasks.task import TaskError, chosen_tasks
 from protocol.command_line import parse
+from protocol.version import DISTRIBUTION
 
 SCALES = {"1x": 1, "9x": 9}
 COLLECTING, JOINED = ".collecting", "joined"
 DONE, INCOMPLETE, REFUSED, INTERRUPTED = 0, 1, 2, 130
 ROWS_PER_EPISODE, BYTES_PER_ROW = 500, 4200  # before anything is measured: both cameras at 256 px and 20 Hz, all tasks
 MEASURED_EPISODES = 5  # from so many on, the estimate is theirs
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PicturesOptions:
+    """Which pictures are rendered."""
+
+    frames: Literal["all", "training"] = "all"
+    """Pictures to render: all at 20 Hz, or only those that training reads (demonstrations, POUNCE's invocations)."""
+    invocation_hz: Literal[1, 2, 4, 5, 10, 20] = 10
+    """Rate of POUNCE's invocations in Hz, with --frames training (paper: every 100 ms in training)."""
+    demonstration_hz: Literal[1, 2, 4, 5, 10, 20] = 1
+    """Rate of demonstration pictures in Hz, with --frames training; the last frame is always rendered (paper: 1)."""
+    image_px: int = 256
+    """Side of the pictures in pixels, an even number (paper and benchmark: 256)."""
+
+    @property
+    def look(self) -> Look:
+        if self.frames == "all":
+            return Look()
+        return Look(demonstration_hz=self.demonstration_hz, execution_hz=self.invocation_hz)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodesOptions:
+    """What happens in the episodes."""
+
+    difficulties: tuple[Difficulty, ...] = DIFFICULTY_CYCLE
+    """Difficulties of a task's episodes, taken in turn."""
+    noise: NoiseKind = "none"
+    """Noise on the executed joint targets. dart: perturb the oracle's path; `action` stays the oracle's, the label."""
+    recovery_share: float = RECOVERY_SHARE
+    """Share of episodes in [0, 1] with a failed grasp, too high or beside the object, before the right one."""
+    texts: Literal["latched", "follow"] = "latched"
+    """Coordinates in subgoals. latched: as first seen (upstream); follow: corrected when the object was pushed."""
+    shove_share: float = 0.0
+    """Share of episodes in [0, 1] in which objects are pushed aside while the hand approaches; needs --texts follow."""
+    max_steps: int = 1300
+    """Limit of control steps per episode; longer episodes are not kept."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MachineOptions:
+    """How the run uses the machine; the dataset does not depend on it."""
+
+    workers: int = os.cpu_count() or 1
+    """Number of worker processes on this computer."""
+    ray: str | None = None
+    """Address of a Ray cluster to work on instead, or `auto`, or `local`."""
+    keep_episodes: bool = False
+    """Keep OUT/.collecting, so that more --episodes can be added to the same folder."""
+    progress: bool = True
+    """Do not show a progress bar."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,58 +104,27 @@ class CollectOptions:
     """Names of the tasks, or `all`. sim-client --list-tasks shows them."""
     episodes: int = 100
     """Number of episodes per task, before --scale."""
-    first_episode: int = 0
-    """Number of episodes of each task to skip: a second folder then holds other scenes and seeds than the first."""
     scale: Literal["1x", "9x"] = "1x"
     """Multiple of --episodes to collect (paper: 100 episodes per task, or 900)."""
-    frames: Literal["all", "training"] = "all"
-    """Pictures to render: all at 20 Hz, or only those that training reads (demonstrations, POUNCE's invocations)."""
-    invocation_hz: Literal[1, 2, 4, 5, 10, 20] = 10
-    """Rate of POUNCE's invocations in Hz, with --frames training (paper: every 100 ms in training)."""
-    demonstration_hz: Literal[1, 2, 4, 5, 10, 20] = 1
-    """Rate of demonstration pictures in Hz, with --frames training; the last frame is always rendered (paper: 1)."""
-    image_px: int = 256
-    """Side of the pictures in pixels, an even number (paper and benchmark: 256)."""
-    noise: NoiseKind = "none"
-    """Noise on the executed joint targets. dart: perturb the oracle's path; `action` stays the oracle's, the label."""
-    recovery_share: float = RECOVERY_SHARE
-    """Share of episodes in [0, 1] with a failed grasp, too high or beside the object, before the right one."""
-    difficulties: tuple[Difficulty, ...] = DIFFICULTY_CYCLE
-    """Difficulties of a task's episodes, taken in turn."""
-    texts: Literal["latched", "follow"] = "latched"
-    """Coordinates in subgoals. latched: as first seen (upstream); follow: corrected when the object was pushed."""
-    shove_share: float = 0.0
-    """Share of episodes in [0, 1] in which objects are pushed aside while the hand approaches; needs --texts follow."""
-    max_steps: int = 1300
-    """Limit of control steps per episode; longer episodes are not kept."""
-    workers: int = os.cpu_count() or 1
-    """Number of worker processes on this computer."""
-    ray: str | None = None
-    """Address of a Ray cluster to work on instead, or `auto`, or `local`."""
-    keep_episodes: bool = False
-    """Keep OUT/.collecting, so that more --episodes can be added to the same folder."""
-    progress: bool = True
-    """Do not show a progress bar."""
+    first_episode: int = 0
+    """Number of episodes of each task to skip: a second folder then holds other scenes and seeds than the first."""
+    pictures: tyro.conf.OmitArgPrefixes[PicturesOptions] = field(default_factory=PicturesOptions)
+    content: tyro.conf.OmitArgPrefixes[EpisodesOptions] = field(default_factory=EpisodesOptions)
+    machine: tyro.conf.OmitArgPrefixes[MachineOptions] = field(default_factory=MachineOptions)
 
     def __post_init__(self) -> None:
-        if self.episodes < 1 or self.workers < 1:
+        if self.episodes < 1 or self.machine.workers < 1:
             raise DatasetError("--episodes and --workers must be at least 1")
         if self.first_episode < 0:
             raise DatasetError(f"--first-episode {self.first_episode}: episodes count from 0")
-        if self.image_px < 16 or self.image_px % 2:
-            raise DatasetError(f"--image-px {self.image_px}: videos need an even number of at least 16")
-        if not 0 <= self.recovery_share <= 1:
-            raise DatasetError(f"--recovery-share {self.recovery_share} is not a share, in [0, 1]")
-        if not 0 <= self.shove_share <= 1:
-            raise DatasetError(f"--shove-share {self.shove_share} is not a share, in [0, 1]")
-        if self.shove_share and self.texts != "follow":
+        if self.pictures.image_px < 16 or self.pictures.image_px % 2:
+            raise DatasetError(f"--image-px {self.pictures.image_px}: videos need an even number of at least 16")
+        if not 0 <= self.content.recovery_share <= 1:
+            raise DatasetError(f"--recovery-share {self.content.recovery_share} is not a share, in [0, 1]")
+        if not 0 <= self.content.shove_share <= 1:
+            raise DatasetError(f"--shove-share {self.content.shove_share} is not a share, in [0, 1]")
+        if self.content.shove_share and self.content.texts != "follow":
             raise DatasetError("--shove-share would make latched coordinates wrong; give --texts follow with it")
-
-    @property
-    def look(self) -> Look:
-        if self.frames == "all":
-            return Look()
-        return Look(demonstration_hz=self.demonstration_hz, execution_hz=self.invocation_hz)
 
     def task_names(self) -> tuple[str, ...]:
         """The tasks in alphabetical order, each once. Raises TaskError for an unknown one."""
@@ -113,39 +136,39 @@ class CollectOptions:
         jobs = jobs_of(
             self.task_names(),
             num_episodes,
-            image_px=self.image_px,
-            max_steps=self.max_steps,
-            look=self.look,
-            noise=self.noise,
-            recovery_share=self.recovery_share,
-            difficulties=self.difficulties,
-            texts_follow=self.texts == "follow",
-            shove_share=self.shove_share,
+            image_px=self.pictures.image_px,
+            max_steps=self.content.max_steps,
+            look=self.pictures.look,
+            noise=self.content.noise,
+            recovery_share=self.content.recovery_share,
+            difficulties=self.content.difficulties,
+            texts_follow=self.content.texts == "follow",
+            shove_share=self.content.shove_share,
             first_slot=self.first_episode,
         )
         return list(jobs)
 
     def settings(self) -> dict[str, Any]:
         """Returns what all episodes of a dataset have in common; their number and the workers are no part of it."""
-        versions = {name: metadata.version(name) for name in ("ponderpounce", "mujoco", "numpy", "av", "pyarrow")}
+        versions = {name: metadata.version(name) for name in (DISTRIBUTION, "mujoco", "numpy", "av", "pyarrow")}
         settings = {
             "first_seed": TRAIN_SEED,
-            "image_px": self.image_px,
-            "max_steps": self.max_steps,
-            "look": asdict(self.look),
+            "image_px": self.pictures.image_px,
+            "max_steps": self.content.max_steps,
+            "look": asdict(self.pictures.look),
             "versions": versions,
         }
         if self.first_episode:
             settings["first_episode"] = self.first_episode
-        if self.recovery_share != RECOVERY_SHARE:
-            settings["recovery_share"] = self.recovery_share
-        if self.difficulties != DIFFICULTY_CYCLE:
-            settings["difficulties"] = list(self.difficulties)
-        if self.texts != "latched":
-            settings["texts"] = self.texts
-        if self.shove_share:
-            settings["shoves"] = SHOVES.settings(self.shove_share)
-        return settings if self.noise == "none" else {**settings, "noise": DART.settings()}
+        if self.content.recovery_share != RECOVERY_SHARE:
+            settings["recovery_share"] = self.content.recovery_share
+        if self.content.difficulties != DIFFICULTY_CYCLE:
+            settings["difficulties"] = list(self.content.difficulties)
+        if self.content.texts != "latched":
+            settings["texts"] = self.content.texts
+        if self.content.shove_share:
+            settings["shoves"] = SHOVES.settings(self.content.shove_share)
+        return settings if self.content.noise == "none" else {**settings, "noise": DART.settings()}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,7 +191,7 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         sys.stderr.write("pp-collect: interrupted; finished episodes are kept, the same command goes on\n")
         return INTERRUPTED
-    noisy = "" if options.noise == "none" else f", {report.num_rejected_noisy} of them under noise"
+    noisy = "" if options.content.noise == "none" else f", {report.num_rejected_noisy} of them under noise"
     print_line(f"{report.num_episodes} episodes in {options.out} ({report.num_rejected} seeds rejected{noisy})")
     for key in report.unsolved:
         sys.stderr.write(f"pp-collect: no episode for {key}: the oracle solved none of its seeds\n")
@@ -192,14 +215,14 @@ def collect(
     wanted = {"settings": options.settings(), "tasks": options.task_names(), "episodes": len(jobs)}
     if (found := _finished(out, wanted)) is not None:
         say(f"{out} is complete; nothing to do")
-        if not options.keep_episodes:
+        if not options.machine.keep_episodes:
             shutil.rmtree(out / COLLECTING, ignore_errors=True)
         return found
     with Store(out / COLLECTING) as store:
         _claim(out / COLLECTING / "settings.json", options.settings())
         sizes = {job.key: store.num_bytes(job.key) for job in _present(store, jobs)}
         say(_disk_sentence(options, jobs, sizes))
-        with tqdm(total=len(jobs), initial=len(sizes), unit="episode", disable=not options.progress) as bar:
+        with tqdm(total=len(jobs), initial=len(sizes), unit="episode", disable=not options.machine.progress) as bar:
             for job, package in workers.run([job for job in jobs if job.key not in sizes]):
                 try:
                     store.commit(job.key, package)
@@ -210,7 +233,7 @@ def collect(
                 bar.update()
                 _require_disk(options, jobs, sizes)
         report = _join(out, store, jobs, wanted)
-    if not options.keep_episodes:
+    if not options.machine.keep_episodes:
         shutil.rmtree(out / COLLECTING)
     return report
 
@@ -231,7 +254,7 @@ def disk_needed(num_missing: int, sizes: Sequence[int], image_px: int) -> int:
 
 def _require_disk(options: CollectOptions, jobs: Sequence[Job], sizes: dict[str, int]) -> tuple[int, int]:
     """Returns the bytes needed and free. Raises DatasetError if they are too few."""
-    needed = disk_needed(len(jobs) - len(sizes), list(sizes.values()), options.image_px)
+    needed = disk_needed(len(jobs) - len(sizes), list(sizes.values()), options.pictures.image_px)
     free = shutil.disk_usage(options.out).free
     if needed > free:
         raise DatasetError(
@@ -336,9 +359,10 @@ def _join(out: Path, store: Store, jobs: Sequence[Job], wanted: dict[str, Any]) 
 
 
 def _workers(options: CollectOptions) -> Workers[Job, Package]:
-    if options.ray is not None:
-        return RayWorkers(options.ray, work_out)
-    return LocalWorkers(options.workers, work_out)
+    machine = options.machine
+    if machine.ray is not None:
+        return RayWorkers(machine.ray, work_out)
+    return LocalWorkers(machine.workers, work_out)
 
 
 if __name__ == "__main__":

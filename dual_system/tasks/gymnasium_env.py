@@ -30,7 +30,7 @@ try:
     from gymnasium import spaces
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError(
-        "dual_system.tasks.gymnasium_env needs Gymnasium, which is not installed: pip install 'ponderpounce[gym]'",
+        "dual_system.tasks.gymnasium_env needs Gymnasium, which is not here: pip install 'ponderpounce-server[gym]'",
         name=error.name,
     ) from error
 

@@ -52,7 +52,7 @@ class PairsOptions:
     """Folder of the new dataset."""
     pairs: int = 100
     """Number of pairs."""
-    task: tuple[str, ...] = ()
+    tasks: tuple[str, ...] = ()
     """Names of tasks of the family. Empty: all that can be forked."""
     seed: int = 0
     """Seed of the first scene of every task."""
@@ -162,7 +162,7 @@ def main(argv: list[str] | None = None, prog: str = "pp-collect pairs") -> int:
     if (options.out / INDEX).exists():
         sys.stderr.write(f"{prog}: {options.out} holds pairs already; give another --out\n")
         return 2
-    tasks = options.task or tuple(
+    tasks = options.tasks or tuple(
         name for name in task_names() if make_task(name).family == options.family and make_task(name).can_be_forked()
     )
     strangers = [name for name in tasks if make_task(name).family != options.family]

@@ -55,19 +55,21 @@ class DiagnoseOptions:
     pounce: Path
     """POUNCE's checkpoint, trained with it."""
     data: Path
-    """A folder of pp-collect or pp-export, with other seeds than the training data's."""
+    """Folder of pp-collect or pp-export, with other seeds than the training data's."""
     out: Path
     """Folder for diagnosis.json."""
     tasks: tuple[str, ...] = ()
-    """Of the data; () for all."""
+    """Names of the tasks to measure on. Empty: all of the data."""
     episodes: int = 80
-    """At most so many, the tasks taking turns (paper: 80)."""
+    """Largest number of episodes, the tasks taking turns (paper: 80)."""
     draws: int = 8
-    """Flow noise and time of each tick; the same ones in every condition."""
+    """Draws of flow noise and time per tick, the same in every condition."""
     seed: int = 0
-    """Of the flow draws."""
+    """Seed of the flow draws."""
     device: Literal["cpu", "cuda"] = "cpu"
+    """Device of both networks."""
     progress: bool = True
+    """Do not show a progress bar."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

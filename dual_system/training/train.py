@@ -80,7 +80,7 @@ class MachineOptions:
     device: Literal["cpu", "cuda"] = "cpu"
     """Device of both systems."""
     dtype: Literal["float32", "bfloat16"] = "float32"
-    """Of PONDER's weights and of POUNCE's stream, when they are loaded; the optimiser keeps float32 masters."""
+    """Number format of PONDER's weights and of POUNCE's stream; the optimiser keeps float32 masters."""
     tf32: bool = False
     """Multiply float32 matrices in TF32 on a GPU that has it, which rounds to 1 in 2000."""
     weights: Literal["sharded", "whole"] = "sharded"
@@ -128,7 +128,7 @@ class TrainOptions:
     pounce: Path | None = None
     """Pretrained pi0.5 or GR00T N1.5 folder; needed unless the recipe is from scratch."""
     tasks: tuple[str, ...] = ()
-    """Tasks of the data to train on; () for all."""
+    """Names of the tasks to train on. Empty: all of the data."""
     instead: tyro.conf.OmitArgPrefixes[InsteadOptions] = field(default_factory=InsteadOptions)
     machine: tyro.conf.OmitArgPrefixes[MachineOptions] = field(default_factory=MachineOptions)
     log: tyro.conf.OmitArgPrefixes[LogOptions] = field(default_factory=LogOptions)

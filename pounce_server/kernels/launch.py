@@ -37,7 +37,7 @@ def kernel(function: Callable[..., None]) -> Any:
 def missing_for(device: torch.device) -> str:
     """Returns what has to be done before kernels can run on ``device``; empty if nothing."""
     if triton is None:
-        return "Triton is not installed: pip install 'ponderpounce[kernels]'"
+        return "Triton is not installed: pip install 'ponderpounce-server[kernels]'"
     if device.type != "cuda" and not triton.knobs.runtime.interpret:
         return f"Triton compiles for a GPU, came device {device}: --device cuda (or, slowly, TRITON_INTERPRET=1)"
     return ""

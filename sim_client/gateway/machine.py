@@ -31,7 +31,7 @@ from sim_client.episode import CLOCK_SILENCE_NS
 from sim_client.gateway.body import Body
 from sim_client.gateway.exchange import Answer, Finish, Frames, Refused, Step
 from sim_client.gateway.lease import Lease
-from sim_client.gateway.node import LiveNode, LockstepNode, Node, Shown
+from sim_client.gateway.node import LiveNode, LockstepNode, Measurement, Node
 from sim_client.gateway.pictures import resized
 from sim_client.gateway.rule import sampled
 from sim_client.recorder import Recorder
@@ -199,10 +199,10 @@ class Machine:
             if frame.shape[:2] != (height, width):
                 came = f"{frame.shape[0]} x {frame.shape[1]}"
                 raise Refused(f"{name}: expected {height} x {width} px as at first, came {came}. See --image-px.")
-        now = Shown(self._packed(frames), step.state)
+        now = Measurement(self._packed(frames), step.state)
         if isinstance(episode.node, LockstepNode):
             px = self._plan.image_px
-            since = [Shown(self._packed(resized(seen.frames, px)), seen.state) for seen in step.since]
+            since = [Measurement(self._packed(resized(seen.frames, px)), seen.state) for seen in step.since]
             self._show(episode.node.show(since, now))
             job.future.set_result(self._play(episode, episode.node))
             return

@@ -23,7 +23,7 @@ from sim_client.gateway.rule import ahead
 _KEEP_CHUNKS = 8
 
 
-class Shown(NamedTuple):
+class Measurement(NamedTuple):
     """What a client saw at one tick, as it is published."""
 
     pictures: tuple[m.Image, ...]
@@ -72,14 +72,14 @@ class LockstepNode:
     """The next one to be commanded."""
     commands: Commands = field(init=False)
     _start_ns: int = 0
-    _coming: list[Shown] = field(default_factory=list)
-    _last: Shown | None = None
+    _coming: list[Measurement] = field(default_factory=list)
+    _last: Measurement | None = None
     _asked_tick: int = 0  # of the request under way
 
     def __post_init__(self) -> None:
         self.commands = Commands(self.info.robot)
 
-    def show(self, since: Sequence[Shown], now: Shown) -> m.Observation:
+    def show(self, since: Sequence[Measurement], now: Measurement) -> m.Observation:
         """A request: what was seen in each tick since the last one, and what is seen now. Returns what is published.
 
         A client that does not tell what it saw in between is taken to have seen what it saw before.
@@ -127,7 +127,7 @@ class LiveNode:
     def __post_init__(self) -> None:
         self.commands = Commands(self.info.robot)
 
-    def show(self, now: Shown, now_ns: int) -> m.Observation:
+    def show(self, now: Measurement, now_ns: int) -> m.Observation:
         """What is published for a request that came at ``now_ns``, episode time: the first tick that it can serve."""
         return m.Observation(tick=self.tick, source_ns=now_ns, proprio=now.state, images=now.pictures)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import shutil
 from collections.abc import Callable, Iterator, Sequence
@@ -16,7 +17,16 @@ from hypothesis import strategies as st
 
 from dual_system.data import collect as module
 from dual_system.data.card import card
-from dual_system.data.collect import COLLECTING, COLLECTION_PATH, CollectOptions, collect, disk_needed
+from dual_system.data.collect import (
+    COLLECTING,
+    COLLECTION_PATH,
+    CollectOptions,
+    EpisodesOptions,
+    MachineOptions,
+    PicturesOptions,
+    collect,
+    disk_needed,
+)
 from dual_system.data.dart import DART
 from dual_system.data.dataset import Dataset
 from dual_system.data.episode import Package
@@ -51,8 +61,13 @@ class InOrder:
 
 
 def options(out: Path, **changes: Any) -> CollectOptions:
-    values: dict[str, Any] = {"out": out, "tasks": TASKS, "episodes": EPISODES, "progress": False}
-    return CollectOptions(**values | changes)
+    """Options by their names on the command line, whichever group they are in."""
+    values: dict[str, Any] = {"out": out, "tasks": TASKS, "episodes": EPISODES, "progress": False} | changes
+    groups = {}
+    for name, kind in {"pictures": PicturesOptions, "content": EpisodesOptions, "machine": MachineOptions}.items():
+        own = {field.name for field in dataclasses.fields(kind)} & values.keys()
+        groups[name] = kind(**{each: values.pop(each) for each in own})
+    return CollectOptions(**values, **groups)
 
 
 def files(folder: Path) -> dict[str, bytes]:

@@ -50,7 +50,7 @@ def test_the_log_follows_from_itself(episode: Any) -> None:
 
 def test_results_tell_what_ran_and_how_it_went(episode: Any) -> None:
     assert set(episode.results) >= {"config", "versions", "episodes"}
-    assert {"ponderpounce", "python", "mujoco", "eclipse-zenoh"} <= set(episode.results["versions"])
+    assert {"ponderpounce-server", "python", "mujoco", "eclipse-zenoh"} <= set(episode.results["versions"])
     assert episode.results["config"]["mode"] == "realtime"
     result = episode.result
     assert (result["status"], result["steps"], result["success"]) == ("TIMEOUT", NUM_TICKS, False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -63,6 +64,20 @@ def test_a_log_is_read_back_and_agrees_with_itself(episode: str, tmp_path: Path)
     assert "agrees with itself" in told
     assert "ticks        60 play" in told
     assert "61 from front (jpeg), 61 from wrist (jpeg)" in told  # one before every action, one after the last
+
+
+def test_the_worth_of_memory_is_counted_scene_by_scene(tmp_path: Path) -> None:
+    for name, successes in {"real": [True, True, False, True], "null": [False, True, True, False]}.items():
+        episodes = [
+            {"task": "StopCube", "run": 0, "seed": seed, "difficulty": "easy", "success": success}
+            for seed, success in enumerate(successes)
+        ]
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "results.json").write_text(json.dumps({"config": {}, "episodes": episodes}))
+    told = printed("05_worth_of_memory.py", "real", "null", cwd=tmp_path).splitlines()
+    assert told[0].endswith("3 of 4 episodes solved")
+    assert told[1].endswith("2 of 4, in the same scenes")
+    assert told[2].endswith("2 only with memory, 1 only without")
 
 
 @pytest.mark.sim

@@ -11,8 +11,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from ponderpounce import commands
 
+from dual_system import commands
 from dual_system.commands import COMMANDS, REFUSED
 
 ENTRIES = {"pp-collect": commands.collect, "pp-export": commands.export, "pp-diagnose": commands.diagnose}
@@ -125,7 +125,7 @@ def test_a_word_like_no_verb_is_refused_with_all(called: list[Any], capsys: pyte
 def test_a_verb_imports_only_what_it_needs(call: str, unneeded: str) -> None:
     code = (
         "import atexit, sys\n"
-        "from ponderpounce import commands\n"
+        "from dual_system import commands\n"
         f"atexit.register(lambda: sys.stderr.write(str({unneeded!r} in sys.modules)))\n"
         f"commands.{call}\n"
     )

@@ -218,4 +218,4 @@ def test_twins_need_no_triton() -> None:
         "print(launch.missing_for(torch.device('cuda')))"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60)
-    assert done.stdout.strip() == "Triton is not installed: pip install 'ponderpounce[kernels]'"
+    assert done.stdout.strip() == "Triton is not installed: pip install 'ponderpounce-server[kernels]'"

@@ -169,10 +169,12 @@ RESULT = st.builds(
 )  # fmt: skip
 DEMO_FRAME = st.builds(m.DemoFrame, images=tuples_of(pictures()))
 OPEN_REQUEST = st.builds(m.OpenRequest, info=INFO, demo=tuples_of(DEMO_FRAME, 2))
+DEMO_SAMPLING = st.builds(m.DemoSampling, hz=st.sampled_from([1, 2, 4, 5, 10, 20]), to_its_end=st.booleans())
 CONTRACT = st.builds(
     m.Contract, proc=TEXT, num_carriers=U32, hidden_size=U32, horizon=U32, action_dim=U32,
     preferred_codec=chosen(m.ImageCodec), infer_p50_ns=DURATION, infer_p99_ns=DURATION, model_hash=TEXT,
     is_fake=st.booleans(), version=TEXT, context_tokens=U32, max_context_tokens=U32,
+    demonstrations=st.none() | DEMO_SAMPLING,
 )  # fmt: skip
 JOURNAL_ENTRY = st.builds(
     m.JournalEntry, query=INDEX, tick=INDEX, source_ns=INSTANT, observation=st.binary(max_size=40)
@@ -226,10 +228,13 @@ MESSAGES: dict[type, st.SearchStrategy[Any]] = {
     m.EpisodeResult: RESULT,
     m.DemoFrame: DEMO_FRAME,
     m.OpenRequest: OPEN_REQUEST,
+    m.DemoSampling: DEMO_SAMPLING,
     m.Contract: CONTRACT,
+    m.ContractRequest: st.builds(m.ContractRequest, header=HEADER),
+    m.ContractReply: st.builds(m.ContractReply, error=TEXT, contract=st.none() | CONTRACT),
     m.OpenReply: st.builds(
         m.OpenReply, error=TEXT, contract=st.none() | CONTRACT, contracts=tuples_of(CONTRACT),
-        warnings=tuples_of(TEXT), try_again=st.booleans(),
+        warnings=tuples_of(TEXT), try_again=st.booleans(), refusal=st.sampled_from(m.Refusal),
     ),
     m.CloseRequest: st.builds(m.CloseRequest, header=HEADER, result=st.none() | RESULT),
     m.CloseReply: st.builds(m.CloseReply, error=TEXT),
@@ -426,11 +431,14 @@ def test_a_value_of_the_wrong_type_is_named() -> None:
         codec.encode(m.Query(query=1, tick=1.5, source_ns=0))  # type: ignore[arg-type]
 
 
-def test_an_unknown_enum_value_is_named() -> None:
-    proto = stream_pb2.Phase.FromString(b"")
-    assert proto.state == ""
-    action = stream_pb2.Action(tick=1, level=99, values=[0.0])
-    with pytest.raises(MalformedMessage, match=r"Action\.level: expected a value of its type, came 99"):
+def test_a_value_of_an_enum_that_came_later_decodes_as_unspecified() -> None:
+    """So a reader of today keeps what a writer of tomorrow says besides; where a value is required, it is refused."""
+    subgoal = stream_pb2.Subgoal(kind=99, text="grasp it", tick=1)  # type: ignore[arg-type]
+    assert codec.decode(m.Subgoal, subgoal.SerializeToString()).kind == m.SubgoalKind.UNSPECIFIED
+    reply = episode_pb2.OpenReply(error="not today", refusal=99)  # type: ignore[arg-type]
+    assert codec.decode(m.OpenReply, reply.SerializeToString()).refusal == m.Refusal.UNSPECIFIED
+    action = stream_pb2.Action(tick=1, level=99, values=[0.0])  # type: ignore[arg-type]
+    with pytest.raises(MalformedMessage, match=r"Action\.level: expected a specified value"):
         codec.decode(m.Action, action.SerializeToString())
 
 

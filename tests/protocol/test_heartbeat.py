@@ -9,6 +9,7 @@ import pytest
 
 from protocol import topics
 from protocol.bus import LocalBus
+from protocol.drops import DropReason
 from protocol.heartbeat import PERIOD_NS, Heartbeat
 from protocol.link import Link, Stream
 from protocol.messages import Health, ServingState
@@ -98,6 +99,6 @@ def test_what_is_no_news_waits_for_the_next_beat(
 
 
 def test_a_beat_reports_what_the_link_dropped(link: Link, heartbeat: Heartbeat, healths: Stream[Health]) -> None:
-    link.drop("somebody", "malformed", "")
+    link.drop("somebody", DropReason.MALFORMED, "")
     heartbeat.beat()
     assert healths.drain()[0].dropped == {"malformed": 1}

@@ -215,6 +215,24 @@ def test_between_episodes_a_late_message_is_nobodys_fault(receiver: Link, caplog
     assert caplog.records == []
 
 
+@pytest.mark.parametrize(
+    ("header", "is_logged"),
+    [
+        (m.Header(session="s", episode="e0", epoch=1), False),
+        (m.Header(session="s", episode="e2", epoch=3), True),
+        (m.Header(session="other", episode="e0", epoch=1), True),
+    ],
+    ids=["an earlier one of the session", "a later one", "another session's"],
+)
+def test_what_is_left_of_an_earlier_episode_is_counted_and_nobodys_fault(
+    receiver: Link, header: m.Header, is_logged: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    receiver.enter_episode("s", "e1", 2)
+    assert not is_of_episode(receiver, header)
+    assert dict(receiver.dropped) == {"other_episode": 1}
+    assert bool(caplog.records) is is_logged
+
+
 def test_our_own_malformed_message_is_a_bug_here(sender: Link) -> None:
     action = m.Action(tick=0, deadline_ns=0, level=m.Level.PLAY, values=np.full(2, np.nan, np.float32))
     with pytest.raises(MalformedMessage, match=r"Action\.values"):

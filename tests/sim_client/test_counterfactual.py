@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from dual_system.analysis import tables
 from dual_system.analysis.counterfactual import read_counterfactual
-from dual_system.models.ponder.demo_sampling import OWN_NAME
+from dual_system.models.ponder.demo_sampling import DemoSampling
 from dual_system.tasks.pair_files import write_index, write_pair
 from dual_system.tasks.pairs import Pair, Telling
 from sim_client import counterfactual
@@ -92,12 +93,12 @@ def test_the_served_models_answer_and_the_table_says_that_they_are_untrained(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The tiny random pair: from files of pairs to a table."""
-    from ponder_server import in_process as ponder_party
-    from pounce_server import in_process as pounce_party
+    from ponder_server import in_process as ponder_in_process
+    from pounce_server import in_process as pounce_in_process
 
-    models = ponder_party.build_reader(None), pounce_party.build_actor(None)
-    monkeypatch.setattr(ponder_party, "build_reader", lambda checkpoint: models[0])
-    monkeypatch.setattr(pounce_party, "build_actor", lambda checkpoint: models[1])
+    models = ponder_in_process.build_reader(None), pounce_in_process.build_actor(None)
+    monkeypatch.setattr(ponder_in_process, "build_reader", lambda checkpoint: models[0])
+    monkeypatch.setattr(pounce_in_process, "build_actor", lambda checkpoint: models[1])
     write_index([write_pair(pair(0, px=PX), tmp_path)], tmp_path)
     arguments = ["--ponder", "any", "--pounce", "any", "--pairs", str(tmp_path), "--out", str(tmp_path / "out")]
     assert counterfactual.main([*arguments, "--draws", "1", "--no-progress"]) == 0
@@ -108,15 +109,16 @@ def test_the_served_models_answer_and_the_table_says_that_they_are_untrained(
     assert "| VideoRepick | 1 |" in (tmp_path / "tables.md").read_text()
 
 
-def test_pairs_whose_videos_are_shown_otherwise_than_ponder_learned_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_demonstrations_sampled_otherwise_than_in_training_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ponder, pairs = tmp_path / "ponder", tmp_path / "pairs"
-    ponder.mkdir()
-    pairs.mkdir()
-    (ponder / OWN_NAME).write_text('{"demonstrations": {"hz": 2, "to_its_end": true}}')
-    write_index([write_pair(pair(0, px=PX), pairs)], pairs)
-    arguments = ["--ponder", str(ponder), "--pounce", "any", "--pairs", str(pairs), "--out", str(tmp_path / "out")]
+    from ponder_server import in_process as ponder_in_process
+
+    spec = SimpleNamespace(demonstrations=DemoSampling(hz=2, to_its_end=True))
+    monkeypatch.setattr(ponder_in_process, "build_reader", lambda checkpoint: (remembers, spec))
+    write_index([write_pair(pair(0, px=PX), tmp_path)], tmp_path)
+    arguments = ["--ponder", "any", "--pounce", "any", "--pairs", str(tmp_path), "--out", str(tmp_path / "out")]
     assert counterfactual.main(arguments) == 2
-    assert "shows videos 1 times a second; " in (told := capsys.readouterr().err)
-    assert "Make pairs with pp-collect pairs --demo-hz 2 --video-end." in told
+    sentence = capsys.readouterr().err
+    assert "samples demonstrations 1 times a second, and this PONDER was trained on 2 times a second" in sentence
+    assert "Make pairs with pp-collect pairs --demo-hz 2 --demo-to-its-end." in sentence

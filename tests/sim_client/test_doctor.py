@@ -85,7 +85,7 @@ def test_a_message_that_never_arrives_is_told() -> None:
 
 def test_packages_name_what_is_missing_and_what_is_too_new() -> None:
     installed = {name: "999" for name in ("numpy", "protobuf", "eclipse-zenoh", "tyro", "mujoco", "tqdm")}
-    finding = look.packages("robot", {**installed, "ponderpounce": "0.1.0"}.get)
+    finding = look.packages("robot", {**installed, "ponderpounce-server": "0.1.0"}.get)
     assert finding.level is FAILED
     assert "mcap is missing" in finding.text
     assert "mujoco is 999, not" in finding.text

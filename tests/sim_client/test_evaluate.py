@@ -28,7 +28,8 @@ from dual_system.models.pounce.configs import tiny_cpu
 from protocol import messages as m
 from protocol.mcap_log import read_log
 from sim_client import evaluate as module
-from sim_client.evaluate import EvalOptions, EvaluationError, EvaluationHarness, Job, Line, evaluate, play
+from sim_client.condition import ConditionOptions, EvalOptions, EvaluationError, Job, LogOptions, WorkersOptions
+from sim_client.evaluate import EvaluationHarness, Line, evaluate, play
 from sim_client.ledger import LedgerError
 from sim_client.null_ponder import cognition_shape
 from sim_client.suite import run_seed
@@ -69,10 +70,16 @@ def pretended(job: Job) -> Line:
 
 
 def options(out: Path, **changes: Any) -> EvalOptions:
+    """Options by their names on the command line, whichever group they are in."""
     values: dict[str, Any] = {
         "out": out, "tasks": TASKS, "episodes": EPISODES, "runs": RUNS, "policy": "oracle", "progress": False,
     }  # fmt: skip
-    return EvalOptions(**values | changes)
+    values |= changes
+    groups = {}
+    for name, kind in {"condition": ConditionOptions, "log": LogOptions, "workers": WorkersOptions}.items():
+        own = {field.name for field in dataclasses.fields(kind)} & values.keys()
+        groups[name] = kind(**{each: values.pop(each) for each in own})
+    return EvalOptions(**values, **groups)
 
 
 @given(
@@ -146,7 +153,7 @@ def test_the_last_evaluation_seed_is_below_the_training_seeds(tmp_path: Path) ->
 
 def test_the_defaults_are_the_paper_s_protocol(tmp_path: Path) -> None:
     paper = EvalOptions(out=tmp_path)
-    schedule = paper.sim().schedule(seed=0)
+    schedule = paper.sim().schedule.of_episode("lockstep", seed=0)
     assert (paper.episodes, paper.runs, schedule.max_ticks, schedule.mode) == (50, 3, 1300, m.Mode.LOCKSTEP)
     assert (schedule.query_period_ns, schedule.invoke_period_ticks) == (10**9, 20)
     assert (schedule.query_delay.kind, schedule.query_delay.mean_ns) == (m.DelayKind.FIXED, 300_000_000)
@@ -163,7 +170,7 @@ def test_the_defaults_are_the_paper_s_protocol(tmp_path: Path) -> None:
     ],
 )
 def test_interventions_are_deliveries(tmp_path: Path, changes: Any, kind: m.DeliveryKind, age_ns: int) -> None:
-    delivery = options(tmp_path, **changes).sim().schedule(seed=0).delivery
+    delivery = options(tmp_path, **changes).sim().schedule.of_episode("lockstep", seed=0).delivery
     assert (delivery.kind, delivery.reported_age_ns) == (kind, age_ns)
 
 
@@ -298,7 +305,7 @@ def test_null_cognition_needs_no_ponder(tmp_path: Path) -> None:
         assert line["schedule"]["null_invocations"] == line["schedule"]["num_invocations"] == 4
         streams[name], models[name] = line["stream_sha256"], line["models"]["ponder"]["model_hash"]
     assert streams["asked"] == streams["nobody"]
-    assert models["nobody"] == "silent" != models["asked"]
+    assert models["nobody"] == "null" != models["asked"]
 
 
 def test_sums_are_rounded_alike_whichever_server_a_process_has() -> None:

@@ -238,7 +238,9 @@ def test_after_either_video_the_picture_is_the_same() -> None:
 def test_videos_can_be_looked_at_more_often_and_at_their_end() -> None:
     name = "PatternLock"
     with make_environment(name, image_px=64) as env, make_environment(name, render=False) as other:
-        once, twice = (find_pair(env, other, name, VIDEO_SEEDS[name], demo_hz=hz, video_end=hz > 1) for hz in (1, 2))
+        once, twice = (
+            find_pair(env, other, name, VIDEO_SEEDS[name], demo_hz=hz, demo_to_its_end=hz > 1) for hz in (1, 2)
+        )
         assert once is not None
         assert twice is not None
         looks, more = (each.own.steps[each.own.is_demonstration] for each in (once, twice))

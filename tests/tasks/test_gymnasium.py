@@ -134,4 +134,4 @@ def test_an_unknown_option_is_refused(blind: gymnasium.Env) -> None:
 def test_without_gymnasium_the_way_out_is_named() -> None:
     script = f"import sys; sys.modules['gymnasium'] = None; import {gymnasium_env.__name__}"
     completed = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-    assert "pip install 'ponderpounce[gym]'" in completed.stderr
+    assert "pip install 'ponderpounce-server[gym]'" in completed.stderr

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dual_system.analysis.counterfactual import p_own
-from dual_system.tasks.pair_files import INDEX, how_shown_in, main, read_pairs, write_index, write_pair
+from dual_system.tasks.pair_files import INDEX, demo_sampling_of, main, read_pairs, write_index, write_pair
 from dual_system.tasks.pairs import Pair, Telling
 from dual_system.tasks.task import Task
 
@@ -60,8 +60,8 @@ def assert_same(a: object, b: object) -> None:
 
 def test_a_written_pair_is_read_back(tmp_path: Path) -> None:
     written = [pair(7), pair(8)]
-    write_index([write_pair(one, tmp_path) for one in written], tmp_path, demo_hz=2, video_end=True)
-    assert how_shown_in(tmp_path) == (2, True)
+    write_index([write_pair(one, tmp_path) for one in written], tmp_path, demo_hz=2, demo_to_its_end=True)
+    assert demo_sampling_of(tmp_path) == (2, True)
     for ours, theirs in zip(written, read_pairs(tmp_path), strict=True):
         assert_same(ours, theirs)
 
@@ -72,14 +72,9 @@ def test_another_schema_is_refused(tmp_path: Path) -> None:
         read_pairs(tmp_path)
 
 
-def test_a_folder_that_does_not_say_how_videos_are_shown_is_of_before(tmp_path: Path) -> None:
-    (tmp_path / INDEX).write_text('{"schema": "ponderpounce-pairs/1", "pairs": []}')
-    assert how_shown_in(tmp_path) == (1, False)
-
-
 @pytest.mark.sim
 def test_the_program_writes_pairs_that_can_be_scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--family", "reference", "--task", "PickHighlight", "--out", str(tmp_path), "--image-px", "32"]
+    arguments = ["--family", "reference", "--tasks", "PickHighlight", "--out", str(tmp_path), "--image-px", "32"]
     assert main([*arguments, "--pairs", "2"]) == 0
     assert "2 pairs of reference" in capsys.readouterr().out
     found = list(read_pairs(tmp_path))
@@ -91,7 +86,7 @@ def test_the_program_writes_pairs_that_can_be_scored(tmp_path: Path, capsys: pyt
 
 
 def test_a_task_of_another_family_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--family", "counting", "--task", "PickHighlight", "--out", str(tmp_path)]
+    arguments = ["--family", "counting", "--tasks", "PickHighlight", "--out", str(tmp_path)]
     assert main(arguments) == 2
     assert "PickHighlight: not of the counting family" in capsys.readouterr().err
 

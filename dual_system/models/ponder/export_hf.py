@@ -48,13 +48,13 @@ class ExportOptions:
     """Writes a trained model as a public folder: Qwen3.5's, pi0.5's or GR00T N1.5's."""
 
     ponder: Path | None = None
-    """PONDER's checkpoint; or"""
+    """PONDER's checkpoint. Give either this or --pounce."""
     pounce: Path | None = None
-    """POUNCE's."""
+    """POUNCE's checkpoint."""
     out: Path
-    """A folder that is not there yet."""
+    """Folder to write; it must not exist yet."""
     layout: Layout = "openpi"
-    """Of pi0.5's names: lerobot's have a leading `model.`."""
+    """Names of pi0.5's tensors: lerobot's have a leading `model.`."""
 
 
 def main(argv: list[str] | None = None, prog: str = "pp-export hf") -> int:

@@ -223,7 +223,7 @@ def test_live_commands_that_stay_away_end_the_episode(bench_with: Callable[..., 
     bench = bench_with(schedules.realtime())
     bench.ask(step_of(begins=True))
     bench.rig.clock.step = lambda: False
-    bench.rig.bus._parties[0] = lambda: False
+    bench.rig.bus._participants[0] = lambda: False
     with pytest.raises(Refused, match="the episode is over: no command for"):
         _ask_for_ever(bench, step_of)
 

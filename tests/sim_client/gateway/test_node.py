@@ -14,12 +14,12 @@ from clock import schedules
 from dual_system.models.ponder.demo_sampling import DemoSampling
 from protocol import messages as m
 from sim_client.episode import STOPPED_TICKS
-from sim_client.gateway.node import LiveNode, LockstepNode, Shown
-from sim_client.gateway.rule import ahead, as_shown
+from sim_client.gateway.node import LiveNode, LockstepNode, Measurement
+from sim_client.gateway.rule import ahead, sampled
 
 TICK_NS = 50_000_000
 START_NS = 300_000_000
-SHOWN = Shown((), np.zeros(3, np.float32))
+SHOWN = Measurement((), np.zeros(3, np.float32))
 
 
 def commanded(tick: int, level: m.Level = m.Level.PLAY) -> m.Action:
@@ -67,8 +67,8 @@ def test_every_tick_is_shown_once_in_order_and_at_its_instant(num_rows: int, num
     assert [int(observation.proprio[0]) for observation in published] == seen
 
 
-def shown_at(tick: int) -> Shown:
-    return Shown((), np.full(3, tick, np.float32))
+def shown_at(tick: int) -> Measurement:
+    return Measurement((), np.full(3, tick, np.float32))
 
 
 def _info() -> m.EpisodeInfo:
@@ -167,7 +167,7 @@ def test_rows_ahead_obey_the_limits(robot_with: Callable[..., m.Robot]) -> None:
 @pytest.mark.parametrize(("num_frames", "read"), [(0, []), (1, [0]), (20, [0]), (21, [0, 20]), (45, [0, 20, 40])])
 def test_of_a_video_ponder_reads_the_first_frame_and_one_a_second(num_frames: int, read: list[int]) -> None:
     video: Any = list(range(num_frames))
-    assert list(as_shown(video, 20, DemoSampling())) == read
+    assert list(sampled(video, 20, DemoSampling())) == read
 
 
 @pytest.mark.parametrize(
@@ -177,4 +177,4 @@ def test_of_a_video_that_is_shown_twice_a_second_and_to_its_end_ponder_reads_the
     num_frames: int, read: list[int]
 ) -> None:
     video: Any = list(range(num_frames))
-    assert list(as_shown(video, 20, DemoSampling(hz=2, to_its_end=True))) == read
+    assert list(sampled(video, 20, DemoSampling(hz=2, to_its_end=True))) == read

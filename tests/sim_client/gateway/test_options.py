@@ -11,7 +11,7 @@ import pytest
 from protocol.errors import TransportError
 from protocol.messages import DelayKind, Mode
 from sim_client.gateway.body import PANDA, read_body
-from sim_client.gateway.options import GatewayOptions
+from sim_client.gateway.options import ClientsOptions, GatewayOptions, ScheduleOptions
 
 ROBOT = """
 name = "arm"
@@ -30,12 +30,12 @@ is_simulated = true
         ({"rows": 21}, "--rows 21.*20 rows"),
         ({"rows": 0}, "--rows 0"),
         ({"dialect": "vla-eval", "rows": 5}, "plays one row"),
-        ({"rows": 8, "invoke_every_ticks": 20}, "no multiple of --rows 8"),
+        ({"rows": 8, "timing": ScheduleOptions(invoke_every_ticks=20)}, "no multiple of --rows 8"),
         ({"listen": "8000"}, "expected HOST:PORT"),
         ({"listen": "127.0.0.1:99999"}, "expected HOST:PORT"),
         ({"listen": "0.0.0.0:8000"}, "can be reached from other hosts"),
         ({"listen": "robot.example:8000"}, "can be reached from other hosts"),
-        ({"dialect": "vla-eval", "api_key_file": Path("key")}, "vla-eval sends no key"),
+        ({"dialect": "vla-eval", "clients": ClientsOptions(api_key_file=Path("key"))}, "vla-eval sends no key"),
         ({"cameras": ("front",)}, "expected NAME=KEY"),
     ],
 )
@@ -49,12 +49,12 @@ def test_what_cannot_work_is_refused(options: dict[str, Any], sentence: str) -> 
     [
         {},
         {"rows": 10},
-        {"rows": 5, "invoke_every_ticks": 10},
+        {"rows": 5, "timing": ScheduleOptions(invoke_every_ticks=10)},
         {"rows": 7, "mode": "realtime"},
         {"listen": "[::1]:8000"},
         {"listen": "localhost:8000"},
-        {"listen": "0.0.0.0:8000", "open_to_anyone": True},
-        {"listen": "0.0.0.0:8000", "api_key_file": Path("key")},
+        {"listen": "0.0.0.0:8000", "clients": ClientsOptions(open_to_anyone=True)},
+        {"listen": "0.0.0.0:8000", "clients": ClientsOptions(api_key_file=Path("key"))},
         {"cameras": ("front=image", "wrist=images/hand")},
     ],
 )
@@ -87,13 +87,14 @@ def test_in_real_time_delays_are_measured() -> None:
 
 def test_a_key_file_must_hold_a_word(tmp_path: Path) -> None:
     file = tmp_path / "key"
+    options = GatewayOptions(dialect="openpi", clients=ClientsOptions(api_key_file=file))
     with pytest.raises(TransportError, match="No such file"):
-        GatewayOptions(dialect="openpi", api_key_file=file).api_key()
+        options.api_key()
     file.write_text("\n")
     with pytest.raises(TransportError, match="expected one word"):
-        GatewayOptions(dialect="openpi", api_key_file=file).api_key()
+        options.api_key()
     file.write_text("open sesame\n")
-    assert GatewayOptions(dialect="openpi", api_key_file=file).api_key() == "open sesame"
+    assert options.api_key() == "open sesame"
 
 
 def test_the_panda_holds_where_it_is_until_its_first_command() -> None:
