@@ -172,7 +172,7 @@ def test_an_opening_without_memory_is_a_refused_session(monkeypatch: pytest.Monk
     engine = opened("ab")
     with monkeypatch.context() as patch:
         patch.setattr(engine._runner, "append", fail)
-        with pytest.raises(SessionError, match="'c': the device had no memory left"):
+        with pytest.raises(SessionError, match="'c': the device has no memory left to encode it"):
             engine.open("c", Opening(instruction="press"))
     for robot in "cd":  # the slot was given back
         engine.open(robot, Opening(instruction="press"))

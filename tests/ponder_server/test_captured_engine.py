@@ -10,7 +10,7 @@ from dual_system.models.graphs import Capture, Work, directly
 from dual_system.models.ponder.configs import tiny_cpu
 from dual_system.models.ponder.network import Ponder
 from ponder_server.__main__ import build_engine
-from ponder_server.config import PonderOptions
+from ponder_server.config import ContextOptions, PonderOptions, SpeedOptions
 from ponder_server.contract import Fire, Frame, Opening, WeightsName
 from ponder_server.draft import TrieDraft
 from ponder_server.engine import QwenEngine
@@ -121,7 +121,9 @@ def test_what_a_device_records_wrongly_never_drives_a_robot() -> None:
 
 @pytest.mark.parametrize("graphs", [True, False])
 def test_on_a_cpu_nothing_is_captured_whatever_the_option_says(graphs: bool) -> None:
-    engine = build_engine(PonderOptions(max_context_tokens=400, graphs=graphs))
+    engine = build_engine(
+        PonderOptions(context=ContextOptions(max_context_tokens=400), speed=SpeedOptions(graphs=graphs))
+    )
     assert isinstance(engine, QwenEngine)
     assert engine._config.graphs is graphs
     assert engine._runner._captured is None

@@ -3,19 +3,21 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 import torch
 
 from dual_system.models.ponder import configs as ponder_configs
+from dual_system.models.ponder.checkpoint import save_ponder
 from dual_system.models.ponder.configs import tiny_cpu
 from dual_system.models.ponder.context import Row, Transition
+from dual_system.models.ponder.demo_sampling import DemoSampling
 from dual_system.models.ponder.network import Ponder
 from dual_system.models.ponder.vocabulary import Vocabulary
 from ponder_server.__main__ import build_engine
-from ponder_server.config import PonderOptions, SizeName
+from ponder_server.config import ContextOptions, PonderOptions, RobotsOptions, SizeName, SpeedOptions
 from ponder_server.contract import ContextFull, Frame, Opening, SessionError
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
@@ -57,10 +59,10 @@ def untrained() -> Ponder:
     return Ponder.random(MODEL, VOCABULARY, seed=1)
 
 
-def training_row(ponder: Ponder, transitions: Script, opening: Opening = WITH_DEMO, notes: Script | None = None) -> Row:
+def training_row(ponder: Ponder, transitions: Script, opening: Opening = WITH_DEMO) -> Row:
     form = ponder.format
     queries = [segment for transition in transitions for segment in form.query(2, transition)]
-    return form.row([*form.opening(INSTRUCTION, [len(views) for views in opening.demo_frames], notes), *queries])
+    return form.row([*form.opening(INSTRUCTION, [len(views) for views in opening.demo_frames]), *queries])
 
 
 def encode(ponder: Ponder, row: Row, opening: Opening = WITH_DEMO) -> torch.Tensor:
@@ -70,11 +72,10 @@ def encode(ponder: Ponder, row: Row, opening: Opening = WITH_DEMO) -> torch.Tens
         return ponder.encode_row(row, torch.from_numpy(np.stack(frames)))
 
 
-def taught(script: Script, opening: Opening = WITH_DEMO, notes: Script | None = None) -> Ponder:
+def taught(script: Script, opening: Opening = WITH_DEMO) -> Ponder:
     """A PONDER whose LM head is fitted to one row's targets by least squares: trained, without training."""
     ponder = untrained()
-    ponder.format = replace(ponder.format, takes_notes=notes is not None)
-    row = training_row(ponder, script, opening, notes)
+    row = training_row(ponder, script, opening)
     hidden_NH = encode(ponder, row, opening)[torch.from_numpy(row.supervised_index)].double()
     targets = torch.tensor(row.targets)[torch.from_numpy(row.supervised_index + 1)]
     assert len(hidden_NH) < ponder.hidden_size, "more targets than the head can fit exactly"
@@ -128,8 +129,8 @@ def test_serving_regenerates_the_training_row(ponder: Ponder, engine: QwenEngine
     assert answers[-1].context_tokens == len(row.ids)
 
 
-def test_serving_regenerates_the_row_of_a_ponder_that_learned_without_words() -> None:
-    """Its LM head has learned nothing: here it says T_yes wherever it is asked."""
+def test_serving_regenerates_the_row_of_a_ponder_that_was_trained_without_texts() -> None:
+    """Its LM head is untrained: here it predicts T_yes wherever it is run."""
     ponder = taught(SCRIPT)
     ponder.format = replace(ponder.format, speaks=False)
     silence: Script = (None,) * len(SCRIPT)
@@ -485,7 +486,7 @@ def test_the_spec_says_what_the_engine_is() -> None:
 def test_example_texts_are_read_into_a_draft(tmp_path: Path) -> None:
     texts = tmp_path / "texts"
     texts.write_text("press the left button\n\npress the left lamp\n")
-    options = PonderOptions(draft_texts=texts, max_context_tokens=400)
+    options = PonderOptions(speed=SpeedOptions(draft_texts=texts), context=ContextOptions(max_context_tokens=400))
     engine = build_engine(options)
     assert isinstance(engine, QwenEngine)
     assert VOCABULARY.decode(engine._writer._draft.propose((), 99)).startswith("press the left")
@@ -493,4 +494,22 @@ def test_example_texts_are_read_into_a_draft(tmp_path: Path) -> None:
 
 def test_every_robot_needs_a_session() -> None:
     with pytest.raises(ValueError, match="3 robots need as many sessions: --max-sessions is 2"):
-        build_engine(PonderOptions(other_robots=("r1", "r2")))
+        build_engine(PonderOptions(robots=RobotsOptions(other_robots=("r1", "r2"))))
+
+
+@pytest.mark.parametrize(
+    ("asked", "expected"),
+    [
+        ({}, DemoSampling(hz=2)),
+        ({"demo_hz": 4}, DemoSampling(hz=4)),
+        ({"demo_to_its_end": True}, DemoSampling(hz=2, to_its_end=True)),
+    ],
+)
+def test_the_engine_asks_for_demonstrations_as_in_training_or_as_it_was_started(
+    tmp_path: Path, asked: dict[str, Any], expected: DemoSampling
+) -> None:
+    trained = untrained()
+    trained.format = replace(trained.format, demonstrations=DemoSampling(hz=2))
+    save_ponder(trained, tmp_path)
+    context = ContextOptions(max_context_tokens=400, **asked)
+    assert build_engine(PonderOptions(checkpoint=tmp_path, context=context)).spec.demonstrations == expected

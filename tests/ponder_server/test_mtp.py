@@ -24,7 +24,7 @@ from dual_system.models.ponder.mtp import MtpHead
 from dual_system.models.ponder.network import Ponder
 from dual_system.models.ponder.vocabulary import Vocabulary
 from ponder_server.__main__ import build_engine
-from ponder_server.config import PonderOptions
+from ponder_server.config import ContextOptions, PonderOptions, SpeedOptions
 from ponder_server.contract import Fire, Opening, Outcome
 from ponder_server.draft import Draft, FirstOf, NoDraft, TrieDraft
 from ponder_server.engine import QwenEngine
@@ -275,10 +275,10 @@ def test_examples_go_first_and_the_head_where_they_say_nothing() -> None:
 def test_a_checkpoint_with_a_head_uses_it_if_told_to(tmp_path: Path) -> None:
     ponder = foreseen(0.0)
     save_ponder(ponder, tmp_path / "with")
-    options = PonderOptions(checkpoint=tmp_path / "with", max_context_tokens=400)
+    options = PonderOptions(checkpoint=tmp_path / "with", context=ContextOptions(max_context_tokens=400))
     num_heard = {}
     for num_tokens in (0, 3):
-        engine = build_engine(replace(options, draft_tokens=num_tokens))
+        engine = build_engine(replace(options, speed=SpeedOptions(draft_tokens=num_tokens)))
         assert isinstance(engine, QwenEngine)
         engine.open("a", Opening(instruction="press"))
         heard: list[None] = []
@@ -290,7 +290,13 @@ def test_a_checkpoint_with_a_head_uses_it_if_told_to(tmp_path: Path) -> None:
 def test_a_checkpoint_without_a_head_serves_as_before(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     save_ponder(Ponder.random(MODEL, VOCABULARY, seed=2), tmp_path / "without")
     with caplog.at_level(logging.WARNING):
-        engine = build_engine(PonderOptions(checkpoint=tmp_path / "without", draft_tokens=3, max_context_tokens=400))
+        engine = build_engine(
+            PonderOptions(
+                checkpoint=tmp_path / "without",
+                speed=SpeedOptions(draft_tokens=3),
+                context=ContextOptions(max_context_tokens=400),
+            )
+        )
     assert "have no multi-token prediction" in caplog.text
     engine.open("a", Opening(instruction="press"))
     assert engine.fire("a", FRAMES * 2).cognition.shape == (1, 48)

@@ -17,7 +17,7 @@ from dual_system.models.ponder.checkpoint import save_ponder
 from dual_system.models.ponder.configs import tiny_cpu
 from dual_system.models.ponder.network import Ponder
 from ponder_server.__main__ import build_engine
-from ponder_server.config import PonderOptions
+from ponder_server.config import ContextOptions, PonderOptions, SpeedOptions
 from ponder_server.contract import Opening, WeightsName
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
@@ -73,7 +73,7 @@ def test_the_change_of_cognition_that_is_told_is_the_one_that_is_seen(weights: W
 
 
 def test_unquantised_is_the_default() -> None:
-    engine = build_engine(PonderOptions(max_context_tokens=400))
+    engine = build_engine(PonderOptions(context=ContextOptions(max_context_tokens=400)))
     assert isinstance(engine, QwenEngine)
     assert (engine.spec.weights, engine.spec.cognition_error) == ("float", 0)
     assert not any(isinstance(module, Int8Linear | Fp8Linear) for module in engine._ponder.modules())
@@ -101,7 +101,9 @@ def test_the_server_says_it_in_its_health_and_log(
 @narrow
 def test_a_checkpoint_is_loaded_as_ever_and_then_made_narrow(weights: WeightsName, tmp_path: Path) -> None:
     save_ponder(Ponder.random(MODEL, seed=1), tmp_path)
-    options = PonderOptions(checkpoint=tmp_path, weights=weights, max_context_tokens=200)
+    options = PonderOptions(
+        checkpoint=tmp_path, speed=SpeedOptions(weights=weights), context=ContextOptions(max_context_tokens=200)
+    )
     config = replace(CONFIG, num_cameras=2)
     loaded, made = build_engine(options), QwenEngine(Ponder.random(MODEL, seed=1), replace(config, weights=weights))
     assert isinstance(loaded, QwenEngine)

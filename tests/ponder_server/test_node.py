@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from dual_system.models.eyes import Eye
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ponder_server.contract import EngineSpec, Fire, Note, Text
+from dual_system.models.small_pair.reading import CropReader
+from ponder_server.contract import EngineSpec, Fire, Text
 from ponder_server.node import KEEP_QUERIES, PonderNode, check_robot
 from protocol import images
 from protocol import messages as m
-from protocol.errors import MalformedMessage
+from protocol.errors import EpisodeRefused, MalformedMessage
 
 SPEC = EngineSpec(
     num_carriers=1, hidden_size=4, image_px=(4, 6), num_cameras=2, max_context_tokens=100, model_hash="abc",
@@ -125,37 +125,47 @@ def test_frames_of_another_engine_are_refused_and_displace_nothing(
     assert worked(node) == [0]
 
 
-def robot(px: tuple[int, int], cameras: tuple[str, ...] = ("front", "wrist")) -> m.Robot:
+def robot(px: tuple[int, int], cameras: tuple[str, ...] = ("front", "wrist"), *, num_proprio: int = 8) -> m.Robot:
     none = np.zeros(1, np.float32)
     return m.Robot(
         name="arm", command_low=none, command_high=none, max_step=none, initial_command=none, cameras=cameras,
-        image_height=px[0], image_width=px[1], num_proprio=1, is_simulated=True,
+        image_height=px[0], image_width=px[1], num_proprio=num_proprio, is_simulated=True,
     )  # fmt: skip
 
 
-WITH_EYES = dataclasses.replace(SPEC, eyes=(Eye(camera=1, box=(0.5, 0.0, 1.0, 0.5)),))
+READS_CROP = dataclasses.replace(
+    SPEC,
+    reader=CropReader(camera=1, box=(0.5, 0, 1, 0.5), first_state_id=9, num_finger_bins=1, num_height_bins=1),
+)
 
 
 @pytest.mark.parametrize("px", [(8, 12), (16, 24)])
-def test_eyes_read_cameras_of_several_sizes(px: tuple[int, int]) -> None:
-    check_robot(robot(px), WITH_EYES)
-    node = PonderNode(WITH_EYES)
+def test_a_crop_is_read_of_cameras_of_several_sizes(px: tuple[int, int]) -> None:
+    check_robot(robot(px), READS_CROP)
+    node = PonderNode(READS_CROP)
     node.on_observation(look(0, px=px))
     node.on_query(ask(0, 0))
     assert worked(node) == [0]
 
 
-def test_a_robot_that_tells_too_little_of_itself_is_refused_where_that_is_read() -> None:
-    check_robot(robot((4, 6)), SPEC)
-    with pytest.raises(ValueError, match="tells 1 numbers of itself; this PONDER reads 8"):
-        check_robot(robot((4, 6)), dataclasses.replace(SPEC, reads_proprio=True))
+def test_a_robot_with_another_state_is_refused_where_it_is_read() -> None:
+    check_robot(robot((4, 6), num_proprio=1), SPEC)
+    with pytest.raises(EpisodeRefused, match="a state of 1 numbers; this PONDER reads 8") as refused:
+        check_robot(robot((8, 12), num_proprio=1), READS_CROP)
+    assert refused.value.refusal is m.Refusal.ROBOT
 
 
-def test_eyes_refuse_what_they_cannot_read_at_open_and_later() -> None:
-    with pytest.raises(ValueError, match="camera 'wrist' gives 10 x 12 px; PONDER reads 8 x 12 or 16 x 24"):
-        check_robot(robot((10, 12)), WITH_EYES)
+def test_a_robot_with_another_number_of_cameras_is_refused() -> None:
+    with pytest.raises(EpisodeRefused, match=r"has 1 cameras \['front'\]; PONDER expects 2") as refused:
+        check_robot(robot((4, 6), ("front",)), SPEC)
+    assert refused.value.refusal is m.Refusal.CAMERAS
+
+
+def test_cameras_that_cannot_be_read_are_refused_at_open_and_later() -> None:
+    with pytest.raises(EpisodeRefused, match="camera 'wrist' gives 10 x 12 px; PONDER reads 8 x 12 or 16 x 24"):
+        check_robot(robot((10, 12)), READS_CROP)
     with pytest.raises(MalformedMessage, match=r"Image\.camera1: expected 8 x 12 or 16 x 24 .* came 10 x 12 px"):
-        PonderNode(WITH_EYES).on_observation(look(0, px=(10, 12)))
+        PonderNode(READS_CROP).on_observation(look(0, px=(10, 12)))
 
 
 def test_bytes_that_are_no_picture_cost_their_query_only(node: PonderNode) -> None:
@@ -200,16 +210,6 @@ def test_texts_are_for_the_log(node: PonderNode) -> None:
     assert [(s.kind, s.text, s.token_ids, s.is_truncated, s.query, s.tick) for s in subgoals] == [
         (m.SubgoalKind.SUBGOAL, "pick the red cube", (4, 5), False, 5, 3),
         (m.SubgoalKind.DEMO_REASONING, "first", (6,), True, 5, 3),
-    ]
-
-
-def test_notes_of_the_demonstration_are_for_the_log_with_the_instant_that_they_are_of(node: PonderNode) -> None:
-    note = Text(kind="subgoal", text="at <1, 2>", token_ids=(4, 5), truncated=False)
-    subgoal = dataclasses.replace(note, text="pick")
-    _, subgoals = answered(node, texts=(subgoal,), notes=(Note(instant=2, text=note),))
-    assert [(s.kind, s.text, s.token_ids, s.query, s.tick) for s in subgoals] == [
-        (m.SubgoalKind.DEMO_NOTE, "at <1, 2>", (4, 5), None, 2),
-        (m.SubgoalKind.SUBGOAL, "pick", (4, 5), 5, 3),
     ]
 
 

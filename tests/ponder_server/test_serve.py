@@ -223,11 +223,11 @@ def test_a_real_engine_restarts_as_if_it_had_never_died(
 ) -> None:
     """The tiny network on the CPU: a rebuilt context gives the same hidden states, bit for bit."""
     from ponder_server.__main__ import build_engine
-    from ponder_server.config import PonderOptions
+    from ponder_server.config import ContextOptions, PonderOptions
 
     vectors = []
     for is_restarted in (False, True):
-        engines = [build_engine(PonderOptions(max_context_tokens=2048)) for _ in range(2)]
+        engines = [build_engine(PonderOptions(context=ContextOptions(max_context_tokens=2048))) for _ in range(2)]
         for engine in engines:
             engine.warm_up = lambda: [1]  # type: ignore[method-assign]
         spec = engines[0].spec

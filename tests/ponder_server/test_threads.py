@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from dual_system.models.ponder.configs import tiny_cpu
 from dual_system.models.ponder.network import Ponder
 from ponder_server.__main__ import build_engine
-from ponder_server.config import PonderOptions
+from ponder_server.config import ContextOptions, PonderOptions, SpeedOptions
 from ponder_server.contract import Opening
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
@@ -159,7 +159,9 @@ def test_there_are_no_more_threads_than_cores(
     wanted: int, count: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr("ponder_server.threads.num_usable_cores", lambda: 2)
-    engine = build_engine(PonderOptions(attention_threads=wanted, max_context_tokens=400))
+    engine = build_engine(
+        PonderOptions(speed=SpeedOptions(attention_threads=wanted), context=ContextOptions(max_context_tokens=400))
+    )
     assert isinstance(engine, QwenEngine)
     assert engine._runner._threads.count == count
     assert ("--attention-threads 9: this process may use 2 core(s)" in caplog.text) == (wanted == 9)
