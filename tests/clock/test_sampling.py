@@ -29,10 +29,6 @@ def drawn(seed: int, clocks: Clocks, num_ticks: int, **options: object) -> Sampl
     return sample_schedule(np.random.default_rng(seed), clocks, num_ticks, **options)  # type: ignore[arg-type]
 
 
-def test_without_spread_the_paper_s_clocks_are_those_of_evaluation_but_for_pounce() -> None:
-    assert replace(ROBOMME.without_spread(), invoke=EVALUATION.invoke) == EVALUATION
-
-
 @given(
     query_ms=st.integers(50, 2_500),
     invoke_ticks=st.integers(1, 12),

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from clock import membership, schedules
+from clock import schedules
 from clock.service import ROBOT_SILENCE_NS, ClockService, ServiceConfig
+from model_server import membership
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.link import Link

@@ -11,7 +11,7 @@ from dual_system.models.groot.prompt import prompt_text
 from dual_system.models.pounce.checkpoint import random_bundle, save_bundle
 from dual_system.models.pounce.configs import tiny_groot
 from pounce_server.__main__ import build_engine
-from pounce_server.config import PounceOptions
+from pounce_server.config import PounceOptions, RandomOptions
 from pounce_server.contract import PounceEngine, Request, example_request
 from pounce_server.engine import EagerEngine
 
@@ -27,7 +27,7 @@ def request_(engine: EagerEngine) -> Request:
 
 
 def test_one_flag_swaps_the_family() -> None:
-    pi05, groot = (build_engine(PounceOptions(family=family)) for family in ("pi05", "groot"))
+    pi05, groot = (build_engine(PounceOptions(random=RandomOptions(family=family))) for family in ("pi05", "groot"))
     assert (pi05.spec.num_steps, groot.spec.num_steps) == (10, 4)
     same = {"num_steps": 0, "model_hash": ""}
     assert replace(pi05.spec, **same) == replace(groot.spec, **same), "to the clock both are the same server"
@@ -37,7 +37,7 @@ def test_a_checkpoint_knows_its_family_and_contradicts_a_wrong_flag(tmp_path: Pa
     save_bundle(random_bundle(tiny_groot(), seed=0), tmp_path)
     assert build_engine(PounceOptions(checkpoint=tmp_path)).spec.num_steps == 4
     with pytest.raises(ValueError, match=r"holds groot; leave --family pi05 out"):
-        build_engine(PounceOptions(checkpoint=tmp_path, family="pi05"))
+        build_engine(PounceOptions(checkpoint=tmp_path, random=RandomOptions(family="pi05")))
 
 
 def test_rows_are_finite_absolute_targets_that_vary(engine: EagerEngine, request_: Request) -> None:

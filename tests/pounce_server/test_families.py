@@ -114,7 +114,7 @@ MISFITS: dict[str, tuple[ActionSpace, dict[str, Any], str]] = {
         "this checkpoint moves the tool (ee_delta) and knows the Panda's arm only; panda_wristcam has joint limits",
     ),
     "an arm of fewer joints": ("ee_delta", {"command_low": np.full(4, -1, np.float32)}, "knows the Panda's arm only"),
-    "one camera": ("joint_delta", {"cameras": ("front",)}, "sees through 2 cameras, the robot has 1: front"),
+    "one camera": ("joint_delta", {"cameras": ("front",)}, "POUNCE reads 2 cameras, the robot has 1: front"),
     "two fingers": ("ee_delta", {"num_proprio": 9}, "POUNCE reads 8 joint values, the robot has 9"),
 }
 

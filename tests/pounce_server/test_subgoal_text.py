@@ -1,4 +1,4 @@
-"""A POUNCE that reads text is told the subgoal of the moment: PONDER's of the query referred to, or the task's."""
+"""A POUNCE that reads text gets the subgoal of the moment: PONDER's of the query referred to, or the task's."""
 
 from __future__ import annotations
 
@@ -10,50 +10,50 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pounce_server.told import Source, Told
 
 from pounce_server.serve import PounceServer
+from pounce_server.subgoal_text import Source, SubgoalText
 from protocol import messages as m
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
 from protocol.topics import SUBGOAL
 
 
-def asked(tick: int, ref_query: int | None) -> m.Invocation:
+def invocation(tick: int, ref_query: int | None) -> m.Invocation:
     return m.Invocation(
         invocation=0, tick=tick, now_ns=0, ref_query=ref_query, age_ns=0, cognition=np.zeros((0, 0), np.float32), seed=0
     )
 
 
-def said(kind: m.SubgoalKind, text: str, *, tick: int = 0, query: int | None = None) -> m.Subgoal:
+def subgoal(kind: m.SubgoalKind, text: str, *, tick: int = 0, query: int | None = None) -> m.Subgoal:
     return m.Subgoal(kind=kind, text=text, tick=tick, query=query)
 
 
 @given(st.sets(st.integers(0, 20), min_size=1), st.none() | st.integers(0, 25))
-def test_it_is_the_newest_that_the_invocation_may_know(written_at: set[int], ref_query: int | None) -> None:
-    told = Told("ponder")
+def test_the_text_is_the_newest_that_the_invocation_may_know(written_at: set[int], ref_query: int | None) -> None:
+    texts = SubgoalText("ponder")
     for query in sorted(written_at):
-        told.hear(said(m.SubgoalKind.SUBGOAL, f"text {query}", query=query))
-        told.hear(said(m.SubgoalKind.TASK_GROUNDED, "the oracle's", tick=query))
+        texts.on_subgoal(subgoal(m.SubgoalKind.SUBGOAL, f"text {query}", query=query))
+        texts.on_subgoal(subgoal(m.SubgoalKind.TASK_GROUNDED, "the oracle's", tick=query))
     known = [query for query in written_at if ref_query is not None and query <= ref_query]
-    assert told.at(asked(0, ref_query)) == (f"text {max(known)}" if known else "")
+    assert texts.at(invocation(0, ref_query)) == (f"text {max(known)}" if known else "")
 
 
-def test_the_oracle_s_is_the_task_s_at_this_tick_as_ponder_would_write_it() -> None:
-    told = Told("oracle")
-    told.hear(said(m.SubgoalKind.TASK_GROUNDED, "press at <128, 64>"))
-    told.hear(said(m.SubgoalKind.TASK_SIMPLE, "pick", tick=30))
-    told.hear(said(m.SubgoalKind.TASK_GROUNDED, "pick at <10, 20>", tick=30))
-    told.hear(said(m.SubgoalKind.SUBGOAL, "PONDER's", query=0))
-    assert [told.at(asked(tick, 0)) for tick in (0, 29, 30)] == [
+def test_the_oracle_s_text_is_the_task_s_at_this_tick_as_ponder_would_write_it() -> None:
+    texts = SubgoalText("oracle")
+    texts.on_subgoal(subgoal(m.SubgoalKind.TASK_GROUNDED, "press at <128, 64>"))
+    texts.on_subgoal(subgoal(m.SubgoalKind.TASK_SIMPLE, "pick", tick=30))
+    texts.on_subgoal(subgoal(m.SubgoalKind.TASK_GROUNDED, "pick at <10, 20>", tick=30))
+    texts.on_subgoal(subgoal(m.SubgoalKind.SUBGOAL, "PONDER's", query=0))
+    assert [texts.at(invocation(tick, 0)) for tick in (0, 29, 30)] == [
         "press at [250, 500]", "press at [250, 500]", "pick at [78, 39]",
     ]  # fmt: skip
-    told.clear()
-    assert told.at(asked(99, 9)) == ""
+    texts.clear()
+    assert texts.at(invocation(99, 9)) == ""
 
 
 @pytest.fixture
-def told_rig(new_rig: Callable[..., Any], fake_pounce: Any) -> Callable[[Source], Any]:
+def text_rig(new_rig: Callable[..., Any], fake_pounce: Any) -> Callable[[Source], Any]:
     """A rig whose POUNCE reads text."""
     fake_pounce.spec = dataclasses.replace(fake_pounce.spec, num_carriers=0, reads_subgoal=True)
 
@@ -71,9 +71,9 @@ def told_rig(new_rig: Callable[..., Any], fake_pounce: Any) -> Callable[[Source]
 
 
 def test_the_texts_of_an_episode_reach_the_engine(
-    told_rig: Callable[[Source], Any], episode_info: Callable[..., m.EpisodeInfo], paper: m.Schedule
+    text_rig: Callable[[Source], Any], episode_info: Callable[..., m.EpisodeInfo], paper: m.Schedule
 ) -> None:
-    rig = told_rig("oracle")
+    rig = text_rig("oracle")
     info = episode_info(paper)
     spoken: list[int] = []
 
@@ -82,16 +82,16 @@ def test_the_texts_of_an_episode_reach_the_engine(
         conductor = rig.clock.conductor
         if conductor is not None and conductor.tick >= 30 and not spoken:
             spoken.append(30)
-            rig.links["sim"].publish(SUBGOAL, said(m.SubgoalKind.TASK_GROUNDED, "place", tick=30), at_ns=0)
+            rig.links["sim"].publish(SUBGOAL, subgoal(m.SubgoalKind.TASK_GROUNDED, "place", tick=30), at_ns=0)
 
     rig.meanwhile = speak
     rig.run(info, 70)
     assert [request.subgoal for request in rig.pounce_engine.requests] == ["", "", "place", "place"]
 
 
-def test_one_that_reads_cognition_is_told_no_text(
-    told_rig: Callable[[Source], Any], fake_pounce: Any, episode_info: Any, paper: m.Schedule
+def test_a_pounce_that_reads_cognition_gets_no_text(
+    text_rig: Callable[[Source], Any], fake_pounce: Any, episode_info: Any, paper: m.Schedule
 ) -> None:
     fake_pounce.spec = dataclasses.replace(fake_pounce.spec, num_carriers=2, reads_subgoal=False)
-    reply = told_rig("oracle").open(episode_info(paper))
+    reply = text_rig("oracle").open(episode_info(paper))
     assert "reads cognition and no subgoals" in reply.error
