@@ -81,6 +81,9 @@ class _Asked:
 class Conductor:
     """One episode's schedule. All instants are episode time.
 
+    One state machine, because every event may change what is due next: a query, an invocation, the tick that is
+    played, or the rung of the ladder.
+
     Attributes:
         info: what was agreed when the episode was opened.
         committed_ticks: ticks that will be played whatever a new chunk says (told to POUNCE).

@@ -96,7 +96,11 @@ class _Episode:
 
 
 class ClockService:
-    """One robot's clock. ``step`` does what is due and says whether anything was; ``wait_ns``, how long to wait."""
+    """One robot's clock. ``step`` does what is due and says whether anything was; ``wait_ns``, how long to wait.
+
+    One class, because calls and streams meet in one episode: a call opens or closes it, and every message is judged by
+    which one is open.
+    """
 
     def __init__(self, link: Link, config: ServiceConfig, *, host_clock: MonotonicClock | None = None) -> None:
         self._link = link

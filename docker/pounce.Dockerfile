@@ -12,7 +12,8 @@ WORKDIR /app
 COPY pyproject.toml README.md requirements.txt ./
 COPY protocol protocol
 COPY clock clock
-COPY ponderpounce ponderpounce
+COPY dual_system dual_system
+COPY model_server model_server
 COPY pounce_server pounce_server
 RUN pip install --no-cache-dir -c requirements.txt ".[serve]"
 

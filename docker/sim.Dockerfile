@@ -12,7 +12,8 @@ WORKDIR /app
 COPY pyproject.toml README.md requirements.txt ./
 COPY protocol protocol
 COPY clock clock
-COPY ponderpounce ponderpounce
+COPY dual_system dual_system
+COPY model_server model_server
 COPY sim_client sim_client
 RUN pip install --no-cache-dir -c requirements.txt ".[sim,replay]"
 # Only its meshes are used. Its own pins contradict numpy 2, hence --no-deps.

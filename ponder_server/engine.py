@@ -61,7 +61,11 @@ WARM_UP_PROPRIO = np.zeros(ROBOT_DIM, np.float32)
 
 
 class QwenEngine:
-    """A ``BatchingEngine`` on one device, one call at a time."""
+    """A ``BatchingEngine`` on one device, one call at a time.
+
+    One class, because a session's promise is kept across its methods: whatever ends a call early, contexts, queries on
+    their way and slots are as they were.
+    """
 
     def __init__(
         self, ponder: Ponder, config: EngineConfig, draft: Draft | None = None, *, capture: Capture | None = None

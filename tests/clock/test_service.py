@@ -125,7 +125,7 @@ class TestUntrainedWeights:
         rig = fitted(ponder, pounce)
         serve_time(rig)
         reply = rig.open(episode_info(paper, robot=robot_with(is_simulated=False)))
-        assert reply.error == f"{who} run untrained weights; a real robot is not theirs to move."
+        assert reply.error == f"{who} run untrained weights, which never move a real robot."
 
     def test_move_a_simulated_one_with_a_warning(
         self, fitted: Callable[..., Any], episode_info: Info, paper: m.Schedule, ponder: Any, pounce: Any, who: str

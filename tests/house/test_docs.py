@@ -24,6 +24,8 @@ PAGES = {
     for path in (*sorted((ROOT / "docs").glob("*.md")), *sorted(ROOT.glob("*.md")))
 }
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+ROOMS = ("protocol", "clock", "model_server", "dual_system", "ponder_server", "pounce_server", "sim_client")
+FOLDERS = (*ROOMS, "benchmarks", "tests", "examples", "docker", "docs")
 every_page = pytest.mark.parametrize("page", PAGES)
 
 
@@ -43,8 +45,7 @@ def test_links_lead_somewhere(page: str) -> None:
 
 @every_page
 def test_files_that_are_named_exist(page: str) -> None:
-    rooms = "protocol|clock|ponderpounce|ponder_server|pounce_server|sim_client|benchmarks|tests|examples|docker|docs"
-    named = re.findall(rf"(?<![\w/.-])((?:{rooms})/[\w./-]*\w)", code(PAGES[page]))
+    named = re.findall(rf"(?<![\w/.-])((?:{'|'.join(FOLDERS)})/[\w./-]*\w)", code(PAGES[page]))
     gymnasium_ids = {name for name in named if re.search(r"-v\d+$", name)}
     assert [name for name in named if not (ROOT / name).exists() and name not in gymnasium_ids] == []
 
@@ -53,7 +54,7 @@ def test_files_that_are_named_exist(page: str) -> None:
 def _options() -> set[str]:
     """Every option that one of our programs has: fields of the dataclasses that tyro reads, and ``--no-`` of flags."""
     found = {"--help"}
-    for path in ("protocol", "clock", "ponder_server", "pounce_server", "sim_client", "ponderpounce", "benchmarks"):
+    for path in (*ROOMS, "benchmarks"):
         for file in (ROOT / path).rglob("*.py"):
             for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.ClassDef) and node.name.endswith(("Options", "Config")):
