@@ -82,7 +82,6 @@ bench: setup
 	$(BIN)/python -m benchmarks.ponder_latency
 	$(BIN)/python -m benchmarks.ponder_concurrency
 	$(BIN)/python -m benchmarks.training_throughput
-	$(BIN)/python -m benchmarks.training_update
 	$(BIN)/python -m benchmarks.playback_jitter
 	$(BIN)/python -m benchmarks.episode_throughput
 	$(BIN)/python -m benchmarks.fault_drill

@@ -16,11 +16,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from clock.membership import percentile_ns
 
 from benchmarks.report import Report, Row, show, spread
 from dual_system.models.ponder.configs import tiny_cpu
 from dual_system.models.ponder.network import Ponder
+from model_server.shell import percentile_ns
 from ponder_server.admission import Admission
 from ponder_server.contract import Frame, Opening, SessionError
 from ponder_server.engine import QwenEngine

@@ -19,9 +19,6 @@ from typing import Literal
 
 import numpy as np
 import torch
-from dual_system.models.eyes import readable_sizes
-from dual_system.training.nudge import NO_NUDGE
-from dual_system.training.training_episode import TrainingEpisode
 from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.report import Report, Row, show, spread
@@ -29,12 +26,12 @@ from dual_system.models.pi05.pounce import freeze
 from dual_system.models.ponder import configs as ponder_configs
 from dual_system.models.ponder.network import Ponder
 from dual_system.models.pounce.checkpoint import PounceBundle, random_bundle
-from dual_system.models.pounce.configs import in_space
 from dual_system.models.pounce.family import action_loss, sample_times
 from dual_system.training.collate import collate_ponder, collate_pounce
+from dual_system.training.episode import TrainingEpisode
 from dual_system.training.example import make_example
 from dual_system.training.joint import Draws, JointModel, PonderBatch, PounceBatch, encode_rows
-from dual_system.training.recipe import Recipe, stages_of
+from dual_system.training.recipe import Recipe
 from dual_system.training.recipes import recipe
 from dual_system.training.trainer import Trainer
 from protocol.command_line import parse
@@ -112,8 +109,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _build(options: ThroughputOptions) -> tuple[JointModel, PounceBundle, Recipe]:
-    *_, run = stages_of(recipe(options.recipe))
-    run = replace(run, pounce=in_space(run.pounce, "joint_delta"))  # statistics of no data are RoboMME's
+    run = recipe(options.recipe)
     if options.ponder != "recipe":
         ponder_config = getattr(ponder_configs, options.ponder)()
         cognition = replace(run.pounce.cognition, cognition_size=ponder_config.hidden_size)
@@ -130,13 +126,16 @@ def _batch(
     model: JointModel, bundle: PounceBundle, run: Recipe, options: ThroughputOptions
 ) -> tuple[PonderBatch, PounceBatch]:
     rng = np.random.default_rng(0)
-    (height, width), *_ = readable_sizes(model.ponder.format.eyes, model.ponder.image_px)
-    views = tuple(rng.integers(0, 256, (height, width, 3), np.uint8) for _ in range(2))
+    images, views = (
+        tuple(rng.integers(0, 256, (*size, 3), np.uint8) for _ in range(2))
+        for size in (model.ponder.image_px, (bundle.model.config.image_px,) * 2)
+    )
     recorded = [
         TrainingEpisode(
             instruction="watch the video, then do the same",
-            demo=(views,) * options.demo,
-            frames=[views] * ticks,
+            demo=(images,) * options.demo,
+            images=[images] * ticks,
+            views=[views] * ticks,
             state_T8=rng.uniform(-0.2, 0.2, (ticks, 8)).astype(np.float32),
             action_T8=rng.uniform(-0.2, 0.2, (ticks, 8)).astype(np.float32),
             subgoals=[f"pick cube {1 + tick // 50} at <{50 + tick // 50}, 120>" for tick in range(ticks)],
@@ -144,9 +143,7 @@ def _batch(
         )
         for ticks in options.ticks
     ]
-    form = model.ponder.format
-    config = replace(run.example, nudge=NO_NUDGE)  # of hands that act in another space
-    examples = [make_example(episode, form, config, rng) for episode in recorded]
+    examples = [make_example(episode, model.ponder.format, run.example, rng) for episode in recorded]
     episodes = collate_ponder(examples)
     invocations = collate_pounce(examples, bundle.model.config, bundle.tokenizer, bundle.statistics)
     return episodes.to(options.device), invocations.to(options.device)
