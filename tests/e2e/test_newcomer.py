@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from dual_system import commands
 from dual_system.analysis import tables
-from dual_system.data import collect
-from dual_system.training import diagnose, train
+from dual_system.training import train
 from sim_client import evaluate
 
 pytestmark = [pytest.mark.e2e, pytest.mark.sim, pytest.mark.slow]
@@ -20,14 +20,14 @@ def test_from_nothing_to_tables(tmp_path: Path) -> None:
     pair = ("--ponder-checkpoint", f"{run}/ponder", "--pounce-checkpoint", f"{run}/pounce")
     few = ("--tasks", "PickHighlight", "--episodes", "1", "--runs", "1", "--max-steps", "41", "--no-progress")
     collected = ("--tasks", "PickHighlight", "--episodes", "2", "--frames", "training", "--invocation-hz", "1")
-    assert collect.main([*collected, "--workers", "1", "--out", data, "--no-progress"]) == 0
+    assert commands.collect([*collected, "--workers", "1", "--out", data, "--no-progress"]) == 0
     trained = ("--recipe", "tiny", "--steps", "2", "--batch-episodes", "1", "--max-invocations", "2")
     assert train.main([*trained, "--data", data, "--out", run, "--no-progress"]) == 0
     for name, cognition in (("real", "real"), ("null", "null")):
         folder = str(tmp_path / name)
         assert evaluate.main([*pair, *few, "--cognition", cognition, "--out", folder]) == 0
     diagnosed = ("--ponder", f"{run}/ponder", "--pounce", f"{run}/pounce", "--draws", "1")
-    assert diagnose.main([*diagnosed, "--data", data, "--out", f"{run}/diagnosis", "--no-progress"]) == 0
+    assert commands.diagnose([*diagnosed, "--data", data, "--out", f"{run}/diagnosis", "--no-progress"]) == 0
     folders = [str(tmp_path / "real"), str(tmp_path / "null"), f"{run}/diagnosis"]
     assert tables.main([*folders, "--out", out]) == 0
 

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import json
-from itertools import product
 from pathlib import Path
 
-import numpy as np
 import pytest
-from dual_system.models.specialty import specialist_for
 
-from dual_system.models.ponder.checkpoint import load_ponder
+from dual_system.models.ponder.checkpoint import load_ponder, weights_hash
 from dual_system.models.pounce.checkpoint import load_bundle
-from dual_system.tasks.difficulty import DIFFICULTIES
-from dual_system.tasks.task import make_task, task_names
 from sim_client import evaluate
 
 CHECKPOINTS = Path(__file__).parents[2] / "checkpoints"
@@ -22,56 +17,26 @@ NUM_SCENES, FIRST_SEED = 6, 100_000
 MOST_BYTES = 20_000_000
 
 
-@pytest.mark.parametrize("name", ["small", "several"])
-def test_it_is_trained(name: str) -> None:
-    assert not load_ponder(CHECKPOINTS / name / "ponder").is_random
-    bundle = load_bundle(CHECKPOINTS / name / "pounce")
+def test_it_is_trained() -> None:
+    assert not load_ponder(SHIPPED / "ponder").is_random
+    bundle = load_bundle(SHIPPED / "pounce")
     assert not bundle.is_random
     assert not bundle.has_fresh_prefix
 
 
-def test_each_pair_is_small() -> None:
-    pairs = [folder.parent for folder in CHECKPOINTS.glob("*/ponder")]
-    assert len(pairs) == 2
-    for pair in pairs:
-        files = [path for system in ("ponder", "pounce") for path in (pair / system).iterdir()]
-        assert sum(path.stat().st_size for path in files) < MOST_BYTES
+def test_the_pair_is_small_and_the_only_one() -> None:
+    assert [path.name for path in CHECKPOINTS.iterdir()] == [SHIPPED.name]
+    files = [path for system in ("ponder", "pounce") for path in (SHIPPED / system).iterdir()]
+    assert sum(path.stat().st_size for path in files) < MOST_BYTES
 
 
-def test_who_knows_several_tasks_was_told_of_them_in_few_words() -> None:
-    """Without pieces of their own its texts would take half as many tokens again."""
-    vocabulary = load_ponder(CHECKPOINTS / "several" / "ponder").format.vocabulary
-    old = load_ponder(SHIPPED / "ponder").format.vocabulary
-    text = "pick up the container at [334, 646] that hides the red cube"
-    assert vocabulary.decode(vocabulary.encode(text)) == text
-    assert len(vocabulary.encode(text)) < 0.75 * len(old.encode(text))
-    known = "pick up the first highlighted cube at [441, 430], which is blue"
-    assert vocabulary.encode(known) == old.encode(known)
-
-
-def test_its_specialist_is_for_the_tasks_that_count_and_no_others() -> None:
-    specialties = load_ponder(CHECKPOINTS / "several" / "ponder").format.specialties
-    counting = {"PickXtimes", "SwingXtimes", "BinFill"}
-    for name in task_names():
-        task = make_task(name)
-        for difficulty, seed in product(DIFFICULTIES, range(8)):
-            instruction = task.instruction(task.sample(np.random.default_rng(seed), difficulty))
-            assert (specialist_for(specialties, instruction) == "counting") == (name in counting), instruction
-
-
-@pytest.mark.parametrize("name", ["small", "several"])
-def test_both_of_a_pair_are_told_the_fingers_alike(name: str) -> None:
-    told = load_ponder(CHECKPOINTS / name / "ponder").format.proprioception
-    assert told is not None
-    assert told.grip == load_bundle(CHECKPOINTS / name / "pounce").statistics.grip
-
-
-@pytest.mark.parametrize(("name", "without_fingers"), [("small", set()), ("several", {"PatternLock", "RouteStick"})])
-def test_its_results_are_of_this_hand(name: str, without_fingers: set[str]) -> None:
-    """Where a robot has no fingers a grip changes nothing, and what was played before there was one is kept."""
-    results = json.loads((CHECKPOINTS / name / "results" / "real" / "results.json").read_text())
-    hands = {e["models"]["pounce"]["model_hash"] for e in results["episodes"] if e["task"] not in without_fingers}
-    assert hands == {load_bundle(CHECKPOINTS / name / "pounce").digest()}
+@pytest.mark.parametrize("name", ["real", "real60", "null", "other"])
+def test_its_results_are_of_these_weights(name: str) -> None:
+    episodes = json.loads((SHIPPED / "results" / name / "results.json").read_text())["episodes"]
+    pounces = {episode["models"]["pounce"]["model_hash"] for episode in episodes}
+    ponders = {episode["models"]["ponder"]["model_hash"].partition(" ")[0] for episode in episodes}
+    assert pounces == {load_bundle(SHIPPED / "pounce").digest()}
+    assert ponders == {weights_hash(load_ponder(SHIPPED / "ponder"))}
 
 
 @pytest.mark.slow
