@@ -1,4 +1,4 @@
-"""Named recipes, each one complete frozen value: everything that fixes a training run but the data and the machine.
+"""Named recipes: frozen values that define a training run except for the data and the machine.
 
 ``robomme`` and ``robocasa_dc`` are the paper's runs, ``robomme_*`` its ablations; ``tiny*`` exercise every part from
 scratch on one CPU core and learn little.
@@ -40,95 +40,41 @@ def robomme() -> Recipe:
 
 def robomme_without_reasoning() -> Recipe:
     """Table 3, second row: no demonstration reasoning among the LM head's targets."""
-    return Recipe(
-        name="robomme_without_reasoning",
-        ponder=ponder_configs.qwen35_9b(),
-        pounce=pounce_configs.pi05_base(),
-        freeze="vlm",
-        example=ExampleConfig(clocks=sampling.ROBOMME, has_reasoning=False),
-        train=_PAPER,
-        num_steps=4320,
-        batch_episodes=32,
-    )
+    example = ExampleConfig(clocks=sampling.ROBOMME, has_reasoning=False)
+    return replace(robomme(), name="robomme_without_reasoning", example=example)
 
 
 def robomme_without_grounding() -> Recipe:
     """Table 3, third row: no LM-head targets at all."""
-    return Recipe(
-        name="robomme_without_grounding",
-        ponder=ponder_configs.qwen35_9b(),
-        pounce=pounce_configs.pi05_base(),
-        freeze="vlm",
-        example=ExampleConfig(clocks=sampling.ROBOMME, is_grounded=False),
-        train=_PAPER,
-        num_steps=4320,
-        batch_episodes=32,
-        w2=0.0,
-    )
+    example = ExampleConfig(clocks=sampling.ROBOMME, is_grounded=False)
+    return replace(robomme(), name="robomme_without_grounding", example=example, w2=0.0)
 
 
 def robomme_subgoal_text() -> Recipe:
     """Table 3, fourth row: POUNCE reads PONDER's newest subgoal as text, and no cognition (K = 0)."""
-    return Recipe(
-        name="robomme_subgoal_text",
-        ponder=ponder_configs.qwen35_9b(),
-        pounce=replace(pounce_configs.pi05_base(num_carriers=0), reads_subgoal=True),
-        freeze="vlm",
-        example=ExampleConfig(clocks=sampling.ROBOMME),
-        train=_PAPER,
-        num_steps=4320,
-        batch_episodes=32,
-    )
+    pounce = replace(pounce_configs.pi05_base(num_carriers=0), reads_subgoal=True)
+    return replace(robomme(), name="robomme_subgoal_text", pounce=pounce)
 
 
 def robomme_refresh_2s() -> Recipe:
     """Figure 4: PONDER is queried every 2 s in training."""
-    return Recipe(
-        name="robomme_refresh_2s",
-        ponder=ponder_configs.qwen35_9b(),
-        pounce=pounce_configs.pi05_base(),
-        freeze="vlm",
-        example=ExampleConfig(clocks=_refreshed_every(2)),
-        train=_PAPER,
-        num_steps=4320,
-        batch_episodes=32,
-    )
+    return replace(robomme(), name="robomme_refresh_2s", example=ExampleConfig(clocks=_refreshed_every(2)))
 
 
 def robomme_refresh_4s() -> Recipe:
     """Figure 4: PONDER is queried every 4 s in training."""
-    return Recipe(
-        name="robomme_refresh_4s",
-        ponder=ponder_configs.qwen35_9b(),
-        pounce=pounce_configs.pi05_base(),
-        freeze="vlm",
-        example=ExampleConfig(clocks=_refreshed_every(4)),
-        train=_PAPER,
-        num_steps=4320,
-        batch_episodes=32,
-    )
+    return replace(robomme(), name="robomme_refresh_4s", example=ExampleConfig(clocks=_refreshed_every(4)))
 
 
 def robomme_0p8b() -> Recipe:
     """Table 5: Qwen3.5-0.8B in place of 9B."""
     ponder = ponder_configs.qwen35_0p8b()
-    return Recipe(
-        name="robomme_0p8b",
-        ponder=ponder,
-        pounce=pounce_configs.pi05_base(cognition_size=ponder.hidden_size),
-        freeze="vlm",
-        example=ExampleConfig(clocks=sampling.ROBOMME),
-        train=_PAPER,
-        num_steps=4320,
-        batch_episodes=32,
-    )
+    pounce = pounce_configs.pi05_base(cognition_size=ponder.hidden_size)
+    return replace(robomme(), name="robomme_0p8b", ponder=ponder, pounce=pounce)
 
 
 def robocasa_dc() -> Recipe:
-    """The paper's RoboCasa-DC run (B.2): GR00T N1.5, actions only, cognition dropout 0.15.
-
-    The paper gives no seed for it: 42 here.
-    """
+    """The paper's RoboCasa-DC run (B.2): GR00T N1.5, actions only, dropout 0.15. The paper gives no seed: 42 here."""
     return Recipe(
         name="robocasa_dc",
         ponder=ponder_configs.qwen35_9b(),
@@ -160,34 +106,15 @@ def tiny() -> Recipe:
 
 def tiny_groot() -> Recipe:
     """``robocasa_dc`` at the size of ``tiny``: GR00T N1.5's parts, actions only, its clocks and its dropout."""
-    return Recipe(
-        name="tiny_groot",
-        ponder=ponder_configs.tiny_cpu(),
-        pounce=pounce_configs.tiny_groot(cognition_size=_TINY_H),
-        freeze="none",
-        example=ExampleConfig(clocks=sampling.ROBOCASA_DC, max_invocations=8, is_grounded=False),
-        train=_TINY,
-        num_steps=200,
-        batch_episodes=2,
-        w2=0.0,
-        from_scratch=True,
-    )
+    pounce = pounce_configs.tiny_groot(cognition_size=_TINY_H)
+    example = ExampleConfig(clocks=sampling.ROBOCASA_DC, max_invocations=8, is_grounded=False)
+    return replace(tiny(), name="tiny_groot", pounce=pounce, example=example, w2=0.0)
 
 
 def tiny_subgoal_text() -> Recipe:
     """``robomme_subgoal_text`` at the size of ``tiny``."""
-    return Recipe(
-        name="tiny_subgoal_text",
-        ponder=ponder_configs.tiny_cpu(),
-        pounce=replace(pounce_configs.tiny_cpu(num_carriers=0, cognition_size=_TINY_H), reads_subgoal=True),
-        freeze="none",
-        example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=8),
-        train=_TINY,
-        num_steps=200,
-        batch_episodes=2,
-        w2=0.3,
-        from_scratch=True,
-    )
+    pounce = replace(pounce_configs.tiny_cpu(num_carriers=0, cognition_size=_TINY_H), reads_subgoal=True)
+    return replace(tiny(), name="tiny_subgoal_text", pounce=pounce)
 
 
 def _refreshed_every(period_s: int) -> sampling.Clocks:
