@@ -52,7 +52,7 @@ class Link:
         self.epoch = 0
         self.dropped: Counter[DropReason] = Counter()
         self._seqs: Counter[str] = Counter()
-        self._told: set[tuple[str, str]] = set()
+        self._reported: set[tuple[str, str]] = set()
 
     def enter_episode(self, session: str, episode: str, epoch: int) -> None:
         """Signs what follows with this episode.
@@ -126,8 +126,8 @@ class Link:
     def drop(self, source: str, reason: DropReason, detail: str) -> None:
         """Counts a message that will not be used; the first of its kind from its source is logged."""
         self.dropped[reason] += 1
-        if (source, reason) not in self._told and len(self._told) < 1000:
-            self._told.add((source, reason))
+        if (source, reason) not in self._reported and len(self._reported) < 1000:
+            self._reported.add((source, reason))
             log.warning("dropped source=%s reason=%s detail=%r (later ones are only counted)", source, reason, detail)
 
 
