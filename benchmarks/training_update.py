@@ -1,7 +1,7 @@
-"""How long does Muon take to turn a small PONDER's matrices, ours beside torch's own?
+"""Duration of a Muon update of a small PONDER's matrices, ours beside torch's own.
 
-Both update a copy of the same weights with the same gradients, in turns, each beginning every other one. What they
-differ in is told in `dual_system.training.muon`; the largest difference of the weights at the end is in the notes.
+Both update a copy of the same weights with the same gradients, in turns, each first every other time.
+`dual_system.training.muon` explains their differences; the notes give the largest difference of the final weights.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ _RATE = 1e-3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UpdateOptions:
-    """Random weights and random gradients: what they are changes no time."""
+    """Random weights and random gradients, whose values do not affect the time."""
 
     recipe: str = "small_beginnings"
     threads: int = 1
     updates: int = 60
-    """Of each, after one that is not counted."""
+    """Measured updates of each, after an uncounted one."""
 
 
 def main(argv: list[str] | None = None) -> int:
