@@ -1,12 +1,12 @@
-"""How long does a policy call take when the policy costs nothing? Ours beside the real openpi-client, in one run.
+"""Latency of a policy call with a policy that costs nothing: ours beside the real openpi-client, in one run.
 
-One call: two 256 x 256 pictures and 8 joint values as numpy arrays become a numpy chunk (20, 8) on the client;
-serialisation, transport, wake-ups and the server's decoding of both pictures are all inside. Every answer is compared
-with the one that only this request can have. Client and server are two processes of one host, on loopback.
+One call takes two 256 x 256 pictures and 8 joint values as numpy arrays to a numpy chunk (20, 8) on the client;
+serialisation, transport, wake-ups and the server's decoding of both pictures are included. Every answer is compared
+with the only right one for its request. Client and server are two processes of one host, on loopback.
 
-Like for like: openpi's client sends one message and gets one; so do our rows "observation -> chunk", through the same
-Link, codec and bus as the daemons. The rows "pounce-serve" are what an episode really pays: an observation, an
-invocation and a chunk, and the daemon's phases and heartbeats beside them.
+openpi's client sends one message and gets one; so do our rows "observation -> chunk", through the same Link, codec and
+bus as the daemons. The rows "pounce-serve" are the cost in a real episode: an observation, an invocation and a chunk,
+and the daemon's phases and heartbeats beside them.
 """
 
 from __future__ import annotations
@@ -63,9 +63,9 @@ class BusOptions:
     """Latency of a policy call, back to back and at 20 Hz."""
 
     rounds: int = 60
-    """Every row is measured once per round, in an order that rotates."""
+    """Rounds; each measures every row once, in rotating order."""
     calls: int = 40
-    """Per row and round."""
+    """Calls per row and round."""
     paced_rounds: int = 8
     paced_calls: int = 25
     paced_hz: int = 20
@@ -74,7 +74,7 @@ class BusOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Way:
-    """One row: a wire, and what travels on it."""
+    """One row: a wire, and the messages on it."""
 
     name: str
     wire: Wire
@@ -82,7 +82,7 @@ class Way:
     shared_memory: bool = False
     codec: m.ImageCodec = m.ImageCodec.RAW
     keeps_memory: bool = False
-    """openpi's client in a process with our allocator setting (protocol/memory.py); ours always have it."""
+    """Gives openpi's client our allocator setting (protocol/memory.py); our clients always have it."""
 
 
 WAYS = (
@@ -98,7 +98,7 @@ WAYS = (
 
 
 class OverWebsocket:
-    """The real openpi-client, as its users call it."""
+    """The real openpi-client, called as by its users."""
 
     def __init__(self, port: int) -> None:
         from openpi_client.websocket_client_policy import WebsocketClientPolicy
@@ -135,7 +135,7 @@ class OverBus:
 
 
 class OverLink:
-    """Our robot's side and, where it takes one, the clock's invocation."""
+    """Our robot's side and, if the server needs one, the clock's invocation."""
 
     def __init__(self, bus: ZenohBus, codec: m.ImageCodec, *, invokes: bool) -> None:
         self._bus = bus
@@ -175,7 +175,7 @@ class OverLink:
 
 
 def episode_info(header: m.Header) -> m.EpisodeInfo:
-    """The least that pounce-serve wants to know."""
+    """A minimal episode for pounce-serve."""
     bound = np.ones(ACTION_DIM, np.float32)
     return m.EpisodeInfo(
         header=header,
@@ -202,7 +202,7 @@ def episode_info(header: m.Header) -> m.EpisodeInfo:
 
 
 class Contestant:
-    """A way, the processes of its server and its client, and what its calls took."""
+    """A way, the processes of its server and its client, and the durations of its calls."""
 
     def __init__(self, way: Way, server: subprocess.Popen[str], client: BaseProcess, pipe: Pipe) -> None:
         self.way = way
@@ -214,7 +214,7 @@ class Contestant:
         self.server_cpu_s = 0.0
 
     def measure(self, calls: int, seed: int, hz: int | None) -> None:
-        """So many calls in the client's process, back to back or on absolute deadlines."""
+        """Runs ``calls`` calls in the client's process, back to back or on absolute deadlines."""
         self._pipe.send(("prepare", calls, seed))
         self._answer()
         client_s, server_s = _cpu_s(self._client), _cpu_s(self._server)
@@ -249,7 +249,7 @@ class Contestant:
 
 
 def serve_client(way: Way, port: int, pipe: Pipe) -> None:
-    """One client in a process of its own: what one client's library sets for its process helps no other."""
+    """Runs one client in its own process, so that a client's process-wide settings do not affect the others."""
     asked: list[tuple[Pictures, NDArray[np.float32]]] = []
     try:
         with _connected(way, port) as call:
@@ -263,7 +263,7 @@ def serve_client(way: Way, port: int, pipe: Pipe) -> None:
                     pipe.send(_measured(way, call, asked, *arguments))
     except EOFError:
         return
-    except Exception as error:  # the parent prints it: a child's traceback would be lost among those of others
+    except Exception as error:  # the parent prints it: children's tracebacks would mix
         pipe.send(f"{type(error).__name__}: {error}")
 
 
@@ -290,7 +290,7 @@ def _check(way: Way, rows: NDArray[np.float32], pictures: Pictures, state: NDArr
 
 @contextmanager
 def contest() -> Iterator[list[Contestant]]:
-    """All servers up and all clients connected; all down again at the end."""
+    """Starts all servers and connects all clients; stops them at the end."""
     with ExitStack() as stack:
         contestants = []
         for way, port in zip(WAYS, free_ports(len(WAYS)), strict=True):
@@ -338,14 +338,14 @@ def _connected(way: Way, port: int) -> Iterator[Call]:
         return
     bus = ZenohBus(Endpoints(connect=(f"tcp/127.0.0.1:{port}",), shared_memory=way.shared_memory))
     try:
-        time.sleep(1.0)  # links and subscriptions find each other
+        time.sleep(1.0)  # until links and subscriptions are established
         yield OverBus(bus) if way.wire == "bytes" else OverLink(bus, way.codec, invokes=way.wire == "pounce")
     finally:
         bus.close()
 
 
 def requests(count: int, seed: int) -> list[tuple[Pictures, NDArray[np.float32]]]:
-    """Pictures with a camera's statistics (smooth, some noise), and a state that no other request has."""
+    """Pictures with a camera's statistics (smooth, some noise), and a unique state per request."""
     rng = np.random.default_rng(seed)
     along = np.arange(SIDE_PX, dtype=np.float32)
     found = []

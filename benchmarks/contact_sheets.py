@@ -1,7 +1,7 @@
-"""Is it the same task to a person's eye? One picture per task: a recorded episode's frames above ours, same scene.
+"""Contact sheets for visual comparison: per task, a recorded episode's frames above ours in the same scene.
 
-Eight moments, evenly spread over the recorded video and execution; ours are those of the oracle's episode at the same
-share of either. Front camera, then wrist camera, recorded above ours in both.
+Eight moments are evenly spread over the recorded video and execution; ours are at the same fractions of the oracle's
+episode. Front camera, then wrist camera, recorded above ours in both.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class SheetsOptions:
     out: Path
     """Folder for one PNG per task."""
     tasks: tuple[str, ...] = ()
-    """All that are recorded, by default."""
+    """Names of the tasks. Empty: all that are recorded."""
     columns: int = 8
 
 
@@ -51,7 +51,7 @@ def recorded_frame(recording: Recording, camera: str, index: int) -> NDArray[np.
 
 
 def our_frames(env: Environment, recording: Recording, layout: object, indices: list[int]) -> list[dict[str, NDArray]]:
-    """Our frames at the same shares of video and execution as the recording's."""
+    """Our frames at the same fractions of video and execution as the recording's."""
     facts, arrays = recording.facts, recording.arrays
     env.reset(facts["seed"], facts["difficulty"], layout=layout)
     past: list[EpisodeState] = [env.save()]

@@ -1,7 +1,7 @@
-"""How many simulated seconds does one wall second give in lockstep? In one process, over zenoh, and without servers.
+"""Simulated seconds per wall second in lockstep: in one process, over zenoh, and without servers.
 
-Lockstep waits for every answer, so this is what a suite of episodes costs, and what the bus adds to it. The oracle rows
-are the ceiling: the same robot, rendering and log, without models and without a bus.
+Lockstep waits for every answer, so this shows the cost of a suite of episodes, and the bus's share of it. The oracle
+rows are the ceiling: the same robot, rendering and log, without models and without a bus.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ class ThroughputOptions:
     """Simulated seconds per wall second."""
 
     episodes: int = 6
-    """Per row and round, after one that is not counted."""
+    """Episodes per row and round, after an uncounted one."""
     rounds: int = 2
-    """Rows take turns."""
+    """Rounds; rows take turns."""
     max_steps: int = 200
     task: str = "PickHighlight"
 
@@ -57,7 +57,7 @@ class Episode:
 
 
 def run(way: Way, options: ThroughputOptions) -> list[Episode]:
-    """All counted episodes of one run of ``sim-client``, each from its reset to its line in results.json."""
+    """Counted episodes of one run of ``sim-client``, each from its reset to its line in results.json."""
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "sim_client", "--task", options.task, "--out", folder, "--no-progress"]
         command += ["--episodes", str(options.episodes + 1), "--max-steps", str(options.max_steps), *way.arguments]

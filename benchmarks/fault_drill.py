@@ -1,8 +1,8 @@
-"""What happens when a daemon dies or freezes in mid-episode? ``kill -9`` and SIGSTOP of each in turn, several times.
+"""Fault injection: each daemon is killed (``kill -9``) or frozen (SIGSTOP) in mid-episode, several times.
 
-Per trial: how long until it is noticed, what the ladder commanded meanwhile, how the episode ended, and whether its log
-is whole and follows from itself. A struck PONDER comes back (restarted, or continued), and the episode with it. Beside
-it: the real openpi-client, whose server is struck in the same ways.
+Per trial: the time to detection, the ladder's levels meanwhile, the episode's end, and whether its log is complete and
+passes pp-check. PONDER is restarted or continued, and the episode recovers. For comparison the same faults hit the
+server of the real openpi-client.
 """
 
 from __future__ import annotations
@@ -42,27 +42,27 @@ _NOTICED_BY = {"ponder": "ponder_lost", "pounce": "pounce_lost", "clock": "clock
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DrillOptions:
-    """Strikes each daemon in mid-episode."""
+    """Kills or freezes each daemon in mid-episode."""
 
     trials: int = 5
     max_steps: int = 360
-    """An episode that survives ends by itself: 18 s."""
+    """Length of a surviving episode [ticks]; 18 s."""
     openpi_cap_s: float = 5.0
-    """How long to wait for openpi's client to notice."""
+    """Limit of the wait for openpi's client to notice [s]."""
     task: str = "PickHighlight"
 
 
 @dataclass(slots=True, kw_only=True)
 class Trial:
-    """One blow and what came of it; instants in seconds after the blow."""
+    """One fault and its consequences; instants in seconds after the fault."""
 
     noticed_s: float | None = None
     back_s: float | None = None
-    """From the restart (or SIGCONT) to the server's being back in the episode, context rebuilt."""
+    """Time from the restart (or SIGCONT) until the server is back in the episode, with its context rebuilt."""
     playing_s: float | None = None
-    """From the restart to the next row played with fresh cognition."""
+    """Time from the restart to the next row played with fresh cognition."""
     ladder: list[tuple[str, float]] = field(default_factory=list)
-    """Each level the robot's commands changed to, and when."""
+    """Changes of the ladder's level, with their instants."""
     ended: str = ""
     is_whole: bool = False
     agrees: bool = False
@@ -70,13 +70,13 @@ class Trial:
 
 
 def drill(name: str, blow: Blow, options: DrillOptions) -> list[Trial]:
-    """All trials of one kind, with one set of daemons; whoever is struck is up again before the next trial."""
+    """Runs all trials of one kind with one set of daemons; the victim is up again before the next trial."""
     with tempfile.TemporaryDirectory() as folder, Rig(Path(folder)) as rig:
         return [strike(rig, name, blow, seed, Path(folder) / str(seed), options) for seed in range(options.trials)]
 
 
 def strike(rig: Rig, name: str, blow: Blow, seed: int, out: Path, options: DrillOptions) -> Trial:
-    """One episode with one blow."""
+    """Runs one episode with one fault."""
     trial = Trial()
     player = rig.play(["--task", options.task, "--seed", str(seed), "--max-steps", str(options.max_steps)], out)
     if not rig.listen(lambda: len(rig.ticks()) >= _STRUCK_AT_TICK, _PATIENCE_S):
@@ -105,7 +105,7 @@ def _revive(rig: Rig, name: str, blow: Blow, victim: subprocess.Popen[bytes]) ->
 
 
 def _bring_back(rig: Rig, blow: Blow, victim: subprocess.Popen[bytes], trial: Trial) -> None:
-    """Restarts a killed PONDER at once; lets a frozen one go on when its last cognition is called stale."""
+    """Restarts a killed PONDER immediately; continues a frozen one once its last cognition is stale."""
     if blow == "SIGSTOP":
         rig.listen(lambda: rig.ticks()[-1].level == m.Level.STALE, _PATIENCE_S)
     since_ns = time.monotonic_ns()
@@ -128,7 +128,7 @@ def _seconds_since(since_ns: int, rig: Rig, event: str) -> float | None:
 
 
 def _changes(rig: Rig, struck_ns: int) -> Iterator[tuple[str, float]]:
-    """The level at the blow, then every change of it."""
+    """The level at the fault, then every change of it."""
     level = None
     for heard in rig.heard:
         tick = heard.message
@@ -138,7 +138,7 @@ def _changes(rig: Rig, struck_ns: int) -> Iterator[tuple[str, float]]:
 
 
 def _judge(folder: Path, trial: Trial) -> None:
-    """How the episode ended, by results.json, and what its log is worth."""
+    """Reads the episode's end from results.json, and checks its log."""
     results = folder / "results.json"
     if not results.exists():
         trial.ended = "no results.json"
@@ -156,7 +156,7 @@ def _judge(folder: Path, trial: Trial) -> None:
 
 
 def openpi_notices(blow: Blow, cap_s: float) -> float | None:
-    """Seconds until the real client raises after its server was struck; None if not within ``cap_s``."""
+    """Seconds from a fault of the server until the real client raises; None if not within ``cap_s``."""
     from openpi_client.websocket_client_policy import WebsocketClientPolicy
 
     port = free_ports(1)[0]
@@ -218,7 +218,7 @@ def _middle(values: list[float], scale: float = 1.0) -> float | None:
 
 
 def timeline_row(name: str, blow: Blow, trials: list[Trial]) -> Row:
-    """The ladder of the first trial with its times, and how many of the others took the same steps."""
+    """The ladder of the first trial with its times, and the number of other trials with the same steps."""
     steps = [[level for level, _ in trial.ladder] for trial in trials]
     shown = " ".join(f"{level} {at_s:+.2f}" for level, at_s in trials[0].ladder)
     return {

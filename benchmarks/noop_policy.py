@@ -1,11 +1,11 @@
-"""A policy that thinks nothing, as a server on four wires: what a call costs when the model costs nothing.
+"""A policy without a model, as a server on four wires, to measure the cost of a call alone.
 
     python -m benchmarks.noop_policy openpi --port 7001      websocket and msgpack-numpy, as openpi's server speaks them
     python -m benchmarks.noop_policy observation --port ...  our Link: an observation is answered by a chunk
     python -m benchmarks.noop_policy bytes --port ...        our bus alone: no messages, checks or identity
     python -m benchmarks.noop_policy pounce --port ...       the whole of pounce-serve, its engine doing nothing
 
-Each decodes both pictures into arrays, reads them, and answers a chunk that only this request can have.
+Each decodes both pictures into arrays, reads them, and answers with a chunk that is unique to the request.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ ROBOT, EPISODE = "bench", "noop"
 INSTRUCTION = "press the button, pick all cubes that were highlighted, then press it again to stop"
 _CACHE_LINE_BYTES = 64
 
-REQUEST_KEY, ANSWER_KEY = "bench/request", "bench/answer"  # of the wire "bytes"
+REQUEST_KEY, ANSWER_KEY = "bench/request", "bench/answer"  # keys of the wire "bytes"
 
 Wire = Literal["openpi", "observation", "bytes", "pounce"]
 
 
 def answer(front: NDArray[np.uint8], wrist: NDArray[np.uint8], state: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Chunk (20, 8): the state it was made from, and how bright the pictures were; reads every cache line of both."""
+    """Chunk (20, 8) of the state and the pictures' brightness; reads every cache line of both pictures."""
     rows = np.tile(np.asarray(state, np.float32), (HORIZON, 1))
     brightness = sum(int(frame.reshape(-1)[::_CACHE_LINE_BYTES].sum()) for frame in (front, wrist))
     rows[0, 0] = np.float32(brightness)
@@ -51,7 +51,7 @@ def answer(front: NDArray[np.uint8], wrist: NDArray[np.uint8], state: NDArray[np
 
 
 def serve_openpi(port: int) -> None:
-    """What openpi's websocket_policy_server does on the wire: metadata first, then one answer per request."""
+    """Speaks openpi's websocket_policy_server protocol: metadata first, then one answer per request."""
     import websockets.asyncio.server as websockets
     from openpi_client import msgpack_numpy
     from websockets.exceptions import ConnectionClosed
@@ -85,7 +85,7 @@ def serve_openpi(port: int) -> None:
 
 
 def serve_observation(bus: ZenohBus) -> None:
-    """One message in, one message out, like openpi's; everything between is what pounce-serve uses."""
+    """One message in, one message out, like openpi's, through the same code as pounce-serve."""
     link = Link(bus, robot=ROBOT, proc="pounce")
     link.enter_episode("bench", EPISODE, 1)
     observations = link.subscribe(topics.OBSERVATION)
@@ -103,7 +103,7 @@ def serve_observation(bus: ZenohBus) -> None:
 
 
 def serve_bytes(bus: ZenohBus) -> None:
-    """The floor under our rows: the same bytes on the same bus, as bare arrays."""
+    """The floor of our rows: the same bytes on the same bus, as bare arrays."""
     received = bus.subscribe(REQUEST_KEY, keep=1)
     state_bytes, picture_bytes = 4 * NUM_PROPRIO, SIDE_PX * SIDE_PX * 3
 
@@ -121,7 +121,7 @@ def serve_bytes(bus: ZenohBus) -> None:
 
 
 def serve_pounce(bus: ZenohBus) -> None:
-    """pounce-serve as it ships, with heartbeat, phases and rendezvous; only the engine is ours."""
+    """The real pounce-serve, with heartbeat, phases and rendezvous, around a no-op engine."""
     link = Link(bus, robot=ROBOT, proc="pounce")
     server = PounceServer(link, NoopEngine(), Heartbeat(link, "0+bench", host_clock_id()), "0+bench")
     server.warm_up()
@@ -131,7 +131,7 @@ def serve_pounce(bus: ZenohBus) -> None:
 
 
 def chunk_of(observation: m.Observation, rows_NA: NDArray[np.float32]) -> m.ActionChunk:
-    """As ``PounceNode.answer`` fills it."""
+    """Builds a chunk like ``PounceNode.answer``."""
     return m.ActionChunk(
         invocation=observation.tick,
         t_row0=observation.tick,
@@ -181,7 +181,7 @@ def _say_ready() -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NoopOptions:
-    """A policy server that costs nothing but its wire."""
+    """A policy server without a model, to measure its wire."""
 
     wire: tyro.conf.Positional[Wire]
     port: int

@@ -1,7 +1,7 @@
-"""How late are the ticks of a real-time episode, and are any missed? A histogram of ``late_ns``, 60 s per row.
+"""Lateness of a real-time episode's ticks, and missed ticks: a histogram of ``late_ns``, 60 s per row.
 
-Rows: the daemons as they ship (three processes, recorder on), the clock service embedded in sim-client, the recorder
-off, and beside them what one writes first: ``while True: step(); time.sleep(0.05)`` around the same simulated robot.
+Rows: the daemons with default options (three processes, recorder on), the clock service embedded in sim-client, the
+recorder off, and the naive loop ``while True: step(); time.sleep(0.05)`` around the same simulated robot.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class JitterOptions:
     """Lateness of ticks at 20 Hz."""
 
     seconds: int = 60
-    """Of ticks per row; if an episode ends early, more are played."""
+    """Seconds of ticks per row; if an episode ends early, more are played."""
     warm_up_ticks: int = 40
-    """Of each episode, not counted."""
+    """Uncounted ticks at the start of each episode."""
     task: str = "PickHighlight"
 
 
@@ -59,7 +59,7 @@ WAYS = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Played:
-    """The counted ticks of one way: how late each was, and how far it came after the one before."""
+    """The counted ticks of one way: each one's lateness, and its interval from the previous one."""
 
     late_ms: list[float]
     interval_ms: list[float]
@@ -68,7 +68,7 @@ class Played:
 
 
 def play(way: Way, options: JitterOptions) -> Played:
-    """Episodes until enough ticks are heard."""
+    """Runs episodes until enough ticks are recorded."""
     wanted = options.seconds * 20 + options.warm_up_ticks
     episodes: list[list[m.Tick]] = []
     while sum(map(len, episodes)) < options.seconds * 20:
@@ -100,7 +100,7 @@ def _judge(episodes: Sequence[Sequence[m.Tick]], limit: int) -> Played:
 
 
 def sleep_loop(options: JitterOptions) -> Played:
-    """What one writes first: the same robot, stepped and rendered, then 50 ms of sleep."""
+    """The naive loop: the same robot, stepped and rendered, then 50 ms of sleep."""
     num_ticks = options.seconds * 20
     instants_ns = []
     with make_environment(options.task, max_steps=num_ticks + options.warm_up_ticks) as environment:

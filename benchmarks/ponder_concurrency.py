@@ -1,11 +1,11 @@
-"""How old is a cognition when several robots think with one PONDER, and what does a greedy robot cost the others?
+"""Age of cognitions when several robots share one PONDER, and the effect of a greedy robot on the others.
 
-Robots ask once a period of one engine in one process: all at the same instant, the worst case, which admission counts
-with; or evenly spread. Age is from the instant a query was due to its cognition on the host. "In common forwards" is
-how ponder-serve runs; "one by one" allows a forward one row. Then as many robots as one core should carry, for longer,
-with the worst of them by name; whom admission would refuse, and with which words; what counting with short contexts
-would lead to; and what three robots notice of a fourth that asks again the moment it is answered, or writes a long text
-every time.
+Robots query one engine in one process once per period: all at the same instant, which is the worst case and admission's
+assumption, or evenly spread. Age is the time from a query's due instant to its cognition on the host. "In common
+forwards" is ponder-serve's way; "one by one" allows one row per forward. Further tables: as many robots as one core
+should serve, for longer, with the worst of them; admission's limits and refusals; the effect of admission by short
+contexts; and the effect on three robots of a fourth that queries again as soon as it is answered, or that generates a
+long text every time.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ LONG_CONTEXT_TOKENS = 14_000
 """Leaves room for the queries of a row and for a text."""
 BUDGET_MS = 1000
 MAX_ROWS = 8
-"""Of a forward, as ponder-serve has it."""
+"""Largest number of rows in a forward, as in ponder-serve."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,18 +42,18 @@ class ConcurrencyOptions:
     robots: tuple[int, ...] = (1, 4, 8, 16)
     period_ms: int = 1000
     seconds: float = 6.0
-    """Per row, after one second that is not counted."""
+    """Seconds per row, after an uncounted one."""
     many: int = 32
     many_seconds: float = 60.0
-    """Per row of so many robots."""
+    """Seconds per row with ``many`` robots."""
     text_tokens: int = 45
-    """Of the robot that writes all the time."""
+    """Text length of the robot that always generates text."""
     threads: int = 1
 
 
 @dataclass(slots=True, kw_only=True)
 class Robot:
-    """A client: when it asks next, and how long its answers took."""
+    """A client: the instant of its next query, and the ages of its cognitions."""
 
     name: str
     due_ns: int
@@ -126,7 +126,7 @@ def _admission(ponder: Ponder, options: ConcurrencyOptions) -> list[Row]:
 
 
 def _admitted(durations_ns: list[int], budget_ms: int, options: ConcurrencyOptions) -> tuple[int, str]:
-    """How many robots, and what the next one is told."""
+    """The number of admitted robots, and the refusal of the next one."""
     p50_ns, p99_ns = (percentile_ns(durations_ns, percent) for percent in (50, 99))
     admission = Admission(fire_p50_ns=p50_ns, fire_p99_ns=p99_ns, latency_budget_ns=budget_ms * 1_000_000)
     while True:
@@ -177,9 +177,9 @@ def _run(
     context_tokens: int = 0,
     change: dict[str, int] | None = None,
 ) -> list[Robot]:
-    """So many robots with their ages; ``change`` is what makes the first one another.
+    """Runs ``count`` robots and returns them with their ages; ``change`` modifies the first one.
 
-    ``context_tokens`` of a demonstration come first, about; all have seen the same one, which is encoded once.
+    Each context begins with about ``context_tokens`` of the same demonstration, which is encoded once.
     """
     engine = _engine(ponder, count, max_rows=max_rows)
     engine.warm_up()

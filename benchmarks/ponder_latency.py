@@ -1,19 +1,18 @@
-"""How long does PONDER think about one query, and how does that grow with what it has in mind?
+"""Latency of one PONDER query, and its growth with the context's length.
 
-One fire: two 256 px frames on the host become a cognition on the host; vision tower, append, T gate and copies are all
-inside. The same query is asked at every context length, after which the context goes back, so lengths do not drift. The
-lengths take turns, so that a machine that gets slower meanwhile is as slow for one as for the other.
-What the longest context adds is set against what its attention's products must take at the speed that this machine
-multiplies large matrices with, in the same run, in the same precision and on as many threads: no code that computes
-them can add less.
+One fire takes two 256 px frames on the host to a cognition on the host, including vision tower, append, T gate and
+copies. The same query is run at every context length, after which the context is restored, so that lengths do not
+drift. The lengths take turns, so that a machine that slows down meanwhile affects all of them alike. The cost of the
+longest context is compared with the time of its attention's products at this machine's speed for large matrices, in
+the same run, precision and number of threads: a lower bound for any implementation.
 
-Beside it what a server without an append-only context pays, the whole context encoded again in one forward, and a
-transition with a text of 45 tokens (the paper's), decoded one by one, with a draft that knows it and with multi-token
-prediction; the fire with narrow weights, int8 on a CPU and fp8 on a GPU; and what an episode's opening with a long
-demonstration takes, in a few large forwards and instant by instant. On a GPU forwards are CUDA graphs, and one more row
-has the fire without them.
+Further tables: encoding the whole context again in one forward, the cost of a server without an append-only context; a
+transition with a text of 45 tokens (the paper's), decoded token by token, with a perfect draft and with multi-token
+prediction; the fire with narrow weights, int8 on a CPU and fp8 on a GPU; and an episode's opening with a long
+demonstration, in a few large forwards and instant by instant. On a GPU forwards are CUDA graphs, and one more row has
+the fire without them.
 
-The networks have random weights: their speed is a trained one's, what they say is not, nor how well it is guessed.
+The networks have random weights: their speed is that of trained ones, their texts and accepted drafts are not.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ WAYS_TO_ENCODE = {"in forwards of 2048 tokens": 2048, "an instant a forward": 1}
 ROUNDS = 5
 TEXT_TOKENS = 45
 DEMO_S = 48
-"""Two views at 1 Hz: some 6.4K tokens, with two frames of 256 px an instant."""
+"""Length of the demonstration; two 256 px views at 1 Hz are about 6.4K tokens."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,18 +56,18 @@ class LatencyOptions:
     size: Literal["tiny_cpu", "qwen35_0p8b", "qwen35_2b", "qwen35_4b", "qwen35_9b"] = "tiny_cpu"
     device: str = "cpu"
     dtypes: tuple[Literal["float32", "bfloat16"], ...] = ("float32", "bfloat16")
-    """Of the same network, one after the other."""
+    """Number formats of the same network, one after the other."""
     attention_threads: tuple[int, ...] = (1, 2)
-    """That share attention, one run of fires each; torch has one thread, and so has everything but these fires."""
+    """Threads for attention, one run of fires each; torch and all other measurements use one thread."""
     contexts: tuple[int, ...] = (800, 4_000, 14_000)
-    """Tokens in the context before the fire, about."""
+    """Approximate tokens in the context before the fire."""
     fires: int = 60
-    """Per context length, in several rounds, each after two that are not counted."""
+    """Fires per context length, in several rounds, each after two uncounted ones."""
     encodes: int = 3
-    """Of the longest context, from nothing."""
+    """Encodings of the longest context without a cache."""
     texts: int = 5
     draft_tokens: int = 3
-    """That multi-token prediction guesses at a time."""
+    """Tokens per draft of multi-token prediction."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -100,7 +99,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _measured(dtype: str, options: LatencyOptions, report: Report) -> dict[str, list[Row]]:
-    """Title to rows of every table, in one precision."""
+    """Rows of every table by its title, in one precision."""
     config = getattr(ponder_configs, options.size)()
     ponder = Ponder.random(config, seed=0, device=options.device, dtype=getattr(torch, dtype))
     ponder.mtp = _untrained_prediction(ponder)
@@ -129,7 +128,7 @@ def _measured(dtype: str, options: LatencyOptions, report: Report) -> dict[str, 
         eager = _engine(ponder, options, graphs=False)
         fires += [_labelled(row, options, graphs=False) for row in _fires(eager, options)]
     weights: WeightsName = "fp8" if _is_on_gpu(options) else "int8"
-    # of another network, because its layers are replaced
+    # Another network, because its layers are replaced.
     another = Ponder.random(config, seed=0, device=options.device, dtype=getattr(torch, dtype))
     narrow = _engine(another, options, weights=weights)
     fires += [_labelled(row, options, weights=weights) for row in _fires(narrow, options)]
@@ -162,7 +161,7 @@ def _is_on_gpu(options: LatencyOptions) -> bool:
 def _labelled(
     row: Row, options: LatencyOptions, *, threads: int = 1, weights: WeightsName = "float", graphs: bool = True
 ) -> Row:
-    """Says whose fires they are. Where there are no graphs, nothing is said of them."""
+    """Adds the options to a row; graphs are mentioned only on a GPU."""
     engine: Row = {"engine": "ours graphs" if graphs else "ours eager"} if _is_on_gpu(options) else {}
     return {**engine, "weights": weights, "attention_threads": threads, **row}
 
@@ -209,17 +208,17 @@ def _fires(engine: QwenEngine, options: LatencyOptions) -> list[Row]:
 
 
 def _floor(engine: QwenEngine, options: LatencyOptions, fires: list[Row], threads: int) -> Row:
-    """The longest context beside the first one."""
+    """The longest context's extra time over the first one's, and its lower bound."""
     text = engine._ponder.qwen.config.text_config
     last = text.num_hidden_layers - 1
-    num_read = 1 + engine.spec.num_carriers  # the last layer answers for these alone
+    num_read = 1 + engine.spec.num_carriers  # the last layer computes these only
     num_queries = [
         num_read if index == last else engine._num_query_ids
         for index, kind in enumerate(text.layer_types)
         if kind == "full_attention"
     ]
     num_keys = options.contexts[-1] - options.contexts[0]
-    # two products, of queries and keys and of shares and values; a multiplication and an addition each
+    # Two products, queries x keys and weights x values, with a multiplication and an addition each.
     flop = 4 * sum(num_queries) * num_keys * text.num_attention_heads * text.head_dim
     torch.set_num_threads(threads)
     flop_per_ms = _product_flop_per_ms(engine)
@@ -236,7 +235,7 @@ def _floor(engine: QwenEngine, options: LatencyOptions, fires: list[Row], thread
 
 
 def _product_flop_per_ms(engine: QwenEngine, size: int = 1024) -> float:
-    """Of the fastest of twenty products of square matrices in the network's own precision."""
+    """Rate of the fastest of twenty products of square matrices in the network's precision."""
     left, right = torch.randn(2, size, size, device=engine._ponder.device, dtype=engine._ponder.dtype)
     took_ms = []
     for _ in range(20):
@@ -247,7 +246,7 @@ def _product_flop_per_ms(engine: QwenEngine, size: int = 1024) -> float:
 
 
 class _Watched:
-    """A draft whose proposals are kept: how much was written, and what was guessed to follow."""
+    """A draft that records its proposals, each with the number of tokens written before."""
 
     def __init__(self, draft: Draft) -> None:
         self._draft = draft
@@ -261,7 +260,7 @@ class _Watched:
 
 
 def _texts(ponder: Ponder, draft: Draft, options: LatencyOptions, fire_p50_ms: float) -> Row:
-    """A step is one certain token and what was rightly guessed; all steps cost what the text adds to a fire."""
+    """Measures texts. A step yields one known token and the accepted draft; all steps cost the text's extra time."""
     watched = _Watched(draft)
     engine = _engine(ponder, options, watched)
     frames = _frames(engine, 2, seed=0)
@@ -287,12 +286,12 @@ def _texts(ponder: Ponder, draft: Draft, options: LatencyOptions, fire_p50_ms: f
 
 
 def _num_right(guesses: Sequence[int], said: Sequence[int]) -> int:
-    """Of the guesses, those before the first wrong one; ``said`` is at least as long."""
+    """Number of guesses before the first wrong one; ``said`` is at least as long."""
     return next((n for n, pair in enumerate(zip(guesses, said, strict=False)) if pair[0] != pair[1]), len(guesses))
 
 
 def _untrained_prediction(ponder: Ponder) -> dict[str, Tensor]:
-    """Random tensors of a multi-token prediction for this network."""
+    """Random tensors of a multi-token prediction block for this network."""
     shapes = {name: tuple(tensor.shape) for name, tensor in ponder.qwen.state_dict().items()}
     generator = torch.Generator().manual_seed(0)
     return {
@@ -302,7 +301,7 @@ def _untrained_prediction(ponder: Ponder) -> dict[str, Tensor]:
 
 
 def _encodes(ponder: Ponder, options: LatencyOptions) -> list[float]:
-    """The whole context at once, through transformers' own forward and without a cache."""
+    """Encodes the whole context at once, through transformers' own forward without a cache."""
     form = ponder.format
     queries = max(1, max(options.contexts) // sum(len(segment) for segment in form.query(2)))
     row: EpisodeRow = form.row([*form.opening("go"), *(s for _ in range(queries) for s in form.query(2))])
@@ -333,14 +332,14 @@ def _demonstration(ponder: Ponder, way: str, prefill_chunk_tokens: int, options:
 
 
 def _own_text(ponder: Ponder) -> tuple[int, ...]:
-    """What this network says when it is made to speak, at the shortest context."""
+    """This network's forced text at the shortest context."""
     engine = QwenEngine(ponder, EngineConfig(max_context_tokens=2048, max_sessions=1))
     _open(engine, 800)
     return engine.fire(SESSION, _frames(engine, 2, seed=0), force_text_tokens=TEXT_TOKENS).texts[0].token_ids
 
 
 def _open(engine: QwenEngine, context_tokens: int, session: str = SESSION) -> None:
-    """A session of about so many tokens: a demonstration of one view, as long as it takes."""
+    """Opens a session of about ``context_tokens`` tokens, filled by a demonstration of one view."""
     view_tokens = engine._format.num_image_tokens + 2
     demo = tuple((frame,) for frame in _frames(engine, max(1, context_tokens // view_tokens), seed=1))
     engine.open(session, Opening(instruction="pick up the red cube", demo_frames=demo))
@@ -356,7 +355,7 @@ def _frames(
 def _timed(
     fire: Callable[[], object], engine: QwenEngine, num_unmeasured: int, num_measured: int, session: str = SESSION
 ) -> list[float]:
-    """Durations in ms; the context is as it was, before every fire and in the end."""
+    """Durations in ms; the context is restored before every fire and at the end."""
     context = engine._episode(session).context
     opened = context.save()
     took_ms = []

@@ -1,10 +1,10 @@
-"""Does PONDER of a real size fit into this machine's memory, and does a session take what it says?
+"""Memory of a PONDER of real size, and of a session compared with its computed size.
 
-Two measurements. *Sessions*: the engine is built with a few and with more sessions, and every byte it allocated is
-written once, because an operating system gives memory when it is written; the difference, per session, stands beside
-what ``EngineSpec.session_bytes`` computes. *Episode*: ``ponder-serve`` with random weights of that size, a tiny
-``pounce-serve`` and ``sim-client`` play one PickHighlight in lockstep, processes of their own as a user starts them;
-the kernel's own account of ``ponder-serve``'s largest resident memory is read at the end. Linux only (/proc).
+Two measurements. *Sessions*: the engine is built with a few and with more sessions, and every allocated byte is
+written once, because the operating system provides memory on writing; the difference per session is compared with
+``EngineSpec.session_bytes``. *Episode*: ``ponder-serve`` with random weights of that size, a tiny ``pounce-serve`` and
+``sim-client`` play one PickHighlight in lockstep, as separate processes; at the end ``ponder-serve``'s peak resident
+memory is read from the kernel. Linux only (/proc).
 """
 
 from __future__ import annotations
@@ -46,15 +46,15 @@ class MemoryOptions:
     dtype: Literal["float32", "bfloat16"] = "bfloat16"
     max_context_tokens: int = 16_384
     sessions: tuple[int, int] = (1, 3)
-    """The sessions of the two engines whose memory is compared."""
+    """Number of sessions of the two engines to compare."""
     served_sessions: int = 2
     """--max-sessions of the episode's ponder-serve."""
     episode: bool = True
     seed: int = 0
-    """Of the scene, which is an easy one."""
+    """Seed of the scene, which is an easy one."""
     max_steps: int = 1300
     limit_gib: float = 24.0
-    """What ponder-serve may take at most; it is said whether it did."""
+    """Limit of ponder-serve's memory; the report says whether it was kept."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -87,11 +87,11 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def session_row(options: MemoryOptions) -> Row:
-    """What one more session takes, three ways, in MiB."""
+    """Memory of one more session, determined in three ways, in MiB."""
     ponder = Ponder.random(getattr(ponder_configs, options.size)(), seed=0, dtype=getattr(torch, options.dtype))
     fewer, more = options.sessions
-    engines, allocated, resident = [], [], []  # all are kept: what a process frees stays resident for its next use
-    for count in (fewer, fewer, more):  # the first one takes what was free before, and is not compared
+    engines, allocated, resident = [], [], []  # all are kept: freed memory would stay resident
+    for count in (fewer, fewer, more):  # the first one reuses free memory and is not compared
         config = EngineConfig(max_sessions=count, max_context_tokens=options.max_context_tokens)
         before = resident_bytes()
         engine, own = made_by(partial(QwenEngine, ponder, config))
@@ -113,7 +113,7 @@ def session_row(options: MemoryOptions) -> Row:
 
 
 def made_by(build: Callable[[], Built]) -> tuple[Built, list[Tensor]]:
-    """What ``build`` returns, and as bytes the memory of the tensors that are alive since."""
+    """Result of ``build``, and the memory of the tensors that it created, as bytes tensors."""
     before = list(storages())  # held, so that no address is used twice
     built = build()
     known = {tensor.data_ptr() for tensor in before}
@@ -121,10 +121,10 @@ def made_by(build: Callable[[], Built]) -> tuple[Built, list[Tensor]]:
 
 
 def storages() -> Iterator[Tensor]:
-    """The memory of every tensor that is alive, each once, as bytes."""
+    """Storage of every live tensor, each once, as a bytes tensor."""
     seen: set[int] = set()
     for each in gc.get_objects():
-        if not issubclass(type(each), Tensor) or each.is_meta:  # isinstance would wake what warns when looked at
+        if not issubclass(type(each), Tensor) or each.is_meta:  # isinstance would trigger deprecation warnings
             continue
         storage = each.untyped_storage()
         if storage.data_ptr() not in seen:
@@ -133,12 +133,12 @@ def storages() -> Iterator[Tensor]:
 
 
 def resident_bytes() -> int:
-    """Of this process, now."""
+    """Resident memory of this process."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def play(options: MemoryOptions, folder: Path) -> tuple[Row, list[float]]:
-    """One easy episode with real processes; the duration of every fire beside it, in ms."""
+    """Plays one easy episode with real processes; also returns the duration of every fire in ms."""
     ponder = ["--size", options.size, "--dtype", options.dtype, "--max-sessions", str(options.served_sessions)]
     ponder += ["--max-context-tokens", str(options.max_context_tokens)]
     hidden_size = getattr(ponder_configs, options.size)().hidden_size
@@ -172,7 +172,7 @@ def play(options: MemoryOptions, folder: Path) -> tuple[Row, list[float]]:
 
 
 def peak_resident_bytes(pid: int) -> int:
-    """The most that a running process ever had."""
+    """Peak resident memory of a running process."""
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) * 1024
 

@@ -1,11 +1,11 @@
-"""How long does POUNCE think about one invocation, and what of that is seen once, what at every flow step?
+"""Latency of one POUNCE invocation, and its parts: the prefix, and the flow steps.
 
 Two shapes: the paper's (appendix D: three views of 224 px, 60 tokens of prompt, 10 flow steps, 20 rows, K = 8) and
-RoboMME's (two views, K = 1, each model's own number of steps). A row is a way to make one chunk from tensors that lie
-on the device, until its actions lie on the host; the engine's rows start from pictures and text instead, as
-``pounce-serve`` does. All ways of one model, shape and batch take turns, so that a busy moment hits all of them.
+RoboMME's (two views, K = 1, each model's own number of steps). A row is a way to generate one chunk, from tensors on
+the device to actions on the host; the engine's rows start from pictures and text instead, as ``pounce-serve`` does. All
+ways of one model, shape and batch take turns, so that a busy moment affects all of them.
 
-The networks have random weights: their speed is a trained one's, what they do is not.
+The networks have random weights: their speed is that of trained ones, their actions are not.
 """
 
 from __future__ import annotations
@@ -60,10 +60,10 @@ class LatencyOptions:
     families: tuple[Family, ...] = ("pi05", "groot")
     batches: tuple[int, ...] = (1, 4)
     rounds: int = 60
-    """Every way is measured once per round, in an order that rotates."""
+    """Rounds; each measures every way once, in rotating order."""
     warm_up_rounds: int = 5
     compile_modes: tuple[CompileMode, ...] | None = None
-    """At the paper's shape and batch 1; default: "default" on a CPU, all of them on a GPU."""
+    """Modes of torch.compile to measure, at the paper's shape and batch 1. None: "default" on a CPU, all on a GPU."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,7 +72,7 @@ class Shape:
     num_cameras: int
     num_carriers: int
     num_steps: int | None
-    """None: the family's own."""
+    """None: the family's own number."""
     is_compiled: bool
 
     def config(self, family: Family, size: str, *, has_cognition: bool = True) -> AnyPounceConfig:
@@ -89,7 +89,7 @@ SHAPES = (
 
 
 class Ways:
-    """One model and one batch of inputs, and the ways to make chunks of them."""
+    """One model and one batch of inputs, and the ways to generate chunks from them."""
 
     def __init__(self, model: AnyPounce, batch_size: int, device: torch.device) -> None:
         config = model.config
@@ -104,7 +104,7 @@ class Ways:
         self._cache = self._prefill(self._inputs)
 
     def compiled(self, mode: CompileMode) -> Call:
-        """Prefix and step compiled apart, as both are reused; shapes are constants."""
+        """Prefix and step compiled separately, as both are reused; shapes are constants."""
         prefill, velocity = (torch.compile(part, mode=mode, dynamic=False) for part in (self._prefill, self._velocity))
 
         def chunk() -> Tensor:
@@ -115,7 +115,7 @@ class Ways:
         return chunk
 
     def fused(self, model: Pounce, device: torch.device) -> Call:
-        """Packs the model's own weights anew: the eager ways go on over views of them."""
+        """Packs the model's weights; the eager ways then use views of them."""
         fused: FusedPounce = fused_for(model, device)
 
         def chunk() -> Tensor:
@@ -125,7 +125,7 @@ class Ways:
         return chunk
 
     def least_ms(self, ceilings: Ceilings) -> float:
-        """The roofline of a whole invocation: the prefix once, and every step."""
+        """The roofline of a whole invocation: the prefix once, and all steps."""
         prefix, step = piece_of(self.prefix), piece_of(self.one_step)
         return prefix.least_ms(ceilings) + self._table.num_steps * step.least_ms(ceilings)
 
@@ -134,7 +134,7 @@ class Ways:
         return self._integrated(lambda index, x: self._velocity(x, self._table.styles[index], cache))
 
     def naive(self) -> Tensor:
-        """What a sampler does that was not told which part of the network the flow step leaves alone."""
+        """A sampler without a prefix cache: it computes the prefix at every flow step."""
         return self._integrated(lambda index, x: self._velocity(x, self._table.styles[index], self._again()))
 
     def prefix(self) -> None:
@@ -247,7 +247,7 @@ def _measure(
 
 
 def _ratios(p50_ms: dict[str, float], steps: str) -> Row:
-    """What the flow steps, the cache, the cognition and the kernels make of an invocation."""
+    """Effect of the flow steps, the cache, the cognition and the kernels on an invocation."""
     compiled = [value for name, value in p50_ms.items() if name.startswith("torch.compile")]
     fused = p50_ms.get(FUSED)
     return {
@@ -278,14 +278,14 @@ def _compile_modes(options: LatencyOptions, notes: list[str]) -> tuple[CompileMo
 
 
 def _compiled(ways: Ways, modes: tuple[CompileMode, ...], what: str, notes: list[str]) -> dict[str, Call]:
-    """The modes that compile; a note says how long that took, or why not."""
+    """The modes that compile; a note gives the compile time or the failure."""
     calls: dict[str, Call] = {}
     for mode in modes:
         name, call = f"torch.compile, {mode}", ways.compiled(mode)
         start_s = time.monotonic()
         try:
             call()
-        except Exception as error:  # whatever a compiler raises, the other rows are worth having
+        except Exception as error:  # a compiler may raise anything; keep the other rows
             notes.append(f"{name} failed for {what}: {type(error).__name__}.")
             continue
         notes.append(f"{name} took {time.monotonic() - start_s:.0f} s for {what}.")
@@ -313,7 +313,7 @@ def _p50(took_ms: list[float]) -> float:
 
 
 def _mae(actions_BNA: Tensor | None, exact_BNA: Tensor) -> float | None:
-    """Over all dims of the network's actions."""
+    """Mean absolute error over all dims of the network's actions."""
     return None if actions_BNA is None else float(f"{(actions_BNA - exact_BNA).abs().mean().item():.1e}")
 
 

@@ -1,8 +1,8 @@
-"""Recorded episodes of the public benchmark beside ours: the same scene, placed by the code that the tests use.
+"""Recorded episodes of the public benchmark, and their scenes in our tasks, placed by the tests' own code.
 
 A folder of recordings holds, per task, ``<Task>_train006.json`` and ``.npz``: goals, texts, actions, object poses and
-frames of one episode, written while the benchmark's own planner drove. They are not part of this repository, but the
-scenes are, with the values that the tests need, in ``tests/tasks/data``.
+frames of one episode of the benchmark's own planner. They are not part of this repository, but their scenes are, with
+the values for the tests, in ``tests/tasks/data``.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Recording:
 
 
 def recorded_tasks(folder: Path) -> list[str]:
-    """Returns our tasks of which the folder has a recording. Raises FileNotFoundError if there is none."""
+    """Returns our tasks with a recording in the folder. Raises FileNotFoundError if there is none."""
     found = [task for task in task_names() if (folder / f"{task}{_SUFFIX}.npz").exists()]
     if not found:
         raise FileNotFoundError(f"no <Task>{_SUFFIX}.npz of any of our tasks in {folder}; give --recordings the folder")
@@ -47,7 +47,7 @@ def read(task: str, folder: Path) -> Recording:
 
 
 def layout_of(task: str) -> Any | None:
-    """Returns the recorded scene in the task's terms; None if no test of recordings knows the task."""
+    """Returns the recorded scene as the task's layout; None if no test has the task's recording."""
     for path in sorted(_TESTS.glob("test_*recordings.py")):
         module = importlib.import_module(f"tests.tasks.{path.stem}")
         if hasattr(module, "FILES") and task in module.FILES:

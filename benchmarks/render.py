@@ -17,12 +17,12 @@ Written by `python -m benchmarks.render` from the JSON files beside it; do not e
 
 
 def render(reports: list[dict[str, Any]]) -> str:
-    """The whole page."""
+    """Returns the whole page."""
     return "\n".join([HEAD, *(section(report) for report in reports)])
 
 
 def reports_in(folder: Path) -> list[dict[str, Any]]:
-    """Each under the name of its file: one benchmark may have run on several machines."""
+    """The reports, each with its file's name: one benchmark may have run on several machines."""
     return [json.loads(path.read_text()) | {"name": path.stem} for path in sorted(folder.glob("*.json"))]
 
 

@@ -1,6 +1,6 @@
-"""One report per question: what was measured, on what, with what; JSON that ``render`` turns into tables.
+"""Reports of measurements with machine, versions and options, as JSON that ``render`` turns into tables.
 
-No host name and no path ever enters a report.
+A report contains no host name and no path.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ Row = dict[str, str | int | float | None]
 
 @dataclass(kw_only=True)
 class Report:
-    """Opened before the first measurement, so that the load it ran under is known on both sides.
+    """Opened before the first measurement, so that the machine's load before and after is recorded.
 
     Args:
-        name: of the JSON file.
-        question: the sentence that the numbers answer.
+        name: name of the JSON file.
+        question: the question that the numbers answer.
         config: the options of this run.
-        warm_up: what was done before measuring, and is in no number.
+        warm_up: description of the uncounted work before measuring.
     """
 
     name: str
@@ -49,7 +49,7 @@ class Report:
     _start_s: float = field(default_factory=time.monotonic)
 
     def add_table(self, title: str, rows: Sequence[Row]) -> None:
-        """Rows with the same keys; units are part of the keys."""
+        """Adds rows with the same keys; units are part of the keys."""
         self.tables.append({"title": title, "rows": list(rows)})
 
     def write(self) -> Path:
@@ -79,7 +79,7 @@ class Report:
 
 
 def spread(values: Sequence[float], unit: str) -> Row:
-    """n, smallest, nearest-rank percentiles and largest: all of them observed values."""
+    """n, minimum, nearest-rank percentiles and maximum: all of them observed values."""
     if not values:
         return {"n": 0, f"min_{unit}": None} | {f"{name}_{unit}": None for name in ("p50", "p95", "p99", "max")}
     p50, p95, p99 = np.percentile(values, (50, 95, 99), method="inverted_cdf")
@@ -116,19 +116,19 @@ def _cpu_model() -> str:
 
 
 def _instructions() -> str:
-    """The widest vectors and matrix units that the CPU has: one name may stand for very different ones."""
+    """The CPU's widest vector and matrix instructions: models of one name may differ in them."""
     return " ".join(flag for flag in _SIMD if flag in _cpu_info("flags").split())
 
 
 def _cpu_info(name: str) -> str:
-    """What Linux says of the first core; empty elsewhere."""
+    """An entry of the first core in /proc/cpuinfo; empty if not on Linux."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     return next((line.partition(":")[2].strip() for line in lines if line.startswith(name)), "")
 
 
 def _git_version() -> str:
-    """Commit of the tree that ran; "+changes" if files that git follows differ from it."""
+    """Commit of the working tree; "+changes" if tracked files differ from it."""
     here = Path(__file__).parent
     try:
         sha = subprocess.run(["git", "rev-parse", "--short=12", "HEAD"], cwd=here, capture_output=True, check=True)

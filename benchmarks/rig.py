@@ -1,7 +1,7 @@
-"""A whole machine for one experiment: daemons, a robot's process that plays episodes, and an ear on what they say.
+"""A test rig for one experiment: daemons, a robot's process that plays episodes, and a listener on the bus.
 
-The ear subscribes like the recorder does, in the experiment's own process, so that an experiment also hears a run that
-writes no log, and a process that dies.
+The listener subscribes like the recorder, in the experiment's own process, so that an experiment also observes runs
+without a log, and processes that die.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _MODULES = {"ponder": "ponder_server", "pounce": "pounce_server", "clock": "cloc
 
 
 class Heard(NamedTuple):
-    """A message and when the ear took it off the bus, on the host's monotonic clock."""
+    """A message and the instant at which the listener received it, on the host's monotonic clock."""
 
     message: m.Tick | m.Event
     at_ns: int
@@ -51,12 +51,12 @@ class Rig:
         self._streams = [link.subscribe(TICK, keep=_KEEP), link.subscribe(EVENT, keep=_KEEP)]
 
     def play(self, arguments: Sequence[str], out: Path) -> subprocess.Popen[bytes]:
-        """Starts ``sim-client`` in real time against these daemons; what was heard before is forgotten.
+        """Starts ``sim-client`` in real time against these daemons; clears the messages heard so far.
 
         Args:
-            out: where its results and logs go.
+            out: folder for its results and logs.
         """
-        self._over |= self._episodes  # a thawed clock service still has something to say about its old episode
+        self._over |= self._episodes  # a continued clock service still sends messages of its old episode
         self.heard.clear()
         out.mkdir(parents=True, exist_ok=True)
         command = [sys.executable, "-m", "sim_client", "--mode", "realtime", "--out", str(out), "--no-progress"]
@@ -69,14 +69,14 @@ class Rig:
         return player
 
     def restart(self, name: str) -> None:
-        """A killed daemon comes back where it was."""
+        """Restarts a killed daemon at its endpoint."""
         arguments = ["--link.robot", ROBOT, "--link.listen", self._endpoints[name]]
         if name == "clock":
             arguments += ["--link.connect", self._endpoints["ponder"], self._endpoints["pounce"]]
         self.daemons.start(name, _MODULES[name], arguments)
 
     def listen(self, is_enough: Callable[[], bool], patience_s: float) -> bool:
-        """Hears until ``is_enough()``; False if that took longer than the patience."""
+        """Listens until ``is_enough()``; returns False on timeout."""
         deadline_s = time.monotonic() + patience_s
         while not is_enough():
             if time.monotonic() > deadline_s:

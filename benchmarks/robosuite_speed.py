@@ -1,7 +1,7 @@
 """The peer's half of ``task_speed``: robosuite's own ``env.step`` on one core. Prints JSON; imports nothing of ours.
 
-Run by the interpreter of an environment that has robosuite 1.5.2 and what it needs (numba, scipy, OpenCV). A first
-run there must not be believed: while numba compiles, robosuite has been seen to render wrong frames.
+It runs in the interpreter of an environment with robosuite 1.5.2 and its dependencies (numba, scipy, OpenCV). Discard a
+first run there: while numba compiles, robosuite may render wrong frames.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""How fast could this device do it? The least time for a piece of a network, from ceilings measured in the same run.
+"""Roofline: the least time for a part of a network on this device, from ceilings measured in the same run.
 
-A piece takes at least as long as its multiplications at the device's own best rate, and as reading its weights once at
-the device's own best rate. Both rates are measured: one large product, one large copy. So the share of the roofline
-means the same on a laptop's core and on a GPU, and no figure of a data sheet is in it.
+A part takes at least the time of its multiplications, and of reading its weights once, at the device's best rates. Both
+rates are measured, with one large product and one large copy, not taken from a data sheet. So the fraction of the
+roofline is comparable between a laptop's core and a GPU.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _REPEATS = 7
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ceilings:
-    """The best of a few tries."""
+    """Best rates of a few runs."""
 
     flops_per_s: float
     bytes_per_s: float
@@ -30,7 +30,7 @@ class Ceilings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Piece:
-    """What a call multiplies and which weights it reads. Attention that runs as one operation may be missing."""
+    """Multiplications and weight bytes of a call. Attention that runs as one operation may be missing."""
 
     flops: int
     weight_bytes: int
@@ -40,7 +40,7 @@ class Piece:
 
 
 def measure_ceilings(device: torch.device, dtype: torch.dtype) -> Ceilings:
-    """One product and one copy, large enough for the device (on a CPU a second or two)."""
+    """Measures one product and one copy, large enough for the device (on a CPU a second or two)."""
     side, num_bytes = (1024, 1 << 28) if device.type == "cpu" else (8192, 1 << 31)
     left, right = (torch.randn(side, side, device=device).to(dtype) for _ in range(2))
     source = torch.ones(num_bytes // 4, device=device)
@@ -51,7 +51,7 @@ def measure_ceilings(device: torch.device, dtype: torch.dtype) -> Ceilings:
 
 
 def piece_of(call: Callable[[], Any]) -> Piece:
-    """Runs ``call`` once, counting. Rows of an embedding are not counted: few of them are read."""
+    """Runs ``call`` once and counts. Embedding tables are not counted, because few of their rows are read."""
     read: dict[int, int] = {}
 
     def note(module: nn.Module, *_: Any) -> None:

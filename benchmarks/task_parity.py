@@ -1,8 +1,8 @@
-"""Are our tasks the public benchmark's? Each is played in the scene of a recorded episode, and both are compared.
+"""Parity of our tasks with the public benchmark's: each is played in the scene of a recorded episode and compared.
 
-Our oracle's episode: goal, ordered texts of video and execution, length. Our world under the recorded actions: texts
-and coordinates of the execution, and where things are that move by script, at every step until the last of them has
-come to rest. (Coordinates are fixed when a thing is first seen. Under other actions a hand may hide it at that moment.)
+Our oracle's episode: goal, ordered texts of video and execution, length. Our simulation under the recorded actions:
+texts and coordinates of the execution, and the poses of scripted objects at every step until the last one rests.
+(Coordinates are fixed when an object is first visible; under other actions the arm may occlude it at that moment.)
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from protocol.command_line import parse
 MAX_LENGTH_OFF, MAX_PX, MAX_M = 0.2, 4, 0.005
 
 _ALIASES = {"moving_cube": "shuttle"}
-_SCRIPTED = ("container_", "moving_cube")  # what the clock moves; VideoRepick's cubes also wait for the arm
+_SCRIPTED = ("container_", "moving_cube")  # objects moved by time alone; VideoRepick's cubes also wait for the arm
 _OUT_OF_SIGHT_M = 5.0
 
 
@@ -37,7 +37,7 @@ class ParityOptions:
     recordings: Path
     """Folder of ``<Task>_train006.json`` and ``.npz``."""
     tasks: tuple[str, ...] = ()
-    """All that are recorded, by default."""
+    """Names of the tasks. Empty: all that are recorded."""
 
 
 def compare(env: Environment, recording: Recording) -> Row:
@@ -91,7 +91,7 @@ def compare(env: Environment, recording: Recording) -> Row:
 
 
 def played(env: Environment, first: Snapshot, actions: Iterable[NDArray[np.float32]]) -> list[Snapshot]:
-    """What is seen under some actions until the episode is over."""
+    """Snapshots under the given actions until the episode ends."""
     snapshots = [first]
     for action in actions:
         snapshots.append(env.step(action))
@@ -101,7 +101,7 @@ def played(env: Environment, first: Snapshot, actions: Iterable[NDArray[np.float
 
 
 def without_repeats(said: Iterable[str]) -> list[str]:
-    """The texts in order, each once until another one comes."""
+    """The texts in order, without consecutive repeats."""
     return [text for text, _ in groupby(said)]
 
 
@@ -116,13 +116,13 @@ def texts(snapshots: Iterable[Snapshot]) -> list[tuple[str, str]]:
 
 
 def apart(ours: str, theirs: str) -> list[int]:
-    """How far the coordinates of two texts are apart, in pixels; as many as both have."""
+    """Differences between the coordinates of two texts, in pixels, for as many as both have."""
     numbers = ([int(n) for n in re.findall(r"\d+", " ".join(re.findall(r"<[^>]*>", text)))] for text in (ours, theirs))
     return [abs(a - b) for a, b in zip(*numbers, strict=False)]
 
 
 def drift(env: Environment, recording: Recording, layout: object) -> float | None:
-    """How far scripted things get from where they were recorded, in metres; None if there are none."""
+    """Largest distance of scripted objects from their recorded poses, in metres; None if there are none."""
     names = [str(name) for name in recording.arrays["object_names"]]
     moved = [name for name in names if name.startswith(_SCRIPTED)]
     if not moved:
@@ -145,7 +145,7 @@ def drift(env: Environment, recording: Recording, layout: object) -> float | Non
 
 
 def farthest_m(env: Environment, names: Sequence[str], theirs: NDArray[np.float32]) -> float:
-    """The largest distance of a thing from its recorded pose (n, 7); what is out of sight in both does not count."""
+    """Largest distance of an object from its recorded pose (n, 7); objects out of sight in both do not count."""
     worst_m = 0.0
     for name, pose in zip(names, theirs, strict=True):
         ours_m = env.physics.position_m(_ALIASES.get(name, name))

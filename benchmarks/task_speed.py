@@ -1,8 +1,8 @@
-"""How fast are demonstrations collected on one core, and how much faster is our ``env.step`` than robosuite's?
+"""Speed of collecting demonstrations on one core, and of our ``env.step`` compared with robosuite's.
 
-Whole oracle episodes, reset and planning inside, at three rates of looking: not at all; at 4 Hz, which holds the 1 Hz
-that PONDER reads and the 4 Hz at which POUNCE is invoked; and at every step. Beside them, in the same run and on the
-same core, robosuite's own step with two cameras of the same size, if an interpreter that can import it is named.
+Whole oracle episodes, with reset and planning, at three rates of rendering: none; 4 Hz, which covers PONDER's 1 Hz and
+POUNCE's 4 Hz; and every step. In the same run and on the same core, robosuite's own step with two cameras of the same
+size, if an interpreter with robosuite is given.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ class SpeedOptions:
     """Simulated seconds per wall second on one core."""
 
     tasks: tuple[str, ...] = ()
-    """All by default."""
+    """Names of the tasks. Empty: all."""
     seeds: tuple[int, ...] = (0, 1, 2)
-    """One episode each: easy, medium, hard."""
+    """Seeds, with one episode each: easy, medium, hard."""
     rounds: int = 1
-    """Ways take turns."""
+    """Rounds; ways take turns."""
     image_px: int = 256
     peer_python: Path | None = None
     """Interpreter of an environment with robosuite 1.5.2; without it the peer's rows are missing."""
@@ -41,7 +41,7 @@ class SpeedOptions:
 
 
 def measured(command: list[str]) -> list[dict[str, Any]]:
-    """The JSON lines that a worker prints."""
+    """Runs a worker and returns its JSON lines."""
     environment = os.environ | {"OMP_NUM_THREADS": "1", "MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl")}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode != 0:

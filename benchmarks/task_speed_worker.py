@@ -1,4 +1,4 @@
-"""The measured half of ``task_speed``, one process on one core: oracle episodes, looked at so often. Prints JSON."""
+"""The measured half of ``task_speed``, one process on one core: oracle episodes rendered at a rate. Prints JSON."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dual_system.tasks.physics import CONTROL_HZ
 
 
 def main(task: str, look_hz: int, image_px: int, seeds: list[int]) -> None:
-    """One line per seed after a first one that is not counted."""
+    """Prints one line per seed, after an uncounted episode."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     every = CONTROL_HZ // look_hz if look_hz else 0

@@ -1,12 +1,12 @@
-"""How fast does training go, where does a step spend its time, and how far is that from what the machine can multiply?
+"""Training throughput, the parts of a step, and their rates compared with the machine's peak.
 
-One step is the trainer's own: forward, backward, clipping, AdamW, average. Timed apart, forward and backward: PONDER's
-rows (pictures and text of whole episodes, with the LM head on supervised tokens), read together and one after the other
-in turns, and POUNCE's invocations with their cognition given. Episodes are noise, of ``--ticks``, under the
-recipe's own schedules; decoding and reading of a dataset are not in the numbers.
+One step is the trainer's: forward, backward, clipping, AdamW, average. Timed separately, forward and backward: PONDER's
+rows (pictures and text of whole episodes, with the LM head on supervised tokens), alternately batched and one after
+the other, and POUNCE's invocations with given cognition. Episodes are noise, of ``--ticks``, under the recipe's own
+schedules; reading and decoding a dataset is not included.
 
 Operations are those that torch counts in matrix products and attention (``FlopCounterMode``), forward and backward; the
-peak is a square product of the same dtype, measured here. A network of a few dozen channels spends its time elsewhere.
+peak is a square product of the same dtype, measured here. Networks of a few dozen channels spend their time elsewhere.
 """
 
 from __future__ import annotations
@@ -46,16 +46,16 @@ class ThroughputOptions:
     """PONDER of this size instead; POUNCE reads its cognition."""
     device: Literal["cpu", "cuda"] = "cpu"
     dtype: Literal["float32", "bfloat16"] = "float32"
-    """Of PONDER's weights and of the product that the peak is measured with."""
+    """Number format of PONDER's weights and of the peak's product."""
     threads: int = 1
     ticks: tuple[int, ...] = (100, 100)
-    """20 Hz steps of each episode of the batch."""
+    """Number of 20 Hz steps of each episode in the batch."""
     demo: int = 5
-    """Seconds of demonstration, a picture of each camera for each."""
+    """Seconds of demonstration, with one picture per camera and second."""
     steps: int = 5
-    """After one that is not counted."""
+    """Measured steps, after an uncounted one."""
     peak_size: int = 1024
-    """Side of the square product; 8192 says more of a GPU."""
+    """Side of the square product; use 8192 on a GPU."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -118,7 +118,7 @@ def _build(options: ThroughputOptions) -> tuple[JointModel, PounceBundle, Recipe
     bundle = random_bundle(run.pounce, seed=0)
     bundle.model.to(options.device)
     freeze(bundle.model, run.freeze)
-    reads_together = options.device != "cpu"  # as pp-train has it
+    reads_together = options.device != "cpu"  # as in pp-train
     return JointModel(ponder, bundle.model, w1=run.w1, w2=run.w2, reads_together=reads_together), bundle, run
 
 
@@ -169,14 +169,14 @@ def _pounce(model: JointModel, invocations: PounceBatch) -> None:
 
 
 def _flops(once: Callable[[], object]) -> int:
-    """Also the warm-up."""
+    """Counts the operations of one pass, which is also the warm-up."""
     with FlopCounterMode(display=False) as counter:
         once()
     return int(counter.get_total_flops())
 
 
 def _peak_flops(options: ThroughputOptions) -> float:
-    """Of a square product, the best of ten."""
+    """Rate of a square product, the best of ten."""
     side = options.peak_size
     left = torch.randn(side, side, device=options.device, dtype=getattr(torch, options.dtype))
     took_ms = [_timed_ms(lambda: left @ left, options.device) for _ in range(11)][1:]

@@ -1,7 +1,7 @@
-"""``pp-check``: does an episode's log follow from itself? Every decision derived again, the first that differs named.
+"""``pp-check``: derives every decision of an episode's log again, and names the first that differs.
 
-Causes before consequences: queries, stamps, invocations, chunks, deadlines, rows, result. An "oracle" episode has no
-servers, so only deadlines and result are checked.
+Causes are checked before consequences: queries, stamps, invocations, chunks, deadlines, rows, result. An "oracle"
+episode has no servers, so only deadlines and result are checked.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ class CheckConfig:
     files: tyro.conf.Positional[tuple[Path, ...]]
     """Episode logs (.mcap, or .mcap.partial of a killed process)."""
     recover: Path | None = None
-    """Write what is readable of the one FILE into this finished log, and check that."""
+    """Write the readable part of the only FILE into this finished log, and check that."""
     json: bool = False
-    """One JSON object per file instead of a sentence."""
+    """Print one JSON object per file instead of a sentence."""
     residual_head: Path | None = None
-    """The head that corrected the rows, if one did."""
+    """File of the residual head that corrected the rows, if there was one."""
     residual_loader: str = DEFAULT_LOADER
-    """Who reads it: package.module:callable."""
+    """Loader of --residual-head, as package.module:callable."""
 
 
 def disagreements(record: EpisodeRecord, residual: ResidualHead | None = None) -> Iterator[Disagreement]:
-    """All of them, causes before consequences; only the first is sure to be a cause. Lazy: take one with ``next``.
+    """Yields all disagreements, causes before consequences; only the first is surely a cause. Lazy: use ``next``.
 
-    ``residual``: the head that corrected the rows, if one did.
+    ``residual``: the head that corrected the rows, if there was one.
     """
     if record.info.policy != "oracle":
         answers = answers_of(record)
@@ -62,18 +62,18 @@ def disagreements(record: EpisodeRecord, residual: ResidualHead | None = None) -
 
 
 def check_residual(record: EpisodeRecord, residual: ResidualHead | None) -> Iterator[Disagreement]:
-    """Whether the head given is the one that played; without it no row can be derived."""
+    """Checks that ``residual`` is the head of the episode; without it no row can be derived."""
     logged = [event.attributes["digest"] for event in record.events if event.name == RESIDUAL_EVENT]
     given = "none (--residual-head)" if residual is None else residual.digest
     yield from compare("Event", 0, residual_head=(given, logged[0] if logged else "none (--residual-head)"))
 
 
 def check_result(record: EpisodeRecord) -> Iterator[Disagreement]:
-    """The result's count and hash; a log without a result, or a result without a hash, promises nothing.
+    """Checks the result's count and hash, if the log has a result with a hash.
 
-    In real time the clock service may play on until it hears of the end: the result counts what the robot obeyed. A
-    tick's account travels behind its action, and of a clock service that was killed in between it never comes: where
-    the robot lost its clock, one may be missing.
+    In real time the clock service may play on until it is notified of the end; the result counts only the actions that
+    the robot executed. A tick's record follows its action, so a clock service that was killed in between never sends
+    it: after a lost clock, one record may be missing.
     """
     result = record.result
     if result is None:

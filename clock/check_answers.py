@@ -1,8 +1,8 @@
-"""Were the right questions asked, and was each answer admitted when it should have been? Queries to chunks.
+"""Checks queries, stamps, invocations and chunks: which were sent, and when each answer was admitted.
 
-Everything is derived again from the messages and the pure rules (``reference``, ``delays``); nothing here knows the
-Conductor, so a defect there cannot hide itself. Two facts of its publishing are relied on: ``header.at_ns`` of a Query
-is the instant of the poll that asked, and the stamps' ``arrived_ns`` are measurements, which no rule gives.
+All of it is derived again from the messages and the pure rules (``reference``, ``delays``), without the Conductor, so
+that a defect there cannot hide itself. Two facts about its messages are assumed: ``header.at_ns`` of a Query is the
+instant of the poll that sent it, and the stamps' ``arrived_ns`` are measurements, which no rule can derive.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from protocol.messages import (
 
 @dataclass(slots=True)
 class Answers:
-    """What the clock service had to work with, by index: the answers it took, and the stamps that admitted them."""
+    """The answers that the clock service took, by index, and the stamps that admitted them."""
 
     cognitions: dict[int, Cognition] = field(default_factory=dict)
     chunks: dict[int, ActionChunk] = field(default_factory=dict)
@@ -44,7 +44,7 @@ class Answers:
     first_ticks: dict[int, int] = field(default_factory=dict)  # by chunk: the first tick decided after it was ready
 
     def admitted(self, now_ns: int) -> list[Chunk]:
-        """The chunks that could be played at ``now_ns``."""
+        """The chunks that were admitted by ``now_ns``."""
         return [
             Chunk(
                 invocation=chunk.invocation,
@@ -60,7 +60,7 @@ class Answers:
 
 
 def answers_of(record: EpisodeRecord) -> Answers:
-    """The answers as the clock service takes them: the first to what was asked; doubles and strangers do not count."""
+    """The answers that the clock service takes: the first to each request; duplicates and unasked ones do not count."""
     asked_ns = {q.query: q.source_ns for q in record.queries}
     invoked_ns = {i.invocation: i.now_ns for i in record.invocations}
     form = (record.info.schedule.horizon, record.info.robot.action_dim, ActionSpace.JOINT_TARGET)
@@ -91,11 +91,11 @@ def answers_of(record: EpisodeRecord) -> Answers:
 
 
 def check_queries(record: EpisodeRecord) -> Iterator[Disagreement]:
-    """Numbered without gaps, each about an observation that was there, never twice in one query period."""
+    """Checks that queries are numbered without gaps, name existing observations, and come once per query period."""
     schedule, queries = record.info.schedule, record.queries
     sources: dict[int, set[int]] = {}
     for observation in record.observations:
-        if observation.header.clock_id == EPISODE_CLOCK:  # on another clock the log cannot say
+        if observation.header.clock_id == EPISODE_CLOCK:  # not comparable on another clock
             sources.setdefault(observation.tick, set()).add(observation.source_ns)
     window = 0
     for index, query in enumerate(queries):
@@ -117,7 +117,7 @@ def check_queries(record: EpisodeRecord) -> Iterator[Disagreement]:
 
 
 def check_stamps(record: EpisodeRecord, answers: Answers) -> Iterator[Disagreement]:
-    """One stamp per answer, in order, at the instant that the delay model gives."""
+    """Checks that there is one stamp per answer, in order, at the instant of the delay model."""
     schedule = record.info.schedule
     query_rng, invoke_rng = map(np.random.default_rng, np.random.SeedSequence(schedule.seed).spawn(2))
     yield from _check_kind(
@@ -151,7 +151,7 @@ def _check_kind(
     for stamp in stamps:
         if stamp.index in seen:
             yield from compare(name, stamp.index, times=("stamped once", "twice"))
-        if is_lockstep and stamp.index < last_index:  # in real time an overdue answer may come after a later one's
+        if is_lockstep and stamp.index < last_index:  # in real time an overdue answer may follow a later one
             yield from compare(name, stamp.index, order=("before the later ones", f"after {last_index}"))
         seen.add(stamp.index)
         answer = answers.get(stamp.index)
@@ -159,7 +159,7 @@ def _check_kind(
             yield from compare(name, stamp.index, answer=("the answer it admits", "none in the log"))
             continue
         delay_ns = delays_ns[stamp.index]
-        if delay_ns is None:  # measured: what it took (lockstep), or when it came (real time)
+        if delay_ns is None:  # measured: compute time (lockstep) or arrival (real time)
             delay_ns = answer.infer_ns if is_lockstep else stamp.arrived_ns - answer.source_ns
         due_ns = answer.source_ns + delay_ns
         ready_ns = in_order(due_ns if is_lockstep else max(due_ns, stamp.arrived_ns), last_ready_ns)
@@ -175,7 +175,7 @@ def _check_kind(
 
 
 def check_invocations(record: EpisodeRecord, answers: Answers) -> Iterator[Disagreement]:
-    """The paper's rule: which cognition, how old, that POUNCE was given that very vector; and its chunk says so too."""
+    """Checks the paper's rule: reference and age of every invocation, the vector it contains, and its chunk's copy."""
     window = -1
     for index, invocation in enumerate(record.invocations):
         yield from _check_given(record, answers, index, invocation)
@@ -203,7 +203,7 @@ def check_invocations(record: EpisodeRecord, answers: Answers) -> Iterator[Disag
 
 
 def _check_given(record: EpisodeRecord, answers: Answers, index: int, invocation: Invocation) -> Iterator[Disagreement]:
-    """Reference, age, vector and noise, from the stamps admitted when it was made."""
+    """Checks reference, age, vector and noise seed against the stamps admitted when the invocation was made."""
     schedule = record.info.schedule
     polled_ns = _polled_ns(record, invocation)
     admitted = [ready for ready in answers.ready if ready.ready_ns <= polled_ns]
@@ -226,12 +226,12 @@ def _check_given(record: EpisodeRecord, answers: Answers, index: int, invocation
 
 
 def _tick_of(record: EpisodeRecord, invocation: Invocation) -> int:
-    """The tick at whose deadline it was made; negative before the first, when it is made as soon as it can be."""
+    """The tick at whose deadline the invocation was made; negative before tick 0, when it is made immediately."""
     return tick_at(record.ticks[0].deadline_ns, invocation.now_ns, record.info.schedule.control_hz)
 
 
 def _polled_ns(record: EpisodeRecord, invocation: Invocation) -> int:
-    """When the poll happened that made this invocation: its tick may have been decided late."""
+    """The instant of the poll that made this invocation: its tick may have been decided late."""
     if not record.ticks:
         return invocation.now_ns
     tick = _tick_of(record, invocation)
@@ -239,9 +239,9 @@ def _polled_ns(record: EpisodeRecord, invocation: Invocation) -> int:
 
 
 def _unplayed_rows(record: EpisodeRecord, answers: Answers, tick: int, invocation: int) -> Floats | None:
-    """What the chunk in use still had to say from ``tick`` on, (n * action_dim,); None if the log ends before.
+    """Unplayed rows of the chunk in use from ``tick`` on, (n * action_dim,); None if the log ends before.
 
-    Earlier invocations only: with a modelled delay of 0 an invocation's own chunk is admitted at the same instant.
+    Only earlier invocations count: with a modelled delay of 0 a chunk is admitted at its invocation's own instant.
     """
     if tick >= len(record.ticks) or record.ticks[tick].level == Level.SKIPPED:
         return None

@@ -1,4 +1,4 @@
-"""One place where a log and the rules disagree, and the comparison that finds it: exact, floats bit for bit."""
+"""Disagreements between a log and the rules, and the exact comparison that finds them: floats bit for bit."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Disagreement:
-    """``message`` number ``index`` says ``found`` in ``field`` where the rules give ``expected``."""
+    """``message`` number ``index`` has ``found`` in ``field`` where the rules give ``expected``."""
 
     message: str
     index: int
@@ -37,8 +37,8 @@ def compare(message: str, index: int, /, **pairs: tuple[Any, Any]) -> Iterator[D
                     message=message, index=index, field=f"{field}[{at}]", expected=values[0], found=values[1]
                 )
         elif expected != found:
-            yield Disagreement(message=message, index=index, field=field, expected=_said(expected), found=_said(found))
+            yield Disagreement(message=message, index=index, field=field, expected=_text(expected), found=_text(found))
 
 
-def _said(value: Any) -> str:
+def _text(value: Any) -> str:
     return str(getattr(value, "name", value))

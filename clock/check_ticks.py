@@ -1,7 +1,7 @@
-"""Was the right row played at every tick? Deadlines, chunk, seam, limits, ladder, command: all derived again.
+"""Checks the row played at every tick: deadline, chunk, seam, limits, ladder and command are derived again.
 
-The only state carried from tick to tick is what the rules themselves carry: the last command, the ladder's rung, and
-which chunk was played last.
+The only state carried from tick to tick is that of the rules: the last command, the ladder's rung, and the chunk
+played last.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _NO_FLOATS: Floats = np.zeros(0, np.float32)
 
 
 def check_deadlines(record: EpisodeRecord) -> Iterator[Disagreement]:
-    """Tick k, without gaps, is due k / hz after tick 0; in lockstep it is never late."""
+    """Checks that tick k, without gaps, is due k / hz after tick 0, and is never late in lockstep."""
     schedule = record.info.schedule
     for index, tick in enumerate(record.ticks):
         yield from compare("Tick", index, tick=(index, tick.tick))
@@ -46,7 +46,7 @@ def check_deadlines(record: EpisodeRecord) -> Iterator[Disagreement]:
 
 
 def check_rows(record: EpisodeRecord, answers: Answers, residual: ResidualHead | None = None) -> Iterator[Disagreement]:
-    """What each tick commanded, and that the Action sent is the same. Assumes that the deadlines agree."""
+    """Checks each tick's command, and that the Action sent is equal. Assumes that the deadlines agree."""
     states = _logged_states(record)
     actions = {action.tick: action for action in record.actions}
     engaged = sorted(event.tick for event in record.events if event.name == "engaged")
@@ -54,7 +54,7 @@ def check_rows(record: EpisodeRecord, answers: Answers, residual: ResidualHead |
     for index, tick in enumerate(record.ticks):
         newest = tick_at(record.ticks[0].deadline_ns, tick.decided_ns, record.info.schedule.control_hz)
         is_skipped = newest > index
-        if is_skipped or tick.level == Level.SKIPPED:  # nothing was commanded, nothing moves on
+        if is_skipped or tick.level == Level.SKIPPED:  # no command, no change of state
             yield from compare("Tick", index, is_skipped=(is_skipped, tick.level == Level.SKIPPED))
             yield from compare("Tick", index, action=(_NO_FLOATS, tick.action), sent=(False, index in actions))
             continue
@@ -82,7 +82,7 @@ def check_rows(record: EpisodeRecord, answers: Answers, residual: ResidualHead |
 
 @dataclass(slots=True)
 class _Playing:
-    """The rules, one tick after the other."""
+    """Applies the rules tick by tick."""
 
     info: EpisodeInfo
     residual: ResidualHead | None
@@ -135,7 +135,7 @@ class _Playing:
 
 
 def _logged_states(record: EpisodeRecord) -> dict[int, list[Floats]]:
-    """Proprio of the observations, by tick; a robot may send one twice."""
+    """Proprioception of the observations, by tick; a robot may send one twice."""
     states: dict[int, list[Floats]] = {}
     for observation in record.observations:
         states.setdefault(observation.tick, []).append(observation.proprio)

@@ -1,8 +1,8 @@
 """The schedule of one episode as a pure state machine: messages and instants in, messages out.
 
-It decides when PONDER looks (query), what POUNCE is given (invocation: reference, age, cognition), which row is played
+It decides when PONDER is queried, what POUNCE is given (invocation: reference, age, cognition), which row is played
 at each tick, and what happens when there is none. It never reads a clock, sleeps or touches a bus, so real time and
-lockstep are the same code: in lockstep the shell asks ``is_waiting`` and lets time stand still meanwhile.
+lockstep are the same code: in lockstep the shell checks ``is_waiting`` and stops time meanwhile.
 
     WAIT_OBSERVATION -> WAIT_COGNITION -> WAIT_CHUNK -> RUNNING -> ENDED
 
@@ -60,20 +60,20 @@ class Stage(Enum):
 
 
 @dataclass(slots=True)
-class _Asked:
-    """A query or an invocation that is under way. ``ready_ns`` is known beforehand only if the delay is modelled."""
+class _Pending:
+    """A pending query or invocation. ``ready_ns`` is known beforehand only if the delay is modelled."""
 
     index: int
     source_ns: int
     delay_ns: int | None
     terms: tuple[int, int | None, int] = (0, None, 0)
-    """Of an invocation: tick of row 0, ref(j) and Delta(j), which its chunk must repeat."""
+    """Tick of row 0, ref(j) and Delta(j) of an invocation, which its chunk must repeat."""
     answer: Cognition | ActionChunk | None = None
     arrived_ns: int = 0
 
     @property
     def due_ns(self) -> int:
-        """No instant before this one depends on the answer."""
+        """The first instant that depends on the answer."""
         return self.source_ns + (self.delay_ns or 0)
 
 
@@ -85,9 +85,9 @@ class Conductor:
     played, or the rung of the ladder.
 
     Attributes:
-        info: what was agreed when the episode was opened.
-        committed_ticks: ticks that will be played whatever a new chunk says (told to POUNCE).
-        residual: corrects every row with the newest joints; None: nobody does.
+        info: the episode's terms, agreed when it was opened.
+        committed_ticks: number of ticks that will be played whatever a new chunk contains; POUNCE receives it.
+        residual: head that corrects every row with the newest joints; None: no correction.
         start_ns: deadline of tick 0, once known.
     """
 
@@ -103,8 +103,8 @@ class Conductor:
     last_command: Floats = field(init=False)
     _absent: set[str] = field(default_factory=set)
     _newest: Observation | None = None
-    _queries: list[_Asked] = field(default_factory=list)
-    _invocations: list[_Asked] = field(default_factory=list)
+    _queries: list[_Pending] = field(default_factory=list)
+    _invocations: list[_Pending] = field(default_factory=list)
     _ready: list[Ready] = field(default_factory=list)
     _vectors: dict[int, Floats] = field(default_factory=dict)
     _chunks: list[Chunk] = field(default_factory=list)
@@ -115,7 +115,7 @@ class Conductor:
     _queried_in: int = -1  # tick
     _invoked_in: int = -1
     _played_invocation: int | None = None
-    _told: set[str] = field(default_factory=set)
+    _emitted: set[str] = field(default_factory=set)
     _join: Join = field(init=False)
     _query_rng: np.random.Generator = field(init=False)
     _invoke_rng: np.random.Generator = field(init=False)
@@ -127,21 +127,21 @@ class Conductor:
         streams = np.random.SeedSequence(self.info.schedule.seed).spawn(2)
         self._query_rng, self._invoke_rng = (np.random.default_rng(s) for s in streams)
 
-    # -- what comes in
+    # -- inputs
 
     def on_observation(self, observation: Observation) -> bool:
-        """Takes what the robot sees; False if something newer is known."""
+        """Takes an observation; returns False if a newer one is known."""
         if self._newest is not None and observation.tick < self._newest.tick:
             return False
         self._newest = observation
         return True
 
     def on_cognition(self, cognition: Cognition, now_ns: int) -> bool:
-        """Takes PONDER's answer; False if nobody asked for it (late, doubled, unknown)."""
+        """Takes PONDER's answer; returns False if it was not asked for (late, duplicate, unknown)."""
         return _take(self._queries, cognition.query, cognition, cognition.infer_ns, now_ns, self._is_lockstep)
 
     def on_chunk(self, chunk: ActionChunk, now_ns: int) -> bool:
-        """Takes POUNCE's answer; False if nobody asked for it, or its shape, space or terms are not those asked for."""
+        """Takes POUNCE's answer; returns False if it was not asked for, or its shape, space or terms are wrong."""
         if (chunk.horizon, chunk.action_dim) != (self.info.schedule.horizon, self.info.robot.action_dim):
             return False
         if chunk.action_space != ActionSpace.JOINT_TARGET:
@@ -152,7 +152,7 @@ class Conductor:
         return _take(self._invocations, chunk.invocation, chunk, chunk.infer_ns, now_ns, self._is_lockstep)
 
     def on_lost(self, proc: str) -> None:
-        """A server is gone. In real time, what it still owed will not come; in lockstep the world waits for it."""
+        """Notes a lost server. In real time its pending answers will not come; in lockstep the world waits for it."""
         if self._is_lockstep:
             return
         self._absent.add(proc)
@@ -165,10 +165,10 @@ class Conductor:
     def engage(self) -> None:
         self.ladder.engage()
 
-    # -- what goes out
+    # -- outputs
 
     def poll(self, now_ns: int) -> list[Effect]:
-        """Everything that is due at ``now_ns``, in order."""
+        """Returns all messages that are due at ``now_ns``, in order."""
         effects: list[Effect] = []
         if self._newest is not None and self._newest.status != TaskStatus.ONGOING:
             self.stage = Stage.ENDED
@@ -188,7 +188,7 @@ class Conductor:
             if self._chunks:
                 self._start(now_ns)
             elif not self._is_lockstep and not self._is_busy(self._invocations, now_ns, self._overdue_ns):
-                # lost on its way, refused, or POUNCE died: ask again
+                # The answer was lost or refused, or POUNCE died: ask again.
                 self.stage = Stage.WAIT_COGNITION
         while self.stage == Stage.RUNNING and self.deadline_ns(self.tick) <= now_ns:
             if not self._run_tick(now_ns, effects):
@@ -196,23 +196,23 @@ class Conductor:
         return effects
 
     def next_ns(self, now_ns: int) -> int | None:
-        """When ``poll`` has something to do at the latest; None if only a message can change anything."""
+        """Latest instant at which ``poll`` has something to do; None if only a message can change anything."""
         if self.stage == Stage.RUNNING:
             return self.deadline_ns(self.tick)
         modelled = [a.due_ns for a in (*self._queries, *self._invocations) if a.delay_ns is not None]
         return min((due for due in modelled if due > now_ns), default=None)
 
     def will_look(self, tick: int) -> bool:
-        """Whether a model may be asked about the observation of ``tick``, the next one; False only if surely none is.
+        """Whether a model may be asked about the observation of ``tick``, the next one; False only if surely not.
 
-        In lockstep the schedule alone decides, so pictures that nobody will ask for need not be made.
+        In lockstep the schedule alone decides, so the robot need not render pictures that no model will read.
         """
         if not self._is_lockstep or self.stage != Stage.RUNNING:
             return True
         return tick >= self._invoke_due_tick or self.deadline_ns(tick) >= self._query_due_ns
 
     def is_waiting(self, now_ns: int) -> bool:
-        """Lockstep: whether time must stand still at ``now_ns`` because an answer or an observation is owed."""
+        """In lockstep: whether time must stop at ``now_ns`` because an answer or an observation is due."""
         if self._newest is None:
             return True
         if self.stage == Stage.RUNNING and self.deadline_ns(self.tick) <= now_ns and self._newest.tick < self.tick:
@@ -222,7 +222,7 @@ class Conductor:
     def deadline_ns(self, tick: int) -> int:
         return deadline_ns(self.start_ns, tick, self.info.schedule.control_hz)
 
-    # -- inside
+    # -- internals
 
     @property
     def _is_lockstep(self) -> bool:
@@ -231,33 +231,32 @@ class Conductor:
     def _is_owed_by(self, now_ns: int) -> bool:
         return any(a.answer is None and a.due_ns <= now_ns for a in (*self._queries, *self._invocations))
 
-    def _is_busy(self, asked: list[_Asked], now_ns: int, overdue_ns: int) -> bool:
-        """Real time: a server gets one request at a time, so that the next one is about a fresh observation.
+    def _is_busy(self, asked: list[_Pending], now_ns: int, overdue_ns: int) -> bool:
+        """In real time a server gets one request at a time, so that the next one is about a fresh observation.
 
-        An answer that is overdue (lost on its way, or refused) no longer holds up the next request; it is still taken
-        if it comes.
+        An overdue answer (lost or refused) no longer blocks the next request, but is still taken if it comes.
         """
         return any(a.answer is None and now_ns - a.source_ns < overdue_ns for a in asked)
 
     @property
     def _overdue_ns(self) -> int:
-        """An invocation is given up while the chunk before it still has rows enough to bridge the next one."""
+        """Time after which an invocation is overdue: the previous chunk then still has rows to bridge another one."""
         schedule = self.info.schedule
         ticks = max(schedule.invoke_period_ticks, schedule.horizon - schedule.invoke_period_ticks)
         return ticks * NS_PER_S // schedule.control_hz
 
     @property
     def owed_query(self) -> int | None:
-        """The oldest query that still waits for an answer."""
+        """The oldest query without an answer."""
         return next((a.index for a in self._queries if a.answer is None), None)
 
     def _start(self, now_ns: int) -> None:
         self.stage, self.start_ns = Stage.RUNNING, now_ns
 
     def _run_tick(self, now_ns: int, effects: list[Effect]) -> bool:
-        """One tick: ask PONDER, ask POUNCE, play. False if it has to wait before one of them (lockstep).
+        """One tick: ask PONDER, ask POUNCE, play. Returns False if it has to wait before one of them (lockstep).
 
-        Whatever is ready at this very instant is seen by what comes next in it: tau_t + d_t <= tau_j includes equality.
+        An answer that is ready at this instant counts in the same tick: tau_t + d_t <= tau_j includes equality.
         """
         if self._is_lockstep and self._newest is not None and self._newest.tick < self.tick:
             return False
@@ -280,14 +279,14 @@ class Conductor:
         return True
 
     def _settle(self, now_ns: int, effects: list[Effect]) -> bool:
-        """Admits what is ready; False if something that must be ready by now has not come (lockstep)."""
+        """Admits ready answers; returns False if one that must be ready by now has not come (lockstep)."""
         if self._is_lockstep and self._is_owed_by(now_ns):
             return False
         self._stamp_answers(now_ns, effects)
         return True
 
     def _skip_missed(self, now_ns: int, effects: list[Effect]) -> None:
-        """The clock itself was stalled: whole ticks are past. They are logged as skipped, and nothing is caught up."""
+        """Logs whole ticks as skipped that passed while the clock service stalled; they are not caught up."""
         newest = tick_at(self.start_ns, now_ns, self.info.schedule.control_hz)
         if newest > self.tick:
             text = f"ticks {self.tick}..{newest - 1} passed unplayed: the clock service was not running"
@@ -323,7 +322,7 @@ class Conductor:
 
     def _ask_ponder(self, observation: Observation, effects: list[Effect]) -> None:
         delay = modelled_ns(self.info.schedule.query_delay, self._query_rng)
-        asked = _Asked(self.num_queries, observation.source_ns, delay)
+        asked = _Pending(self.num_queries, observation.source_ns, delay)
         self._queries.append(asked)
         effects.append(Query(query=asked.index, tick=observation.tick, source_ns=observation.source_ns))
         self.num_queries += 1
@@ -333,7 +332,7 @@ class Conductor:
         reference = refer(self._ready, tau_ns, self.info.schedule.delivery)
         delay = modelled_ns(self.info.schedule.invoke_delay, self._invoke_rng)
         row0_tick = self._newest.tick if self._newest is not None else tick
-        asked = _Asked(self.num_invocations, tau_ns, delay, (row0_tick, reference.query, reference.age_ns))
+        asked = _Pending(self.num_invocations, tau_ns, delay, (row0_tick, reference.query, reference.age_ns))
         self._invocations.append(asked)
         tail = self._unplayed_rows(tick)
         effects.append(
@@ -361,7 +360,7 @@ class Conductor:
         return chunks[-1].rows_NA[tick - chunks[-1].t_row0 :]
 
     def _stamp_answers(self, now_ns: int, effects: list[Effect]) -> None:
-        """Admits every answer that is ready; the stamp is the log's authority on it."""
+        """Admits every ready answer; the log's stamp is authoritative."""
         for asked, stamp in self._ripe(self._queries, StampKind.COGNITION, now_ns):
             answer = asked.answer
             assert isinstance(answer, Cognition)
@@ -391,16 +390,16 @@ class Conductor:
             effects.append(stamp)
         self._chunks = [c for c in self._chunks if c.t_row0 + len(c.rows_NA) > self.tick]
 
-    def _ripe(self, asked: list[_Asked], kind: StampKind, now_ns: int) -> list[tuple[_Asked, Stamp]]:
+    def _ripe(self, asked: list[_Pending], kind: StampKind, now_ns: int) -> list[tuple[_Pending, Stamp]]:
         return _ripe(asked, kind, self._last_ready_ns, now_ns, self._is_lockstep)
 
     def _forget_vectors(self) -> None:
-        """Keeps only vectors that a delivery can still refer to: the newest, the first, and the last transitions'.
+        """Keeps only vectors that a delivery can still refer to: the newest, the first, and the last two transitions'.
 
-        Two transitions: the last one may have come after the tick's deadline and before this late poll.
+        Two, because the last one may have come after the tick's deadline and before this late poll.
         """
         transitions = [r.query for r in self._ready if r.is_transition]
-        first = min(r.query for r in self._ready)  # an overdue answer may have come after a later one
+        first = min(r.query for r in self._ready)  # an overdue answer may follow a later one
         keep = {first, *transitions[-2:], *(r.query for r in self._ready[-8:])}
         for query in self._vectors.keys() - keep:
             del self._vectors[query]
@@ -430,7 +429,7 @@ class Conductor:
         is_stale = bool(usable) and usable[-1].age_ns > schedule.max_age_ns
         command = self.ladder.step(row, is_stale, self.last_command, proprio)
         level = self.ladder.level
-        if level in (Level.DECELERATE, Level.STOPPED):  # the straight line obeys the limits too
+        if level in (Level.DECELERATE, Level.STOPPED):  # the interpolation must respect the limits too
             command = _limited(command, self.last_command, self.info)
         played = usable[-1] if level in (Level.PLAY, Level.STALE) else None
         jump = self._seam_jump(played, raw)
@@ -441,7 +440,7 @@ class Conductor:
         effects.append(self._account(self.tick, now_ns, level, played, command, raw, hit, jump))
 
     def _seam_jump(self, chunk: Chunk | None, raw: Floats) -> float:
-        """How far the first row of a new chunk lies from the last command; 0 between switches."""
+        """Distance of a new chunk's first row from the last command; 0 between switches."""
         if chunk is None or chunk.invocation == self._played_invocation or not np.isfinite(raw).all():
             return 0.0
         self._played_invocation = chunk.invocation
@@ -493,14 +492,14 @@ class Conductor:
         self._tell(effects, severity, "level", f"{before.name} -> {level.name}: {why}", always=True)
 
     def _tell(self, effects: list[Effect], severity: Severity, name: str, text: str, *, always: bool = False) -> None:
-        """An event; those that would repeat every tick are told once per episode and counted in the ticks."""
-        if always or name not in self._told:
-            self._told.add(name)
+        """Emits an event; one that would repeat every tick is emitted once per episode and counted in the ticks."""
+        if always or name not in self._emitted:
+            self._emitted.add(name)
             effects.append(Event(severity=severity, name=name, text=text, tick=self.tick))
 
 
 def invocation_seed(episode_seed: int, invocation: int) -> int:
-    """The flow noise's seed: the same for the same episode seed and invocation, wherever and whenever it runs."""
+    """Seed of the flow noise, a function of the episode's seed and the invocation's number alone."""
     return int(np.random.SeedSequence([episode_seed, invocation]).generate_state(1, np.uint64)[0] >> 1)
 
 
@@ -510,7 +509,7 @@ def _limited(command: Floats, last_command: Floats, info: EpisodeInfo) -> Floats
 
 
 def _take(
-    asked: list[_Asked],
+    asked: list[_Pending],
     index: int,
     answer: Cognition | ActionChunk,
     infer_ns: int,
@@ -521,21 +520,21 @@ def _take(
     if found is None or answer.source_ns != found.source_ns:
         return False
     found.answer, found.arrived_ns = answer, now_ns
-    if found.delay_ns is None:  # measured: what it took (lockstep), or when it came (real time)
+    if found.delay_ns is None:  # measured: compute time (lockstep) or arrival (real time)
         found.delay_ns = infer_ns if is_lockstep else now_ns - found.source_ns
     return True
 
 
 def _ripe(
-    asked: list[_Asked], kind: StampKind, last_ready_ns: dict[StampKind, int], now_ns: int, is_lockstep: bool
-) -> list[tuple[_Asked, Stamp]]:
-    """Removes and stamps the answers that are ready at ``now_ns``, in the order they were asked for.
+    asked: list[_Pending], kind: StampKind, last_ready_ns: dict[StampKind, int], now_ns: int, is_lockstep: bool
+) -> list[tuple[_Pending, Stamp]]:
+    """Removes and stamps the answers that are ready at ``now_ns``, in the order of their requests.
 
-    None is ready before an earlier one. In real time an answer that comes later than its modelled delay is ready when
-    it came, and an earlier one may never come, so nobody waits for it. In lockstep time steps from tick to tick and
-    then waits, so when an answer happened to arrive in between must not show.
+    No answer is ready before an earlier one. In real time an answer that arrives after its modelled delay is ready on
+    arrival, and later ones do not wait for an earlier one, which may never come. In lockstep time steps from tick to
+    tick and then waits, so an answer's arrival in between must not matter.
     """
-    ripe: list[tuple[_Asked, Stamp]] = []
+    ripe: list[tuple[_Pending, Stamp]] = []
     for head in list(asked):
         if head.answer is None or head.delay_ns is None:
             if is_lockstep:

@@ -12,7 +12,7 @@ from protocol.options import LinkOptions
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockOptions:
-    """The clock service as a process of its own: opens episodes, issues every instant, plays rows at 20 Hz."""
+    """The clock service as its own process: opens episodes, issues every instant, plays rows at 20 Hz."""
 
     link: LinkOptions = field(
         default_factory=lambda: LinkOptions(
@@ -22,14 +22,14 @@ class ClockOptions:
     allow_starved: bool = False
     """Start although the schedule leaves ticks without a row (see docs/clock.md)."""
     max_clock_bound_ms: float = 5.0
-    """Refuse to start when another host's clock is known less exactly than this."""
+    """Refuse to start if the offset to another host's clock is less certain than this [ms]."""
     residual_head: Path | None = None
-    """Correct every row at 20 Hz with this head, a file of its loader's (see docs/clock.md)."""
+    """File of a residual head that corrects every row at 20 Hz (see docs/clock.md)."""
     residual_loader: str = DEFAULT_LOADER
-    """Who reads it: package.module:callable."""
+    """Loader of --residual-head, as package.module:callable."""
 
     def service(self) -> ServiceConfig:
-        """Raises ValueError or OSError if the residual head cannot be had."""
+        """Loads the residual head. Raises ValueError or OSError if that fails."""
         head = None if self.residual_head is None else load_head(self.residual_head, self.residual_loader)
         return ServiceConfig(
             allow_starved=self.allow_starved,

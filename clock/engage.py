@@ -1,4 +1,4 @@
-"""``pp-engage``: a person says that motion may start again after the ladder stopped the robot."""
+"""``pp-engage``: an operator allows motion again after the ladder stopped the robot."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _CALL_NS = 2_000_000_000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EngageOptions:
-    """Lets a stopped robot move again; the log keeps who said so."""
+    """Lets a stopped robot move again; the operator is logged."""
 
     link: LinkOptions = field(default_factory=lambda: LinkOptions(connect=("tcp/127.0.0.1:7447",)))
     operator: str = field(default_factory=getpass.getuser)

@@ -1,8 +1,8 @@
-"""Can this schedule play without a gap? Checked before anything moves: d <= s <= H - d.
+"""Checks, before the robot moves, that a schedule plays without gaps: d <= s <= H - d.
 
-H rows a chunk, s ticks between invocations, d ticks from an invocation to its first playable row. The paper's own
-setting (20 rows at 20 Hz, an invocation a second: s = H = 20) starves d ticks per chunk in real time; in its lockstep
-evaluation d is 0 and nothing is lost.
+H is the number of rows per chunk, s the ticks between invocations, d the ticks from an invocation to its first playable
+row. The paper's own setting (20 rows at 20 Hz, one invocation per second: s = H = 20) starves d ticks per chunk in real
+time; in its lockstep evaluation d is 0 and no tick starves.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from protocol.messages import DelayKind, Mode, Schedule
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Feasibility:
-    """``starved_ticks`` a chunk leaves without a row; ``ways_out`` are complete sentences for a person."""
+    """Result of the check; ``ways_out`` are complete sentences for the user."""
 
     horizon: int
     invoke_ticks: int
@@ -38,16 +38,16 @@ class Feasibility:
 
 
 def delay_ticks(schedule: Schedule, invoke_p99_ns: int) -> int:
-    """Ticks from an invocation until its chunk can be played: a chunk that arrives between ticks waits for the next."""
+    """Ticks from an invocation to its chunk's first playable row; a chunk between two ticks waits for the next one."""
     if schedule.invoke_delay.kind != DelayKind.MEASURED:
         invoke_p99_ns = schedule.invoke_delay.mean_ns
     elif schedule.mode == Mode.LOCKSTEP:
-        return 0  # the world waits
+        return 0  # in lockstep the world waits
     return -(-invoke_p99_ns * schedule.control_hz // NS_PER_S)
 
 
 def check_feasible(schedule: Schedule, invoke_p99_ns: int) -> Feasibility:
-    """``invoke_p99_ns``: measured at the server's warm-up, transport included if known."""
+    """Checks a schedule. ``invoke_p99_ns`` is measured at the server's warm-up, with transport if known."""
     d, s, h = delay_ticks(schedule, invoke_p99_ns), schedule.invoke_period_ticks, schedule.horizon
     ways_out: list[str] = []
     if not d <= s <= h - d:

@@ -1,7 +1,7 @@
-"""What is commanded when there is nothing good to command: play, stale, hold, decelerate, stop.
+"""The degradation ladder, which selects each tick's command: play, stale, hold, decelerate, stop.
 
-A row comes from a chunk, or it is the last commanded row, or a straight line from there to where the joints were
-measured: never zeros, never an extrapolation. Once decelerating, only ``engage`` starts motion again.
+A command is a chunk's row, the last command, or an interpolation from it to the measured joints; never zeros, never an
+extrapolation. Once decelerating, only ``engage`` starts motion again.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from protocol.messages import Floats, Level, Schedule
 
 @dataclass(slots=True)
 class Ladder:
-    """The rung the robot stands on. ``step`` is called once per tick, in tick order."""
+    """The robot's current rung. Call ``step`` once per tick, in tick order."""
 
     schedule: Schedule
     level: Level = Level.HOLD
@@ -30,17 +30,17 @@ class Ladder:
         return self.level in (Level.DECELERATE, Level.STOPPED)
 
     def engage(self) -> None:
-        """Somebody says that motion may start again: back to HOLD, playing as soon as there is a row."""
+        """Allows motion again: back to HOLD, then playing as soon as there is a row."""
         self.level, self.held_ticks, self.slowing_ticks = Level.HOLD, 0, 0
 
     def step(self, row: Floats | None, is_stale: bool, last_command: Floats, proprio: Floats) -> Floats:
-        """The command of this tick and, in ``level``, where it came from.
+        """Returns the command of this tick and sets ``level`` to its rung.
 
         Args:
             row: (action_dim,) within limits, from a chunk; None if no chunk has one.
-            is_stale: the cognition behind ``row`` was older than ``max_age_ns``.
-            last_command: (action_dim,).
-            proprio: (num_proprio,) newest measured joints; the last command's dimension is the gripper, kept as it is.
+            is_stale: the cognition behind ``row`` is older than ``max_age_ns``.
+            last_command: (action_dim,); its last dim, the gripper, is kept while decelerating.
+            proprio: (num_proprio,) newest measured joints.
         """
         if not self.is_latched:
             if row is not None:
@@ -50,7 +50,7 @@ class Ladder:
                     True,
                 )
                 return row
-            # Before the first row there is nothing to have lost: the servos hold what they held at reset.
+            # Before the first row no row was lost: the servos hold their reset position.
             self.held_ticks += self.has_played
             if self.held_ticks <= self.schedule.hold_limit_ticks:
                 self.level = Level.HOLD

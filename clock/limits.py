@@ -1,4 +1,4 @@
-"""The last gate before the robot: joint limits, the step limit, and no NaN, whoever asked for it."""
+"""The last check before the robot: joint limits, step limit, and no NaN, whatever the command's source."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from protocol.messages import Floats, Robot
 
 
 class Hit(IntFlag):
-    """What a row ran into (Tick.limits_hit)."""
+    """The limits that a row hit (Tick.limits_hit)."""
 
     NONE = 0
     JOINT = 1
@@ -19,7 +19,7 @@ class Hit(IntFlag):
 
 
 def within_limits(row: Floats, last_command: Floats, robot: Robot) -> tuple[Floats | None, Hit]:
-    """The row as it may be commanded, (action_dim,), or None if it may not be commanded at all.
+    """Returns the row clipped to the limits, (action_dim,), or None if it must not be commanded, and the limits hit.
 
     The step limit is relative to the last command, not to the measured joints: a position-controlled arm lags its
     target by design, and limiting against the lag would slow it down twice.

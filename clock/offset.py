@@ -1,8 +1,8 @@
-"""The difference between two clocks, with a bound that holds whatever the network does.
+"""The offset between two clocks, with a bound that holds for any network delay.
 
-Four instants (NTP, RFC 5905 section 8): t0 asked and t3 answered on our clock, t1 received and t2 replied on theirs.
-The offset lies in [t1 - t0 - rtt, t1 - t0] if the two ways take between nothing and the whole round trip, so the
-midpoint is wrong by at most half the round trip, asymmetric links included. Narrowest of several wins.
+Four instants (NTP, RFC 5905 section 8): request sent t0 and reply received t3 on our clock, request received t1 and
+reply sent t2 on theirs. The offset lies in [t1 - t0 - rtt, t1 - t0] if each way takes between zero and the whole round
+trip, so the midpoint is wrong by at most half the round trip, asymmetric links included. The narrowest of several wins.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Offset:
-    """theirs = ours + ``offset_ns``, and the truth is within ``bound_ns`` of that."""
+    """theirs = ours + ``offset_ns``, with an error of at most ``bound_ns``."""
 
     offset_ns: int
     bound_ns: int
@@ -23,10 +23,10 @@ class Offset:
 
 
 def from_exchange(t0_ns: int, t1_ns: int, t2_ns: int, t3_ns: int) -> Offset:
-    """One exchange.
+    """Offset from one exchange.
 
     Raises:
-        ValueError: instants of one clock run backwards.
+        ValueError: the instants of one clock run backwards.
     """
     round_trip_ns = (t3_ns - t0_ns) - (t2_ns - t1_ns)
     if t3_ns < t0_ns or t2_ns < t1_ns or round_trip_ns < 0:
@@ -35,5 +35,5 @@ def from_exchange(t0_ns: int, t1_ns: int, t2_ns: int, t3_ns: int) -> Offset:
 
 
 def narrowest(offsets: Iterable[Offset]) -> Offset:
-    """The one with the smallest bound. Drift over the seconds they span is ignored: 100 ppm over 1 s is 0.1 ms."""
+    """The offset with the smallest bound. Clock drift in between is ignored: 100 ppm over 1 s is 0.1 ms."""
     return min(offsets, key=lambda o: o.bound_ns)

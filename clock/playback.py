@@ -1,7 +1,7 @@
-"""Chunk to action at a fixed rate: which row is due at a tick, and how chunks are joined.
+"""Playback of chunks at a fixed rate: the row due at a tick, and how chunks are joined.
 
-The row is a function of the tick and of the chunk's ``t_row0``, never of an estimated latency: rows that are already
-past when a chunk arrives are simply never asked for. Deadlines are computed from the start, so nothing accumulates.
+The row is a function of the tick and of the chunk's ``t_row0``, never of an estimated latency: rows that are past when
+a chunk arrives are never played. Deadlines are computed from the start, so errors do not accumulate.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from protocol.messages import Floats, Seam, SeamKind
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Chunk:
-    """What playback needs to know of one POUNCE answer. ``rows_NA``: (horizon, action_dim) float32, robot units."""
+    """A POUNCE answer, as far as playback needs it. ``rows_NA``: (horizon, action_dim) float32, robot units."""
 
     invocation: int
     t_row0: int
     rows_NA: Floats
     ref_query: int | None
     age_ns: int
-    first_tick: int | None = None  # the first tick decided with it at hand: its rows before that were past when it came
+    first_tick: int | None = None  # first tick decided after its arrival; earlier rows were past
 
 
 def deadline_ns(start_ns: int, tick: int, rate_hz: int) -> int:
@@ -34,7 +34,7 @@ def deadline_ns(start_ns: int, tick: int, rate_hz: int) -> int:
 
 
 def tick_at(start_ns: int, now_ns: int, rate_hz: int) -> int:
-    """The newest tick whose deadline has come; the inverse of ``deadline_ns``. Negative before the start."""
+    """The newest tick whose deadline has passed; the inverse of ``deadline_ns``. Negative before the start."""
     return (now_ns - start_ns) * rate_hz // NS_PER_S
 
 
@@ -50,19 +50,19 @@ def chunk_for(chunks: Sequence[Chunk], tick: int) -> Chunk | None:
 
 
 Join = Callable[[Sequence[Chunk], int], Floats]
-"""A seam policy: from the chunks that have a row for a tick (oldest first, at least one), and it, to (action_dim,)."""
+"""A seam policy: (chunks with a row for the tick, oldest first, at least one; tick) -> row (action_dim,)."""
 
 
 def switch(chunks: Sequence[Chunk], tick: int) -> Floats:
-    """The newest chunk's row, at once."""
+    """The newest chunk's row."""
     return _row(chunks[-1], tick)
 
 
 def offset_fade(fade_ticks: int) -> Join:
     """Cancels the jump at the switch and fades the correction out linearly over ``fade_ticks``.
 
-    The jump is what the previous chunk says at the first tick that the new one can play, minus what the new one says
-    there: pure functions of the chunks and of when they came, so the log re-derives it.
+    The jump is the previous chunk's row minus the new chunk's at the first tick that the new one can play: a pure
+    function of the chunks and of their arrivals, so it can be derived again from the log.
     """
 
     def join(chunks: Sequence[Chunk], tick: int) -> Floats:
@@ -76,14 +76,14 @@ def offset_fade(fade_ticks: int) -> Join:
         if weight == 0.0 or row_of(old, switched) is None:
             return row
         jump = _row(old, switched) - _row(new, switched)
-        jump[-1] = 0.0  # the gripper is a switch, not a coordinate
+        jump[-1] = 0.0  # the gripper is binary: do not blend it
         return (row + np.float32(weight) * jump).astype(np.float32)
 
     return join
 
 
 def ensemble(decay: float) -> Join:
-    """Exponential average over all chunks that cover the tick, the oldest weighing most for decay > 0 (ACT)."""
+    """Exponential average over all chunks that cover the tick; the oldest weighs most for decay > 0 (ACT)."""
 
     def join(chunks: Sequence[Chunk], tick: int) -> Floats:
         weights = [math.exp(-decay * rank) for rank in range(len(chunks))]

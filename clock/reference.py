@@ -1,4 +1,4 @@
-"""Which cognition does this POUNCE invocation see? The paper's rule (section 3.3) and its interventions (5.2).
+"""The cognition that a POUNCE invocation refers to: the paper's rule (section 3.3) and its interventions (5.2).
 
     ref(j) = max{ t : tau_t + d_t <= tau_j },   Delta(j) = tau_j - tau_ref(j);   nothing ready: null, Delta = 0
 
@@ -15,7 +15,7 @@ from protocol.messages import Delivery, DeliveryKind
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ready:
-    """When one PONDER query looked at the world, and from when on its answer may be used. Episode time."""
+    """The instants of one PONDER query's observation and of its answer's availability, in episode time."""
 
     query: int
     source_ns: int
@@ -25,7 +25,7 @@ class Ready:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reference:
-    """What an invocation is given: a query (None: the null cognition) and the age it is told."""
+    """An invocation's query (None: the null cognition) and the age with which it is conditioned."""
 
     query: int | None
     age_ns: int
@@ -40,19 +40,19 @@ def latest_ready(stamps: Iterable[Ready], now_ns: int) -> Ready | None:
 
 
 def age_ns(ref: Ready | None, now_ns: int) -> int:
-    """Age counts from the observation, not from when the answer was ready; the null cognition has age 0."""
+    """Age since the observation, not since the answer was ready; the null cognition has age 0."""
     return 0 if ref is None else now_ns - ref.source_ns
 
 
 def held_at_transition(stamps: Iterable[Ready], now_ns: int) -> Ready | None:
-    """The newest ready one among the first query and those at transitions (paper, 5.2)."""
+    """The newest ready query among the first one and those at transitions (paper, 5.2)."""
     stamps = list(stamps)
     first = min((s.query for s in stamps), default=None)
     return latest_ready((s for s in stamps if s.is_transition or s.query == first), now_ns)
 
 
 def refer(stamps: Iterable[Ready], now_ns: int, delivery: Delivery) -> Reference:
-    """Applies a delivery to the stamps: what invocation j at ``now_ns`` may see."""
+    """Applies a delivery to the stamps: the reference of an invocation at ``now_ns``."""
     if delivery.kind == DeliveryKind.NULL:
         return NULL
     if delivery.kind == DeliveryKind.HELD_TRANSITION:

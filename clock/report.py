@@ -1,4 +1,4 @@
-"""What an episode's clock has to say about itself: counts, delays, ages, and one hash over everything commanded.
+"""Statistics of an episode: counts, delays, ages, and one hash over all commands.
 
 Pure functions of the log's messages; the client puts them into its results, ``pp-check`` prints them.
 """
@@ -22,11 +22,11 @@ _TAIL = struct.Struct("<qq")  # cognition reference or -1, age_ns
 PLAYED = (Level.PLAY, Level.STALE)
 
 CLOCK_LOST_EVENT = "clock_lost"
-"""The robot's side heard no command for so long that it gave up."""
+"""Event of a robot side that ended the episode because no command came for too long."""
 
 
 def stream_sha256(ticks: Iterable[Tick]) -> str:
-    """One hash over what was commanded and from which cognition: equal streams, equal episodes.
+    """One hash over all commands and the cognition behind each: equal hashes mean equal episodes.
 
     The hashed bytes, little-endian, tick after tick without padding::
 
@@ -36,7 +36,7 @@ def stream_sha256(ticks: Iterable[Tick]) -> str:
         int64    query of the cognition behind the row; -1 for none
         int64    age_ns
 
-    Instants of the clock are left out on purpose: they differ from run to run in real time.
+    Instants of the clock are not hashed, because in real time they differ from run to run.
     """
     digest = hashlib.sha256()
     for tick in ticks:
@@ -47,9 +47,9 @@ def stream_sha256(ticks: Iterable[Tick]) -> str:
 
 
 def statistics(ticks: Sequence[Tick], stamps: Sequence[Stamp], invocations: Sequence[Invocation]) -> dict[str, float]:
-    """Statistics of one episode, flat, as they go into ``EpisodeResult.statistics``.
+    """Flat statistics of one episode, for ``EpisodeResult.statistics``.
 
-    Percentiles are observed values (nearest rank). A quantity nobody observed is absent rather than zero.
+    Percentiles are observed values (nearest rank). A quantity without observations is absent rather than zero.
     """
     commanded = [t for t in ticks if t.level != Level.SKIPPED]
     played = [t for t in commanded if t.level in PLAYED]
@@ -70,7 +70,7 @@ def statistics(ticks: Sequence[Tick], stamps: Sequence[Stamp], invocations: Sequ
 
 
 def num_starved(ticks: Iterable[Tick]) -> int:
-    """Ticks for which no chunk had a usable row, counted from the first row played: before it nothing was lost."""
+    """Number of ticks for which no chunk had a usable row, after the first row played."""
     has_played = False
     starved = 0
     for tick in ticks:

@@ -1,11 +1,11 @@
-"""A hook at 20 Hz: a small head may correct every row with the newest joints, between two of POUNCE's chunks.
+"""Residual heads: a small head may correct every row at 20 Hz with the newest joints, between two of POUNCE's chunks.
 
-A chunk is made from an observation that grows old while its rows are played. A residual head looks again at every tick
-(A2C2: "Leave No Observation Behind", 2025). It lives where rows are played, in the clock service: the one place that
-sees every observation *and* knows the row that is due. It sees joints and no pictures, and it is a pure function of
-what a tick logs, so that ``pp-check``, given the same head, derives the command again.
+A chunk's observation ages while its rows are played. A residual head reads the newest one at every tick (A2C2: "Leave
+No Observation Behind", 2025). It runs in the clock service, the only place that has every observation *and* the row
+that is due. It reads joints and no pictures, and it is a pure function of a tick's logged values, so that ``pp-check``,
+given the same head, derives the command again.
 
-Any class with these two names will do; `load_head` finds its loader by a dotted name. `residual_mlp` is one.
+Any class with these two names will do; `load_head` finds its loader by a dotted name. `residual_mlp` is an example.
 """
 
 from __future__ import annotations
@@ -21,30 +21,30 @@ import numpy as np
 from protocol.messages import Floats, Robot
 
 RESIDUAL_EVENT = "residual_head"
-"""Tells in the log that rows were corrected, and by which head (attribute ``digest``)."""
+"""Event that logs the head that corrects the rows (attribute ``digest``)."""
 DEFAULT_LOADER = "clock.residual_mlp:load"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Due:
-    """The row that is due, and what is known at its tick."""
+    """The row that is due, with the inputs of a correction at its tick."""
 
     row_A: Floats
-    """What would be commanded, before the robot's limits: joint targets (rad), and the gripper last."""
+    """Command before correction and the robot's limits: joint targets (rad), then the gripper."""
     state: Floats
     """Newest proprioception: joint positions (rad), finger opening (m)."""
     row: int
-    """Its index in the newest chunk: so many ticks old is what POUNCE saw."""
+    """Index in the newest chunk, which is the age of POUNCE's observation in ticks."""
     age_ns: int
-    """Of the cognition, at the chunk's invocation."""
+    """Age of the cognition at the chunk's invocation."""
 
 
 class ResidualHead(Protocol):
-    """Corrects rows. Deterministic, quick (it stands before a 50 ms deadline), and it never raises."""
+    """Corrects rows. It must be deterministic, fast (it runs before a 50 ms deadline) and never raise."""
 
     @property
     def digest(self) -> str:
-        """Equal digests correct equally; logged, and compared by ``pp-check``."""
+        """Digest of the head; equal digests mean equal corrections. Logged, and compared by ``pp-check``."""
         ...
 
     def correction(self, due: Due) -> Floats:
@@ -57,20 +57,20 @@ def corrected(head: ResidualHead | None, due: Due) -> Floats:
     if head is None:
         return due.row_A
     step_A = head.correction(due).astype(np.float32)
-    step_A[-1] = 0.0  # the gripper is a switch, not a coordinate
+    step_A[-1] = 0.0  # the gripper is binary: do not correct it
     return (due.row_A + step_A).astype(np.float32)
 
 
 def check_head(head: ResidualHead, robot: Robot) -> None:
-    """Tries the head once on a robot, before it moves.
+    """Runs the head once for a robot, before it moves.
 
     Raises:
-        ValueError: the head is for another robot; the message says what came.
+        ValueError: the head is for another robot.
     """
     row_A, state = robot.initial_command.astype(np.float32), np.zeros(robot.num_proprio, np.float32)
     try:
         step_A = head.correction(Due(row_A=row_A, state=state, row=0, age_ns=0))
-    except Exception as error:  # whatever somebody's head raises, an episode must not begin with it
+    except Exception as error:  # a head that raises anything must not start an episode
         raise ValueError(f"the residual head {head.digest} does not fit {robot.name}: {error}") from error
     if step_A.shape != row_A.shape or not np.isfinite(step_A).all():
         raise ValueError(
@@ -83,7 +83,7 @@ def load_head(path: Path, loader: str = DEFAULT_LOADER) -> ResidualHead:
     """Calls ``loader``, "package.module:callable", with ``path``.
 
     Raises:
-        ValueError: there is no such loader, or it refuses the file.
+        ValueError: there is no such loader, or it rejects the file.
         OSError: the file cannot be read.
     """
     module_name, _, name = loader.partition(":")

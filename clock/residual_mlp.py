@@ -1,7 +1,7 @@
-"""A residual head that is a perceptron: newest joints and due row in, a bounded correction of the joints out.
+"""A residual head that is a perceptron: from the newest joints and the due row to a bounded correction of the joints.
 
-Its hidden layer is drawn from a seed and stays; the last layer is fitted in closed form (ridge regression), so a head
-is made from a few thousand ticks in a second, without a gradient. Untrained, its last layer is zero: no correction.
+Its hidden layer is random and fixed; the last layer is fitted in closed form (ridge regression), so fitting to a few
+thousand ticks takes a second, without gradients. Untrained, the last layer is zero: no correction.
 """
 
 # T ticks, A action dim, J = A - 1 joints, F features, U hidden units
@@ -28,14 +28,14 @@ RIDGE = 1e-3
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ResidualMlp:
-    """See the module. Raises ValueError where the arrays do not fit each other or are not finite."""
+    """See the module. Raises ValueError if the arrays do not fit each other or are not finite."""
 
     inner: Floats
     """(F, U)"""
     outer: Floats
-    """(U + 1, J), the bias last"""
+    """(U + 1, J), bias last"""
     limit_rad: Floats
-    """(J,): no correction of a joint is larger"""
+    """(J,): largest correction per joint"""
 
     def __post_init__(self) -> None:
         units, joints = self.inner.shape[-1], self.limit_rad.shape[-1]
@@ -57,7 +57,7 @@ class ResidualMlp:
         )
 
     def fitted(self, seen: Sequence[Due], wanted_TJ: Floats) -> ResidualMlp:
-        """Returns the head whose corrections come nearest to ``wanted_TJ`` (rad), with the same hidden layer."""
+        """Returns the head with the same hidden layer whose corrections fit ``wanted_TJ`` (rad) best."""
         hidden_TU = np.stack([self._hidden(due) for due in seen]).astype(np.float64)
         gram = hidden_TU.T @ hidden_TU + RIDGE * np.eye(hidden_TU.shape[1])
         scaled_TJ = np.arctanh(np.clip(wanted_TJ / self.limit_rad, -0.99, 0.99))
@@ -94,7 +94,7 @@ class ResidualMlp:
 
 
 def load(path: Path) -> ResidualMlp:
-    """Reads what `ResidualMlp.save` wrote.
+    """Reads a file of `ResidualMlp.save`.
 
     Raises:
         ValueError: the file is no such head.
@@ -108,5 +108,5 @@ def load(path: Path) -> ResidualMlp:
 
 
 def _num_features(num_joints: int) -> int:
-    """Joints, distance to the row, gripper; row, age and one."""
+    """Number of features: joints, distance to the row, gripper, row index, age and 1."""
     return 2 * num_joints + 1 + 3

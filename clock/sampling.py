@@ -1,9 +1,9 @@
-"""The schedule of a training episode: when both models would have run, and which cognition an invocation had seen.
+"""The schedule of a training episode: when both models run, and each invocation's cognition.
 
-Training samples its clocks (paper, A.1) and then pairs by the functions that serving pairs by. World and time are
-related as in serving with ``WaitKind.STAND_STILL``: the world stands until the first cognition is ready, so tick k is
-due ``d_0 + k * 50 ms`` after the first observation. Without that, a policy is trained on a robot that already moves
-while, in serving, it still stands.
+Training samples its clocks (paper, A.1) and then pairs queries and invocations with the same functions as serving.
+World and time are related as in serving with ``WaitKind.STAND_STILL``: the world stands until the first cognition is
+ready, so tick k is due ``d_0 + k * 50 ms`` after the first observation. Otherwise a policy would be trained on a robot
+that already moves when in serving it still stands.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class LogNormal:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Clocks:
-    """How often both models run in training, and how long PONDER takes."""
+    """Query and invocation intervals in training, and PONDER's delay."""
 
     query: LogNormal
     invoke: LogNormal
@@ -50,7 +50,7 @@ ROBOMME: Final = Clocks(  # paper, A.1
     invoke=LogNormal(mean_ns=100 * NS_PER_MS, sigma=0.05),
     delay=LogNormal(mean_ns=300 * NS_PER_MS, sigma=0.3),
 )
-ROBOCASA_DC: Final = replace(  # paper, B.2; its sigmas are not told: those of RoboMME
+ROBOCASA_DC: Final = replace(  # paper, B.2; it gives no sigmas: those of RoboMME
     ROBOMME, query=LogNormal(mean_ns=4 * NS_PER_S, sigma=0.05), invoke=LogNormal(mean_ns=2 * NS_PER_S, sigma=0.05)
 )
 EVALUATION: Final = Clocks(  # paper, B.1: both at 1 Hz, 300 ms
@@ -62,7 +62,7 @@ EVALUATION: Final = Clocks(  # paper, B.1: both at 1 Hz, 300 ms
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SampledQuery:
-    """PONDER looks at the observation of ``tick``."""
+    """A query of PONDER on the observation of ``tick``."""
 
     tick: int
     stamp: Ready
@@ -70,7 +70,7 @@ class SampledQuery:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SampledInvocation:
-    """POUNCE looks at the observation of ``tick``, whose row 0 it plans, and at a cognition."""
+    """An invocation of POUNCE on the observation of ``tick``, at which its row 0 is due, and on a cognition."""
 
     tick: int
     now_ns: int
@@ -79,7 +79,7 @@ class SampledInvocation:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SampledSchedule:
-    """Both in order of time."""
+    """Queries and invocations, each in order of time."""
 
     queries: tuple[SampledQuery, ...]
     invocations: tuple[SampledInvocation, ...]
@@ -95,7 +95,7 @@ def sample_schedule(
 ) -> SampledSchedule:
     """Draws the schedule of an episode of ``num_ticks`` observations.
 
-    A query is a transition if it is the first, or the first to see a tick of ``transition_ticks``.
+    A query is a transition if it is the first, or the first at or after a tick of ``transition_ticks``.
 
     Raises:
         ValueError: the episode has no tick.
@@ -122,7 +122,7 @@ def sample_schedule(
 def _due_ticks(
     rng: np.random.Generator, interval: LogNormal, first_ns: int, start_ns: int, num_ticks: int, control_hz: int
 ) -> Iterator[int]:
-    """Ticks after the one at ``first_ns`` at which something that comes at intervals is due; never a tick twice."""
+    """Distinct ticks, after the one at ``first_ns``, at which a request with this interval is due."""
     due_ns, tick = first_ns + interval.draw_ns(rng), 0
     while True:
         tick = max(tick + 1, -(-(due_ns - start_ns) * control_hz // NS_PER_S))  # the first tick that is not before

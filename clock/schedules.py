@@ -1,4 +1,4 @@
-"""Named schedules: the paper's, and one that a real clock can keep."""
+"""Named schedules: the paper's, and one that is feasible in real time."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def paper() -> Schedule:
         query_delay=FIXED_300_MS,
         invoke_delay=NONE,
         wait=WaitKind.STAND_STILL,
-        max_age_ns=2 * NS_PER_S,  # a fire with text takes 0.87 s p95: 1.9 s is still normal at 1 Hz
+        max_age_ns=2 * NS_PER_S,  # a fire with text takes 0.87 s p95: an age of 1.9 s is normal at 1 Hz
         stale_limit_ns=10 * NS_PER_S,
         hold_limit_ticks=10,
         decelerate_ticks=10,
@@ -37,5 +37,5 @@ def paper() -> Schedule:
 
 
 def realtime() -> Schedule:
-    """What a real clock can keep: POUNCE every 10 ticks, so up to H - s = 10 ticks may pass while it thinks."""
+    """Feasible in real time: POUNCE every 10 ticks, so an invocation may take up to H - s = 10 ticks."""
     return replace(paper(), mode=Mode.REALTIME, invoke_period_ticks=10, query_delay=MEASURED, invoke_delay=MEASURED)

@@ -1,8 +1,8 @@
 """The clock service: the shell around the conductor, embedded in ``sim-client`` or running as ``clock-serve``.
 
-It is the authority on time: it opens the episode at both model servers, checks that they fit and that the schedule can
-be kept, issues every instant, watches who is alive, and keeps the journal from which a restarted PONDER rebuilds its
-context. One thread; nothing here blocks while an episode runs.
+It is the authority on time: it opens the episode at both model servers, checks that they fit and that the schedule is
+feasible, issues every instant, monitors the other processes, and keeps the journal from which a restarted PONDER
+rebuilds its context. It has one thread; nothing here blocks while an episode runs.
 """
 
 from __future__ import annotations
@@ -61,19 +61,19 @@ _TOPIC_OF: dict[type, Topic[object]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServiceConfig:
-    """What the clock service insists on."""
+    """Options of the clock service."""
 
     allow_starved: bool = False
-    """Start although d <= s <= H - d fails; starved ticks are held and counted."""
+    """Start although d <= s <= H - d fails; starved ticks hold the last command and are counted."""
     max_clock_bound_ns: int = 5_000_000
-    """An episode does not start when a clock on another host is known less exactly than this."""
+    """Largest accepted uncertainty of another host's clock offset; beyond it no episode starts."""
     heartbeat_timeout_ns: int = HEARTBEAT_TIMEOUT_NS
     residual: ResidualHead | None = None
-    """Corrects every row at 20 Hz."""
+    """Residual head that corrects every row at 20 Hz."""
     journal_limit_bytes: int = 2 << 30
-    """Observations kept for a PONDER that restarts; beyond it, a restarted PONDER is refused and the ladder acts."""
+    """Limit of the observations kept for a restarted PONDER; beyond it a rejoin is refused and the ladder acts."""
     watches: bool = True
-    """False when all participants share one thread and none can die alone."""
+    """False if all participants share one thread, so that none can die alone."""
 
 
 @dataclass(slots=True)
@@ -96,10 +96,10 @@ class _Episode:
 
 
 class ClockService:
-    """One robot's clock. ``step`` does what is due and says whether anything was; ``wait_ns``, how long to wait.
+    """One robot's clock. ``step`` does due work and returns whether there was any; ``wait_ns`` is the time to wait.
 
-    One class, because calls and streams meet in one episode: a call opens or closes it, and every message is judged by
-    which one is open.
+    One class, because calls and streams meet in one episode: a call opens or closes it, and the open episode decides
+    what every message means.
     """
 
     def __init__(self, link: Link, config: ServiceConfig, *, host_clock: MonotonicClock | None = None) -> None:
@@ -132,7 +132,7 @@ class ClockService:
         return self._episode.conductor if self._episode else None
 
     def wait_ns(self, longest_ns: int) -> int:
-        """How long nothing is due, if no message comes."""
+        """Time until something is due if no message comes, at most ``longest_ns``."""
         episode = self._episode
         due_ns = episode.conductor.next_ns(episode.now_ns) if episode and episode.clock else None
         if episode is None or due_ns is None or episode.is_lockstep:
@@ -140,18 +140,18 @@ class ClockService:
         return max(0, min(longest_ns, due_ns - episode.now_ns))
 
     def step(self) -> bool:
-        if self._is_stepping:  # called back while we wait for a server on a LocalBus
+        if self._is_stepping:  # re-entered while waiting for a server on a LocalBus
             return False
         self._is_stepping = True
         try:
-            worked = any([service.answer(handler) > 0 for service, handler in self._services])  # all of them
+            worked = any([service.answer(handler) > 0 for service, handler in self._services])  # a list: all answer
             worked |= self._take_messages()
-            self._look_around()
+            self._check_liveness()
             return self._conduct() or worked
         finally:
             self._is_stepping = False
 
-    # -- what comes in
+    # -- inputs
 
     def _take_messages(self) -> bool:
         worked = False
@@ -197,8 +197,8 @@ class ClockService:
         self._link.drop(f"{header.proc}#{header.boot_id}", DropReason.UNASKED, f"{what} {index}")
         return False
 
-    def _look_around(self) -> None:
-        """Notices lost and returned servers; a lost robot ends the episode."""
+    def _check_liveness(self) -> None:
+        """Detects lost and returned servers; a lost robot ends the episode."""
         episode = self._episode
         if episode is None or not self._config.watches:
             return
@@ -215,7 +215,7 @@ class ClockService:
             self._event(m.Severity.ERROR, "sim_lost", "the robot side is gone: the episode is over")
             self._finish(None)
 
-    # -- what goes out
+    # -- outputs
 
     def _conduct(self) -> bool:
         episode = self._episode
@@ -260,7 +260,7 @@ class ClockService:
     # -- calls
 
     def open(self, request: m.OpenRequest) -> m.OpenReply:
-        """Opens an episode at both servers, or says why not; ``try_again`` if that may pass by itself."""
+        """Opens an episode at both servers, or replies with the reason; ``try_again`` if it may be temporary."""
         info = request.info
         header = info.header
         if header.epoch <= self._last_epoch.get(header.session, 0):
@@ -271,7 +271,7 @@ class ClockService:
             error = f"robot {self._link.robot} is busy with episode {self._link.episode}"
             return m.OpenReply(error=error, refusal=m.Refusal.BUSY, try_again=True)
         if self._episode is not None:
-            self._finish(None)  # the same robot starts over: its old episode is abandoned
+            self._finish(None)  # the same robot restarts: abandon its old episode
         if info.policy != "servers":
             return self._begin(request, contracts=(), warnings=(), committed_ticks=0)
         not_ready = self._not_ready() if self._config.watches else ""
@@ -322,7 +322,7 @@ class ClockService:
         return ""
 
     def _measure_offsets(self, procs: Sequence[str]) -> None:
-        """Raises ProtocolError when another host's clock is known too badly."""
+        """Raises ProtocolError if another host's clock offset is too uncertain."""
         self._offsets = {}
         for proc in procs:
             exchanges = []
@@ -344,7 +344,7 @@ class ClockService:
             self._offsets[proc] = offset
 
     def _open_at(self, proc: str, request: m.OpenRequest) -> m.Contract:
-        """Raises EpisodeRefused if the server refuses, CallFailed if it does not answer."""
+        """Opens the episode at a server. Raises EpisodeRefused if it refuses, CallFailed if it does not answer."""
         reply = self._link.call(OPEN, proc, request, timeout_ns=_OPEN_NS)
         if reply.error or reply.contract is None:
             why = reply.error or "it sent no contract"
@@ -352,10 +352,10 @@ class ClockService:
         return reply.contract
 
     def _agree(self, info: m.EpisodeInfo, contracts: Sequence[m.Contract]) -> tuple[list[str], int]:
-        """Warnings and the ticks an invocation takes.
+        """Checks that the parts fit; returns warnings and the ticks that an invocation takes.
 
         Raises:
-            EpisodeRefused: the parts do not fit, the schedule cannot be kept, or untrained weights would move a robot.
+            EpisodeRefused: the parts do not fit, the schedule is infeasible, or untrained weights would move a robot.
         """
         ponder, pounce = contracts
         fits = (
@@ -400,10 +400,10 @@ class ClockService:
         return m.CloseReply()
 
     def _finish(self, result: m.EpisodeResult | None) -> None:
-        episode, self._episode = self._episode, None  # first: a server that finds a late query must not rejoin it
+        episode, self._episode = self._episode, None  # first, so that a server with a late query cannot rejoin it
         if episode is not None and episode.request.info.policy == "servers":
             self._close_servers(result)
-        self._watch.forget_losses()  # whoever is restarted between episodes comes back to no episode, and is not lost
+        self._watch.forget_losses()  # a server that restarts between episodes is not lost
         self._link.leave_episode()
 
     def _close_servers(self, result: m.EpisodeResult | None) -> None:

@@ -1,6 +1,6 @@
-"""Clocks: a monotonic one that runs by itself, and a virtual one that moves only when told.
+"""Clocks: a monotonic one in real time, and a virtual one that moves only by ``advance_to``.
 
-All instants are int nanoseconds. ``MonotonicClock`` counts from the moment it is made; on one Linux host
+All instants are int nanoseconds. ``MonotonicClock`` counts from its creation; on one Linux host
 ``time.monotonic_ns`` is the same clock in every process, between hosts it is not (see ``offset``).
 """
 
@@ -28,7 +28,7 @@ class MonotonicClock:
 
 
 class VirtualClock:
-    """Time that stands still until ``advance_to`` moves it; never backwards."""
+    """Time that moves only by ``advance_to``, never backwards."""
 
     def __init__(self) -> None:
         self._now_ns = 0

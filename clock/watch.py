@@ -1,4 +1,4 @@
-"""Who is alive: liveliness tokens for the process, heartbeats for the work. Pure: told what came and when."""
+"""Liveness of servers: liveliness tokens show the process, heartbeats its work. Pure: messages and instants in."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class _Seen:
 
 @dataclass(slots=True)
 class Watch:
-    """Notices within a second that a server died, froze or hangs, and that it is back *and knows the episode*."""
+    """Detects within a second that a server died, froze or hangs, and that it is back *and in the episode*."""
 
     timeout_ns: int = HEARTBEAT_TIMEOUT_NS
     _seen: dict[str, _Seen] = field(default_factory=dict)
@@ -39,10 +39,10 @@ class Watch:
         seen = self._seen.setdefault(proc, _Seen())
         seen.has_token = is_alive
         if not is_alive:
-            seen.health = None  # of a process that is no more: it cannot speak for its successor
+            seen.health = None  # a dead process's heartbeat says nothing about its successor
 
     def health_of(self, proc: str) -> Health | None:
-        """The newest heartbeat of a server that is there; None if it is not."""
+        """The newest heartbeat of a present server; None if it is absent."""
         seen = self._seen.get(proc)
         return seen.health if seen and seen.has_token and not seen.is_lost else None
 
@@ -52,12 +52,12 @@ class Watch:
         return seen is not None and not seen.has_token
 
     def forget_losses(self) -> None:
-        """A new episode starts from what is there now."""
+        """Resets losses: a new episode starts from the current state."""
         for seen in self._seen.values():
             seen.is_lost = False
 
     def poll(self, procs: tuple[str, ...], episode: str, now_ns: int) -> list[Change]:
-        """What changed for ``procs``, which have all opened ``episode``."""
+        """Changes of ``procs``, which have all opened ``episode``, since the last poll."""
         changes = []
         for proc in procs:
             seen = self._seen.setdefault(proc, _Seen(heard_ns=now_ns))

@@ -1,1 +1,1 @@
-"""What both model servers do alike: a process on the bus, an episode that the clock opens, a measured engine."""
+"""Common parts of both model servers: a process on the bus, an episode that the clock opens, a measured engine."""

@@ -1,4 +1,4 @@
-"""A model server's life as a process: on the bus, loading, warm, serving until told to stop."""
+"""A model server's life as a process: joins the bus, loads, warms up, serves until a stop signal."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ EngineT = TypeVar("EngineT")
 
 
 class ModelServer(Protocol):
-    """What the shells of PONDER and POUNCE have in common."""
+    """Interface of the shells of PONDER and POUNCE."""
 
     def warm_up(self) -> None: ...
     def ready(self) -> None: ...
@@ -33,14 +33,15 @@ def serve_model(
     load: Callable[[], EngineT],
     make: Callable[[Link, EngineT, Heartbeat, str], ModelServer],
 ) -> int:
-    """Runs a model server until SIGTERM or SIGINT; returns the exit status, 2 if it could not begin.
+    """Runs a model server until SIGTERM or SIGINT; returns the exit status, 2 if it could not start.
 
-    It is on the bus before it loads, so that everybody sees it loading, or failing and why.
+    It joins the bus before it loads, so that others see it loading, or why it fails.
 
     Args:
         proc: "ponder" or "pounce".
-        weights: what is loaded, for people.
-        load: makes the engine; raises OSError or ValueError with a sentence for a person.
+        weights: description of the weights, for logs.
+        load: builds the engine; raises OSError or ValueError with a message for the user.
+        make: builds the server around the engine.
     """
     set_up_logging()
     should_stop = StopFlag()

@@ -1,6 +1,6 @@
-"""A model server's part in an episode: the clock service opens and closes it, and tells a restarted one what it missed.
+"""A model server's membership in an episode: the clock service opens and closes it, and a restarted server catches up.
 
-It calls three functions of the server and keeps identity, heartbeat and refusals in one place.
+It calls three functions of the server and handles identity, heartbeat and refusals in one place.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ class Membership:
     """Keeps one server in the episode that the clock service runs.
 
     Args:
-        contract: what the server promises in any episode; raises ValueError if it cannot promise anything yet.
-        open_episode: starts the episode in the engine and promises a contract; raises ValueError to refuse.
-        close_episode: forgets the episode; called also before a new one.
+        contract: returns the server's contract for any episode; raises ValueError if there is none yet.
+        open_episode: starts the episode in the engine and returns a contract; raises ValueError to refuse.
+        close_episode: ends the episode; called also before a new one.
     """
 
     def __init__(
@@ -51,14 +51,14 @@ class Membership:
         self._ask_again_ns = 0
 
     def step(self) -> bool:
-        """Answers waiting calls."""
+        """Answers waiting calls; returns whether there were any."""
         answered = self._opening.answer(self._on_open) + self._closing.answer(self._on_close)
         return answered + self._asking.answer(self._on_contract) + self._timing.answer(_on_time) > 0
 
     def rejoin(self) -> m.ActiveReply | None:
-        """Asks the clock service which episode runs, at most once a second; opens it here.
+        """Asks the clock service for the running episode, at most once a second, and opens it here.
 
-        Returns what the clock service said of it, or None if there is none or we are in it already.
+        Returns the clock service's reply, or None if no episode runs or this server is in it already.
         """
         now_ns = time.monotonic_ns()
         if now_ns < self._ask_again_ns:
@@ -80,7 +80,7 @@ class Membership:
         return reply  # type: ignore[no-any-return]
 
     def journal(self, num_queries: int) -> Iterator[m.JournalEntry]:
-        """The observations that the episode's queries were about, oldest first.
+        """The episode's queries with their observations, oldest first.
 
         Raises:
             CallFailed: the clock service stopped answering.
@@ -88,7 +88,7 @@ class Membership:
         """
         first = 0
         while first < num_queries:
-            # not beyond what was asked for: the journal grows, and what is new comes as a query of its own
+            # Not beyond num_queries: the journal grows, and newer queries arrive as messages.
             request = m.JournalRequest(first_query=first, max_queries=min(JOURNAL_PAGE, num_queries - first))
             reply = self._link.call(JOURNAL, "clock", request, timeout_ns=_CALL_NS)
             if reply.error or not reply.entries:
@@ -97,7 +97,7 @@ class Membership:
             first += len(reply.entries)
 
     def announce(self) -> None:
-        """Tells the clock service that this server knows the episode."""
+        """Informs the clock service that this server is in the episode."""
         self._heartbeat.set(open_episode=self._link.episode)
 
     def _on_open(self, request: m.OpenRequest, *, announce: bool = True) -> m.OpenReply:

@@ -1,7 +1,6 @@
-"""A request names the observation it is about; whichever comes first waits for the other.
+"""Pairs requests with their observations; whichever arrives first waits for the other.
 
-Observations and requests travel with different priorities, so neither may assume that the other is already here.
-Pure; both model servers' nodes are built on it.
+Observations and requests have different bus priorities, so either may arrive first. Pure; both servers' nodes use it.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ class Rendezvous(Generic[R]):
             self.num_superseded += 1
 
     def next_pair(self) -> tuple[R, Observation] | None:
-        """The oldest request whose observation is here, and that observation."""
+        """The oldest request whose observation is there, and that observation."""
         for position, request in enumerate(self._requests):
             observation = self._observations.get(request.tick)
             if observation is not None:
@@ -53,7 +52,7 @@ class Rendezvous(Generic[R]):
         return None
 
     def give_up(self) -> Iterator[R]:
-        """Removes requests whose observation can no longer come: a newer one is here and the ring has moved past."""
+        """Removes requests whose observation can no longer arrive, because a newer one did and the ring moved past."""
         oldest = next(iter(self._observations), None)
         for request in list(self._requests):
             if oldest is not None and request.tick < oldest:

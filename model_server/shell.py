@@ -24,28 +24,28 @@ KEEP_OBSERVATIONS = 8
 
 
 class Spec(Protocol):
-    """What every engine says of itself."""
+    """The part of every engine's spec that the shell uses."""
 
     @property
     def model_hash(self) -> str: ...
     @property
     def is_fake(self) -> bool:
-        """Something that was drawn, not trained, decides the answers."""
+        """True if untrained weights decide the answers."""
         ...
 
 
 class Engine(Protocol):
-    """What the shell needs of an engine."""
+    """The part of an engine that the shell uses."""
 
     @property
     def spec(self) -> Spec: ...
     def warm_up(self) -> list[int]:
-        """Durations in ns of at least 20 answers, the first few left unmeasured."""
+        """Durations in ns of at least 20 answers, without the first few."""
         ...
 
 
 class ModelShell(ABC):
-    """One model server on a bus. ``step`` does one piece of work and says whether there was any."""
+    """One model server on a bus. ``step`` does one piece of work and returns whether there was any."""
 
     def __init__(self, link: Link, engine: Engine, heartbeat: Heartbeat, version: str) -> None:
         self._link = link
@@ -60,30 +60,30 @@ class ModelShell(ABC):
 
     @abstractmethod
     def rejoin(self) -> bool:
-        """After a restart: asks which episode runs, and enters it. Whether there was one."""
+        """After a restart: asks for the running episode and joins it; returns whether there was one."""
 
     @abstractmethod
     def _on_observation(self, observation: m.Observation) -> None:
-        """Raises MalformedMessage for one that the engine cannot read."""
+        """Takes an observation. Raises MalformedMessage if the engine cannot read it."""
 
     @abstractmethod
     def _contract(self) -> m.Contract:
-        """What this server promises in any episode."""
+        """This server's contract for any episode."""
 
     @abstractmethod
     def _open(self, request: m.OpenRequest) -> m.Contract:
-        """Starts the episode in the engine. Raises ValueError to refuse, EpisodeRefused to say why in a code."""
+        """Starts the episode in the engine. Raises ValueError to refuse, or EpisodeRefused with a refusal code."""
 
     @abstractmethod
     def _close(self) -> None:
-        """Forgets the episode."""
+        """Ends the episode."""
 
     def _weights_note(self) -> str:
-        """What narrow weights cost, for people; "" for float weights."""
+        """The error of narrow weights, for logs; "" for float weights."""
         return ""
 
     def warm_up(self) -> None:
-        """Measures the engine before anybody relies on it; the first answers of a process are no measure."""
+        """Measures the engine before it serves, without the first answers of the process, which are slower."""
         self._heartbeat.set(state=m.ServingState.WARMING)
         durations_ns = self._warmed_engine.warm_up()
         spec = self._warmed_engine.spec
@@ -99,7 +99,7 @@ class ModelShell(ABC):
             log.info("%s", note)
 
     def ready(self) -> None:
-        """Joins a running episode, if there is one, and only then says that it is ready."""
+        """Joins a running episode, if there is one, and only then reports readiness."""
         self.rejoin()
         self._heartbeat.set(state=m.ServingState.READY)
         log.info("ready infer_p50_ms=%.1f", self._heartbeat.health.infer_p50_ns / 1e6)
@@ -114,7 +114,7 @@ class ModelShell(ABC):
                     self._link.drop(source, DropReason.WRONG_SHAPE, str(error))
 
     def _begin_inference(self, phase: str) -> int:
-        """Says that an answer is being computed; returns since when (monotonic ns)."""
+        """Reports that an answer is being computed; returns the start (monotonic ns)."""
         self._phase(phase)
         self._heartbeat.set(is_inferring=True)
         return time.monotonic_ns()
@@ -144,7 +144,7 @@ class ModelShell(ABC):
 
 
 def percentile_ns(durations_ns: list[int], percent: float) -> int:
-    """Nearest-rank percentile; 0 of nothing."""
+    """Nearest-rank percentile; 0 for an empty list."""
     if not durations_ns:
         return 0
     rank = max(1, -(-len(durations_ns) * percent // 100))

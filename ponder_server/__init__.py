@@ -1,8 +1,8 @@
-"""Serving PONDER. Importing this before torch's first product keeps a row's bits apart from how many rows there are.
+"""Serving PONDER. Import this before torch's first matrix product, so that a row's bits do not depend on other rows.
 
-MKL picks its kernels by shape, and with AVX-512 some sum in another order when a robot more is served: on such a CPU
-the laws of test_batching, test_fleet and test_mtp failed by 7e-7. Its strict mode does not (Intel, "Conditional
-Numerical Reproducibility"); on products of PONDER's sizes it costs nothing that could be measured.
+MKL selects its kernels by shape, and with AVX-512 some of them sum in another order when one more robot is served: on
+such a CPU test_batching, test_fleet and test_mtp fail by 7e-7. MKL's strict mode avoids this (Intel, "Conditional
+Numerical Reproducibility"), at no measurable cost for products of PONDER's sizes.
 """
 
 import os

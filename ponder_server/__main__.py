@@ -19,12 +19,12 @@ log = logging.getLogger(__name__)
 
 
 def build_engine(options: PonderOptions) -> BatchingEngine:
-    """Loads or draws the model.
+    """Loads or randomly initialises the model.
 
     Raises:
-        FileNotFoundError, ValueError: the checkpoint folder is not one, or does not fit; the message says why.
+        FileNotFoundError, ValueError: the folder is no checkpoint or does not fit; the message says why.
     """
-    import torch  # here, so that --help and a mistyped option answer at once
+    import torch  # here, so that --help and a mistyped option respond immediately
 
     from dual_system.models.bfloat16 import warn_of_slow
     from dual_system.models.ponder import configs

@@ -1,8 +1,8 @@
-"""Which session may join: refused with a reason before it costs anybody else their latency. Pure arithmetic.
+"""Admission control: refuses, with a reason, a session that would break the latency budget. Pure arithmetic.
 
-Sessions take turns (``batching``), so the worst a query waits is one fire of every other session. One of these may be a
-slow one, not all of them: the others count with their median. Contexts grow, and a fire with them: every session counts
-as if its context were full. Batching makes it better than that; the promise does not count on it.
+Sessions take turns (``batching``), so a query waits for at most one fire of every other session. One of these fires is
+assumed slow (p99), the others median, and all of them in full contexts. Batching makes waits shorter, but the
+guarantee does not rely on it.
 """
 
 from dataclasses import dataclass, field
@@ -10,22 +10,22 @@ from dataclasses import dataclass, field
 from ponder_server.contract import SessionError
 
 MAX_LOAD = 0.8
-"""Share of the time that the queries of all sessions may take: the rest is for texts, and for luck."""
+"""Largest load from the queries of all sessions, as a fraction of time: the rest is for texts and variation."""
 
 
 @dataclass(slots=True, kw_only=True)
 class Admission:
-    """Bookkeeping of admitted sessions, by what a cognition-only fire in a full context was measured to take."""
+    """Tracks admitted sessions; durations are measured on cognition-only fires in a full context."""
 
     fire_p50_ns: int
     fire_p99_ns: int
     latency_budget_ns: int
-    """From a query to its cognition, when every session asks at once."""
+    """Limit of the time from a query to its cognition when all sessions query at once."""
     periods_ns: dict[str, int] = field(default_factory=dict)
-    """Admitted session -> the time between its queries."""
+    """Query period of every admitted session."""
 
     def admit(self, session: str, period_ns: int) -> None:
-        """Takes a session in, or raises SessionError saying what it would cost and what to change."""
+        """Admits a session, or raises SessionError with the expected latency or load and the way out."""
         others = {name: period for name, period in self.periods_ns.items() if name != session}
         worst_ns = len(others) * self.fire_p50_ns + self.fire_p99_ns
         if worst_ns > self.latency_budget_ns:

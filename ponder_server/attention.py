@@ -1,14 +1,14 @@
-"""Attention of a few new tokens over everything before them, reading the cache where it lies.
+"""Attention of a few new tokens over all tokens before them, reading the cache in place.
 
-The queries are always those of the *last* positions, so visibility needs no mask: all of them see the past, and among
-themselves they are causal. The two parts are computed apart and joined by their log-sum-exp, which is exact. A mask
-would be queries x context floats per fire, and repeating the key heads would copy the whole cache.
+The queries are always the *last* positions, so no mask is needed: all of them attend to the past, and among themselves
+they are causal. The two parts are computed separately and merged by their log-sum-exp, which is exact. A mask would be
+queries x context floats per fire, and repeating the key heads would copy the whole cache.
 
-In bfloat16 a CPU multiplies several times as fast, but torch's attention in many small products, which gain nothing by
-it. There the same sums are taken in a few large products.
+In bfloat16 a CPU multiplies several times as fast, but torch's attention uses many small products, which do not gain.
+`attend_in_windows` computes the same sums in a few large products.
 
-Both ways come in pieces, by key heads and windows, for one thread or several: a large past is the one thing in a fire
-that is large enough to be shared out.
+Both ways are divided into pieces, by key heads and windows, for one or several threads: attention over a long past is
+the only part of a fire that is large enough to parallelise.
 
 # H query heads, G key heads, H = G * group; M queries, S positions, P = S - M past ones, D head dimension
 # N products of R rows, the queries of one or several heads that share a key head; W positions of a window
@@ -24,25 +24,24 @@ from torch.nn import functional as F
 from dual_system.models.bfloat16 import HAS_FAST_BFLOAT16
 from ponder_server.threads import ALONE, Threads
 
-# Internal, but the one CPU attention that returns its log-sum-exp; the tests compare it with the public function.
+# Internal, but the only CPU attention that returns its log-sum-exp; the tests compare it with the public function.
 _flash_cpu: Any = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu
 
 SHIFT = 38.0
-"""Taken off every score of :func:`attend_in_windows`."""
+"""Subtracted from every score of :func:`attend_in_windows`."""
 _MIN_TOTAL, _MAX_TOTAL = 1e-30, 2.0**-9
-"""Of a query's shifted exponentials: below, the smallest are lost; above, they are no exponentials any more."""
+"""Valid sums of a query's shifted exponentials: below, small terms underflow; above, sigmoid is not exp."""
 _WINDOW_STEP = 256
 _ROWS = 1024
-"""Of a product at most, if one head has no more: shares of a long window take memory."""
+"""Largest number of rows in a product unless one head has more: attention weights of a long window take memory."""
 _LEAST_WORK = 2**21
-"""Numbers in the queries times positions: with less, calling several functions, or a second thread, costs more than it
-saves."""
+"""Elements of the queries times positions below which more calls or a second thread cost more than they save."""
 
 
 def attend(queries_HMD: Tensor, keys_GSD: Tensor, values_GSD: Tensor, threads: Threads = ALONE) -> Tensor:
-    """What the last M of S positions see (H, M, D); scores are scaled by D ** -0.5.
+    """Attention output (H, M, D) of the last M of S positions; scores are scaled by D ** -0.5.
 
-    No bit of it depends on the number of ``threads``, which are for a CPU.
+    The result is bit-identical for any number of ``threads``, which are used on a CPU only.
     """
     if queries_HMD.device.type != "cpu":
         return attend_masked(queries_HMD, keys_GSD, values_GSD)
@@ -54,7 +53,7 @@ def attend(queries_HMD: Tensor, keys_GSD: Tensor, values_GSD: Tensor, threads: T
 
 
 def attend_in_parts(queries_HMD: Tensor, keys_GSD: Tensor, values_GSD: Tensor, threads: Threads = ALONE) -> Tensor:
-    """On a CPU: past and present apart, nothing of the past copied."""
+    """`attend` on a CPU: past and present separately, without copying the past."""
     num_heads, num_queries, head_dim = queries_HMD.shape
     num_key_heads, num_past = keys_GSD.shape[0], keys_GSD.shape[1] - num_queries
     group = num_heads // num_key_heads
@@ -63,7 +62,7 @@ def attend_in_parts(queries_HMD: Tensor, keys_GSD: Tensor, values_GSD: Tensor, t
     recent, recent_lse = _flash_cpu(queries_HMD[None], recent_keys[None], recent_values[None], is_causal=True)
     if num_past == 0:
         return recent[0]  # type: ignore[no-any-return]
-    # Without a mask every query is alike: the heads that share a key head are one longer list of queries.
+    # Without a mask queries are interchangeable: the heads that share a key head form one longer list of queries.
     shared = queries_HMD.reshape(1, num_key_heads, group * num_queries, head_dim)
     past, past_lse = torch.empty_like(shared), torch.empty(1, num_key_heads, group * num_queries)
 
@@ -82,18 +81,18 @@ def attend_in_parts(queries_HMD: Tensor, keys_GSD: Tensor, values_GSD: Tensor, t
 def attend_in_windows(
     queries_HMD: Tensor, keys_GSD: Tensor, values_GSD: Tensor, threads: Threads = ALONE
 ) -> Tensor | None:
-    """In bfloat16 on a CPU; None where the other way is faster, or scores are too far from zero for this one.
+    """`attend` in bfloat16 on a CPU; None if `attend_in_parts` is faster or scores are too far from zero.
 
-    The product of queries and keys takes the exponential along, before anything is rounded. torch fuses no exponential
-    but a logistic function; far below zero, where :data:`SHIFT` brings the scores, these two are one.
+    The product of queries and keys is fused with the exponential, so that it is not rounded in between. torch fuses
+    only the logistic function, which equals the exponential far below zero, where :data:`SHIFT` moves the scores.
 
-    Two windows of one length cover all positions. They overlap, and the second one leaves to the first what both see:
-    lengths are multiples of a step, so that a growing context rarely meets a product of a new shape, which costs more.
+    Two windows of equal length cover all positions. They overlap, and the second one skips what the first has seen:
+    lengths are multiples of a step, so that a growing context seldom needs a product of a new shape, which is slower.
     """
     num_heads, num_queries, head_dim = queries_HMD.shape
     num_positions = keys_GSD.shape[1]
     window = -(-num_positions // (2 * _WINDOW_STEP)) * _WINDOW_STEP
-    # the first window must lie in the past
+    # The first window must lie in the past.
     if window > num_positions - num_queries or queries_HMD.numel() * num_positions < _LEAST_WORK:
         return None
     group = num_heads // keys_GSD.shape[0]
@@ -114,7 +113,7 @@ def attend_in_windows(
             shares_RW[:, : window - first] = 0
             shares_RW.view(num_shared, num_queries, window)[..., window - num_queries :] *= is_visible_MM
         seen_2NRD[part, index] = shares_RW @ values_GSD[head, here]
-        # in two stages, because each sum is rounded
+        # Two stages, because bfloat16 sums are rounded.
         total_2NR1[part, index] = shares_RW.unflatten(1, (-1, _WINDOW_STEP)).sum(-1).sum(-1, True, dtype=torch.float32)
 
     threads.do(partial(look_into, part, index) for index in range(len(scaled_NRD)) for part in (0, 1))
@@ -126,7 +125,7 @@ def attend_in_windows(
 
 
 def attend_masked(queries_HMD: Tensor, keys_GSD: Tensor, values_GSD: Tensor) -> Tensor:
-    """The same in one call of the public function, for devices whose kernels read a mask cheaply."""
+    """`attend` in one call of the public function, for devices whose kernels read a mask cheaply."""
     num_queries, num_positions = queries_HMD.shape[1], keys_GSD.shape[1]
     visible_MS = torch.ones(num_queries, num_positions, dtype=torch.bool, device=queries_HMD.device)
     visible_MS = visible_MS.tril_(diagonal=num_positions - num_queries)

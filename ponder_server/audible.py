@@ -1,7 +1,7 @@
-"""A sign of life from inside a forward, layer by layer.
+"""Heartbeats from inside a forward pass, layer by layer.
 
-The heartbeat stops when the work stops, and a server silent for 0.7 s is taken for lost. A large network on a CPU, or
-many pictures at once, takes longer than that for one forward.
+The heartbeat comes from the working loop, and a server without one for 0.7 s counts as lost. A large network on a CPU,
+or many pictures at once, takes longer than that for one forward pass.
 """
 
 from collections.abc import Iterable, Iterator
@@ -14,7 +14,7 @@ from ponder_server.contract import Progress, no_progress
 
 @contextmanager
 def audible(modules: Iterable[nn.Module], progress: Progress) -> Iterator[None]:
-    """Within it, ``progress`` is called whenever one of the modules has run; what it raises ends the forward."""
+    """Calls ``progress`` whenever one of the modules has run; its exceptions abort the forward pass."""
     handles = []
     if progress is not no_progress:
         handles = [module.register_forward_hook(lambda *_: progress()) for module in modules]

@@ -1,16 +1,15 @@
-"""One forward over several contexts as work that can be captured: every number that varies is read on the device.
+"""A forward pass over several contexts that can be captured as a CUDA graph: all varying numbers are device tensors.
 
-What ``decoder.decode`` does with Python numbers (which slot, how long its past, how many tokens are new, whose hidden
-states are wanted) is done here with index tensors. A shape is rows, tokens of a row, and positions that attention
-reads; a forward of one shape is always the same operations, so a CUDA graph of it serves every slot and every length.
-The tests hold it to ``decode`` on a CPU, where it runs without a graph.
+``decoder.decode`` uses Python numbers for slots, lengths of the past, new tokens and wanted hidden states; here they
+are index tensors. A shape is rows, tokens per row, and positions that attention reads. A forward of one shape is always
+the same operations, so its CUDA graph serves every slot and every length. The tests compare it with ``decode`` on a
+CPU, where it runs without a graph.
 
-Attention gathers the slots' keys and values, past their last one the first one again. So it reads from memory what is
-valid and no more, and meets nothing that somebody else left behind. What it computes is at most twice as much as with
-the exact length, which lies between one power of two and the next.
+Attention gathers the slots' keys and values, and repeats the first position in place of those past the last one. So it
+reads only valid memory. It computes at most twice as much as with the exact length, because buckets are powers of two.
 
 # B rows, T tokens of a row with its padding, H hidden, D head dimension, Q query heads, G key heads
-# K positions that are read, W hidden states of a row that are handed out
+# K positions that are read, W hidden states returned per row
 """
 
 from collections.abc import Sequence
@@ -26,14 +25,14 @@ from ponder_server.decoder import Place, decode, gated_delta, project
 from ponder_server.slots import AttentionMemory, SlotMemory
 
 LEAST_POSITIONS = 1024
-"""That attention reads: what shorter contexts would save is no time on a GPU, and every further shape is a graph."""
+"""Smallest bucket of positions: shorter ones would save no time on a GPU, and each is another graph."""
 
 MOST_CHANGE = {torch.float32: 1e-3, torch.bfloat16: 5e-2, torch.float16: 1e-2}
-"""Of cognition by capturing, relative L2. TF32 products and other orders of summation stay below."""
+"""Largest relative L2 change of cognition by capturing; TF32 and the order of summation stay below it."""
 
 
 def position_buckets(max_tokens: int, least: int = LEAST_POSITIONS) -> tuple[int, ...]:
-    """Powers of two times ``least`` up to ``max_tokens``, itself the last: a context fills half of its own at least."""
+    """``least`` times powers of two, then ``max_tokens``; a context of at least ``least`` fills half of its bucket."""
     buckets = []
     while least < max_tokens:
         buckets.append(least)
@@ -42,12 +41,12 @@ def position_buckets(max_tokens: int, least: int = LEAST_POSITIONS) -> tuple[int
 
 
 def check_captured(captured_KH: Tensor, eager_KH: Tensor, dtype: torch.dtype) -> None:
-    """Raises RuntimeError unless both are the same cognition, up to sums that a device takes in another order.
+    """Raises RuntimeError unless both cognitions are equal up to the order of summation.
 
-    No robot shall be the first to find out that a driver records something else than it was given.
+    It detects a driver that records wrongly before a robot moves.
     """
     change, most = float((captured_KH - eager_KH).norm() / eager_KH.norm()), MOST_CHANGE[dtype]
-    if not change <= most:  # NaN is no cognition either
+    if not change <= most:  # also refuses NaN
         raise RuntimeError(
             f"captured forwards change cognition by {change:.1e} (relative L2) against the same ones run directly; at "
             f"most {most:.0e} is rounding in {dtype}. ponder-serve --no-graphs does without graphs; please report it."
@@ -55,9 +54,9 @@ def check_captured(captured_KH: Tensor, eager_KH: Tensor, dtype: torch.dtype) ->
 
 
 class CapturedDecoder:
-    """Forwards over one memory, each shape captured when it is first met.
+    """Forwards over one memory; each shape is captured at its first use.
 
-    ``max_rows`` rows of ``b`` lengths reading ``k`` numbers of positions are ``max_rows * b * k`` graphs at most.
+    ``max_rows`` rows, ``b`` lengths and ``k`` position buckets need at most ``max_rows * b * k`` graphs.
     """
 
     def __init__(
@@ -69,8 +68,7 @@ class CapturedDecoder:
         num_read: int,
         least_positions: int = LEAST_POSITIONS,
     ) -> None:
-        """``num_read``: hidden states of a row that a forward hands out at most; one that is asked for more is run
-        by ``decode``."""
+        """``num_read``: most hidden states returned per row; a forward that needs more runs through ``decode``."""
         self._text_model = text_model
         self._memory = memory
         self._capture = capture
@@ -79,13 +77,13 @@ class CapturedDecoder:
         self._forwards: dict[tuple[int, int, int], Forward] = {}
 
     def __len__(self) -> int:
-        """Graphs so far."""
+        """Number of captured graphs."""
         return len(self._forwards)
 
     def __call__(self, places: Sequence[Place], embeds_BTH: Tensor, positions_3BT: Tensor) -> list[Tensor]:
-        """Appends each row to its slot; final hidden states (num_wanted, H) of each, as ``decode`` does.
+        """Appends each row to its slot and returns final hidden states (num_wanted, H) per row, as ``decode`` does.
 
-        No row may be idle. Rows beyond the places are nobody's and are left out.
+        No row may be idle. Padding rows beyond ``places`` are dropped.
         """
         assert len({place.slot for place in places}) == len(places), "two rows of one slot"
         assert all(place.num_new for place in places), "an idle row"
@@ -100,11 +98,11 @@ class CapturedDecoder:
         return forward.hidden(places)
 
     def prepare(self, lengths: Sequence[int], *, max_rows: int) -> None:
-        """Captures every forward of 1 to ``max_rows`` rows of these lengths, whatever the contexts'.
+        """Captures every forward of 1 to ``max_rows`` rows of these lengths, for all position buckets.
 
-        Raises RuntimeError if the device has no memory for them, or cannot record them; the message has the way out.
+        Raises RuntimeError if the device has not enough memory or cannot record them; the message has the way out.
         """
-        # Large ones first: what they need is in the pool, for the others to use again.
+        # Large ones first, so that the others reuse their memory in the pool.
         for shape in product(range(max_rows, 0, -1), sorted(lengths, reverse=True), reversed(self.position_buckets)):
             try:
                 self.forward(*shape)
@@ -116,7 +114,7 @@ class CapturedDecoder:
                 ) from error
 
     def forward(self, num_rows: int, length: int, num_positions: int) -> "Forward":
-        """The one of this shape; captures it if it is new, which leaves the memory as it was."""
+        """The forward of this shape. Captures it if it is new, which leaves the memory unchanged."""
         key = (num_rows, length, num_positions)
         if key not in self._forwards:
             num_read = min(length, self._num_read)
@@ -145,17 +143,17 @@ class Forward:
         self.run: Work = self._captured(capture)
 
     def load(self, places: Sequence[Place], embeds_BTH: Tensor, positions_3BT: Tensor) -> None:
-        """Fills the buffers; pads must be finite."""
+        """Fills the buffers; padding must be finite."""
         self._embeds_BTH.copy_(embeds_BTH)
         rows = [[getattr(p, name) for p in places] for name in ("slot", "num_past", "num_new", "num_wanted")]
         self._numbers.copy_(torch.cat([torch.tensor(rows).flatten(), positions_3BT.cpu().flatten()]))
 
     def hidden(self, places: Sequence[Place]) -> list[Tensor]:
-        """Of the last run (num_wanted, H) each; copies, because the next run writes where they lay."""
+        """Hidden states (num_wanted, H) per row of the last run; copies, because the next run overwrites them."""
         return [row_WH[: place.num_wanted].clone() for row_WH, place in zip(self._hidden_BWH, places, strict=True)]
 
     def _captured(self, capture: Capture) -> Work:
-        """Capturing runs the work, which appends: to slot 0 from its beginning, where all of it is put back."""
+        """Captures the work. Capturing runs it, which appends to the beginning of slot 0; that is restored after."""
         self._num_new_B.fill_(1)
         changed = [*self._memory.states(0), *self._memory.keys_and_values(0, 1)]
         kept = [tensor.clone() for tensor in changed]
@@ -166,7 +164,7 @@ class Forward:
                 tensor.copy_(was)
 
     def _work(self) -> None:
-        """``decode`` without a number that Python knows."""
+        """``decode`` without Python numbers."""
         device, length = self._embeds_BTH.device, self._embeds_BTH.shape[1]
         token_T = torch.arange(length, device=device)
         num_read = self._hidden_BWH.shape[1]
@@ -180,7 +178,7 @@ class Forward:
         for index, layer in enumerate(self._text_model.layers):
             normed_BTH = layer.input_layernorm(hidden)
             if index in self._memory.attention:
-                # Of the last layer's queries only those that somebody wants to know of.
+                # The last layer computes only the wanted queries.
                 asking_BW = (row_B1, read_BW) if index == last else None
                 mixed = _attention(
                     layer.self_attn, self._memory.attention[index], window, normed_BTH, cos_sin, bias_BTK, asking_BW
@@ -195,7 +193,7 @@ class Forward:
 
 
 class _Window:
-    """Where rows write and read keys and values: the first K positions of their slots."""
+    """Indices at which rows write and read keys and values, in the first K positions of their slots."""
 
     def __init__(
         self, slot_B: Tensor, num_past_B: Tensor, num_new_B: Tensor, token_T: Tensor, num_positions: int
@@ -204,20 +202,20 @@ class _Window:
         position_K = torch.arange(num_positions, device=token_T.device)
         self.slot_B1 = slot_B[:, None]
         self.stored_BT = token_T * (token_T < num_new_B1)
-        """Tokens whose keys and values are written. A pad stands for the first one: the same bits to the same place,
-        whoever comes last. It has no place of its own where the slot ends before the bucket does."""
+        """Tokens whose keys and values are written. Padding repeats the first token, so that the order of writes does
+        not matter: the slot may end before the bucket does, so padding has no place of its own."""
         self.places_BT = num_past_B1 + self.stored_BT
         self.seen_BK = position_K * (position_K < num_past_B1 + num_new_B1)
-        """Positions that are read: what is past the last one is garbage, and need not be finite."""
+        """Positions that are read; those past the last one hold garbage, which may be NaN, and are replaced by 0."""
         self._is_visible_BTK = position_K <= (num_past_B1 + token_T)[..., None]
 
     def bias(self, dtype: torch.dtype) -> Tensor:
-        """What is added to scores (B, T, K): a token sees itself and what is before it. Every pad sees something."""
+        """Causal attention bias (B, T, K). Padding attends to something too, so that no row is NaN."""
         is_hidden_BTK = ~self._is_visible_BTK
         return torch.zeros_like(is_hidden_BTK, dtype=dtype).masked_fill_(is_hidden_BTK, float("-inf"))
 
     def store(self, memory: Tensor, new_BGTD: Tensor) -> None:
-        """Writes the rows' new keys or values (B, G, T, D) into theirs (N, G, S, D)."""
+        """Writes the rows' new keys or values (B, G, T, D) into ``memory`` (N, G, S, D)."""
         stored_BT1 = self.stored_BT[:, :, None, None].expand(-1, -1, new_BGTD.shape[1], new_BGTD.shape[3])
         memory[self.slot_B1, :, self.places_BT] = new_BGTD.transpose(1, 2).gather(1, stored_BT1)
 
@@ -236,7 +234,7 @@ def _attention(
     bias_BTK: Tensor,
     asking: tuple[Tensor, Tensor] | None,
 ) -> Tensor:
-    """Stores every row's keys and values; what its tokens see (B, T, H), or the ``asking`` ones alone (B, W, H)."""
+    """Stores every row's keys and values; attention output (B, T, H), or (B, W, H) of the tokens ``asking``."""
     queries, keys, values, gate = project(attention, hidden_BTH, cos_sin)
     window.store(memory.keys, keys)
     window.store(memory.values, values)
@@ -248,8 +246,8 @@ def _attention(
 
 
 def _attend(queries_BQTD: Tensor, keys_BGKD: Tensor, values_BGKD: Tensor, bias_BTK: Tensor) -> Tensor:
-    """(B, Q, T, D). Key heads are rows, their query heads its heads: kernels that know masks know no grouped heads,
-    and to repeat the keys would copy them once more for every query head."""
+    """Attention output (B, Q, T, D). Key heads become rows and their query heads the heads: torch's kernels with masks
+    do not support grouped heads, and repeating the keys would copy them for every query head."""
     num_rows, num_heads, num_queries, head_dim = queries_BQTD.shape
     num_key_heads = keys_BGKD.shape[1]
     group = num_heads // num_key_heads

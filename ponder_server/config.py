@@ -13,14 +13,14 @@ from ponder_server.contract import WeightsName
 from protocol.options import LinkOptions
 
 SizeName = Literal["tiny_cpu", "qwen35_0p8b", "qwen35_2b", "qwen35_4b", "qwen35_9b"]
-"""Functions of ``dual_system.models.ponder.configs``."""
+"""Names of functions in ``dual_system.models.ponder.configs``."""
 
-NUM_TORCH_THREADS = 1  # on a CPU one thread per process beats two: a contended second one costs more than it gives
+NUM_TORCH_THREADS = 1  # on a CPU one thread per process beats two: contention for the second core costs more
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RandomOptions:
-    """The network without --checkpoint: it moves a robot and knows nothing."""
+    """The network without --checkpoint."""
 
     size: SizeName = "tiny_cpu"
     """Size of the random network. It has the tiny vocabulary at every size."""
@@ -30,24 +30,24 @@ class RandomOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ContextOptions:
-    """What a session's context holds."""
+    """Limits and contents of a session's context."""
 
     max_context_tokens: int = 16_384
     """Most tokens of one session (paper, section 3.4)."""
     when_full: PolicyName = "refuse"
-    """Refuse the query; forget the oldest queries but not the demonstration; or forget old pictures and keep
-    carriers."""
+    """Refuse the query; forget the oldest queries but not the demonstration; or forget old pictures and keep texts
+    and carriers."""
     max_text_tokens: int = 256
     """Most tokens of one subgoal or demonstration reasoning."""
     demo_hz: Literal[1, 2, 4, 5, 10, 20] | None = None
-    """Frames a second of demonstrations that PONDER asks for. None: as in its training (paper: 1)."""
+    """Frames per second of demonstrations that PONDER asks for. None: as in its training (paper: 1)."""
     demo_to_its_end: bool = False
-    """Ask for the last frame of demonstrations as well, although training does not say so."""
+    """Ask for the last frame of demonstrations as well, even if training did not use it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpeedOptions:
-    """What a query costs; texts and cognitions stay the same up to rounding."""
+    """Speed and memory; texts and cognitions stay the same up to rounding."""
 
     weights: WeightsName = "float"
     """Precision of the layers' weights. int8 (CPU) and fp8 (GPU of compute capability 8.9 or more) take one byte each;
@@ -55,28 +55,27 @@ class SpeedOptions:
     graphs: bool = True
     """Do not record forwards as CUDA graphs at start, on a GPU."""
     attention_threads: int = 1
-    """Threads for long-context attention on a CPU; at most the number of usable cores. The answers stay the same. One
-    leaves the next core to POUNCE, whose deadlines are nearer."""
+    """Threads for long-context attention on a CPU; at most the number of usable cores. The answers stay the same. 1
+    leaves the other cores to POUNCE, whose deadlines are shorter."""
     draft_texts: Path | None = None
-    """File of example texts, one a line: texts like them are decoded several tokens a forward."""
+    """File of example texts, one per line: similar texts are decoded several tokens per forward."""
     draft_tokens: int = 0
-    """Tokens that the checkpoint's multi-token prediction drafts at a time where the examples have no draft; at most
-    15."""
+    """Tokens per draft of the checkpoint's multi-token prediction, where the examples have no draft; at most 15."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobotsOptions:
-    """Several robots, one network."""
+    """Serving several robots with one network."""
 
     other_robots: tuple[str, ...] = ()
     """Further robots to serve; they share the weights with --link.robot and are batched together."""
     max_sessions: int = 2
-    """Contexts held at once; their memory is allocated at start."""
+    """Largest number of open contexts; their memory is allocated at start."""
     max_batch_rows: int = 8
-    """Most robots in one forward. With 1, no robot's answer depends on the others in its last bits."""
+    """Largest number of robots in one forward. With 1, no robot's answer depends on the others in its last bits."""
     latency_budget_ms: int = 1000
-    """With other robots: most time from a query to its cognition when all ask at once with full contexts. An episode
-    that would exceed it is refused."""
+    """With other robots: limit of the time from a query to its cognition when all query at once with full contexts.
+    An episode that would exceed it is refused."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,9 +1,9 @@
-"""What to do when a context is full. Pure: which spans of it stay.
+"""Policies for a full context: pure functions that choose which spans stay.
 
-Beyond ``refuse``, attention forgets spans for good: their keys and values leave the cache, later tokens keep their
-positions, and the recurrent layers keep what they had summed up of them. No token is computed again, so a full context
-costs one copy and never a second's pause. Training never saw contexts with holes: these are for episodes that would
-otherwise end, and a model should be trained or at least tested with the one it is served with.
+All but ``refuse`` make attention forget spans for good: their keys and values leave the cache, later tokens keep their
+positions, and the recurrent layers keep their summary of them. No token is recomputed, so a full context costs one copy
+and no pause. Training has no contexts with holes: these policies are for episodes that would otherwise end, and a
+model should be trained, or at least tested, with the policy it is served with.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,7 +22,7 @@ class Span:
 
 
 Policy: TypeAlias = Callable[[Sequence[Span], int], list[bool]]
-"""(the context's spans, tokens that must go) to which spans stay. It may free less, and the query is refused then."""
+"""(spans of the context, tokens to free) -> which spans stay. If it frees fewer tokens, the query is refused."""
 
 PolicyName: TypeAlias = Literal["refuse", "pin-and-slide", "carriers-only"]
 
@@ -30,17 +30,17 @@ _OF_A_QUERY = (SegmentKind.OBSERVATION, SegmentKind.TEXT, SegmentKind.CARRIERS)
 
 
 def refuse(spans: Sequence[Span], num_excess: int) -> list[bool]:
-    """Everything stays: the query is refused, cognition ages, and the ladder acts."""
+    """Keeps everything: the query is refused, cognition ages, and the ladder acts."""
     return [True] * len(spans)
 
 
 def pin_and_slide(spans: Sequence[Span], num_excess: int) -> list[bool]:
-    """Instruction and demonstration stay; whole queries go, oldest first, at least half of them."""
+    """Keeps instruction and demonstration; forgets whole queries, oldest first, at least half of them."""
     return _forget_oldest(spans, num_excess, _OF_A_QUERY)
 
 
 def carriers_only(spans: Sequence[Span], num_excess: int) -> list[bool]:
-    """Of old queries only texts and carriers stay, which saw the observations that go, at least half of these."""
+    """Forgets at least half of the observations, oldest first; keeps texts and carriers, which summarise them."""
     return _forget_oldest(spans, num_excess, (SegmentKind.OBSERVATION,))
 
 
@@ -52,7 +52,7 @@ POLICIES: dict[PolicyName, Policy] = {
 
 
 def _forget_oldest(spans: Sequence[Span], num_excess: int, kinds: Sequence[SegmentKind]) -> list[bool]:
-    """Half at once, so that it happens seldom; and up to the end of a query, so that none is cut."""
+    """Forgets half at a time, so that it happens seldom, and up to the end of a query, so that none is cut."""
     num_candidates = sum(span.num_tokens for span in spans if span.kind in kinds)
     num_to_go = max(num_excess, num_candidates // 2)
     stays: list[bool] = []

@@ -1,6 +1,6 @@
-"""What the daemon and a PONDER engine say to each other: no tensors, no torch.
+"""The interface between the daemon and a PONDER engine, without tensors or torch.
 
-The node and the shell need this file only, so they can be tested with a fake engine in milliseconds.
+The node and the shell need only this file, so a fake engine can test them in milliseconds.
 
 # K carriers, H hidden, h w height and width in pixels
 """
@@ -19,14 +19,14 @@ Frame: TypeAlias = npt.NDArray[np.uint8]
 """One camera image, (h, w, 3) uint8 RGB."""
 
 Proprio: TypeAlias = npt.NDArray[np.float32]
-"""The robot's state at the observation, (8,): 7 joint angles [rad], a finger [m]. Most models ignore it."""
+"""The robot's state at the observation, (8,): 7 joint angles [rad], finger opening [m]. Most models ignore it."""
 
 Result = TypeVar("Result")
 
 WeightsName: TypeAlias = Literal["float", "int8", "fp8"]
 
 Progress: TypeAlias = Callable[[], None]
-"""Called between pieces of work, so that a heartbeat comes from the loop that works and not from a timer."""
+"""Called between pieces of work, so that the heartbeat comes from the working loop and not from a timer."""
 
 
 def no_progress() -> None:
@@ -38,7 +38,7 @@ class SessionError(ValueError):
 
 
 class ContextFull(ValueError):
-    """A session's context has no room for what was asked; the session is left as it was."""
+    """A session's context has no room for an append; the session is unchanged."""
 
     def __init__(self, *, session: str, used: int, wanted: int, limit: int) -> None:
         super().__init__(
@@ -51,7 +51,7 @@ class ContextFull(ValueError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EngineSpec:
-    """What an engine expects and what it gives; fixed for its lifetime."""
+    """An engine's inputs, outputs and limits; fixed for its lifetime."""
 
     num_carriers: int
     """K"""
@@ -63,34 +63,34 @@ class EngineSpec:
     """Frames per fire, always the same cameras in the same order."""
     max_context_tokens: int
     model_hash: str
-    """12 hex digits over the weights, and how they were narrowed."""
+    """12 hex digits over the weights, with a suffix for narrow ones."""
     is_random: bool
-    """The carriers were never trained: every cognition is noise, and reports must say so."""
+    """True if the carriers were never trained: every cognition is noise, and reports must say so."""
     dtype: str
-    """Of weights and activations, e.g. "float32"; cognition is float32 always."""
+    """Number format of weights and activations, e.g. "float32"; cognition is always float32."""
     reader: ObservationReader = WHOLE_VIEWS
-    """What is read of the frames and of the robot's state."""
+    """Maps the frames and the robot's state to images and tokens."""
     demonstrations: DemoSampling = PAPER_SAMPLING
-    """How a demonstration is to be sampled."""
+    """Sampling of demonstrations."""
     session_bytes: int = 0
-    """Memory of one session at its longest; that of all of them is allocated at start."""
+    """Memory of one session at full length; it is allocated for all sessions at start."""
     weights: WeightsName = "float"
     cognition_error: float = 0.0
-    """Relative L2 change of C that ``weights`` cost, after one and the same short context (the warm-up's)."""
+    """Relative L2 change of C by narrow ``weights``, measured in the warm-up's short context."""
 
     @property
     def is_fake(self) -> bool:
-        """Something that was drawn, not trained, decides the answers."""
+        """True if untrained weights decide the answers."""
         return self.is_random
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Opening:
-    """What an episode starts from."""
+    """Instruction and demonstration at the start of an episode."""
 
     instruction: str
     demo_frames: tuple[tuple[Frame, ...], ...] = field(default=())
-    """Demonstration, sampled as ``EngineSpec.demonstrations`` says: for each instant, its views."""
+    """Views of the demonstration at each instant, sampled as ``EngineSpec.demonstrations`` says."""
 
     @property
     def has_demo(self) -> bool:
@@ -99,13 +99,13 @@ class Opening:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Text:
-    """A text PONDER wrote into its own context. It never reaches POUNCE."""
+    """A text that PONDER generated into its own context."""
 
     kind: Literal["subgoal", "demo_reasoning"]
     text: str
     token_ids: tuple[int, ...]
     truncated: bool
-    """True if it was cut at the token limit and closed as it was."""
+    """True if it was cut at the token limit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -113,7 +113,7 @@ class Fire:
     """The answer to one query."""
 
     cognition: npt.NDArray[np.float32]
-    """C_t, (K, H): the carriers' final hidden states, neither decoded nor pooled."""
+    """C_t, (K, H) float32: the carriers' final hidden states, neither decoded nor pooled."""
     is_transition: bool
     """T_t = T_yes."""
     texts: tuple[Text, ...]
@@ -123,7 +123,7 @@ class Fire:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome(Generic[Result]):
-    """How a query ended: with an answer, or with the error that kept it from leaving a trace."""
+    """Result of a query: an answer, or the error after which the session is unchanged."""
 
     session: str
     result: Result | None
@@ -144,7 +144,7 @@ class PonderEngine(Protocol):
     def spec(self) -> EngineSpec: ...
 
     def open(self, session: str, opening: Opening, progress: Progress = no_progress) -> int:
-        """Starts an episode; its context tokens. Raises SessionError, ContextFull or ValueError."""
+        """Starts an episode; returns its context tokens. Raises SessionError, ContextFull or ValueError."""
 
     def fire(
         self,
@@ -156,27 +156,27 @@ class PonderEngine(Protocol):
     ) -> Fire:
         """Appends one observation and answers it, or raises SessionError, ContextFull or ValueError.
 
-        All or nothing: after an error the session is as it was.
+        Atomic: after an error the session is unchanged.
         """
 
     def close(self, session: str) -> None:
         """Ends an episode and frees its memory. Raises SessionError if it is not open."""
 
     def warm_up(self) -> list[int]:
-        """Runs throwaway fires; durations in ns of at least 20, the first few left unmeasured."""
+        """Runs throwaway fires; returns the durations in ns of at least 20, without the first few."""
 
 
 class BatchingEngine(PonderEngine, Protocol):
-    """Thinks about queries of several sessions at once; ``fire`` is for when it thinks about nothing else."""
+    """Runs queries of several sessions at once; ``fire`` requires that none is in progress."""
 
     def begin(self, session: str, frames: tuple[Frame, ...], *, proprio: Proprio | None = None) -> None:
-        """Takes on one query of a session that has none. Raises as ``fire`` does, and changes nothing then."""
+        """Accepts one query of a session that has none. Raises as ``fire`` does, and then changes nothing."""
 
     def warm_up_full(self) -> list[int]:
-        """Runs throwaway forwards of a query in a context as long as one may get; durations in ns of at least 10."""
+        """Runs throwaway queries in a full context; returns the durations in ns of at least 10."""
 
     def step(self, progress: Progress = no_progress) -> list[Outcome[Fire]]:
-        """A piece of work, about as long as one forward; the queries that it answered or that failed in it.
+        """Runs about one forward; returns the queries that it answered or that failed in it.
 
-        Sessions take turns; a query begun between two steps joins the next one. Empty and at once if none is begun.
+        Sessions take turns; a query begun between two steps joins the next one. Without queries it returns [].
         """

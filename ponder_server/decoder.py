@@ -1,8 +1,8 @@
-"""One forward of Qwen3.5's text stack over several contexts: the network's own modules, our memory.
+"""One forward of Qwen3.5's text stack over several contexts: the network's own modules with our cache.
 
-transformers' decoder has one length for all rows, moves the recurrent state by padding and attends to whatever a cache
-returns. Here every row is a slot with a length of its own, padding on the right is inert, and attention reads valid
-positions only. The modules are transformers'; the tests hold this file to its own forward.
+transformers' decoder has one length for all rows, updates the recurrent state with padding and attends to all that a
+cache returns. Here every row is a slot with its own length, right padding has no effect, and attention reads valid
+positions only. The modules are transformers'; the tests compare this file with their own forward.
 
 # B rows, T tokens of a row with its padding, H hidden, D head dimension, C conv channels, W conv width
 """
@@ -23,20 +23,20 @@ from ponder_server.slots import AttentionMemory, RecurrentMemory, SlotMemory
 from ponder_server.threads import ALONE, Threads
 
 LEAST_TOKENS = 4
-"""Rows times tokens of a forward, at least. A CPU multiplies one to three rows of a matrix by other kernels than more,
-which round differently; from four on, no token's bits depend on how many others share its forward."""
+"""Smallest number of rows times tokens of a forward. A CPU uses other kernels, which round differently, for one to
+three rows of a matrix; from four on, a token's bits do not depend on the others in its forward."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Place:
-    """Where a row's tokens go, and for how many of them the caller wants hidden states."""
+    """Slot and number of tokens of a row, and how many hidden states the caller wants."""
 
     slot: int
     num_past: int
     num_new: int
     """Valid tokens of the row; 0 is an idle row. The rest up to T is padding."""
     num_wanted: int
-    """The last so many of the new tokens."""
+    """Number of new tokens, counted from the last, whose hidden states are wanted."""
 
 
 def decode(
@@ -47,10 +47,10 @@ def decode(
     positions_3BT: Tensor,
     threads: Threads = ALONE,
 ) -> list[Tensor]:
-    """Appends each row to its slot; final hidden states (num_wanted, H) of each.
+    """Appends each row to its slot; returns final hidden states (num_wanted, H) per row.
 
-    Rows must be of different slots, and padding must be finite; positions may lie on any device. Rows beyond the places
-    are nobody's: see LEAST_TOKENS.
+    Rows must have different slots, and padding must be finite; positions may be on any device. Rows beyond ``places``
+    are padding (LEAST_TOKENS).
     """
     assert len({place.slot for place in places}) == len(places), "two rows of one slot"
     num_new_B = torch.tensor([place.num_new for place in places], device=embeds_BTH.device)
@@ -61,7 +61,7 @@ def decode(
     for index, layer in enumerate(text_model.layers):
         normed_BTH = layer.input_layernorm(hidden)
         if index in memory.attention:
-            # What nobody wants to know of the last layer need not look around: its keys and values are enough.
+            # In the last layer only wanted tokens attend; the others need only their keys and values.
             num_queries = [place.num_wanted if index == last else place.num_new for place in places]
             mixed_BTH = _attention(
                 layer.self_attn, memory.attention[index], places, num_queries, normed_BTH, cos_sin, threads
@@ -96,7 +96,7 @@ def _attention(
     cos_sin: tuple[Tensor, Tensor],
     threads: Threads,
 ) -> Tensor:
-    """Stores every row's keys and values; (B, T, H), zero but for the last ``num_queries`` valid tokens of a row."""
+    """Stores every row's keys and values; output (B, T, H), zero except a row's last ``num_queries`` valid tokens."""
     queries, keys, values, gate = project(attention, hidden_BTH, cos_sin)
     seen = torch.zeros_like(gate)
     for row, (place, count) in enumerate(zip(places, num_queries, strict=True)):
@@ -112,16 +112,16 @@ def _attention(
 
 
 def _rule(length: int, device: torch.device) -> DeltaRule:
-    """transformers' functions, which are fla's kernels where that is installed; on a CPU our own is the faster one."""
+    """transformers' functions (fla's kernels if installed); on a CPU our own, which is faster."""
     if length == 1:
         return delta_rule_of_one
     return cast(DeltaRule, gated_delta_rule) if device.type == "cpu" else delta_rule_of_many
 
 
 def gated_delta(delta: Any, memory: RecurrentMemory, slot_B: Tensor, num_new_B: Tensor, hidden_BTH: Tensor) -> Tensor:
-    """Advances every row's states by its valid tokens; (B, T, H), of which rows beyond the slots mean nothing.
+    """Advances every row's states by its valid tokens; output (B, T, H), garbage in rows beyond the slots.
 
-    Where the states are and how many tokens are valid it reads on the device, so it can be captured (``captured``).
+    Slots and numbers of valid tokens are device tensors, so it can be captured (``captured``).
     """
     batch, length = len(slot_B), hidden_BTH.shape[1]
     width = delta.conv_kernel_size
@@ -131,7 +131,7 @@ def gated_delta(delta: Any, memory: RecurrentMemory, slot_B: Tensor, num_new_B: 
     kept_BW = num_new_B[:, None] + torch.arange(width, device=hidden_BTH.device)
     memory.conv[slot_B] = inputs_BCT.gather(2, kept_BW[:, None].expand(-1, inputs_BCT.shape[1], -1))
     mixed_BCT = F.silu(F.conv1d(inputs_BCT, delta.conv1d.weight, delta.conv1d.bias, groups=inputs_BCT.shape[1]))
-    # Beta 0 writes nothing, decay exp(0) forgets nothing: a pad leaves the state as it is, to the last bit.
+    # With beta 0 and decay exp(0), padding leaves the state unchanged to the last bit.
     is_valid_BT1 = (torch.arange(length, device=hidden_BTH.device) < num_new_B[:, None])[..., None]
     read, state = _rule(length, hidden_BTH.device)(
         *mixers.heads(delta, mixed_BCT[..., -length:].transpose(1, 2)),

@@ -1,7 +1,7 @@
-"""Guesses of how a text goes on, for the network to check many tokens in one forward.
+"""Drafts for speculative decoding: the network verifies many draft tokens in one forward.
 
-Subgoals are sentences from templates with a few varying words, so a trie over example texts guesses most of each
-sentence. A guess can only save time: what is written is what greedy decoding writes, token for token.
+Subgoals are sentences from templates with a few varying words, so a trie over example texts predicts most of each
+sentence. Drafts only save time: the result is that of greedy decoding, token for token.
 """
 
 from collections import Counter
@@ -11,30 +11,29 @@ from typing import Protocol
 from torch import Tensor, nn
 
 MAX_SUFFIX = 8
-"""Tokens of the past that a guess looks at."""
+"""Longest suffix of the text, in tokens, on which a draft token is conditioned."""
 MIN_SUFFIX = 2
-"""Less of the past than this is no ground for a guess, but for the beginning of a text."""
+"""Shortest such suffix, except at the beginning of a text."""
 MIN_CONFIDENCE = 0.5
-"""A guess ends where the examples do not mostly agree: a wrong one costs a forward of its own."""
+"""Smallest share of examples that agree on a draft token: a wrong one costs an extra forward."""
 _BEGINNING = -1
 
 
 class Draft(Protocol):
-    """Must depend on its arguments alone: it decides which tokens share a forward, and with it the last bits."""
+    """Proposes tokens. It must be a pure function: a draft decides which tokens share a forward, thus the last bits."""
 
     parts: Sequence[nn.Module]
-    """Run one after another for a proposal, so that it can be heard (``audible``)."""
+    """Modules that a proposal runs in turn, for heartbeats (``audible``)."""
 
     def propose(self, written: Sequence[int], max_tokens: int, hidden_TH: Tensor | None = None) -> tuple[int, ...]:
-        """At most ``max_tokens`` tokens that may follow those ``written`` since the text began.
+        """At most ``max_tokens`` text tokens, without an end token, that may follow those ``written`` in this text.
 
-        Tokens of text only, none that ends it. ``hidden_TH``: the network's hidden state before each of those written,
-        for a draft that reads it.
+        ``hidden_TH``: the network's hidden state before each written token, for drafts that use it.
         """
 
 
 class NoDraft:
-    """Plain greedy decoding."""
+    """Proposes nothing: plain greedy decoding."""
 
     parts: Sequence[nn.Module] = ()
 
@@ -43,7 +42,7 @@ class NoDraft:
 
 
 class FirstOf:
-    """Asks one draft after another until one has a guess."""
+    """Returns the first non-empty proposal of several drafts."""
 
     def __init__(self, drafts: Sequence[Draft]) -> None:
         self._drafts = drafts
@@ -55,9 +54,9 @@ class FirstOf:
 
 
 class TrieDraft:
-    """Goes where most examples went after the same few tokens.
+    """Proposes the token that most examples have after the same suffix.
 
-    A trie over every run of up to ``MAX_SUFFIX`` tokens in the examples, so that a text that left its template at a
+    The trie holds every run of up to ``MAX_SUFFIX`` tokens in the examples, so that a text that left its template at a
     number or a colour is recognised again two tokens later.
     """
 

@@ -1,12 +1,11 @@
-"""The engine that thinks with a Qwen3.5: sessions, one-pass fires, greedy text.
+"""The engine that runs Qwen3.5: sessions, one-pass fires, greedy text.
 
-A fire appends observation *and carriers* in one forward and reads T_t at the last observation token. T_no,
-the usual case, is done then: T_no is never part of the context (appendix A.2), so the guess was the truth. On
-T_yes the append is undone, the observation is appended again with T_yes behind it (its vision tokens are
-kept), the text is decoded, and the carriers follow.
+A fire appends observation *and carriers* in one forward and reads T_t at the last observation token. T_no, the
+usual case, is then complete, because T_no is never part of the context (appendix A.2). On T_yes the append is
+undone, the observation is appended again followed by T_yes (its vision tokens are reused), the text is decoded,
+and the carriers follow.
 
-Nothing here depends on a clock or on chance: on one machine equal calls give equal bits, also after reopening
-a session.
+The engine is deterministic: on one machine equal calls give equal bits, also after reopening a session.
 
 # K carriers, H hidden, T tokens, V vocabulary
 """
@@ -70,12 +69,12 @@ class QwenEngine:
     def __init__(
         self, ponder: Ponder, config: EngineConfig, draft: Draft | None = None, *, capture: Capture | None = None
     ) -> None:
-        """Takes over ``ponder``, whose layers are replaced if ``config.weights`` says so.
+        """Takes over ``ponder``, and replaces its layers if ``config.weights`` is narrow.
 
-        ``capture`` is how forwards are captured; by default as CUDA graphs on a GPU and not at all on a CPU.
+        ``capture`` captures forwards; default: CUDA graphs on a GPU, none on a CPU.
 
-        Raises ValueError if the sessions do not fit in memory, if the cameras are not those that the network was made
-        for, or for narrow weights that its device cannot have.
+        Raises ValueError if the sessions do not fit in memory, if the network cannot read the cameras, or if its device
+        does not support ``config.weights``.
         """
         check_weights(config.weights, ponder.device)
         self._ponder = ponder
@@ -129,7 +128,7 @@ class QwenEngine:
             self._spec = replace(self._spec, weights=config.weights, model_hash=hash_, cognition_error=change)
         if capture is None and config.graphs:
             capture = graphs_for(ponder.device)
-        if capture is not None:  # last: what is captured keeps the weights that it saw
+        if capture is not None:  # last, because captured graphs keep their weights
             self._runner.capture(capture, num_read=max(MAX_CHECKED_TOKENS, 1 + self._format.num_carriers))
 
     @property
@@ -182,11 +181,10 @@ class QwenEngine:
         proprio: Proprio | None = None,
         force_text_tokens: int | None = None,
     ) -> Fire:
-        """One query, alone; see ``PonderEngine.fire``.
+        """Runs one query alone; see ``PonderEngine.fire``.
 
-        ``force_text_tokens`` makes it a transition with a subgoal of exactly so many tokens, whatever the
-        model wants to say (the paper's 45-token workload, appendix D). For benchmarks: the text is
-        meaningless.
+        ``force_text_tokens`` forces a transition with a subgoal of exactly this many tokens, for benchmarks (the
+        paper's 45-token workload, appendix D).
         """
         if self._begun or self._batch:
             busy = (*self._begun, *self._batch.sessions)
@@ -204,7 +202,7 @@ class QwenEngine:
         proprio: Proprio | None = None,
         force_text_tokens: int | None = None,
     ) -> None:
-        """Takes on one query, to be answered by :meth:`step`; see ``BatchingEngine.begin``."""
+        """Accepts one query, which :meth:`step` answers; see ``BatchingEngine.begin``."""
         episode = self._episode(session)
         context = episode.context
         if session in (*self._begun, *self._batch.sessions):
@@ -226,15 +224,15 @@ class QwenEngine:
         )
 
     def drop(self, session: str) -> None:
-        """Forgets a query that was begun and not answered; without one it changes nothing."""
+        """Cancels a session's unanswered query, if any."""
         self._begun.pop(session, None)
         self._batch.drop(session)
 
     @torch.inference_mode()
     def step(self, progress: Progress = no_progress) -> list[Outcome[Fire]]:
-        """One forward for the queries that were begun; those answered by it. See ``BatchingEngine.step``."""
+        """Runs one forward; returns the queries that it answered. See ``BatchingEngine.step``."""
         with audible(self._parts, progress):
-            # no more than share a forward: the rest would wait behind their vision tower, and outgrow the caches
+            # At most as many as share a forward: more would lengthen the vision tower's pass and exceed CPU caches.
             begun = {session: self._begun.pop(session) for session in [*self._begun][: self._config.max_batch_rows]}
             if begun:
                 pictures = [picture for query in begun.values() for picture in query.pictures]
@@ -245,7 +243,7 @@ class QwenEngine:
             return self._batch.step(progress)
 
     def _think(self, query: Query, embeds_TH: Tensor) -> Steps[Fire]:
-        """One query's way through the network; whatever ends it early, the context is as it was."""
+        """Runs one query through the network; if it ends early, the context is restored."""
         episode, exactly = query.episode, query.force_text_tokens
         context = episode.context
         num_observed = len(query.ids) - self._format.num_carriers
@@ -295,10 +293,10 @@ class QwenEngine:
 
     @torch.inference_mode()
     def warm_up(self) -> list[int]:
-        """Durations in ns of cognition-only fires at one and the same short context, results on the host.
+        """Durations in ns of cognition-only fires in the same short context, including the copy to the host.
 
-        Before, all that an episode may need is captured, if anything is: no robot waits for that. Raises RuntimeError
-        if it cannot be, or gives another cognition.
+        First captures, if enabled, every forward that an episode may need, so that no robot waits for it. Raises
+        RuntimeError if that fails or changes cognition.
         """
         longest = max(self._num_query_ids, MAX_CHECKED_TOKENS)
         if self._runner.prepare(longest, max_rows=self._config.max_batch_rows):
@@ -321,7 +319,7 @@ class QwenEngine:
 
     @torch.inference_mode()
     def warm_up_full(self) -> list[int]:
-        """Durations in ns of queries, frames to cognition, in a context that has room for one; it means nothing."""
+        """Durations in ns of queries, frames to cognition, in a context filled with meaningless tokens."""
         self.open(WARM_UP_SESSION, WARM_UP_OPENING)
         try:
             context = self._episode(WARM_UP_SESSION).context
@@ -338,14 +336,14 @@ class QwenEngine:
         return durations_ns[1:]
 
     def example_frames(self) -> tuple[Frame, ...]:
-        """Frames of one query, of noise: for measurements."""
+        """Noise frames for one query, for measurements."""
         noise = np.random.default_rng(0)
         shape = (*self._frame_px, 3)
         return tuple(noise.integers(0, 256, shape, dtype=np.uint8) for _ in range(self._config.num_cameras))
 
     @torch.inference_mode()
     def _example_cognition(self) -> Tensor:
-        """C (K, H) after the warm-up's context and one observation, as if T_t were T_no: always the same tokens."""
+        """C (K, H) after the warm-up's context and one observation, without text: always the same tokens."""
         self.open(WARM_UP_SESSION, WARM_UP_OPENING)
         try:
             return self._example_query(self._episode(WARM_UP_SESSION).context)
@@ -353,7 +351,7 @@ class QwenEngine:
             self.close(WARM_UP_SESSION)
 
     def _example_query(self, context: Session) -> Tensor:
-        """C (K, H) of one observation as if T_t, which is looked at, were T_no."""
+        """C (K, H) of one observation; T_t is computed but taken as T_no."""
         ids = self._query_ids(WARM_UP_PROPRIO)
         embeds_TH = self._embed(ids, [*self._see(self.example_frames(), "warm-up")])
         context.save(context.before_fire)
@@ -368,7 +366,7 @@ class QwenEngine:
         return episode
 
     def _query_ids(self, proprio: Proprio | None) -> tuple[int, ...]:
-        """O_t and the carriers: always as many."""
+        """Tokens of O_t and the carriers, a fixed number."""
         observed = self._format.observation(self._config.num_cameras, proprio)
         return (*observed.ids, *self._format.carrier_ids)
 
@@ -385,7 +383,7 @@ class QwenEngine:
 
     @torch.inference_mode()
     def _make_room(self, episode: Episode) -> None:
-        """Asks the policy, early enough that a transition with texts of full length would still fit."""
+        """Applies the context policy, early enough for a transition with texts of full length to fit."""
         context = episode.context
         num_wanted = self._num_query_ids + 2 * (1 + self._config.max_text_tokens)
         if num_wanted <= context.room:
@@ -405,16 +403,12 @@ class QwenEngine:
         episode.spans = [span for span, stay in zip(episode.spans, stays, strict=True) if stay]
 
     def _answer(self, context: Session, hidden_KH: Tensor, texts: tuple[Text, ...]) -> Fire:
-        # a copy: a view would keep the hidden states of the whole observation alive
+        # A copy, because a view would keep the hidden states of the whole observation alive.
         cognition = hidden_KH.to("cpu", torch.float32, copy=True).numpy()
         if not np.isfinite(cognition).all():
             raise FloatingPointError(
                 f"session {context.name!r}: cognition is not finite after {context.num_tokens} tokens; "
                 f"weights {self._spec.model_hash} in {self._spec.dtype} are broken or overflow."
             )
-        return Fire(
-            cognition=cognition,
-            is_transition=bool(texts),
-            texts=texts,
-            context_tokens=context.num_tokens,
-        )
+        num_tokens = context.num_tokens
+        return Fire(cognition=cognition, is_transition=bool(texts), texts=texts, context_tokens=num_tokens)

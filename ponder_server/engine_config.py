@@ -1,4 +1,4 @@
-"""How an engine serves: limits of its contexts, what shares a forward, and what the weights are kept as."""
+"""Options of an engine: limits of its contexts, batching, and the weights' precision."""
 
 from __future__ import annotations
 
@@ -11,32 +11,32 @@ from ponder_server.runner import BUCKETS
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EngineConfig:
-    """How an engine serves; what it serves is in its ``Ponder``."""
+    """Options of an engine; the network is in its ``Ponder``."""
 
     num_cameras: int = 2
     """Frames per fire, always the same cameras in the same order."""
     max_context_tokens: int = 16_384
-    """Per session (paper, section 3.4: 16K holds 100 fires of two cameras and more)."""
+    """Limit per session (paper, section 3.4: 16K holds more than 100 fires of two cameras)."""
     max_sessions: int = 4
-    """Contexts held at once; all of them are allocated when the engine is built."""
+    """Largest number of open contexts; all of them are allocated when the engine is built."""
     when_full: PolicyName = "refuse"
     """See ``context_policy``."""
     max_text_tokens: int = 256
-    """Limit of one text. A text that reaches it is closed as it is and flagged ``truncated``."""
+    """Limit of one text. A text that reaches it is cut and flagged ``truncated``."""
     prefill_chunk_tokens: int = 2048
-    """Opening tokens per forward: more is faster, fewer lets ``progress`` be heard more often."""
+    """Opening tokens per forward: more is faster, fewer calls ``progress`` more often."""
     max_batch_rows: int = 8
-    """Sessions that share a forward at most."""
+    """Largest number of sessions that share a forward."""
     max_prefixes: int = 2
-    """Demonstrations kept encoded for further episodes that begin with the same one."""
+    """Number of encoded openings to keep for further episodes with the same one."""
     buckets: tuple[int, ...] = BUCKETS
-    """Lengths that a forward's rows are padded to, growing."""
+    """Lengths, in ascending order, to which a forward's rows are padded."""
     attention_threads: int = 1
-    """That share a long context's attention on a CPU. No bit of an answer depends on them."""
+    """Threads for long-context attention on a CPU; answers are bit-identical for any number."""
     weights: WeightsName = "float"
-    """int8, fp8: a byte a weight of the layers; the change of cognition is measured when the engine is built."""
+    """int8, fp8: one byte per layer weight; the change of cognition is measured when the engine is built."""
     graphs: bool = True
-    """On a GPU forwards are CUDA graphs (``captured``)."""
+    """Run forwards as CUDA graphs on a GPU (``captured``)."""
 
     def __post_init__(self) -> None:
         for name in self.__slots__:

@@ -1,4 +1,4 @@
-"""What an engine keeps of an episode beside its tokens, and of a query on its way."""
+"""An engine's state of an episode besides its tokens, and of a query in progress."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from ponder_server.runner import Session
 
 @dataclass(slots=True, kw_only=True)
 class Episode:
-    """A session in use, and what its tokens do not say about it."""
+    """A session in use, with the state that its tokens do not show."""
 
     context: Session
     spans: list[Span]
-    """What the cached tokens are."""
+    """Kinds of the cached tokens, in order."""
     owes_reasoning: bool
-    """A demonstration was shown and its reasoning (DR) not yet written; the first transition writes it."""
+    """True from a demonstration to the first transition, which generates its reasoning (DR)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Query:
-    """A query that was begun."""
+    """A query in progress."""
 
     episode: Episode
     pictures: Pictures
-    """(images, h, w, 3): what is read of its frames."""
+    """(images, h, w, 3): the network's images of its frames."""
     ids: tuple[int, ...]
-    """O_t and the carriers."""
+    """Tokens of O_t and the carriers."""
     force_text_tokens: int | None
     turn: int

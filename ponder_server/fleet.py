@@ -1,7 +1,7 @@
-"""Several robots, one network: a server per robot, all of them thinking in common forwards.
+"""Several robots, one network: a server per robot, with queries batched in common forwards.
 
-Every robot has its own link, heartbeat and node, exactly as if it were alone; they share the engine, and with it the
-weights and the turns. A robot is admitted to an episode if everybody's latency budget still holds with it.
+Every robot has its own link, heartbeat and node, exactly as if it were alone; they share the engine, hence its weights
+and its queue. A robot is admitted to an episode if the latency budget then still holds for every robot.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from protocol.process import host_clock_id
 
 
 class SharedEngine:
-    """One engine, and what it has answered that nobody has fetched yet."""
+    """One engine, and its answers that were not fetched yet."""
 
     def __init__(self, engine: BatchingEngine) -> None:
         self.engine = engine
@@ -46,7 +46,7 @@ class SharedEngine:
 
 
 class RobotEngine:
-    """The shared engine as one robot sees it: a ``PonderEngine`` whose sessions are its own."""
+    """One robot's view of the shared engine: a ``PonderEngine`` with its own sessions."""
 
     def __init__(self, shared: SharedEngine, robot: str, durations_ns: Sequence[int]) -> None:
         self._shared = shared
@@ -64,7 +64,7 @@ class RobotEngine:
         self._shared.engine.begin(self._name(session), frames, proprio=proprio)
 
     def fetch(self, session: str) -> Outcome[Fire] | None:
-        """How the query that was begun ended, if it did."""
+        """The outcome of the session's query; None while it is in progress."""
         return self._shared.outcomes.pop(self._name(session), None)
 
     def fire(
@@ -75,7 +75,7 @@ class RobotEngine:
         *,
         proprio: Proprio | None = None,
     ) -> Fire:
-        """Begins and waits; the others' queries go on meanwhile."""
+        """Begins a query and waits for it; the other robots' queries continue meanwhile."""
         self.begin(session, frames, proprio=proprio)
         while (outcome := self.fetch(session)) is None:
             self._shared.step(progress)
@@ -86,7 +86,7 @@ class RobotEngine:
         self._shared.engine.close(self._name(session))
 
     def warm_up(self) -> list[int]:
-        """The engine was warmed up once for all."""
+        """Returns the durations of the engine's common warm-up."""
         return self._durations_ns
 
     def _name(self, session: str) -> str:
@@ -96,8 +96,8 @@ class RobotEngine:
 class RobotServer(PonderServer):
     """PONDER for one of several robots: a query is begun in one step and answered in a later one.
 
-    A lost context is rebuilt in the same way, a query at a time, so that the other robots' queries take turns with it;
-    what its own robot asks meanwhile waits for the end of it.
+    A lost context is rebuilt in the same way, query by query, so that the other robots' queries take turns with it;
+    its own robot's new queries wait until it is rebuilt.
     """
 
     def __init__(
@@ -115,14 +115,14 @@ class RobotServer(PonderServer):
         return self._thinking is not None or self._rebuild is not None
 
     def step(self) -> bool:
-        """Takes in what came and hands over what was answered; the fleet does the thinking in between."""
+        """Reads messages and publishes answers; the fleet runs the engine in between."""
         worked = self._listen()
         while len(self._waiting) < KEEP_QUERIES and (work := self._next_work()) is not None:
-            self._waiting.append(work)  # out of the node: observations are kept for ticks there, not for seconds
+            self._waiting.append(work)  # taken early: the node keeps observations for ticks, not for seconds
         return self._finish() or self._begin() or worked
 
     def rejoin(self) -> bool:
-        """Asks which episode runs, and begins to rebuild its context."""
+        """Asks for the running episode, and begins to rebuild its context."""
         rejoined = self._membership.rejoin()
         if rejoined is None:
             return False
@@ -145,7 +145,7 @@ class RobotServer(PonderServer):
         return self._waiting.popleft() if self._waiting else None
 
     def _next_rebuilt(self) -> Work | None:
-        """The next query to be thought over; without one the rebuilding is over."""
+        """The next query of a rebuild; without one, the rebuild is complete."""
         if self._rebuild is None:
             return None
         try:
@@ -179,7 +179,7 @@ class RobotServer(PonderServer):
             self._give_up(error)
 
     def _is_owed(self, work: Work) -> bool:
-        """Whether somebody waits for the answer, or the context alone needs it."""
+        """Whether the clock waits for the answer; otherwise only the context needs the query."""
         return self._rebuild is None or work.query.query == self._rebuild.owed_query
 
     def _open(self, request: m.OpenRequest) -> m.Contract:
@@ -198,12 +198,12 @@ class RobotServer(PonderServer):
 
 @dataclass(frozen=True, slots=True)
 class _Rebuild:
-    """A lost context on its way back."""
+    """A lost context that is being rebuilt."""
 
     missed: Iterator[Work]
     num_queries: int
     owed_query: int | None
-    """The clock still waits for this one's answer (lockstep)."""
+    """Query whose answer the clock still waits for (lockstep)."""
 
 
 class PonderFleet:
@@ -219,7 +219,7 @@ class PonderFleet:
         other_robots: Sequence[str],
         latency_budget_ns: int,
     ) -> None:
-        """``link`` and ``heartbeat`` are the first robot's; the others' are made here."""
+        """``link`` and ``heartbeat`` are the first robot's; the others are created here."""
         self._shared = SharedEngine(engine)
         self._version = version
         self._latency_budget_ns = latency_budget_ns
@@ -250,7 +250,7 @@ class PonderFleet:
             server.ready()
 
     def step(self) -> bool:
-        """Every robot is heard, then one forward for all of those that asked."""
+        """Reads every robot's messages, then runs one forward for those with queries."""
         worked = [server.step() for server in self._servers]
         self._shared.step(self._beat)
         return any(worked) or any(server.is_busy for server in self._servers)

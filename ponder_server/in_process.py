@@ -22,7 +22,7 @@ _OFFLINE = "offline"
 
 
 def build(bus: Bus, robot: str, checkpoint: Path | None) -> Callable[[], bool]:
-    """A warm server's step function."""
+    """Returns the step function of a warm server."""
     link = Link(bus, robot=robot, proc="ponder")
     heartbeat = Heartbeat(link, version(), host_clock_id())
     server = PonderServer(link, build_engine(PonderOptions(checkpoint=checkpoint)), heartbeat, version())
@@ -32,15 +32,15 @@ def build(bus: Bus, robot: str, checkpoint: Path | None) -> Callable[[], bool]:
 
 
 Views = Sequence[Frame]
-"""One instant, camera by camera."""
+"""Frames of one instant, in camera order."""
 Read = Callable[[str, Sequence[Views], Sequence[Views], NDArray[np.float32]], NDArray[np.float32]]
 
 
 def build_reader(checkpoint: Path | None) -> tuple[Read, EngineSpec]:
-    """A PONDER outside of any episode, for offline measurements.
+    """Builds a PONDER outside of any episode, for offline measurements.
 
-    Returns a function from an instruction, a demonstration's looks and the observations since, with the robot's states
-    (T, 8) at these, to the cognition (K, H) of the last one, as served: texts are PONDER's own. And what the engine is.
+    Returns the engine's spec, and a function from an instruction, the demonstration's instants and the T observations
+    since with the robot's states (T, 8), to the last one's cognition (K, H) as in serving, with PONDER's own texts.
     """
     engine = build_engine(PonderOptions(checkpoint=checkpoint))
 

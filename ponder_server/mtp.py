@@ -1,9 +1,8 @@
-"""Guesses of a checkpoint's own multi-token prediction.
+"""Drafts from a checkpoint's own multi-token prediction.
 
-The head looks back over the text that is being written and no further: its past is a function of what the writer hands
-over, so there is no second cache that restoring, forking and forgetting would have to follow. What came before the text
-reaches it through the network's hidden states. It was trained to look at the whole context as well, which could only
-make its guesses better, never other texts.
+The head attends only to the text being generated: its past is a function of the writer's arguments, so there is no
+second cache to restore, fork and forget along with the first. Earlier context reaches it through the network's hidden
+states. It was trained with attention to the whole context; that could improve drafts but never change texts.
 
 # T tokens of the text, H hidden, V vocabulary
 """
@@ -20,27 +19,22 @@ from ponder_server.slots import SlotMemory
 from ponder_server.writer import MAX_CHECKED_TOKENS, ends_of_text, sayable
 
 WINDOW = 64
-"""Tokens of the text that the head looks back over: they are read again for every proposal."""
+"""Tokens of the text to which the head attends; they are recomputed for every proposal."""
 MAX_DRAFT_TOKENS = MAX_CHECKED_TOKENS - 1
 
 
 class MtpDraft:
-    """Proposes ``num_tokens`` at a time, fewer where the head sees the text end."""
+    """Proposes ``num_tokens`` at a time, fewer where the head predicts the end of the text."""
 
     def __init__(self, ponder: Ponder, *, num_tokens: int) -> None:
-        """Raises ValueError for a number of tokens that cannot be checked in one forward, and as :class:`MtpHead`."""
+        """Raises ValueError if ``num_tokens`` cannot be verified in one forward, and as :class:`MtpHead`."""
         if not 1 <= num_tokens <= MAX_DRAFT_TOKENS:
             raise ValueError(f"{num_tokens} tokens at a time were asked for; 1 to {MAX_DRAFT_TOKENS} can be checked.")
         self._ponder = ponder
         self._num_tokens = num_tokens
         self._head = MtpHead(ponder)
-        self._memory = SlotMemory(
-            self._head.text_config,
-            num_slots=1,
-            max_tokens=WINDOW + num_tokens,
-            device=ponder.device,
-            dtype=ponder.dtype,
-        )
+        max_tokens, config = WINDOW + num_tokens, self._head.text_config
+        self._memory = SlotMemory(config, num_slots=1, max_tokens=max_tokens, device=ponder.device, dtype=ponder.dtype)
         self._may_end_V = sayable(ponder, ends=True)
         self._ends = ends_of_text(ponder.format.vocabulary)
         self.parts: Sequence[nn.Module] = [layer.mlp for layer in self._head.layers]  # type: ignore[misc]
@@ -63,7 +57,7 @@ class MtpDraft:
         return tuple(guesses)
 
     def _last_hidden(self, ids: Sequence[int], hidden_TH: Tensor, num_past: int) -> Tensor:
-        """Appends tokens to the head's own past; its output (1, H) behind the last of them."""
+        """Appends tokens to the head's own past; returns its output (1, H) at the last of them."""
         place = Place(slot=0, num_past=num_past, num_new=len(ids), num_wanted=1)
         positions_T = torch.arange(num_past, num_past + len(ids), device=hidden_TH.device)
         merged_TH = self._head.merge(self._ponder.embed(ids), hidden_TH)

@@ -1,7 +1,7 @@
-"""Which of PONDER's matrices are narrow, in int8 or fp8: those of the text layers and of the vision tower.
+"""Narrow weights (int8 or fp8) for the matrices of PONDER's text layers and vision tower.
 
-Embeddings, LM head, norms and convolutions stay as they are, and so do the two small projections that set the decay and
-the writing strength of the recurrent layers, whose errors would add up over thousands of tokens.
+Embeddings, LM head, norms and convolutions keep their precision, and so do the two small projections for the decay and
+the write strength of the recurrent layers, whose errors would accumulate over thousands of tokens.
 """
 
 from typing import Final
@@ -20,7 +20,7 @@ _LAYERS: Final = {"int8": Int8Linear, "fp8": Fp8Linear}
 
 
 def check_weights(weights: WeightsName, device: torch.device) -> None:
-    """Raises ValueError if ``device`` cannot have such weights; the message says what can be had instead."""
+    """Raises ValueError if ``device`` does not support these weights; the message names an alternative."""
     if weights == "int8" and device.type != "cpu":
         raise ValueError("int8 weights are for a CPU; take --weights fp8, or leave it out and take --dtype bfloat16.")
     if weights == "fp8" and (missing := missing_for(device)):
@@ -28,7 +28,7 @@ def check_weights(weights: WeightsName, device: torch.device) -> None:
 
 
 def quantise(ponder: Ponder, weights: WeightsName) -> int:
-    """Replaces the layers in place; returns how many bytes that saved, 0 for float weights."""
+    """Replaces the layers in place; returns the number of bytes saved, 0 for float weights."""
     if weights == "float":
         return 0
     kind = _LAYERS[weights]

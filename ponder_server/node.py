@@ -1,4 +1,4 @@
-"""When PONDER fires, and on which observation. Pure: messages in, work and messages out."""
+"""Decides when PONDER fires, and on which observation. Pure: messages in, work and messages out."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from protocol import messages as m
 from protocol.errors import EpisodeRefused, MalformedMessage
 
 KEEP_QUERIES = 8
-"""All of them matter: a query skipped is a gap in the context."""
+"""Largest number of queries kept; none may be skipped, because that would leave a gap in the context."""
 
 _KINDS = {"subgoal": m.SubgoalKind.SUBGOAL, "demo_reasoning": m.SubgoalKind.DEMO_REASONING}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Work:
-    """One fire to do: query t, and of its observation the frames and the robot's state."""
+    """One fire to run: a query, and the frames and the robot's state of its observation."""
 
     query: m.Query
     frames: tuple[Frame, ...]
@@ -42,10 +42,10 @@ class PonderNode:
         self.next_query = next_query
 
     def on_observation(self, observation: m.Observation) -> None:
-        """Keeps what a query may name; one without any picture none does (`Conductor.will_look`).
+        """Keeps an observation for queries; without pictures it is ignored, as no query names it (`will_look`).
 
         Raises:
-            MalformedMessage: not the cameras that the engine was built for; nothing good is displaced by it.
+            MalformedMessage: the engine cannot read these cameras; the observation displaces no other.
         """
         if not observation.images:
             return
@@ -57,10 +57,10 @@ class PonderNode:
             self._rendezvous.on_request(query)
 
     def next_work(self) -> Work | None:
-        """The oldest query whose observation has come.
+        """The oldest query whose observation is there.
 
         Raises:
-            MalformedMessage: a frame is no picture; the query is then forgotten.
+            MalformedMessage: a frame is no picture; the query is then dropped.
         """
         pair = self._rendezvous.next_pair()
         if pair is None:
@@ -68,20 +68,20 @@ class PonderNode:
         return _work(*pair)
 
     def replay(self, query: m.Query, observation: m.Observation) -> Work:
-        """A query of the past and the observation that it was about, from the journal.
+        """A past query and its observation, from the journal.
 
         Raises:
-            MalformedMessage: not what the engine can read.
+            MalformedMessage: the engine cannot read the observation.
         """
         check_pictures(observation, self._spec)
         return _work(query, observation)
 
     def missed(self) -> list[m.Query]:
-        """Queries whose observation was lost on the way."""
+        """Queries whose observation was lost in transit."""
         return list(self._rendezvous.give_up())
 
     def answer(self, work: Work, fire: Fire, *, ready_ns: int, infer_ns: int) -> tuple[m.Cognition, list[m.Subgoal]]:
-        """What is published: the cognition, and for the log alone the texts that PONDER wrote to itself."""
+        """Messages to publish: the cognition, and PONDER's generated texts."""
         query = work.query
         self.next_query = query.query + 1
         vector = np.ascontiguousarray(fire.cognition, np.float32)
@@ -118,7 +118,7 @@ def _work(query: m.Query, observation: m.Observation) -> Work:
 
 
 def check_robot(robot: m.Robot, spec: EngineSpec) -> None:
-    """Raises EpisodeRefused unless the engine can read what this robot's cameras will give: no robot moves unseen."""
+    """Raises EpisodeRefused unless the engine can read this robot's cameras and state."""
     if len(robot.cameras) != spec.num_cameras:
         raise EpisodeRefused(
             m.Refusal.CAMERAS,

@@ -1,4 +1,4 @@
-"""Fills an empty context with an episode's opening, in a few large forwards.
+"""Encodes an episode's opening into an empty context, in a few large forwards.
 
 # T tokens, H hidden
 """
@@ -15,7 +15,7 @@ from ponder_server.runner import Session
 
 
 class Opener:
-    """Encodes openings for one engine. An equal opening of before is copied."""
+    """Encodes openings for one engine; an opening that was encoded before is copied."""
 
     def __init__(
         self,
@@ -24,7 +24,7 @@ class Opener:
         max_prefixes: int,
         chunk_tokens: int,
     ) -> None:
-        """``embed``: tokens and the pictures among them, (T, H); the rest as in ``EngineConfig``."""
+        """``embed`` maps tokens and their pictures to (T, H); the other arguments are ``EngineConfig``'s."""
         self._embed = embed
         self._prefixes = Prefixes(max_prefixes)
         self._chunk_tokens = chunk_tokens
@@ -37,7 +37,7 @@ class Opener:
         pictures: Sequence[Pictures],
         progress: Progress,
     ) -> None:
-        """Appends ``segments`` with their ``pictures``. Raises what a forward raises; the caller closes the context."""
+        """Appends ``segments`` with their ``pictures``. If a forward raises, the caller must close the context."""
         if opening.has_demo and (found := self._prefixes.find(opening)) is not None:
             context.start_from(found)
             return

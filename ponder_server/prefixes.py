@@ -1,4 +1,4 @@
-"""Openings that were encoded once and are forked for every further episode that begins with the same bits."""
+"""Cache of encoded openings, which further episodes with an identical opening fork."""
 
 import hashlib
 from collections import OrderedDict
@@ -10,9 +10,9 @@ from ponder_server.runner import Prefix, Session
 
 
 class Prefixes:
-    """The most recently used openings, ``max_prefixes`` at most; 0 keeps none.
+    """The ``max_prefixes`` most recently used openings; 0 keeps none.
 
-    Only a whole opening can be shared: a recurrent state says nothing about where its tokens ended.
+    Only a whole opening can be shared, because a recurrent state cannot be cut at an earlier token.
     """
 
     def __init__(self, max_prefixes: int) -> None:
@@ -20,7 +20,7 @@ class Prefixes:
         self._prefixes: OrderedDict[bytes, Prefix] = OrderedDict()
 
     def find(self, opening: Opening) -> Prefix | None:
-        """An equal opening's context."""
+        """Context of an identical opening; None if there is none."""
         key = _digest(opening)
         found = self._prefixes.get(key)
         if found is not None:
@@ -28,7 +28,7 @@ class Prefixes:
         return found
 
     def keep(self, opening: Opening, context: Session) -> None:
-        """Copies a context that holds exactly ``opening``; does without if the device has no memory for it."""
+        """Copies a context that holds exactly ``opening``, or drops all copies if the device runs out of memory."""
         while self._prefixes and len(self._prefixes) >= self._max_prefixes:
             self._prefixes.popitem(last=False)
         if self._max_prefixes:

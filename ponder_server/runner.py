@@ -1,12 +1,12 @@
 """Contexts on a device: append to several at once, save, restore, fork.
 
-Append-only with one exception: the state saved before an append can be restored. That costs little, because only the
-recurrent layers forget what they were: their state is copied out and back, while keys and values past the restored
-length are simply no longer looked at.
+Contexts are append-only with one exception: the state saved before an append can be restored. That is cheap, because
+only the recurrent layers overwrite their state, which is copied out and back; keys and values past the restored length
+are simply no longer read.
 
-Rows are padded on the right to one of a few *buckets*, so that a forward has one of a few shapes; what is longer than
-the largest bucket goes in several forwards. A row's buckets do not depend on who shares its forwards. All memory is
-allocated at construction, and everything writes in place.
+Rows are padded on the right to one of a few *buckets*, so that forwards have few shapes; an append longer than the
+largest bucket takes several forwards. A row's buckets do not depend on the other rows of its forwards. All memory is
+allocated at construction, and all writes are in place.
 
 # T new tokens, H hidden
 """
@@ -28,15 +28,15 @@ from ponder_server.slots import SlotMemory
 from ponder_server.threads import ALONE, Threads
 
 NUM_SAVED_STATES = 2
-"""Per slot, allocated with it: before a query, and before a draft."""
+"""Saved states per slot, allocated with it: before a query, and before a draft."""
 
 BUCKETS = (1, 16, 160, 512, 2048)
-"""Tokens of a row: a decoded token, a verified draft, a fire of two 256 px cameras, pieces of a demonstration."""
+"""Padded row lengths: a decoded token, a verified draft, a fire of two 256 px cameras, pieces of a demonstration."""
 _BUCKET_STEP = 16
 
 
 def fitted(buckets: tuple[int, ...], num_query_ids: int) -> tuple[int, ...]:
-    """The buckets, and one for queries where they would be padded to twice their length."""
+    """The buckets, with one more for queries if they would otherwise be padded to twice their length."""
     own = -(-num_query_ids // _BUCKET_STEP) * _BUCKET_STEP
     padded = next((bucket for bucket in buckets if bucket >= num_query_ids), own)
     return tuple(sorted({*buckets, own})) if 2 * own <= padded else buckets
@@ -44,7 +44,7 @@ def fitted(buckets: tuple[int, ...], num_query_ids: int) -> tuple[int, ...]:
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class SavedState:
-    """A point in a session to come back to: lengths, and copies of the recurrent tensors."""
+    """A restore point of a session: lengths, and copies of the recurrent tensors."""
 
     num_ids: int
     next_position: int
@@ -53,7 +53,7 @@ class SavedState:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Prefix:
-    """A whole context, copied out: what forks start from. It costs memory by its length."""
+    """A copy of a whole context, from which forks start. Its memory grows with its length."""
 
     ids: tuple[int, ...]
     next_position: int
@@ -67,7 +67,7 @@ class Prefix:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Append:
-    """Tokens for one session, and how many of their hidden states are wanted: the last so many, None for all."""
+    """Tokens for one session; the hidden states of the last ``num_wanted`` are returned, of all if None."""
 
     session: "Session"
     ids: Sequence[int]
@@ -87,7 +87,7 @@ class Runner:
         buckets: tuple[int, ...] = BUCKETS,
         threads: Threads = ALONE,
     ) -> None:
-        """``threads`` are for attention on a CPU."""
+        """``threads`` are for attention on a CPU only."""
         self._ponder = ponder
         self._threads = threads
         self._text_model = ponder.qwen.model.language_model
@@ -101,17 +101,17 @@ class Runner:
         self._saved = [tuple(self._blank_state(slot) for _ in range(NUM_SAVED_STATES)) for slot in range(num_slots)]
 
     def capture(self, capture: Capture, *, num_read: int) -> None:
-        """Forwards are captured from now on (``captured``), when they are first met or by :meth:`prepare`.
+        """Turns on capturing of forwards (``captured``), at their first use or by :meth:`prepare`.
 
-        What is captured keeps the weights that it saw: replace none afterwards. A row's hidden states are handed out
-        ``num_read`` at most; forwards that are asked for more run uncaptured.
+        Captured forwards keep their weights: replace none afterwards. They return at most ``num_read`` hidden states
+        per row; a forward that needs more runs uncaptured.
         """
         self._captured = CapturedDecoder(self._text_model, self.memory, capture, num_read=num_read)
 
     def prepare(self, num_tokens: int, *, max_rows: int) -> int:
-        """Captures all forwards that appends of up to so many tokens to so many sessions at once can need, and any
-        append to one session; how many graphs there are then, 0 without :meth:`capture`. Raises RuntimeError if the
-        device cannot."""
+        """Captures all forwards for appends of up to ``num_tokens`` to up to ``max_rows`` sessions at once, and for any
+        append to one session; returns the number of graphs, 0 without :meth:`capture`. Raises RuntimeError on failure.
+        """
         if self._captured is None:
             return 0
         shared = [bucket for bucket in self._buckets if bucket <= self.bucket(num_tokens)]
@@ -120,7 +120,7 @@ class Runner:
         return len(self._captured)
 
     def check(self, appended: Callable[[], Tensor]) -> None:
-        """Raises RuntimeError if what is appended comes out otherwise with what was captured than without it."""
+        """Raises RuntimeError if ``appended`` returns another result with captured forwards than without."""
         with_it, captured = appended(), self._captured
         self._captured = None
         try:
@@ -129,7 +129,7 @@ class Runner:
             self._captured = captured
 
     def open(self, name: str) -> "Session":
-        """An empty context in a free slot. Raises SessionError if there is none."""
+        """Opens an empty context in a free slot. Raises SessionError if no slot is free."""
         if not self._free_slots:
             raise SessionError(f"session {name!r} does not fit: all {self.memory.num_slots} slots are in use.")
         slot = self._free_slots.pop()
@@ -137,18 +137,18 @@ class Runner:
         return Session(self, name, slot, *self._saved[slot])
 
     def close(self, session: "Session") -> None:
-        """Gives the slot back; the session must not be used again."""
+        """Frees the slot; the session must not be used again."""
         assert session.slot not in self._free_slots, "closed twice"
         self._free_slots.append(session.slot)
 
     def bucket(self, num_tokens: int) -> int:
-        """Length of the next forward of a row that has so many tokens left."""
+        """Length of the next forward of a row with ``num_tokens`` left."""
         return next((bucket for bucket in self._buckets if bucket >= num_tokens), self._buckets[-1])
 
     def append(self, appends: Sequence[Append]) -> list[Tensor]:
-        """Appends to different sessions in common forwards; the wanted hidden states (num_wanted, H) of each.
+        """Appends to different sessions in common forwards; returns hidden states (num_wanted, H) per append.
 
-        Raises ContextFull before anything changes if one of them does not fit.
+        Raises ContextFull, before anything changes, if one of them does not fit.
         """
         for one in appends:
             one.session.check_room(len(one.ids))
@@ -192,7 +192,7 @@ class Runner:
 
 
 class _Row:
-    """An append on its way."""
+    """An append in progress."""
 
     def __init__(self, append: Append, ponder: Ponder) -> None:
         session = append.session
@@ -214,14 +214,7 @@ class _Row:
 class Session:
     """One context in a slot of its runner, which opens and closes it."""
 
-    def __init__(
-        self,
-        runner: Runner,
-        name: str,
-        slot: int,
-        before_fire: SavedState,
-        before_draft: SavedState,
-    ) -> None:
+    def __init__(self, runner: Runner, name: str, slot: int, before_fire: SavedState, before_draft: SavedState) -> None:
         self.before_fire = before_fire
         self.before_draft = before_draft
         self._runner = runner
@@ -231,13 +224,13 @@ class Session:
         self.next_position = 0
         """mRoPE position of the next token."""
         self.ids: list[int] = []
-        """Every token of the episode, as its training row would have it."""
+        """Every token of the episode, as in its training row."""
         self.num_forgotten = 0
-        """Of them, those whose keys and values are gone (:meth:`keep`)."""
+        """Number of tokens whose keys and values are gone (:meth:`keep`)."""
 
     @property
     def num_tokens(self) -> int:
-        """Tokens that attention sees, and that take room."""
+        """Number of cached tokens, to which attention attends."""
         return len(self.ids) - self.num_forgotten
 
     @property
@@ -249,7 +242,7 @@ class Session:
         return self.max_tokens - self.num_tokens
 
     def check_room(self, num_new: int) -> None:
-        """Raises ContextFull if so many more tokens do not fit."""
+        """Raises ContextFull if ``num_new`` more tokens do not fit."""
         if num_new > self.room:
             raise ContextFull(session=self.name, used=self.num_tokens, wanted=num_new, limit=self.max_tokens)
 
@@ -259,7 +252,7 @@ class Session:
         return self._runner.append([append])[0]
 
     def save(self, into: SavedState | None = None) -> SavedState:
-        """Copies the state out, into ``into`` if given (no allocation)."""
+        """Copies the state, into ``into`` if given (no allocation)."""
         tensors = self._memory.states(self.slot)
         if into is None:
             into = SavedState(num_ids=0, next_position=0, tensors=[torch.empty_like(t) for t in tensors])
@@ -269,7 +262,7 @@ class Session:
         return into
 
     def restore(self, saved: SavedState) -> None:
-        """Goes back to a state saved since the last :meth:`keep`; what was appended since never happened."""
+        """Goes back to a state saved since the last :meth:`keep`, and so undoes all appends since."""
         assert self.num_forgotten <= saved.num_ids <= len(self.ids), "a session can only go back"
         for tensor, kept in zip(self._memory.states(self.slot), saved.tensors, strict=True):
             tensor.copy_(kept)
@@ -277,14 +270,14 @@ class Session:
         self.next_position = saved.next_position
 
     def keep(self, ranges: Sequence[range]) -> None:
-        """Attention forgets all cached tokens but these, in growing order; the recurrent states stay as they are."""
+        """Keeps only these ranges of cached tokens, in ascending order; the recurrent states do not change."""
         kept = torch.tensor([index for indices in ranges for index in indices], dtype=torch.long)
         for tensor in self._memory.keys_and_values(self.slot, self.num_tokens):
             tensor[:, : len(kept)] = tensor[:, kept.to(tensor.device)]
         self.num_forgotten += self.num_tokens - len(kept)
 
     def fill(self, num_tokens: int) -> None:
-        """Makes the context so long with tokens that mean nothing: what a query costs there is measured at once."""
+        """Fills the context with meaningless tokens up to ``num_tokens``, to measure queries at that length."""
         for tensor in self._memory.keys_and_values(self.slot, num_tokens):
             tensor[:, self.num_tokens :] = 0.0
         num_more = num_tokens - self.num_tokens
@@ -292,8 +285,8 @@ class Session:
         self.next_position += num_more
 
     def copy(self) -> Prefix:
-        """Everything in this context, for any number of sessions to start from."""
-        assert self.num_forgotten == 0, "a context with holes is nobody's beginning"
+        """A copy of this context, from which any number of sessions can start."""
+        assert self.num_forgotten == 0, "a context with holes cannot be forked"
         return Prefix(
             ids=tuple(self.ids),
             next_position=self.next_position,

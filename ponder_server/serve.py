@@ -45,13 +45,13 @@ class PonderServer(ModelShell):
         return worked or work is not None
 
     def _listen(self) -> bool:
-        """Takes in everything that came; whether there was a call among it."""
+        """Reads all pending messages; returns whether there was a call among them."""
         self._heartbeat.beat()
         worked = self._membership.step()
         self._take_observations()
         for query in self._queries.drain():
             if query.header.episode != self._link.episode:
-                worked |= self.rejoin()  # restarted, or opened elsewhere: we are asked about an episode unknown to us
+                worked |= self.rejoin()  # unknown episode: this process restarted, or another one opened it
             if is_of_episode(self._link, query.header):
                 self._node.on_query(query)
         for query in self._node.missed():
@@ -69,7 +69,7 @@ class PonderServer(ModelShell):
         self._node.on_observation(observation)
 
     def rejoin(self) -> bool:
-        """After a restart: asks for the episode and every observation that was queried, and thinks it all over."""
+        """After a restart: asks for the episode and its past queries with their observations, and reruns them."""
         rejoined = self._membership.rejoin()
         if rejoined is None:
             return False
@@ -90,7 +90,7 @@ class PonderServer(ModelShell):
         """The first queries of the running episode, from the clock service's journal.
 
         Raises:
-            CallFailed, ProtocolError: it does not answer, or not with what was asked.
+            CallFailed, ProtocolError: the clock service does not answer, or not with the requested queries.
         """
         for entry in self._membership.journal(num_queries):
             query = m.Query(query=entry.query, tick=entry.tick, source_ns=entry.source_ns)
@@ -120,7 +120,7 @@ class PonderServer(ModelShell):
         return self._engine.fire(self._link.episode, work.frames, self._heartbeat.beat, proprio=work.proprio)
 
     def _refuse(self, work: Work, error: Exception) -> None:
-        """The engine is as it was. The clock sees no answer, cognition ages, and the ladder acts."""
+        """Reports a query that the engine refused, unchanged. Without an answer cognition ages, and the ladder acts."""
         self._tell(m.Severity.ERROR, "fire_refused", f"query {work.query.query}: {error}")
 
     def _answer(self, work: Work, fire: Fire, start_ns: int) -> None:

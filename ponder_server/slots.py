@@ -1,9 +1,9 @@
-"""The memory of several contexts at once: one slot each, allocated when the engine starts and never again.
+"""The memory of several contexts: one slot each, allocated once, when the engine starts.
 
 A slot holds, for every attention layer, the keys and values of its tokens, and for every Gated DeltaNet layer one
-state that sums up all tokens. Keys and values only grow, so going back is a matter of length; the states are
-overwritten by every append, and going back needs a copy of them. (transformers' own caches have one length for all
-rows, and cannot go back.) How many tokens a slot holds is its session's business.
+state that summarises all tokens. Keys and values are append-only, so restoring them only needs the length; the states
+are overwritten by every append, so restoring them needs a copy. (transformers' own caches have one length for all rows
+and cannot be restored.) The sessions keep the slots' lengths.
 
 # N slots, G key heads, S most tokens of a slot, D head dimension, C conv channels, W conv width
 """
@@ -17,19 +17,19 @@ from torch import Tensor
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SlotSize:
-    """What one context of a given network costs in memory."""
+    """Memory of one context of a given network."""
 
     bytes_per_token: int
     """Keys and values, all attention layers together."""
     state_bytes: int
-    """Recurrent and convolution states, all other layers together; whatever the length."""
+    """Recurrent and convolution states, all other layers together; independent of the length."""
 
     def slot_bytes(self, max_tokens: int) -> int:
         return self.bytes_per_token * max_tokens + self.state_bytes
 
 
 def slot_size(text_config: Any, dtype: torch.dtype) -> SlotSize:
-    """Computed from the configuration alone; nothing is allocated."""
+    """Computes the size from the configuration alone, without allocating."""
     num_attention = sum(kind == "full_attention" for kind in text_config.layer_types)
     num_recurrent = len(text_config.layer_types) - num_attention
     token_elements = 2 * text_config.num_key_value_heads * text_config.head_dim
@@ -45,7 +45,7 @@ def slot_size(text_config: Any, dtype: torch.dtype) -> SlotSize:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttentionMemory:
-    """Of one attention layer; what lies beyond a slot's length is garbage."""
+    """Keys and values of one attention layer; positions beyond a slot's length hold garbage."""
 
     keys: Tensor
     """(N, G, S, D)"""
@@ -55,12 +55,12 @@ class AttentionMemory:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecurrentMemory:
-    """Of one Gated DeltaNet layer. Zeros are the state of an empty context, so there is no special first append."""
+    """States of one Gated DeltaNet layer. An empty context's are zero, so the first append is no special case."""
 
     conv: Tensor
     """(N, C, W): the last W inputs of the convolution."""
     state: Tensor
-    """(N, value heads, key dim, value dim) float32 in every dtype of model: it sums up thousands of tokens."""
+    """(N, value heads, key dim, value dim) float32 whatever the model's dtype: it sums over thousands of tokens."""
 
 
 class SlotMemory:
@@ -90,17 +90,17 @@ class SlotMemory:
                 self.recurrent[index] = RecurrentMemory(conv, torch.zeros(state_shape, device=device))
 
     def states(self, slot: int) -> list[Tensor]:
-        """Views of everything in a slot that an append overwrites."""
+        """Views of all tensors in a slot that an append overwrites."""
         return [tensor[slot] for layer in self.recurrent.values() for tensor in (layer.conv, layer.state)]
 
     def keys_and_values(self, slot: int, num_tokens: int) -> list[Tensor]:
-        """Views (G, num_tokens, D) of everything in a slot that an append only adds to."""
+        """Views (G, num_tokens, D) of a slot's keys and values, which an append only extends."""
         return [
             tensor[slot, :, :num_tokens] for layer in self.attention.values() for tensor in (layer.keys, layer.values)
         ]
 
     def clear(self, slot: int) -> None:
-        """Makes a slot the empty context."""
+        """Resets a slot to the empty context."""
         for tensor in self.states(slot):
             tensor.zero_()
 

@@ -1,11 +1,10 @@
-"""Threads that share out the pieces of one large computation.
+"""Threads that share the independent pieces of one large computation.
 
-torch's own threads divide every product of the network, and most of them are too small to gain by it: they stay at one
-(``config.NUM_TORCH_THREADS``). What is large enough is handed out here in pieces that do not depend on each other.
-Whoever is free takes the next piece, the caller among them. A helper whose core is busy elsewhere takes none, and costs
-nobody more time than the piece that it has begun.
+torch's own threads divide every matrix product, most of which are too small to gain, so torch uses one
+(``config.NUM_TORCH_THREADS``). Large computations are divided here into pieces that the threads, the caller's
+included, take from a queue. A helper whose core is busy takes none, and delays the others by one piece at most.
 
-Which pieces there are is the caller's affair: where that does not depend on the number of threads, no bit does.
+Results are bit-identical for any number of threads as long as the caller's pieces do not depend on that number.
 """
 
 from __future__ import annotations
@@ -19,16 +18,16 @@ from typing import TypeAlias
 import torch
 
 Piece: TypeAlias = Callable[[], None]
-"""Writes its result where no other piece writes."""
+"""Work that writes its result where no other piece writes."""
 
 
 def num_usable_cores() -> int:
-    """Of those in the machine, the ones that this process may run on."""
+    """Number of the machine's cores on which this process may run."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class Threads:
-    """``count`` of them, the caller's own included; the others wait for work and end with this object."""
+    """``count`` threads, the caller's included; the others wait for work and end with this object."""
 
     def __init__(self, count: int) -> None:
         assert count >= 1, "the caller's own thread is one"
@@ -36,9 +35,9 @@ class Threads:
         self._pool = ThreadPoolExecutor(count - 1, "threads") if count > 1 else None
 
     def do(self, pieces: Iterable[Piece]) -> None:
-        """Returns when all of them are done. Raises what one of them raised, when no piece is under way any more."""
+        """Runs all pieces and returns when they are done. Raises a piece's exception once no piece is running."""
         left = deque(pieces)
-        is_inference = torch.is_inference_mode_enabled()  # a thread's own affair
+        is_inference = torch.is_inference_mode_enabled()  # per thread
         num_helpers = min(self.count, len(left)) - 1
         begun = [self._pool.submit(_work_off, left, is_inference) for _ in range(num_helpers)] if self._pool else []
         try:
@@ -46,7 +45,7 @@ class Threads:
         finally:
             left.clear()
             for helper in begun:
-                if not helper.cancel():  # one that has not even woken up is not waited for
+                if not helper.cancel():  # do not wait for a helper that has not started
                     helper.result()
 
 

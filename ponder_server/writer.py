@@ -1,7 +1,7 @@
-"""The text of a transition, decoded greedily and written into the context that it belongs to.
+"""Decodes the text of a transition greedily into its context.
 
-Written as a generator: it yields what it wants appended and is sent the wanted hidden states, so that somebody else
-decides whose tokens share a forward.
+It is a generator that yields appends and is sent their hidden states, so that the scheduler (``batching``) decides
+which sessions share a forward.
 
 # T tokens, N wanted ones, H hidden, V vocabulary
 """
@@ -23,16 +23,16 @@ Steps: TypeAlias = Generator[Append, Tensor, Result]
 """Yields appends, is sent their wanted hidden states (N, H), returns a result."""
 
 MAX_CHECKED_TOKENS = 16
-"""Tokens of one forward while text is decoded: the bucket beyond a single token."""
+"""Largest number of tokens in a decoding forward: the bucket after that of a single token."""
 
 
 def ends_of_text(vocabulary: Vocabulary) -> frozenset[int]:
-    """Tokens that end a text; none of them is part of it."""
+    """Tokens that end a text and are not part of it."""
     return frozenset({vocabulary.t_yes, vocabulary.t_no, vocabulary.end_of_text, vocabulary.im_end})
 
 
 def sayable(ponder: Ponder, *, ends: bool) -> Tensor:
-    """Which tokens may follow in a text, (V) bool: no control tokens, carriers or unused rows, ``ends`` or not."""
+    """Tokens allowed in a text, (V,) bool: no control tokens, carriers or unused rows; end tokens if ``ends``."""
     vocabulary = ponder.format.vocabulary
     is_text_V = torch.zeros(ponder.vocab_size, dtype=torch.bool)
     is_text_V[: vocabulary.num_tokens] = True
@@ -45,8 +45,7 @@ class TransitionWriter:
     """Appends O_t and [T_yes, S], or [T_yes, DR, T_yes, S], and always leaves room for the carriers.
 
     T_no ends a text, as the end-of-text and end-of-turn tokens do; none of them enters the context. Other control
-    tokens, carriers and unused rows cannot be said: a context cannot hold them as text. A text that reaches its
-    limit is closed as it is.
+    tokens, carriers and unused rows are masked, because they are no text. A text that reaches its limit is cut.
     """
 
     def __init__(self, ponder: Ponder, draft: Draft, *, max_text_tokens: int) -> None:
@@ -58,7 +57,7 @@ class TransitionWriter:
         self._is_text_V, self._may_end_V = sayable(ponder, ends=False), sayable(ponder, ends=True)
 
     def wants_to_write(self, hidden_1H: Tensor) -> bool:
-        """Whether T_yes is the most likely next token, of all tokens."""
+        """Whether T_yes is the most likely of all next tokens."""
         return int(self._ponder.logits(hidden_1H)[0].argmax()) == self._t_yes
 
     def write(
@@ -71,12 +70,12 @@ class TransitionWriter:
         with_reasoning: bool,
         exactly: int | None,
     ) -> Steps[tuple[Text, ...]]:
-        """Writes a transition into ``context``, which is at ``before``; DR first if ``with_reasoning``.
+        """Generates a transition into ``context``, which is at ``before``; DR first if ``with_reasoning``.
 
-        DR is closed by the T_yes that opens S, or by its limit, and then S follows all the same; T_no after DR ends
-        the transition without S. ``exactly``: one text of so many tokens whatever the model wants to say.
+        DR ends with the T_yes that opens S, or at its limit, and S follows in both cases; T_no after DR ends the
+        transition without S. ``exactly`` forces one text of this many tokens.
 
-        Raises ContextFull if not even one token of each text fits; the caller restores ``before``.
+        Raises ContextFull if not even one token of each text fits; the caller must restore ``before``.
         """
         num_carriers = self._ponder.format.num_carriers
         t_yes_TH = self._ponder.embed([self._t_yes])
@@ -96,11 +95,11 @@ class TransitionWriter:
         return (*texts, text)
 
     def _limit(self, context: Session, before: SavedState, num_kept: int, exactly: int | None) -> int:
-        """Tokens the next text may have while ``num_kept`` positions stay free; ContextFull if that is too few."""
+        """Limit of the next text's tokens if ``num_kept`` positions stay free. Raises ContextFull if that is < 1."""
         room = context.room - num_kept
         limit = min(self._max_text_tokens, room) if exactly is None else exactly
         if not 1 <= limit <= room:
-            used = before.num_ids - context.num_forgotten  # what the session goes back to
+            used = before.num_ids - context.num_forgotten  # length after the caller's restore
             wanted = context.num_tokens - used + max(limit, 1) + num_kept
             raise ContextFull(session=context.name, used=used, wanted=wanted, limit=context.max_tokens)
         return limit
@@ -113,10 +112,10 @@ class TransitionWriter:
         limit: int,
         exactly: int | None,
     ) -> Steps[tuple[Text, int | None]]:
-        """Greedy text after the given hidden state, and the token that ended it (None: the limit did).
+        """Greedy text after the given hidden state, and its end token (None: it reached the limit).
 
-        A draft rides behind the token that is certain. Where it is wrong the state is restored, which forgets the
-        right tokens too: they are ``pending``, and ride along with the next forward.
+        A draft is appended after the known token. If part of it is wrong the state is restored, which also undoes the
+        right tokens: they become ``pending`` and are appended again with the next forward.
         """
         sayable_V = self._may_end_V if exactly is None else self._is_text_V
         ids: list[int] = []
@@ -136,11 +135,11 @@ class TransitionWriter:
             draft = self._draft.propose(ids, room, torch.cat(hidden_before)) if room > 0 else ()
             before_draft = context.save(context.before_draft) if draft else None
             hidden_NH = yield self._append(context, [*pending, *draft], num_wanted=1 + len(draft))
-            said = self._greedy(hidden_NH, sayable_V)
-            num_right = next((i for i, guess in enumerate(draft) if guess != said[i]), len(draft))
+            predicted = self._greedy(hidden_NH, sayable_V)
+            num_right = next((i for i, guess in enumerate(draft) if guess != predicted[i]), len(draft))
             ids += draft[:num_right]
             hidden_before.append(hidden_NH[: num_right + 1])
-            token = said[num_right]
+            token = predicted[num_right]
             if before_draft is not None and num_right < len(draft):
                 context.restore(before_draft)
                 pending += draft[:num_right]
@@ -160,6 +159,6 @@ class TransitionWriter:
         return Append(session=context, ids=ids, embeds_TH=self._ponder.embed(ids), num_wanted=num_wanted)
 
     def _greedy(self, hidden_NH: Tensor, sayable_V: Tensor) -> list[int]:
-        """The most likely token that can be said after each of N."""
+        """The most likely allowed token after each of N."""
         logits_NV = self._ponder.logits(hidden_NH).masked_fill(~sayable_V, float("-inf"))
         return logits_NV.argmax(dim=-1).tolist()  # type: ignore[no-any-return]

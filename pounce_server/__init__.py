@@ -1,7 +1,7 @@
-"""Serving POUNCE. Importing this before torch's first product makes a chunk the same whatever shares its process.
+"""Serving POUNCE. Import this before torch's first matrix product, so that chunks do not depend on the process.
 
-`ponder_server` asks MKL for its strict mode, for a reason of its own, and in one process POUNCE gets it too. Without it
-here, a process of its own would round otherwise, and so would an episode in which PONDER is not loaded.
+`ponder_server` sets MKL's strict mode, which in a shared process applies to POUNCE too. Without it here, POUNCE would
+round differently in its own process, or in an episode without PONDER.
 """
 
 import os

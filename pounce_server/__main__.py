@@ -15,10 +15,10 @@ log = logging.getLogger(__name__)
 
 
 def build_engine(options: PounceOptions) -> PounceEngine:
-    """Loads or draws the model.
+    """Loads or randomly initialises the model.
 
     Raises:
-        FileNotFoundError, ValueError: the checkpoint folder is not one, or does not fit; the message says why.
+        FileNotFoundError, ValueError: the folder is no checkpoint or does not fit; the message says why.
     """
     import torch
 

@@ -1,4 +1,4 @@
-"""Either network through ``torch.compile``: the prefix and the flow step apart, since the one is run once for many.
+"""Either network through ``torch.compile``: prefix and flow step separately, since one prefix serves many steps.
 
 Mode "compile" is PyTorch's ``reduce-overhead``, with CUDA graphs on a GPU; "max-autotune" also searches for kernels.
 Compiling takes a minute at the first invocation, which is the warm-up's; a prompt of another length may compile again.
@@ -24,7 +24,7 @@ MODES: Final = {"compile": "reduce-overhead", "max-autotune": "max-autotune"}
 
 
 def compiled_sampler(model: AnyPounce, mode: str) -> Callable[[Any, Tensor], Iterator[EulerStep]]:
-    """Returns what `Pounce.sample` and `GrootPounce.sample` do, from inputs and noise (B, N, A).
+    """Returns a function from inputs and noise (B, N, A) that samples like `Pounce.sample` or `GrootPounce.sample`.
 
     Args:
         mode: a key of `MODES`.
@@ -41,7 +41,7 @@ def compiled_sampler(model: AnyPounce, mode: str) -> Callable[[Any, Tensor], Ite
 
         def velocity_at(index: int, x_BNA: Tensor) -> Tensor:
             moved: Tensor = velocity(x_BNA, table.styles[index], cache)
-            return moved.clone()  # the graph's own buffer is written again by the next step
+            return moved.clone()  # the next step overwrites the graph's buffer
 
         return euler(velocity_at, noise_BNA.clone(), table.num_steps)
 

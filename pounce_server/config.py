@@ -10,19 +10,19 @@ import tyro
 
 from protocol.options import LinkOptions
 
-NUM_TORCH_THREADS = 1  # on a CPU one thread per process beats two: a contended second one costs more than it gives
+NUM_TORCH_THREADS = 1  # on a CPU one thread per process beats two: contention for the second core costs more
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RandomOptions:
-    """The network without --checkpoint: it moves a robot and knows nothing."""
+    """The network without --checkpoint."""
 
     family: Literal["pi05", "groot"] | None = None
-    """Action model of the random weights; None: pi05. With --checkpoint, what the folder must hold."""
+    """Action model of the random weights; None: pi05. With --checkpoint, the family that the folder must hold."""
     num_carriers: int = 1
-    """K of the random weights; must be PONDER's."""
+    """K of the random weights; must equal PONDER's."""
     hidden_size: int | None = None
-    """H of the random weights; must be PONDER's. None: the tiny PONDER's."""
+    """H of the random weights; must equal PONDER's. None: the tiny PONDER's."""
     seed: int = 0
     """Seed of the random weights."""
 
@@ -32,11 +32,11 @@ class SpeedOptions:
     """How an invocation is computed."""
 
     path: Literal["eager", "compile", "max-autotune", "fused"] = "eager"
-    """compile, max-autotune: torch.compile, for either family, a minute at start. fused: Triton kernels, static buffers
-    and CUDA graphs for pi0.5; needs a GPU and Triton."""
+    """compile, max-autotune: torch.compile, for either family; takes a minute at start. fused: Triton kernels, static
+    buffers and CUDA graphs for pi0.5; needs a GPU and Triton."""
     autotune: bool = False
-    """With --path fused: time cuBLAS against cuBLASLt for every product, once per GPU; the choice is kept in the user's
-    cache folder."""
+    """With --path fused: time cuBLAS against cuBLASLt for every product, once per GPU; the choice is stored in the
+    user's cache folder."""
     weights: Literal["float", "int8"] = "float"
     """Precision of the weights. int8: a quarter of the memory on a CPU; the error of the actions is measured at start
     and logged."""
@@ -44,13 +44,13 @@ class SpeedOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ContinuityOptions:
-    """How a chunk continues the one being played."""
+    """Continuity between a chunk and the one being played."""
 
     continuity: Literal["none", "rtc", "trained"] = "none"
-    """Whether pi0.5 continues the rows being played. rtc: real-time chunking, at the cost of a backward pass per flow
-    step; trained: at no cost, by a checkpoint that learned to (`pp-train --max-committed-rows`)."""
+    """Whether pi0.5 continues the rows being played. rtc: real-time chunking, which costs a backward pass per flow
+    step. trained: free, but needs a checkpoint trained for it (`pp-train --max-committed-rows`)."""
     roll_forward: bool = False
-    """Plan from the state that the committed rows lead to instead of the measured one."""
+    """Plan from the predicted state after the committed rows instead of the measured one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,6 +1,6 @@
-"""What the daemon and an action engine say to each other: arrays and numbers, no tensors, no torch.
+"""The interface between the daemon and an action engine: arrays and numbers, without tensors or torch.
 
-The node and the shell need this file only, so they are tested with a fake engine in milliseconds.
+The node and the shell need only this file, so a fake engine can test them in milliseconds.
 """
 
 # N horizon, K carriers, H carrier size
@@ -21,17 +21,17 @@ DTypeName: TypeAlias = Literal["float32", "bfloat16"]
 WeightsName: TypeAlias = Literal["float", "int8"]
 
 Continuity: TypeAlias = Literal["none", "rtc", "trained"]
-"""Whether a chunk continues the rows being played: not, pulled to them (`rtc`), or given them (`committed`)."""
+"""How a chunk continues the rows being played: not at all, guided to them (`rtc`), or conditioned (`committed`)."""
 
 _LIMIT_SLACK_RAD = 1e-3  # limits travel as float32
 
 Progress: TypeAlias = Callable[[], None]
-"""Called between flow steps, so that a heartbeat comes from the loop that works and not from a timer."""
+"""Called between flow steps, so that the heartbeat comes from the working loop and not from a timer."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EngineSpec:
-    """What a process announces about its engine, and what requests are checked against."""
+    """An engine's inputs, outputs and limits: a process announces them, and requests are checked against them."""
 
     horizon: int
     """Rows per chunk, played at 20 Hz."""
@@ -48,26 +48,26 @@ class EngineSpec:
     """Flow steps per invocation, hence calls of ``progress``."""
     num_cameras: int
     model_hash: str
-    """Equal hashes act equally on equal requests (same dtype and machine)."""
+    """Engines with equal hashes give equal rows for equal requests (same dtype and machine)."""
     is_random: bool
-    """Weights drawn, not trained."""
+    """True if the weights are random, not trained."""
     has_fresh_prefix: bool
-    """The cognition prefix is drawn, not trained: cognition moves the actions, but not with sense."""
+    """True if the cognition prefix is untrained: cognition affects the actions, but not meaningfully."""
     dtype: DTypeName
     space: ActionSpace = "joint_delta"
-    """What the network answers in. Rows are absolute joint targets all the same; see `check_robot`."""
+    """The network's action space. Rows are absolute joint targets in any case; see `check_robot`."""
     continuity: Continuity = "none"
     max_committed_rows: int = 0
-    """The most committed rows that the network was trained to be given; matters to continuity "trained" only."""
+    """Largest number of committed rows in the network's training; for continuity "trained" only."""
     weights: WeightsName = "float"
     action_error: float = 0.0
-    """Mean absolute error of the network's normalised actions that ``weights`` cost, on made-up requests."""
+    """Mean absolute error of the normalised actions due to narrow ``weights``, on example requests."""
     reads_subgoal: bool = False
-    """The engine reads PONDER's newest subgoal in place of cognition (then K = 0)."""
+    """True if the engine reads PONDER's newest subgoal in place of cognition (then K = 0)."""
 
     @property
     def is_fake(self) -> bool:
-        """Something that was drawn, not trained, decides the answers."""
+        """True if untrained weights decide the answers."""
         return self.is_random or self.has_fresh_prefix
 
 
@@ -77,7 +77,7 @@ class Request:
 
     instruction: str
     frames: tuple[NDArray[np.uint8] | None, ...]
-    """(h, w, 3) uint8 per camera, front then wrist; None for a camera that did not deliver."""
+    """(h, w, 3) uint8 per camera, front then wrist; None for a missing camera."""
     proprio: NDArray[np.float32]
     """(8,) float32: 7 joint positions (rad), finger opening (m)."""
     cognition: NDArray[np.float32] | None
@@ -85,13 +85,13 @@ class Request:
     age_ns: int
     """Age of the cognition's source observation; 0 with null."""
     seed: int
-    """Of the starting noise, at least 0: same seed and inputs, same rows, bit for bit on one machine."""
+    """Seed of the initial noise, at least 0: on one machine equal seeds and inputs give equal rows, bit for bit."""
     previous_rows: NDArray[np.float32] | None = None
-    """(n, action_dim) float32 in robot units: what is left of the chunk being played; None if there is none."""
+    """(n, action_dim) float32 in robot units: unplayed rows of the chunk being played; None if there are none."""
     previous_row0: int = 0
-    """The row of the new chunk that belongs to the tick of the first previous one."""
+    """Index in the new chunk of the row for the first previous row's tick."""
     committed_rows: int = 0
-    """How many of the previous rows will be played whatever the new chunk says."""
+    """Number of previous rows that will be played whatever the new chunk contains."""
     subgoal: str = ""
     """PONDER's newest subgoal, for engines that read it; empty before there is one."""
 
@@ -101,7 +101,7 @@ def no_progress() -> None:
 
 
 class PounceEngine(Protocol):
-    """What the node drives; pi0.5 here, other action models behind the same three names."""
+    """The node's view of an action model: pi0.5, GR00T or a fake."""
 
     @property
     def spec(self) -> EngineSpec: ...
@@ -111,14 +111,14 @@ class PounceEngine(Protocol):
         ...
 
     def warm_up(self) -> list[int]:
-        """Runs until times are steady, then returns the durations of at least 20 invocations, in ns."""
+        """Runs invocations; returns the durations in ns of at least 20, without the first ones."""
         ...
 
 
 def check_robot(robot: Robot, spec: EngineSpec) -> None:
-    """Raises EpisodeRefused if the engine cannot read this robot or its chunks are none for it.
+    """Raises EpisodeRefused if the engine cannot read this robot or cannot command it.
 
-    Horizon and row size are the clock's to compare: it knows the schedule.
+    The clock compares horizon and row size, because it knows the schedule.
     """
     if robot.num_proprio != spec.proprio_dim:
         raise EpisodeRefused(
@@ -144,7 +144,7 @@ def check_robot(robot: Robot, spec: EngineSpec) -> None:
 
 
 def check_request(request: Request, spec: EngineSpec) -> None:
-    """Raises ValueError, saying what was expected and what came, unless ``request`` fits ``spec``."""
+    """Raises ValueError, with the expected and the actual value, unless ``request`` fits ``spec``."""
     if not request.instruction.strip():
         raise ValueError("instruction is empty; POUNCE needs the task's text")
     if len(request.frames) != spec.num_cameras:
@@ -193,7 +193,7 @@ def _check_floats(name: str, values: NDArray[np.float32], shape: tuple[int, ...]
 
 
 def example_request(spec: EngineSpec, *, frame_px: int = 256, seed: int = 0) -> Request:
-    """Fabricates a request that fits ``spec``: noise for pictures, joints at zero, cognition 300 ms old."""
+    """Makes a request that fits ``spec``: noise for pictures, joints at zero, cognition 300 ms old."""
     generator = np.random.default_rng(seed)
     shape = (frame_px, frame_px, 3)
     cognition = generator.standard_normal((spec.num_carriers, spec.cognition_size)).astype(np.float32)

@@ -1,6 +1,6 @@
-"""A POUNCE of either family as an action engine: requests in, a chunk of absolute joint targets out for each."""
+"""POUNCE of either family as an action engine: for each request a chunk of absolute joint targets."""
 
-# B requests, N horizon, A padded action dim, D numbers of the action space
+# B requests, N horizon, A padded action dim, D dims of the action space
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -45,12 +45,12 @@ from pounce_server.precision import cast_for_serving
 from pounce_server.roll_forward import placed, rolled
 
 Sampler: TypeAlias = Callable[[Sequence[Request], Tensor], Iterator[tuple[list[int], EulerStep]]]
-"""Reads requests and yields flow steps from given noise, (B, N, A), each with the indices of the requests it moves."""
+"""Samples requests from given noise, (B, N, A); yields flow steps, each with the indices of its requests."""
 
 PathName: TypeAlias = Literal["eager", "compile", "max-autotune", "fused"]
 
 NUM_COMPARED = 4
-"""Made-up requests on which the error of int8 weights is taken."""
+"""Number of example requests on which the error of int8 weights is measured."""
 WARM_UP_UNMEASURED = 3
 WARM_UP_MEASURED = 20
 
@@ -61,9 +61,9 @@ class EagerEngine:
     Takes over the bundle's model: casts, moves and freezes it.
 
     Raises:
-        ValueError: ``continuity`` is not "none" and the model is not pi0.5, or it is "trained" and the model was never
-            trained so, or ``path`` is not "eager"; or ``path`` is "fused", and the model is not pi0.5 or Triton has
-            nothing to run on; or the state is rolled forward past the rows that the chunk is to be given.
+        ValueError: the options exclude each other, or model or device do not support them. ``continuity`` needs pi0.5
+            and the eager path, and "trained" a model trained for it; the fused path needs pi0.5 and Triton; int8
+            needs the eager path on a CPU; rolling forward excludes ``continuity`` "trained".
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class EagerEngine:
         """See `PounceEngine.invoke`.
 
         Raises:
-            ValueError: the request does not fit ``spec``, or holds a number that is not finite.
+            ValueError: the request does not fit ``spec``, or has a number that is not finite.
         """
         check_request(request, self.spec)
         (rows_N8,) = self._invoke((request,), progress)
@@ -138,14 +138,13 @@ class EagerEngine:
 
     @torch.inference_mode()
     def invoke_many(self, requests: Sequence[Request], progress: Progress = no_progress) -> list[NDArray[np.float32]]:
-        """Several robots' invocations at once; rows for each, in order.
+        """Runs several robots' invocations at once; returns rows for each, in order.
 
-        They are those of `invoke` to float32 rounding (products of another size round otherwise), whatever the
-        others ask: prompts may differ in length and cameras may be missing. GR00T runs prompts of different
-        lengths one after the other.
+        Rows equal those of `invoke` up to float32 rounding, which depends on the size of products. Prompts may differ
+        in length and cameras may be missing; GR00T runs prompts of different lengths one after the other.
 
         Raises:
-            ValueError: there is no request, or one does not fit ``spec``; nothing is then computed for the others.
+            ValueError: there is no request, or one does not fit ``spec``; then nothing is computed.
         """
         if not requests:
             raise ValueError("expected at least one request, came none")
@@ -167,7 +166,7 @@ class EagerEngine:
 
     @torch.inference_mode()
     def _network_actions(self, requests: Sequence[Request], progress: Progress) -> Tensor:
-        """(B, N, D), normalised."""
+        """Normalised actions (B, N, D)."""
         noise_BNA = torch.cat([self._noise(request.seed) for request in requests])
         actions_BNA = noise_BNA.clone()
         for moved, step in self._sample(requests, noise_BNA):
@@ -197,7 +196,7 @@ class EagerEngine:
         return durations_ns[WARM_UP_UNMEASURED:]
 
     def _noise(self, seed: int) -> Tensor:
-        """Drawn on the CPU: one seed is one noise on every device."""
+        """Initial noise, drawn on the CPU, so that a seed gives the same noise on every device."""
         generator = torch.Generator().manual_seed(seed)
         shape = (1, self.spec.horizon, self._padded_action_dim)
         return torch.randn(shape, generator=generator).to(self._device)
@@ -205,7 +204,7 @@ class EagerEngine:
 
 @torch.inference_mode()
 def _sampler(model: AnyPounce, bundle: PounceBundle, device: torch.device, continuity: Continuity) -> Sampler:
-    """Tabulates what depends on the flow step only, and returns the rest."""
+    """Tabulates all that depends on the flow step only, and returns the sampler."""
     statistics, tokenizer = bundle.statistics, bundle.tokenizer
     if isinstance(model, Pounce):
         assert isinstance(tokenizer, Tokenizer), "the bundle checks this"
@@ -247,7 +246,7 @@ def _pi05_sampler(
     return sample
 
 
-@torch.inference_mode(False)  # what is differentiated through must not be an inference tensor
+@torch.inference_mode(False)  # autograd refuses inference tensors
 def _rtc_sampler(
     pounce: Pounce,
     read: Callable[[Request], PounceInputs],

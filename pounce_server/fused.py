@@ -1,8 +1,8 @@
 """POUNCE's fast path for pi0.5: packed weights, static buffers, fused operations, and a graph per shape of the prefix.
 
-The prefix is padded to a bucket of 16 tokens; padding is unseen and takes no position, so it changes no number beyond
-rounding. A bucket's work is captured once: the prefill, and each flow step with its own styles, so that a heartbeat
-can be given between steps.
+The prefix is padded to a multiple of 16 tokens; padding is masked and takes no position, so it changes nothing but
+rounding. A bucket's work is captured once: the prefill, and each flow step with its own styles, so that heartbeats
+fit between steps.
 """
 
 # B batch, T prefix tokens with padding, N horizon, A padded action dim, E expert width, S = T + N slots
@@ -28,9 +28,9 @@ BUCKET_TOKENS = 16
 
 
 class FusedPounce:
-    """A pi0.5 POUNCE that samples as `Pounce.sample` does, within rounding. Takes the model over: repacks its weights.
+    """A pi0.5 POUNCE that samples like `Pounce.sample`, up to rounding. Takes over the model and repacks its weights.
 
-    Not for two threads: all samples of a bucket share its buffers.
+    It is not thread-safe: all samples of a bucket share its buffers.
     """
 
     @torch.no_grad()
@@ -42,10 +42,10 @@ class FusedPounce:
         self._network = FusedNetwork(pi05, operations, model.config.num_steps)
 
     def sample(self, inputs: PounceInputs, noise_BNA: Tensor) -> Iterator[EulerStep]:
-        """Yields the sampler's steps. Their tensors are the bucket's own: copy what must outlive the next step."""
+        """Yields the sampler's steps. Their tensors are the bucket's buffers, which the next step overwrites."""
         prefix = _padded(self._model.embed_prefix(inputs))
         key = (prefix.is_real.shape[0], prefix.is_real.shape[1])
-        if key not in self._buckets:  # captured before it is loaded: capturing runs the work on whatever lies there
+        if key not in self._buckets:  # captured before loading, because capturing overwrites the buffers
             self._buckets[key] = Bucket(self._network, prefix, self._capture)
         bucket = self._buckets[key]
         bucket.load(prefix, noise_BNA)
@@ -56,12 +56,12 @@ class FusedPounce:
 
 
 def fused_for(model: Pounce, device: torch.device, *, autotune: bool = False) -> FusedPounce:
-    """The fast path on ``device``: graphs on a GPU, plain calls in Triton's interpreter.
+    """Builds the fast path on ``device``: graphs on a GPU, plain calls in Triton's interpreter.
 
-    ``autotune``: the large products go to the library that was fastest on this GPU (`kernels.choice`).
+    ``autotune``: large products use the library that was fastest on this GPU (`kernels.choice`).
 
     Raises:
-        ValueError: Triton, or a device that it can run on, is missing; the message says what to do.
+        ValueError: Triton, or a device that it supports, is missing; the message says what to do.
     """
     if missing := missing_for(device):
         raise ValueError(f"--path fused cannot run here. {missing}; or --path eager")
@@ -85,7 +85,7 @@ def _padded(prefix: Prefix) -> Prefix:
 
 
 class FusedNetwork:
-    """What does not depend on a request: both streams' packed weights, the tabulated norms, the projections."""
+    """The part that does not depend on requests: both streams' packed weights, tabulated norms, projections."""
 
     def __init__(self, pi05: Pi05, operations: Operations, num_steps: int) -> None:
         self.config = pi05.config

@@ -22,7 +22,7 @@ from pounce_server.kernels.rope import Slots, rope_eager, rope_fused
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Operations:
-    """One implementation of everything between two GEMMs, and of the GEMMs."""
+    """One implementation of the GEMMs and of all operations between them."""
 
     norm: Callable[[Tensor, Tensor, Style, Residual | None], None]
     rope: Callable[[Tensor, Rotation, Tensor, Slots], None]
@@ -45,7 +45,7 @@ class Norm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PackedLayer:
-    """One layer's matrices, (out, in) as PyTorch keeps them."""
+    """One layer's matrices, (out, in) as in PyTorch."""
 
     qkv: Tensor
     attention_out: Tensor
@@ -54,7 +54,7 @@ class PackedLayer:
 
     @classmethod
     def of(cls, layer: GemmaLayer | ExpertLayer) -> "PackedLayer":
-        """Packs ``layer``, whose own parameters become views: no weight is held twice."""
+        """Packs ``layer``, whose parameters become views, so that no weight is stored twice."""
         attention, mlp = layer.self_attn, layer.mlp
         return cls(
             qkv=_joined(attention.q_proj, attention.k_proj, attention.v_proj),
@@ -73,13 +73,13 @@ def _joined(*projections: nn.Linear) -> Tensor:
 
 
 class Run:
-    """Static buffers of T tokens that go through a stream together, and what they see.
+    """Static buffers of T tokens that go through a stream together.
 
-    Whoever runs the stream fills ``x``, ``rotation`` and ``visible`` first.
+    The caller must fill ``x``, ``rotation`` and ``visible`` before running the stream.
     """
 
     def __init__(self, config: GemmaConfig, batch_size: int, num_tokens: int, seen: slice, like: Tensor) -> None:
-        """``seen`` are the slots that these tokens look at, themselves the last; ``like`` gives type and device."""
+        """``seen``: slots to which these tokens attend, their own the last; ``like`` gives dtype and device."""
         num_rows, device = batch_size * num_tokens, like.device
         head_dim, num_heads, num_kv_heads = config.head_dim, config.num_heads, config.num_kv_heads
         self.seen = seen
@@ -96,7 +96,7 @@ class Run:
         self.visible = torch.ones(batch_size, 1, 1, seen.stop - seen.start, dtype=torch.bool, device=device)
 
     def place(self, positions_BT: Tensor, visible_BS: Tensor) -> None:
-        """Loads where the tokens stand and which of the slots that they look at are real."""
+        """Loads the tokens' positions, and which of the attended slots are real."""
         rotation = Rotation.at(positions_BT, 2 * self.rotation.cos.shape[-1])
         self.rotation.cos.copy_(rotation.cos)
         self.rotation.sin.copy_(rotation.sin)
@@ -113,8 +113,8 @@ class FusedStream:
     def __call__(self, run: Run, norms: Sequence[Norm], cache: Sequence[tuple[Tensor, Tensor]]) -> None:
         """Runs ``run.x`` through the layers; keys and values go into ``cache``, the last norm into ``run.normed``.
 
-        ``norms`` are two a layer and, for a stream whose output is read, the last. Without it the last layer ends
-        after its keys and values: its output would feed nothing.
+        ``norms`` are two per layer and, for a stream whose output is used, the last. Without it the last layer
+        computes only keys and values.
         """
         residual: Residual | None = None
         for index, (layer, (keys, values)) in enumerate(zip(self._layers, cache, strict=True)):

@@ -1,4 +1,4 @@
-"""The rows being played, as the network takes them: a pull on the next chunk (`rtc`), or given (`committed`)."""
+"""The rows being played as inputs of the network: a guidance target (`rtc`) or committed rows (`committed`)."""
 
 from collections.abc import Sequence
 
@@ -15,7 +15,7 @@ from pounce_server.contract import Request
 def guide(
     requests: Sequence[Request], config: PounceConfig, statistics: RobotStatistics, device: torch.device
 ) -> rtc.Guide | None:
-    """Returns where the previous rows pull each request's chunk; None if nobody has any that the chunk reaches."""
+    """Returns the guidance towards each request's previous rows; None if no chunk overlaps any."""
     shape = (len(requests), config.horizon, config.padded_action_dim)
     target_BNA, weight_BNA = torch.zeros(shape), torch.zeros(shape)
     dims = config.robot_action_dim
@@ -36,10 +36,10 @@ def guide(
 def given(
     requests: Sequence[Request], config: PounceConfig, statistics: RobotStatistics, device: torch.device
 ) -> Committed | None:
-    """Returns the rows that each request's chunk begins with; None if nobody has any.
+    """Returns the committed rows at the start of each request's chunk; None if no request has any.
 
-    Of more committed rows than training gave, the first so many are given. A late observation's chunk begins at ticks
-    that are past: nobody says what was commanded there, so the first row left stands in.
+    At most as many as in training are given, the first ones. A late observation's chunk begins at past ticks, whose
+    commands the request does not contain: the first unplayed row stands in.
     """
     shape = (len(requests), config.horizon, config.padded_action_dim)
     rows_BNA, count_B = torch.zeros(shape), torch.zeros(len(requests), dtype=torch.int64)
@@ -57,14 +57,14 @@ def given(
 
 
 def num_given(request: Request, max_rows: int) -> int:
-    """How many rows of the chunk are fixed before it is made: those of past ticks and the committed ones."""
+    """Number of the chunk's rows that are fixed before it is generated: those of past ticks and the committed ones."""
     if request.previous_rows is None or request.committed_rows == 0:
         return 0
     return min(request.previous_row0 + request.committed_rows, max_rows)
 
 
 def with_committed(rows_N8: Floats, request: Request, max_rows: int) -> Floats:
-    """``rows_N8`` with the given rows as they came: normalising and back rounds."""
+    """``rows_N8`` with exact committed rows: normalising and back has rounded them."""
     count = num_given(request, max_rows) - request.previous_row0
     if request.previous_rows is None or count <= 0:
         return rows_N8

@@ -21,7 +21,7 @@ from protocol.version import version
 
 
 def build(bus: Bus, robot: str, checkpoint: Path | None, subgoals: Source | None = None) -> Callable[[], bool]:
-    """A warm server's step function. ``subgoals``: see `subgoal_text`."""
+    """Returns the step function of a warm server. ``subgoals``: see `subgoal_text`."""
     link = Link(bus, robot=robot, proc="pounce")
     heartbeat = Heartbeat(link, version(), host_clock_id())
     engine = build_engine(PounceOptions(checkpoint=checkpoint))
@@ -33,11 +33,11 @@ def build(bus: Bus, robot: str, checkpoint: Path | None, subgoals: Source | None
 
 Floats = NDArray[np.float32]
 Act = Callable[[str, Sequence[NDArray[np.uint8]], Floats, Floats | None, int, int], Floats]
-"""From an instruction, frames, proprioception, cognition (None: null), its age [ns] and a noise seed to a chunk."""
+"""(instruction, frames, proprioception, cognition (None: null), its age [ns], noise seed) -> chunk."""
 
 
 def build_actor(checkpoint: Path | None) -> tuple[Act, EngineSpec]:
-    """A POUNCE outside of any episode, for offline measurements: a function, and what the engine is."""
+    """Builds a POUNCE outside of any episode, for offline measurements: a function, and the engine's spec."""
     engine = build_engine(PounceOptions(checkpoint=checkpoint))
 
     def act(
@@ -51,7 +51,7 @@ def build_actor(checkpoint: Path | None) -> tuple[Act, EngineSpec]:
         return engine.invoke(
             Request(
                 instruction=instruction,
-                frames=tuple(frames)[: engine.spec.num_cameras],  # some read none
+                frames=tuple(frames)[: engine.spec.num_cameras],  # some models read no camera
                 proprio=proprio,
                 cognition=cognition,
                 age_ns=age_ns,

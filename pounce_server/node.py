@@ -1,7 +1,7 @@
-"""Which invocation POUNCE answers, and what the answer says. Pure: messages in, work and messages out.
+"""Selects the invocation that POUNCE answers, and builds the answer. Pure: messages in, work and messages out.
 
-POUNCE keeps nothing between invocations: each one brings its own cognition and names its observation, so a restarted
-POUNCE is as good as one that never died.
+POUNCE is stateless: each invocation contains its cognition and names its observation, so a restarted POUNCE continues
+as if it had never stopped.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from protocol import messages as m
 from protocol.errors import MalformedMessage
 
 KEEP_INVOCATIONS = 1
-"""Only the newest is worth answering: an older chunk would be superseded before it is played."""
+"""Only the newest invocation is answered: an older one's chunk would be superseded before it is played."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Work:
-    """One chunk to make."""
+    """One chunk to generate."""
 
     invocation: m.Invocation
     request: Request
@@ -42,24 +42,24 @@ class PounceNode:
         return self._rendezvous.num_superseded
 
     def open(self, info: m.EpisodeInfo | None) -> None:
-        """Starts an episode, or with None forgets it."""
+        """Starts an episode; None ends it."""
         self._rendezvous.clear()
         self._info = info
         if self._texts is not None:
             self._texts.clear()
 
     def on_observation(self, observation: m.Observation) -> None:
-        """Keeps what an invocation may name; one without any picture none does (`Conductor.will_look`).
+        """Keeps an observation for invocations; without pictures it is ignored, as none names it (`will_look`).
 
         Raises:
-            MalformedMessage: not the joints or cameras that the engine reads; nothing good is displaced by it.
+            MalformedMessage: the engine cannot read its joints or cameras; the observation displaces no other.
         """
         num_cameras = self._spec.num_cameras
         if num_cameras and not observation.images:
             return
         for field, expected in (("proprio", self._spec.proprio_dim), ("images", num_cameras)):
             came = len(getattr(observation, field))
-            if came != expected and (field != "images" or num_cameras):  # who reads none takes any
+            if came != expected and (field != "images" or num_cameras):  # an engine without cameras accepts any
                 raise MalformedMessage("Observation", field, f"{expected} of them", f"{came}")
         self._rendezvous.on_observation(observation)
 
@@ -71,14 +71,14 @@ class PounceNode:
         self._rendezvous.on_request(invocation)
 
     def missed(self) -> list[m.Invocation]:
-        """Invocations whose observation was lost on the way."""
+        """Invocations whose observation was lost in transit."""
         return list(self._rendezvous.give_up())
 
     def next_work(self) -> Work | None:
-        """The invocation whose observation has come.
+        """The invocation whose observation is there.
 
         Raises:
-            MalformedMessage: a frame is no picture, or the cognition is not (K, H); the invocation is then forgotten.
+            MalformedMessage: a frame is no picture, or the cognition is not (K, H); the invocation is then dropped.
         """
         pair = self._rendezvous.next_pair()
         if pair is None or self._info is None:
@@ -92,7 +92,7 @@ class PounceNode:
         if previous_rows.size % self._spec.action_dim:
             expected_size = f"rows of {self._spec.action_dim}"
             raise MalformedMessage("Invocation", "previous_rows", expected_size, f"{previous_rows.size} numbers")
-        # The rows left are those from the invocation's tick on, the new chunk's those from its observation's.
+        # The previous rows start at the invocation's tick, the new chunk's at its observation's.
         late_ticks = tick_at(observation.source_ns, invocation.now_ns, self._info.schedule.control_hz)
         request = Request(
             instruction=self._info.instruction,
@@ -109,7 +109,7 @@ class PounceNode:
         return Work(invocation=invocation, request=request)
 
     def answer(self, work: Work, rows_NA: m.Floats, *, infer_ns: int) -> m.ActionChunk:
-        """The chunk of (horizon, action_dim) rows; row 0 belongs to the tick of the observation it was made from."""
+        """The chunk message for rows (horizon, action_dim); row 0 belongs to the tick of its observation."""
         info, invocation = self._info, work.invocation
         rate_hz = info.schedule.control_hz if info is not None else 1
         horizon, action_dim = rows_NA.shape

@@ -1,4 +1,4 @@
-"""Which parameters may be bfloat16 when serving, and which stay float32 (openpi's choice)."""
+"""Selects the parameters that are bfloat16 in serving and those that stay float32 (openpi's choice)."""
 
 import torch
 
@@ -13,7 +13,7 @@ _FLOAT32_PARTS = ("norm", "patch_embedding", "position_embedding")
 
 
 def is_of_a_stream(name: str) -> bool:
-    """Whether a parameter is one of the streams' matrices, which may be narrow."""
+    """Whether a parameter is a matrix of a stream, which may be narrow."""
     return name.startswith(_STREAMS) and not any(part in name for part in _FLOAT32_PARTS)
 
 

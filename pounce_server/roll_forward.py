@@ -1,9 +1,9 @@
-"""State roll-forward: a chunk is planned from where the robot will be when it takes over (VLASH, 2512.01031).
+"""State roll-forward: a chunk is planned from the robot's state when it takes over (VLASH, 2512.01031).
 
-The committed rows will be played in any case, so the state after them is known but for the arm's lag: the last one's
-joint targets. The network is told that state, its first row is the first that is not committed, and the chunk that
-leaves is laid out as always: row 0 at the observation's tick, committed rows where they belong. Pictures stay those of
-the observation, which no ordinary training shows beside a later state; a network wants to be trained on such pairs.
+The committed rows will be played in any case, so the state after them is known up to the arm's lag: the last one's
+joint targets. The network is conditioned on that state, and its first row is the first uncommitted one. The published
+chunk has the usual layout: row 0 at the observation's tick, committed rows in their places. The pictures are still the
+observation's. Ordinary training never pairs them with a later state, so a network should be trained on such pairs.
 """
 
 # N horizon
@@ -18,14 +18,14 @@ from pounce_server.contract import Request
 
 
 def ticks_ahead(request: Request, horizon: int) -> int:
-    """How many rows of the chunk are settled before it is made: past ticks and committed rows. At least one is left."""
+    """Number of the chunk's rows that are fixed beforehand: past ticks and committed rows; at most horizon - 1."""
     if request.previous_rows is None or request.committed_rows == 0:
         return 0
     return min(request.previous_row0 + request.committed_rows, horizon - 1)
 
 
 def rolled(request: Request, horizon: int) -> Request:
-    """The request as of the tick at which its chunk takes over. The finger's opening (m) stays as measured."""
+    """The request rolled forward to the tick at which its chunk takes over. The finger opening stays as measured."""
     ahead = ticks_ahead(request, horizon)
     if ahead <= request.previous_row0 or request.previous_rows is None:
         return request
@@ -39,9 +39,9 @@ def rolled(request: Request, horizon: int) -> Request:
 
 
 def placed(rows_N8: NDArray[np.float32], request: Request) -> NDArray[np.float32]:
-    """The chunk of ``request``, from the rows that were planned from its `rolled` state: the last few fall off its end.
+    """The chunk of ``request``, from rows planned from its `rolled` state; the last few fall off its end.
 
-    Rows of past ticks, which nobody plays, repeat the first that is left.
+    Rows of past ticks are never played; they repeat the first previous row.
     """
     horizon = len(rows_N8)
     ahead = ticks_ahead(request, horizon)

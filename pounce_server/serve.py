@@ -24,7 +24,7 @@ class PounceServer(ModelShell):
     def __init__(
         self, link: Link, engine: PounceEngine, heartbeat: Heartbeat, version: str, subgoals: Source | None = None
     ) -> None:
-        """``subgoals``: whose texts an engine that reads them gets; see `subgoal_text`."""
+        """``subgoals``: source of the texts for an engine that reads them; see `subgoal_text`."""
         super().__init__(link, engine, heartbeat, version)
         self._engine = engine
         self._has_subgoals = subgoals is not None
@@ -66,7 +66,7 @@ class PounceServer(ModelShell):
         self._node.on_observation(observation)
 
     def rejoin(self) -> bool:
-        """After a restart: asks which episode runs. There is nothing to rebuild."""
+        """After a restart: asks for the running episode. There is nothing to rebuild."""
         if self._membership.rejoin() is None:
             return False
         self._membership.announce()
@@ -77,7 +77,7 @@ class PounceServer(ModelShell):
             try:
                 rows_NA = self._engine.invoke(work.request, self._heartbeat.beat)
             except ValueError as error:
-                # No chunk: the clock plays what it has, then holds.
+                # Without a chunk the clock plays the rows it has, then holds.
                 text = f"invocation {work.invocation.invocation}: {error}"
                 self._tell(m.Severity.ERROR, "invocation_refused", text)
                 return
@@ -125,7 +125,7 @@ class PounceServer(ModelShell):
         return self._contract()
 
     def _check_committed(self, schedule: m.Schedule) -> None:
-        """Raises EpisodeRefused if an invocation takes more ticks than the network learned to be given rows for."""
+        """Raises EpisodeRefused if an invocation takes more ticks than the network's committed rows in training."""
         spec = self._engine.spec
         if spec.continuity != "trained":
             return

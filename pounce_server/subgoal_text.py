@@ -1,7 +1,7 @@
-"""Which subgoal text an invocation gets, for a POUNCE that reads text in place of cognition (paper, 3.1 and Table 3).
+"""Selects an invocation's subgoal text, for a POUNCE that reads text in place of cognition (paper, 3.1 and Table 3).
 
-The text is PONDER's newest one, or the task's own annotation. Evaluation only, with all servers in one thread: on a
-network nothing says that a text came before the invocation that it is for.
+The text is PONDER's newest one, or the task's own annotation. It is for evaluation only, with all servers in one
+thread: over a network nothing guarantees that a text arrives before its invocation.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ class SubgoalText:
         self._texts.clear()
 
     def on_subgoal(self, subgoal: m.Subgoal) -> None:
-        """Keeps a text of this source, by the query it was written at, or by the tick from which it holds."""
+        """Keeps a text of this source with its query, or with the tick from which it is valid."""
         if self._source == "ponder" and subgoal.kind == m.SubgoalKind.SUBGOAL and subgoal.query is not None:
             self._texts.append((subgoal.query, subgoal.text))
         elif self._source == "oracle" and subgoal.kind == m.SubgoalKind.TASK_GROUNDED:
-            self._texts.append((subgoal.tick, normalised_text(subgoal.text)))  # as PONDER would write it
+            self._texts.append((subgoal.tick, normalised_text(subgoal.text)))  # in the form that PONDER generates
 
     def at(self, invocation: m.Invocation) -> str:
-        """PONDER's newest text up to the query referred to, or the task's at this tick; empty before there is one."""
+        """PONDER's newest text up to the referenced query, or the task's at this tick; empty before the first."""
         limit = invocation.ref_query if self._source == "ponder" else invocation.tick
         if limit is None:
             return ""

@@ -1,7 +1,7 @@
 """A bus moves bytes between processes; ``LocalBus`` moves them within one, in order and without threads.
 
-A ``Bus`` knows keys and bytes only; ``link`` adds types, identity and suspicion. Nobody is called back with a message:
-a subscriber drains its subscription when it is ready, so no model ever runs on a transport's receive thread.
+A ``Bus`` handles keys and bytes only; ``link`` adds types, identity and validation. There are no message callbacks: a
+subscriber drains its subscription when it is ready, so no model ever runs on a transport's receive thread.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from typing import NamedTuple, Protocol
 from protocol.errors import CallFailed
 from protocol.topics import Priority, matches
 
-ATTACHMENT_BYTES = 24  # seq u64, source_ns i64, boot_id u64, little-endian: drops and restarts seen without decoding
+ATTACHMENT_BYTES = 24  # seq u64, source_ns i64, boot_id u64, little-endian: shows drops and restarts without decoding
 
 
 class Sample(NamedTuple):
-    """One message as it travelled. ``payload`` of an alive subscription is b"1" (appeared) or b"" (gone)."""
+    """One message as transmitted. The ``payload`` of a liveliness subscription is b"1" (appeared) or b"" (gone)."""
 
     key: str
     payload: bytes
@@ -28,9 +28,9 @@ class Sample(NamedTuple):
 
 
 class Subscription:
-    """A ring of the newest ``keep`` samples (zenoh's RingChannel, with a bell): old ones fall out and are counted.
+    """A ring of the newest ``keep`` samples (zenoh's RingChannel, with a bell): older ones are dropped and counted.
 
-    Filled by one thread, drained by another; both ends of a deque with ``maxlen`` are atomic.
+    One thread fills it, another drains it; operations on both ends of a deque with ``maxlen`` are atomic.
     """
 
     def __init__(self, keep: int) -> None:
@@ -39,36 +39,36 @@ class Subscription:
         self._num_drained = 0
 
     def put(self, sample: Callable[[], Sample]) -> None:
-        """Stores a sample by the function that copies it out of the transport: what falls out is never copied."""
+        """Stores a function that copies the sample out of the transport, so that dropped samples are never copied."""
         self._ring.append(sample)
         self.num_received += 1
 
     def drain(self) -> list[Sample]:
-        """Everything that waits, oldest first."""
+        """Removes and returns all waiting samples, oldest first."""
         samples = []
         while self._ring:
             try:
                 samples.append(self._ring.popleft()())
-            except IndexError:  # the filler pushed the last one out meanwhile
+            except IndexError:  # the other thread pushed the last one out meanwhile
                 break
         self._num_drained += len(samples)
         return samples
 
     @property
     def num_superseded(self) -> int:
-        """Samples that newer ones pushed out unread."""
+        """Number of unread samples that newer ones pushed out."""
         return max(0, self.num_received - self._num_drained - len(self._ring))
 
 
 class Request(NamedTuple):
-    """A call that waits for ``reply(bytes)``; leaving it unanswered lets the caller time out."""
+    """A call that waits for ``reply(bytes)``; without a reply the caller times out."""
 
     payload: bytes
     reply: Callable[[bytes], None]
 
 
 class Inbox:
-    """Requests in order of arrival; at most ``keep``, the oldest falling out (its caller times out)."""
+    """Requests in order of arrival, at most ``keep``; beyond that the oldest is dropped and its caller times out."""
 
     def __init__(self, keep: int = 32) -> None:
         self._requests: deque[Request] = deque(maxlen=keep)
@@ -84,16 +84,16 @@ class Inbox:
 
 
 class Bus(Protocol):
-    """What a process needs of a transport."""
+    """Interface of a transport."""
 
     is_local: bool
-    """True if every peer shares this host: raw pixels travel well."""
+    """True if every peer shares this host, so that raw pixels are cheap to send."""
 
     def publish(self, key: str, payload: bytes, *, encoding: str, attachment: bytes, priority: Priority) -> None: ...
     def subscribe(self, expression: str, *, keep: int) -> Subscription: ...
     def serve(self, key: str) -> Inbox: ...
     def call(self, key: str, payload: bytes, *, timeout_ns: int) -> bytes:
-        """Raises CallFailed if nobody answers in time."""
+        """Sends a request and returns the reply. Raises CallFailed if no reply comes in time."""
         ...
 
     def declare_alive(self, key: str) -> None: ...
@@ -108,9 +108,9 @@ class Bus(Protocol):
 class LocalBus:
     """All participants in one process and one thread: ``publish`` returns with a message in its subscribers' rings.
 
-    A call is answered by running the other participants' ``step`` functions until one replies; a participant that waits
-    for a call of its own is not stepped meanwhile, as it would not be over zenoh. Used by the in-process lockstep mode
-    and by tests; it is the whole difference between them and zenoh.
+    A call runs the other participants' ``step`` functions until one replies; as over zenoh, a participant that waits
+    for its own call is not stepped meanwhile. The in-process lockstep mode and the tests use it; nothing else differs
+    from zenoh.
     """
 
     is_local = True
@@ -124,7 +124,7 @@ class LocalBus:
         self._stepping: set[int] = set()
 
     def add_participant(self, step: Callable[[], bool]) -> None:
-        """``step`` does one piece of pending work and says whether there was any."""
+        """Adds a participant, whose ``step`` does one piece of pending work and returns whether there was any."""
         self._participants.append(step)
 
     def publish(self, key: str, payload: bytes, *, encoding: str, attachment: bytes, priority: Priority) -> None:
@@ -153,8 +153,8 @@ class LocalBus:
         return answers[0]
 
     def run_participants(self) -> bool:
-        """Lets every participant do one piece of work; False if nobody had any."""
-        return any([self._step(number) for number in range(len(self._participants))])  # a list: everybody gets a turn
+        """Lets every participant do one piece of work; returns False if none had any."""
+        return any([self._step(number) for number in range(len(self._participants))])  # a list: all get a turn
 
     def _step(self, number: int) -> bool:
         if number in self._stepping:
@@ -170,7 +170,7 @@ class LocalBus:
         self._announce(key, b"1")
 
     def end_alive(self, key: str) -> None:
-        """What a transport does when a process dies (tests)."""
+        """Simulates a dying process, for tests."""
         self._alive.remove(key)
         self._announce(key, b"")
 
@@ -198,7 +198,7 @@ class LocalBus:
 class Bell:
     """Wakes one waiting thread when anything arrives on any subscription.
 
-    A lock that is free while the bell has been rung: one system call to ring, one to wait, where ``threading.Event``
+    It is a lock that is free while the bell is rung: one system call to ring, one to wait, where ``threading.Event``
     makes a new lock for every wait.
     """
 
@@ -207,7 +207,7 @@ class Bell:
         self._silence.acquire()
 
     def ring(self) -> None:
-        with contextlib.suppress(RuntimeError):  # rung already, and not yet heard
+        with contextlib.suppress(RuntimeError):  # rung already
             self._silence.release()
 
     def wait(self, timeout_ns: int) -> None:

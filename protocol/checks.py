@@ -1,7 +1,7 @@
-"""What a decoded message must satisfy before anything else sees it: shapes, finiteness, size caps.
+"""Checks of a decoded message before any other code uses it: shapes, finiteness, size caps.
 
-Each check is pure and raises ``MalformedMessage`` with both numbers. The caps bound memory that a stranger can make us
-hold; they are far above anything a real model sends.
+Each check is pure and raises ``MalformedMessage`` with the expected and the actual value. The caps bound the memory
+that an untrusted peer can make us allocate; they are far above any real model's messages.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MAX_INSTANT_NS = 10**18  # 31 years: more is a unit mistake
 MAX_INDEX = 2**53
 MAX_DEMO_FRAMES = 600
 DEMO_VIDEO_HZ = 20
-MAX_DECAY = 10  # per chunk: exp(-10) is nothing
+MAX_DECAY = 10  # per chunk: exp(-10) is negligible
 MAX_JOURNAL_ENTRIES = 64
 
 
@@ -41,7 +41,7 @@ def _require(ok: bool, message: object, field: str, expected: str, came: object)
         raise _broken(message, field, expected, came)
 
 
-# What follows runs a dozen times per message, on the control path: no sentence is made before it is needed.
+# The following checks run a dozen times per message on the control path: they format a message only on failure.
 
 
 def _index(message: Any, *names: str) -> None:
@@ -74,7 +74,7 @@ def _vector(message: Any, name: str, *, low: int = 0, high: int = MAX_DIM) -> No
 
 
 def _are_finite(values: m.Floats) -> bool:
-    """As ``np.isfinite(values).all()``, by one call where the sum of squares neither overflows nor is NaN."""
+    """``np.isfinite(values).all()`` in one call, unless the sum of squares overflows or is NaN."""
     return not values.size or math.isfinite(np.vdot(values, values)) or bool(np.isfinite(values).all())
 
 
@@ -213,7 +213,7 @@ def check_tick(t: m.Tick) -> None:
     _chosen(t, "level")
     for name in ("state", "action"):
         _vector(t, name)
-    # raw_row may hold the very NaN that the limits refused: it is evidence, not a command.
+    # raw_row may hold a NaN that the limits refused: it is logged, not commanded.
     _require(
         t.raw_row.ndim == 1 and len(t.raw_row) <= MAX_DIM,
         t,
@@ -223,7 +223,7 @@ def check_tick(t: m.Tick) -> None:
     )
 
 
-def check_subgoal(s: m.Subgoal) -> None:  # of whatever kind: it is logged, and nobody acts on an unknown one
+def check_subgoal(s: m.Subgoal) -> None:  # of any kind, because an unknown kind is only logged
     _text(s, "text")
     _index(s, "tick")
     _require(len(s.token_ids) <= MAX_TEXT, s, "token_ids", f"at most {MAX_TEXT}", len(s.token_ids))
@@ -401,7 +401,7 @@ CHECKS: dict[type, Callable[[Any], None]] = {
 
 
 def check(message: Any) -> None:
-    """Raises MalformedMessage if ``message`` may not be acted on."""
+    """Raises MalformedMessage if ``message`` breaks a rule."""
     header = getattr(message, "header", None)
     if header is not None:
         check_header(header)

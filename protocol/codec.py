@@ -1,12 +1,11 @@
-"""The border: protobuf bytes to frozen dataclasses with numpy arrays, and back.
+"""Converts protobuf bytes to frozen dataclasses with numpy arrays, and back.
 
-Dataclass and protobuf message have the same name and the same field names (a test holds them together), so one pair of
-functions per *kind of field* serves every message; ``put`` and ``get`` stand side by side. ``decode`` refuses whatever
-``checks`` refuses, so nothing behind the border ever sees a wrong shape, a NaN or an oversized blob. ``encode`` applies
-the same checks: we do not send what a peer must drop.
+Dataclass and protobuf message have the same name and the same field names (a test compares them), so one pair of
+functions per *kind of field*, ``put`` and ``get``, serves every message. ``decode`` refuses all that ``checks``
+refuses, so no other code gets a wrong shape, a NaN or an oversized blob. ``encode`` applies the same checks.
 
-Images are spliced: their bytes enter and leave the protobuf wire format by hand, as one copy instead of four. The
-bytes are ordinary protobuf; any other decoder reads them.
+Images are spliced: their bytes enter and leave the protobuf wire format by hand, with one copy instead of four. The
+result is ordinary protobuf, which any other decoder can read.
 """
 
 from __future__ import annotations
@@ -72,7 +71,7 @@ def decode(cls: type[T], payload: bytes) -> T:
     """Parses and checks one message.
 
     Raises:
-        MalformedMessage: not the bytes of a ``cls``, or a rule of ``checks`` is broken.
+        MalformedMessage: the bytes are no ``cls``, or the message breaks a rule of ``checks``.
     """
     if len(payload) > MAX_MESSAGE_BYTES:
         raise MalformedMessage(cls.__name__, "*", f"at most {MAX_MESSAGE_BYTES} bytes", f"{len(payload)}")
@@ -81,7 +80,7 @@ def decode(cls: type[T], payload: bytes) -> T:
         if cls is m.Observation:
             payload, images = splice.split(payload, _OBSERVATION_IMAGES, _IMAGE_DATA)
         fields = _from_fields(cls, proto_class(cls).FromString(payload))
-        if images:  # those that stood first; an encoder that knows nothing of this puts none there
+        if images:  # those at the front; other encoders put none there
             fields["images"] = tuple(_image(meta, data) for meta, data in images) + fields["images"]
         message = cls(**fields)
     except (DecodeError, ValueError) as error:
@@ -94,14 +93,14 @@ def _meta(image: m.Image) -> bytes:
     return _meta_bytes(image.camera, image.codec, image.height, image.width, image.crc32)
 
 
-@lru_cache(maxsize=64)  # the next picture of a camera differs in its pixels
+@lru_cache(maxsize=64)  # a camera's pictures differ only in their pixels
 def _meta_bytes(camera: str, codec: m.ImageCodec, height: int, width: int, crc32: int) -> bytes:
     return _to_proto(m.Image(camera=camera, codec=codec, height=height, width=width, crc32=crc32)).SerializeToString()
 
 
 def _image(meta: bytes, data: memoryview) -> m.Image:
     known = _image_of(meta) if len(meta) <= _MAX_CACHED_BYTES else _image_of.__wrapped__(meta)
-    return known if known.data else dataclasses.replace(known, data=data)  # proto3: of two, the last one counts
+    return known if known.data else dataclasses.replace(known, data=data)  # proto3: the last of two values counts
 
 
 @lru_cache(maxsize=64)
@@ -110,7 +109,7 @@ def _image_of(meta: bytes) -> m.Image:
 
 
 def _to_proto(message: Any, *, but: str = "") -> Proto:
-    """All fields, or all but one."""
+    """Converts all fields, or all but one."""
     try:
         return proto_class(type(message))(**_to_fields(message, but))
     except (TypeError, ValueError):
@@ -118,7 +117,7 @@ def _to_proto(message: Any, *, but: str = "") -> Proto:
 
 
 def _culprit(message: Any) -> MalformedMessage:
-    """The field that protobuf would not take, found by offering each alone."""
+    """The field that protobuf refuses, found by trying each alone."""
     plan = _plan(type(message))  # type: ignore[arg-type]
     for name in plan.names:
         value = getattr(message, name)
@@ -137,7 +136,7 @@ def _culprit(message: Any) -> MalformedMessage:
 
 
 def _to_fields(message: Any, but: str = "") -> dict[str, Any]:
-    """What the generated class's constructor takes: one call into C instead of one per field."""
+    """Arguments of the generated class's constructor: one call into C instead of one per field."""
     plan = _plan(type(message))  # type: ignore[arg-type]
     fields = dict(zip(plan.names, plan.read(message), strict=True))
     fields.pop(but, None)
@@ -163,12 +162,12 @@ def _from_fields(cls: type, proto: Proto) -> dict[str, Any]:
     return fields
 
 
-_Put = Callable[[Any], Any]  # the dataclass's value -> what the constructor takes
-_Get = Callable[[Proto, Any], Any]  # the message and its attribute -> the dataclass's value
+_Put = Callable[[Any], Any]  # dataclass value -> constructor argument
+_Get = Callable[[Proto, Any], Any]  # message and attribute -> dataclass value
 
 
 class _Plan(NamedTuple):
-    """How one message crosses the border: all of its fields, and those that are not the same on both sides."""
+    """Conversion of one message type: all of its fields, and those that differ between the two sides."""
 
     names: tuple[str, ...]
     read: Callable[[Any], tuple[Any, ...]]
@@ -211,7 +210,7 @@ def _kind(field: Any, default: Any) -> tuple[_Put | None, _Get | None]:
     if field.type == FieldDescriptor.TYPE_ENUM:
         cls = getattr(m, field.enum_type.name)
         members = {int(member): member for member in cls}
-        return None, lambda proto, value: members.get(value, cls.UNSPECIFIED)  # a newer peer's, or a reserved one
+        return None, lambda proto, value: members.get(value, cls.UNSPECIFIED)  # a newer peer's value, or a reserved one
     if field.has_presence:
         return None, lambda proto, value: value if proto.HasField(name) else None
     return (bytes, None) if field.type == FieldDescriptor.TYPE_BYTES else (None, None)
@@ -239,7 +238,7 @@ def _put_tensor(value: Any) -> dict[str, Any]:
 
 
 def _get_tensor(tensor: Any) -> m.Floats:
-    """float32, whatever dtype travelled: bf16 and f16 widen exactly."""
+    """Converts to float32; bf16 and f16 widen exactly."""
     shape, data = tuple(tensor.shape), tensor.data
     if not data and 0 in (shape or (0,)):
         return np.zeros((0, 0), np.float32)
@@ -274,6 +273,6 @@ def _put_messages(value: Any) -> list[dict[str, Any]]:
 
 _NO_FLOATS = np.zeros(0, np.float32)
 _NO_FLOATS.flags.writeable = False
-_MAX_CACHED_BYTES = 512  # a stranger must not choose how much memory a cache holds
+_MAX_CACHED_BYTES = 512  # so that an untrusted peer cannot fill a cache with large keys
 _OBSERVATION_IMAGES = stream_pb2.Observation.DESCRIPTOR.fields_by_name["images"].number
 _IMAGE_DATA = common_pb2.Image.DESCRIPTOR.fields_by_name["data"].number

@@ -1,6 +1,6 @@
-"""One way to read a command line: a frozen dataclass, its docstrings as ``--help``, one flag per switch.
+"""Parses command lines into frozen dataclasses, with docstrings as ``--help`` and one flag per switch.
 
-A switch that is off has ``--x``; one that is on has ``--no-x`` alone, so its docstring says what *not* to do.
+A switch that is off by default has ``--x``; one that is on has only ``--no-x``, so its docstring says "Do not ...".
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ Options = TypeVar("Options")
 
 
 def parse(kind: type[Options], argv: Sequence[str] | None, *, prog: str) -> Options:
-    """Returns the options of ``argv``; None: of the process. Leaves the process after ``--help`` or a mistake."""
+    """Returns the options in ``argv`` (None: the process's). Exits the process after ``--help`` or an error."""
     return tyro.cli(kind, args=argv, prog=prog, description=kind.__doc__, config=(tyro.conf.FlagCreatePairsOff,))
 
 
 def flat(options: Any) -> dict[str, Any]:
-    """Options as JSON holds them, by their names on the command line: groups do not show."""
+    """Options as JSON values by their names on the command line, without groups."""
     found: dict[str, Any] = {}
     for field in dataclasses.fields(options):
         value = getattr(options, field.name)

@@ -1,14 +1,14 @@
-"""What is on disk survives a power cut; what is merely written may not."""
+"""Syncs files to disk, so that they survive a power cut."""
 
 import os
 from pathlib import Path
 
 
 def sync(path: Path) -> None:
-    """Forces a file down to the disk; or a folder, without which a rename or a new file in it may be forgotten.
+    """Syncs a file; or a folder, without which a rename or a new file in it may be lost.
 
     Raises:
-        OSError: the disk does not take it.
+        OSError: the disk cannot be written.
     """
     handle = os.open(path, os.O_RDONLY)
     try:

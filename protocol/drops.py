@@ -1,4 +1,4 @@
-"""Why a message was not used: the keys of ``Health.dropped``."""
+"""Reasons for dropping a message: the keys of ``Health.dropped``."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from enum import StrEnum
 
 
 class DropReason(StrEnum):
-    """One word for each; programs may rely on them."""
+    """Stable names of the reasons."""
 
     WRONG_ENCODING = "wrong_encoding"
-    """Not the type that its key promises."""
+    """Its encoding is not its topic's type."""
     MALFORMED = "malformed"
     """It does not decode, or breaks a rule of ``checks``."""
     WRONG_ROBOT = "wrong_robot"
@@ -19,16 +19,16 @@ class DropReason(StrEnum):
     OTHER_EPISODE = "other_episode"
     """It belongs to another episode than the running one."""
     NO_EPISODE = "no_episode"
-    """It came between episodes."""
+    """It arrived between episodes."""
     WRONG_SHAPE = "wrong_shape"
-    """An observation of other pictures or joints than the models read."""
+    """An observation with other pictures or joints than the models read."""
     NO_PICTURE = "no_picture"
-    """An image that is none."""
+    """An image that cannot be decoded."""
     WRONG_REQUEST = "wrong_request"
     """An invocation that does not fit the model."""
     UNKNOWN_CLOCK = "unknown_clock"
-    """Its instant is on a clock that nobody has measured."""
+    """Its instant is on a clock whose offset was not measured."""
     UNASKED = "unasked"
-    """An answer to no question."""
+    """An answer without a request."""
     REFUSED_CALL = "refused_call"
-    """A call whose request was refused."""
+    """A call with a refused request."""

@@ -1,4 +1,4 @@
-"""What can be wrong with a message or a link, told from the facts."""
+"""Errors of messages and links, which build their text from facts."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ class ProtocolError(ValueError):
 
 
 class MalformedMessage(ProtocolError):
-    """A message that must not reach anybody: it says which, what was expected and what came."""
+    """An invalid message; names message and field, the expected and the actual value."""
 
     def __init__(self, message: str, field: str, expected: str, came: str) -> None:
         super().__init__(f"{message}.{field}: expected {expected}, came {came}")
@@ -19,7 +19,7 @@ class MalformedMessage(ProtocolError):
 
 
 class EpisodeRefused(ProtocolError):
-    """An episode that cannot be opened: a code for programs and a sentence for people."""
+    """An episode that cannot be opened: a code for programs and a sentence for the user."""
 
     def __init__(self, refusal: Refusal, sentence: str) -> None:
         super().__init__(sentence)
@@ -31,7 +31,7 @@ class TransportError(RuntimeError):
 
 
 class CallFailed(TransportError):
-    """A request without an answer: nobody serves the key, or it took too long."""
+    """A request without a reply: no process serves the key, or it took too long."""
 
     def __init__(self, key: str, timeout_ms: float, why: str) -> None:
         super().__init__(f"no answer on {key} within {timeout_ms:.0f} ms: {why}")

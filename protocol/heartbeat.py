@@ -1,7 +1,7 @@
 """A heartbeat that stops when the work stops.
 
-Zenoh's liveliness token belongs to the process: it survives a hung model thread. This heartbeat is sent by whoever does
-the work, from inside the work (between layers, tokens, flow steps), so its silence means that nothing moves.
+Zenoh's liveliness token belongs to the process and survives a hung model thread. This heartbeat is sent from inside the
+work (between layers, tokens, flow steps), so its silence means that the work stopped.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ PERIOD_NS = 100_000_000
 
 
 class Heartbeat:
-    """Publishes ``Health``; ``beat`` is cheap enough to call anywhere and sends at most every 100 ms."""
+    """Publishes ``Health``; ``beat`` is cheap enough to call anywhere, and sends at most every 100 ms."""
 
     def __init__(self, link: Link, version: str, clock_id: str) -> None:
         self._link = link
@@ -27,7 +27,7 @@ class Heartbeat:
         link.bus.declare_alive(alive_key(link.robot, link.proc))
 
     def set(self, **changes: object) -> None:
-        """Changes what is reported; a change of state is reported at once."""
+        """Changes the reported values; a change of state is sent immediately."""
         is_news = changes.keys() & {"state", "open_episode"}
         self.health = replace(self.health, **changes)  # type: ignore[arg-type]
         if is_news:

@@ -1,7 +1,7 @@
-"""One process's typed end of the bus: it signs what it sends and suspects what it receives.
+"""A process's typed end of the bus: it adds headers to sent messages and validates received ones.
 
 A message that does not decode, breaks a rule of ``checks``, names another robot, or whose header disagrees with its key
-is counted, logged once per source and reason, and dropped. Nothing a peer sends can raise out of ``Stream.drain``.
+is counted, logged once per source and reason, and dropped. No peer's message can make ``Stream.drain`` raise.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _ATTACHMENT = struct.Struct("<QqQ")  # seq, source_ns, boot_id
 
 
 class Received(NamedTuple, Generic[T]):
-    """A checked message, and the bytes it came as (the log and the journal keep those)."""
+    """A checked message and its bytes as received, which the log and the journal keep."""
 
     message: T
     sample: Sample
@@ -39,7 +39,7 @@ class Received(NamedTuple, Generic[T]):
 class Link:
     """A process's identity on a bus.
 
-    ``enter_episode`` sets the episode that everything published afterwards belongs to.
+    ``enter_episode`` sets the episode of all messages published afterwards.
     """
 
     def __init__(self, bus: Bus, *, robot: str, proc: str, boot_id: int | None = None) -> None:
@@ -52,10 +52,10 @@ class Link:
         self.epoch = 0
         self.dropped: Counter[DropReason] = Counter()
         self._seqs: Counter[str] = Counter()
-        self._told: set[tuple[str, str]] = set()
+        self._reported: set[tuple[str, str]] = set()
 
     def enter_episode(self, session: str, episode: str, epoch: int) -> None:
-        """Signs what follows with this episode.
+        """Sets the episode in the headers and keys of further messages.
 
         Raises:
             ProtocolError: an id cannot be part of a key.
@@ -83,10 +83,10 @@ class Link:
         )
 
     def publish(self, topic: Topic[T], message: T, *, at_ns: int, clock_id: str = EPISODE_CLOCK) -> T:
-        """Signs, checks, encodes and sends; returns the message as sent.
+        """Adds the header, checks, encodes and sends; returns the message as sent.
 
         Raises:
-            MalformedMessage: our own message breaks the protocol (a bug here, not the peer's fault).
+            MalformedMessage: the message breaks the protocol, which is a bug of this process.
         """
         signed = dataclasses.replace(message, header=self.header(topic.name, at_ns, clock_id))  # type: ignore[type-var]
         payload = codec.encode(signed)
@@ -101,7 +101,7 @@ class Link:
         return signed  # type: ignore[no-any-return]
 
     def subscribe(self, topic: Topic[T], *, keep: int | None = None, proc: str = "*") -> Stream[T]:
-        """All episodes of this robot on ``topic``; whose turn it is, the node decides."""
+        """Subscribes to ``topic`` for this robot, in all episodes; the nodes filter by episode."""
         expression = topics.stream_key(topic, self.robot, "*", proc)
         return Stream(self, topic, self.bus.subscribe(expression, keep=keep or topic.keep))
 
@@ -109,10 +109,10 @@ class Link:
         return Service(self, call, self.bus.serve(topics.call_key(call, self.robot, self.proc)))
 
     def call(self, call: Call, proc: str, request: Any, *, timeout_ns: int) -> Any:
-        """Asks ``proc`` and waits.
+        """Calls ``proc`` and waits for the reply.
 
         Raises:
-            CallFailed: no answer, or an answer that is not a ``call.reply``.
+            CallFailed: no reply, or one that is not a ``call.reply``.
         """
         key = topics.call_key(call, self.robot, proc)
         if hasattr(request, "header"):
@@ -124,10 +124,10 @@ class Link:
             raise CallFailed(key, timeout_ns / 1e6, f"unreadable answer: {error}") from None
 
     def drop(self, source: str, reason: DropReason, detail: str) -> None:
-        """Counts a message that will not be used; the first of its kind from its source is logged."""
+        """Counts a dropped message; the first one per source and reason is logged."""
         self.dropped[reason] += 1
-        if (source, reason) not in self._told and len(self._told) < 1000:
-            self._told.add((source, reason))
+        if (source, reason) not in self._reported and len(self._reported) < 1000:
+            self._reported.add((source, reason))
             log.warning("dropped source=%s reason=%s detail=%r (later ones are only counted)", source, reason, detail)
 
 
@@ -144,7 +144,7 @@ class Stream(Generic[T]):
         return [received.message for received in self.receive()]
 
     def receive(self) -> list[Received[T]]:
-        """As ``drain``, with the bytes each message travelled as."""
+        """Like ``drain``, with each message's bytes as received."""
         accepted = []
         for sample in self.subscription.drain():
             message = self._accept(sample)
@@ -202,8 +202,7 @@ class Service:
     def answer(self, handler: Callable[[Any], Any]) -> int:
         """Answers every waiting call with ``handler(request)``; returns how many there were.
 
-        A request that does not decode, or that the handler refuses with a ProtocolError, gets that sentence as its
-        reply's ``error``: never a traceback.
+        If a request does not decode, or the handler raises ProtocolError, the reply's ``error`` is that message.
         """
         requests = self._inbox.drain()
         for request in requests:
@@ -217,10 +216,10 @@ class Service:
 
 
 def is_of_episode(link: Link, header: Header) -> bool:
-    """Whether a message belongs to the episode this process is in; if not, it is counted as dropped."""
+    """Whether a message belongs to this process's episode; if not, it is counted as dropped."""
     if header.episode == link.episode and header.epoch == link.epoch:
         return True
-    if not link.episode:  # between episodes: the tail of the last one, nobody's fault
+    if not link.episode:  # between episodes: late messages of the last one are no fault
         link.dropped[DropReason.NO_EPISODE] += 1
         return False
     if header.session == link.session and header.epoch < link.epoch:  # the tail of an earlier one, nobody's fault

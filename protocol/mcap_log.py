@@ -1,15 +1,14 @@
-"""One MCAP file per episode, the system of record: every message as the bytes it travelled as.
+"""One MCAP file per episode, the system of record: every message with its bytes as transmitted.
 
-Time rule: ``log_time`` is ``t0_unix_ns`` plus the message's episode time (of a message on another clock: the last
-``log_time``), never decreasing, because viewers replay on it; ``publish_time`` is the wall clock of whoever recorded.
+Time rule: ``log_time`` is ``t0_unix_ns`` plus the message's episode time (for a message on another clock, the last
+``log_time``), and never decreases, because viewers replay on it; ``publish_time`` is the recorder's wall clock.
 
-One exception to "the bytes as they travelled": with ``pixels="jpeg"`` an Observation is logged without its pixels
-(codec ELSEWHERE, crc32 kept), which lie on ``/camera/<camera>`` instead: those that travelled compressed untouched, so
-that their crc32 still matches, raw ones as JPEG, good for eyes but not for running a model again. ``pixels="exact"``
-keeps both.
+One exception to "as transmitted": with ``pixels="jpeg"`` an Observation is logged without its pixels (codec ELSEWHERE,
+crc32 kept); they are on ``/camera/<camera>`` instead, unchanged and matching their crc32 if they were sent compressed;
+raw ones as JPEG, good for viewing but not for running a model again. ``pixels="exact"`` keeps both.
 
-Crash safety: all channels stand in the first chunk, a chunk ends at least every second of episode time and whenever the
-queue runs dry for a second, so a killed process loses at most that (``recover`` rewrites what is left).
+Crash safety: all channels are in the first chunk, and a chunk ends at least every second of episode time and whenever
+the queue is empty for a second, so a killed process loses at most that (``recover`` repairs the file).
 Layout of the container: mcap.dev/spec. Only this file imports mcap.
 """
 
@@ -47,11 +46,11 @@ T = TypeVar("T")
 
 log = logging.getLogger(__name__)
 
-LANES = {"ponder": "s2", "pounce": "s1"}  # topic prefix of a process; others go by their own name
+LANES = {"ponder": "s2", "pounce": "s1"}  # topic prefix of a process; others use their own name
 QUEUE_SIZE = 1024  # messages: at 20 Hz about 8 s, of which 160 observations hold 64 MB of raw 256 px pairs
 FLUSH_NS = 1_000_000_000
 FLUSHES_PER_FSYNC = 5
-MAX_RECORD_BYTES = 256 << 20  # more is a damaged length
+MAX_RECORD_BYTES = 256 << 20  # a larger length is damaged
 
 Pixels = Literal["jpeg", "exact"]
 WhenFull = Literal["drop", "wait"]
@@ -77,13 +76,13 @@ _KNOWN_PROCS = ("clock", "ponder", "pounce", "sim")
 
 
 def log_topic(topic: Topic[T], proc: str) -> str:
-    """The MCAP topic of what ``proc`` publishes on ``topic``: ``/tick``, ``/s2/phase``, ``/sim/subgoal``."""
+    """The MCAP topic of ``proc``'s messages on ``topic``: ``/tick``, ``/s2/phase``, ``/sim/subgoal``."""
     return _TOPICS[topic.name].format(lane=LANES.get(proc, proc))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Closing:
-    """What became of the file. ``error`` "": all is well, and ``path`` is the finished file."""
+    """State of the closed file. If ``error`` is "", ``path`` is the finished file."""
 
     path: Path
     num_messages: int
@@ -103,14 +102,14 @@ class _Last(NamedTuple):
 
 
 class EpisodeLog:
-    """Writes one episode to ``<path>.partial`` from a thread of its own, and renames it to ``path`` when it is closed.
+    """Writes one episode to ``<path>.partial`` in its own thread, and renames it to ``path`` when it is closed.
 
-    Nothing after the constructor raises into the caller: a full queue drops and counts, a full disk ends the recording;
-    ``close`` tells. Lockstep passes ``when_full="wait"``: there the world has time, and a log with gaps is no proof.
+    Only the constructor raises: later a full queue drops and counts messages, and a full disk ends the recording;
+    ``close`` reports both. Lockstep passes ``when_full="wait"``: there the world can wait, and the log has no gaps.
 
     Raises:
         FileExistsError: ``path`` or its ``.partial`` exists; a record is never overwritten.
-        OSError: the file cannot be made. Better now than when the robot moves.
+        OSError: the file cannot be created.
         MalformedMessage: ``info`` breaks the protocol.
     """
 
@@ -142,7 +141,7 @@ class EpisodeLog:
         self._thread.start()
 
     def write(self, topic: Topic[T], message: T, payload: bytes, wall_ns: int) -> None:
-        """Queues one message and its bytes; ``wall_ns``: unix time at which it was recorded."""
+        """Queues one message and its bytes; ``wall_ns`` is the unix time of recording."""
         if self._is_closed:
             self._overflowed[topic.name] += 1
             return
@@ -152,10 +151,10 @@ class EpisodeLog:
             self._overflowed[topic.name] += 1
 
     def close(self, result: m.EpisodeResult | None = None) -> Closing:
-        """Finishes and renames the file, and says what was lost. Closing again returns the same answer.
+        """Finishes and renames the file, and reports losses. Closing again returns the same answer.
 
         Args:
-            result: how the episode ended; None if nobody knows.
+            result: the episode's result; None if unknown.
         """
         if self._closing is None:
             self._is_closed = True
@@ -171,17 +170,17 @@ class EpisodeLog:
         return self._closing
 
     def _run(self) -> None:
-        """The thread: takes until the last one. After a failure it goes on taking, so that nobody waits for it."""
+        """The thread: takes entries until the last one. After a failure it discards them, so that no writer blocks."""
         while not isinstance(entry := self._next(), _Last):
             if self._error:
                 self._refused[entry.topic.name] += 1
                 continue
             try:
                 self._writer.write(entry)
-            except ProtocolError as error:  # this message is wrong, the file is not
+            except ProtocolError as error:  # the message is invalid, the file is intact
                 self._refused[entry.topic.name] += 1
                 log.error("not logged topic=%s error=%r", entry.topic.name, str(error))
-            except Exception as error:  # disk full or a defect here: the control loop must not hear of it now
+            except Exception as error:  # disk full or a bug here: it must not disturb the control loop
                 self._refused[entry.topic.name] += 1
                 self._fail(error)
         try:
@@ -193,7 +192,7 @@ class EpisodeLog:
             self._fail(error)
 
     def _next(self) -> _Entry | _Last:
-        """The next entry; what lies unflushed is flushed when none comes for a second."""
+        """The next entry; flushes when none comes for a second."""
         with suppress(queue.Empty):
             return self._queue.get(timeout=FLUSH_NS / 1e9)
         if not self._error:
@@ -261,7 +260,7 @@ class _Writer:
             os.fsync(self._file.fileno())
 
     def finish(self, result: m.EpisodeResult | None, dropped: Counter[str], error: str) -> None:
-        if error:  # the disk is full or the file is broken: leave it as it is for ``recover``
+        if error:  # the disk is full or the file is broken: leave it for ``recover``
             with suppress(OSError):
                 self._file.close()
             return
@@ -274,9 +273,9 @@ class _Writer:
         self._file.close()
 
     def _place_pixels(self, payload: bytes, wall_ns: int) -> bytes:
-        """Puts an observation's pictures on their cameras' channels; returns the observation's bytes for the log.
+        """Writes an observation's pictures to their cameras' channels; returns the observation's bytes for the log.
 
-        Decoded anew from the bytes: the caller's message may be a view into a frame that is already being redrawn.
+        It decodes the bytes again, because the caller's message may be a view of a frame that is being overwritten.
         """
         observation = codec.decode(m.Observation, payload)
         carried = [i for i in observation.images if i.codec != m.ImageCodec.ELSEWHERE]
@@ -315,9 +314,9 @@ class _Writer:
 
 @dataclass(slots=True, kw_only=True)
 class EpisodeRecord:
-    """A log in memory, without pictures: each kind of message in the order it was logged.
+    """A log in memory, without pictures: each kind of message in logged order.
 
-    ``recovered``: the file is unfinished or damaged and these are the messages before that place; ``why`` names it.
+    ``recovered``: the file is unfinished or damaged, and these are the messages before that place, which ``why`` names.
     """
 
     info: m.EpisodeInfo
@@ -363,7 +362,7 @@ def read_log(path: Path) -> EpisodeRecord:
 
     Raises:
         OSError: the file cannot be opened.
-        ProtocolError: no EpisodeInfo before the end or the first damage, or a message that the protocol refuses.
+        ProtocolError: no EpisodeInfo before the end or the first damage, or an invalid message.
     """
     lists: dict[str, list[Any]] = {name: [] for name in _LISTS.values()}
     metadata: dict[str, dict[str, str]] = {}
@@ -388,7 +387,7 @@ def read_log(path: Path) -> EpisodeRecord:
 
 
 class Picture(NamedTuple):
-    """What one camera saw at ``source_ns`` of episode time: ``data`` in ``format`` ("jpeg" or "png")."""
+    """One camera's picture at ``source_ns`` of episode time: ``data`` in ``format`` ("jpeg" or "png")."""
 
     camera: str
     source_ns: int
@@ -397,7 +396,7 @@ class Picture(NamedTuple):
 
 
 def read_pictures(path: Path) -> Iterator[Picture]:
-    """All pictures in the order they were logged, one in memory at a time.
+    """Yields all pictures in logged order, with one in memory at a time.
 
     Raises:
         OSError: the file cannot be opened.
@@ -424,7 +423,7 @@ def recover(src: Path, dst: Path) -> Recovery:
 
     Raises:
         OSError: ``src`` cannot be read, or ``dst`` exists or cannot be written.
-        ProtocolError: not one message could be read.
+        ProtocolError: no message could be read.
     """
     num_messages = 0
     schemas, channels = {0: 0}, dict[int, int]()
@@ -467,7 +466,7 @@ def recover(src: Path, dst: Path) -> Recovery:
 
 
 class _Records:
-    """The file's records up to its end or the first damage, which ``damage`` then names."""
+    """The file's records up to its end or to the first damage, which ``damage`` names."""
 
     def __init__(self, file: BinaryIO) -> None:
         self.damage = ""
@@ -482,7 +481,7 @@ class _Records:
                 record = next(self._records)
             except StopIteration:
                 return
-            except Exception as error:  # cut short or damaged, the library raises almost anything, OverflowError too
+            except Exception as error:  # on damaged files the library raises many types, even OverflowError
                 self.damage = f"unfinished or damaged near byte {self._file.tell()}: {type(error).__name__} {error}"
                 return
             if isinstance(record, Schema):
@@ -496,8 +495,8 @@ class _Records:
 
 
 def _without_pixels(image: m.Image) -> m.Image:
-    """What the log keeps of a picture that lies elsewhere: its size, and a checksum of the bytes that travelled."""
-    crc32 = image.crc32 or zlib.crc32(image.data)  # nobody computes it for raw pixels on the control path
+    """The log's entry for a picture stored elsewhere: its size, and a checksum of the transmitted bytes."""
+    crc32 = image.crc32 or zlib.crc32(image.data)  # not computed for raw pixels on the control path
     return dataclasses.replace(image, codec=m.ImageCodec.ELSEWHERE, crc32=crc32, data=b"")
 
 
@@ -542,7 +541,7 @@ def _result_metadata(result: m.EpisodeResult | None, dropped: Counter[str]) -> d
 
 
 def _described(file: Any) -> FileDescriptorSet:
-    """``file`` and everything it imports, dependencies first: a reader needs nothing but the log."""
+    """``file`` and all its imports, dependencies first, so that the log is self-contained."""
     described = FileDescriptorSet()
     seen: set[str] = set()
 

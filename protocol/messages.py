@@ -1,8 +1,8 @@
-"""The messages as frozen dataclasses with numpy arrays: what the code inside the rooms sees.
+"""The messages as frozen dataclasses with numpy arrays, for all code behind the codec.
 
-Field for field the same names as in ``protocol/ponderpounce/v1/*.proto``, where each field is explained; ``codec``
-converts at the border. Arrays are read-only views after decoding. Instants are int nanoseconds; "episode time" is the
-clock service's, 0 at reset.
+Fields have the same names as in ``protocol/ponderpounce/v1/*.proto``, where each is explained; ``codec`` converts.
+Arrays are read-only views after decoding. Instants are int nanoseconds; "episode time" is the clock service's, 0 at
+reset.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class ActionSpace(IntEnum):
 
 
 class Level(IntEnum):
-    """The ladder, from best to worst."""
+    """Rungs of the ladder, from best to worst."""
 
     UNSPECIFIED = 0
     PLAY = 1
@@ -225,7 +225,7 @@ class ActionChunk:
     horizon: int
     action_dim: int
     dt_ns: int
-    rows: Floats  # (horizon * action_dim,) on the wire's order; ``rows_NA`` reshapes
+    rows: Floats  # (horizon * action_dim,), row-major; ``rows_NA`` reshapes
     source_ns: int
     ref_query: int | None
     age_ns: int
@@ -550,4 +550,4 @@ Message = (
     | EpisodeInfo
     | EpisodeResult
 )
-"""What streams on topics; every one has a ``header``. The other records are requests and replies."""
+"""Messages of topics; every one has a ``header``. The other classes are requests and replies."""

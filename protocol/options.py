@@ -1,4 +1,4 @@
-"""The options that every daemon shares: which robot, where to listen, whom to connect to."""
+"""Options of every daemon: the robot, and the endpoints to listen on and to connect to."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from protocol.errors import TransportError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkOptions:
-    """How a process reaches the others. Loopback needs nothing more; other hosts need the three TLS files."""
+    """Connections to the other processes. Loopback needs no TLS files; other hosts need all three."""
 
     robot: str = "r0"
     """Name of the robot; part of every key."""
     listen: tuple[str, ...] = ()
     """Zenoh endpoints to listen on, e.g. tcp/127.0.0.1:7448 or tls/0.0.0.0:7448."""
     connect: tuple[str, ...] = ()
-    """Zenoh endpoints of the other processes; absent ones are tried again until they are there."""
+    """Zenoh endpoints of the other processes; connecting is retried until they are there."""
     tls_ca: Path | None = None
-    """Certificate of the authority that signed everybody's certificates, in PEM."""
+    """Certificate of the authority that signed all processes' certificates, in PEM."""
     tls_certificate: Path | None = None
     """This process's certificate, in PEM."""
     tls_key: Path | None = None
-    """The key of that certificate, in PEM."""
+    """Private key of that certificate, in PEM."""
     shared_memory: bool = True
     """Do not send raw frames through shared memory to processes of the same host."""
 
     def tls_files(self) -> tuple[Path, Path, Path] | None:
-        """(ca, certificate, key), or None.
+        """Returns (ca, certificate, key), or None.
 
         Raises:
-            TransportError: only some of the three were given, or one is not a file.
+            TransportError: only some of the three are given, or one is not a file.
         """
         files = (self.tls_ca, self.tls_certificate, self.tls_key)
         if not any(files):

@@ -1,7 +1,7 @@
-"""``python -m protocol.probe ponder``: is that process there, and does it work? For health checks of containers.
+"""``python -m protocol.probe ponder``: checks that a process runs and works, for health checks of containers.
 
-A liveliness token says that the process exists, a READY heartbeat that its model is warm and its loop moves. The clock
-service has no model to warm and sends no heartbeat: its token is all there is to see.
+A liveliness token shows that the process exists, a READY heartbeat that its model is warm and its loop runs. The clock
+service has no model and sends no heartbeat: only its token is checked.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ _LOOK_AGAIN_NS = 20_000_000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProbeOptions:
-    """Looks for one process of a robot. Exit code 0: it is there and ready, 1: it is not, 2: no look was possible."""
+    """Checks one process of a robot. Exit code 0: it is there and ready, 1: it is not, 2: the check failed."""
 
     proc: tyro.conf.Positional[str]
     """ponder, pounce, clock or sim."""
     link: LinkOptions = field(default_factory=LinkOptions)
     within_ms: int = 2000
-    """How long to look."""
+    """Timeout of the check [ms]."""
 
 
 def trouble(link: Link, proc: str, *, within_ns: int) -> str:
-    """What is wrong with ``proc`` after at most ``within_ns``; "" as soon as nothing is."""
+    """The problem of ``proc`` after ``within_ns``; returns "" as soon as there is none."""
     tokens = link.bus.watch_alive(alive_key(link.robot, proc))
     healths = link.subscribe(HEALTH, proc=proc)
     is_there, newest, deadline_ns = False, None, time.monotonic_ns() + within_ns

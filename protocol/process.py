@@ -1,4 +1,4 @@
-"""How a daemon runs and leaves: one thread, a stop flag set by signals, log lines that a person can grep."""
+"""Common parts of the daemons: the loop in one thread, a stop flag set by signals, greppable log lines."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from protocol.bus import Bus
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
-IDLE_WAIT_NS = 20_000_000  # an idle daemon looks up this often: its heartbeat depends on it
+IDLE_WAIT_NS = 20_000_000  # an idle daemon steps this often: its heartbeat depends on it
 
 
 PARENT_VARIABLE = "PONDERPOUNCE_PARENT_PID"
-"""Who started a daemon for its own use writes its process id here, and the daemon leaves when that process is gone."""
+"""Environment variable with the process id of a parent; a daemon that has it exits when the parent is gone."""
 
 
 class StopFlag:
-    """True once SIGTERM or SIGINT came, or whoever wanted this process died; the loop then leaves by the door."""
+    """True after SIGTERM or SIGINT, or once the parent process died; the loop then ends normally."""
 
     def __init__(self) -> None:
         self.is_set = False
@@ -40,7 +40,7 @@ class StopFlag:
 
 
 def run(bus: Bus, step: Callable[[], bool], should_stop: Callable[[], bool]) -> None:
-    """Steps while there is work, waits for the bus while there is none."""
+    """Steps while there is work, and waits for the bus while there is none."""
     freeze_heap()
     while not should_stop():
         if not step():
@@ -48,16 +48,16 @@ def run(bus: Bus, step: Callable[[], bool], should_stop: Callable[[], bool]) -> 
 
 
 def freeze_heap() -> None:
-    """Tells the garbage collector that what exists now stays for good.
+    """Excludes all current objects from garbage collection.
 
-    Else it walks through a model library's million objects every now and then, in the middle of an episode.
+    Otherwise a collection would traverse a model library's million objects in the middle of an episode.
     """
     gc.collect()
     gc.freeze()
 
 
 def set_up_logging(level: str = "INFO") -> None:
-    """One line per fact on stderr, key=value."""
+    """Logs to stderr, one line per fact, key=value."""
     logging.basicConfig(stream=sys.stderr, level=level, format="%(asctime)s %(levelname)s %(name)s %(message)s")
 
 

@@ -1,9 +1,9 @@
-"""Large byte fields enter and leave protobuf without being copied four times.
+"""Encodes and decodes large byte fields of protobuf messages without the library's four copies.
 
-Protobuf's wire format lets a message's fields stand in any order, so a message with big blobs is written as ``tag
+Protobuf's wire format allows a message's fields in any order, so a message with big blobs is written as ``tag
 length bytes`` for each blob, followed by its small part as the library serializes it. Python's library would copy a
-200 kB image into the message, into its parent, into the string, and again on the way out; joining by hand copies once,
-splitting not at all. The blobs stand first: a reader finds them without walking through anything else.
+200 kB image into the message, into its parent, into the string, and again when decoding; joining by hand copies once,
+splitting not at all. The blobs come first, so that a reader finds them without parsing the rest.
 Format: protobuf.dev/programming-guides/encoding (field tag = number << 3 | wire type; 2 = length-delimited).
 """
 
@@ -17,7 +17,7 @@ _LENGTH_DELIMITED = 2
 
 
 def join(small: bytes, field: int, blob_field: int, blobs: Iterable[Blob]) -> bytes:
-    """One sub-message ``field`` per blob, whose ``blob_field`` holds it, and ``small``. Field numbers below 16."""
+    """Joins one sub-message ``field`` per blob, which is its ``blob_field``, and ``small``. Field numbers < 16."""
     parts: list[bytes | memoryview] = []
     for meta, blob in blobs:
         blob_head = _head(blob_field, len(blob)) if len(blob) else b""
@@ -28,9 +28,9 @@ def join(small: bytes, field: int, blob_field: int, blobs: Iterable[Blob]) -> by
 
 
 def split(payload: bytes, field: int, blob_field: int) -> tuple[bytes, list[tuple[bytes, memoryview]]]:
-    """The inverse of ``join``: what follows the blobs, and each leading sub-message with its blob apart.
+    """The inverse of ``join``: the bytes after the blobs, and each leading sub-message with its blob separated.
 
-    Another encoder may put the same fields elsewhere. Those stay where they are, for protobuf to read.
+    Another encoder may put these fields elsewhere. They remain in the bytes, for protobuf to parse.
 
     Raises:
         ValueError: a leading blob is cut short.
@@ -59,7 +59,7 @@ def _head(field: int, size: int) -> bytes:
 
 
 def _extent(payload: bytes, at: int, limit: int) -> tuple[int, int]:
-    """Where the bytes begin and end whose length stands at ``at``."""
+    """Start and end of the bytes whose length prefix is at ``at``."""
     size = shift = 0
     while at < limit and shift < 70:
         byte = payload[at]

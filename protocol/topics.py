@@ -1,7 +1,7 @@
-"""Where each message travels: one name per topic, its key expression, its quality of service.
+"""Topics and calls: their names, key expressions and quality of service.
 
-Root ``pp/@v1/{robot}``: a chunk that starts with ``@`` is never matched by a wildcard, so protocol majors cannot mix.
-The episode id is part of the key: a late answer to an older episode cannot match.
+The root is ``pp/@v1/{robot}``: no wildcard matches a chunk that starts with ``@``, so protocol majors cannot mix. The
+episode id is part of the key, so a late answer to an older episode cannot match.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 
 class Priority(IntEnum):
-    """Zenoh's classes, so that only ``zenoh_bus`` needs zenoh."""
+    """Zenoh's priority classes, so that only ``zenoh_bus`` imports zenoh."""
 
     REAL_TIME = 1
     INTERACTIVE_HIGH = 2
@@ -36,8 +36,8 @@ class Topic(Generic[T]):
     """One stream of one message type.
 
     Congestion control is DROP on every topic: a hung subscriber must never block the control path (with BLOCK a put was
-    measured to wait 5 s). ``keep`` is how many undrained messages a subscriber holds; older ones fall out, so data
-    never grows old in a queue.
+    measured to wait 5 s). A subscriber holds at most ``keep`` undrained messages and drops older ones, so that data
+    never ages in a queue.
     """
 
     name: str
@@ -88,7 +88,7 @@ def checked_id(value: str, what: str) -> str:
     """Returns ``value`` if it can be one chunk of a key.
 
     Raises:
-        ProtocolError: it is empty, too long or has a character that keys give a meaning.
+        ProtocolError: it is empty, too long, or has a character with a meaning in keys.
     """
     if not _ID.fullmatch(value):
         raise ProtocolError(
@@ -98,14 +98,14 @@ def checked_id(value: str, what: str) -> str:
 
 
 def stream_key(topic: Topic[T], robot: str, episode: str, proc: str) -> str:
-    """Key a message of ``topic`` is published on; '*' stands for any episode or process."""
+    """Key of a message of ``topic``; '*' stands for any episode or process."""
     if topic is HEALTH or topic is PHASE:
         return f"{ROOT}/{robot}/{topic.name}/{proc}"
     return f"{ROOT}/{robot}/ep/{episode}/{topic.name}"
 
 
 def episode_of(key: str) -> str:
-    """The episode chunk of a stream key; "" for keys that have none."""
+    """The episode chunk of a stream key; "" if it has none."""
     parts = key.split("/")
     return parts[4] if len(parts) > 4 and parts[3] == "ep" else ""
 
@@ -115,11 +115,11 @@ def call_key(call: Call, robot: str, proc: str) -> str:
 
 
 def alive_key(robot: str, proc: str) -> str:
-    """Liveliness token: disappears within the lease when the process dies or freezes."""
+    """Key of a process's liveliness token, which disappears within the lease when it dies or freezes."""
     return f"{ROOT}/{robot}/alive/{proc}"
 
 
-@lru_cache(maxsize=4096)  # a bus in one process asks it of every subscription at every message
+@lru_cache(maxsize=4096)  # LocalBus calls it for every subscription at every message
 def matches(expression: str, key: str) -> bool:
     """Zenoh's rule for '*' (one chunk, never one that starts with '@'); '**' is not used here."""
     left, right = expression.split("/"), key.split("/")

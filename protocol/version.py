@@ -1,4 +1,4 @@
-"""Which program this is: the distribution's version."""
+"""The distribution's version."""
 
 from __future__ import annotations
 
@@ -10,5 +10,5 @@ DISTRIBUTION = "ponderpounce-server"
 def version() -> str:
     try:
         return metadata.version(DISTRIBUTION)
-    except metadata.PackageNotFoundError:  # run from a source tree that was never installed
+    except metadata.PackageNotFoundError:  # a source tree that is not installed
         return "0+source"

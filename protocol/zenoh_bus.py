@@ -1,8 +1,8 @@
 """The bus over zenoh; the only file that imports zenoh.
 
-Peers with explicit endpoints: no multicast, no gossip, so strangers on the host cannot join. Loopback by default; an
-endpoint that others can reach is refused without TLS. Shared memory is on: raw frames between processes of one host
-travel through it by themselves. Lease 500 ms: a frozen peer's token is gone in half a second (default: 10 s).
+Peers have explicit endpoints, no multicast and no gossip, so that other processes on the host cannot join. Endpoints
+that other hosts can reach are refused without TLS. Shared memory is on: zenoh sends raw frames between processes of one
+host through it. The lease is 500 ms (default: 10 s): a frozen peer's token is gone in half a second.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ _RUNTIME_VARIABLE = "ZENOH_RUNTIME"
 _ONE_RUNTIME = (
     "(" + ", ".join(f"{n}: (handover: app)" for n in ("rx", "tx", "net", "acc")) + ", app: (worker_threads: 2))"
 )
-"""Zenoh's threads: two that do everything, instead of six that wake each other; a fifth less per message (measured)."""
+"""Zenoh's threads: two for all work instead of six that wake each other; a fifth less time per message (measured)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tls:
-    """Mutual TLS: PEM files. Both sides prove who they are; access control by certificate is zenoh's config."""
+    """PEM files for mutual TLS, which authenticates both sides; access control by certificate is zenoh's config."""
 
     ca: Path
     certificate: Path
@@ -51,7 +51,7 @@ class Tls:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Endpoints:
-    """Where one process listens and whom it connects to, as zenoh endpoints: ``tcp/127.0.0.1:7448``."""
+    """Endpoints to listen on and to connect to, in zenoh's form: ``tcp/127.0.0.1:7448``."""
 
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
@@ -76,7 +76,7 @@ def is_loopback(endpoint: str) -> bool:
     """Whether only this host can use ``endpoint``.
 
     Raises:
-        TransportError: it does not read ``PROTOCOL/ADDRESS``.
+        TransportError: it is not of the form ``PROTOCOL/ADDRESS``.
     """
     protocol, slash, address = endpoint.partition("/")
     if not slash or not address:
@@ -99,13 +99,13 @@ def zenoh_config(endpoints: Endpoints) -> zenoh.Config:
         "scouting/gossip/enabled": False,
         "listen/endpoints": list(endpoints.listen),
         "connect/endpoints": list(endpoints.connect),
-        "connect/timeout_ms": -1,  # with the next line: keep trying behind our back; 0 would try once
+        "connect/timeout_ms": -1,  # with the next line: keep trying in the background; 0 would try once
         "connect/exit_on_failure": False,
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 400, "period_increase_factor": 2},
         "transport/link/tx/lease": LEASE_MS,
         "transport/link/tx/keep_alive": 5,
-        # Sixteen batches per class, the most there are; the default is two. A raw observation is seven of them, and the
-        # clock's poll says several small things at once: on a busy host the third would be dropped after 1 ms.
+        # Sixteen batches per class, the maximum; the default is two. A raw observation takes seven, and the clock's
+        # poll sends several small messages at once: on a busy host the third would be dropped after 1 ms.
         **{f"transport/link/tx/queue/size/{name}": 16 for name in _QUEUES},
         "transport/shared_memory/enabled": endpoints.shared_memory and endpoints.are_local,
     }
@@ -128,14 +128,14 @@ def zenoh_config(endpoints: Endpoints) -> zenoh.Config:
 class ZenohBus:
     """``Bus`` over one zenoh session.
 
-    Zenoh's threads only append to rings and ring the bell; whoever owns the bus drains and works in its own thread.
+    Zenoh's threads only append to rings and ring the bell; the owner of the bus drains and works in its own thread.
 
     Raises:
         TransportError: the listen endpoint is taken or cannot be opened.
     """
 
     def __init__(self, endpoints: Endpoints) -> None:
-        os.environ.setdefault(_RUNTIME_VARIABLE, _ONE_RUNTIME)  # zenoh reads it once per process, and has no other way
+        os.environ.setdefault(_RUNTIME_VARIABLE, _ONE_RUNTIME)  # zenoh's only way to set it; read once per process
         zenoh.init_log_from_env_or("error")
         keep_freed_memory()
         try:
@@ -146,12 +146,12 @@ class ZenohBus:
         self.is_local = endpoints.are_local
         self._bell = Bell()
         self._publishers: dict[str, Any] = {}
-        self._declared: list[Any] = []  # dropped handles would undeclare themselves
+        self._declared: list[Any] = []  # zenoh undeclares handles that are garbage-collected
 
     def publish(self, key: str, payload: bytes, *, encoding: str, attachment: bytes, priority: Priority) -> None:
         publisher = self._publishers.get(key)
         if publisher is None:
-            if len(self._publishers) >= _MAX_PUBLISHERS:  # keys name episodes: forget the oldest
+            if len(self._publishers) >= _MAX_PUBLISHERS:  # keys contain episodes: drop the oldest
                 self._publishers.pop(next(iter(self._publishers))).undeclare()
             publisher = self._session.declare_publisher(
                 key,
@@ -223,7 +223,7 @@ def _copy(sample: zenoh.Sample) -> Sample:
 def _replier(query: zenoh.Query, key: str) -> Callable[[bytes], None]:
     def reply(payload: bytes) -> None:
         query.reply(key, payload)
-        query.drop()  # the caller waits for the end of replies, not for the first
+        query.drop()  # the caller waits for the end of the replies, not for the first
 
     return reply
 

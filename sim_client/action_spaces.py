@@ -1,4 +1,4 @@
-"""What policies of other benchmarks mean by an action, as joint targets of our arm.
+"""Action spaces of other benchmarks' policies, converted to joint targets of our arm.
 
 | space | numbers | meaning |
 | --- | --- | --- |
@@ -53,7 +53,7 @@ def row_of(message: Mapping[str, Any]) -> NDArray[np.float64]:
 
 
 def hold(space: ActionSpace, last: Mapping[str, Any] | None, joints: NDArray[Any]) -> dict[str, Any]:
-    """What stays where it is: the last targets again, no delta, or before any target the joints as they are.
+    """An action that holds still: the last targets, a zero delta, or before any target the measured joints.
 
     Raises:
         ValueError: tool poses, before the first one.

@@ -18,7 +18,7 @@ from sim_client.swapped_ponder import donors_in
 
 
 class EvaluationError(Exception):
-    """An evaluation that cannot be made: the message says what was expected, what came, and the way out."""
+    """An evaluation that cannot run; the message says what was expected, what was given, and the way out."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,7 +46,7 @@ class ConditionOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkersOptions:
-    """Who plays the episodes. The results do not depend on it."""
+    """Processes that play the episodes. The results do not depend on them."""
 
     workers: int = 1
     """Number of worker processes on this computer; each loads the checkpoints."""
@@ -62,7 +62,7 @@ class WorkersOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogOptions:
-    """What is written and shown."""
+    """Logs and progress."""
 
     record: bool = False
     """Write one MCAP per episode, about 10 MB a minute."""

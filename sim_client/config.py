@@ -79,14 +79,14 @@ class ServersOptions:
     """Where the clock service runs, and how long servers may take."""
 
     clock: Literal["auto", "embedded", "daemon"] = "auto"
-    """Place of the clock service. auto: a process of its own in real time, this process in lockstep."""
+    """Place of the clock service. auto: its own process in real time, this process in lockstep."""
     patience_s: float = 120.0
     """Longest wait in seconds for servers to be ready, and in lockstep for any answer."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogOptions:
-    """What is written and shown."""
+    """Logs and progress."""
 
     record: bool = True
     """Do not write an MCAP per episode."""

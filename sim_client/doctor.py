@@ -1,4 +1,4 @@
-"""``pp-doctor``: checks whether this computer can run the servers and the simulator, and says what to type if not."""
+"""``pp-doctor``: checks whether this computer can run the servers and the simulator, and names commands to fix it."""
 
 from __future__ import annotations
 

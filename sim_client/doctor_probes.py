@@ -1,7 +1,7 @@
-"""What ``pp-doctor`` looks at: each probe is a function from facts to one ``Finding``.
+"""The checks of ``pp-doctor``: each probe is a function from facts to one ``Finding``.
 
-The facts come in as arguments, so a test can break each of them. What may hang, crash or pull in a large package
-(rendering, torch) runs in a process of its own.
+The facts are arguments, so a test can break each of them. Checks that may hang, crash or import a large package
+(rendering, torch) run in their own process.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ print(f"torch {torch.__version__}, transformers {transformers.__version__}, {dev
 class Level(StrEnum):
     OK = "ok"
     WARNING = "warning"
-    """Something works less well, or not at all, that nobody may need."""
+    """Something optional does not work, or works less well."""
     FAILED = "failed"
 
 
@@ -174,7 +174,7 @@ def run(command: Sequence[str], environment: Mapping[str, str], *, limit_s: floa
 
 
 def gl(backend: str, run: Run = run) -> Finding:
-    """Renders one picture and looks whether anything is on it."""
+    """Renders one picture and checks that it is not empty."""
     ran = run([sys.executable, "-c", _RENDER], {"MUJOCO_GL": backend})
     contrast = re.search(r"^contrast (\d+)$", ran.output, re.MULTILINE)
     if ran.code == 0 and contrast and int(contrast[1]) > 0:

@@ -1,4 +1,4 @@
-"""The robot's side of one episode: say what is seen, do what is commanded, and be safe when the commands stop.
+"""The robot's side of one episode: publishes observations, executes commands, and is safe when the commands stop.
 
 The simulated world moves only by commanded ticks. The observation of tick k+1 is published as soon as it is rendered,
 with the instant it belongs to; the schedule uses it from that instant on, so transport and rendering lie between ticks.
@@ -27,12 +27,12 @@ from sim_client.robot import observation, status_of
 CLOCK_SILENCE_NS = 500 * NS_PER_MS
 """Real time: commands that stay away this long mean that the clock service is gone. The servos hold meanwhile."""
 HOLD_TICKS = 10
-"""Ticks for which the robot then holds by itself, half a second, before it ends the episode."""
+"""Ticks (half a second) for which the robot then holds before it ends the episode."""
 STOPPED_TICKS = 60
-"""An episode that the ladder stopped, and nobody engaged again for three seconds, is over."""
+"""Ticks (three seconds) after which an episode that the ladder stopped ends unless it is engaged again."""
 
 Others = Callable[[int], None]
-"""Lets everybody else run: returns when something may have come, or after so many nanoseconds."""
+"""Lets the other participants run: returns when a message may have come, or after the given nanoseconds."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,7 +51,7 @@ def always(tick: int) -> bool:
 
 @dataclass(slots=True)
 class RobotSide:
-    """Runs one episode against whoever publishes actions. Where nobody ``looks`` at a tick, it is not rendered."""
+    """Runs one episode with the publisher of actions. A tick for which ``looks`` is False is not rendered."""
 
     link: Link
     environment: Environment
@@ -118,7 +118,7 @@ class RobotSide:
         self.link.publish(OBSERVATION, observation(snapshot, self._tick, source_ns, codec), at_ns=source_ns)
         texts = (snapshot.simple_subgoal, snapshot.grounded_subgoal)
         kinds = (m.SubgoalKind.TASK_SIMPLE, m.SubgoalKind.TASK_GROUNDED)
-        is_new = snapshot.subgoal_index != self._subgoal_index  # said again even if its words are the ones before
+        is_new = snapshot.subgoal_index != self._subgoal_index  # published again even if its text is the same
         for kind, text, before in zip(kinds, texts, self._texts, strict=True):
             if is_new or text != before:
                 subgoal = m.Subgoal(kind=kind, text=text, tick=self._tick)

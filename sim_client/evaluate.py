@@ -73,7 +73,7 @@ def evaluate(options: EvalOptions, workers: Workers[Job, Line]) -> dict[str, Any
         EvaluationError: an episode could not be started.
         LedgerError: the folder holds another condition, or another process works in it.
         DatasetError: workers keep dying, or there is no Ray.
-        TaskError, DonorError, TransportError: as their names say, before or at the first episode.
+        TaskError, DonorError, TransportError: before or at the first episode; see there.
     """
     jobs = options.jobs()
     common = {name: value for name, value in options.config().items() if name not in (*_HOW_MANY, *_HOW)}

@@ -21,7 +21,7 @@ _GRACE_S = 5.0
 
 
 def free_ports(count: int) -> list[int]:
-    """Loopback ports that nobody uses now (somebody may take one before we do: the server then says so)."""
+    """Free loopback ports; if another process takes one meanwhile, the server reports it."""
     sockets = [socket.socket() for _ in range(count)]
     try:
         for s in sockets:

@@ -1,7 +1,7 @@
-"""Finished episodes of an evaluation: a line each in one file, there once and whole, whoever is killed when.
+"""Finished episodes of an evaluation: one line each in a file, complete and stored once, even if processes are killed.
 
-A line is appended and forced to disk before the next; one that a kill has torn has no end of line and is cut off by
-the next run. A lock keeps two evaluations from one folder.
+A line is appended and synced to disk before the next; one that a kill has truncated has no end of line and is removed
+by the next run. A lock keeps two evaluations out of one folder.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ SETTINGS, EPISODES = "settings.json", "episodes.jsonl"
 
 
 class LedgerError(Exception):
-    """The folder cannot be gone on with: the message says what was expected, what came, and the way out."""
+    """The evaluation cannot continue in this folder; the message says what was expected, and the way out."""
 
 
 class Ledger:
@@ -50,7 +50,7 @@ class Ledger:
             raise
 
     def commit(self, key: str, line: dict[str, Any]) -> None:
-        """Puts one line on disk; a key that is there already stays as it is."""
+        """Writes one line to disk; an existing key is kept."""
         if key in self.lines:
             return
         self._file.write(json.dumps({"key": key, "episode": line}).encode() + b"\n")
@@ -85,7 +85,7 @@ class Ledger:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Atomically: a reader never sees half a file."""
+    """Writes atomically, so that a reader never gets a partial file."""
     partial = path.with_suffix(".json.partial")
     partial.write_text(json.dumps(value, indent=1) + "\n")
     partial.replace(path)

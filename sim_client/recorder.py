@@ -1,6 +1,6 @@
-"""Everything that was said, taken off the bus and handed to the log's writer thread.
+"""Records all messages on the bus through the log's writer thread.
 
-A passive observer: it subscribes like anybody else, so what lands in the file is what travelled, byte for byte.
+It is a passive subscriber, so the file has the messages as transmitted, byte for byte.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Recorder:
                 self._log.write(topic, message, sample.payload, time.time_ns())
 
     def end(self, result: m.EpisodeResult) -> list[str]:
-        """Writes the result and closes the log; says what is missing from it."""
+        """Writes the result and closes the log; returns descriptions of what is missing from it."""
         missing: list[str] = []
         if self._log is not None:
             self._link.publish(RESULT, result, at_ns=max((t.decided_ns for t in self.ticks), default=0))

@@ -32,9 +32,9 @@ from sim_client.blueprint import TIMELINE, episode_blueprint
 
 APPLICATION_ID = "ponderpounce"
 _OPEN_S = 60.0  # software rendering on a busy machine
-_SETTLE_S = 3.0  # the viewer tells nobody when it has decoded and drawn what is on screen
+_SETTLE_S = 3.0  # the viewer does not report when it has decoded and drawn its screen
 _STEP_S = 0.1
-_END_S = 5.0  # for a viewer that nobody hears any more to be gone
+_END_S = 5.0  # for a viewer that closed its connection to exit
 _TAIL_CHARS = 500
 
 
@@ -131,14 +131,14 @@ def _headless() -> Iterator[Any]:
         port = free.getsockname()[1]
     command = [_rerun(), "--headless", "--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen"]
     with tempfile.TemporaryFile("w+") as output:
-        # A group of its own: ``rerun`` is a script that starts the viewer, and both have to end.
+        # In its own process group: ``rerun`` is a script that starts the viewer, and both have to end.
         process = subprocess.Popen(command, env=_environ(), stdout=output, stderr=output, start_new_session=True)
         try:
             _await(lambda: process.poll() is not None or _listens(port), "the viewer did not start")
             if process.poll() is not None:
                 raise ReplayError(_last_words(output))
             yield ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
-        except ConnectionError as error:  # it listens before it looks for a driver, and ends if there is none
+        except ConnectionError as error:  # it listens before it searches for a driver, and exits if there is none
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(_END_S)
                 raise ReplayError(_last_words(output)) from error
@@ -153,8 +153,8 @@ def _last_words(output: IO[str]) -> str:
     output.seek(0)
     text = output.read()
     panic = text.find("panicked at")  # what follows is a backtrace
-    said = text[-_TAIL_CHARS:].strip() if panic < 0 else text[panic:].partition("\n")[0]
-    return f"the viewer ended at once; is a Vulkan driver installed (mesa-vulkan-drivers has one)? It said: {said}"
+    message = text[-_TAIL_CHARS:].strip() if panic < 0 else text[panic:].partition("\n")[0]
+    return f"the viewer ended at once; is a Vulkan driver installed (mesa-vulkan-drivers has one)? It said: {message}"
 
 
 def _has_opened(viewer: Any) -> bool:

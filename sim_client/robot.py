@@ -1,4 +1,4 @@
-"""The simulated robots as the protocol sees them: their limits, their cameras, their observations."""
+"""The simulated robots in the protocol's terms: their limits, cameras and observations."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def demonstration(environment: Environment, codec: ImageCodec, sampling: DemoSam
 
 
 def observation(snapshot: Snapshot, tick: int, source_ns: int, codec: ImageCodec) -> Observation:
-    """What the robot says at ``tick``; without images where nothing was rendered."""
+    """The robot's observation at ``tick``; without images if nothing was rendered."""
     return Observation(
         tick=tick,
         source_ns=source_ns,

@@ -1,6 +1,6 @@
 """The robot's end of the bus, between and around episodes: it opens them with the servers, and closes them.
 
-What moves in between is the caller's: a simulated world (`suite`), or a client of another protocol (`gateway.machine`).
+The caller runs the episode in between: a simulation (`suite`), or a client of another protocol (`gateway.machine`).
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class RobotEnd:
         """Asks PONDER which frames of a demonstration it reads.
 
         Raises:
-            EpisodeRefused: it cannot say.
+            EpisodeRefused: PONDER refuses the call.
             TransportError: it is not ready within the patience.
         """
         reply = self._patiently(self._ask_ponder)
@@ -80,7 +80,7 @@ class RobotEnd:
         return self._patiently(lambda: self._ask_clock(request))
 
     def take_turn(self, longest_ns: int) -> None:
-        """One turn for everybody else; with an embedded clock, no longer than until it has something to do."""
+        """Gives the other participants one turn; with an embedded clock, at most until it has something to do."""
         if self.clock is not None:
             if self.clock.step():
                 return
@@ -146,7 +146,7 @@ class RobotEnd:
         if self.clock is not None:
             self.clock.close(request)
         else:
-            with contextlib.suppress(CallFailed):  # the log already says that the clock is lost
+            with contextlib.suppress(CallFailed):  # the log already has the clock's loss
                 self._link.call(CLOSE, "clock", request, timeout_ns=_CLOSE_NS)
 
     def _await_ticks(self, num_ticks: int) -> None:

@@ -30,7 +30,7 @@ from sim_client.robot import demonstration, simulated_robot
 from sim_client.robot_end import RobotEnd
 
 OnTick = Callable[[int, int], None]
-"""Called with (episode index, ticks played) as an episode goes on."""
+"""Called with (episode index, ticks played) during an episode."""
 
 
 class Suite:
@@ -140,13 +140,13 @@ class Suite:
         )
 
     def _demonstration(self, environment: Environment) -> tuple[m.DemoFrame, ...]:
-        """Raises TransportError, EpisodeRefused: PONDER does not say how it is to be sampled."""
+        """The demonstration's frames. Raises TransportError or EpisodeRefused if PONDER's contract is not available."""
         if not environment.has_demonstration:
             return ()
         return demonstration(environment, images.wire_codec(self._link.bus.is_local), self._end.demo_sampling())
 
     def _looks(self, tick: int) -> bool:
-        """Whether the pictures of a tick are wanted: by the log, or by the models when the schedule says so."""
+        """Whether a tick's pictures are needed, by the log or, according to the schedule, by the models."""
         conductor = self._end.clock.conductor if self._end.clock is not None else None
         is_logged = self._options.log.record and tick % (CONTROL_HZ // self._options.log.record_hz) == 0
         return is_logged or conductor is None or conductor.will_look(tick)
@@ -157,7 +157,7 @@ class Suite:
 
 
 def versions() -> dict[str, str]:
-    """What ran: part of every log and result."""
+    """Versions of the software and the machine, for every log and result."""
     found = {DISTRIBUTION: version(), "python": platform.python_version(), "machine": platform.machine()}
     for name in ("mujoco", "numpy", "eclipse-zenoh", "protobuf", "mcap"):
         try:
@@ -173,7 +173,7 @@ def run_seed(seed: int, run: int) -> int:
 
 
 def _model(contract: m.Contract) -> dict[str, Any]:
-    """What is worth knowing afterwards about a model that answered."""
+    """Facts about a model for the results."""
     wanted = contract.demonstrations
     return {
         "model_hash": contract.model_hash,

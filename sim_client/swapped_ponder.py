@@ -22,7 +22,7 @@ Key = tuple[str, int, int]  # task, run, seed
 
 
 class DonorError(ValueError):
-    """There is no cognition to answer with: the message says what is missing and the way out."""
+    """There is no cognition to answer with; the message says what is missing, and the way out."""
 
 
 class SwappedPonder(PonderDouble):

@@ -141,7 +141,7 @@ class TableBenchmark(StepBenchmark):  # type: ignore[misc]  # untyped where vla-
         return {"success": snapshot.status.value == "success", "status": snapshot.status.value}
 
     def get_hold_action(self, last_action: dict[str, Any] | None) -> dict[str, Any]:
-        """What a live runner commands when the model has nothing new: the last targets, or where the arm is."""
+        """A live runner's command when the model has no new one: the last targets, or the arm's pose."""
         from dual_system.tasks.panda import HOME_QPOS
 
         snapshot: Snapshot | None = self._last_result.obs

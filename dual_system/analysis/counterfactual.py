@@ -1,8 +1,8 @@
-"""Does a policy act on its own past? The score over counterfactual pairs, whose presents are the same to the last bit.
+"""P(own): whether a policy acts on its own past, over counterfactual pairs whose presents are equal to the last bit.
 
-Of each pair the policy is asked twice, once with each past, and each answer is compared with what the script does next
-in either branch. P(own) is how often the answer is closer to that of the branch whose past was given. A policy that
-does not use the past gives the same answer twice, so it is right once and wrong once, or tied: it scores exactly 1/2.
+The policy predicts twice per pair, once with each past, and each prediction is compared with the script's next actions
+in both branches. P(own) is how often it is closer to the branch whose past was given. A policy that ignores the past
+predicts the same twice, so it is right once and wrong once, or tied: it scores exactly 1/2.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SCHEMA = "ponderpounce-counterfactual/1"
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Counterfactual:
-    """What ``pp-counterfactual`` found for one pair of checkpoints: per task, (P,) mean scores of its pairs."""
+    """Result of ``pp-diagnose counterfactual`` for one pair of checkpoints: per task, (P,) mean scores of its pairs."""
 
     label: str
     by_task: Mapping[str, NDArray[np.float64]]
@@ -35,7 +35,7 @@ class Counterfactual:
 
 
 def read_counterfactual(path: Path) -> Counterfactual:
-    """Reads a file of ``pp-counterfactual``, or that of a folder. Raises ResultsError if it is none or has no pairs."""
+    """Reads a result file, or that of a folder. Raises ResultsError if it is not one or has no pairs."""
     file = path / COUNTERFACTUAL if path.is_dir() else path
     try:
         found = json.loads(file.read_text())
@@ -48,22 +48,22 @@ def read_counterfactual(path: Path) -> Counterfactual:
             scores.setdefault(pair["task"], []).append(float(pair["score"]))
         is_untrained = any(model["is_untrained"] for model in found["models"].values())
     except OSError as error:
-        raise ResultsError(f"{file} cannot be read ({error.strerror}); give folders of pp-counterfactual") from error
+        raise ResultsError(f"{file} cannot be read ({error.strerror}); pp-diagnose counterfactual writes it") from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ResultsError(f"{file} is no file of pp-counterfactual: {error!r}") from error
+        raise ResultsError(f"{file} is no file of pp-diagnose counterfactual: {error!r}") from error
     label = str(path.parent if path.name == COUNTERFACTUAL else path)
     by_task = {task: np.array(of_task) for task, of_task in sorted(scores.items())}
     return Counterfactual(label=label, by_task=by_task, is_untrained=is_untrained)
 
 
 def follows_own_past(predicted: ArrayLike, script: ArrayLike, *, scale: ArrayLike | None = None) -> NDArray[np.float64]:
-    """Returns for each pair and branch (P, 2): 1 if the answer follows the past it was given, 0 the other, 1/2 tied.
+    """Returns for each pair and branch (P, 2): 1 if the prediction follows the given past, 0 the other, 1/2 if tied.
 
     Args:
-        predicted: (P, 2, H, A) answers of the policy; [p, b] given the past of branch b.
-        script: (P, 2, H, A) what the script does next in the branches.
-        scale: (A,) what a difference of each action entry is divided by, such as its standard deviation in the
-            training data; 1 by default, a radian beside a gripper command.
+        predicted: (P, 2, H, A) actions of the policy; [p, b] is given the past of branch b.
+        script: (P, 2, H, A) the script's next actions in the branches.
+        scale: (A,) divisors of the differences per action dim, such as the standard deviations in the training data;
+            1 by default, so that a radian weighs as much as a gripper command of 1.
 
     Raises:
         ValueError: shapes differ or are not (P, 2, H, A), values are not finite, or a scale is not positive.
@@ -82,7 +82,7 @@ def follows_own_past(predicted: ArrayLike, script: ArrayLike, *, scale: ArrayLik
 
 
 def p_own(predicted: ArrayLike, script: ArrayLike, *, scale: ArrayLike | None = None) -> float:
-    """Returns P(the action follows its own past) over all pairs and branches; see `follows_own_past`.
+    """Returns P(own), the mean of `follows_own_past` over all pairs and branches.
 
     Raises ValueError as that does, and if there are no pairs.
     """

@@ -1,7 +1,7 @@
-"""What ``pp-diagnose`` writes down, ``diagnosis.json``, with its uncertainty: pure functions of losses.
+"""Reads ``diagnosis.json`` of ``pp-diagnose`` and estimates its uncertainty.
 
-Losses of one task are an (E, C) array: a mean over an episode's ticks in each of C conditions. Ticks of one episode are
-not independent, so it is episodes that are resampled, within their task (the paper's task-stratified bootstrap).
+Losses of one task are an (E, C) array: means over each episode's ticks in each of C conditions. Ticks of one episode
+are not independent, so episodes are resampled, within their task (the paper's task-stratified bootstrap).
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ class Losses:
     """One part of a diagnosis.
 
     Attributes:
-        names: of the conditions.
-        means: per task, (E, C).
-        num_ticks: per task, (E,): how many each mean is over, at least 1.
+        names: names of the conditions.
+        means: mean losses per task, (E, C).
+        num_ticks: number of ticks in each mean, per task, (E,), at least 1.
     """
 
     names: tuple[str, ...]
@@ -63,7 +63,7 @@ def read_diagnosis(path: Path) -> Diagnosis:
     """Reads a diagnosis, or that of a folder.
 
     Raises:
-        ResultsError: no such file, or it is not one.
+        ResultsError: the file does not exist or is no diagnosis.
     """
     file = path / DIAGNOSIS if path.is_dir() else path
     try:
@@ -82,12 +82,12 @@ def read_diagnosis(path: Path) -> Diagnosis:
 
 
 def absolute(losses: Losses, name: str) -> Interval:
-    """Returns one condition's mean over all ticks. Raises ValueError if there are none."""
+    """Returns one condition's mean over all ticks. Raises ValueError if there are no ticks."""
     return _bootstrap(losses, losses.names.index(name), None)
 
 
 def ratio(losses: Losses, name: str, to: str) -> Interval:
-    """Returns one condition's mean over another's, resampled together. Raises ValueError if there are no ticks."""
+    """Returns the ratio of two conditions' means, resampled together. Raises ValueError if there are no ticks."""
     return _bootstrap(losses, losses.names.index(name), losses.names.index(to))
 
 

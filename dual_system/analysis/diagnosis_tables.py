@@ -1,4 +1,4 @@
-"""Tables of what ``pp-diagnose`` and ``pp-counterfactual`` wrote, the paper's Figure 4 in numbers among them."""
+"""Tables of ``pp-diagnose`` and its counterfactual pairs, among them the paper's Figure 4 in numbers."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from dual_system.analysis.statistics import Interval, bootstrap_mean
 DIAGNOSIS_NOTE = f"""\
 Offline and teacher-forced: flow-matching loss on recorded episodes, the same ticks, targets and flow draws in every
 condition; 95 % intervals in brackets by a bootstrap of episodes within tasks. No success rate. Rows marked
-"{paper.MARK}" are told in the paper's 5.2: another dataset and other models."""
+"{paper.MARK}" are reported in the paper's 5.2: another dataset and other models."""
 COUNTERFACTUAL_NOTE = """\
-Pairs of episodes that look the same now and had another past: how often the action is closer to what its own past asks
-for. Whoever does not use the past scores exactly 50. 95 % intervals by a bootstrap of pairs."""
+Pairs of episodes with equal presents and different pasts: how often the action is closer to that of its own past. A
+policy that ignores the past scores exactly 50. 95 % intervals by a bootstrap of pairs."""
 
 
 def diagnosis_tables(diagnoses: Sequence[Diagnosis]) -> str:
-    """Returns everything as markdown. Raises ValueError if a diagnosis has no ticks to measure on."""
+    """Returns all tables as markdown. Raises ValueError if a diagnosis has no ticks."""
     untrained = [f"- `{each.label}`: **untrained weights.**" for each in diagnoses if each.is_untrained]
     return "\n\n".join(
         [
@@ -37,7 +37,7 @@ def diagnosis_tables(diagnoses: Sequence[Diagnosis]) -> str:
 
 
 def by_age(diagnoses: Sequence[Diagnosis]) -> str:
-    """Returns a row for each diagnosis: the loss at every age over that at 0.3 s, and that one itself."""
+    """Returns a row for each diagnosis: the loss at 0.3 s, and that at every age relative to it."""
     ages_s = [f"{FRESH_AGE_S + float(name):.1f}" for name in diagnoses[0].parts["staleness"].names]
     rows = []
     for each in diagnoses:

@@ -1,7 +1,6 @@
-"""The paper's own figures on RoboMME, typed from its tables: success in per cent, measured in another simulator.
+"""The paper's own results on RoboMME, typed from its Tables 1, 3, 4 and 7 and Figure 4: success in per cent.
 
-They stand beside ours as what was published, never as a baseline of ours. Reported there: tables 1, 3, 4 and 7, and
-figure 4.
+They were measured in another simulator. They appear beside ours as published numbers, never as a baseline of ours.
 """
 
 from __future__ import annotations
@@ -70,7 +69,7 @@ TABLE_7 = MappingProxyType(
         ),
     }
 )  # fmt: skip
-"""Per task, in the order of `TASKS`."""
+"""Success per task, in the order of `TASKS`."""
 
 TABLE_1 = MappingProxyType(
     {
@@ -87,7 +86,7 @@ TABLE_1 = MappingProxyType(
         "PonderPounce 9×": (81.33, 80.17, 92.67, 48.00, 75.54),
     }
 )
-"""Per family, in the order of `FAMILIES`, and the average."""
+"""Success per family, in the order of `FAMILIES`, and the average."""
 
 TABLE_3 = MappingProxyType(
     {
@@ -97,7 +96,7 @@ TABLE_3 = MappingProxyType(
         "subgoal text in place of cognition": (62.00, 61.67, 73.34, 42.83, 59.96),
     }
 )
-"""As Table 1: what was trained otherwise (Table 3)."""
+"""The training ablations of Table 3, in the form of `TABLE_1`."""
 
 TABLE_4 = MappingProxyType(
     {
@@ -105,7 +104,7 @@ TABLE_4 = MappingProxyType(
         "transitions only, told 300 ms": (0.17, 0.17, 0.67, 6.33, 1.83),
     }
 )
-"""As Table 1: one checkpoint, another delivery (Table 4)."""
+"""The delivery ablations of Table 4 with one checkpoint, in the form of `TABLE_1`."""
 
 FIGURE_4 = MappingProxyType(
     {
@@ -114,9 +113,9 @@ FIGURE_4 = MappingProxyType(
         "4 s": {0.3: 1.00, 4.3: 1.14},
     }
 )
-"""By the refresh interval in training: the loss at an age [s], over that at 0.3 s. What the text of 5.2 tells."""
+"""Per refresh interval in training: the loss at an age [s] relative to that at 0.3 s, from the text of 5.2."""
 FIGURE_4_FRESH = MappingProxyType({"1 s": 0.117, "2 s": 0.213, "4 s": 0.232})
-"""The loss itself at 0.3 s."""
+"""Per refresh interval in training: the loss at 0.3 s."""
 
 SHOWN = (
     "π0.5 1×",
@@ -126,7 +125,7 @@ SHOWN = (
     "FrameSamp+Modul 9×",
     "PonderPounce 9×",
 )
-"""Those of Table 7 whose columns stand beside ours."""
+"""Methods of Table 7 to show beside ours."""
 
 
 def mean_of(method: str, tasks: Sequence[str]) -> float:

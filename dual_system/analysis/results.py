@@ -1,4 +1,4 @@
-"""What ``sim-client`` and ``pp-eval`` write down, ``results.json``, as arrays to count with."""
+"""Reads ``results.json`` of ``sim-client`` and ``pp-eval`` into arrays."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from dual_system.analysis import paper
 
-Scene = tuple[int, str]  # seed, difficulty: the same scene whenever both are
+Scene = tuple[int, str]  # seed and difficulty, which determine a task's scene
 RESULTS = "results.json"
 
 
 class ResultsError(Exception):
-    """A results file that cannot be counted: the message says what was expected, what came, and the way out."""
+    """A results file that cannot be used; the message says what was expected, what was found, and the way out."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -27,11 +27,11 @@ class Results:
     """One condition: the same scenes in one or several runs.
 
     Attributes:
-        label: the folder as it was named.
-        config: the options it was made with.
+        label: the folder as given.
+        config: the evaluation's options.
         outcomes: per task, in the paper's order, (R, E): 1 where the episode succeeded.
         scenes: per task, the E scenes in ascending order.
-        num_carriers: K of PONDER, and ``is_untrained`` whether either model is random; None and False if nobody said.
+        num_carriers, is_untrained: PONDER's K, and whether either model is random; None and False if unknown.
     """
 
     label: str
@@ -58,8 +58,8 @@ def read_results(path: Path) -> Results:
     """Reads a results file, or that of a folder.
 
     Raises:
-        ResultsError: no such file, no episodes, a task that the paper has not, a scene twice in one run, or runs that
-            are not of the same scenes, as when an evaluation was not finished.
+        ResultsError: no such file, no episodes, a task that is not in the paper, a scene twice in one run, or runs
+            over different scenes, as in an unfinished evaluation.
     """
     file = path / RESULTS if path.is_dir() else path
     try:
@@ -106,7 +106,7 @@ def read_results(path: Path) -> Results:
 def read_comparable(paths: Sequence[Path]) -> list[Results]:
     """Reads several conditions over the same tasks.
 
-    Raises ResultsError as `read_results` does, or if one has other tasks than the first, or a label is there twice.
+    Raises ResultsError as `read_results` does, or if one has other tasks than the first, or for a repeated label.
     """
     results = [read_results(path) for path in paths]
     _require(bool(results), "no results were given")

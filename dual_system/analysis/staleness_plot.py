@@ -1,4 +1,4 @@
-"""The paper's Figure 4 of one's own checkpoints: loss over cognition's age, as one PNG drawn with Pillow."""
+"""The paper's Figure 4 for own checkpoints: loss over cognition's age, as one PNG drawn with Pillow."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _INK, _GRID = (40, 40, 40), (225, 225, 225)
 
 
 def plot_staleness(diagnoses: Sequence[Diagnosis], png: Path) -> None:
-    """Draws each diagnosis' loss at growing ages over its own at 0.3 s, on a log2 axis, with its 95 % band.
+    """Draws each diagnosis' loss at growing ages relative to its loss at 0.3 s, on a log2 axis, with a 95 % band.
 
     Raises:
-        ValueError: one of them has no ticks.
+        ValueError: a diagnosis has no ticks.
     """
     curves = []
     for each in diagnoses:

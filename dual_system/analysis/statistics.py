@@ -1,8 +1,8 @@
 """Success rates with their uncertainty, over tasks, scenes and runs. Pure functions of zeros and ones.
 
 Outcomes of one task are an (R, E) array: R runs over the same E scenes, 1 where the episode succeeded. Episodes of one
-scene are not independent, so it is scenes that are resampled, and with them all their runs; of the runs as wholes there
-are few, and they are resampled too. Tasks are not: the suite is what it is (the paper's task-stratified bootstrap).
+scene are not independent, so scenes are resampled together with all their runs. Whole runs are resampled too, because
+there are few. Tasks are not, because the suite is fixed (the paper's task-stratified bootstrap).
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ def wilson(rate: float, num_trials: int, level: float = LEVEL) -> Interval:
 
     Args:
         rate: fraction of successes; a mean over runs of one set of scenes need not be a multiple of 1/num_trials.
-        num_trials: independent trials, which are the scenes, however many runs there were: never too narrow.
+        num_trials: number of independent trials. That is the number of scenes, whatever the number of runs, so that
+            the interval is never too narrow.
 
     Raises ValueError if there are no trials, or the rate is no fraction.
     """
@@ -68,9 +69,9 @@ def bootstrap(
     """Returns the mean over tasks with its task-stratified percentile interval.
 
     Args:
-        tasks: (R, E) outcomes of each task; R is the same in all, E need not be.
+        tasks: (R, E) outcomes of each task; R must be equal in all tasks, E need not be.
 
-    Raises ValueError if there are no outcomes, values other than 0 and 1, or tasks with other numbers of runs.
+    Raises ValueError if there are no outcomes, values other than 0 and 1, or tasks with different numbers of runs.
     """
     outcomes = _checked(tasks)
     rng = np.random.default_rng(seed)
@@ -97,11 +98,11 @@ def paired(
     num_resamples: int = NUM_RESAMPLES,
     seed: int = 0,
 ) -> Paired:
-    """Returns by how much the second condition is better than the first, scene by scene.
+    """Returns the second condition's gain over the first, scene by scene.
 
     Args:
-        first, second: as in `bootstrap`, the same tasks and scenes in the same order; runs are not paired, and of the
-            two conditions one may have more.
+        first, second: as in `bootstrap`, with the same tasks and scenes in the same order. Runs are not paired, and
+            their numbers may differ.
 
     Raises ValueError as `bootstrap` does, or if scenes do not match.
     """
@@ -125,7 +126,7 @@ def paired(
 
 
 def sign_test(num_better: int, num_worse: int) -> float:
-    """Returns the exact two-sided p-value of so many signs if both were equally likely; ties are left out before."""
+    """Returns the exact two-sided p-value of these counts if both signs are equally likely; leave ties out."""
     num_signs, fewer = num_better + num_worse, min(num_better, num_worse)
     return min(1.0, 2 * sum(math.comb(num_signs, k) for k in range(fewer + 1)) / 2**num_signs)
 
@@ -142,19 +143,19 @@ def _checked(tasks: Sequence[ArrayLike]) -> list[Array]:
 
 
 def _whole_gains(before: Array, after: Array) -> Array:
-    """(E,) a whole number with the sign of each scene's gain: in fractions, 2/3 - 4/6 need not be 0."""
+    """(E,): integers with the sign of each scene's gain; with floats, 2/3 - 4/6 need not be 0."""
     return len(before) * after.sum(0) - len(after) * before.sum(0)
 
 
 def _drawn_runs(num_runs: int, num_resamples: int, rng: np.random.Generator) -> Array:
-    """(B, R): how much each run counts in each resample. A run is one of the whole suite: all tasks share the draw."""
+    """(B, R): weight of each run in each resample. A run covers the whole suite, so all tasks share the draw."""
     return rng.multinomial(num_runs, np.full(num_runs, 1 / num_runs), num_resamples) / num_runs
 
 
 def _resampled(tasks: Sequence[Array], weights_BR: Array, rng: np.random.Generator) -> Array:
-    """(B,): means over tasks of resamples of their scenes, which differ only by their columns: those are counted.
+    """(B,): means over tasks of resampled scenes. Scenes with equal outcomes are interchangeable, so counts are drawn.
 
-    So the order of scenes changes nothing, and a resample costs 2^R numbers however many scenes there are.
+    So the order of scenes does not matter, and a resample costs at most 2^R numbers for any number of scenes.
     """
     means = np.zeros(len(weights_BR))
     for outcomes_RE in tasks:

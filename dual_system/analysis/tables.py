@@ -1,6 +1,6 @@
-"""``pp-tables``: results files as tables and plots in the form of the paper's, with intervals, beside its own figures.
+"""``pp-tables``: tables and plots of results in the paper's form, with intervals, beside the paper's own numbers.
 
-What is printed follows from the files alone, to the last digit: the bootstrap's seed is fixed.
+The output depends on the files alone, to the last digit: the bootstrap's seed is fixed.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     options.out.mkdir(parents=True, exist_ok=True)
     if diagnoses:
-        from dual_system.analysis.staleness_plot import plot_staleness  # needs Pillow, and tables alone do not
+        from dual_system.analysis.staleness_plot import plot_staleness  # needs Pillow; tables alone do not
 
         plot_staleness(diagnoses, options.out / "staleness.png")
     (options.out / TABLES).write_text("\n\n".join(parts) + "\n")
@@ -72,7 +72,7 @@ def _holds(path: Path, name: str) -> bool:
 
 
 def tables(results: Sequence[Results]) -> str:
-    """Returns everything as markdown. Raises ResultsError if two conditions were run on other scenes."""
+    """Returns all tables as markdown. Raises ResultsError if conditions were run on different scenes."""
     parts = ["# Evaluation", NOTE, "\n".join(_about(each) for each in results)]
     parts += ["## By family (form of the paper's Table 1)", by_family(results)]
     parts += ["## By task (form of the paper's Table 7)", by_task(results), *_ceilings(results)]
@@ -100,7 +100,7 @@ def by_task(results: Sequence[Results]) -> str:
 
 
 def _ceilings(results: Sequence[Results]) -> list[str]:
-    """A sentence for each task of which it is known what can be reached without memory, over each one's scenes."""
+    """A sentence for each task with a known ceiling without memory, over each condition's scenes."""
     sentences = []
     for task in results[0].tasks:
         exact = [ceiling_of(task, (difficulty for _, difficulty in each.scenes[task])) for each in results]
@@ -153,7 +153,7 @@ _GIVEN = {
 
 
 def _condition(results: Results) -> tuple[str, str, str, str]:
-    """What POUNCE got, how often PONDER looked, its delay and K; as far as the file says."""
+    """POUNCE's cognition, PONDER's query period, its delay and K, as far as the file has them."""
     config = results.config
     if config.get("policy") == "oracle":
         return "nothing: the oracle played", "", "", ""
@@ -182,7 +182,7 @@ def _about(results: Results) -> str:
 
 
 def _families(tasks: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """The families that have any of the tasks, and which."""
+    """The given tasks by family; families without any are left out."""
     found = {name: tuple(task for task in of if task in tasks) for name, of in paper.FAMILIES.items()}
     return {name: of for name, of in found.items() if of}
 

@@ -39,12 +39,12 @@ SCALES = {"1x": 1, "9x": 9}
 COLLECTING, JOINED = ".collecting", "joined"
 DONE, INCOMPLETE, REFUSED, INTERRUPTED = 0, 1, 2, 130
 ROWS_PER_EPISODE, BYTES_PER_ROW = 500, 4200  # before anything is measured: both cameras at 256 px and 20 Hz, all tasks
-MEASURED_EPISODES = 5  # from so many on, the estimate is theirs
+MEASURED_EPISODES = 5  # from this number on, the estimate is measured
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PicturesOptions:
-    """Which pictures are rendered."""
+    """Rendering of pictures."""
 
     frames: Literal["all", "training"] = "all"
     """Pictures to render: all at 20 Hz, or only those that training reads (demonstrations, POUNCE's invocations)."""
@@ -64,7 +64,7 @@ class PicturesOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodesOptions:
-    """What happens in the episodes."""
+    """Contents of the episodes."""
 
     difficulties: tuple[Difficulty, ...] = DIFFICULTY_CYCLE
     """Difficulties of a task's episodes, taken in turn."""

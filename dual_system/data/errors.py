@@ -2,4 +2,4 @@
 
 
 class DatasetError(Exception):
-    """Something that the user can mend: the message says what was expected, what came, and the way out."""
+    """An error that the user can fix; the message says what was expected, what was found, and the way out."""

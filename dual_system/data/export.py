@@ -120,11 +120,11 @@ def read_episode(
             writer.add(row, frames)
         reasoning = narrator.reasoning()
         if follows:
-            told = _played_again(path, environment, first, observations, actions)
+            captions = _played_again(path, environment, first, observations, actions)
         else:
-            told = texts_by_tick(record.subgoals, len(actions))
+            captions = texts_by_tick(record.subgoals, len(actions))
         for observation, action, (plain, grounded, is_new), seen in zip(
-            observations, actions, told, _pictures(path, observations), strict=True
+            observations, actions, captions, _pictures(path, observations), strict=True
         ):
             is_first = observation is observations[0]
             row = Row(
@@ -160,17 +160,17 @@ def _played_again(
 
     Raises DatasetError if a state differs from the log's.
     """
-    told, index = [], -1
+    captions, index = [], -1
     for observation, action in zip(observations, actions, strict=True):
         if not np.array_equal(snapshot.state, observation.proprio):
             raise DatasetError(
                 f"{path}: at tick {observation.tick} the robot stands at {snapshot.state.tolist()} here and at "
                 f"{observation.proprio.tolist()} in the log; export it with the versions that made it, or as logged"
             )
-        told.append((snapshot.simple_subgoal, snapshot.grounded_subgoal, snapshot.subgoal_index != index))
+        captions.append((snapshot.simple_subgoal, snapshot.grounded_subgoal, snapshot.subgoal_index != index))
         index = snapshot.subgoal_index
         snapshot = environment.step(action, look=False)
-    return told
+    return captions
 
 
 def _again(

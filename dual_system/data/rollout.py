@@ -1,4 +1,4 @@
-"""What a worker does for one job: the oracle plays an episode, and it is packed."""
+"""A worker's job: the oracle plays an episode, which is then packed."""
 
 from __future__ import annotations
 

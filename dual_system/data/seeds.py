@@ -1,4 +1,4 @@
-"""Which scenes are for training and which for evaluation."""
+"""Division of the scenes' seeds between training and evaluation."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Finished episodes under way to a dataset: each is whole or absent, and there once, whoever is killed when.
+"""Finished episodes before they join a dataset: each is complete or absent, and stored once, whatever is killed.
 
-A package is written aside, forced to disk and renamed to its place; what a killed process left aside is swept away by
-the next. A lock keeps two collectors from one folder.
+A package is written aside, synced to disk and renamed to its place; the next process removes what a killed one left
+aside. A lock keeps two collectors out of one folder.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from protocol import disk
 
 
 class Store:
-    """Packages by key, in a folder of its own; a key is ``task/number``. A context manager, because of the lock.
+    """Packages by key, in their own folder; a key is ``task/number``. A context manager, because of the lock.
 
     Raises:
         DatasetError: another process works in this folder.
@@ -38,7 +38,7 @@ class Store:
         shutil.rmtree(self._aside, ignore_errors=True)
 
     def commit(self, key: str, package: Package) -> None:
-        """Puts a package on disk, all of it or nothing; one that is there already stays as it is."""
+        """Writes a package to disk atomically; an existing one is kept."""
         place = self._episodes / key
         if place.exists():
             return

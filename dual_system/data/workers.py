@@ -14,7 +14,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from dual_system.data.errors import DatasetError
 
-QUEUED_PER_WORKER = 2  # enough to keep it busy; results that nobody has taken yet are some megabytes each
+QUEUED_PER_WORKER = 2  # enough to keep it busy; a waiting result takes some megabytes
 MAX_DEATHS = 3
 
 
@@ -31,10 +31,10 @@ ResultT_co = TypeVar("ResultT_co", covariant=True)
 
 
 class Workers(Protocol[JobT, ResultT_co]):
-    """Anything that works jobs out."""
+    """Anything that runs jobs."""
 
     def run(self, jobs: Sequence[JobT]) -> Iterator[tuple[JobT, ResultT_co]]:
-        """Yields each job with its result as it comes."""
+        """Yields each job with its result, in order of completion."""
 
 
 class LocalWorkers(Generic[JobT, ResultT]):
@@ -78,7 +78,7 @@ class LocalWorkers(Generic[JobT, ResultT]):
 
 
 def _leave_with_parent() -> None:
-    """Ends this process when its parent is killed: nobody would take its results, and it would wait for ever."""
+    """Ends this process when its parent is killed; otherwise it would wait forever with its result."""
     parent = multiprocessing.parent_process()
     if parent is not None:
 
@@ -92,9 +92,9 @@ def _leave_with_parent() -> None:
 class RayWorkers(Generic[JobT, ResultT]):
     """A Ray cluster, on whose nodes this package is installed; results travel back, so no disk need be shared.
 
-    ``address``: of a running cluster (``auto``, ``ray://head:10001``), or ``local`` for one that is started here;
-    ``num_gpus``: what each job asks for; none by default, and then Ray shows it none.
-    Raises DatasetError if Ray is not installed or nobody answers.
+    ``address``: that of a running cluster (``auto``, ``ray://head:10001``), or ``local`` for one that is started here;
+    ``num_gpus``: GPUs per job; with the default of none, Ray hides all GPUs from it.
+    Raises DatasetError if Ray is not installed or the cluster does not answer.
     """
 
     def __init__(self, address: str, work_out: Callable[[JobT], ResultT], num_gpus: float = 0) -> None:

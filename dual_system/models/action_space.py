@@ -1,15 +1,15 @@
-"""What POUNCE's numbers mean on the arm. Outside, a chunk is always absolute joint targets; the model may learn better.
+"""Action spaces of POUNCE. Outside this module a chunk is always absolute joint targets; the network may use deltas.
 
-- ``joint_delta`` (the paper's): the seven joints relative to the chunk's first state, then the gripper. 8 numbers;
-  the network reads the state as it is: seven joints [rad], finger opening [m].
-- ``ee_delta``: the tool pose at the commanded joints relative to the tool pose at the chunk's first state:
-  translation [m], rotation vector [rad], then the gripper. 7 numbers. Both parts are in the table's frame, not in the
-  tool's, and apart (no screw): a tool that moves straight and turns about a fixed axis draws straight lines of numbers.
-  The network reads, also as 7, the tool's position [m], its rotation vector [rad] away from pointing straight down
-  (for an upright tool (0, 0, yaw)), and the finger opening [m].
+- ``joint_delta`` (the paper's), 8 dims: the seven joints relative to the chunk's first state, then the gripper.
+  The network reads the raw state: seven joints [rad], finger opening [m].
+- ``ee_delta``, 7 dims: the tool pose at the commanded joints relative to the tool pose at the chunk's first state, as
+  translation [m] and rotation vector [rad], then the gripper. Both parts are in the table's frame, not the tool's, and
+  separate (no screw motion): a tool that moves straight and turns about a fixed axis gives actions linear in time.
+  The network's state also has 7 dims: tool position [m], rotation vector [rad] away from pointing straight down
+  (for an upright tool (0, 0, yaw)), and finger opening [m].
 
-The gripper is absolute everywhere, -1 closed to 1 open. A robot without one has finger 0 and command -1, and is
-otherwise the same arm: the tool point is the gripper's for it too, 47 mm above the tip of RoboMME's stick.
+The gripper is absolute in both, -1 closed to 1 open. A robot without one has finger 0 and command -1 and is otherwise
+the same arm: it keeps the gripper's tool point, which is 47 mm above the tip of RoboMME's stick.
 """
 
 # T targets, M chunks, N rows of a chunk, 8 = 7 arm joints (rad) + gripper, D numbers of the space
@@ -35,13 +35,13 @@ from dual_system.models.arm import (
 ActionSpace: TypeAlias = Literal["joint_delta", "ee_delta"]
 
 ROBOT_DIM = NUM_ARM_JOINTS + 1
-"""Of a robot's state and of a command, whatever the space."""
+"""Dims of a robot's state and of a command, whatever the space."""
 GRIPPER_MIN, GRIPPER_MAX = -1.0, 1.0  # closed, open
 _NUM_DIMS: dict[ActionSpace, int] = {"joint_delta": ROBOT_DIM, "ee_delta": 7}
 
 
 def num_dims(space: ActionSpace) -> int:
-    """Returns how many numbers an action has, and a state as the network reads it.
+    """Returns the number of dims of an action, and of a state as the network reads it.
 
     Raises:
         ValueError: no such space.
@@ -62,7 +62,7 @@ def states_in(space: ActionSpace, states_8: ArrayLike) -> Array:
 
 
 def actions_in(space: ActionSpace, targets_T8: ArrayLike, states_M8: ArrayLike, rows_MN: NDArray[np.integer]) -> Array:
-    """Whole episodes at once: chunk m starts at state m, and its row n commands target ``rows_MN[m, n]``.
+    """Converts a whole episode: chunk m starts at state m, and its row n commands target ``rows_MN[m, n]``.
 
     Returns (M, N, D), not yet normalised. Forward kinematics runs once per target and state, not once per row.
     """
@@ -80,8 +80,8 @@ def actions_in(space: ActionSpace, targets_T8: ArrayLike, states_M8: ArrayLike, 
 def targets_from(space: ActionSpace, actions_ND: ArrayLike, state_8: ArrayLike) -> Array:
     """One chunk's actions (N, D) -> absolute joint targets and gripper (N, 8); the gripper is clipped to [-1, 1].
 
-    From ``ee_delta`` the joints are within the arm's limits. The arm has a joint more than a pose needs; each row takes
-    the joints nearest to the row before, the first those nearest to the state.
+    From ``ee_delta`` the joints stay within the arm's limits. The arm is redundant (7 joints for a 6D pose): each row
+    takes the joints nearest to the previous row's, the first those nearest to the state.
     """
     actions, state = np.asarray(actions_ND, dtype=np.float64), np.asarray(state_8, dtype=np.float64)
     targets = np.empty((len(actions), ROBOT_DIM))

@@ -1,9 +1,8 @@
-"""The Panda's arm in numpy: tool poses, their derivative and the way back to joint angles. For POUNCE's `action_space`.
+"""The Panda arm in numpy: forward kinematics, Jacobian and inverse kinematics, for POUNCE's `action_space`.
 
-Numbers are Franka's, as the simulator's scene has them (tests hold them equal); nothing here needs a simulator. Frame:
-the table's, +x forward from the robot, +z up; the robot's base stands at x = -0.615 m. The tool point is one fixed
-point of the hand, between the fingers of RoboMME's gripper. Whatever else the hand carries, poses and joint angles
-translate into each other by the same point.
+The constants are Franka's, equal to those of the simulator's scene (a test compares them); no simulator is needed.
+Frame: the table's, +x forward from the robot, +z up; the robot's base is at x = -0.615 m. The tool point is a fixed
+point of the hand, between the fingers of RoboMME's gripper, whatever tool the hand carries.
 """
 
 # ... any number of leading dims, R rotation matrices
@@ -25,7 +24,7 @@ TOOL_DOWN = np.diag([1.0, -1.0, -1.0])
 """The tool's rotation while it points straight down and is not turned."""
 
 _BASE_M = (-0.615, 0.0, 0.0)
-_LINKS = (  # of each joint in the frame of the joint before: place (m) and turn about x (quarters); it turns about z
+_LINKS = (  # each joint in the previous joint's frame: position (m), quarter turns about x; its own axis is z
     ((0.0, 0.0, 0.333), 0),
     ((0.0, 0.0, 0.0), -1),
     ((0.0, -0.316, 0.0), 1),
@@ -39,14 +38,14 @@ _HAND_TURN_RAD = -np.pi / 4
 
 _DAMPING = 1e-4
 _MAX_ITERATIONS = 6
-_MAX_STEP_RAD = 0.3  # of the whole arm in one iteration: near a stretched arm the derivative promises too much
-_LEVER_M = 0.1  # so much out of place is as bad as one radian
+_MAX_STEP_RAD = 0.3  # norm of one iteration's step: near a stretched arm the linearisation overshoots
+_LEVER_M = 0.1  # position error that weighs as much as a rotation error of one radian
 _POSITION_TOLERANCE_M, _ROTATION_TOLERANCE_RAD = 1e-5, 1e-4
 _SMALL_RAD = 1e-9
 
 
 class Poses(NamedTuple):
-    """Where the tool is, in the table's frame."""
+    """Tool poses in the table's frame."""
 
     position_m: Array
     """(..., 3)"""
@@ -68,9 +67,9 @@ def tool_jacobian(joints_rad: ArrayLike) -> Array:
 def joints_near(target: Poses, start_rad: Array) -> Array:
     """Returns joint angles (7,) near ``start_rad`` (7,), within the limits, that bring the tool to one pose.
 
-    Damped least squares: the steps are the shortest in joint space, so rows of a chunk, each started where the one
-    before ended, make a smooth path. A joint that meets a limit stays there while the others go on. Never raises: of
-    a pose out of reach it returns the nearest that its few iterations come to.
+    Damped least squares takes the shortest steps in joint space, so the rows of a chunk, each started from the previous
+    row's solution, make a smooth path. A joint that meets a limit stays there while the others move on. Never raises:
+    for a pose out of reach it returns the nearest iterate.
     """
     joints = start_rad.clip(JOINT_LOW_RAD, JOINT_HIGH_RAD)
     nearest, least = joints, np.inf
@@ -80,7 +79,7 @@ def joints_near(target: Poses, start_rad: Array) -> Array:
         move, turn = target.position_m - frames[-1, :3, 3], _turn(target.rotation @ frames[-1, :3, :3].T)
         error = np.concatenate([move, turn])
         distance = float(move @ move) / _LEVER_M**2 + float(turn @ turn)
-        if not distance >= least:  # NaN comes through: the limits in front of the robot refuse it
+        if not distance >= least:  # lets NaN through: the limit check before the robot rejects it
             nearest, least = joints, distance
         if max(abs(move)) < _POSITION_TOLERANCE_M and max(abs(turn)) < _ROTATION_TOLERANCE_RAD:
             break
@@ -97,7 +96,7 @@ def rotation_vectors(R: Array) -> Array:
     xx, yy, zz = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     x, y, z = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
     xy, xz, yz = R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1]
-    # 4 q q^T of the quaternion q = (w, x, y, z). Any row is q but for its length; the longest has lost no digits.
+    # 4 q q^T of the quaternion q = (w, x, y, z). Every row is q up to scale; the longest is numerically the best.
     rows = (
         (1 + xx + yy + zz, x, y, z),
         (x, 1 + xx - yy - zz, xy, xz),
@@ -115,7 +114,7 @@ def rotation_vectors(R: Array) -> Array:
 
 
 def _turn(R: Array) -> Array:
-    """`rotation_vectors` (3,) of one rotation (3, 3), five times as fast below a quarter turn."""
+    """Scalar `rotation_vectors`: (3, 3) -> (3,), five times as fast below a quarter turn."""
     cos = (R[0, 0] + R[1, 1] + R[2, 2] - 1) / 2
     if not cos > 0:
         return rotation_vectors(R)
@@ -136,7 +135,7 @@ def rotations(vectors_rad: Array) -> Array:
 
 
 def _turned(axis: int, angle_rad: float) -> Array:
-    """(4, 4)"""
+    """Homogeneous rotation (4, 4) about a coordinate axis."""
     vector = np.zeros(3)
     vector[axis] = angle_rad
     T = np.eye(4)
@@ -145,7 +144,7 @@ def _turned(axis: int, angle_rad: float) -> Array:
 
 
 def _placed(place_m: tuple[float, float, float], quarters: int) -> Array:
-    """(4, 4)"""
+    """Homogeneous transform (4, 4): a translation and quarter turns about x."""
     T = _turned(0, quarters * np.pi / 2)
     T[:3, 3] = place_m
     return T
@@ -171,7 +170,7 @@ def _frames(joints_rad: Array) -> list[Array]:
 
 
 def _jacobian(frames: Array) -> Array:
-    """(6, 7) from `_frames` (8, 4, 4): a joint turns the tool about its own z axis."""
+    """Jacobian (6, 7) from `_frames` (8, 4, 4): each joint turns the tool about its own z axis."""
     axes, arms = frames[:-1, :3, 2].T, (frames[-1, :3, 3] - frames[:-1, :3, 3]).T
     x, y, z = axes
     ax, ay, az = arms

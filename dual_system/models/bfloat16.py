@@ -1,13 +1,13 @@
-"""Whether this computer's processor gains by bfloat16, which some only pretend to have."""
+"""Whether this machine's CPU multiplies bfloat16 in hardware; torch emulates it on the others."""
 
 import torch
 
 HAS_FAST_BFLOAT16 = torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported()
-"""Of the CPU. Where it is not so, torch multiplies bfloat16 number by number: AVX2 alone, some twenty times slower."""
+"""False on CPUs with AVX2 alone, where torch emulates bfloat16 products at about a twentieth of the speed."""
 
 
 def warn_of_slow(dtype: str, device: str, option: str = "--dtype") -> str | None:
-    """Returns what to tell somebody who asked for this precision by this option on this device; None: nothing."""
+    """Returns a warning for a user who chose this precision by ``option`` on this device; None if it is fast."""
     if dtype != "bfloat16" or device != "cpu" or HAS_FAST_BFLOAT16:
         return None
     return (

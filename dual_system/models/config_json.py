@@ -1,6 +1,6 @@
 """Nested frozen dataclasses from JSON: an absent name takes the record's default, an unknown one is an error.
 
-Defaults are the paper's values and do not change, so a field that is added later leaves older files as they are.
+Defaults are the paper's values and do not change, so a field that is added later keeps older files valid.
 Writing needs no code: `dataclasses.asdict` and `json.dumps`.
 """
 
@@ -13,7 +13,7 @@ Record = TypeVar("Record")
 
 
 def from_json(kind: type[Record], values: Any, where: str) -> Record:
-    """Builds ``kind`` from parsed JSON; ``where`` names the place in errors.
+    """Builds ``kind`` from parsed JSON; ``where`` names the source in errors.
 
     Fields may be numbers, strings, booleans, Literals, unions, homogeneous tuples, records of these, and tuples of such
     records.
@@ -36,8 +36,8 @@ def from_json(kind: type[Record], values: Any, where: str) -> Record:
 
 
 def deviations(record: Any) -> dict[str, Any]:
-    """The fields of a record that differ from their defaults: what a digest is over, so that a field that is added
-    later changes no digest."""
+    """The fields of a record that differ from their defaults. Digests are taken over these, so that adding a field
+    changes no digest."""
     found = {}
     for each in dataclasses.fields(record):
         value = getattr(record, each.name)

@@ -1,7 +1,7 @@
 """Flow matching as pi0.5 does it: the straight path, its velocity, the loss and the Euler sampler.
 
 Convention: t = 1 is noise and t = 0 is data, as in the public pi0.5 code. The pi0 paper and GR00T N1.5 write
-it the other way round; weights of one convention, sampled with the other, drive away from the data.
+it the other way round; weights of one convention, sampled with the other, integrate away from the data.
 """
 
 # B batch, N horizon, A action dim
@@ -15,7 +15,7 @@ from torch import Tensor
 
 LossDims = Literal["real", "all"]
 
-# t ~ Beta(1.5, 1) * 0.999 + 0.001: leans towards noise, stays away from t = 0 where nothing is left to learn.
+# t ~ Beta(1.5, 1) * 0.999 + 0.001: favours noise and avoids t = 0, where nothing is left to learn.
 TIME_BETA_ALPHA = 1.5
 TIME_SPAN = 0.999
 TIME_MIN = 0.001
@@ -35,7 +35,7 @@ def target_velocity(actions_BNA: Tensor, noise_BNA: Tensor) -> Tensor:
 def sample_times(batch_size: int, generator: torch.Generator) -> Tensor:
     """Draws training times, (B,) float32 in [0.001, 1.0].
 
-    Beta(a, 1) has the closed inverse u**(1/a): no rejection, so one seed means one draw everywhere.
+    Beta(a, 1) has the closed-form inverse u**(1/a): no rejection sampling, so a seed gives the same draw everywhere.
     """
     uniform_B = torch.rand(batch_size, generator=generator, device=generator.device)
     return uniform_B ** (1.0 / TIME_BETA_ALPHA) * TIME_SPAN + TIME_MIN
@@ -44,8 +44,8 @@ def sample_times(batch_size: int, generator: torch.Generator) -> Tensor:
 def mean_loss(loss_BNA: Tensor, num_real_dims: int, over: LossDims = "real") -> Tensor:
     """Averages the unreduced loss over the robot's own dims ("real", lerobot) or all dims ("all", openpi).
 
-    The two differ in scale: with 8 of 32 dims in use, "all" is a quarter of the robot's error plus whatever
-    is left on the padding, which is easy to learn. The paper does not say; default "real", so that w_1 = 1
+    The two differ in scale: with 8 of 32 dims in use, "all" is a quarter of the robot's error plus the error on
+    the padding, which is easy to learn. The paper does not specify; the default is "real", so that w_1 = 1
     weighs action error alone.
     """
     if not 0 < num_real_dims <= loss_BNA.shape[-1]:
@@ -56,7 +56,7 @@ def mean_loss(loss_BNA: Tensor, num_real_dims: int, over: LossDims = "real") -> 
 
 
 def euler_times(num_steps: int) -> list[float]:
-    """Returns 1, 1 - 1/n, ..., 1/n: where each Euler step looks.
+    """Returns 1, 1 - 1/n, ..., 1/n: the flow time at which each Euler step evaluates the velocity.
 
     Computed from the index, as lerobot does. openpi accumulates ``time += dt`` in float32, which moves the
     goldens' actions by up to 2e-5.
@@ -68,7 +68,7 @@ def euler_times(num_steps: int) -> list[float]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EulerStep:
-    """One step of the sampler: where it was taken, the velocity there, and the actions after it."""
+    """One step of the sampler: its flow time, the velocity there, and the actions after it."""
 
     index: int
     velocity: Tensor

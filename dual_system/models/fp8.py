@@ -1,11 +1,11 @@
-"""fp8 weights (e4m3): a byte each, and on a GPU that has them fp8 products.
+"""fp8 weights (e4m3), one byte each; products are fp8 too on a GPU that supports them.
 
-Each output row has its own scale, its largest weight / 448. Between powers of two there are eight steps, so a weight is
-off by a sixteenth of itself at most; int8 is off by as much for every weight of a row, which is less for the large ones
-and more for the small ones.
+Each output row has its own scale, its largest weight / 448. e4m3 has eight steps between powers of two, so a weight's
+relative error is at most 1/16. int8's absolute error is the same for every weight of a row: smaller than fp8's for the
+large ones, larger for the small ones.
 
-A GPU of compute capability 8.9 or more multiplies bfloat16 activations as fp8, each row of them with a scale of its
-own, taken as it comes (``torch._scaled_mm``). Everywhere else weights are widened as a layer is called, as int8's are.
+On a GPU of compute capability 8.9 or more, bfloat16 activations are quantised to fp8 as well, with one dynamic scale
+per row (``torch._scaled_mm``). Everywhere else weights are widened when a layer is called, as int8's are.
 """
 
 # O output rows, R rows of either matrix, I input columns, M rows of activations
@@ -16,14 +16,14 @@ from torch import Tensor, nn
 from dual_system.models.narrow_linear import NarrowLinear, row_scale
 
 LEAST_CAPABILITY = (8, 9)
-"""Ada and Hopper: the first with fp8 products."""
+"""Ada and Hopper: the first GPUs with fp8 products."""
 _MOST = 448.0
 _MULTIPLE = 16
-"""Of rows and columns, in fp8 products."""
+"""``torch._scaled_mm`` requires multiples of this many rows and columns."""
 
 
 def missing_for(device: torch.device) -> str:
-    """Why there can be no fp8 weights on ``device``, for a person; empty if there can."""
+    """Why ``device`` cannot hold fp8 weights, for an error message; empty if it can."""
     if not hasattr(torch, "float8_e4m3fn"):
         return f"torch {torch.__version__} has no float8_e4m3fn"
     if device.type not in ("cpu", "cuda"):
@@ -32,14 +32,14 @@ def missing_for(device: torch.device) -> str:
 
 
 def has_products(device: torch.device) -> bool:
-    """Whether ``device`` multiplies fp8, and this torch can ask it to."""
+    """Whether ``device`` and this torch support fp8 products."""
     if device.type != "cuda" or not hasattr(torch, "_scaled_mm"):
         return False
     return torch.cuda.get_device_capability(device) >= LEAST_CAPABILITY
 
 
 class Fp8Linear(NarrowLinear):
-    """`nn.Linear` over fp8 weights. Its device must stay: it decides how products are taken."""
+    """`nn.Linear` over fp8 weights. Do not move it: the kind of product is chosen for its first device."""
 
     def __init__(self, linear: nn.Linear) -> None:
         super().__init__(linear)
@@ -48,20 +48,20 @@ class Fp8Linear(NarrowLinear):
 
     @staticmethod
     def narrowed(exact_RI: Tensor) -> tuple[Tensor, Tensor]:
-        """As `NarrowLinear`'s. What is not finite stays so."""
+        """See `NarrowLinear.narrowed`. NaN and infinity are kept."""
         scale_R = row_scale(exact_RI, _MOST)
-        # Beyond the largest number a conversion gives NaN, and the division may be rounded there.
+        # Conversion overflows to NaN, and rounding in the division may pass the largest number.
         return (exact_RI / scale_R[:, None]).clamp(-_MOST, _MOST).to(torch.float8_e4m3fn), scale_R
 
     def product(self, x: Tensor) -> Tensor:
-        # Products come out in bfloat16: a float32 network has asked for more.
+        # fp8 products return bfloat16, less precision than a float32 network asks for.
         if self._multiplies and x.dtype == torch.bfloat16:
             return _product(x.flatten(0, -2), self.weight_OI, self.scale_O).unflatten(0, x.shape[:-1])
         return super().product(x)
 
 
 def _product(x_MI: Tensor, weight_OI: Tensor, scale_O: Tensor) -> Tensor:
-    """(M, O) in bfloat16. The second matrix is read by columns, as the weight lies."""
+    """Returns (M, O) bfloat16. ``_scaled_mm`` wants its second matrix column-major: the weight's transpose."""
     narrow_MI, scale_M = Fp8Linear.narrowed(x_MI.float())
     return torch._scaled_mm(
         narrow_MI, weight_OI.t(), scale_a=scale_M[:, None], scale_b=scale_O[None], out_dtype=torch.bfloat16

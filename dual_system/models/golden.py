@@ -1,8 +1,8 @@
-"""Golden folders: tiny random models with what public implementations made of them, and the config they describe.
+"""Golden folders: tiny random models of public implementations, with their inputs and outputs.
 
 A folder holds config.json (architecture and shapes), weights.safetensors (public layout), inputs.safetensors and
-expected.safetensors. Sizes are read; facts that this package has only one answer to (activations, norms, where
-time comes in) are compared and refused where they differ, so that no golden is half understood.
+expected.safetensors. Sizes are read from config.json. Choices that this package builds in only one way (activations,
+norms, where time enters) are compared, and a golden that differs in one is refused.
 """
 
 import json
@@ -37,34 +37,34 @@ _VISION_FACTS = {
 _GIVEN = {"images", "image_masks", "token_ids", "token_mask", "actions", "noise", "time"}
 _GIVEN_TO_GROOT = {"state", "embodiment_id", "action_mask"}
 _EXPECTED = {"velocity", "loss_unreduced", "actions"}
-"""Without these three nothing is shown."""
+"""Tensors that every golden must have."""
 
 
 class GoldenError(ValueError):
-    """A folder is no golden that this package can run; says which file or fact."""
+    """A folder is no golden that this package can run; the message names the file or the config entry."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Golden:
-    """A folder, read: its model built and loaded by this package, K = 0."""
+    """A golden folder in memory: its model built and loaded by this package with K = 0, its inputs and outputs."""
 
     name: str
     model: Pounce | GrootPounce
     given: dict[str, Tensor]
     expected: dict[str, Tensor]
     end_to_end_rows: tuple[int, ...]
-    """Samples whose features, and so actions, do not hang on how an implementation treats padding."""
+    """Samples whose features and actions do not depend on how an implementation treats padding."""
 
 
 class _Sizes:
-    """A parsed config.json, read by dotted names."""
+    """A parsed config.json, indexed by dotted names."""
 
     def __init__(self, values: dict[str, Any], where: str) -> None:
         self._values = values
         self._where = where
 
     def find(self, name: str) -> Any:
-        """Returns the value, or None where the file is silent."""
+        """Returns the value, or None if the file has no such entry."""
         value: Any = self._values
         for part in name.split("."):
             value = value.get(part) if isinstance(value, dict) else None
@@ -91,7 +91,7 @@ def read_golden(folder: Path) -> Golden:
     """Reads a folder and loads its weights through the package's own loader.
 
     Raises:
-        GoldenError: a file or a size is missing, or a fact differs from what is built here.
+        GoldenError: a file or a size is missing, or the architecture differs from this package's.
         WeightsError: the weights do not fit the configuration.
     """
     sizes = _Sizes(_read_json(folder / "config.json"), str(folder / "config.json"))

@@ -1,7 +1,7 @@
-"""Work over static buffers, recorded once and replayed: CUDA graphs, and the same without a GPU.
+"""CUDA graphs: work over static buffers, recorded once and replayed; the same interface without a GPU.
 
-A replay does what was recorded with whatever then lies in the buffers. So work that is captured takes nothing, returns
-nothing, and decides nothing from the numbers it finds. Which work is the business of who serves a network.
+A replay repeats the recorded operations on the buffers' current contents. So captured work takes no arguments, returns
+nothing, and has no control flow that depends on tensor values. The servers decide what to capture.
 """
 
 from collections.abc import Callable
@@ -12,14 +12,14 @@ import torch
 
 Work: TypeAlias = Callable[[], None]
 Capture: TypeAlias = Callable[[Work], Work]
-"""Takes work, returns its replay. May run the work any number of times first: load the buffers afterwards."""
+"""Takes work and returns its replay. It may run the work several times first: fill the buffers afterwards."""
 
 WARM_UPS = 2
-"""Runs before recording: kernels are compiled and libraries take their workspaces, neither of which can be recorded."""
+"""Runs before recording, in which kernels compile and libraries allocate workspaces: neither can be recorded."""
 
 
 def directly(work: Work) -> Work:
-    """Records nothing: every replay is a run."""
+    """Records nothing: every replay runs the work."""
     return work
 
 
@@ -27,8 +27,8 @@ def cuda_graph(work: Work, *, pool: Any = None, stream: torch.cuda.Stream | None
     """Records ``work`` on the current CUDA device; a replay is one launch, in the current stream.
 
     Args:
-        pool: of memory (``torch.cuda.graph_pool_handle``) for what ``work`` allocates; its own if None.
-        stream: on which it is run and recorded; another one each time if None.
+        pool: memory pool (``torch.cuda.graph_pool_handle``) for what ``work`` allocates; a private one if None.
+        stream: stream on which to warm up and record; a new one each time if None.
     """
     side = stream or torch.cuda.Stream()
     side.wait_stream(torch.cuda.current_stream())
@@ -45,12 +45,12 @@ def cuda_graph(work: Work, *, pool: Any = None, stream: torch.cuda.Stream | None
 def cuda_graphs() -> Capture:
     """:func:`cuda_graph` for many graphs of which one runs at a time, on the current CUDA device.
 
-    They share one pool of memory, so a replay overwrites what an earlier one left there: results must lie in buffers
-    that were allocated before. They share one stream as well, because libraries keep a workspace for each.
+    They share one memory pool, so a replay overwrites what an earlier one left there: results must lie in buffers
+    that were allocated before. They share one stream as well, because libraries keep one workspace per stream.
     """
     return partial(cuda_graph, pool=torch.cuda.graph_pool_handle(), stream=torch.cuda.Stream())
 
 
 def graphs_for(device: torch.device) -> Capture | None:
-    """How work on ``device`` is captured by default: not at all but on a GPU."""
+    """Default capture for work on ``device``: CUDA graphs on a GPU, None elsewhere."""
     return cuda_graphs() if device.type == "cuda" else None

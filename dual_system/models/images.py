@@ -1,4 +1,4 @@
-"""Camera frames to network pixels: resize with the ratio kept, pad to a square, scale to [-1, 1]."""
+"""Camera frames to network pixels: resize with the aspect ratio kept, pad to a square, scale to [-1, 1]."""
 
 from collections.abc import Sequence
 
@@ -27,17 +27,17 @@ def resize_with_pad(frame: NDArray[np.uint8], size_px: int) -> Tensor:
 
 
 def resized(frame: NDArray[np.uint8], size_px: int) -> NDArray[np.uint8]:
-    """(h, w, 3) uint8, its longer side brought to ``size_px``: to `resize_with_pad` it is the same picture."""
+    """Returns (h, w, 3) uint8 with the longer side scaled to ``size_px``; `resize_with_pad` gives the same for both."""
     return _resized(frame, size_px).permute(1, 2, 0).contiguous().numpy()
 
 
 def _resized(frame: NDArray[np.uint8], size_px: int) -> Tensor:
-    """(3, h, w) uint8"""
+    """Returns (3, h, w) uint8."""
     height_px, width_px = frame.shape[:2]
     longest_px = max(height_px, width_px)
     new_height_px = max(1, height_px * size_px // longest_px)
     new_width_px = max(1, width_px * size_px // longest_px)
-    # Copied: frames off the wire are read-only views of bytes, which torch warns of, and may have any strides.
+    # Copied: frames off the wire are read-only views of bytes, which torch warns about, and may have any strides.
     pixels = torch.from_numpy(np.array(frame, order="C")).permute(2, 0, 1)
     if (new_height_px, new_width_px) == (height_px, width_px):
         return pixels
@@ -47,7 +47,7 @@ def _resized(frame: NDArray[np.uint8], size_px: int) -> Tensor:
 
 
 def camera_batch(frames: Sequence[NDArray[np.uint8] | None], size_px: int) -> tuple[Tensor, Tensor]:
-    """Returns one moment's views, (1, V, 3, px, px), and which cameras were not None, (1, V) bool."""
+    """Returns one observation's views, (1, V, 3, px, px), and which cameras were not None, (1, V) bool."""
     if not frames:
         return torch.empty(1, 0, 3, size_px, size_px), torch.empty(1, 0, dtype=torch.bool)
     missing = torch.full((3, size_px, size_px), PADDING)

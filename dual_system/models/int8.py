@@ -1,4 +1,4 @@
-"""Weight-only int8: a quarter of the memory, for CPUs; the products themselves stay floating.
+"""Weight-only int8: a quarter of float32's memory, for CPUs; products are computed in floating point.
 
 Each output row's scale is its largest weight / 127.
 """

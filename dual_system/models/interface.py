@@ -1,10 +1,9 @@
-"""The cognition interface: P = [e_age, W_c C_1, ..., W_c C_K], all that System 2 tells System 1 (paper 3.1).
+"""The cognition interface: P = [e_age, W_c C_1, ..., W_c C_K], all that passes from System 2 to System 1 (paper 3.1).
 
 Choices the paper leaves open, made here: the age enters as [sin | cos] at log-spaced periods from 0.1 s to
-100 s and does not pass W_c (as the equation reads); P stands in front of the images; fresh W_c and W_a give P
-the rms of the text embeddings. That scale matters little to pi0.5, whose first act is a scale-free RMSNorm: a
-small W_c does not make the prefix silent, and even an all-zero token takes part in the softmax. Null is not
-absent.
+100 s and does not pass W_c (as the equation reads); P precedes the images; fresh W_c and W_a give P the rms of the
+text embeddings. That scale matters little to pi0.5, which begins with a scale-free RMSNorm: a small W_c does not
+silence the prefix, and even an all-zero token takes part in the softmax. Null is not absent.
 """
 
 # B batch, K carriers, H size of a carrier state, W width of the language stream, P = 1 + K tokens
@@ -32,16 +31,16 @@ class CognitionConfig:
     cognition_size: int = 4096
     """H, the hidden size of PONDER (4096 for Qwen3.5-9B)."""
     attention: PrefixAttention = "full"
-    """full: P is in one bidirectional block with images and text, as a text prefix would be. isolated: P and
-    they do not see each other, so image and text keys do not depend on cognition; the actions see both."""
+    """full: P is in one bidirectional block with images and text, as a text prefix would be. isolated: P does not
+    attend to images and text nor they to P, so their keys do not depend on cognition; the actions attend to both."""
     gradient_scale: float = 0.5
     """Scale of the action gradient that enters PONDER through C (paper A.3)."""
     projector_std: float | None = None
     """Initial std of W_c. None: for C of rms 1, W_c C has the rms of the text embeddings. (The paper's 1e-3
     is for GR00T.)"""
     rounds_places: bool = False
-    """Snap the first numbers of every carrier to the nearest place's code (`small_pair.place_code`). Declared by the
-    demo's POUNCE alone; no other folder has it."""
+    """Snap the place encoding at the start of every carrier to the nearest valid one (`small_pair.place_code`). Only
+    the demo's POUNCE declares it."""
     age_features: int = 64
     age_min_period_s: float = 0.1
     age_max_period_s: float = 100.0
@@ -58,7 +57,7 @@ class CognitionConfig:
 
     @property
     def num_tokens(self) -> int:
-        """Length of P: one age token and K carriers, or nothing at K = 0."""
+        """Length of P: one age token and K carriers, or 0 at K = 0."""
         return self.num_carriers + 1 if self.num_carriers else 0
 
 
@@ -74,7 +73,7 @@ class _ScaleGradient(torch.autograd.Function):
 
 
 def scale_gradient(x: Tensor, scale: float) -> Tensor:
-    """Identity forward; multiplies the gradient by ``scale`` on the way back."""
+    """Identity in the forward pass; multiplies the gradient by ``scale`` in the backward pass."""
     return cast(Tensor, _ScaleGradient.apply(x, scale))  # type: ignore[no-untyped-call]
 
 
@@ -100,7 +99,7 @@ class CognitionPrefix(nn.Module):
 
     @torch.no_grad()
     def initialise(self, text_rms: float, generator: torch.Generator) -> None:
-        """Fresh weights: null cognition and bias zero, W_c and W_a normal so that P has the rms ``text_rms``.
+        """Draws fresh weights: null cognition and biases zero, W_c and W_a normal so that P has the rms ``text_rms``.
 
         Args:
             text_rms: rms of the text embeddings as they enter the stream, sqrt(W) included.
@@ -120,11 +119,11 @@ class CognitionPrefix(nn.Module):
 
         Args:
             cognition_BKH: carrier states; None means null for every sample.
-            age_ns_B: int64 age of each cognition. Null samples get age 0 whatever stands here (paper 3.1).
-            is_null_B: bool, samples that see C_null instead: nothing ready yet, or cognition dropout.
+            age_ns_B: int64 age of each cognition. Null samples get age 0 regardless (paper 3.1).
+            is_null_B: bool, samples that get C_null instead: nothing ready yet, or cognition dropout.
 
         Raises:
-            ValueError: cognition has another K or H than configured; the network would run with any K.
+            ValueError: cognition has another K or H than configured; the network itself would accept any K.
         """
         null_BKH = self.null_cognition.expand(len(age_ns_B), -1, -1)
         if cognition_BKH is None:
@@ -135,10 +134,10 @@ class CognitionPrefix(nn.Module):
                 "(batch, num_carriers, cognition_size)"
             )
         else:
-            # Scaled before the null is chosen: C_null is POUNCE's own parameter and learns at full rate.
+            # Scaled before the null is chosen: C_null is POUNCE's own parameter and gets its full gradient.
             source_BKH = scale_gradient(cognition_BKH.float(), self.config.gradient_scale)
             if self.config.rounds_places:
-                from dual_system.models.small_pair.place_code import snap_to_code  # here: nothing else may need it
+                from dual_system.models.small_pair.place_code import snap_to_code  # lazy: only the demo's pair has it
 
                 source_BKH = snap_to_code(source_BKH)
             if is_null_B is not None:

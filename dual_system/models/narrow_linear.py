@@ -1,7 +1,7 @@
-"""Linear layers with a byte a weight, each output row under a scale of its own: what int8 and fp8 share.
+"""Linear layers with one byte per weight and one scale per output row: the common part of int8 and fp8.
 
-Weights are widened as a layer is called, which costs about what reading them as floats would. Which layers of a model
-are narrow is the business of who serves it.
+Weights are widened when a layer is called, which costs about as much as reading float weights. The servers decide
+which layers of a model are narrow.
 """
 
 # O output rows, I input columns
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 
 class NarrowLinear(nn.Module, ABC):
-    """`nn.Linear` over narrow weights. How they are narrowed is the subclass's."""
+    """`nn.Linear` over narrow weights; the subclass defines how to narrow them."""
 
     weight_OI: Tensor
     scale_O: Tensor
@@ -30,7 +30,7 @@ class NarrowLinear(nn.Module, ABC):
     @staticmethod
     @abstractmethod
     def narrowed(exact_RI: Tensor) -> tuple[Tensor, Tensor]:
-        """Float32 rows as numbers of a byte, and the scale (R) float32 that widens each row again."""
+        """Returns float32 rows as one-byte numbers, and each row's scale (R,) float32 for widening."""
 
     def product(self, x: Tensor) -> Tensor:
         """``x`` times the weight, without the bias."""
@@ -42,14 +42,14 @@ class NarrowLinear(nn.Module, ABC):
 
 
 def row_scale(exact_RI: Tensor, most: float) -> Tensor:
-    """(R) float32 under which every row's largest weight becomes ``most``. A row of zeros has one as well."""
+    """Scales (R,) float32 that map every row's largest weight to ``most``; positive for a row of zeros too."""
     return (exact_RI.abs().amax(dim=1) / most).clamp(min=torch.finfo(torch.float32).tiny)
 
 
 def quantise_where(
     model: nn.Module, is_narrow: Callable[[str], bool], narrowed: Callable[[nn.Linear], NarrowLinear]
 ) -> int:
-    """Replaces linear layers in place, those whose weight has such a name; returns how many bytes that saved."""
+    """Replaces in place the linear layers whose weight's name satisfies ``is_narrow``; returns the bytes saved."""
     saved = 0
     for name, module in list(model.named_modules()):
         for child_name, child in list(module.named_children()):

@@ -1,4 +1,4 @@
-"""Robot units to the network's [-1, 1] and back: an `action_space` and the quantiles of its numbers."""
+"""Robot units to the network's [-1, 1] and back: an `action_space` and the quantiles of its dims."""
 
 # N horizon, 8 = 7 arm joints (rad) + gripper, D numbers of the space
 
@@ -16,7 +16,7 @@ QUANTILE_EPS = 1e-6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Quantiles:
-    """1 % and 99 % quantiles of each dim in the training data; what lies beyond maps beyond [-1, 1]."""
+    """1 % and 99 % quantiles of each dim in the training data; values beyond them map beyond [-1, 1]."""
 
     q01: tuple[float, ...]
     q99: tuple[float, ...]
@@ -50,19 +50,19 @@ class Quantiles:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobotStatistics:
-    """What the network's numbers mean: in which space it reads states and answers, and the quantiles there.
+    """How the network's numbers map to the robot: the action space of its states and actions, and their quantiles.
 
     Raises:
-        ValueError: no such space, or quantiles of another number of dims.
+        ValueError: no such space, or quantiles with a wrong number of dims.
     """
 
     state: Quantiles
     action: Quantiles
     space: ActionSpace = "joint_delta"
     reach: tuple[float, ...] = ()
-    """Of each row of a chunk, how far it moves compared with all of them; () takes all rows as one, as the released
-    RoboMME statistics do. The first rows move little: measured by the whole chunk's spread, what decides over a grasp
-    is lost in a flow's last bit of noise."""
+    """Spread of each chunk row relative to the whole chunk's, by which the row is scaled; () for one scale, as in the
+    released RoboMME statistics. The first rows move little: on the whole chunk's scale, the differences that decide a
+    grasp drown in the flow's residual noise."""
 
     def __post_init__(self) -> None:
         expected = num_dims(self.space)
@@ -82,7 +82,7 @@ class RobotStatistics:
     def normalise_targets(self, targets_N8: ArrayLike, state_8: ArrayLike, *, first_row: int = 0) -> Floats:
         """Absolute joint targets -> the network's actions (N, D); all rows are relative to the one current state.
 
-        ``first_row``: which row of its chunk the first target is.
+        ``first_row``: index of the first target within its chunk.
         """
         rows_1N = np.arange(len(np.asarray(targets_N8)))[None]
         return self.normalise_chunks(targets_N8, np.asarray(state_8)[None], rows_1N, first_row=first_row)[0]
@@ -90,7 +90,7 @@ class RobotStatistics:
     def normalise_chunks(
         self, targets_T8: ArrayLike, states_M8: ArrayLike, rows_MN: NDArray[np.integer], *, first_row: int = 0
     ) -> Floats:
-        """`normalise_targets` of many chunks (M, N, D): chunk m starts at state m and commands ``targets[rows[m]]``."""
+        """`normalise_targets` for M chunks (M, N, D): chunk m starts at state m and commands ``targets[rows[m]]``."""
         actions_MND = actions_in(self.space, targets_T8, states_M8, rows_MN)
         actions_MND[..., :-1] /= self._reach(actions_MND.shape[1], first_row)
         return self.action.normalise(actions_MND)
@@ -102,7 +102,7 @@ class RobotStatistics:
         return targets_from(self.space, actions, state_8).astype(np.float32)
 
     def _reach(self, num_rows: int, first_row: int) -> NDArray[np.float64]:
-        """(N, 1). Raises ValueError for a longer chunk than the statistics are of."""
+        """Scales (N, 1) of the rows. Raises ValueError for a chunk longer than the statistics cover."""
         if not self.reach:
             return np.ones((num_rows, 1))
         if first_row + num_rows > len(self.reach):
@@ -120,5 +120,5 @@ ROBOMME = RobotStatistics(
         q99=(0.196, 0.377, 0.117, 0.414, 0.126, 0.522, 0.417, 1.0),
     ),
 )
-"""RoboMME's published statistics, as we have them: rounded to three decimals. Right for models trained with
-this table; a public RoboMME checkpoint wants the exact numbers of its own norm_stats."""
+"""RoboMME's published statistics, rounded to three decimals. Right for models trained with this table; a public
+RoboMME checkpoint needs the exact numbers of its own norm_stats."""

@@ -1,4 +1,4 @@
-"""``pp-parity``: does this package compute what the public implementations computed? One JSON line a golden folder.
+"""``pp-parity``: compares this package's outputs with the public implementations'. One JSON line per golden folder.
 
 Every tensor that a golden expects is compared by its largest absolute error: features, velocity, loss, sampling.
 GR00T is run twice, since its head attends to padding: the head alone on the stored features (every row must agree),
@@ -42,7 +42,7 @@ class ParityConfig:
 
 
 def max_abs_errors(golden: Golden) -> dict[str, float]:
-    """Returns the largest absolute error of every tensor that is compared, by the golden's names.
+    """Returns the largest absolute error of every compared tensor, by the golden's names.
 
     Names that begin with ``end_to_end.`` are GR00T's second run. NaN anywhere is an error of infinity.
 
@@ -55,7 +55,7 @@ def max_abs_errors(golden: Golden) -> dict[str, float]:
 
 
 def _compared(golden: Golden) -> Iterator[tuple[str, Tensor, Tensor]]:
-    """Pairs ours with what is expected, where both are defined."""
+    """Pairs our tensors with the expected ones, where both are defined."""
     expected = golden.expected
     if isinstance(golden.model, Pounce):
         yield from _pairs(_run_pi05(golden, golden.model), expected, only={"prefix_hidden": "prefix_pad_mask"})
@@ -71,7 +71,7 @@ def _compared(golden: Golden) -> Iterator[tuple[str, Tensor, Tensor]]:
 
 
 def _pairs(ours: Tensors, expected: Tensors, *, only: dict[str, str]) -> Iterator[tuple[str, Tensor, Tensor]]:
-    """``only`` names the mask of a tensor that is defined in some rows."""
+    """``only`` names the mask of a tensor that is defined in some rows only."""
     for name in ours.keys() & expected.keys():
         chosen = expected[only[name]] if name in only else slice(None)
         yield name, ours[name][chosen], expected[name][chosen]
@@ -156,7 +156,7 @@ def _is_exact(name: str) -> bool:
 
 
 def report(golden: Golden, tolerance: float) -> dict[str, object]:
-    """Returns the fields of one line: which tensors agree, which do not, which nobody compared."""
+    """Returns the fields of one line: which tensors agree, which do not, which were not compared."""
     errors = max_abs_errors(golden)
     failed = [name for name, error in errors.items() if not error <= (0.0 if _is_exact(name) else tolerance)]
     return {

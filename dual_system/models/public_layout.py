@@ -1,7 +1,7 @@
-"""Reading and writing checkpoints in a public layout: what both families share.
+"""Reading and writing checkpoints in a public layout: the code that both families share.
 
-A layout is a table of names and a few habits: tensors that are stored and never used, a prefix that a foreign
-policy class adds. Our own tensors ride in the same file under ``pounce_prefix.``.
+A layout is a table of names and a few peculiarities: stored tensors that are never used, a prefix that another
+project's policy class adds. Our own tensors are in the same file under ``pounce_prefix.``.
 """
 
 import json
@@ -55,7 +55,7 @@ def weights_files(path: Path) -> list[Path]:
 
 
 def read_tensors(path: Path, is_used: Callable[[str], bool] = lambda name: True) -> dict[str, Tensor]:
-    """Reads the tensors of a file or of its shards; names that ``is_used`` refuses are never touched."""
+    """Reads the tensors of a file or of its shards; those for which ``is_used`` is False are never read."""
     tensors: dict[str, Tensor] = {}
     for file_path in weights_files(path):
         try:
@@ -72,10 +72,10 @@ def write_tensors(tensors: Mapping[str, Tensor], path: Path) -> None:
 
 
 def renamed(name: str, table: Iterable[tuple[str, str]]) -> str:
-    """Exchanges the first prefix of ``table`` that ``name`` begins with.
+    """Replaces the prefix of ``name`` by the first entry (ours, public) of ``table`` that matches.
 
     Raises:
-        KeyError: none fits.
+        KeyError: no entry matches.
     """
     for ours, public in table:
         if name.startswith(ours):
@@ -84,9 +84,9 @@ def renamed(name: str, table: Iterable[tuple[str, str]]) -> str:
 
 
 def assign(model: nn.Module, found: Mapping[str, Tensor], public_name: Callable[[str], str], source: str) -> bool:
-    """Puts tensors under public names into ``model``, float32 throughout; returns whether a cognition prefix came.
+    """Loads tensors with public names into ``model``, float32 throughout; returns whether a cognition prefix was there.
 
-    A public file has none: the model's own prefix parameters are then left as they are.
+    A public file has none: the model then keeps its own prefix parameters.
 
     Raises:
         WeightsError: a tensor is missing, unknown or of another shape.
@@ -110,8 +110,8 @@ def assign(model: nn.Module, found: Mapping[str, Tensor], public_name: Callable[
     }
     if any(problems.values()):
         raise WeightsError(source, problems)
-    # Copied even where float32 already: tensors of a mapped file lie unaligned, and CPU products of unaligned
-    # weights differ in the last bit from those of the model that was saved.
+    # Copied even if float32 already: tensors of a mapped file are unaligned, and CPU products of unaligned
+    # weights differ in the last bit from those of the saved model.
     state = {name: found[public].to(torch.float32, copy=True) for public, name in wanted.items()}
     model.load_state_dict(state, strict=False, assign=True)
     return has_prefix

@@ -46,7 +46,7 @@ class Float32LayerNorm(nn.LayerNorm):
 
 
 class VisionAttention(nn.Module):
-    """Every patch sees every patch of its own image."""
+    """Self-attention among the patches of one image."""
 
     def __init__(self, config: VisionConfig) -> None:
         super().__init__()
@@ -94,7 +94,7 @@ class VisionLayer(nn.Module):
 
 
 class VisionTower(nn.Module):
-    """Submodules carry the public key names, so that `pi05_weights` renames whole prefixes only."""
+    """Submodules have the public key names, so that `pi05.weights` renames whole prefixes only."""
 
     def __init__(self, config: VisionConfig) -> None:
         super().__init__()
@@ -107,7 +107,7 @@ class VisionTower(nn.Module):
     def forward(self, images_B3PP: Tensor, stream_dtype: torch.dtype) -> Tensor:
         """(B, 3, P, P) float32 in [-1, 1] -> (B, S, W) after the last LayerNorm.
 
-        Pixels and positions are added in float32; the layers run in ``stream_dtype``, that of their matrices.
+        Patch and position embeddings are added in float32; the layers run in ``stream_dtype``, their weights' dtype.
         """
         patches_BSW = self.patch_embedding(images_B3PP).flatten(2).transpose(1, 2)
         x_BSW = (patches_BSW + self.position_embedding.weight).to(stream_dtype)

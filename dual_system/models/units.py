@@ -1,8 +1,8 @@
-"""The parts of both systems that hold most weights and run through ``forward`` alone.
+"""The modules to shard with FSDP2: they hold most weights of both systems and are called through ``forward`` alone.
 
-What gathers weights when a module runs (FSDP2) sees only ``forward``. Of pi0.5's layers, GR00T's blocks and PONDER's
-vision blocks it can have the MLPs, most of their weights: their attention is called otherwise (`gemma.Attention.qkv`,
-`ponder_vision`).
+FSDP2 gathers a module's weights in hooks around ``forward``. In pi0.5's layers, GR00T's blocks and PONDER's vision
+blocks only the MLPs qualify, which hold most of the weights: attention is called through other methods
+(`gemma.Attention.qkv`, `ponder.vision`).
 """
 
 from __future__ import annotations
@@ -19,5 +19,5 @@ _UNITS = (Qwen3_5DecoderLayer, Qwen3_5VisionMLP, VisionLayer, GeGlu, Qwen3Layer,
 
 
 def units_of(model: nn.Module) -> list[nn.Module]:
-    """Returns them in the order of the model; none holds another."""
+    """Returns the shardable modules in the order of the model; none contains another."""
     return [module for module in model.modules() if isinstance(module, _UNITS)]

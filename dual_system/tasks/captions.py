@@ -1,6 +1,6 @@
 """Subgoal texts: one template per subtask, a plain and a grounded reading of it, and when the grounded one is fixed.
 
-In a template, what only the grounded text says stands in brackets, and ``<>`` is a coordinate: "press the button[
+In a template, the part of the grounded text alone is in brackets, and ``<>`` is a coordinate: "press the button[
 at <>]" reads "press the button", or "press the button at <69, 99>" with the row first. Templates are upstream's,
 typos included.
 """

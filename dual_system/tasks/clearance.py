@@ -1,7 +1,7 @@
-"""How far the tool is from the next thing that it could touch: what says whether an arm may be nudged.
+"""Distance from the tool to the nearest object that it could touch, which decides whether an arm may be nudged.
 
-Things are the boxes around their geoms. That is exact for cubes, pegs and walls, a little early for round ones, and
-takes a tenth of a millisecond. What the fingers hold moves with the hand and does not count.
+Objects are approximated by the boxes around their geoms. That is exact for cubes, pegs and walls, conservative for
+round ones, and takes a tenth of a millisecond. An object between the fingers moves with the hand and does not count.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Clearance:
         self._root = model.body_rootid[self._body]
 
     def tool_m(self) -> float:
-        """Returns the distance in m from the tool point to the nearest thing that is not in the hand; 0 inside one."""
+        """Returns the distance in m from the tool point to the nearest object not in the hand; 0 inside one."""
         data = self._physics.data
         R = data.geom_xmat[self._geoms].reshape(-1, 3, 3)
         tool_m = self._physics.tcp_transform()[:3, 3] - data.geom_xpos[self._geoms]

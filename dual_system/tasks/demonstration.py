@@ -21,12 +21,12 @@ from dual_system.tasks.physics import Physics, PhysicsState
 from dual_system.tasks.task import Task
 
 Look = Callable[[Sequence[str]], list[captions.Pixel] | None]
-"""Returns where the front camera sees bodies, in order; None if one of them is hidden."""
+"""Returns the bodies' pixels in the front camera, in order; None if one of them is hidden."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """One frame of the video, 50 ms after the one before unless something unrecorded lies between."""
+    """One frame of the video, 50 ms after the previous one unless something unrecorded lies between."""
 
     physics: PhysicsState
     caption: Caption

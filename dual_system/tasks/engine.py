@@ -26,7 +26,7 @@ class Status(enum.Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Progress:
-    """The subtask that is current, and the outcome so far; ``reason`` says why an episode ended."""
+    """The current subtask and the outcome so far; ``reason`` is why an episode ended."""
 
     index: int = 0
     status: Status = Status.ONGOING

@@ -125,7 +125,7 @@ class Environment:
 
     @property
     def layout(self) -> Any:
-        """What this episode looks like and asks for; the type is the task's."""
+        """Scene and goal of this episode; the type is the task's."""
         self._require_episode()
         return self._layout
 

@@ -57,7 +57,7 @@ class Fork:
     own: Branch
     twin: Branch
     is_cut: bool  # else it is retold
-    seam: float  # rad or m: how far things jump, on a cut twin's last step or after another video; 0 without either
+    seam: float  # rad or m: jump of the objects on a cut twin's last step or after another video; 0 without either
 
 
 def fork(environment: Environment, variant: int = 0) -> Fork:
@@ -77,12 +77,12 @@ def fork(environment: Environment, variant: int = 0) -> Fork:
         if not task.repeats_itself:
             layouts = task.retold(now.layout)
             seam = retell(environment, _nth(layouts, variant, now.step), (*own.past, own.now)[0])
-            told = _replayed(environment, now)
-            if _is_another_world(environment.physics, told.now.physics, now.physics):
+            other = _replayed(environment, now)
+            if _is_another_world(environment.physics, other.now.physics, now.physics):
                 raise ForkError(f"at step {now.step} one still sees which past it was; step on until nothing is shown")
-            if not _was_shown_apart(environment.physics, own, told):
+            if not _was_shown_apart(environment.physics, own, other):
                 raise ForkError(f"by step {now.step} nothing has been shown yet that could tell two pasts apart")
-            twin = replace(told, now=_in_the_world_of(now, told.now))
+            twin = replace(other, now=_in_the_world_of(now, other.now))
             return Fork(own=own, twin=twin, is_cut=False, seam=seam)
         moment, seam = _nth(earlier_moments_like(environment.physics, own.past, now), variant, now.step)
         twin = Branch(past=own.past[:moment], now=_in_the_world_of(now, own.past[moment]))
@@ -109,7 +109,7 @@ def retell(environment: Environment, layout: Any, first: EpisodeState) -> float:
 
 
 def _is_another_world(physics: Physics, a: PhysicsState, b: PhysicsState) -> bool:
-    """Returns whether two states can be told apart, now or by how they continue; hidden paint does not count.
+    """Returns whether two states differ visibly or in how they continue; hidden paint does not count.
 
     It casts rays and renders no pictures, and leaves the physics in one of the two states.
     """
@@ -123,7 +123,7 @@ def _is_another_world(physics: Physics, a: PhysicsState, b: PhysicsState) -> boo
 
 
 def _was_shown_apart(physics: Physics, a: Branch, b: Branch) -> bool:
-    """Returns whether two pasts, conditioning videos included, could be told apart while they lasted."""
+    """Returns whether two pasts, conditioning videos included, differed visibly."""
     one, other = _shown(a), _shown(b)
     if len(one) != len(other):
         return True

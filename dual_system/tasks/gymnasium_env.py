@@ -8,7 +8,7 @@ Actions: (8,), as `Environment.step` takes them: radians, not normalised; wrap i
 Reward: 1 at success, else 0. The episode is terminated by success or failure and truncated by Gymnasium's own time
 limit, the paper's 1300 steps unless ``make(max_episode_steps=...)`` says otherwise.
 
-What a memory task cannot be solved without is in the info of `reset`: the instruction, and the conditioning video.
+The info of `reset` has the instruction and the conditioning video, without which a memory task cannot be solved.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Import this before mujoco: without a display, MuJoCo must be told to render through EGL when it is first imported."""
+"""Import this before mujoco: without a display, MuJoCo must be set to EGL rendering before its first import."""
 
 import os
 import sys

@@ -100,7 +100,7 @@ class Kinematics:
         raise UnreachableError(f"the arm cannot reach {target[:3, 3].round(4)} m from {start.round(3)} rad")
 
     def overlap_m(self, world: Any, qpos: Array, ignored_body: str) -> float:
-        """Returns how deep the arm would cut into things at joint angles (7,) with open fingers; 0 if it has room.
+        """Returns the arm's penetration into objects [m] at joint angles (7,) with open fingers; 0 if it is free.
 
         Args: world is the MjData whose props are in the way, which is only read; one body of it does not count.
         """

@@ -1,6 +1,6 @@
-"""The oracle's motion library: generators of absolute joint targets, written as one would tell a robot what to do.
+"""The oracle's motion library: generators of absolute joint targets, written like instructions to a robot.
 
-Every motion plans from where the arm is when it starts, not from where it was told to be, so it must be consumed
+Every motion plans from the arm's measured pose when it starts, not from its last target, so it must be consumed
 step by step with the physics: next action, advance, next action. Motions are straight screws of the tool, timed to
 the arm's speed and acceleration limits; a gripper command holds the arm still for six steps.
 """
@@ -58,21 +58,21 @@ _QUARTERS = ((1, 0), (0, 1), (0, -1), (-1, 0))  # cosine and sine of 0, 90, -90 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FailedGrasp:
-    """A grasp that closes beside or above the thing before the right one is made: data that show how to recover."""
+    """A grasp that closes beside or above the object before the right one: demonstrations of recovery."""
 
     before: int  # which of the script's grasps it precedes, from 0
     offset: tuple[int, int, int]  # where it is aimed: -1, 0 or 1 times upstream's miss along x, y and z
 
 
 class Motions:
-    """What the oracle can do with one arm. Actions are (8,) float32: seven joint targets [rad], gripper in [-1, 1].
+    """The oracle's motions of one arm. Actions are (8,) float32: seven joint targets [rad], gripper in [-1, 1].
 
     ``num_grasps`` counts the grasps begun so far, without the failed ones.
 
-    With ``watches`` a grasp follows a thing that is moved meanwhile; without, as upstream, it closes where that was.
+    With ``watches`` a grasp follows an object that moves meanwhile; without, as upstream, it closes where that was.
 
-    With ``resumes`` the first grasp takes over from whoever moved the arm before: it goes on from where the tool is,
-    down upon the thing, up with it, or up and over it once more. ``has_resumed`` is true from then on.
+    With ``resumes`` the first grasp takes over from another controller: it continues from the tool's pose, down on
+    the object, up with it, or up and over it once more. ``has_resumed`` is true from then on.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class Motions:
 
     @property
     def strays_by(self) -> int:
-        """1 or -1 where a grasp was made to fail: to which side an insertion first goes astray, too; else 0."""
+        """Side to which an insertion first strays, 1 or -1, if a grasp is made to fail; else 0."""
         return 0 if self._failed_grasp is None else next((sign for sign in self._failed_grasp.offset if sign), 1)
 
     def move(self, target: Array) -> Actions:
@@ -106,7 +106,7 @@ class Motions:
             yield self._action(qpos)
 
     def hold(self, num_steps: int) -> Actions:
-        """Keeps the arm where it is and the gripper as it was told."""
+        """Holds the arm's pose and the gripper's last command."""
         qpos = self._physics.arm_qpos()
         for _ in range(num_steps):
             yield self._action(qpos)
@@ -139,12 +139,12 @@ class Motions:
         yield from self.move(above)
 
     def wait_until(self, elapsed_steps: int) -> Actions:
-        """Stands still until so many control steps have passed since reset, in rounds of a gripper command's length."""
+        """Stands still until ``elapsed_steps`` control steps after reset, in rounds of a gripper command's length."""
         while self._physics.elapsed_steps() < elapsed_steps:
             yield from self.hold(GRIPPER_STEPS)
 
     def wait(self, num_steps: int) -> Actions:
-        """Stands still for at least so many control steps, in rounds of a gripper command's length."""
+        """Stands still for at least ``num_steps`` control steps, in rounds of a gripper command's length."""
         for _ in range(0, num_steps, GRIPPER_STEPS):
             yield from self.hold(GRIPPER_STEPS)
 
@@ -344,7 +344,7 @@ class Motions:
         return bool(np.linalg.norm(self._physics.position_m(body)[:2] - above[:2, 3]) > OVER_M)
 
     def _resume(self, body: str, from_z_m: float, grasp_z_m: float) -> Actions:
-        """A grasp that somebody else has begun, well or badly."""
+        """Continues a grasp that another controller has begun, well or badly."""
         self.num_grasps += 1
         here = self._physics.tcp_transform()
         if self._physics.is_grasped(body):
@@ -407,7 +407,7 @@ class Motions:
             yield self._action(qpos)
 
     def _tip_over(self, target: str) -> Array:
-        """Where the stick points at a target (4, 4), turned as it is now."""
+        """Tool pose (4, 4) at which the stick points at a target, with its current rotation."""
         x_m, y_m, _ = self._physics.position_m(target)
         return put_at(self._physics.tcp_transform(), x_m, y_m, _TIP_M)
 
@@ -442,7 +442,7 @@ class Motions:
             return 0.0
 
     def _carried_to(self, x_m: float, y_m: float, z_m: float) -> Array:
-        """The tool (4, 4) at a place as it is turned now, or by quarter turns if the wrist cannot get there so."""
+        """Tool pose (4, 4) at a place with its current rotation, or with quarter turns if the wrist cannot reach it."""
         held = self._physics.tcp_transform()
         quarters = [np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) for c, s in _QUARTERS]
         return self._first_reachable([put_at(T @ held, x_m, y_m, z_m) for T in quarters])

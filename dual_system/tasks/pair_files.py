@@ -97,7 +97,7 @@ def write_index(
 
 
 def read_pairs(folder: Path) -> Iterator[Pair]:
-    """Yields the pairs of a folder in the index's order, read as they are asked for.
+    """Yields the pairs of a folder in the index's order, reading lazily.
 
     Raises FileNotFoundError without an index, and ValueError for another schema.
     """
@@ -120,9 +120,9 @@ def _index(folder: Path) -> dict[str, Any]:
 def _read_pair(entry: dict[str, Any], folder: Path) -> Pair:
     with np.load(folder / entry["file"]) as file:
         arrays = {name: file[name] for name in file.files}
-    told: dict[str, Any] = {branch: _telling(branch, entry[branch], arrays) for branch in _BRANCHES}
+    branches: dict[str, Any] = {branch: _telling(branch, entry[branch], arrays) for branch in _BRANCHES}
     plain = {name: value for name, value in entry.items() if name not in {"file", *_BRANCHES}}
-    return Pair(**plain, frames=_pictures("now", arrays), state=arrays["now/state"], **told)
+    return Pair(**plain, frames=_pictures("now", arrays), state=arrays["now/state"], **branches)
 
 
 def _telling(branch: str, texts: dict[str, str], arrays: dict[str, NDArray[Any]]) -> Telling:

@@ -51,7 +51,7 @@ _CELL_M = 0.006  # clustering grid of the visual meshes: looks the same at 256 p
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Robot:
-    """What the arm carries, and what states (8,) and actions (8,) therefore hold.
+    """The arm's tool, and the layout of states (8,) and actions (8,) that follows from it.
 
     Both begin with the seven joints [rad]. With a gripper, the state ends with one finger's opening [m] and the action
     with a command in [-1, 1], -1 closed. Without one, the state ends with 0 and the action with -1, which moves

@@ -1,6 +1,6 @@
-"""Numbers by name: one MuJoCo world that is set, advanced by whole control steps, read, saved and restored.
+"""Physics: one MuJoCo world that is set, advanced by whole control steps, read by names, saved and restored.
 
-Physics knows where things are, never what they mean: success and failure live in the tasks.
+It has poses but no meaning: the tasks define success and failure.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ class Physics:
         return self.data.qvel[self._arm_qvel]
 
     def state(self) -> Array:
-        """What the robot says of itself (8,): seven joints in rad, and one finger's opening in m, 0 without fingers."""
+        """The robot's state (8,): seven joints in rad, and one finger's opening in m, 0 without fingers."""
         return np.append(self.arm_qpos(), self.finger_openings_m()[:1] if self.robot.has_gripper else 0.0)
 
     def finger_openings_m(self) -> Array:
@@ -200,9 +200,9 @@ class Physics:
         self.refresh()  # leaves the solver's warm start as it is; only a step moves that
 
     def gap(self, a: PhysicsState, b: PhysicsState, *, scripted: bool = True) -> float:
-        """How far apart things are in two states: the largest difference of a joint's position, in rad or m.
+        """Distance of two states: the largest difference of a joint's position, in rad or m.
 
-        Without ``scripted``, things that only a task's stage moves do not count.
+        Without ``scripted``, objects that only a task's stage moves do not count.
         """
         parts = mujoco.mjtState.mjSTATE_QPOS
         if scripted:

@@ -1,4 +1,4 @@
-"""Drawing where things lie: the button, cubes and targets of one episode, none upon another.
+"""Draws the places of the button, cubes and targets of one episode, without overlap.
 
 The order of the draws is part of a task: change it, and every seed gives another scene.
 """
@@ -40,7 +40,7 @@ class PlacedCube:
 
     @property
     def footprint(self) -> Footprint:
-        """What it covers of the table."""
+        """The area that it covers on the table."""
         return Footprint(center_m=(self.x_m, self.y_m), half_m=(CUBE_HALF_M, CUBE_HALF_M), yaw_rad=self.yaw_rad)
 
     def put(self, physics: Physics, name: str) -> None:
@@ -81,7 +81,7 @@ def draw_button(
 
 
 def draw_threesome(rng: np.random.Generator) -> tuple[Point, ...]:
-    """Draws the three points that things are scattered about: a triangle's corners or a line's, not yet turned."""
+    """Draws the three points around which objects are scattered: on a triangle or a line, not yet rotated."""
     return (_TRIANGLE_M, _LINE_M)[int(rng.integers(2))]
 
 

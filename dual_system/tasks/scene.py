@@ -1,7 +1,7 @@
-"""What stands around the arm: table, lights, cameras, and the props a task may put on the table.
+"""The scene around the arm: table, lights, cameras, and the props that a task may put on the table.
 
 A prop is added to the specification once, under a name, and placed anew for each episode by `Physics.place`. Cubes move
-freely; buttons, discs and other scripted things are mocap bodies, so that where they are is part of the physics state.
+freely; buttons, discs and other scripted objects are mocap bodies, so that their poses are part of the physics state.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Which pixels of a camera show an object: ray casting, so that grounded texts need no renderer.
+"""Visibility of objects in a camera's pixels by ray casting, so that grounded texts need no renderer.
 
 The same rays that a renderer would trace through pixel centres are cast at the object's surroundings only. Texts are
 therefore identical with rendering on or off, and do not depend on a graphics driver.
@@ -40,7 +40,7 @@ def project(K: Array, Rt: Array, points_m: Array) -> Array:
 
 
 def visible_pixels(physics: Physics, camera: str, body: str, image_px: int) -> NDArray[np.int64]:
-    """Returns the pixels (n, 2) as row, column in which the camera sees the body itself (not its child bodies)."""
+    """Returns the pixels (n, 2), as row and column, that show the body itself (not its child bodies)."""
     K, Rt = intrinsic(physics, camera, image_px), extrinsic(physics, camera)
     corners_px = project(K, Rt, _corners(physics, body))
     low = np.clip(np.floor(corners_px.min(axis=0)).astype(int) - 1, 0, image_px)

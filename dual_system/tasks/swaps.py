@@ -1,4 +1,4 @@
-"""Things that change places before one's eyes, two at a time, each in its own lane.
+"""Objects that change places in view, two at a time, each in its own lane.
 
 Where everything stands is a function of the time since the first swap began: nothing accumulates, and a restored
 episode needs no memory of it.
@@ -18,15 +18,15 @@ Swap = tuple[int, int]  # indices of the two that change places
 
 
 def nearest(spots: Sequence[Spot], index: int) -> int:
-    """Returns which other spot is closest to that of ``index``."""
+    """Returns the index of the other spot closest to that of ``index``."""
     others = [i for i in range(len(spots)) if i != index]
     return min(others, key=lambda i: float(np.hypot(*np.subtract(spots[i].xy_m, spots[index].xy_m))))
 
 
 def spots_after(spots: Sequence[Spot], swaps: Sequence[Swap], elapsed_steps: float, lane_m: float) -> tuple[Spot, ...]:
-    """Returns where everything stands so many steps after the first swap began; ``lane_m`` is a lane's widest bulge.
+    """Returns all places ``elapsed_steps`` after the first swap began; ``lane_m`` is a lane's widest bulge.
 
-    Swaps that are over, half done and yet to come are all accounted for.
+    Swaps that are over, in progress and yet to come are all accounted for.
     """
     now = list(spots)
     for nth, (first, second) in enumerate(swaps):

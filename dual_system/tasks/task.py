@@ -1,9 +1,8 @@
-"""What a task is: a scene, a list of subtasks, and a registry of the tasks that exist.
+"""The base of tasks: a scene, a list of subtasks, and a registry of all tasks.
 
-Physics knows numbers by name, a task knows what they mean, the environment knows the order of calls. A task never
-steps, physics never scores, predicates are pure readings. Task objects hold no state: what one episode asks is its
-layout, what has happened so far is its memory, and both are frozen values, so that an episode can be saved and
-restored.
+Physics has numbers by name, a task defines their meaning, the environment the order of calls. A task never steps,
+physics never scores, and predicates only read. Task objects are stateless: an episode's goal is its layout, its past
+events are its memory, and both are frozen values, so that an episode can be saved and restored.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ TaskT = TypeVar("TaskT", bound="type[Task[Any, Any]]")
 
 
 class TaskError(ValueError):
-    """A task or difficulty was asked for that does not exist."""
+    """A task or difficulty does not exist."""
 
 
 def never(physics: Physics, memory: Any) -> str | None:
@@ -91,7 +90,7 @@ class Task(ABC, Generic[LayoutT, MemoryT]):
 
     @abstractmethod
     def sample(self, rng: np.random.Generator, difficulty: str) -> LayoutT:
-        """Draws what one episode looks like and asks for."""
+        """Draws the scene and the goal of one episode."""
 
     @abstractmethod
     def arrange(self, physics: Physics, layout: LayoutT) -> None:

@@ -24,7 +24,7 @@ def facing_down(closing: Array) -> Array:
 
 
 def is_over(tool: Array, above: Array, grasp_z_m: float) -> bool:
-    """Whether a tool (4, 4) is on the straight way down from where it would wait above a thing."""
+    """Whether a tool (4, 4) is on the straight way down from its waiting pose above an object."""
     aside_m = np.linalg.norm(tool[:2, 3] - above[:2, 3])
     is_between = grasp_z_m - OVER_Z_M < tool[2, 3] < above[2, 3] + OVER_Z_M
     return bool(aside_m < OVER_M and is_between and tool[:3, 1] @ above[:3, 1] > _OVER_COS)
@@ -38,7 +38,7 @@ def at_height(T: Array, z_m: float) -> Array:
 
 
 def put_at(T: Array, x_m: float, y_m: float, z_m: float) -> Array:
-    """The same, turned as it is, at another place."""
+    """The transform with the same rotation at another place."""
     moved = T.copy()
     moved[:3, 3] = x_m, y_m, z_m
     return moved
@@ -52,7 +52,7 @@ def lying_along(along: Array) -> Array:
 
 
 def ways_of_carrying(body: Array, tool: Array, poses: Sequence[Array]) -> list[list[Array]]:
-    """Where the tool (4, 4) goes so that a body held by it comes to poses (4, 4): straight, or by way of the middle."""
+    """Tool poses (4, 4) that bring a held body to poses (4, 4): directly, or through the middle."""
     targets = [pose @ np.linalg.inv(body) @ tool for pose in poses]
     if not targets:
         return [[]]

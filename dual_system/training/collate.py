@@ -1,4 +1,4 @@
-"""Examples become the batch that the joint model takes, POUNCE's side read by what ``pounce-serve`` reads with."""
+"""Collates examples into the joint model's batch; POUNCE's inputs come from the code that ``pounce-serve`` uses."""
 
 # I invocations of all examples, N horizon, A padded action dim
 
@@ -31,11 +31,11 @@ _CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Asked:
-    """One invocation as a `pounce_reading.Moment`. Its cognition comes later: it is on the graph."""
+class _TrainingMoment:
+    """One invocation as a `pounce.reading.Moment`, without cognition: the model adds that from the autograd graph."""
 
     index: int
-    """Of its example in the batch."""
+    """Index of the example in the batch."""
     example: Example
     invocation: SampledInvocation
 
@@ -67,28 +67,22 @@ class _Asked:
 
 def collate_ponder(examples: Sequence[Example]) -> PonderBatch:
     """PONDER's side: rows and images."""
-    return PonderBatch(
-        rows=tuple(each.row for each in examples),
-        frames=tuple(each.images for each in examples),
-    )
+    return PonderBatch(rows=tuple(each.row for each in examples), frames=tuple(each.images for each in examples))
 
 
 def collate_pounce(
-    examples: Sequence[Example],
-    config: AnyPounceConfig,
-    tokenizer: AnyTokenizer,
-    statistics: RobotStatistics,
+    examples: Sequence[Example], config: AnyPounceConfig, tokenizer: AnyTokenizer, statistics: RobotStatistics
 ) -> PounceBatch:
-    """POUNCE's side. Without pictures it is as if no camera had delivered; pi0.5 only.
+    """POUNCE's side. Without pictures every camera counts as missing; pi0.5 only.
 
-    Prompts of unequal length are padded: on the right and masked for pi0.5. GR00T is padded on the left, as in its
-    public data path; its mixer attends to the pads, which serving, one moment at a time, never has.
+    Prompts of unequal length are padded: for pi0.5 on the right, masked; for GR00T on the left, as in its public data
+    path. GR00T's mixer attends to this padding, which serving, one observation at a time, never has.
 
     Raises:
         ValueError: a prompt is longer than ``max_prompt_tokens``, the tokenizer is another family's, or the examples
             have no invocation.
     """
-    moments = [_Asked(index=n, example=e, invocation=i) for n, e in enumerate(examples) for i in e.invocations]
+    moments = [_TrainingMoment(index=n, example=e, invocation=i) for n, e in enumerate(examples) for i in e.invocations]
     if not moments:
         raise ValueError(f"none of the {len(examples)} examples has an invocation to learn from")
     inputs: PounceInputs | GrootInputs

@@ -1,4 +1,4 @@
-"""A collected dataset as training reads it: whole episodes, decoded once and kept while there is room."""
+"""A collected dataset for training: whole episodes, decoded once and cached up to a memory limit."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ _QUANTILES = (0.01, 0.99)
 _SYSTEMS = ("pounce", "ponder")
 _MIN_REACH = 1e-3
 _MIN_SPAN = 1e-3
-"""A dimension that hardly moves is not blown up to fill [-1, 1]."""
+"""Smallest span of a dim: one that hardly moves is not stretched to fill [-1, 1]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PictureSizes:
-    """At which sizes a run reads pictures. Kept so, a set of hundreds of episodes stays in memory."""
+    """Picture sizes of a run. Cached at these sizes, hundreds of episodes fit in memory."""
 
     form: ContextFormat | None = None
-    """PONDER's, which says what it reads of the views; None: PONDER is not run."""
+    """PONDER's format, whose reader makes its images from the views; None: PONDER is not run."""
     pounce_px: int | None = None
-    """Side of POUNCE's pictures, to which they are resized as serving does; None: POUNCE reads none."""
+    """Side of POUNCE's pictures, resized as in serving; None: POUNCE reads none."""
 
     @property
     def key(self) -> str:
-        """Equal for equal pictures of one episode."""
+        """Identifies the sizes: equal keys give equal pictures of an episode."""
         return f"{None if self.form is None else (self.form.reader, self.form.image_px)} {self.pounce_px}"
 
     def of_ponder(self, views: tuple[Frame, ...]) -> tuple[Frame, ...]:
@@ -55,7 +55,7 @@ class PictureSizes:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Source:
-    """Where an episode lies."""
+    """An episode in a dataset."""
 
     dataset: Dataset
     entry: Entry
@@ -64,22 +64,22 @@ class _Source:
         return self.dataset.rows(self.entry.index)
 
     def frames(self, rows: Sequence[int]) -> Iterator[tuple[Frame, ...]]:
-        """Every camera's picture at each of these rows."""
+        """Yields every camera's picture at each of these rows."""
         return zip(*(self.dataset.frames(self.entry.index, camera, rows) for camera in CAMERAS), strict=True)
 
     @property
     def key(self) -> bytes:
-        """Equal for equal pictures: the scene, what was done in it, and when it was rendered."""
+        """Identifies the episode's pictures: the scene, the states and actions, and the rendered rows."""
         rows = self.rows()
         scene = f"{self.entry.task} {self.entry.seed} {self.entry.difficulty} {self.dataset.image_px}"
         return b" ".join((scene.encode(), rows.state.tobytes(), rows.action.tobytes(), rows.is_rendered.tobytes()))
 
 
 class TrainingSet:
-    """Episodes by number. ``pp-collect`` and ``pp-export`` make the folders.
+    """Episodes by number, from folders of ``pp-collect`` or ``pp-export``.
 
-    Where a dataset holds only some pictures (``--frames training``), a tick without its own has the one before it,
-    as in the video, and PONDER's texts are of the tick that was rendered (`TrainingEpisode.as_seen`).
+    If a dataset holds only some pictures (``--frames training``), a tick without its own has the previous one, as in
+    the video, and PONDER's texts are those of the rendered tick (`TrainingEpisode.as_seen`).
     """
 
     def __init__(
@@ -91,20 +91,20 @@ class TrainingSet:
         store: Path | None = None,
         demo_hz: int = 1,
     ) -> None:
-        """Reads the successful episodes of ``tasks``, or all.
+        """Indexes the successful episodes.
 
         Args:
             roots: folders of datasets.
             tasks: the tasks to read; () for all.
-            sizes: of the pictures; None reads none.
+            sizes: sizes of the pictures; None reads none.
             cache_mb: memory for pictures.
-            store: a folder for pictures at these sizes, to be read instead of videos from then on.
-            demo_hz: frames a second of demonstrations, a divisor of 20; reading one whose pictures were rendered more
-                seldom raises ValueError.
+            store: folder for decoded pictures at these sizes, read instead of the videos once it holds them.
+            demo_hz: frames per second of demonstrations, a divisor of 20. Reading an episode that was rendered at a
+                lower rate raises ValueError.
 
         Raises:
             DatasetError: a folder holds no dataset of ours.
-            ValueError: no episode of these tasks is in a folder, or the folders' pictures differ in size.
+            ValueError: a folder has no episode of these tasks, or the folders' pictures differ in size.
         """
         self._sizes, self._demo_hz = sizes or PictureSizes(), demo_hz
         self._store = None if store is None else PictureStore(store, self._sizes.key)
@@ -123,7 +123,7 @@ class TrainingSet:
 
     @property
     def hash(self) -> str:
-        """16 hex digits over which episodes these are and what was done in them."""
+        """16 hex digits over the episodes' tasks, seeds, instructions and actions."""
         digest = hashlib.blake2b(digest_size=8)
         for source in self._sources:
             entry = source.entry
@@ -141,9 +141,9 @@ class TrainingSet:
         return self._sources[number].entry.num_rows
 
     def demo_sampling(self) -> DemoSampling | None:
-        """How these demonstrations are sampled; None if there are none.
+        """Sampling of these demonstrations; None if there are none.
 
-        To their end if most of those that end between two samples have their last frame rendered.
+        ``to_its_end`` is set if most of those that end between two samples have their last frame rendered.
         """
         begins = [source.entry.num_demonstration_rows for source in self._sources]
         shown = [(source, begin - 1) for source, begin in zip(self._sources, begins, strict=True) if begin]
@@ -151,11 +151,11 @@ class TrainingSet:
         return DemoSampling(hz=self._demo_hz, to_its_end=2 * sum(ends) > len(ends)) if shown else None
 
     def instructions(self) -> list[str]:
-        """Every instruction once, in order."""
+        """Distinct instructions, sorted."""
         return sorted({source.entry.instruction for source in self._sources})
 
     def instructions_with_subgoals(self) -> list[str]:
-        """Every instruction, alone and with each subgoal of its episodes, in order: see `prompt.with_subgoal`."""
+        """Distinct instructions, alone and with each subgoal of their episodes (`prompt.with_subgoal`), sorted."""
         found = {
             with_subgoal(source.entry.instruction, normalised_text(text))
             for source in self._sources
@@ -164,7 +164,7 @@ class TrainingSet:
         return sorted(found)
 
     def texts(self) -> list[str]:
-        """All that PONDER reads or writes in these episodes, each text once, in order."""
+        """Distinct texts that PONDER reads or writes in these episodes, sorted."""
         found = set()
         for source in self._sources:
             rows = source.rows()
@@ -213,7 +213,7 @@ class TrainingSet:
         return episode if self._sizes.form is None else episode.as_seen((rendered[start:] - start).clip(min=0))
 
     def _pictures(self, source: _Source, rows: Sequence[int]) -> tuple[Views, Views]:
-        """POUNCE's views and PONDER's images of the rows, which may repeat."""
+        """POUNCE's views and PONDER's images at ``rows``, which may repeat."""
         if self._sizes == PictureSizes():
             return [()] * len(rows), [()] * len(rows)
         once = sorted(set(rows))
@@ -221,7 +221,7 @@ class TrainingSet:
         return [views[row] for row in rows], [images[row] for row in rows]
 
     def _decoded(self, source: _Source, rows: Sequence[int]) -> tuple[Views, ...]:
-        """The same of different rows; from the store, if there is one and it has them."""
+        """`_pictures` of distinct rows, from the store if it has them."""
         key = source.key + (f" {self._demo_hz}".encode() if self._demo_hz != 1 else b"")
         if self._store is not None and (kept := self._store.read(key, len(rows), _SYSTEMS)) is not None:
             return kept
@@ -232,9 +232,9 @@ class TrainingSet:
         return views, images
 
     def statistics(self, horizon: int, space: ActionSpace = "joint_delta", *, by_row: bool = False) -> RobotStatistics:
-        """Quantiles of the states as the network reads them, and of the actions as it learns them in an `action_space`.
+        """Quantiles of the network's states and actions in an `action_space`.
 
-        All rows of a chunk are pooled, as the released RoboMME statistics are; ``by_row`` first brings every row to
+        All rows of a chunk are pooled, as in the released RoboMME statistics; ``by_row`` first scales every row to
         the same spread (`RobotStatistics.reach`).
         """
         states, actions = [], []
@@ -267,7 +267,7 @@ def _sources(dataset: Dataset, tasks: Sequence[str]) -> list[_Source]:
 
 
 def _reach(moves_MND: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Each row's rms move over that of all rows, dims weighed alike; never 0."""
+    """Each row's rms move relative to that of all rows, with equal weight per dim; at least `_MIN_REACH`."""
     squares_ND = np.square(moves_MND, dtype=np.float64).mean(axis=0)
     share_N: NDArray[np.float64] = np.sqrt((squares_ND / squares_ND.mean(axis=0).clip(_MIN_SPAN**2)).mean(axis=1))
     return share_N.clip(_MIN_REACH)
@@ -280,6 +280,6 @@ def _quantiles(values: NDArray[np.float32]) -> Quantiles:
 
 
 def _num_bytes(episode: TrainingEpisode) -> int:
-    """Size of its pictures, each counted once however many rows share it."""
+    """Bytes of the episode's pictures; one that several ticks share counts once."""
     instants = {id(each): each for each in (*episode.demo, *episode.images, *episode.views)}
     return sum(picture.nbytes for pictures in instants.values() for picture in pictures)

@@ -1,14 +1,13 @@
-"""``pp-diagnose``: what POUNCE takes from cognition, teacher-forced on recorded episodes, without a robot.
+"""``pp-diagnose``: measures offline, on recorded episodes, how much POUNCE's loss depends on cognition.
 
-Two questions, with the same ticks, targets, pictures and flow draws in every condition:
+There are two comparisons; ticks, targets, pictures and flow draws are the same in every condition:
 
-- *Staleness* (paper, Figure 4): C_t is replaced by C_{t-k}, k = 0, 1, 2, 4 queries at 1 Hz, told its true age,
-  0.3 + k s.
-- *Cognition*: the real one, the learned null, or that of the next episode of the same task at the same query. Over all
-  ticks, and at branch points: the first invocation after each beginning of a subgoal, where the way parts and the
-  motion itself does not yet tell it. The mean over all ticks is no guide to success; this is.
+- *Staleness* (paper, Figure 4): C_{t-k} in place of C_t, k = 0, 1, 2, 4 queries at 1 Hz, with its true age 0.3 + k s.
+- *Cognition*: the real one, the learned null, or that of the next episode of the same task at the same query. Means are
+  over all ticks, and over branch points: the first invocation after each start of a subgoal, where the motion does not
+  yet show which way to go. The mean over all ticks does not predict success; that over branch points does.
 
-PONDER reads with the recorded texts in its row, as in training. ``pp-tables`` makes tables and a plot of the file.
+PONDER's row has the recorded texts, as in training. ``pp-tables`` makes tables and a plot of the result.
 """
 
 # Q queries of an episode, I its invocations, K carriers, H hidden, N horizon, A padded action dim
@@ -42,13 +41,13 @@ from dual_system.training.joint import NO_QUERY, PounceBatch, encode_rows, gathe
 from protocol.command_line import parse
 
 STALE_BY = (0, 1, 2, 4)
-"""k of C_{t-k}: queries, which at 1 Hz are seconds."""
+"""k of C_{t-k}, in queries; at 1 Hz also in seconds."""
 EVERY_INVOCATION = ExampleConfig(clocks=EVALUATION, max_invocations=1 << 30)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiagnoseOptions:
-    """Measures offline what POUNCE takes from cognition, on episodes that it was not trained on."""
+    """Measures offline how much POUNCE's loss depends on cognition, on episodes that it was not trained on."""
 
     ponder: Path
     """PONDER's checkpoint."""
@@ -74,7 +73,7 @@ class DiagnoseOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Given:
-    """A condition: which cognition every invocation of an episode gets, and how old it is."""
+    """A condition: the cognition of every invocation of an episode, and its age."""
 
     cognition_IKH: Tensor
     age_ns_I: Tensor
@@ -98,7 +97,7 @@ def diagnose(options: DiagnoseOptions) -> dict[str, Any]:
     """Returns the contents of ``diagnosis.json``.
 
     Raises:
-        DatasetError, FileNotFoundError, ValueError: what was given does not fit together; the message says why.
+        DatasetError, FileNotFoundError, ValueError: the inputs do not fit together; the message says why.
     """
     ponder = load_ponder(options.ponder, device=options.device)
     bundle = load_bundle(options.pounce)
@@ -144,11 +143,11 @@ def measure(
     num_draws: int,
     generator: torch.Generator,
 ) -> dict[str, Any]:
-    """One episode's mean losses per condition, and over how many ticks.
+    """One episode's mean losses per condition, and the number of ticks in each mean.
 
     Args:
-        own_QKH: cognition of its queries.
-        others_QKH: that of another episode; beyond its end, its last one.
+        own_QKH: cognition of the episode's queries.
+        others_QKH: cognition of another episode; its last one is repeated beyond its end.
     """
     batch = collate_pounce([example], bundle.model.config, bundle.tokenizer, bundle.statistics).to(own_QKH.device)
     noise_DINA = torch.randn(num_draws, *batch.actions_INA.shape, generator=generator)
@@ -171,7 +170,7 @@ def measure(
 
 
 def cognition_conditions(batch: PounceBatch, own_QKH: Tensor, others_QKH: Tensor) -> dict[str, Given]:
-    """The same ages throughout; null counts as age 0."""
+    """Real, null and shuffled cognition with the same ages; POUNCE sets the null's age to 0."""
     index_I = batch.query_I.clamp(min=0)
     is_null_I = batch.query_I == NO_QUERY
     age_ns_I = batch.inputs.age_ns
@@ -185,7 +184,7 @@ def cognition_conditions(batch: PounceBatch, own_QKH: Tensor, others_QKH: Tensor
 
 
 def stale(example: Example, batch: PounceBatch, own_QKH: Tensor, k: int) -> Given:
-    """C_{t-k} with its true age; where there is none so old, the first one."""
+    """C_{t-k} with its true age, or the first query's cognition where t < k."""
     query_I = (batch.query_I - k).clamp(min=0)
     source_ns_Q = torch.tensor([query.stamp.source_ns for query in example.schedule.queries], device=query_I.device)
     now_ns_I = torch.tensor([invocation.now_ns for invocation in example.invocations], device=query_I.device)
@@ -204,7 +203,7 @@ def is_branch_point(example: Example) -> Tensor:
 
 
 def in_turns(tasks: Sequence[str], count: int) -> list[int]:
-    """Which of the episodes, given by their tasks: at most ``count``, as evenly over tasks as they allow, in order."""
+    """Selects at most ``count`` episodes, as evenly over tasks as possible; returns sorted indices into ``tasks``."""
     rounds: list[tuple[int, int]] = []
     seen: dict[str, int] = {}
     for number, task in enumerate(tasks):
@@ -214,11 +213,7 @@ def in_turns(tasks: Sequence[str], count: int) -> list[int]:
 
 
 def next_alike(tasks: Sequence[str], place: int) -> int:
-    """The next episode of the same task, cyclically.
-
-    Raises:
-        ValueError: there is no other one.
-    """
+    """Index of the next episode of the same task, cyclically. Raises ValueError if there is no other one."""
     alike = [(each <= place, each) for each, task in enumerate(tasks) if task == tasks[place] and each != place]
     if not alike:
         raise ValueError(f"only one episode of {tasks[place]}: another's cognition needs at least two of every task")
@@ -237,11 +232,11 @@ def _cognition(ponder: Ponder, example: Example) -> Tensor:
 
 
 def _losses(model: AnyPounce, batch: PounceBatch, given: Given, noise_DINA: Tensor, time_DI: Tensor) -> Tensor:
-    """(I,): the flow loss of every invocation over the robot's own dims, a mean over D flow draws."""
+    """(I,): flow loss of every invocation over the robot's own dims, averaged over D flow draws."""
     device = given.cognition_IKH.device
     noise_DINA, time_DI = noise_DINA.to(device), time_DI.to(device)
     inputs: Any = replace(batch.inputs, cognition=given.cognition_IKH, age_ns=given.age_ns_I, is_null=given.is_null_I)
-    if isinstance(model, Pounce):  # what is read is computed once for all draws
+    if isinstance(model, Pounce):  # computes the prefix once for all draws
         flat = model.unreduced_loss(inputs, batch.actions_INA, noise_DINA.flatten(0, 1), time_DI.flatten())
         squared_DINA = flat.unflatten(0, time_DI.shape)
     else:

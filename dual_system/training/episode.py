@@ -1,4 +1,4 @@
-"""What training reads of a recorded episode."""
+"""A recorded episode as training data."""
 
 # T ticks
 
@@ -15,7 +15,7 @@ Frame = NDArray[np.uint8]  # (height, width, 3) RGB
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TrainingEpisode:
-    """What training reads of an episode of T ticks. Row k is the world before action k.
+    """Training data of an episode of T ticks. Row k is the state before action k.
 
     Raises:
         ValueError: the columns differ in length, or ``imitated_from`` is none of the ticks.
@@ -23,25 +23,25 @@ class TrainingEpisode:
 
     instruction: str
     demo: tuple[tuple[Frame, ...], ...]
-    """Per sampled instant of the demonstration, the images that PONDER reads; () without one."""
+    """PONDER's images, per sampled instant of the demonstration; () without one."""
     images: Sequence[tuple[Frame, ...]]
-    """Per tick, the images that PONDER reads of the views (`ObservationReader.images`); () where PONDER is not run."""
+    """PONDER's images (`ObservationReader.images`), per tick; empty tuples if PONDER is not run."""
     views: Sequence[tuple[Frame, ...]]
-    """Per tick, POUNCE's views in the order of the robot's cameras; () where POUNCE reads none."""
+    """POUNCE's views in the order of the robot's cameras, per tick; empty tuples if POUNCE reads none."""
     state_T8: NDArray[np.float32]
     action_T8: NDArray[np.float32]
     """Absolute joint targets and the gripper's command."""
     subgoals: Sequence[str]
     """T grounded texts; empty texts for data without annotations."""
     is_transition_T: NDArray[np.bool_]
-    """Where another subgoal begins. Texts do not tell: two in a row may be the same, and one changes when its object
-    comes into sight."""
+    """True where another subgoal begins. Texts do not show it: two in a row may be equal, and one changes when its
+    object comes into view."""
     reasoning: str = ""
-    """What PONDER writes at the first transition after a demonstration; empty without one."""
+    """PONDER's target text at the first transition after a demonstration; empty without one."""
     imitated_from: int = 0
     """The tick from which POUNCE imitates; before it a policy acted (`pp-collect correct`, DAgger)."""
     seen_at_T: NDArray[np.intp] | None = None
-    """The tick that the picture of each tick was taken at (`as_seen`); None: itself."""
+    """For each tick, the tick at which its picture was taken (`as_seen`); None: the same tick."""
 
     def __post_init__(self) -> None:
         columns = (self.images, self.views, self.state_T8, self.action_T8, self.subgoals, self.is_transition_T)
@@ -64,10 +64,10 @@ class TrainingEpisode:
         return frozenset(np.flatnonzero(self.is_transition_T).tolist())
 
     def as_seen(self, seen_at_T: NDArray[np.intp]) -> TrainingEpisode:
-        """The same episode with pictures taken at some ticks only: tick t shows the picture of ``seen_at_T[t]``.
+        """The same episode with pictures taken at some ticks only: tick t has the picture of ``seen_at_T[t]``.
 
-        PONDER's texts are then of that instant, too: a PONDER whose pictures lag behind its texts learns not to look.
-        POUNCE's state and commands stay. Transitions that no picture tells apart become one.
+        PONDER's texts are taken from that tick too: if its pictures lagged behind its texts, PONDER would learn to
+        ignore them. POUNCE's states and commands stay. Transitions without a picture in between become one.
         """
         count_T = np.cumsum(self.is_transition_T)[seen_at_T]
         return replace(

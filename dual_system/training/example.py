@@ -1,7 +1,7 @@
-"""One recorded episode under one drawn schedule: PONDER's row, and what each POUNCE invocation saw and should do.
+"""One recorded episode under one sampled schedule: PONDER's row, and POUNCE's invocations.
 
-Serving builds the same row segment by segment (``ponder.context``) and refers by the same rule (``clock.reference``);
-tests hold them equal.
+Serving builds the same row segment by segment (``ponder.context``) and assigns cognitions to invocations by the same
+rule (``clock.reference``); tests compare the two.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ class ExampleConfig:
 
     clocks: Clocks
     max_invocations: int = 16
-    """POUNCE invocations drawn from an episode's schedule: they cost most."""
+    """Largest number of POUNCE invocations drawn from an episode's schedule; they dominate the cost of a step."""
     is_grounded: bool = True
     """False: the row has no texts, as in RoboCasa-DC."""
     has_reasoning: bool = True
-    """False: the first transition after a demonstration writes the subgoal alone (paper, Table 3)."""
+    """False: the text at the first transition after a demonstration is the subgoal alone (paper, Table 3)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -38,18 +38,18 @@ class Example:
     episode: TrainingEpisode
     row: Row
     images: Tensor | None
-    """PONDER's images in the order of the row, (N, height, width, 3) uint8; None where PONDER is not run."""
+    """PONDER's images in the order of the row, (N, height, width, 3) uint8; None if PONDER is not run."""
     schedule: SampledSchedule
     invocations: tuple[SampledInvocation, ...]
-    """The drawn ones of the schedule's."""
+    """The invocations drawn from the schedule."""
     said: tuple[str, ...]
-    """Per query, the subgoal that PONDER wrote last; empty texts without grounding."""
+    """PONDER's newest subgoal at every query; empty texts without grounding."""
 
 
 def make_example(
     episode: TrainingEpisode, form: ContextFormat, config: ExampleConfig, rng: np.random.Generator
 ) -> Example:
-    """Draws a schedule and lays the episode out under it."""
+    """Samples a schedule and builds the example under it."""
     schedule = sample_schedule(rng, config.clocks, episode.num_ticks, transition_ticks=episode.transition_ticks)
     imitated = [each for each in schedule.invocations if each.tick >= episode.imitated_from]
     count = min(config.max_invocations, len(imitated))
@@ -81,7 +81,7 @@ def episode_row(episode: TrainingEpisode, form: ContextFormat, schedule: Sampled
 
 
 def subgoals_by_query(episode: TrainingEpisode, schedule: SampledSchedule) -> tuple[str, ...]:
-    """The newest subgoal at every query, as PONDER writes it: new ones come at predicted transitions only."""
+    """The newest subgoal at every query, as PONDER generates it: it changes at predicted transitions only."""
     texts: list[str] = []
     for query in schedule.queries:
         text = episode.subgoals[query.tick]

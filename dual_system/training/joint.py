@@ -1,15 +1,15 @@
 """L = w1 L_fm + w2 L_ground: both systems in one graph (paper, 3.2).
 
-PONDER reads every episode as one causal row, all queries in one pass. Every POUNCE invocation takes the cognition that
-the schedule referred it to, so many invocations share one; their action loss reaches PONDER only through it, scaled
-(A.3). The LM head runs only where a token is supervised.
+PONDER reads every episode as one causal row, all queries in one pass. Every POUNCE invocation is conditioned on the
+cognition that the schedule assigns to it, so many invocations share one; their action loss reaches PONDER only through
+it, scaled (A.3). The LM head runs at supervised tokens only.
 
-One system can be trained alone. PONDER alone learns its texts. POUNCE alone learns from the cognition of a PONDER that
-does not change, or, where it reads subgoals as text (K = 0), without PONDER.
+One system can be trained alone: PONDER on its texts; POUNCE on the cognition of a frozen PONDER or, if it reads
+subgoals as text (K = 0), without PONDER.
 """
 
 # B episodes, T tokens, H hidden, Q queries, I invocations of all episodes, K carriers, N horizon, A padded action dim
-# S flow samples: every invocation once, or the whole list of them several times over
+# S flow samples: every invocation once, or the whole list of them several times
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ from dual_system.models.ponder.network import Ponder
 from dual_system.models.pounce.family import AnyPounce, action_loss
 
 Trains = Literal["both", "ponder", "pounce"]
-"""Which systems learn; the other's weights do not change."""
+"""The systems to train; the other's weights do not change."""
 
 SampleTimes = Callable[[int, torch.Generator], Tensor]
-"""Draws so many flow times."""
+"""Draws the given number of flow times."""
 
 NO_QUERY = -1
-"""Reference of an invocation for which no cognition was ready: it sees the learned null."""
+"""Reference of an invocation for which no cognition was ready: it gets the learned null."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PonderBatch:
-    """What PONDER reads of B episodes."""
+    """PONDER's inputs for B episodes."""
 
     rows: tuple[Row, ...] = ()
-    """() where PONDER is not run."""
+    """() if PONDER is not run."""
     frames: tuple[Tensor | None, ...] = ()
     """Per row, (num_images, height, width, 3) uint8 in the order of its image positions; None without images."""
 
@@ -61,7 +61,7 @@ class PonderBatch:
 
 
 def _moved(tensors: Sequence[Tensor], device: torch.device | str) -> Sequence[Tensor]:
-    """All of them on the device in one transfer: each would wait for the one before, and rows are many."""
+    """Moves all tensors to the device in one transfer, which is faster than one transfer per row."""
     if not tensors or torch.device(device).type == "cpu":
         return tensors
     return torch.cat(list(tensors)).to(device).split([len(each) for each in tensors])
@@ -72,17 +72,17 @@ class PounceBatch:
     """I invocations of the same episodes, in any order."""
 
     inputs: PounceInputs | GrootInputs
-    """Images, prompts and ages; its cognition is filled in by the model."""
+    """Images, prompts and ages; the model adds the cognition."""
     actions_INA: Tensor
     """Normalised targets, zero beyond the robot's dims."""
     episode_I: Tensor
-    """int64: which row of the PonderBatch."""
+    """int64: row index in the PonderBatch."""
     query_I: Tensor
-    """int64: which query of that row, or NO_QUERY."""
+    """int64: query index in that row, or NO_QUERY."""
 
     @property
     def num_episodes(self) -> int:
-        """Up to the last one that has an invocation."""
+        """Number of episodes up to the last one with an invocation."""
         return 1 + int(self.episode_I.max())
 
     def to(self, device: torch.device | str) -> PounceBatch:
@@ -100,18 +100,18 @@ class PounceBatch:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Draws:
-    """The chance in one step, drawn by one generator: a step repeats exactly, whatever ran before it."""
+    """The random draws of one step, from generators of its own: a step repeats exactly, whatever ran before it."""
 
     noise_SNA: Tensor
     time_S: Tensor
     is_dropped_I: Tensor
     """bool: cognition dropout."""
     num_committed_S: Tensor | None = None
-    """int64: how many rows each chunk is given to continue; None: POUNCE does not learn to."""
+    """int64: number of committed rows of each chunk; None: training without committed rows."""
 
     @property
     def num_counted_rows(self) -> int:
-        """Rows under the action loss."""
+        """Number of chunk rows that contribute to the action loss."""
         num_committed = 0 if self.num_committed_S is None else int(self.num_committed_S.sum())
         return self.noise_SNA.shape[0] * self.noise_SNA.shape[1] - num_committed
 
@@ -126,9 +126,9 @@ class Draws:
         num_samples: int = 1,
         max_committed_rows: int = 0,
     ) -> Draws:
-        """One CPU generator for each episode: what is drawn for it depends on no other, nor on the device.
+        """Draws with one CPU generator per episode: an episode's draws depend on no other episode, nor on the device.
 
-        ``num_samples`` flow samples of each invocation share what POUNCE reads, which is then computed once.
+        ``num_samples`` flow samples of each invocation share one prefix, which is computed once.
         """
         count, episode_I = len(batch.actions_INA), batch.episode_I.cpu()
         noise_DINA = torch.empty(num_samples, *batch.actions_INA.shape)
@@ -153,17 +153,17 @@ class Draws:
 
 
 class JointLoss(NamedTuple):
-    """The parts of one step's loss, scalars on the graph. A tuple: FSDP2 looks for its tensors."""
+    """The parts of one step's loss, scalars on the graph. A tuple, because FSDP2 must find its tensors."""
 
     total: Tensor
     flow_matching: Tensor
     grounding: Tensor
     said_N: Tensor
-    """int64: at every token under the LM head's cross-entropy, row after row, the likeliest one instead."""
+    """int64: PONDER's most likely token at every supervised position, row after row."""
     num_null: int
-    """Invocations that saw the null cognition."""
+    """Number of invocations with null cognition."""
     num_rows: int
-    """Rows of chunks that flow matching is the mean over: those that were not given."""
+    """Number of chunk rows over which flow matching is the mean: those that are not committed."""
 
     @property
     def num_supervised(self) -> int:
@@ -184,9 +184,9 @@ class JointModel(nn.Module):
         reads_together: bool = True,
         num_groups: int = 1,
     ) -> None:
-        """``reads_together`` and ``num_groups`` are `encode_rows`'s.
+        """``reads_together`` and ``num_groups`` are `encode_rows`'s ``together`` and ``num_groups``.
 
-        Raises ValueError if POUNCE was built for another cognition than PONDER gives.
+        Raises ValueError if POUNCE was built for another (K, H) than PONDER's.
         """
         super().__init__()
         wanted = (pounce.config.cognition.num_carriers, pounce.config.cognition.cognition_size)
@@ -204,7 +204,7 @@ class JointModel(nn.Module):
 
     @property
     def runs_ponder(self) -> bool:
-        """Whether a step needs PONDER's rows: it learns, or gives POUNCE its cognition."""
+        """Whether a step runs PONDER: to train it, or for POUNCE's cognition."""
         return runs_ponder(self.trains, self.pounce.config.cognition.num_carriers)
 
     def forward(self, episodes: PonderBatch, invocations: PounceBatch, draws: Draws) -> JointLoss:
@@ -229,21 +229,16 @@ class JointModel(nn.Module):
                 self.pounce, inputs, invocations.actions_INA, draws.noise_SNA, draws.time_S, draws.num_committed_S
             )
         return JointLoss(
-            total=self.weigh(matching, grounding),
-            flow_matching=matching,
-            grounding=grounding,
-            said_N=said_N,
-            num_rows=num_rows,
-            num_null=num_null,
+            self.weigh(matching, grounding), matching, grounding, said_N=said_N, num_null=num_null, num_rows=num_rows
         )
 
     def weigh(self, matching: Tensor, grounding: Tensor) -> Tensor:
-        """L of its parts."""
+        """Returns L, the weighted sum of its parts."""
         return self.w1 * matching + self.w2 * grounding
 
     def _grounding(self, episodes: PonderBatch, hidden: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         """Mean cross-entropy over every supervised token of the batch; zero, on the graph, if there is none."""
-        if self.w2 == 0:  # no annotations: the LM head is not even run
+        if self.w2 == 0:  # no annotations: skip the LM head
             return hidden[0].new_zeros(()), torch.zeros(0, dtype=torch.int64)
         index = [row.supervised_index for row in episodes.rows]
         wanted = [np.asarray(row.targets)[places + 1] for row, places in zip(episodes.rows, index, strict=True)]
@@ -254,13 +249,13 @@ class JointModel(nn.Module):
 
 
 def runs_ponder(trains: Trains, num_carriers: int) -> bool:
-    """Whether a step needs PONDER: only a POUNCE without cognition (K = 0) that learns alone does not."""
+    """Whether a step runs PONDER: always, except when POUNCE without cognition (K = 0) is trained alone."""
     return trains != "pounce" or num_carriers > 0
 
 
 def _taken(hidden: Sequence[Tensor], index: Sequence[NDArray[np.integer]]) -> Tensor:
-    """(N, H) of all rows: of each the hidden states at these positions. One look-up: on a GPU each costs a dozen
-    launches on the way back."""
+    """Hidden states (N, H) at each row's positions. One look-up for all rows, because on a GPU each costs a dozen
+    kernel launches in the backward pass."""
     places = [begin + each.reshape(-1) for begin, each in zip(_begins(hidden), index, strict=True)]
     return torch.cat(list(hidden))[torch.from_numpy(np.concatenate(places)).to(hidden[0].device)]
 
@@ -269,20 +264,13 @@ def _begins(parts: Sequence[Tensor]) -> list[int]:
     return [0, *accumulate(len(part) for part in parts)][:-1]
 
 
-def encode_rows(
-    ponder: Ponder,
-    episodes: PonderBatch,
-    *,
-    together: bool = True,
-    num_groups: int = 1,
-) -> list[Tensor]:
-    """Final hidden states (T, H) of each row.
+def encode_rows(ponder: Ponder, episodes: PonderBatch, *, together: bool = True, num_groups: int = 1) -> list[Tensor]:
+    """Final hidden states (T, H) of each row. The images of all rows are encoded in one call.
 
-    All pictures are read in one call, however many rows there are. Rows are read ``together``, padded on the right: a
-    row is causal, so what stands behind it cannot reach it and pads are never read. With FSDP2 it has to be so: every
-    process must call every layer equally often. One after the other they cost a CPU less: no pads, and what a layer
-    leaves for the way back stays small (`benchmarks.training_throughput`). Between the two, rows of like length go
-    together, in ``num_groups`` (or as many as there are rows): fewer pads for more calls.
+    With ``together`` the rows are one batch, padded on the right, where padding cannot affect a causal row. FSDP2 needs
+    it: every process must call every layer equally often. One call per row is cheaper on a CPU: no padding, and fewer
+    activations alive at once (`benchmarks.training_throughput`). ``num_groups`` is the middle way: batches of rows of
+    similar length (at most one per row), with less padding and more calls.
     """
     frames = [each for each in episodes.frames if each is not None]
     ids = np.concatenate([row.ids for row in episodes.rows])
@@ -311,15 +299,10 @@ def encode_rows(
 
 
 def gather_cognition(rows: Sequence[Row], hidden: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """Cognition of all queries of all rows, (Q, K, H), and the index of each row's first, (B,) int64."""
-    device = hidden[0].device
+    """Cognition of all queries of all rows, (Q, K, H), and the index of each row's first query, (B,) int64."""
     index = [row.carrier_index for row in rows]
-    cognition_QKH = _taken(hidden, index).unflatten(0, (-1, index[0].shape[1]))
-    return cognition_QKH, _starts([len(each) for each in index], device)
-
-
-def _starts(counts: Sequence[int], device: torch.device) -> Tensor:
-    """Where each row's queries begin among those of all rows, (B,) int64."""
+    counts = [len(each) for each in index]
     if 0 in counts:
         raise ValueError("a row without a query gives no cognition; leave such an episode out")
-    return torch.tensor([0, *accumulate(counts)][:-1], device=device)
+    cognition_QKH = _taken(hidden, index).unflatten(0, (-1, index[0].shape[1]))
+    return cognition_QKH, torch.tensor([0, *accumulate(counts)][:-1], device=hidden[0].device)

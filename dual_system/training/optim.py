@@ -1,9 +1,7 @@
-"""AdamW as the paper runs it: linear warm-up, then constant; joint gradient norm clipped; weights averaged.
+"""AdamW as in the paper: linear warm-up, then a constant rate; joint gradient clipping; averaged weights (EMA).
 
-A run may end with a falling rate, which the paper's do not need.
-
-Weights of fewer than 32 bits have float32 masters that are updated in their place, and are rounded from them: in
-bfloat16 itself an update of a thousandth is less than half of a weight's last bit, and nothing would ever move.
+The rate may decay at the end of a run, which the paper's runs do not use. Weights of fewer than 32 bits are rounded
+from float32 masters: in bfloat16 an update of a thousandth is less than half of a weight's last bit and would be lost.
 """
 
 from __future__ import annotations
@@ -19,8 +17,8 @@ from dual_system.training.parallel import local, whole
 from dual_system.training.shards import RowReader
 
 _LEAST_RATE = 0.02
-_REMEMBERED = ("step", "exp_avg", "exp_avg_sq")  # by AdamW, of a parameter
-_EMA_MEMORY = 10  # the average of n steps goes back n / 10 of them at most
+_ADAM_STATE = ("step", "exp_avg", "exp_avg_sq")  # AdamW's state of a parameter
+_EMA_MEMORY = 10  # after n steps the average's time constant is at most n / 10 steps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,13 +28,13 @@ class OptimConfig:
     learning_rate: float = 2e-5
     warmup_steps: int = 100
     decay: tuple[int, int] | None = None
-    """Between these two steps the rate falls in proportion, to a fiftieth; None: it stays."""
+    """First and last step of a linear decay of the rate, to a fiftieth; None: no decay."""
     betas: tuple[float, float] = (0.9, 0.95)
     eps: float = 1e-8
     weight_decay: float = 1e-10
     clip_norm: float = 1.0
     ema_decay: float = 0.0
-    """0: no average is kept."""
+    """Decay of the weights' exponential moving average; 0: no average."""
 
     def __post_init__(self) -> None:
         if self.learning_rate <= 0 or self.clip_norm <= 0 or self.warmup_steps < 0:
@@ -48,7 +46,7 @@ class OptimConfig:
 
 
 def learning_rate(config: OptimConfig, step: int) -> float:
-    """Of the ``step``-th update, from 0: the first one already moves."""
+    """Rate of the ``step``-th update, counted from 0; it is above 0 from the first one on."""
     rate = config.learning_rate * min(1.0, (step + 1) / max(1, config.warmup_steps))
     if config.decay is None:
         return rate
@@ -57,7 +55,7 @@ def learning_rate(config: OptimConfig, step: int) -> float:
 
 
 class Optimiser:
-    """Updates the parameters that want gradients, and their average. Both are kept in float32."""
+    """Updates the trainable parameters and their average, both in float32."""
 
     def __init__(self, model: nn.Module, config: OptimConfig) -> None:
         self._config = config
@@ -98,19 +96,19 @@ class Optimiser:
         with torch.no_grad():
             for parameter, master in self._mastered().values():
                 parameter.copy_(master)
-            decay = min(self._config.ema_decay, (1 + step) / (_EMA_MEMORY + step))  # early weights are soon forgotten
+            decay = min(self._config.ema_decay, (1 + step) / (_EMA_MEMORY + step))  # forgets early weights soon
             for name, average in self.average.items():
                 local(average).lerp_(local(self._masters[name]), 1 - decay)
         return norm
 
     @torch.no_grad()
     def take_average(self) -> None:
-        """Copies the averaged weights into the model; nothing where no average is kept."""
+        """Copies the averaged weights into the model; does nothing without an average."""
         for name, average in self.average.items():
             self._named[name].copy_(average)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Everything that the next update depends on besides the parameters."""
+        """The optimiser's whole state by name, without the parameters themselves."""
         found = {f"average.{name}": tensor for name, tensor in self.average.items()}
         found |= {f"master.{name}": master.detach() for name, (_, master) in self._mastered().items()}
         for name, parameter in self._masters.items():
@@ -119,12 +117,12 @@ class Optimiser:
         return found
 
     def load(self, stored: RowReader) -> None:
-        """Takes back what ``tensors`` gave: the state of every parameter that had a gradient so far.
+        """Restores the state that ``tensors`` returned; only parameters that had gradients have one.
 
-        The parameters themselves must be loaded already: a checkpoint from before there were masters has none.
+        The parameters must be loaded already: masters that the checkpoint lacks start from them.
 
         Raises:
-            ValueError: it is another model's, or of another freeze mode or dtype.
+            ValueError: the state is of another model, freeze mode or dtype.
         """
         mastered = self._mastered()
         with torch.no_grad():
@@ -138,7 +136,7 @@ class Optimiser:
             fits = parameter is not None and (stored.shape(full_name) == tuple(parameter.shape) or is_step)
             is_own = key in ("average", "master")
             unknown = (key == "average" and name not in self.average) or (key == "master" and name not in mastered)
-            if parameter is None or not fits or unknown or not (is_own or key in _REMEMBERED):
+            if parameter is None or not fits or unknown or not (is_own or key in _ADAM_STATE):
                 raise ValueError(f"the optimiser's state is of another model, freeze mode or dtype: it has {full_name}")
             rows = stored.read(full_name, parameter)
             if is_step:
@@ -155,14 +153,14 @@ class Optimiser:
             self._adam.state[self._masters[name]] = found
 
     def _groups(self) -> list[list[nn.Parameter]]:
-        """Those of which a process holds its rows, and those of which it holds all: no operation takes both at once."""
+        """Sharded and whole parameters separately, because no torch operation takes both."""
         groups: tuple[list[nn.Parameter], list[nn.Parameter]] = ([], [])
         for each in self._masters.values():
             groups[not isinstance(each, DTensor)].append(each)
         return [group for group in groups if group]
 
     def _clip(self) -> float:
-        """Shortens the gradients, all together; returns their norm before."""
+        """Clips the joint norm of all gradients; returns the norm before."""
         groups = self._groups()
         if len(groups) == 1:
             return float(whole(nn.utils.clip_grad_norm_(groups[0], self._config.clip_norm)))
@@ -174,7 +172,7 @@ class Optimiser:
         return norm
 
     def _mastered(self) -> dict[str, tuple[nn.Parameter, nn.Parameter]]:
-        """Parameters that have a master, and it."""
+        """Pairs (parameter, master) by name, for parameters that have a master."""
         pairs = ((name, parameter, self._masters[name]) for name, parameter in self._named.items())
         return {name: (parameter, master) for name, parameter, master in pairs if master is not parameter}
 

@@ -1,9 +1,9 @@
-"""Several processes, one run: torchrun's environment, FSDP2 over both systems, and sums over all processes.
+"""Data-parallel training: torchrun's environment, FSDP2 over both systems, and sums over all processes.
 
-A process is given its share of a batch's episodes. Gradients are averaged over processes, so each scales its part of
-the loss such that the average is the gradient of the whole batch (``trainer``). Parameters keep their names. Sharded, a
-process holds its rows of each, and FSDP2 averages; whole, it holds all of them, and `average_gradients` does: what
-CPUs can train is small, and there the processes then need not wait for each other at every layer.
+Each process has its share of a batch's episodes. Gradients are averaged over processes, so each scales its part of the
+loss such that the average is the gradient of the whole batch (``trainer``). Parameters keep their names. A process
+holds either its rows of every parameter, whose gradients FSDP2 averages, or whole parameters, whose gradients
+`average_gradients` averages: that suits CPUs, because the processes then do not synchronise at every layer.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _FACTOR, _NUM_CHECKSUMS = 31, 1 << 20
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class World:
-    """Which of a run's processes this is; the default is a run of one."""
+    """This process's place among a run's processes; the default is a single process."""
 
     rank: int = 0
     size: int = 1
@@ -41,14 +41,14 @@ class World:
 
     @property
     def is_first(self) -> bool:
-        """Of the process that writes what is written once."""
+        """True for the process that writes logs and exports."""
         return self.rank == 0
 
     def share(self, count: int) -> range:
-        """This process's part of ``count`` episodes: every ``size``-th.
+        """This process's share of ``count`` episodes: every ``size``-th.
 
         Raises:
-            ValueError: there are fewer than processes; an idle one would leave the others waiting.
+            ValueError: there are fewer episodes than processes; the others would wait forever for an idle one.
         """
         if count < self.size:
             raise ValueError(
@@ -57,20 +57,20 @@ class World:
         return range(self.rank, count, self.size)
 
     def sums(self, numbers: Sequence[float | Tensor]) -> list[float]:
-        """Each number summed over all processes, in float64. All must call it."""
+        """Sums each number over all processes, in float64. All must call it."""
         total = torch.tensor([float(number) for number in numbers], dtype=torch.float64, device=self.device)
         if self.size > 1:
             dist.all_reduce(total)
         return [float(number) for number in total.tolist()]
 
     def wait(self) -> None:
-        """Until every process is here."""
+        """Waits for every process to call it."""
         self.sums([0.0])
 
 
 @contextmanager
 def joined(device: str) -> Iterator[World]:
-    """Joins the processes that torchrun started; alone without torchrun. On CUDA each takes the GPU of its local rank.
+    """Joins torchrun's process group; without torchrun, yields a world of one. On CUDA the local rank selects the GPU.
 
     Raises:
         ValueError: torchrun started more processes on this host than it has GPUs.
@@ -92,10 +92,10 @@ def joined(device: str) -> Iterator[World]:
 
 
 def require_alike(model: nn.Module, world: World) -> None:
-    """Every process must have built or loaded the same weights; all must call it, before `shard`.
+    """Checks that every process built or loaded the same weights; all must call it, before `shard`.
 
     Raises:
-        ValueError: they differ. Averaged gradients would then be nobody's, and the loss would fall all the same.
+        ValueError: they differ. Averaged gradients would then be wrong for each, though the loss would still fall.
     """
     mine = checksum(model)
     total, squares = world.sums([mine, mine * mine])
@@ -107,7 +107,7 @@ def require_alike(model: nn.Module, world: World) -> None:
 
 
 def checksum(model: nn.Module) -> int:
-    """Of all weights' bits, below 2**20. Whole numbers, so neither the device nor the order of a sum matters."""
+    """Checksum of all weights' bits, below 2**20. In integers, so neither device nor summation order matters."""
     total = 0
     for parameter in model.parameters():
         bits = parameter.detach().view(_BITS[parameter.element_size()]).sum(dtype=torch.int64)
@@ -116,13 +116,12 @@ def checksum(model: nn.Module) -> int:
 
 
 def shard(model: nn.Module, world: World) -> None:
-    """Leaves each process its rows of every parameter; nothing where there is one process.
+    """Shards every parameter over the processes by rows (FSDP2); does nothing for a single process.
 
-    Units are gathered when they run and let go after; the rest stays gathered from the start of a step to its end.
-
-    The processes must have built the same weights. FSDP2 sums gradients of one dtype together: what learns and has
-    another than most of its unit (decays and norms of PONDER's recurrent layers, pi0.5's attention beside a PONDER in
-    bfloat16) stays whole on every process, and `average_gradients` is for it. Sums are in float32.
+    Units are gathered while they run; the remaining parameters stay gathered throughout a step. All processes must
+    have built the same weights. FSDP2 reduces gradients of one dtype per unit: trainable parameters of another dtype
+    (decays and norms of PONDER's recurrent layers, pi0.5's attention beside a PONDER in bfloat16) stay whole on every
+    process, and `average_gradients` averages theirs. Reductions are in float32.
     """
     if world.size == 1:
         return
@@ -139,7 +138,7 @@ def shard(model: nn.Module, world: World) -> None:
 
 
 def _most(weights: Sequence[Tensor]) -> torch.dtype | None:
-    """The dtype of most of the numbers."""
+    """The dtype of most elements."""
     counts: Counter[torch.dtype] = Counter()
     for each in weights:
         counts[each.dtype] += each.numel()
@@ -148,9 +147,9 @@ def _most(weights: Sequence[Tensor]) -> torch.dtype | None:
 
 @torch.no_grad()
 def average_gradients(model: nn.Module, world: World) -> None:
-    """Replaces gradients of whole weights by their mean over all processes, which must all call it.
+    """Replaces gradients of whole parameters by their mean over all processes, which must all call it.
 
-    A gradient that only some have counts as zero on the others; FSDP2 has averaged those of sharded weights already.
+    A missing gradient counts as zero if any process has one; FSDP2 has averaged those of sharded parameters already.
     """
     if world.size == 1:
         return
@@ -168,12 +167,12 @@ def average_gradients(model: nn.Module, world: World) -> None:
 
 
 def local(tensor: Tensor) -> Tensor:
-    """This process's rows of a parameter or of what belongs to it, sharing memory; the tensor itself if it is whole."""
+    """This process's rows of a sharded tensor, sharing memory; the tensor itself if it is whole."""
     return tensor.to_local() if isinstance(tensor, DTensor) else tensor
 
 
 def whole(tensor: Tensor) -> Tensor:
-    """All rows. All processes must call it."""
+    """Gathers all rows of a tensor. All processes must call it."""
     return tensor.full_tensor() if isinstance(tensor, DTensor) else tensor
 
 
@@ -181,8 +180,7 @@ def whole(tensor: Tensor) -> Tensor:
 def gather(model: nn.Module, into: nn.Module | None) -> None:
     """Copies the whole weights into a model of the same kind, one parameter at a time. All processes must call it.
 
-    Args:
-        into: on any device; None on processes that want none.
+    ``into`` is a model on any device, or None on processes that need no copy.
     """
     targets = None if into is None else dict(into.named_parameters())
     for name, parameter in model.named_parameters():

@@ -1,6 +1,6 @@
-"""Decoded pictures on disk, at the sizes that the networks read: videos are decoded once, not once per process and run.
+"""Decoded pictures on disk, at the networks' sizes: videos are decoded once, not once per process and run.
 
-One file per episode. A process that misses one makes it; several may do so at once, and write the same bytes.
+There is one file per episode. A process writes a missing file; several may do so at once with the same bytes.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from dual_system.training.episode import Frame
 
 Views = list[tuple[Frame, ...]]
-"""Of every instant, one picture per view; () where none are read."""
+"""Per instant, one picture per view; empty tuples if no view is read."""
 
 
 class PictureStore:
-    """A folder of the pictures of one recipe and dataset."""
+    """A folder of decoded pictures."""
 
     def __init__(self, folder: Path, kind: str) -> None:
-        """``kind`` tells everything that pictures depend on but the episode; a folder may hold several kinds.
+        """``kind`` identifies all that pictures depend on besides the episode; a folder may hold several kinds.
 
         Raises OSError if the folder cannot be made.
         """
@@ -31,9 +31,9 @@ class PictureStore:
         self._folder.mkdir(parents=True, exist_ok=True)
 
     def read(self, episode: bytes, num_instants: int, names: tuple[str, ...]) -> tuple[Views, ...] | None:
-        """What `write` was given under these names; None if it is not there or is damaged: make it again."""
+        """The views that `write` stored under these names; None if the file is missing or damaged."""
         try:
-            with (self._folder / f"{_name(episode)}.npz").open("rb") as file:  # np.load leaves a damaged one open
+            with (self._folder / f"{_name(episode)}.npz").open("rb") as file:  # np.load would leave a damaged one open
                 arrays = dict(np.load(file, allow_pickle=False))
         except (OSError, ValueError, EOFError, zipfile.BadZipFile):
             return None
@@ -41,9 +41,9 @@ class PictureStore:
         return found if all(len(views) == num_instants for views in found) else None
 
     def write(self, episode: bytes, views: dict[str, Views]) -> None:
-        """Keeps pictures (height, width, 3) uint8. A disk that is full keeps nothing, and training goes on."""
+        """Stores pictures (height, width, 3) uint8. Does nothing if the disk is full: training goes on without."""
         path = self._folder / f"{_name(episode)}.npz"
-        partial = path.with_suffix(f".{uuid.uuid4().hex}")  # of no other process, on whichever host
+        partial = path.with_suffix(f".{uuid.uuid4().hex}")  # unique among processes and hosts
         try:
             with partial.open("wb") as file:
                 np.savez(file, **_arrays(views))  # type: ignore[arg-type]  # no view is called allow_pickle
@@ -52,8 +52,8 @@ class PictureStore:
             partial.unlink(missing_ok=True)
 
 
-def _name(of: bytes) -> str:
-    return hashlib.blake2b(of, digest_size=12).hexdigest()
+def _name(key: bytes) -> str:
+    return hashlib.blake2b(key, digest_size=12).hexdigest()
 
 
 def _arrays(views: dict[str, Views]) -> dict[str, NDArray[np.uint8]]:

@@ -1,4 +1,4 @@
-"""A run at a glance: its losses and gradient norm over its steps, as one PNG drawn with Pillow."""
+"""Plots a run's losses and gradient norm over its steps, as one PNG drawn with Pillow."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ _SMOOTHING = 0.95
 
 
 def plot_log(log: Path, png: Path) -> None:
-    """Draws ``log.jsonl``: a panel per curve, every step pale and their running mean dark, on a logarithmic scale.
+    """Draws ``log.jsonl``: a panel per curve, single steps pale and their running mean dark, on a logarithmic scale.
 
-    A curve that is zero throughout (a recipe without texts) is left out, as is one that an older log does not have.
+    A curve that is zero throughout (a recipe without texts) or missing from an older log is left out.
 
     Raises:
         ValueError: the log has no steps.
@@ -42,7 +42,7 @@ def plot_log(log: Path, png: Path) -> None:
 
 
 def smoothed(values: Iterable[float]) -> NDArray[np.float64]:
-    """Running mean with exponential weights, without a bias towards the first value."""
+    """Exponential moving average, bias-corrected as in Adam."""
     mean, weight, out = 0.0, 0.0, []
     for value in values:
         mean = _SMOOTHING * mean + (1 - _SMOOTHING) * value

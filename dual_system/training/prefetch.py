@@ -1,8 +1,8 @@
-"""Batches prefetched by other processes: one process lays out rows slower than a GPU learns from them.
+"""Batches prefetched by worker processes, because one process prepares them more slowly than a GPU consumes them.
 
-A batch is a pure function of its step, so who makes it changes nothing but the time. The processes are forked from a
-trainer that may already use a GPU: they touch numpy and CPU tensors only, and nobody else's threads hold a lock that
-they need, since torch's own are not used there.
+A batch is a pure function of its step, so workers change nothing but the time. They are forked from a trainer that may
+already use a GPU. That is safe because they use numpy and CPU tensors only and do not run torch's thread pools, so no
+thread of the parent can hold a lock that they need.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from dual_system.training.joint import PonderBatch, PounceBatch
 from dual_system.training.trainer import Batches
 
 _Batch = tuple[PonderBatch, PounceBatch]
-_AHEAD = 2  # batches each process may have ready
+_AHEAD = 2  # batches that each worker prefetches
 
 
 class Prefetcher:
-    """`Batches` for consecutive steps, made by other processes."""
+    """`Batches` for consecutive steps, made by worker processes."""
 
     def __init__(self, make: Batches, device: torch.device | str, num_workers: int) -> None:
-        """``make`` gives a step's batch on the CPU. Raises ValueError if there is nobody to make it."""
+        """``make`` returns a step's batch on the CPU. Raises ValueError for fewer than one worker."""
         if num_workers < 1:
             raise ValueError(f"expected at least one process that makes batches, came {num_workers}")
         self._make, self._device, self._num_workers = make, device, num_workers
@@ -37,10 +37,10 @@ class Prefetcher:
         self._moving = ThreadPoolExecutor(1, "batches")
 
     def __call__(self, step: int) -> _Batch:
-        """The batch of ``step``, on the device. Of another step than the next one what was made ahead is thrown away.
+        """The batch of ``step``, on the device. A step other than the next one discards the prefetched batches.
 
         Raises:
-            Exception: what making it raised.
+            Exception: the worker's exception.
         """
         if self._next is None or step != self._step:
             self._begin(step)
@@ -51,19 +51,19 @@ class Prefetcher:
         return batch
 
     def close(self) -> None:
-        """Ends the processes."""
+        """Ends the workers."""
         self._moving.shutdown(wait=True, cancel_futures=True)
         self._made = iter(())
 
     def _begin(self, step: int) -> None:
         if self._next is not None:
-            self._next.exception()  # of a step that nobody wants any more
+            self._next.exception()  # waits for the discarded batch and ignores its error
         loader = DataLoader(
             _Steps(self._make, step),
             batch_size=None,
             num_workers=self._num_workers,
             prefetch_factor=_AHEAD,
-            collate_fn=_as_it_is,
+            collate_fn=_identity,
             multiprocessing_context="fork",
         )
         self._made, self._step = iter(loader), step
@@ -75,28 +75,28 @@ class Prefetcher:
 
 
 class _Steps(Dataset[Any]):
-    """What the loader's processes run: item n is the batch of step ``first`` + n, with arrays for tensors.
+    """The workers' dataset: item n is the batch of step ``first`` + n, with arrays in place of tensors.
 
-    torch hands every tensor over by a file descriptor of its own, and a batch holds hundreds.
+    torch passes every tensor between processes by its own file descriptor, and a batch holds hundreds.
     """
 
     def __init__(self, make: Batches, first: int) -> None:
         self._make, self._first = make, first
 
     def __len__(self) -> int:
-        return 1 << 40  # without end
+        return 1 << 40  # unlimited
 
     def __getitem__(self, index: int) -> _Batch:
         made: _Batch = _with_arrays(self._make(self._first + index))
         return made
 
 
-def _as_it_is(batch: Any) -> Any:
+def _identity(batch: Any) -> Any:
     return batch
 
 
 def _with_arrays(value: Any) -> Any:
-    """The same, every tensor an array."""
+    """Replaces every tensor by an `_Array`."""
     return _mapped(value, Tensor, lambda tensor: _Array(tensor.numpy()))
 
 
@@ -105,7 +105,7 @@ def _with_tensors(value: Any) -> Any:
 
 
 class _Array:
-    """An array that was a tensor; rows have arrays of their own that stay."""
+    """Marks an array that was a tensor; rows also contain plain arrays."""
 
     def __init__(self, array: Any) -> None:
         self.array = array

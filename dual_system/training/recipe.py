@@ -1,4 +1,4 @@
-"""What a training run is, apart from its data."""
+"""The definition of a training run, apart from its data and the machine."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Recipe:
     ponder: PonderConfig
     pounce: AnyPounceConfig
     freeze: Freeze
-    """Which of POUNCE's pretrained parts stay as they are."""
+    """POUNCE's pretrained parts to freeze."""
     example: ExampleConfig
     train: TrainConfig
     num_steps: int
@@ -30,19 +30,19 @@ class Recipe:
     w1: float = 1.0
     """Weight of flow matching."""
     w2: float = 0.1
-    """Weight of grounding: the LM head's cross-entropy. 0 goes with examples that are not grounded."""
+    """Weight of grounding, the LM head's cross-entropy. It is 0 if and only if the examples are not grounded."""
     trains: Trains = "both"
-    """Which systems learn."""
+    """The systems to train."""
     demo_hz: int = 1
-    """Frames a second of demonstrations (paper: 1); PONDER's checkpoint and contract keep it."""
+    """Frames per second of demonstrations (paper: 1); stored in PONDER's checkpoint and contract."""
     space: ActionSpace = "joint_delta"
-    """What POUNCE's actions are."""
+    """POUNCE's action space."""
     statistics_by_row: bool = False
     """Normalise every row of a chunk by its own spread (`RobotStatistics.reach`)."""
     has_own_tokenizers: bool = False
     """Train both tokenizers on the data's texts, which then take fewer tokens; for networks from scratch."""
     from_scratch: bool = False
-    """True: weights are drawn. False: both systems start from pretrained checkpoints, given to the program."""
+    """True: random initial weights. False: both systems start from pretrained checkpoints."""
 
     def __post_init__(self) -> None:
         if self.trains != "pounce" and self.example.is_grounded != (self.w2 > 0):

@@ -1,7 +1,7 @@
 """Tensors on disk, by rows: each process writes its own, and any number of processes reads them back.
 
-One safetensors file a process. torch.distributed.checkpoint would do the same, but its index is a pickle, which we
-read from no disk; and gathering everything on one process would need room for the whole optimiser there.
+Each process has one safetensors file. torch.distributed.checkpoint would do the same, but its index is a pickle, which
+may run code; and gathering on one process would need memory for the whole optimiser there.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from protocol import disk
 
 
 def write_rows(tensors: Mapping[str, Tensor], folder: Path, stem: str, world: World) -> None:
-    """Writes this process's rows to ``folder/stem-RANK-of-SIZE.safetensors``, down to the disk.
+    """Writes this process's rows to ``folder/stem-RANK-of-SIZE.safetensors`` and syncs the file.
 
-    Of a tensor that every process holds whole, its rows are the ones that it would hold if it were cut.
+    A tensor that every process holds whole is cut as FSDP2 would cut it.
     """
     path = folder / f"{stem}-{world.rank:05d}-of-{world.size:05d}.safetensors"
     save_file({name: _rows_to_write(tensor.detach(), world).contiguous() for name, tensor in tensors.items()}, path)
@@ -32,10 +32,10 @@ def write_rows(tensors: Mapping[str, Tensor], folder: Path, stem: str, world: Wo
 
 
 class RowReader:
-    """The files of one ``write_rows``, opened together."""
+    """Reads the files that all processes wrote with ``write_rows``."""
 
     def __init__(self, folder: Path, stem: str, world: World) -> None:
-        """Raises FileNotFoundError if not every file that was written is there."""
+        """Raises FileNotFoundError if a process's file is missing."""
         self._world = world
         paths = sorted(folder.glob(f"{stem}-*-of-*.safetensors"))
         wanted = int(paths[0].stem.rsplit("-", 1)[1]) if paths else 1
@@ -59,12 +59,12 @@ class RowReader:
         return set(self._files[0].keys())
 
     def shape(self, name: str) -> tuple[int, ...]:
-        """Of the whole tensor."""
+        """Shape of the whole tensor."""
         shapes = [tuple(file.get_slice(name).get_shape()) for file in self._files]
         return (sum(shape[0] for shape in shapes), *shapes[0][1:]) if shapes[0] else ()
 
     def read(self, name: str, like: Tensor) -> Tensor:
-        """The rows of ``name`` that this process holds of ``like``."""
+        """The rows of tensor ``name`` that this process holds of ``like``."""
         if not self.shape(name):
             scalar: Tensor = self._files[0].get_tensor(name)
             return scalar
@@ -81,7 +81,7 @@ class RowReader:
 
 
 def held_rows(tensor: Tensor, world: World) -> tuple[int, int]:
-    """First row that this process holds, and the one after the last."""
+    """The range [first, last + 1) of rows that this process holds."""
     count = tensor.shape[0] if tensor.ndim else 1
     return _cut(count, world) if isinstance(tensor, DTensor) else (0, count)
 
@@ -94,6 +94,6 @@ def _rows_to_write(tensor: Tensor, world: World) -> Tensor:
 
 
 def _cut(count: int, world: World) -> tuple[int, int]:
-    """This process's of so many rows: FSDP2 cuts as ``torch.chunk`` does."""
+    """This process's range of ``count`` rows, cut like ``torch.chunk`` as in FSDP2."""
     rows = -(-count // world.size)
     return min(world.rank * rows, count), min((world.rank + 1) * rows, count)

@@ -1,9 +1,9 @@
 """``pp-train``: trains both systems together on a collected dataset, and leaves folders that the servers load.
 
-    OUT/checkpoint/     where a killed run goes on: weights, optimiser, step
-    OUT/log.jsonl       one line per step; OUT/run.png draws it at the end
-    OUT/samples.jsonl   what PONDER writes at intervals, beside what it should
-    OUT/ponder, pounce  at the end: what ponder-serve and pounce-serve take as --checkpoint
+    OUT/checkpoint/     weights, optimiser and step, from which a killed run resumes
+    OUT/log.jsonl       one line per step; OUT/run.png plots it at the end
+    OUT/samples.jsonl   PONDER's predicted texts at intervals, beside their targets
+    OUT/ponder, pounce  at the end: checkpoints for ponder-serve and pounce-serve --checkpoint
 
 The same command again resumes. On several GPUs or hosts:
 
@@ -22,7 +22,6 @@ from typing import Literal
 import numpy as np
 import torch
 import tyro
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from dual_system.data.episode import CAMERAS
@@ -54,12 +53,12 @@ from protocol.command_line import parse
 
 DONE, REFUSED, INTERRUPTED = 0, 2, 130
 _SYSTEMS = ("ponder", "pounce")
-_EPISODE_STREAM = 7  # of a step's random numbers: which episodes, which schedules
+_EPISODE_STREAM = 7  # random stream of a step for episodes and schedules
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InsteadOptions:
-    """Values that take the place of the recipe's."""
+    """Values that override the recipe's."""
 
     steps: int | None = None
     """Number of updates."""
@@ -70,7 +69,7 @@ class InsteadOptions:
     max_invocations: int | None = None
     """POUNCE invocations drawn from each episode of a batch."""
     max_committed_rows: int | None = None
-    """Most rows of a chunk that pi0.5 learns to continue, for `pounce-serve --continuity trained`."""
+    """Largest number of committed rows of a chunk in training, for `pounce-serve --continuity trained`; pi0.5 only."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,8 +83,8 @@ class MachineOptions:
     tf32: bool = False
     """Multiply float32 matrices in TF32 on a GPU that has it, which rounds to 1 in 2000."""
     weights: Literal["sharded", "whole"] = "sharded"
-    """With several processes: each holds its rows of the weights (FSDP2), or all of them, which is faster where they
-    fit many times over."""
+    """With several processes: each holds a shard of the weights (FSDP2), or all of them, which is faster for small
+    models."""
     recompute: bool = False
     """Recompute PONDER's activations in the backward pass: less memory for long rows, more time."""
     length_groups: int = 1
@@ -100,7 +99,7 @@ class MachineOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogOptions:
-    """What the run writes while it goes."""
+    """What a run writes while it trains."""
 
     save_every: int = 100
     """Updates between checkpoints."""
@@ -135,9 +134,9 @@ class TrainOptions:
 
 
 class Batches:
-    """This process's share of a step's batch: which episodes, under which schedules.
+    """Makes this process's share of a step's batch.
 
-    Each schedule follows from (seed, step, place in the batch), so the shares of N processes are the batch of one.
+    Each schedule follows from (seed, step, place in the batch), so N processes together train on one process's batch.
     """
 
     def __init__(self, data: TrainingSet, run: Recipe, model: JointModel, bundle: PounceBundle, world: World) -> None:
@@ -145,7 +144,7 @@ class Batches:
         self._data, self._run = data, run
         self._bundle, self._device = bundle, world.device
         self._places = world.share(run.batch_episodes)
-        # not the model itself: another process may ask (`prefetch`), and its weights lie on a GPU
+        # Not the model itself: worker processes copy this object (`prefetch`), and its weights may be on a GPU.
         self._form, self._pounce, self._runs_ponder = model.ponder.format, model.pounce.config, model.runs_ponder
 
     def __call__(self, step: int) -> tuple[PonderBatch, PounceBatch]:
@@ -153,28 +152,23 @@ class Batches:
         return episodes.to(self._device), invocations.to(self._device)
 
     def on_cpu(self, step: int) -> tuple[PonderBatch, PounceBatch]:
-        """The same, not yet on the device."""
+        """The batch of a step, not yet on the device."""
         run, bundle = self._run, self._bundle
         chance = (run.train.seed, _EPISODE_STREAM, step)
         numbers = self._draw(np.random.default_rng(chance))
         examples = [
-            make_example(
-                self._data[int(numbers[place])],
-                self._form,
-                run.example,
-                np.random.default_rng([*chance, place]),
-            )
+            make_example(self._data[numbers[place]], self._form, run.example, np.random.default_rng([*chance, place]))
             for place in self._places
         ]
         episodes = collate_ponder(examples if self._runs_ponder else [])
-        if run.trains == "ponder":  # POUNCE is not run: one moment stands for the batch's shape
+        if run.trains == "ponder":  # POUNCE is not run: one invocation suffices for the batch's shape
             examples = [replace(each, invocations=each.schedule.invocations[:1]) for each in examples]
         return episodes, collate_pounce(examples, self._pounce, bundle.tokenizer, bundle.statistics)
 
-    def _draw(self, rng: np.random.Generator) -> NDArray[np.integer]:
-        """Numbers of the batch's episodes, long ones first, so that the processes' shares are of like length."""
-        numbers = rng.integers(len(self._data), size=self._run.batch_episodes)
-        return np.array(sorted(numbers.tolist(), key=lambda number: -self._data.num_rows(number)))
+    def _draw(self, rng: np.random.Generator) -> list[int]:
+        """Numbers of the batch's episodes, long ones first, so that the processes' shares have similar lengths."""
+        numbers: list[int] = rng.integers(len(self._data), size=self._run.batch_episodes).tolist()
+        return sorted(numbers, key=lambda number: -self._data.num_rows(number))
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -199,9 +193,9 @@ def train(options: TrainOptions) -> None:
     """Runs a recipe to its end, alone or as one of torchrun's processes.
 
     Raises:
-        DatasetError, CheckpointError, FileNotFoundError, ValueError: what was given does not fit; the message says why.
+        DatasetError, CheckpointError, FileNotFoundError, ValueError: the inputs do not fit; the message says why.
         FloatingPointError: the loss is not finite; the last checkpoint is kept.
-        SaveError: a checkpoint could not be written; the one before is kept.
+        SaveError: a checkpoint could not be written; the previous one is kept.
     """
     machine, run = options.machine, _adjusted(recipe(options.recipe), options.instead)
     if _is_finished(options.out):
@@ -210,7 +204,7 @@ def train(options: TrainOptions) -> None:
         raise ValueError("--tf32 is for GPUs; on a CPU leave it out")
     data = TrainingSet(*options.data, tasks=options.tasks, demo_hz=run.demo_hz)
     with joined(machine.device) as world:
-        if not 0 < machine.length_groups <= max(1, run.batch_episodes // world.size):  # all processes have as many
+        if not 0 < machine.length_groups <= max(1, run.batch_episodes // world.size):  # every process has this many
             raise ValueError(
                 f"--length-groups {machine.length_groups}: expected 1 to {run.batch_episodes // world.size}, the rows "
                 "that every process has of a batch"
@@ -232,7 +226,7 @@ def train(options: TrainOptions) -> None:
 def _update(
     run: Recipe, model: JointModel, batches: Batches, data_hash: str, options: TrainOptions, world: World
 ) -> None:
-    """All updates of the run, from the checkpoint on if there is one; leaves the averaged weights in ``model``."""
+    """Runs all updates, from the checkpoint on if there is one; leaves the averaged weights in ``model``."""
     log, checkpoint = options.log, options.out / "checkpoint"
     with ExitStack() as stack:
         prefetcher = None
@@ -246,14 +240,10 @@ def _update(
         bar = stack.enter_context(tqdm(total=run.num_steps, initial=trainer.step, unit="step", disable=not shows))
         watch = None
         if world.is_first:
-            watch = stack.enter_context(
-                Watch(
-                    options.out,
-                    first_step=trainer.step,
-                    sample_every=log.sample_every,
-                    tensorboard=log.tensorboard,
-                )
+            watch = Watch(
+                options.out, first_step=trainer.step, sample_every=log.sample_every, tensorboard=log.tensorboard
             )
+            stack.enter_context(watch)
         for report in trainer.run(run.num_steps):
             if watch is not None:
                 watch.step(report, trainer)
@@ -272,7 +262,7 @@ def _is_finished(out: Path) -> bool:
 
 
 def _prepare(model: JointModel, machine: MachineOptions, world: World) -> None:
-    """Makes a model that was just built ready for the machine and the other processes."""
+    """Prepares a new model for the machine and the other processes."""
     require_alike(model, world)
     model.reads_together = machine.device != "cpu" or (world.size > 1 and machine.weights == "sharded")
     model.num_groups = machine.length_groups
@@ -288,7 +278,7 @@ def _prepare(model: JointModel, machine: MachineOptions, world: World) -> None:
 def _write(
     run: Recipe, model: JointModel, bundle: PounceBundle, data: TrainingSet, options: TrainOptions, world: World
 ) -> None:
-    """Writes what was trained, once."""
+    """Writes the trained systems, from the first process alone."""
     if world.size == 1:
         export(model, bundle, options.out, trained=run.trains)
     else:
@@ -302,10 +292,10 @@ def _write(
 
 
 def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointModel, PounceBundle]:
-    """Both systems, drawn or loaded, frozen as the recipe says, with the data's own statistics.
+    """Both systems, initialised or loaded, frozen as the recipe says, with the data's own statistics.
 
     Raises:
-        ValueError: pretrained weights are missing, or the pictures have another size than PONDER reads.
+        ValueError: pretrained weights are missing, or PONDER cannot read the pictures' size.
         FileNotFoundError: a given folder holds no checkpoint.
     """
     device, seed = options.machine.device, run.train.seed
@@ -325,19 +315,16 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
         wanted_px = ponder.format.reader.readable_sizes(ponder.image_px)[0][0]
         raise ValueError(f"{', '.join(map(str, options.data))}: {error}; collect with --image-px {wanted_px}") from None
     if run.trains != "pounce":
-        ponder.format = replace(
-            ponder.format,
-            speaks=run.w2 > 0,
-            demonstrations=data.demo_sampling() or ponder.format.demonstrations,
-        )
+        demonstrations = data.demo_sampling() or ponder.format.demonstrations
+        ponder.format = replace(ponder.format, speaks=run.w2 > 0, demonstrations=demonstrations)
     measured = partial(data.statistics, run.pounce.horizon, run.space, by_row=run.statistics_by_row)
     if options.pounce is None:
         bundle = random_bundle(run.pounce, seed, statistics=measured(), tokenizer=_own_tokenizer(run, data))
         open_gates(bundle.model)
     else:
-        # A public folder has no prefix and does not say what it should read; the recipe does.
+        # A public folder has neither a cognition prefix nor a declaration of POUNCE's inputs; the recipe has both.
         bundle = load_bundle(options.pounce, config=None if declares_config(options.pounce) else run.pounce)
-        if bundle.statistics == ROBOMME:  # a public folder; our own act in the measure that they were trained in
+        if bundle.statistics == ROBOMME:  # a public folder; our own keep the statistics that they were trained with
             bundle = replace(bundle, statistics=measured())
     pounce = bundle.model.to(device)
     if type(pounce.config) is not type(run.pounce):
@@ -349,16 +336,15 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
 
 
 def _own_tokenizer(run: Recipe, data: TrainingSet) -> Tokenizer | None:
-    """A tokenizer for POUNCE of all prompts in the data; None: the family's."""
+    """A tokenizer for POUNCE, trained on all prompts in the data; None for the family's."""
     if not run.has_own_tokenizers or not isinstance(run.pounce, PounceConfig):
         return None
-    return tokenizer_of_instructions(
-        data.instructions_with_subgoals() if run.pounce.reads_subgoal else data.instructions()
-    )
+    prompts = data.instructions_with_subgoals() if run.pounce.reads_subgoal else data.instructions()
+    return tokenizer_of_instructions(prompts)
 
 
 def export(model: JointModel, bundle: PounceBundle, out: Path, *, trained: Trains = "both") -> None:
-    """Writes the folders of what was trained, as the servers read them."""
+    """Writes checkpoint folders of the trained systems for the servers."""
     if trained != "pounce":
         model.ponder.is_random = False
         save_ponder(model.ponder, out / "ponder")
@@ -367,7 +353,7 @@ def export(model: JointModel, bundle: PounceBundle, out: Path, *, trained: Train
 
 
 def _adjusted(run: Recipe, instead: InsteadOptions) -> Recipe:
-    """The recipe with the command line's values in place of its own."""
+    """The recipe with the command line's overrides."""
     pounce = run.pounce
     if instead.max_committed_rows is not None:
         if not isinstance(pounce, PounceConfig):
@@ -384,12 +370,10 @@ def _adjusted(run: Recipe, instead: InsteadOptions) -> Recipe:
 
 
 def _picture_sizes(run: Recipe, model: JointModel) -> PictureSizes:
-    """What the run reads of the pictures."""
+    """The picture sizes that the run's networks read."""
     pounce = model.pounce.config
-    sees = run.trains != "ponder" and pounce.num_cameras > 0
-    return PictureSizes(
-        form=model.ponder.format if model.runs_ponder else None, pounce_px=pounce.image_px if sees else None
-    )
+    pounce_px = pounce.image_px if run.trains != "ponder" and pounce.num_cameras else None
+    return PictureSizes(form=model.ponder.format if model.runs_ponder else None, pounce_px=pounce_px)
 
 
 def _out_of_memory(options: TrainOptions, error: BaseException) -> str:

@@ -1,7 +1,7 @@
-"""The loop: steps that repeat exactly, checkpoints that survive a kill, and a resume that continues bit for bit.
+"""The training loop: reproducible steps, atomic checkpoints, and a resume that continues bit for bit.
 
-Everything random in a step follows from (seed, step), so a checkpoint holds no random state: what a step does depends
-on the weights, the optimiser and its number alone.
+Everything random in a step follows from (seed, step), so a checkpoint holds no random state: a step depends on the
+weights, the optimiser and its number alone.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ Batches = Callable[[int], tuple[PonderBatch, PounceBatch]]
 """This process's share of the batch of a step (``World.share``); a pure function of the step's number."""
 
 _WEIGHTS, _OPTIMISER, _FACTS = "weights", "optimiser", "facts.json"
-_DRAW_STREAM = 11  # of a step's random numbers: noise, flow times, cognition dropout
+_DRAW_STREAM = 11  # random stream of a step for noise, flow times and cognition dropout
 
 
 class CheckpointError(ValueError):
-    """A checkpoint cannot be continued from."""
+    """A run cannot continue from this checkpoint."""
 
 
 class SaveError(RuntimeError):
-    """A checkpoint could not be written; the one before is whole."""
+    """A checkpoint could not be written; the previous one is intact."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepReport:
-    """What one update did."""
+    """Losses and counts of one update."""
 
     step: int
     total: float
@@ -55,18 +55,18 @@ class StepReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainConfig:
-    """What a step depends on besides model and data."""
+    """Options of a step besides model and data."""
 
     seed: int = 42
     dropout: float = 0.0
-    """Share of invocations that see the null cognition instead (paper: 0 for RoboMME, 0.15 for RoboCasa-DC)."""
+    """Probability of cognition dropout (null cognition) per invocation (paper: RoboMME 0, RoboCasa-DC 0.15)."""
     flow_samples: int = 1
-    """Noise and flow time drawn so often for each invocation, over one reading of it. pi0.5 only if above 1."""
+    """Draws of noise and flow time per invocation, which share one prefix. Above 1 for pi0.5 only."""
     optim: OptimConfig = field(default_factory=OptimConfig)
 
 
 class Trainer:
-    """Updates a joint model, one batch at a time; alone, or as one of several processes with a share of each batch."""
+    """Updates a joint model, one batch at a time; one of several processes takes its share of each batch."""
 
     def __init__(
         self,
@@ -77,9 +77,9 @@ class Trainer:
         data_hash: str = "",
         world: World | None = None,
     ) -> None:
-        """``data_hash`` names the data: a checkpoint made with other data is refused.
+        """``data_hash`` identifies the data: a checkpoint made with other data is refused.
 
-        Where there are several processes, ``model`` is sharded already or the same on all of them.
+        With several processes, ``model`` must be sharded already, or equal on all of them.
         """
         self.model = model
         self.config = config
@@ -94,7 +94,7 @@ class Trainer:
         """Updates until ``step`` is ``until``; yields after each.
 
         Raises:
-            FloatingPointError: the loss or its gradients are not finite; the weights are those of the step before.
+            FloatingPointError: the loss or its gradients are not finite; the weights are those of the previous step.
         """
         while self.step < until:
             yield self._update()
@@ -103,7 +103,7 @@ class Trainer:
         world, model = self._world, self.model
         episodes, invocations = self._batches(self.step)
         loss = model(episodes, invocations, self._draws(invocations))
-        # The parts are means over the whole batch: a process's own weigh as much as it has of what they count.
+        # The losses are means over the whole batch: each process's mean is weighted by its share of the count.
         counts = (loss.num_rows, loss.num_supervised, loss.num_null)
         num_rows, num_supervised, num_null = (int(number) for number in world.sums(counts))
         matching = loss.flow_matching * (loss.num_rows / max(1, num_rows))
@@ -115,7 +115,7 @@ class Trainer:
                 f"step {self.step}: the loss is {total} (flow matching {flow_matching}, grounding {text}). Look at "
                 "that batch's data, or lower learning_rate; the last checkpoint is untouched."
             )
-        (part * world.size).backward()  # the average over processes divides by their number
+        (part * world.size).backward()  # averaging gradients over processes divides by their number
         average_gradients(model, world)
         norm = self._optimiser.update(self.step)
         report = StepReport(
@@ -133,7 +133,7 @@ class Trainer:
 
     @property
     def latest(self) -> tuple[PonderBatch, Tensor]:
-        """This process's episodes of the last update, and what PONDER would have said in them (``JointLoss.said_N``).
+        """This process's episodes of the last update, and PONDER's predictions in them (``JointLoss.said_N``).
 
         Raises:
             RuntimeError: there was no update yet.
@@ -143,7 +143,7 @@ class Trainer:
         return self._latest
 
     def _draws(self, invocations: PounceBatch) -> Draws:
-        """The chance of this step, episode by episode: the same for an episode whichever process has it."""
+        """The random draws of this step, per episode: independent of the process that has the episode."""
         generators = []
         for index in range(invocations.num_episodes):
             place = self._world.rank + index * self._world.size
@@ -159,16 +159,16 @@ class Trainer:
         )
 
     def take_average(self) -> None:
-        """Puts the averaged weights in place of the last ones, at the end of a run; nothing where none are kept."""
+        """Replaces the weights by their average, at the end of a run; does nothing without an average."""
         self._optimiser.take_average()
 
     def save(self, folder: Path) -> None:
-        """Writes a checkpoint; a kill at any instant leaves the old one or the new one, whole.
+        """Writes a checkpoint atomically: a kill at any instant leaves the old one or the new one intact.
 
         Every process writes its own rows (``shards``), so all of them must see ``folder``.
 
         Raises:
-            SaveError: a process could not write (a full disk); the old checkpoint is kept, the new one's rest removed.
+            SaveError: a process could not write (a full disk); the old checkpoint is kept, the partial one removed.
         """
         fresh, old = (folder.with_name(folder.name + suffix) for suffix in (".tmp", ".old"))
         world = self._world
@@ -196,7 +196,7 @@ class Trainer:
         world.wait()
 
     def resume(self, folder: Path) -> bool:
-        """Continues from a checkpoint, whatever number of processes wrote it; False if there is none yet.
+        """Continues from a checkpoint of any number of processes; returns False if there is none yet.
 
         Raises:
             CheckpointError: it was made with another configuration, other data, or another model.

@@ -1,4 +1,4 @@
-"""What a run shows while it goes: a log, what PONDER says beside what it should, and TensorBoard if asked for."""
+"""Monitoring of a run: a log, samples of PONDER's predicted texts beside their targets, and optionally TensorBoard."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ _TAGS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sample:
-    """A supervised stretch of a row, control tokens included by name."""
+    """A supervised span of a row as text, with control tokens by name."""
 
     wanted: str
+    """The targets."""
     said: str
-    """The likeliest token at each place, each after the right ones before it (teacher-forced): what the gradient sees,
-    not what free decoding would have written."""
+    """The most likely token at each position under teacher forcing; free decoding could differ."""
 
 
 class Watch:
-    """Writes the files of a run. Lines of steps that a resumed run will do again are dropped first."""
+    """Writes a run's log and samples. Lines from ``first_step`` on, which a resumed run repeats, are removed first."""
 
     def __init__(self, out: Path, *, first_step: int, sample_every: int, tensorboard: bool) -> None:
-        """Raises ValueError if TensorBoard is asked for and not installed."""
+        """Raises ValueError if ``tensorboard`` is True and TensorBoard is not installed."""
         self._sample_every = sample_every
         self._board: Any = _board(out / BOARD_FOLDER, first_step) if tensorboard else None
         self._log = _cut(out / LOG_FILE, first_step)
@@ -58,7 +58,7 @@ class Watch:
             self._board.close()
 
     def step(self, report: StepReport, trainer: Trainer) -> None:
-        """After every update."""
+        """Logs one update; call it after every update."""
         facts = asdict(report)
         self._log.write(json.dumps(facts) + "\n")
         if self._board is not None:
@@ -68,13 +68,13 @@ class Watch:
             self._show(report.step, trainer)
 
     def flush(self) -> None:
-        """Before a checkpoint: what it stands on is on disk."""
+        """Flushes the files; call it before a checkpoint, so that the log covers all its steps."""
         for file in (self._log, self._samples):
             file.flush()
 
     def _show(self, step: int, trainer: Trainer) -> None:
         episodes, said_N = trainer.latest
-        if not episodes.rows:  # a stage without PONDER
+        if not episodes.rows:  # PONDER is not run
             return
         row, frames = episodes.rows[0], episodes.frames[0]
         samples = samples_of(row, said_N, trainer.model.ponder.format.vocabulary)
@@ -89,11 +89,7 @@ class Watch:
 
 
 def samples_of(row: Row, said_N: Tensor, vocabulary: Vocabulary) -> list[Sample]:
-    """The row's supervised stretches, each told once.
-
-    Args:
-        said_N: the likeliest ids at the batch's supervised places, this row's first (``JointLoss.said_N``).
-    """
+    """The row's distinct supervised spans. ``said_N``: see ``JointLoss.said_N``; this row's positions come first."""
     places = np.flatnonzero(np.asarray(row.targets) != IGNORE)
     said = said_N[: len(places)].tolist()
     if not len(said):
@@ -107,7 +103,7 @@ def samples_of(row: Row, said_N: Tensor, vocabulary: Vocabulary) -> list[Sample]
 
 
 def _cut(path: Path, step: int) -> TextIO:
-    """The file, open at its end, with the lines of earlier steps only."""
+    """Opens the file for appending, with only the lines of earlier steps kept."""
     if path.exists():
         lines: Sequence[str] = path.read_text().splitlines(keepends=True)
         path.write_text("".join(line for line in lines if line.endswith("\n") and json.loads(line)["step"] < step))

@@ -1,1 +1,1 @@
-"""Fused operations of POUNCE's fast path in Triton, one a file, each beside its eager twin and their tolerance."""
+"""Fused operations of POUNCE's fast path in Triton, one per file, each beside its eager twin and their tolerance."""

@@ -1,8 +1,8 @@
-"""Which library multiplies a given shape fastest on this GPU: timed once, kept on disk, never asked again.
+"""Selects the fastest library per matrix product on this GPU: timed once and stored on disk.
 
-cuBLAS and cuBLASLt give the same product by other kernels, and neither wins everywhere. The choice is made the first
-time a shape is met, before a graph is captured (`graphs.cuda_graph` runs work first). Choices of other GPUs and of
-other versions stand beside in the same file, and are left alone.
+cuBLAS and cuBLASLt compute the same product with different kernels, and neither is always faster. The choice is made
+at the first use of a shape, before a graph is captured (`graphs.cuda_graph` runs work first). The file also holds the
+choices of other GPUs and versions, which are kept.
 """
 
 # M rows, K inputs, N outputs
@@ -22,23 +22,23 @@ LIBRARIES = ("cublas", "cublaslt")
 REPEATS = 20
 
 Timer: TypeAlias = Callable[[Callable[[], None]], float]
-"""How long work takes, in any unit."""
+"""Returns the duration of work, in any unit."""
 Switch: TypeAlias = Callable[[str], AbstractContextManager[None]]
-"""Makes torch multiply by one library within."""
+"""Returns a context in which torch uses the named library."""
 
 
 def default_cache() -> Path:
-    """Where choices are kept: the user's cache folder."""
+    """Default file of choices, in the user's cache folder."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ponderpounce" / "products.json"
 
 
 def machine_name(device: torch.device) -> str:
-    """What a choice is good for: this GPU, with these versions."""
+    """Key of the machine's choices: the GPU's name and the versions of torch and CUDA."""
     return f"{torch.cuda.get_device_name(device)}, torch {torch.__version__}, CUDA {torch.version.cuda}"
 
 
 class Choices:
-    """The file: machine -> product -> library. A file that does not parse is begun anew; a lost one costs a few ms."""
+    """The file of choices: machine -> product -> library. A damaged file is replaced; timing again costs a few ms."""
 
     def __init__(self, path: Path, machine: str) -> None:
         self._path, self._machine = path, machine
@@ -48,7 +48,7 @@ class Choices:
         return self._mine.get(product)
 
     def keep(self, product: str, library: str) -> None:
-        """Writes at once: the file is whole at any instant, and keeps what others wrote meanwhile."""
+        """Stores a choice atomically, and keeps those that other processes wrote meanwhile."""
         self._mine[product] = library
         everything = self._read()
         everything[self._machine] = everything.get(self._machine, {}) | self._mine
@@ -68,7 +68,7 @@ class Choices:
 
 
 class ChosenProduct:
-    """Multiplies like `product`, each shape by the library chosen for it."""
+    """Multiplies like `product`, each shape with its fastest library."""
 
     def __init__(self, choices: Choices, timer: Timer, switch: Switch) -> None:
         self._choices, self._timer, self._switch = choices, timer, switch
@@ -92,13 +92,13 @@ class ChosenProduct:
 
 
 def product(x_MK: Tensor, weight_NK: Tensor, out_MN: Tensor) -> None:
-    """x W^T into ``out_MN``, by whatever torch prefers."""
+    """Writes x W^T to ``out_MN``, with torch's preferred library."""
     torch.mm(x_MK, weight_NK.T, out=out_MN)
 
 
 @contextlib.contextmanager
 def preferring(library: str) -> Iterator[None]:
-    """The `Switch` of a CUDA build: a CPU build knows no such choice."""
+    """The `Switch` for CUDA builds of torch; CPU builds have no such option."""
     before = torch.backends.cuda.preferred_blas_library()
     torch.backends.cuda.preferred_blas_library(library)
     try:
@@ -108,7 +108,7 @@ def preferring(library: str) -> Iterator[None]:
 
 
 def cuda_time_ms(work: Callable[[], None]) -> float:
-    """Mean of `REPEATS` runs in the current stream, after one that does not count."""
+    """Mean duration [ms] of `REPEATS` runs in the current stream, after a warm-up run."""
     work()
     start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
     start.record()

@@ -1,4 +1,4 @@
-"""The end of a flow step: the action projection's bias, and the Euler step from it."""
+"""The end of a flow step: the action projection's bias, then the Euler step."""
 
 # R rows (batch times horizon), A padded action dim
 
@@ -22,7 +22,7 @@ def euler_fused(x_RA: Tensor, velocity_RA: Tensor, bias_A: Tensor, num_steps: in
     """`euler_eager` in one launch.
 
     Raises:
-        ValueError: a tensor is not float32, contiguous and of the shape that the others ask for.
+        ValueError: a tensor is not float32 or not contiguous, or shapes do not match.
     """
     num_rows, action_dim = x_RA.shape
     check_tensor("x", x_RA, (num_rows, action_dim), torch.float32)

@@ -19,7 +19,7 @@ MAX_BLOCK = 1024
 
 
 def geglu_eager(gate_up_R2M: Tensor, out_RM: Tensor) -> None:
-    """Writes gelu_tanh(gate) * up to ``out_RM``: the models' arithmetic."""
+    """Writes gelu_tanh(gate) * up to ``out_RM``, with the models' arithmetic."""
     gate_RM, up_RM = gate_up_R2M.chunk(2, dim=-1)
     torch.mul(F.gelu(gate_RM, approximate="tanh"), up_RM, out=out_RM)
 
@@ -28,7 +28,7 @@ def geglu_fused(gate_up_R2M: Tensor, out_RM: Tensor) -> None:
     """`geglu_eager` in one launch, in float32 between load and store.
 
     Raises:
-        ValueError: a tensor is not of the shape, type or layout that the other asks for.
+        ValueError: shapes, dtypes or layouts do not match.
     """
     num_rows, width = out_RM.shape
     check_tensor("out", out_RM, (num_rows, width), out_RM.dtype)

@@ -1,4 +1,4 @@
-"""Triton if it is installed, what keeps a kernel from running, and what every fused operation asks of its tensors."""
+"""Triton if it is installed, the conditions for running kernels, and the checks of their tensors."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ __all__ = ["Tolerance", "block_size", "check_tensor", "kernel", "missing_for", "
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tolerance:
-    """How far a kernel may be from its eager twin: |kernel - twin| <= atol + rtol * |twin|, elementwise."""
+    """Allowed difference between a kernel and its eager twin: |kernel - twin| <= atol + rtol * |twin|, elementwise."""
 
     rtol: float
     atol: float
 
 
 def kernel(function: Callable[..., None]) -> Any:
-    """`triton.jit`. Without Triton the plain function: its module can be imported, its twin can be run.
+    """`triton.jit`, or the plain function without Triton, so that the module can be imported and its twin run.
 
-    The environment variable TRITON_INTERPRET, read here, decides between compiler and interpreter.
+    The environment variable TRITON_INTERPRET, read here, selects Triton's interpreter.
     """
     return function if triton is None else triton.jit(function)
 
 
 def missing_for(device: torch.device) -> str:
-    """Returns what has to be done before kernels can run on ``device``; empty if nothing."""
+    """Returns what to do before kernels can run on ``device``; empty if they can."""
     if triton is None:
         return "Triton is not installed: pip install 'ponderpounce-server[kernels]'"
     if device.type != "cuda" and not triton.knobs.runtime.interpret:
@@ -44,14 +44,14 @@ def missing_for(device: torch.device) -> str:
 
 
 def block_size(count: int) -> int:
-    """The smallest power of two that holds ``count``: Triton's ranges have such lengths only."""
+    """The smallest power of two of at least ``count``: Triton's ranges need such lengths."""
     return 1 << (count - 1).bit_length()
 
 
 def check_tensor(name: str, tensor: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> None:
-    """Raises ValueError unless ``tensor`` is contiguous and of this shape and type.
+    """Raises ValueError unless ``tensor`` is contiguous and of this shape and dtype.
 
-    A kernel believes its pointers: a misfit would not fail, it would read or write somewhere else.
+    Kernels do not check their pointers: with a wrong tensor they would read or write elsewhere in memory.
     """
     if tuple(tensor.shape) != shape or tensor.dtype != dtype or not tensor.is_contiguous():
         layout = "contiguous" if tensor.is_contiguous() else f"strides {tensor.stride()}"

@@ -1,7 +1,7 @@
 """Gemma's RMSNorm, plain or styled by time (adaRMS), together with the gated residual that precedes it.
 
-Between two GEMMs of a pi0.5 stream stands x <- x + gate * branch, then norm(x): as eager operations six passes over
-memory, here one.
+Between two GEMMs of a pi0.5 stream comes x <- x + gate * branch, then norm(x): six passes over memory as eager
+operations, one here.
 """
 
 # R rows (batch times tokens), E width
@@ -18,14 +18,14 @@ from pounce_server.kernels.launch import Tolerance, block_size, check_tensor, ke
 
 TOLERANCE = {
     torch.float32: Tolerance(rtol=1e-5, atol=1e-6),
-    # Twin: gate, product and sum are rounded one by one; kernel: the sum only. Each rounding is half of 2**-7.
+    # Twin: gate, product and sum are each rounded; kernel: the sum only. Each rounding is half of 2**-7.
     torch.bfloat16: Tolerance(rtol=2**-7, atol=2**-6),
 }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Style:
-    """What a norm multiplies by and adds, (E,) float32 each; without ``shift`` it is the plain one."""
+    """Scale and shift of a norm, (E,) float32 each; without ``shift`` the norm is plain."""
 
     scale: Tensor
     """1 + w of a plain norm, 1 + scale of a styled one."""
@@ -34,16 +34,16 @@ class Style:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Residual:
-    """What is added to the stream before the norm."""
+    """The residual that is added to the stream before the norm."""
 
     branch: Tensor
-    """(R, E), as the stream"""
+    """(R, E), in the stream's dtype"""
     gate: Tensor | None = None
-    """(E,) float32; None adds the branch as it is."""
+    """(E,) float32; None adds the branch ungated."""
 
 
 def norm_eager(x_RE: Tensor, out_RE: Tensor, style: Style, residual: Residual | None = None) -> None:
-    """Adds ``residual`` to ``x_RE`` in place and writes the norm of the sum to ``out_RE``: the models' arithmetic."""
+    """Adds ``residual`` to ``x_RE`` in place and writes the norm of the sum to ``out_RE``, as the models do."""
     if residual is not None:
         gated_RE = residual.branch if residual.gate is None else residual.gate.to(x_RE.dtype) * residual.branch
         x_RE += gated_RE
@@ -52,10 +52,10 @@ def norm_eager(x_RE: Tensor, out_RE: Tensor, style: Style, residual: Residual | 
 
 
 def norm_fused(x_RE: Tensor, out_RE: Tensor, style: Style, residual: Residual | None = None) -> None:
-    """`norm_eager` in one launch, a program a row. Sums in float32, and norms the sum as it is stored.
+    """`norm_eager` in one launch, one program per row. It sums in float32, and normalises the sum as stored.
 
     Raises:
-        ValueError: a tensor is not of the shape, type or layout that the others ask for.
+        ValueError: shapes, dtypes or layouts do not match.
     """
     num_rows, width = x_RE.shape
     check_tensor("x", x_RE, (num_rows, width), x_RE.dtype)

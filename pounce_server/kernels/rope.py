@@ -1,4 +1,4 @@
-"""RoPE of queries and keys in one pass over the packed projection, each written to where attention reads it."""
+"""RoPE of queries and keys in one pass over the packed projection, written in attention's layout."""
 
 # B batch, T tokens, S slots of the key buffer, h query heads, g key heads, D head dim, C = D/2 pairs
 
@@ -14,13 +14,13 @@ from pounce_server.kernels.launch import Tolerance, block_size, check_tensor, ke
 
 TOLERANCE = {
     torch.float32: Tolerance(rtol=1e-5, atol=1e-6),
-    torch.bfloat16: Tolerance(rtol=2**-7, atol=2**-9),  # the same float32 arithmetic, but contracted; rounded once
+    torch.bfloat16: Tolerance(rtol=2**-7, atol=2**-9),  # the same float32 arithmetic with fused multiply-adds
 }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Slots:
-    """One layer's keys and values, (B, g, S, D) each, and the first slot that these tokens take."""
+    """One layer's keys and values, (B, g, S, D) each, and the first slot of these tokens."""
 
     keys: Tensor
     values: Tensor
@@ -30,7 +30,7 @@ class Slots:
 def rope_eager(qkv: Tensor, rotation: Rotation, queries: Tensor, slots: Slots) -> None:
     """Writes rotated queries (B, h, T, D), and rotated keys and plain values into T of the slots.
 
-    ``qkv`` is (B * T, (h + 2g) * D), a row per token: heads of q, of k, of v. ``rotation`` holds (B, 1, T, C) float32.
+    ``qkv`` is (B * T, (h + 2g) * D), per token the heads of q, k and v. ``rotation`` holds (B, 1, T, C) float32.
     """
     batch_size, num_heads, num_tokens, head_dim = queries.shape
     num_kv_heads = slots.keys.shape[1]
@@ -43,11 +43,10 @@ def rope_eager(qkv: Tensor, rotation: Rotation, queries: Tensor, slots: Slots) -
 
 
 def rope_fused(qkv: Tensor, rotation: Rotation, queries: Tensor, slots: Slots) -> None:
-    """`rope_eager` in one launch, a program a token.
+    """`rope_eager` in one launch, one program per token.
 
     Raises:
-        ValueError: a tensor is not of the shape, type or layout that the others ask for, or the tokens do not fit
-            into the slots.
+        ValueError: shapes, dtypes or layouts do not match, or the tokens do not fit into the slots.
     """
     batch_size, num_heads, num_tokens, head_dim = queries.shape
     _, num_kv_heads, num_slots, _ = slots.keys.shape
@@ -110,7 +109,7 @@ def _rope(
     second = tl.load(x_at + PAIRS, mask=inside, other=0.0).to(tl.float32)
     cos = tl.load(cos_ptr + row * PAIRS + pair, mask=is_pair, other=0.0)
     sin = tl.load(sin_ptr + row * PAIRS + pair, mask=is_pair, other=0.0)
-    # Pairs are (i, i + D/2), the half-split convention; values pass as they are.
+    # Pairs are (i, i + D/2), the half-split convention; values are copied.
     turned_first = tl.where(is_v, first, first * cos - second * sin).to(q_ptr.dtype.element_ty)
     turned_second = tl.where(is_v, second, second * cos + first * sin).to(q_ptr.dtype.element_ty)
 

@@ -68,7 +68,7 @@ def _machine(options: GatewayOptions, daemons: Daemons) -> Iterator[Machine]:
 
 @contextmanager
 def _serving(options: GatewayOptions, machine: Machine) -> Iterator[None]:
-    """Listens in a thread of its own for as long as the block lasts. Raises TransportError if it cannot."""
+    """Listens in its own thread for as long as the block lasts. Raises TransportError if it cannot."""
     host, port = options.address
     max_bytes, terms, dialect = options.clients.max_message_mb << 20, options.terms(), options.dialect_class()
     if options.dialect == "challenge-http":

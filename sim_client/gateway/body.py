@@ -1,4 +1,4 @@
-"""The robot that a client drives, as the protocol describes it: ours, or one told by a TOML file."""
+"""The robot that a client drives, as the protocol describes it: ours, or one described by a TOML file."""
 
 from __future__ import annotations
 
@@ -46,34 +46,34 @@ def read_body(path: Path) -> Body:
         TransportError: the file cannot be read, or does not describe a robot.
     """
     try:
-        told = tomllib.loads(path.read_text(encoding="utf-8"))
+        given = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise TransportError(f"--robot-file {path}: {error}") from None
     expected = {each.name for each in fields(Robot)} - _MEASURED
-    if told.keys() - expected or expected - _OPTIONAL - told.keys():
+    if given.keys() - expected or expected - _OPTIONAL - given.keys():
         raise TransportError(
-            f"--robot-file {path}: expected {', '.join(sorted(expected))}; came {', '.join(sorted(told))}"
+            f"--robot-file {path}: expected {', '.join(sorted(expected))}; came {', '.join(sorted(given))}"
         )
     try:
-        num_proprio = int(told["num_proprio"])
-        checks.check_robot(_told(told, np.zeros(num_proprio, np.float32), (1, 1)))
+        num_proprio = int(given["num_proprio"])
+        checks.check_robot(_robot(given, np.zeros(num_proprio, np.float32), (1, 1)))
     except (MalformedMessage, TypeError, ValueError) as error:
         raise TransportError(f"--robot-file {path}: {error}") from None
-    return Body(num_proprio, lambda state, image_px: _told(told, state, image_px))
+    return Body(num_proprio, lambda state, image_px: _robot(given, state, image_px))
 
 
-def _told(told: dict[str, Any], state: Floats, image_px: tuple[int, int]) -> Robot:
-    limits = {name: np.asarray(told[name], np.float32) for name in ("command_low", "command_high", "max_step")}
-    initial = told.get("initial_command")
+def _robot(given: dict[str, Any], state: Floats, image_px: tuple[int, int]) -> Robot:
+    limits = {name: np.asarray(given[name], np.float32) for name in ("command_low", "command_high", "max_step")}
+    initial = given.get("initial_command")
     if initial is None:
         initial = np.clip(state[: len(limits["command_low"])], limits["command_low"], limits["command_high"])
     return Robot(
-        name=str(told["name"]),
+        name=str(given["name"]),
         **limits,
         initial_command=np.asarray(initial, np.float32),
-        cameras=tuple(told["cameras"]),
+        cameras=tuple(given["cameras"]),
         image_height=image_px[0],
         image_width=image_px[1],
-        num_proprio=int(told["num_proprio"]),
-        is_simulated=bool(told["is_simulated"]),
+        num_proprio=int(given["num_proprio"]),
+        is_simulated=bool(given["is_simulated"]),
     )

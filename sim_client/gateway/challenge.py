@@ -1,8 +1,8 @@
 """The RoboMME challenge's policy protocol: ``reset`` and ``infer``, over openpi's websocket framing or over HTTP.
 
-An episode begins with a reset and an ``infer`` that says ``is_first_step``; its lists hold the conditioning video and,
-last, what is seen now. Later calls bring everything that was seen since the last one: one observation for each row that
-was played, so a client that plays fewer rows than it was given is noticed.
+An episode begins with a reset and an ``infer`` with ``is_first_step``; its lists hold the conditioning video and, last,
+the current observation. Later calls hold all observations since the last one, one per played row, so a client that
+plays fewer rows than it received is detected.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ RESET_FINISHED = {"reset_finished": True}
 
 
 class ChallengeDialect:
-    """Joint-angle actions, the challenge's default. Depth and camera parameters may be sent; nobody reads them."""
+    """Joint-angle actions, the challenge's default. Depth and camera parameters are accepted and ignored."""
 
     def __init__(self, terms: Terms) -> None:
         self._terms = terms
@@ -48,7 +48,7 @@ class ChallengeDialect:
                 f"--rows {len(seen)}."
             )
         instruction = reading.text(message, "task_goal")
-        if begins:  # the states of the video are nobody's to read
+        if begins:  # the states of the video are ignored
             return Asked(
                 Step(
                     instruction=instruction,

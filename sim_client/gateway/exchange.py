@@ -1,4 +1,4 @@
-"""What a client asks and what it gets, in our words. A dialect translates its own messages to these and back."""
+"""Requests and answers of clients in our own types. A dialect converts its protocol's messages to these and back."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from protocol.messages import Floats, Level, Mode, TaskStatus
 Frames = Mapping[str, NDArray[np.uint8]]
 """Camera name -> (height, width, 3) RGB."""
 Packet = bytes | str
-"""What a websocket carries: one binary or one text frame."""
+"""One websocket message, a binary or a text frame."""
 
 
 class Refused(Exception):
-    """A request that gets a sentence instead of actions. Whoever sent it may go on with another one."""
+    """A request that gets an error message instead of actions. The client may continue with another one."""
 
 
 class Busy(Refused):
-    """The robot is another client's."""
+    """Another client has the robot."""
 
 
 class Seen(NamedTuple):
-    """What the client's robot saw and felt at one tick."""
+    """Observation of the client's robot at one tick."""
 
     frames: Frames
     state: Floats
@@ -34,11 +34,11 @@ class Seen(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Step:
-    """What the client's robot sees now; it asks what to do next.
+    """A request for actions, with the current observation of the client's robot.
 
-    ``begins``: a new episode, whatever was before. ``may_begin``: a new one if none is open; of a protocol that has no
-    episodes. ``demo`` is the conditioning video at the control rate, read only where an episode begins. ``since``:
-    what was seen at the ticks between the last request and this one, of a protocol that tells.
+    ``begins``: start a new episode in any case. ``may_begin``: start one if none is open, for protocols without
+    episodes. ``demo`` is the conditioning video at the control rate, used only at the start of an episode. ``since``:
+    the observations between the last request and this one, for protocols that send them.
     """
 
     instruction: str
@@ -53,7 +53,7 @@ class Step:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finish:
-    """The client's episode is over. Status ONGOING: it did not say how it ended."""
+    """The client's episode is over. Status ONGOING: its outcome is unknown."""
 
     status: TaskStatus = TaskStatus.ONGOING
     reason: str = "the client went on without saying how the episode ended"
@@ -69,7 +69,7 @@ class Answer:
 
 
 class Asked(NamedTuple):
-    """One message of a client: what it wants of the robot, if anything, and what it is told whatever comes of it."""
+    """One message of a client: its request to the robot, if any, and a reply that needs no answer, if any."""
 
     request: Step | Finish | None
     seq: int = 0
@@ -78,7 +78,7 @@ class Asked(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Terms:
-    """What a client may know before it asks, and where its dialect finds things.
+    """Facts that a client may know before its first request, and the keys that its dialect reads.
 
     ``cameras`` are our names with the client's keys; an empty key: the client's pictures in their own order.
     """
@@ -93,14 +93,14 @@ class Terms:
 
 
 class Dialect(Protocol):
-    """One client's conversation. It keeps what its protocol leaves unsaid, so every connection has its own."""
+    """One client's conversation. It may keep state between messages, so every connection has its own."""
 
     def greeting(self) -> Packet | None:
-        """What is said before the client has said anything."""
+        """The message to send before the client's first one."""
         ...
 
     def read(self, packet: Packet) -> Asked:
-        """Raises Refused: the packet is not of this dialect, or lacks what the robot needs."""
+        """Parses a packet. Raises Refused if it is not of this dialect or is incomplete."""
         ...
 
     def answer(self, asked: Asked, answer: Answer) -> Packet: ...

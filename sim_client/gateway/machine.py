@@ -143,7 +143,7 @@ class Machine:
     # -- the working thread
 
     def run(self, should_stop: Callable[[], bool]) -> None:
-        """Works until told to stop; an episode that is open then is ended."""
+        """Works until ``should_stop()``, then ends an open episode."""
         self._should_stop = should_stop
         try:
             while not should_stop():
@@ -156,7 +156,7 @@ class Machine:
             self._end(m.TaskStatus.ABORTED, _STOPPED)
 
     def step(self) -> None:
-        """One job if there is any, and one turn for everybody else."""
+        """Does one job if there is any, and gives the other participants one turn."""
         is_live = self._episode is not None and isinstance(self._episode.node, LiveNode)
         with contextlib.suppress(queue.Empty):
             self._work(self._jobs.get(block=not is_live, timeout=_IDLE_NS / 1e9))
@@ -267,7 +267,7 @@ class Machine:
         return ""
 
     def _take_background(self, node: Node) -> None:
-        """What a promise is made of: the accounts of ticks, and chunks."""
+        """Reads the sources of forecast rows: the records of ticks, and chunks."""
         for account in self._of_episode(self._accounts):
             node.commands.on_account(account)
         for chunk in self._of_episode(self._chunks):
@@ -331,7 +331,7 @@ class Machine:
         return episode
 
     def _demonstration(self, video: Sequence[Frames], control_hz: int) -> tuple[m.DemoFrame, ...]:
-        """Raises TransportError, EpisodeRefused: PONDER does not say which frames it reads."""
+        """PONDER's frames of a video. Raises TransportError or EpisodeRefused if PONDER's contract is not available."""
         if not video:
             return ()
         frames = sampled(video, control_hz, self._robot_end.demo_sampling())
@@ -351,7 +351,7 @@ class Machine:
         return self._plan.out / day / info.task / f"{info.header.episode}.mcap"
 
     def _end(self, status: m.TaskStatus, reason: str, keep: _Episode | None = None) -> None:
-        """Closes the log and the servers' episode. One that is kept stays known, to tell its client why it is over."""
+        """Closes the log and the servers' episode. ``keep`` stays known, so that its client gets the reason."""
         episode, self._episode = self._episode, keep
         if episode is None or not self._link.episode:
             return
@@ -370,5 +370,5 @@ def _refuse(future: Future[Answer | None], sentence: str) -> None:
 
 
 def _id_of(name: str) -> str:
-    """A client's name for something, as far as it can be part of a key and of a file's name."""
+    """A client's name for something, reduced to characters that keys and file names allow."""
     return _NO_ID.sub("-", name).strip("-.")[:60]

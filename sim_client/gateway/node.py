@@ -1,11 +1,11 @@
 """One episode between a client that asks and a clock that commands. Pure: requests, commands and instants in, messages
 out.
 
-An answer of several rows is a command and a promise. The command is the clock's, for the tick that the request shows;
-the promise is what the same chunk has for the ticks after it, within the robot's limits. In lockstep the client plays
-it all and then asks again: the ticks in between are commanded then, each on what was seen in it, and they are the rows
-that were promised, because no chunk is made in between. In live mode the clock waits for nobody, and a promise is a
-forecast.
+An answer of several rows is a command and a forecast. The command is the clock's, for the request's tick; the forecast
+is the same chunk's rows for the following ticks, within the robot's limits. In lockstep the client plays all rows and
+then sends its next request: only then are the ticks in between commanded, each with its own observation, and the
+commands equal the forecast, because no chunk is generated in between. In live mode the clock does not wait for the
+client, and commands may differ from the forecast.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _KEEP_CHUNKS = 8
 
 
 class Measurement(NamedTuple):
-    """What a client saw at one tick, as it is published."""
+    """A client's observation at one tick, in the form to publish."""
 
     pictures: tuple[m.Image, ...]
     state: m.Floats
@@ -48,7 +48,7 @@ class Commands:
             del self._chunks[min(self._chunks)]
 
     def answer(self, num_rows: int) -> Answer | None:
-        """The newest command and what is ahead of it; None while that cannot be told."""
+        """The newest command and its forecast; None while the forecast is unknown."""
         newest, account = self.newest, self._account
         if newest is None:
             return None
@@ -64,7 +64,7 @@ class Commands:
 
 @dataclass(slots=True)
 class LockstepNode:
-    """Counts ticks. ``show`` what the client sees, hand in each command, take ``answer`` when it is complete."""
+    """Counts ticks. Call ``show`` with observations, pass in each command, and take ``answer`` when it is complete."""
 
     info: m.EpisodeInfo
     num_rows: int
@@ -80,15 +80,15 @@ class LockstepNode:
         self.commands = Commands(self.info.robot)
 
     def show(self, since: Sequence[Measurement], now: Measurement) -> m.Observation:
-        """A request: what was seen in each tick since the last one, and what is seen now. Returns what is published.
+        """Takes a request's observations since the last request and now; returns the observation to publish.
 
-        A client that does not tell what it saw in between is taken to have seen what it saw before.
+        If the client does not send the observations in between, the last one is repeated.
         """
         if self._last is None:
             self._coming = [now]
         else:
-            untold = [self._last] * (self.num_rows - 1 - len(since))
-            self._coming = [*since, *untold, now]
+            repeated = [self._last] * (self.num_rows - 1 - len(since))
+            self._coming = [*since, *repeated, now]
         self._last = now
         self._asked_tick = self.tick + len(self._coming) - 1
         return self._next()
@@ -128,7 +128,7 @@ class LiveNode:
         self.commands = Commands(self.info.robot)
 
     def show(self, now: Measurement, now_ns: int) -> m.Observation:
-        """What is published for a request that came at ``now_ns``, episode time: the first tick that it can serve."""
+        """The observation to publish for a request at ``now_ns``, episode time, at the first tick that it can serve."""
         return m.Observation(tick=self.tick, source_ns=now_ns, proprio=now.state, images=now.pictures)
 
     def on_action(self, action: m.Action) -> None:
@@ -138,7 +138,7 @@ class LiveNode:
         self._stopped_ticks = self._stopped_ticks + 1 if action.level == m.Level.STOPPED else 0
 
     def answer(self) -> Answer | None:
-        """What is commanded now, and what is ahead of it; None before the first command."""
+        """The current command and its forecast; None before the first command."""
         return self.commands.answer(self.num_rows)
 
     def over(self) -> str:

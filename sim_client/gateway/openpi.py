@@ -54,7 +54,7 @@ class OpenpiDialect:
 
 
 def metadata(terms: Terms) -> dict[str, Any]:
-    """What a client is told of the server that it has reached."""
+    """Metadata of the server for its clients."""
     return {
         "server": f"ponderpounce {terms.version}",
         "mode": "live" if terms.mode == Mode.REALTIME else "lockstep",

@@ -51,7 +51,7 @@ class ScheduleOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClientsOptions:
-    """Who may connect, and what a request may be."""
+    """Access of clients, and limits of their requests."""
 
     api_key_file: Path | None = None
     """File with a word that clients must send as "Authorization: Api-Key WORD", as openpi-client's api_key does."""
@@ -68,14 +68,14 @@ class ServersOptions:
     """Where the clock service runs, and how long servers may take."""
 
     clock: Literal["auto", "embedded", "daemon"] = "auto"
-    """Place of the clock service. auto: a process of its own in real time, this process in lockstep."""
+    """Place of the clock service. auto: its own process in real time, this process in lockstep."""
     patience_s: float = 120.0
     """Longest wait in seconds for servers to be ready, and in lockstep for any command."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogOptions:
-    """What is written."""
+    """Logs of episodes."""
 
     record: bool = True
     """Do not write an MCAP per episode."""
@@ -176,7 +176,7 @@ class GatewayOptions:
         return _SPOKEN[self.dialect][0]
 
     def terms(self) -> Terms:
-        """What the dialect is told. Raises TransportError for a camera that is not NAME=KEY."""
+        """The terms for the dialect. Raises TransportError for a camera that is not NAME=KEY."""
         _, cameras, state_key, rows = _SPOKEN[self.dialect]
         pairs = [each.partition("=") for each in self.cameras]
         if any(not name or not key for name, _, key in pairs):
@@ -213,7 +213,7 @@ class GatewayOptions:
         return body.read_body(self.robot_file) if self.robot_file else body.PANDA
 
     def plan(self) -> Plan:
-        """What all episodes have in common. Raises TransportError as ``body``."""
+        """The common plan of all episodes. Raises TransportError as ``body``."""
         return Plan(
             schedule=self.schedule,
             num_rows=self.terms().rows,

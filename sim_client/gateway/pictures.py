@@ -1,6 +1,6 @@
-"""Pictures as strangers send them: compressed until somebody looks, of no other size than announced, resized if asked.
+"""Pictures from clients: decoded lazily, checked against their announced size, and resized on request.
 
-Of a video that was sent at 20 Hz, PONDER reads one frame in twenty; the others are never decoded.
+PONDER reads one frame in twenty of a video at 20 Hz; the others are never decoded.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from sim_client.gateway.exchange import Frames, Refused
 
 @dataclass(frozen=True, slots=True)
 class EncodedPicture:
-    """A PNG or JPEG as it came, and the shape that it claims to have."""
+    """A PNG or JPEG as received, and its announced shape."""
 
     format: str
     data: bytes
@@ -44,7 +44,7 @@ class EncodedPicture:
 
 
 def resized(frames: Frames, side_px: int | None) -> Frames:
-    """The frames as squares of ``side_px``, bilinearly; as they are if it is None or if they fit."""
+    """The frames resized bilinearly to squares of ``side_px``; unchanged if it is None or if they fit."""
     if side_px is None:
         return frames
     return {name: _resized(frame, side_px) for name, frame in frames.items()}

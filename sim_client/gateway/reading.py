@@ -1,4 +1,4 @@
-"""Taking things out of a client's message: every miss is told with what was expected, what came, and the way out."""
+"""Reads values from a client's message; errors name the expected value, the actual one, and the way out."""
 
 from __future__ import annotations
 

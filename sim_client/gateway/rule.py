@@ -1,4 +1,4 @@
-"""The arithmetic of the gateway: which frames of a video PONDER reads, and what lies ahead of a command."""
+"""The arithmetic of the gateway: PONDER's frames of a video, and the forecast of commands."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ def sampled(video: Sequence[Frames], control_hz: int, sampling: DemoSampling) ->
 
 
 def ahead(command: Action, chunk: ActionChunk | None, robot: Robot, num_rows: int) -> tuple[Floats, tuple[Level, ...]]:
-    """What will be commanded from a tick on if nothing new comes: (num_rows, action_dim), and the rungs.
+    """The commands from a tick on unless a new chunk comes: (num_rows, action_dim), and their rungs.
 
-    First the command itself, then the rows that ``chunk`` has for the following ticks, within the robot's limits, then
-    the last of them held. A robot that is not playing is promised nothing but its command.
+    First the command itself, then ``chunk``'s rows for the following ticks, within the robot's limits, then the last of
+    them held. For a robot that is not playing, the command is repeated.
     """
     rows, levels = [command.values], [command.level]
     is_playing = command.level in (Level.PLAY, Level.STALE)

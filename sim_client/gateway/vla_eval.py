@@ -1,8 +1,8 @@
 """vla-eval's model-server protocol: typed, numbered messages; episodes are announced, actions answer observations.
 
-Written against the published package, 0.8. Its harness drives LIBERO, RoboCasa, SimplerEnv, RoboMME and more, and hands
-a conditioning video over with the first observation. Its live runner says so when an episode starts, and then waits for
-nobody: each of its observations gets the command that is current.
+Written for the published package 0.8. Its harness drives LIBERO, RoboCasa, SimplerEnv, RoboMME and more, and sends a
+conditioning video with the first observation. Its live runner announces itself when an episode starts, and then does
+not wait for answers: each of its observations gets the current command.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ PROTOCOL_VERSION = 1
 CAMERAS = {"front": "", "wrist": ""}  # by order: every benchmark names them after its own simulator
 VIDEOS = {"front": "video_history", "wrist": "wrist_video_history"}
 OBSERVATION_PARAMS = {"send_wrist_image": True, "send_state": True, "send_video_history": True}
-"""What the harness sets in a benchmark that knows these parameters; others are left as they are."""
-_SPECS = {  # vla-eval compares them with the benchmark's and warns; "raw" promises nothing
+"""Parameters that the harness sets in benchmarks that have them; others are unchanged."""
+_SPECS = {  # vla-eval compares them with the benchmark's and warns; "raw" matches all
     "action_spec": {"action": {"name": "raw", "dims": 0, "format": "raw"}},
     "observation_spec": {"language": {"name": "language", "dims": 0, "format": "language"}},
 }
 
 
 class VlaEvalDialect:
-    """A start that cannot be served is told in answer to its observations: the sync runner waits for nothing else."""
+    """A refused start is reported in the answers to observations, because the sync runner waits for nothing else."""
 
     def __init__(self, terms: Terms) -> None:
         self._terms = terms
@@ -76,7 +76,7 @@ class VlaEvalDialect:
         theirs = payload.get("protocol_version", PROTOCOL_VERSION)
         if theirs != PROTOCOL_VERSION:
             raise Refused(f"expected protocol version {PROTOCOL_VERSION} (vla-eval 0.8), came {theirs!r}")
-        told = {
+        hello = {
             "harness_version": f"ponderpounce {self._terms.version}",
             "protocol_version": PROTOCOL_VERSION,
             "model_server": "pp-gateway",
@@ -84,7 +84,7 @@ class VlaEvalDialect:
             "observation_params": OBSERVATION_PARAMS,
             **_SPECS,
         }
-        return Asked(None, self._seq, reply=_message("hello", told, self._seq))
+        return Asked(None, self._seq, reply=_message("hello", hello, self._seq))
 
     def _start(self, payload: Mapping[Any, Any]) -> Asked:
         """Nothing opens yet: the instruction and the video come with the first observation."""

@@ -1,4 +1,4 @@
-"""The websocket side: one task per connection, which reads, submits, and sends what comes of it."""
+"""The websocket server: one task per connection, which reads requests, submits them and sends the answers."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ log = logging.getLogger("pp-gateway")
 
 _PING_S = 20.0
 _PONG_S = 120.0
-"""A client's simulator may hold its thread for as long as this; a cable that was pulled is noticed after it."""
+"""Longest time that a client's simulator may block its thread; a lost connection is detected after it."""
 
 
 @dataclass(frozen=True, slots=True)
 class WebsocketSide:
-    """Serves one dialect. ``api_key``: what clients must know; "" if anybody may come."""
+    """Serves one dialect. ``api_key``: the key that clients must send; "" admits all."""
 
     machine: Machine
     terms: Terms
@@ -60,7 +60,7 @@ class WebsocketSide:
             raise TransportError(f"--listen {host}:{port}: {error}") from None
 
     def _answer_http(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Health checks and metadata for whoever comes with plain HTTP; None lets the websocket begin."""
+        """Answers health checks and metadata requests in plain HTTP; None lets the websocket begin."""
         if request.path in ("/healthz", "/health"):
             return connection.respond(http.HTTPStatus.OK, "OK\n")
         if not is_allowed(request.headers.get("Authorization"), self.api_key):
@@ -89,7 +89,7 @@ class WebsocketSide:
                 task = asyncio.create_task(self._reply(connection, dialect, asked, future))
                 under_way.add(task)
                 task.add_done_callback(under_way.discard)
-                if self.terms.mode == Mode.LOCKSTEP:  # live, nobody waits: the next observation is read at once
+                if self.terms.mode == Mode.LOCKSTEP:  # in live mode the next observation is read immediately
                     await task
         except ConnectionClosed as error:
             log.info("client=%s closed: %s", client, error)
@@ -112,12 +112,12 @@ class WebsocketSide:
             try:
                 await connection.send(packet)
             except ConnectionClosed:
-                return  # the conversation's own loop says so
+                return  # the conversation's own loop reports it
 
 
 KEY_WANTED = "expected the header Authorization: Api-Key WORD, with the word in --api-key-file\n"
 
 
 def is_allowed(authorization: str | None, api_key: str) -> bool:
-    """Whether a client may come in."""
+    """Whether a client is admitted."""
     return not api_key or hmac.compare_digest((authorization or "").encode(), f"Api-Key {api_key}".encode())

@@ -1,4 +1,4 @@
-"""Transformer blocks of GR00T's action head: attention with biases, tanh-GELU MLP; and one linear layer a robot."""
+"""Transformer blocks of GR00T's action head (attention with biases, tanh-GELU MLP); per-embodiment linear layers."""
 
 # B batch, T query tokens, S key tokens, W width, h heads, D head dim, E embodiments, I in, O out
 
@@ -30,7 +30,7 @@ class BlockConfig:
 
 
 class BlockAttention(nn.Module):
-    """Nothing is ever masked here, padding included: the public head attends to whole rows."""
+    """Attention without a mask: like the public head it attends to padding too."""
 
     def __init__(self, config: BlockConfig, source_width: int) -> None:
         super().__init__()
@@ -41,7 +41,7 @@ class BlockAttention(nn.Module):
         self.to_out = nn.Linear(config.width, config.width)
 
     def keys_values(self, source_BSX: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns what may be read of a source, both (B, h, S, D): constants of a sampler if the source is one."""
+        """Returns keys and values of a source, both (B, h, S, D); a sampler computes them once per observation."""
         return self._heads(self.to_k(source_BSX)), self._heads(self.to_v(source_BSX))
 
     def forward(self, x_BTW: Tensor, keys_values: tuple[Tensor, Tensor]) -> Tensor:
@@ -91,7 +91,7 @@ class Affine(NamedTuple):
 
 
 class EmbodimentLinear(nn.Module):
-    """A linear layer with weights of its own for every embodiment; stored (E, in, out), as the public ones are."""
+    """A linear layer with separate weights for every embodiment; stored (E, in, out), like the public ones."""
 
     def __init__(self, num_embodiments: int, width_in: int, width_out: int) -> None:
         super().__init__()

@@ -1,6 +1,6 @@
-"""GR00T's diffusion transformer: even blocks read the vision-language features, odd blocks their own tokens.
+"""GR00T's diffusion transformer: even blocks cross-attend to the vision-language features, odd blocks self-attend.
 
-Time enters as a style: scale and shift of every first norm. Styles depend on the time bucket only and the keys
+Time enters as a style: scale and shift of every first norm. Styles depend on the time bucket only, and the keys
 and values of even blocks on the observation only, so a sampler computes both once.
 """
 
@@ -31,7 +31,7 @@ def bucket_features(bucket_B: Tensor, num_channels: int) -> Tensor:
 
 
 def action_time_features(bucket_B: Tensor, width: int) -> Tensor:
-    """Returns [sin | cos] of the bucket, (B, 1, width) float32: what stands beside every embedded action."""
+    """Returns [sin | cos] of the bucket, (B, 1, width) float32, concatenated with every embedded action."""
     half = width // 2
     exponent = -torch.arange(half, dtype=torch.float32, device=bucket_B.device) * (math.log(MAX_PERIOD) / half)
     angle = bucket_B[:, None, None].float() * exponent.exp()
@@ -46,7 +46,7 @@ def styled_norm(x_BTW: Tensor, style_2B1W: Tensor, eps: float) -> Tensor:
 
 
 class AdaLayerNorm(nn.Module):
-    """Scale and shift, linear in silu(time)."""
+    """LayerNorm whose scale and shift are linear in silu(time)."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -68,7 +68,7 @@ class DitBlock(nn.Module):
         self.ff = BlockMlp(config)
 
     def forward(self, x_BTW: Tensor, style_2B1W: Tensor, keys_values: tuple[Tensor, Tensor] | None) -> Tensor:
-        """``keys_values`` of the features to read; None makes it self-attention."""
+        """``keys_values``: those of the features for cross-attention; None for self-attention."""
         normed_BTW = styled_norm(x_BTW, style_2B1W, BLOCK_NORM_EPS)
         x_BTW = x_BTW + self.attn1(normed_BTW, keys_values or self.attn1.keys_values(normed_BTW))
         plain_BTW = F.layer_norm(x_BTW.float(), x_BTW.shape[-1:], eps=BLOCK_NORM_EPS).to(x_BTW.dtype)
@@ -98,7 +98,7 @@ class Dit(nn.Module):
         """Returns (M, 2, B, 1, W): the styles of all first norms and of the last."""
         hidden_BW = F.silu(self.time_mlp_in(bucket_features(bucket_B, self.time_channels)))
         activated_BW = F.silu(self.time_mlp_out(hidden_BW))
-        shift, scale = self.proj_out_1(activated_BW).chunk(2, dim=-1)  # this one the other way round than the blocks
+        shift, scale = self.proj_out_1(activated_BW).chunk(2, dim=-1)  # the opposite order of the blocks'
         last = torch.stack([1.0 + scale, shift])[:, :, None]
         return torch.stack([*(block.norm1.style(activated_BW) for block in self.blocks), last])
 

@@ -1,8 +1,8 @@
-"""Eagle, what GR00T N1.5 sees and reads with: SigLIP2, one linear layer, and the first Qwen3 layers.
+"""Eagle, GR00T N1.5's vision-language model: SigLIP2, one linear layer, and the first Qwen3 layers.
 
 The text already holds a slot for every patch: rows whose id is the image token's are overwritten with patch
-features, view after view. Text is not scaled; positions count padding, which stands on the left, and RoPE does
-not mind.
+features, view after view. Text embeddings are not scaled. Positions count the left padding, which does not matter
+to RoPE.
 """
 
 # B batch, V views, S patches a view, T tokens, P cognition tokens, W language width
@@ -21,7 +21,7 @@ class EagleConfig:
     vision: VisionConfig
     language: Qwen3Config
     image_token_id: int = 151_669
-    """The id of ``<IMG_CONTEXT>``, one per patch in the text."""
+    """Id of ``<IMG_CONTEXT>``, one per patch in the text."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.image_token_id < self.language.vocab_size:
@@ -49,7 +49,7 @@ class Eagle(nn.Module):
         """Embeds the text and writes the patches into their slots, (B, T, W).
 
         Raises:
-            ValueError: a sample has not exactly one image token per patch.
+            ValueError: a sample does not have exactly one image token per patch.
         """
         is_image_BT = token_ids_BT == self.config.image_token_id
         num_patches = vision_BVSW.shape[1] * vision_BVSW.shape[2]
@@ -64,8 +64,8 @@ class Eagle(nn.Module):
     def features(self, embeds_BTW: Tensor, is_token_BT: Tensor, cognition_BPW: Tensor | None = None) -> Tensor:
         """Runs embeddings through the language layers, (B, P + T, W) after the last norm.
 
-        ``cognition_BPW`` stands in front, right before the first real token whatever the padding: every later
-        token sees it, and rows of a batch do not depend on how far they were padded.
+        ``cognition_BPW`` is inserted right before the first real token, after any padding: every real token sees
+        it, and the rows of a batch do not depend on the amount of padding.
         """
         positions_BT = torch.arange(embeds_BTW.shape[1], device=embeds_BTW.device).expand_as(is_token_BT)
         if cognition_BPW is not None:

@@ -1,6 +1,6 @@
 """Flow matching as GR00T N1.5 does it: t = 0 is noise and t = 1 is data, the other way round than pi0.5 (`flow`).
 
-The network never sees t itself but its bucket: the integer part of 1000 t, truncated towards zero.
+The network never reads t itself but its bucket: the integer part of 1000 t, truncated towards zero.
 """
 
 # B batch, N horizon, A action dim
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dual_system.models.flow import EulerStep
 
-# t = (s - b) / s with b ~ Beta(1.5, 1): leans towards noise. b > s gives a t a little below 0, in bucket 0.
+# t = (s - b) / s with b ~ Beta(1.5, 1): favours noise. b > s gives a t slightly below 0, in bucket 0.
 TIME_BETA_ALPHA = 1.5
 TIME_S = 0.999
 
@@ -40,14 +40,14 @@ def time_buckets(time_B: Tensor, num_buckets: int) -> Tensor:
 
 
 def euler_buckets(num_steps: int, num_buckets: int) -> list[int]:
-    """Returns the buckets of 0, 1/n, ..., (n-1)/n: where each Euler step looks."""
+    """Returns the buckets of 0, 1/n, ..., (n-1)/n, the flow times of the Euler steps."""
     if num_steps < 1:
         raise ValueError(f"the Euler sampler needs at least 1 step, came {num_steps}")
     return [int(step / num_steps * num_buckets) for step in range(num_steps)]
 
 
 def masked_mean(loss_BNA: Tensor, mask_BNA: Tensor) -> Tensor:
-    """Averages an unreduced, already masked loss over what the mask leaves."""
+    """Averages an unreduced, already masked loss over the unmasked entries."""
     return loss_BNA.sum() / mask_BNA.sum()
 
 

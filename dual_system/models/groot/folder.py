@@ -1,8 +1,8 @@
-"""Public GR00T N1.5 folders: which model their tensors and NVIDIA's config.json describe.
+"""Public GR00T N1.5 folders: the model that their tensors and NVIDIA's config.json describe.
 
-Sizes of Eagle stand in no config file of the folder; they are read off the tensors. Head counts cannot be: those
-of the action head are in NVIDIA's config.json (lerobot's has none and means the published model), SigLIP's is the
-published one.
+No config file of the folder has Eagle's sizes; they are read off the tensors. Head counts cannot be: the action
+head's are in NVIDIA's config.json (lerobot's has none and means the published model), and SigLIP's is taken to be
+the published one.
 """
 
 from typing import Any
@@ -22,7 +22,7 @@ _LANGUAGE = "backbone.eagle_model.language_model.model."
 _MIXER = "action_head.vl_self_attention.transformer_blocks."
 _DIT = "action_head.model.transformer_blocks."
 
-# What this package has one answer to; NVIDIA's names.
+# Entries of NVIDIA's config.json for which this package builds one value only.
 _FACTS: dict[str, object] = {
     "model_type": "gr00t_n1_5",
     "backbone_cfg.project_to_dim": None,
@@ -36,15 +36,15 @@ _FACTS: dict[str, object] = {
 
 
 def groot_config_of(shapes: Shapes, values: dict[str, Any] | None, where: str) -> tuple[GrootConfig, int]:
-    """Returns the network of a public folder, and how many Euler steps it is sampled with.
+    """Returns the network of a public folder, and its number of Euler steps.
 
     Args:
-        shapes: of all tensors, NVIDIA's names or lerobot's.
-        values: the parsed config.json; None, or one of another dialect, means the published model's.
+        shapes: shapes of all tensors, by NVIDIA's names or lerobot's.
+        values: the parsed config.json; None, or one of another format, means the published model's.
         where: names the folder in errors.
 
     Raises:
-        ValueError: a tensor that sizes are read from is missing, or the config says what is not built here.
+        ValueError: a tensor that sizes are read from is missing, or the config describes an unsupported network.
     """
     shapes = {name.removeprefix(LEROBOT_PREFIX): shape for name, shape in shapes.items()}
     published = groot_n1_5()
@@ -60,7 +60,7 @@ def groot_config_of(shapes: Shapes, values: dict[str, Any] | None, where: str) -
 
 
 def nvidia_config(groot: GrootConfig, num_steps: int) -> dict[str, Any]:
-    """Returns the config.json of a public folder: what `groot_config_of` reads there, and the facts it insists on."""
+    """Returns the config.json of a public folder: all that `groot_config_of` reads or checks."""
     head = "action_head_cfg."
     told = {
         **_FACTS,

@@ -1,8 +1,8 @@
-"""GR00T N1.5: an Eagle that sees and reads, a mixer over its features, and a diffusion transformer that acts.
+"""GR00T N1.5: the vision-language model Eagle, a mixer over its features, and a diffusion transformer for actions.
 
 Features of the observation are mixed once (`prefill`); every evaluation of the velocity, in training as in
-sampling, reads them (`velocity`). Neither mixer nor transformer masks anything: a padded token is attended to
-like any other, so padding changes the actions, here as in the public model. Serve one request at a time.
+sampling, reads them (`velocity`). Neither mixer nor transformer has a mask: padding is attended to like any other
+token and changes the actions, here as in the public model. Serve one request at a time.
 """
 
 # B batch, V views, T tokens, P cognition tokens, N horizon, A padded action dim, U padded state dim
@@ -33,13 +33,13 @@ from dual_system.models.stack import Stack
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GrootConfig:
-    """Sizes of the public model; nothing of ours."""
+    """Sizes of the public model, without the cognition prefix."""
 
     eagle: EagleConfig
     mixer: BlockConfig
     dit: BlockConfig
     hidden_width: int = 1024
-    """Of the embodiments' MLPs, and of what the transformer hands to the action decoder."""
+    """Hidden width of the embodiments' MLPs, and output width of the transformer, which the action decoder reads."""
     num_embodiments: int = 32
     num_future_tokens: int = 32
     """Learned tokens between state and actions."""
@@ -66,7 +66,7 @@ class GrootConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GrootCache:
-    """What does not depend on the flow step."""
+    """Tensors that do not depend on the flow step."""
 
     features_read: tuple[tuple[Tensor, Tensor], ...]
     """Keys and values of the cross-attention, (B, h, P + T, d) per even block."""
@@ -78,7 +78,7 @@ class GrootCache:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TimeStyle:
-    """What depends on the time bucket only."""
+    """Tensors that depend on the time bucket only."""
 
     norms: Tensor
     """(M, 2, B, 1, D)"""
@@ -95,7 +95,7 @@ class GrootStepTable:
 
 
 class ActionEncoder(nn.Module):
-    """Embeds one noised action and the time, by the weights of its embodiment."""
+    """Embeds noised actions and the flow time, with the weights of their embodiment."""
 
     def __init__(self, num_embodiments: int, action_dim: int, width: int) -> None:
         super().__init__()
@@ -108,7 +108,7 @@ class ActionEncoder(nn.Module):
 
 
 class Groot(nn.Module):
-    """The public GR00T N1.5 network, and room for cognition tokens in front of its features or its text."""
+    """The public GR00T N1.5 network, which takes cognition tokens in front of its features or its text."""
 
     def __init__(self, config: GrootConfig) -> None:
         super().__init__()
@@ -151,7 +151,7 @@ class Groot(nn.Module):
         return out(F.relu(hidden(state_BU[:, None])))
 
     def prefill(self, features_BTW: Tensor, state_BU: Tensor, embodiment_B: Tensor) -> GrootCache:
-        """Mixes Eagle's features (with any cognition in front) and computes all that every step shares."""
+        """Mixes Eagle's features (with any cognition in front) and computes all tensors that the steps share."""
         state_B1D = self.state_features(state_BU, embodiment_B)
         future_BFD = self.future_tokens.weight.expand(len(state_BU), -1, -1)
         return GrootCache(
@@ -179,7 +179,7 @@ class Groot(nn.Module):
         return last(F.relu(hidden(out_BTH[:, -num_actions:].float())))
 
     def velocity_at(self, x_BNA: Tensor, time_B: Tensor, cache: GrootCache) -> Tensor:
-        """`velocity` with one flow time per sample: training's form."""
+        """`velocity` with one flow time per sample, as in training."""
         bucket_B = groot_flow.time_buckets(time_B, self.config.num_time_buckets)
         return self.velocity(x_BNA, self.style(bucket_B), cache)
 

@@ -1,10 +1,10 @@
 """POUNCE with GR00T N1.5 in place of pi0.5: the cognition prefix in front of Eagle's features, or of its text.
 
-Slots, both open in the paper, which gives W_c's std (1e-3) for GR00T only:
+There are two slots; the paper specifies neither (for GR00T it gives only W_c's std, 1e-3):
 
-- ``features`` (default): P stands beside the features before the mixer, whose four layers are trained to mix; the
-  frozen language model is left alone. The norm in front of the mixer makes the scale of P irrelevant.
-- ``embeddings``: P stands before the text and images of the causal language model, so all of them see it.
+- ``features`` (default): P joins the features before the mixer, whose four layers are trainable; the frozen language
+  model is unchanged. The norm in front of the mixer makes the scale of P irrelevant.
+- ``embeddings``: P precedes the text and images of the causal language model, so all of them attend to it.
 """
 
 # B batch, V views, T text tokens, K carriers, H carrier size, N horizon, A padded action dim, U padded state dim
@@ -27,18 +27,18 @@ PrefixSlot = Literal["features", "embeddings"]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GrootInputs:
-    """One batch as the network takes it: resized, normalised, tokenised. The public model has no view mask."""
+    """One batch of network inputs: resized, normalised, tokenised. The public model has no view mask."""
 
     images: Tensor
     """(B, V, 3, px, px) float32 in [-1, 1]"""
     token_ids: Tensor
     """(B, T) int64, an image token for every patch among them; padded on the left"""
     is_token: Tensor
-    """(B, T) bool; False for padding, which moves the actions all the same (`groot`)"""
+    """(B, T) bool; False for padding, which still affects the actions (`groot.network`)"""
     state: Tensor
     """(B, U) float32, zero beyond the robot's dims"""
     embodiment: Tensor
-    """(B,) int64: whose encoders and decoder"""
+    """(B,) int64: the embodiment whose encoders and decoder are used"""
     age_ns: Tensor
     """(B,) int64 age of the cognition; 0 where null"""
     cognition: Tensor | None = None
@@ -49,13 +49,13 @@ class GrootInputs:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GrootPounceConfig:
-    """Everything that fixes POUNCE's shapes with GR00T inside."""
+    """Shapes and options of POUNCE with GR00T inside."""
 
     groot: GrootConfig
     cognition: CognitionConfig
     slot: PrefixSlot = "features"
     embodiment: int = 31
-    """Which of the embodiments the robot is; 31 is the public model's slot for a new one."""
+    """The robot's index among the embodiments; 31 is the public model's slot for a new one."""
     robot_action_dim: int = 8
     """The first dims of the padded action: 7 arm joints and the gripper."""
     robot_state_dim: int = 8
@@ -64,9 +64,9 @@ class GrootPounceConfig:
     num_steps: int = 4
     """Euler steps per chunk."""
     max_prompt_tokens: int = 200
-    """Of the text, without the image tokens."""
+    """Limit of the text's tokens, without the image tokens."""
     reads_subgoal: bool = False
-    """The newest subgoal's text stands in the prompt instead of cognition: the paper's subgoal-text reference (3.1)."""
+    """Put the newest subgoal's text into the prompt in place of cognition: the paper's subgoal-text reference (3.1)."""
 
     def __post_init__(self) -> None:
         check_channel(self.cognition, self.reads_subgoal)
@@ -101,7 +101,7 @@ class GrootPounceConfig:
         return self.groot.eagle.language.vocab_size
 
     def example_inputs(self, batch_size: int, *, num_tokens: int = 12, seed: int = 0) -> GrootInputs:
-        """Fabricates a valid batch for tests and benchmarks: images, then text, cognition 300 ms old."""
+        """Makes a valid batch for tests and benchmarks: images, then text, cognition 300 ms old."""
         generator = torch.Generator().manual_seed(seed)
         groot, cognition = self.groot, self.cognition
         image_id = groot.eagle.image_token_id
@@ -124,7 +124,7 @@ class GrootPounceConfig:
         )
 
     def example_actions(self, batch_size: int, *, seed: int = 0) -> Tensor:
-        """Fabricates normalised training targets, (B, N, A) float32, zero beyond the robot's dims."""
+        """Makes normalised training targets, (B, N, A) float32, zero beyond the robot's dims."""
         generator = torch.Generator().manual_seed(seed)
         actions = torch.zeros(batch_size, self.horizon, self.padded_action_dim)
         actions[..., : self.robot_action_dim].uniform_(-1, 1, generator=generator)
@@ -132,7 +132,7 @@ class GrootPounceConfig:
 
 
 class GrootPounce(nn.Module):
-    """GR00T N1.5 plus, for K >= 1, the cognition prefix. Answers to the same names as `pounce.Pounce`."""
+    """GR00T N1.5 plus, for K >= 1, the cognition prefix. Has the interface of `pi05.pounce.Pounce`."""
 
     def __init__(self, config: GrootPounceConfig) -> None:
         super().__init__()
@@ -148,7 +148,7 @@ class GrootPounce(nn.Module):
         return Backbone(vision=(eagle.vision, eagle.projector), language=eagle.language)
 
     def features(self, inputs: GrootInputs) -> Tensor:
-        """Returns what the mixer gets: (B, 1 + K + T, W), the prefix in front in either slot."""
+        """Returns the mixer's input, (B, 1 + K + T, W), with the prefix in front in either slot."""
         cognition_BPW = None
         if self.cognition_prefix is not None:
             cognition_BPW = self.cognition_prefix(inputs.cognition, inputs.age_ns, inputs.is_null)
@@ -164,7 +164,7 @@ class GrootPounce(nn.Module):
         return torch.cat([cognition_BPW.to(features_BTW.dtype), features_BTW], dim=1)
 
     def prefill(self, inputs: GrootInputs) -> GrootCache:
-        """Everything that no flow step changes: features, mixer, cross-attention, state."""
+        """Computes all that does not depend on the flow step: features, mixer, cross-attention keys, state."""
         return self.groot.prefill(self.features(inputs), inputs.state, inputs.embodiment)
 
     def loss(

@@ -1,8 +1,8 @@
-"""The text GR00T N1.5 reads: a chat turn with a slot for every image patch, in Eagle's tokens.
+"""GR00T N1.5's prompt: a chat turn with a slot for every image patch, in Eagle's tokens.
 
-Traps: the public data paths hand the instruction over as a Python list and print it, brackets and quotes included
-(``['pick up the cube']``), and the weights were trained on that; proprioception is no part of the text, it has a
-token of its own in the action head.
+Traps: the public data paths pass the instruction as a Python list and print it, brackets and quotes included
+(``['pick up the cube']``), and the weights were trained on that. Proprioception is not part of the text; it has its
+own token in the action head.
 """
 
 import json
@@ -17,7 +17,7 @@ CONTROL_TOKENS = ("<|endoftext|>", IM_START, IM_END, IMAGE_START, IMAGE_END, IMA
 
 
 def prompt_text(instruction: str, num_views: int, patches_per_view: int) -> str:
-    """Returns the whole turn; ``<IMG_CONTEXT>`` stands once for every patch, view after view."""
+    """Returns the whole turn, with one ``<IMG_CONTEXT>`` per patch, view after view."""
     views = "".join(
         f"<image {view}>{IMAGE_START}{IMAGE_CONTEXT * patches_per_view}{IMAGE_END}" for view in range(1, num_views + 1)
     )
@@ -67,7 +67,7 @@ class EagleTokenizer:
 
 
 def tiny_eagle_tokenizer_for_random_weights() -> EagleTokenizer:
-    """One id per byte, then the control tokens: equal on every call, no use to real weights."""
+    """A tokenizer with one id per byte, then the control tokens. Deterministic; useless with real weights."""
     alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
     pieces = Pieces(models.BPE(vocab={byte: id_ for id_, byte in enumerate(alphabet)}, merges=[]))
     pieces.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False)

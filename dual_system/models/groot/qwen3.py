@@ -1,4 +1,4 @@
-"""Qwen3's decoder layers as GR00T N1.5 reads them: causal, normalised heads, no LM head, all of one width."""
+"""Qwen3's decoder layers as GR00T N1.5 uses them: causal, q/k-normalised heads, no LM head, all of one width."""
 
 # B batch, T tokens, W width, h query heads, g key heads, D head dim
 
@@ -34,7 +34,7 @@ class Qwen3Config:
 
 
 class PlainRmsNorm(nn.Module):
-    """RMSNorm whose stored weight multiplies as it is, unlike Gemma's (1 + w)."""
+    """RMSNorm that multiplies by the stored weight w, unlike Gemma's (1 + w)."""
 
     def __init__(self, width: int, eps: float) -> None:
         super().__init__()
@@ -95,9 +95,9 @@ class Qwen3Layer(nn.Module):
 
 
 def causal_bias(is_real_BT: Tensor, dtype: torch.dtype) -> Tensor:
-    """Returns what is added to the logits, (B, 1, T, T): 0 where a row may look, the lowest finite number elsewhere.
+    """Returns the attention bias, (B, 1, T, T): 0 where a row may attend, the lowest finite number elsewhere.
 
-    Finite on purpose. A row of left padding may look nowhere; the lowest number swallows all its logits, so it
+    Finite on purpose. A row of left padding may attend nowhere; the lowest number absorbs all its logits, so it
     averages every value, as in the public model, whose head then attends to that row.
     """
     num_tokens = is_real_BT.shape[1]

@@ -1,10 +1,10 @@
 """Public GR00T N1.5 checkpoints: their tensor names, and reading and writing them.
 
 NVIDIA's folder holds 585 tensors of the backbone and 314 of the action head, usually in shards with an index;
-lerobot's ``groot`` policy adds a leading ``_groot_model.``. Habits of the layout:
+lerobot's ``groot`` policy adds a leading ``_groot_model.``. Peculiarities of the layout:
 
 - the LM head is stored beside the token embedding, differs from it, and is never used; nor is SigLIP's pooling
-  head (11 tensors). Both are dropped here and written back as zeros, so that strict foreign loaders are content;
+  head (11 tensors). Both are dropped here and written back as zeros, for foreign loaders that are strict;
 - embodiment-specific weights are (E, in, out), not torch's (out, in).
 """
 
@@ -24,7 +24,7 @@ _LM_HEAD = _EAGLE + "language_model.lm_head.weight"
 _POOLING_HEAD = _VISION + "head."
 LEROBOT_PREFIX = "_groot_model."
 
-# (ours, public), first match wins; what follows is the same on both sides but for _INNER.
+# (our prefix, public prefix), first match wins; the rest of a name is the same on both sides except for _INNER.
 _PREFIXES = (
     ("groot.eagle.vision.layers.", _VISION + "encoder.layers."),
     ("groot.eagle.vision.post_layernorm.", _VISION + "post_layernorm."),
@@ -52,7 +52,7 @@ def public_name(name: str) -> str:
 
 
 def unused_shapes(config: GrootConfig) -> dict[str, tuple[int, ...]]:
-    """Returns the tensors that public files hold and nobody reads."""
+    """Returns the shapes of tensors that public files hold and no implementation reads."""
     vision, language = config.eagle.vision, config.eagle.language
     width, mlp_width = vision.width, vision.mlp_width
     pooling: dict[str, tuple[int, ...]] = {
@@ -73,14 +73,14 @@ def unused_shapes(config: GrootConfig) -> dict[str, tuple[int, ...]]:
 
 
 def save_weights(model: GrootPounce, path: Path) -> None:
-    """Writes ``model`` in the public layout, complete: what nobody reads as zeros."""
+    """Writes ``model`` in the complete public layout: unused tensors are zeros."""
     tensors = {public_name(name): tensor for name, tensor in model.state_dict().items()}
     unused = {name: torch.zeros(shape) for name, shape in unused_shapes(model.config.groot).items()}
     write_tensors(tensors | unused, path)
 
 
 def read_weights(path: Path) -> dict[str, Tensor]:
-    """Reads a file (or shards) in the public layout, undoing its habits; keys are NVIDIA's names."""
+    """Reads a file (or shards) in the public layout without its unused tensors; keys are NVIDIA's names."""
 
     def is_used(name: str) -> bool:
         name = name.removeprefix(LEROBOT_PREFIX)

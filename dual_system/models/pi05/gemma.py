@@ -1,4 +1,4 @@
-"""Gemma layers as pi0.5 uses them: a plain stream for what is seen, an adaRMS stream for the actions."""
+"""Gemma layers as pi0.5 uses them: a plain stream for images and text, an adaRMS stream for the actions."""
 
 # B batch, T query tokens, S key tokens, W width, h query heads, g key heads, D head dim
 # M norms of the expert (two per layer and the last), E expert width
@@ -36,7 +36,7 @@ class GemmaConfig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rotation:
-    """RoPE of given positions: cosines and sines, (B, 1, T, D/2) float32."""
+    """RoPE at given positions: cosines and sines, (B, 1, T, D/2) float32."""
 
     cos: Tensor
     sin: Tensor
@@ -57,7 +57,7 @@ class Rotation:
 def attend(q_BhTD: Tensor, k_BgSD: Tensor, v_BgSD: Tensor, visible: Tensor | None) -> Tensor:
     """Grouped-query attention -> (B, T, h*D). ``visible`` broadcasts to (B, 1, T, S); None means all.
 
-    Hidden keys get weight exactly 0, where the public code adds -2.38e38 to their logits: the same numbers
+    Hidden keys get weight exactly 0, where the public code adds -2.38e38 to their logits: the results are equal
     for every row that sees at least one key.
     """
     mixed_BhTD = F.scaled_dot_product_attention(q_BhTD, k_BgSD, v_BgSD, attn_mask=visible, enable_gqa=True)
@@ -117,7 +117,7 @@ class AdaRmsNorm(nn.Module):
         self.dense = nn.Linear(width, 3 * width)
 
     def style(self, cond_BE: Tensor) -> Tensor:
-        """Returns (3, B, 1, E): 1 + scale, shift, gate. Depends on time only, so a sampler tabulates it."""
+        """Returns (3, B, 1, E): 1 + scale, shift, gate. They depend on time only, so a sampler tabulates them."""
         scale, shift, gate = self.dense(cond_BE).chunk(3, dim=-1)
         return torch.stack([1.0 + scale, shift, gate])[:, :, None]
 
@@ -147,7 +147,7 @@ class ExpertLayer(nn.Module):
 
 
 class LanguageModel(nn.Module):
-    """Gemma over [cognition][images][text]: token embedding, layers, last norm. pi0.5 reads no LM head."""
+    """Gemma over [cognition][images][text]: token embedding, layers, last norm. pi0.5 uses no LM head."""
 
     def __init__(self, config: GemmaConfig, vocab_size: int) -> None:
         super().__init__()
@@ -156,7 +156,7 @@ class LanguageModel(nn.Module):
         self.norm = RmsNorm(config.width)
 
     def embed(self, token_ids_BT: Tensor) -> Tensor:
-        """Text embeddings times sqrt(width); image and cognition tokens are not scaled."""
+        """Returns text embeddings times sqrt(width); image and cognition tokens are not scaled."""
         embeds_BTW: Tensor = self.embed_tokens(token_ids_BT)
         return embeds_BTW * math.sqrt(embeds_BTW.shape[-1])
 
@@ -170,6 +170,6 @@ class ActionExpert(nn.Module):
         self.norm = AdaRmsNorm(config.width)
 
     def styles(self, cond_BE: Tensor) -> Tensor:
-        """Returns (M, 3, B, 1, E): the styles of all norms in the order in which the stream meets them."""
+        """Returns (M, 3, B, 1, E): the styles of all norms in the order of the forward pass."""
         norms = [norm for layer in self.layers for norm in (layer.input_layernorm, layer.post_attention_layernorm)]
         return torch.stack([norm.style(cond_BE) for norm in (*norms, self.norm)])

@@ -1,9 +1,9 @@
-"""pi0.5: a PaliGemma that sees, and an action expert that reads its keys and values.
+"""pi0.5: PaliGemma, and an action expert that attends to its keys and values.
 
-The token stream is [cognition P][view 0]...[view V-1][text], then the action tokens. All before the actions is
-"prefix" here, as in the pi0 literature; the paper's prefix P is "cognition". The prefix never sees the actions,
-so its keys and values are computed once (`prefill`), and every evaluation of the velocity, in training as in
-sampling, reads them (`velocity`).
+The token stream is [cognition P][view 0]...[view V-1][text], then the action tokens. Everything before the actions
+is the "prefix" here, as in the pi0 literature; the paper's prefix P is "cognition". The prefix never attends to the
+actions, so its keys and values are computed once (`prefill`), and every evaluation of the velocity, in training as
+in sampling, reads them (`velocity`).
 """
 
 # B batch, V views, P cognition tokens, T prefix tokens, N horizon, A action dim
@@ -29,7 +29,7 @@ TIME_MAX_PERIOD = 4.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pi05Config:
-    """Sizes of the public model; nothing of ours."""
+    """Sizes of the public model, without the cognition prefix."""
 
     vision: VisionConfig
     language: GemmaConfig
@@ -53,21 +53,21 @@ class Prefix:
     embeds: Tensor
     """(B, T, W)"""
     is_real: Tensor
-    """(B, T) bool; False for padding and missing cameras: tokens that are unseen and take no position."""
+    """(B, T) bool; False for padding and missing cameras: such tokens are masked and take no position."""
     num_cognition: int = 0
     """The first tokens are P; the rest are images and text."""
     is_isolated: bool = False
-    """P and (images, text) do not see each other; the actions see both."""
+    """P and (images, text) do not attend to each other; the actions attend to both."""
 
     def positions(self) -> Tensor:
-        """Returns (B, T) int64, counting real tokens only. P stands before 0: the rest is where it is without P."""
+        """Returns (B, T) int64, counting real tokens only. P gets negative positions, so it does not shift the rest."""
         return self.is_real.long().cumsum(dim=1) - 1 - self.num_cognition
 
     def streams(self) -> tuple["Prefix", ...]:
-        """Returns the parts that see only themselves, in order: the whole, or P and the rest.
+        """Returns the parts that attend only to themselves, in order: the whole, or P and the rest.
 
-        Isolated parts are run apart rather than masked: images and text then go through the very same products
-        as without P, and keep every bit.
+        Isolated parts run separately rather than masked: images and text then go through exactly the same
+        products as without P, bit for bit.
         """
         count = self.num_cognition
         if not (self.is_isolated and count):
@@ -78,18 +78,18 @@ class Prefix:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PrefixCache:
-    """What the action stream reads of the prefix."""
+    """Keys and values of the prefix, for the action stream."""
 
     keys: tuple[Tensor, ...]
     """Rotated, one (B, g, T, D) per layer."""
     values: tuple[Tensor, ...]
     visible: Tensor
-    """(B, T) bool: which prefix tokens the actions may see."""
+    """(B, T) bool: prefix tokens that the actions may attend to."""
     next_position: Tensor
-    """(B,) int64: of the first action token."""
+    """(B,) int64: position of the first action token."""
 
     def repeated(self, times: int) -> "PrefixCache":
-        """The batch ``times`` over: several action streams against one prefix."""
+        """The batch repeated ``times``: several action streams against one prefix."""
         if times == 1:
             return self
         return PrefixCache(
@@ -104,18 +104,18 @@ class PrefixCache:
 class StepTable:
     """The adaRMS styles at every time of the Euler sampler: constants of the weights, computed once.
 
-    At full size this keeps 37 dense layers out of every one of the 10 steps.
+    At full size this saves 37 dense layers in each of the 10 steps.
     """
 
     num_steps: int
     styles: tuple[Tensor, ...]
     """One (M, 3, 1, 1, E) per step; broadcasts over the batch."""
     done: Tensor
-    """(M, 3, 1, 1, E): of rows that are data already (`committed`)."""
+    """(M, 3, 1, 1, E): styles of committed rows, which are data already (`committed`)."""
 
 
 class Pi05(nn.Module):
-    """The public pi0.5 network, and room for cognition tokens at the front of its prefix."""
+    """The public pi0.5 network, which takes cognition tokens at the front of its prefix."""
 
     def __init__(self, config: Pi05Config) -> None:
         super().__init__()
@@ -153,12 +153,11 @@ class Pi05(nn.Module):
         state_B1W: Tensor | None = None,
         is_isolated: bool = False,
     ) -> Prefix:
-        """Assembles [P][views][text][state]. A missing camera keeps its slots but is neither seen nor counted.
+        """Assembles [P][views][text][state]. A missing camera keeps its slots but is masked and takes no positions.
 
-        ``cognition_BPW`` and ``state_B1W`` enter as they are: like image tokens and unlike text they are not
-        multiplied by sqrt(W).
+        ``cognition_BPW`` and ``state_B1W`` are not multiplied by sqrt(W): like image tokens and unlike text.
         """
-        image_embeds = self.embed_images(images_BV3PP)  # without any view, no tokens
+        image_embeds = self.embed_images(images_BV3PP)  # no tokens if there is no view
         is_image = has_view_BV.repeat_interleave(self.config.vision.num_patches, dim=1)
         parts = [image_embeds, self.language.embed(token_ids_BT)]
         is_real = [is_image, is_token_BT]
@@ -180,7 +179,7 @@ class Pi05(nn.Module):
     def prefill(self, prefix: Prefix) -> PrefixCache:
         """Runs the prefix through the language layers and keeps every layer's keys and values.
 
-        Of the last layer only keys and values are computed: its output feeds nothing.
+        The last layer computes only keys and values, because nothing uses its output.
         """
         runs = [self._run_prefix(stream, last_layer_output=False) for stream in prefix.streams()]
         keys, values = (
@@ -191,7 +190,7 @@ class Pi05(nn.Module):
         return PrefixCache(keys=keys, values=values, visible=prefix.is_real, next_position=next_position_B)
 
     def prefix_hidden(self, prefix: Prefix) -> Tensor:
-        """Returns (B, T, W) after the last norm. Acting needs it nowhere; parity tests and probes do."""
+        """Returns (B, T, W) after the last norm: for parity tests and probes, not for acting."""
         runs = [self._run_prefix(stream, last_layer_output=True) for stream in prefix.streams()]
         hidden_BTW = torch.cat([hidden for _, _, hidden in runs], dim=1)
         normed_BTW: Tensor = self.language.norm(hidden_BTW)
@@ -201,7 +200,7 @@ class Pi05(nn.Module):
         self, prefix: Prefix, *, last_layer_output: bool
     ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...], Tensor]:
         rotation = Rotation.at(prefix.positions(), self.config.language.head_dim)
-        # Rows of padding see the real keys too: nobody reads such a row, and one that saw nothing would be NaN.
+        # Padding rows attend to the real keys too: their outputs are unused, and a fully masked row would be NaN.
         visible_B11T = prefix.is_real[:, None, None, :]
         hidden_BTW = prefix.embeds
         keys: list[Tensor] = []
@@ -217,7 +216,7 @@ class Pi05(nn.Module):
         return tuple(keys), tuple(values), hidden_BTW
 
     def time_condition(self, time_B: Tensor) -> Tensor:
-        """Returns (B, E): the vector every adaRMS norm of the expert is conditioned on."""
+        """Returns (B, E): the vector on which every adaRMS norm of the expert is conditioned."""
         features_BE = sinusoid(time_B, self.config.expert.width, min_period=TIME_MIN_PERIOD, max_period=TIME_MAX_PERIOD)
         return F.silu(self.time_mlp_out(F.silu(self.time_mlp_in(features_BE))))
 
@@ -235,7 +234,7 @@ class Pi05(nn.Module):
     def velocity(self, x_BNA: Tensor, styles_M3B1E: Tensor, cache: PrefixCache) -> Tensor:
         """Returns v(x_t, t | prefix), (B, N, A) float32; ``styles_M3B1E`` carries t, or (M, 3, B, N, E) one per row.
 
-        Action tokens see every visible prefix token and each other. pi0.5 has no state token.
+        Action tokens attend to every visible prefix token and to each other. pi0.5 has no state token.
         """
         num_actions = x_BNA.shape[1]
         offsets_N = torch.arange(num_actions, device=x_BNA.device)
@@ -259,7 +258,7 @@ class Pi05(nn.Module):
     def velocity_at(
         self, x_BNA: Tensor, time_B: Tensor, cache: PrefixCache, *, is_given_BN: Tensor | None = None
     ) -> Tensor:
-        """`velocity` with one flow time per sample: training's form. ``is_given_BN``: rows that are data already."""
+        """`velocity` with one flow time per sample, as in training. ``is_given_BN`` marks committed rows."""
         styles = self.expert.styles(self.time_condition(time_B))
         if is_given_BN is not None:
             styles = row_styles(styles, self._done_styles(), is_given_BN)
@@ -270,7 +269,7 @@ class Pi05(nn.Module):
     ) -> Iterator[flow.EulerStep]:
         """Integrates from noise to actions against one prefilled prefix; yields after every step.
 
-        Rows that are ``given`` stand in the actions of every step, bit for bit.
+        Rows that are ``given`` appear unchanged, bit for bit, in the actions of every step.
         """
         if given is None:
             return flow.euler(

@@ -1,7 +1,7 @@
 """openpi's JAX checkpoints: the same pi0.5 with layers stacked on axis 0 and einsum-shaped matrices.
 
-A checkpoint is an orbax folder (``params/`` of an openpi download). Reading it needs tensorstore, which nothing else
-here does: ``pip install tensorstore`` where such a folder is to be loaded.
+A checkpoint is an orbax folder (``params/`` of an openpi download). Reading one needs ``pip install tensorstore``,
+which is no dependency of this project because nothing else uses it.
 """
 
 # W width, h heads, g key heads, D head dim, M mlp width
@@ -28,7 +28,7 @@ _LAYERS = "PaliGemma/llm/layers/"
 
 
 class _Rule(NamedTuple):
-    """One tensor of ours (of every layer, where stacked) out of one array of theirs."""
+    """How one of our tensors (one per layer, if stacked) is made from one JAX array."""
 
     jax: str
     ours: str
@@ -113,10 +113,10 @@ def _rules() -> Iterator[_Rule]:
 
 
 def public_tensors(arrays: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
-    """Turns JAX arrays into tensors under public names (`pi05_weights`).
+    """Turns JAX arrays into tensors under public names (`pi05.weights`).
 
     Args:
-        arrays: by slash-separated path below ``params``, without the trailing ``/value`` of some checkpoints.
+        arrays: arrays by slash-separated path below ``params``, without the trailing ``/value`` of some checkpoints.
         source: names the checkpoint in errors.
 
     Raises:
@@ -136,12 +136,12 @@ def public_tensors(arrays: Mapping[str, Tensor], source: str) -> dict[str, Tenso
 
 
 def read_params(folder: Path) -> dict[str, Tensor]:
-    """Reads an orbax folder into float32 tensors, named as `public_tensors` wants them.
+    """Reads an orbax folder into float32 tensors, under the paths that `public_tensors` expects.
 
     Raises:
         FileNotFoundError: the folder is no orbax checkpoint.
         ValueError: tensorstore is not installed.
-        WeightsError: an array does not read.
+        WeightsError: an array cannot be read.
     """
     if not (folder / METADATA_FILE).is_file():
         raise FileNotFoundError(f"{folder} is no orbax checkpoint (no {METADATA_FILE}); openpi's is called params/")
@@ -166,7 +166,7 @@ def read_params(folder: Path) -> dict[str, Tensor]:
 
 
 def load_jax_weights(model: Pounce, folder: Path) -> None:
-    """Loads openpi's JAX ``folder`` into ``model``; a cognition prefix is left as it is.
+    """Loads openpi's JAX ``folder`` into ``model``; the model's own cognition prefix is kept.
 
     Raises:
         WeightsError: an array is missing, unknown or of another shape.

@@ -1,4 +1,4 @@
-"""POUNCE, System 1: pi0.5 with the cognition prefix in front of what it sees (paper 3.1)."""
+"""POUNCE, System 1: pi0.5 with the cognition prefix in front of images and text (paper 3.1)."""
 
 # B batch, V views, T text tokens, K carriers, H carrier size, N horizon, A padded action dim
 
@@ -20,7 +20,7 @@ StateInput = Literal["prompt", "token"]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PounceInputs:
-    """One batch as the network takes it: resized, normalised, tokenised."""
+    """One batch of network inputs: resized, normalised, tokenised."""
 
     images: Tensor
     """(B, V, 3, px, px) float32 in [-1, 1]; a missing camera is all -1."""
@@ -37,32 +37,32 @@ class PounceInputs:
     is_null: Tensor | None = None
     """(B,) bool; samples of ``cognition`` to replace by the learned null"""
     state: Tensor | None = None
-    """(B, S) float32, normalised; where the config's ``state_input`` is "token"."""
+    """(B, S) float32, normalised; required if the config's ``state_input`` is "token"."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PounceConfig:
-    """Everything that fixes POUNCE's shapes. Named complete ones are in `pounce_configs`."""
+    """Shapes and options of POUNCE. Named complete configurations are in `pounce.configs`."""
 
     pi05: Pi05Config
     cognition: CognitionConfig
     robot_action_dim: int = 8
     """The first dims of the padded action: 7 arm joints and the gripper."""
     num_cameras: int = 2
-    """front, wrist. 0: it acts on state and cognition alone, and takes any robot's cameras."""
+    """front, wrist. 0: it acts on state and cognition alone, whatever cameras the robot has."""
     num_steps: int = 10
     """Euler steps per chunk."""
     max_prompt_tokens: int = 200
     state_input: StateInput = "prompt"
-    """prompt: 256 bins written as digits, as pi0.5 does. token: one linear token of the numbers, as pi0 has in its
-    action stream; here it ends the prefix, so that its keys are computed once. A network that starts from nothing
+    """prompt: 256 bins written as digits, as pi0.5 does. token: one linearly projected token, as pi0 has in its action
+    stream; here it ends the prefix, so that its keys are computed once. It is for networks trained from scratch, which
     would first have to learn to read digits."""
     robot_state_dim: int = 8
-    """S, with ``state_input`` "token"; a prompt takes any."""
+    """S, for ``state_input`` "token"; a prompt takes any size."""
     max_committed_rows: int = 0
-    """The most rows that training gives a chunk to continue (`committed`); 0: it was never trained to."""
+    """Largest number of committed rows in training (`committed`); 0 if it was not trained with any."""
     reads_subgoal: bool = False
-    """The newest subgoal's text stands in the prompt instead of cognition: the paper's subgoal-text reference (3.1)."""
+    """Put the newest subgoal's text into the prompt in place of cognition: the paper's subgoal-text reference (3.1)."""
 
     def __post_init__(self) -> None:
         check_channel(self.cognition, self.reads_subgoal)
@@ -91,7 +91,7 @@ class PounceConfig:
         return self.pi05.vocab_size
 
     def example_inputs(self, batch_size: int, *, num_tokens: int = 12, seed: int = 0) -> PounceInputs:
-        """Fabricates a valid batch for tests and benchmarks: all views present, cognition 300 ms old."""
+        """Makes a valid batch for tests and benchmarks: all views present, cognition 300 ms old."""
         generator = torch.Generator().manual_seed(seed)
         px = self.pi05.vision.image_px
         cognition, has_token = self.cognition, self.state_input == "token"
@@ -109,7 +109,7 @@ class PounceConfig:
         )
 
     def example_actions(self, batch_size: int, *, seed: int = 0) -> Tensor:
-        """Fabricates normalised training targets, (B, N, A) float32, zero beyond the robot's dims."""
+        """Makes normalised training targets, (B, N, A) float32, zero beyond the robot's dims."""
         generator = torch.Generator().manual_seed(seed)
         actions = torch.zeros(batch_size, self.pi05.horizon, self.pi05.action_dim)
         actions[..., : self.robot_action_dim].uniform_(-1, 1, generator=generator)
@@ -126,7 +126,7 @@ class Backbone:
 
 
 class Freezable(Protocol):
-    """A POUNCE of either family, as `freeze` sees it."""
+    """The part of either family's POUNCE that `freeze` uses."""
 
     @property
     def backbone(self) -> Backbone: ...
@@ -155,7 +155,7 @@ class Pounce(nn.Module):
         """Embeds [P][images][text][state].
 
         Raises:
-            ValueError: the state is missing where it is a token.
+            ValueError: ``state_input`` is "token" and the state is missing.
         """
         cognition_BPW = None
         if self.cognition_prefix is not None:
@@ -192,7 +192,7 @@ class Pounce(nn.Module):
         """Returns the scalar L_fm, by default over the robot's action dims only (`flow.mean_loss`).
 
         ``actions_BNA`` are normalised and zero beyond the robot's dims; noise fills all of A, as in sampling. The
-        first ``num_committed_B`` rows of each sample are given and do not count (`committed`).
+        first ``num_committed_B`` rows of each sample are committed and do not contribute (`committed`).
         """
         unreduced_BNA = self.unreduced_loss(inputs, actions_BNA, noise_BNA, time_B, num_committed_B=num_committed_B)
         if num_committed_B is not None:
@@ -208,10 +208,10 @@ class Pounce(nn.Module):
         *,
         num_committed_B: Tensor | None = None,
     ) -> Tensor:
-        """Returns the squared error of the velocity, (S, N, A); of a row that is given it says nothing.
+        """Returns the squared error of the velocity, (S, N, A); it is meaningless on committed rows.
 
-        Noise, times and counts may be several for each sample, the whole batch over and over (S = D * B): what is
-        read is then computed once, for D flow samples.
+        Noise, times and counts may hold D flow samples per observation, the whole batch repeated D times (S = D * B):
+        the prefix is then computed once for all of them.
         """
         num_draws = len(noise_BNA) // len(actions_BNA)
         actions_BNA = actions_BNA.repeat(num_draws, 1, 1)
@@ -237,12 +237,12 @@ class Pounce(nn.Module):
 def freeze(model: Freezable, what: Freeze = "vlm") -> None:
     """Sets ``requires_grad`` of every parameter. Gradients still pass *through* frozen layers to C.
 
-    - ``vlm`` (the paper, B.1: "including the PaliGemma backbone"; GR00T's own recipe keeps its language frozen
-      too): vision, projector and language are frozen.
-    - ``vision`` (RoboMME's released pi0.5 recipe; the paper's wording differs): vision and projector are.
-    - ``none``: everything trains.
+    - ``vlm`` freezes vision, projector and language (the paper, B.1: "including the PaliGemma backbone"; GR00T's own
+      recipe freezes its language too).
+    - ``vision`` freezes vision and projector (RoboMME's released pi0.5 recipe; the paper's wording differs).
+    - ``none`` freezes nothing.
 
-    Never run the prefix under ``no_grad`` or ``detach`` it to save memory: that is the path to PONDER.
+    Never run the prefix under ``no_grad`` or ``detach`` it to save memory: PONDER's gradient passes through it.
     """
     backbone = model.backbone
     frozen: dict[Freeze, tuple[nn.Module, ...]] = {

@@ -1,9 +1,8 @@
-"""The text POUNCE reads: instruction and proprioception in one line, and its tokens.
+"""POUNCE's prompt: instruction and proprioception in one line, and its tokens.
 
-Traps, each a different prompt from the same inputs in public code: the state is written BEFORE it is padded
-to 32 dims (lerobot 0.4.x wrote 32 numbers); openpi's pi05_libero and RoboMME's policies leave the state out
-altogether (``discrete_state_input=False``) and so act without proprioception; a value below -1 becomes bin
--1, not 0.
+Traps: public implementations make different prompts from the same inputs. The state is written BEFORE it is padded
+to 32 dims (lerobot 0.4.x wrote 32 numbers); openpi's pi05_libero and RoboMME's policies omit the state
+(``discrete_state_input=False``) and so act without proprioception; a value below -1 becomes bin -1, not 0.
 """
 
 import io
@@ -20,7 +19,7 @@ TINY_VOCAB_SIZE = 512
 _MAX_PIECE = 64  # characters
 _REPEATS = 4  # pairs that occur once are not merged
 
-# Enough of RoboMME's language for the pieces of a tiny tokenizer to be words; bytes cover everything else.
+# Enough of RoboMME's language for the pieces of a tiny tokenizer to be words; bytes cover all other text.
 _TASK_LANGUAGE = (
     "put two red cubes and one blue cube into the bin, then press the button to stop",
     "pick up the green cube and place it on the target, repeating this action three times",
@@ -49,7 +48,7 @@ def prompt_text(instruction: str, state: ArrayLike) -> str:
 
 
 def stateless_prompt_text(instruction: str) -> str:
-    """Returns the prompt of a network that is given its state as numbers: pi0's, the instruction and a line's end."""
+    """Returns the prompt for ``state_input`` "token": pi0's, the instruction and a newline."""
     return _cleaned(instruction) + "\n"
 
 
@@ -58,9 +57,9 @@ def _cleaned(instruction: str) -> str:
 
 
 def with_subgoal(instruction: str, subgoal: str) -> str:
-    """Returns what a POUNCE that reads text is told: the instruction and the newest subgoal, or the instruction alone.
+    """Returns the instruction with the newest subgoal, or the instruction alone if there is none yet.
 
-    The wording is ours; RoboMME's own subgoal baselines write "Current Subgoal" and leave the state out.
+    The wording is ours; RoboMME's own subgoal baselines write "Current Subgoal" and omit the state.
     """
     return f"{instruction.strip()}, Subgoal: {subgoal.strip()}" if subgoal.strip() else instruction
 
@@ -99,7 +98,7 @@ class Tokenizer:
 
 
 def tiny_tokenizer_for_random_weights() -> Tokenizer:
-    """Trains a 512-id byte-fallback BPE on a few task sentences: equal on every call, no use to real weights.
+    """Trains a 512-id byte-fallback BPE on a few task sentences. Deterministic; useless with real weights.
 
     Special ids are PaliGemma's (pad 0, eos 1, bos 2, unk 3) and digits are split, as Gemma's tokenizer does.
     """
@@ -108,9 +107,9 @@ def tiny_tokenizer_for_random_weights() -> Tokenizer:
 
 
 def tokenizer_of_instructions(instructions: Sequence[str], vocab_size: int = TINY_VOCAB_SIZE) -> Tokenizer:
-    """Trains a tokenizer on the instructions of a dataset, for a network that starts from nothing.
+    """Trains a tokenizer on the instructions of a dataset, for a network trained from scratch.
 
-    Its pieces may span words: what is always said alike becomes a few tokens, and every token costs.
+    Pieces may span words, so that recurring phrases become few tokens: every token costs time.
     """
     prompts = [stateless_prompt_text(instruction) for instruction in instructions]
     return _trained(prompts * _REPEATS, vocab_size, split_by_whitespace=False, max_sentencepiece_length=_MAX_PIECE)

@@ -1,8 +1,8 @@
 """Real-time chunking at inference (Black, Galliker and Levine 2025): a chunk that continues the one being played.
 
-The flow is pulled towards the previous chunk's unplayed rows: fully where they are committed, less and less after
-them, not at all where there are none. The pull is a vector-Jacobian product through the network, so that the rows
-which are not pulled follow from the others. Flow time as in `flow`: t = 1 is noise; the paper's tau is 1 - t.
+The flow is guided towards the previous chunk's unplayed rows: fully where they are committed, decaying after
+them, not at all beyond the last of them. The guidance is a vector-Jacobian product through the network, so the
+unguided rows stay consistent with the others. Flow time as in `flow`: t = 1 is noise; the paper's tau is 1 - t.
 """
 
 # B batch, N horizon, A padded action dim
@@ -17,15 +17,15 @@ from torch import Tensor
 from dual_system.models import flow
 
 MAX_WEIGHT = 5.0
-"""The paper's beta: with few steps, larger pulls diverge."""
+"""The paper's beta: with few steps, larger guidance weights diverge."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Guide:
-    """Where to, and how firmly."""
+    """The guidance's target chunk and the weight of each of its entries."""
 
     target: Tensor
-    """(B, N, A) normalised; anything where the weight is 0"""
+    """(B, N, A) normalised; arbitrary where the weight is 0"""
     weight: Tensor
     """(B, N, A) in [0, 1]"""
     max_weight: float = MAX_WEIGHT

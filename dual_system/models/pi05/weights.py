@@ -1,11 +1,11 @@
 """Public pi0.5 checkpoints: their tensor names, and reading and writing them.
 
 The layout is the one openpi's PyTorch port and lerobot share (812 tensors at full size); lerobot's policy
-adds a leading ``model.``. Its habits:
+adds a leading ``model.``. Its peculiarities:
 
 - the token embedding is tied to the LM head and usually stored only as ``...paligemma.lm_head.weight``;
 - ``...gemma_expert.lm_head.weight`` (263 M numbers at full size) is never used: dropped here and written back
-  as zeros, so that strict foreign loaders are content;
+  as zeros, for foreign loaders that are strict;
 - Gemma norms store w of (1 + w).
 """
 
@@ -28,7 +28,7 @@ _EMBEDDING = _PALIGEMMA + "language_model.embed_tokens.weight"
 _UNUSED_HEAD = _ROOT + "gemma_expert.lm_head.weight"
 _LEROBOT_PREFIX = "model."
 
-# (ours, public), first match wins; names below these prefixes are the same on both sides.
+# (our prefix, public prefix), first match wins; the rest of a name is the same on both sides.
 _PREFIXES = (
     ("pi05.language.embed_tokens.weight", _TIED_HEAD),
     ("pi05.vision.layers.", _PALIGEMMA + "vision_tower.vision_model.encoder.layers."),
@@ -49,19 +49,19 @@ def public_name(name: str) -> str:
 
 
 def unused_shapes(config: Pi05Config) -> dict[str, tuple[int, ...]]:
-    """Returns the tensors that public files hold and nobody reads."""
+    """Returns the shapes of tensors that public files hold and no implementation reads."""
     return {_UNUSED_HEAD: (config.vocab_size, config.expert.width)}
 
 
 def save_weights(model: Pounce, path: Path) -> None:
-    """Writes ``model`` in the public layout, complete: the embedding once, as the tied LM head."""
+    """Writes ``model`` in the complete public layout, with the embedding once, as the tied LM head."""
     tensors = {public_name(name): tensor for name, tensor in model.state_dict().items()}
     unused = {name: torch.zeros(shape) for name, shape in unused_shapes(model.config.pi05).items()}
     write_tensors(tensors | unused, path)
 
 
 def read_weights(path: Path) -> dict[str, Tensor]:
-    """Reads a file (or shards) in the public layout, undoing its habits; keys are canonical public names."""
+    """Reads a file (or shards) in the public layout and undoes its peculiarities; keys are canonical public names."""
     tensors = read_tensors(path, lambda name: not name.endswith(_UNUSED_HEAD))
     if any(name.startswith(_LEROBOT_PREFIX + _ROOT) for name in tensors):
         tensors = {name.removeprefix(_LEROBOT_PREFIX): tensor for name, tensor in tensors.items()}
@@ -76,7 +76,7 @@ def read_weights(path: Path) -> dict[str, Tensor]:
 def load_weights(model: Pounce, path: Path) -> bool:
     """Loads ``path`` into ``model``, float32 throughout; returns whether the file held a cognition prefix.
 
-    A public pi0.5 file has none: the model's own prefix parameters are then left as they are.
+    A public pi0.5 file has none: the model then keeps its own prefix parameters.
 
     Raises:
         FileNotFoundError: neither the file nor an index of shards is there.

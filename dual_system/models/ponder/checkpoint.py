@@ -3,9 +3,9 @@
     config.json          transformers' Qwen3.5 configuration
     tokenizer.json       the tokenizer
     model.safetensors    the weights, or model.safetensors.index.json and its shards
-    ponder.json          what PONDER adds: carriers, image size, whether it speaks, how demonstrations are sampled
+    ponder.json          what PONDER adds: carriers, image size, whether it generates text, demonstration sampling
 
-A public Qwen3.5 checkpoint has no ponder.json and loads as it is; its carriers are untrained padding rows. Loaded in
+A public Qwen3.5 checkpoint has no ponder.json and still loads; its carriers are untrained padding rows. Loaded in
 the dtype it was written in, it is written back bit for bit, multi-token prediction included.
 """
 
@@ -46,7 +46,7 @@ class CheckpointError(ValueError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredPonder:
-    """Contents of ponder.json. An absent field has its default, which is the paper's; an unknown one is refused."""
+    """Contents of ponder.json. An absent field takes its default, the paper's value; an unknown one is an error."""
 
     format: Literal["ponderpounce.ponder/1"] = "ponderpounce.ponder/1"
     num_carriers: int = 1
@@ -56,14 +56,14 @@ class StoredPonder:
     speaks: bool = True
     demonstrations: DemoSampling = PAPER_SAMPLING
     is_random: bool = True
-    """The carriers were never trained."""
+    """True if the carriers were never trained."""
 
 
 def load_ponder(directory: Path, *, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Ponder:
     """Reads a checkpoint folder.
 
-    Raises FileNotFoundError for a file that is not there, CheckpointError naming every missing, extra or
-    misshapen tensor, and ValueError for a configuration that contradicts itself.
+    Raises FileNotFoundError for a missing file, CheckpointError naming every missing, extra or misshapen tensor,
+    and ValueError for an inconsistent configuration.
     """
     config_path = directory / CONFIG_NAME
     if not config_path.is_file():
@@ -104,7 +104,7 @@ def load_ponder(directory: Path, *, device: torch.device | str = "cpu", dtype: t
 def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_SHARD_BYTES) -> None:
     """Writes a folder that :func:`load_ponder` and transformers' ``from_pretrained`` both read.
 
-    Raises FileExistsError rather than mix two checkpoints in one folder.
+    Raises FileExistsError if the folder already holds a checkpoint.
     """
     if (directory / CONFIG_NAME).exists():
         raise FileExistsError(f"{directory} already holds a checkpoint; save into a new folder.")
@@ -147,7 +147,7 @@ def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_S
 def weights_hash(ponder: Ponder) -> str:
     """12 hex digits of sha256 over the name, dtype, shape and bytes of every tensor: provenance.
 
-    Reads every weight once, which takes seconds per ten gigabytes: compute it when a network is loaded.
+    It reads every weight, which takes seconds per ten gigabytes: compute it once, when a network is loaded.
     """
     digest = hashlib.sha256()
     for name, tensor in sorted(_own_tensors(ponder.qwen).items()):
@@ -158,10 +158,10 @@ def weights_hash(ponder: Ponder) -> str:
 
 
 def mtp_shapes(text_config: Any, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
-    """The multi-token prediction block that belongs to a network with tensors of these ``shapes``.
+    """Shapes of the multi-token prediction block of a network with tensors of these ``shapes``.
 
-    Attention layers like the network's own, behind a projection of [embedding; hidden] and before a norm. Source:
-    tensor names of public Qwen3.5 checkpoints; the sum is their published number of parameters.
+    The block is a projection of [embedding; hidden], attention layers like the network's own, and a norm. Source:
+    tensor names of public Qwen3.5 checkpoints; the total is their published number of parameters.
     """
     hidden = text_config.hidden_size
     like = f"model.language_model.layers.{text_config.layer_types.index('full_attention')}."
@@ -208,7 +208,7 @@ def _read_stored(directory: Path) -> tuple[StoredPonder, ObservationReader]:
     stored = from_json(StoredPonder, values, str(path))
     if declared is None:
         return stored, WHOLE_VIEWS
-    from dual_system.models.small_pair.reading import CropReader  # here: no other checkpoint may need it
+    from dual_system.models.small_pair.reading import CropReader  # lazy: only the demo's pair has it
 
     return stored, from_json(CropReader, declared, f"{path}: {SMALL_PAIR}")
 
@@ -260,4 +260,4 @@ def _read_tensors(files: dict[str, Path], ponder: Ponder) -> None:
                 if name in own and files.get(name) == path:
                     own[name].copy_(file.get_tensor(name))
                 elif name.startswith(MTP_PREFIX) and files.get(name) == path:
-                    ponder.mtp[name] = file.get_tensor(name)  # mapped, not read: until it is saved it costs no memory
+                    ponder.mtp[name] = file.get_tensor(name)  # memory-mapped: costs no memory until it is used

@@ -1,8 +1,7 @@
 """Complete, named sizes of PONDER: one tiny enough for a laptop core, and Qwen3.5's four.
 
-The four real sizes build exactly the published number of parameters (without the multi-token-prediction
-block, which transformers does not have). Sources: Qwen3.5 model cards; checked on the meta device in
-tests/models.
+The four real sizes have exactly the published number of parameters (without the multi-token prediction block,
+which transformers omits). Source: Qwen3.5 model cards; tests/models checks them on the meta device.
 """
 
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from dual_system.models.ponder.vocabulary import Vocabulary
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PonderConfig:
-    """Sizes of one PONDER. GDN is Gated DeltaNet, the linear attention of three layers in four."""
+    """Sizes of one PONDER. GDN is Gated DeltaNet, the linear attention in three of every four layers."""
 
     hidden_size: int
     ffn_size: int
@@ -35,7 +34,7 @@ class PonderConfig:
     vision_ffn_size: int
     vision_num_heads: int
     vision_num_positions: int = 2304
-    """A square number: the learned positions' grid, interpolated to the picture's."""
+    """Size of the learned position grid, a square number; it is interpolated to the image's grid."""
 
     mrope_section: tuple[int, int, int] = (11, 11, 10)
     """Rotary frequencies for t, h, w; they sum to an eighth of ``head_dim``."""
@@ -44,9 +43,9 @@ class PonderConfig:
     num_carriers: int = 1
     """K: carriers per query, each giving one row of C_t."""
     first_carrier_id: int = 248_077
-    """First unused row of the embedding table; the K carriers live there."""
+    """First unused row of the embedding table; the K carriers start there."""
     image_px: tuple[int, int] = (256, 256)
-    """Height and width of every picture that the network reads, in pixels."""
+    """Height and width of every input image, in pixels."""
 
     def __post_init__(self) -> None:
         if self.first_carrier_id + self.num_carriers > self.vocab_size:
@@ -106,7 +105,7 @@ class PonderConfig:
 
 
 def tiny_cpu() -> PonderConfig:
-    """Every kind of layer (6 GDN, 2 attention, 2 vision), small enough to think on one laptop core."""
+    """Every kind of layer (6 GDN, 2 attention, 2 vision), small enough to run on one laptop core."""
     return PonderConfig(
         hidden_size=96,
         ffn_size=192,

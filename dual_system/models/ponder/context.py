@@ -1,16 +1,15 @@
-"""An episode as one row of tokens: what PONDER reads, in which order, and where the LM head is supervised.
+"""An episode as one row of tokens: PONDER's context, and where its LM head is supervised.
 
-The row is built from segments, and only ever grows: training concatenates them, serving appends them one by
-one, and both get them from here (the official chat template rewrites earlier turns, so it cannot be used).
-One episode is
+The row is built from segments and is append-only: training concatenates them, serving appends them one by one, and
+both get them from here (the official chat template rewrites earlier turns, so it cannot be used). One episode is
 
     <|im_start|>user\\n Ins [demo frames, 1 Hz] <|im_end|>\\n<|im_start|>assistant\\n     once, at opening
     O_t  [ T_yes S_t | T_yes DR T_yes S_t ]  K carriers                               per query t
 
 where a frame is ``<|vision_start|> <|image_pad|> * n <|vision_end|>`` (n = 64 at 256 px), one per image that the
-`observation` reader gives. **T_no is never in the row.** It is only the LM *target* at the first carrier position
-(paper, appendix A.2), so T_t is always decided by the logits of the token before: the last one of O_t, or the last one
-of the text. Carriers are rows of the embedding table that no real token uses; their ids are ordinary ids.
+`observation` reader returns. **T_no is never in the row.** It is only the LM *target* at the first carrier position
+(paper, appendix A.2), so T_t is always decided by the logits of the preceding token: the last one of O_t, or the last
+one of the text. Carriers are rows of the embedding table that no real token uses; their ids are ordinary ids.
 
 A target belongs to the position it labels: the logits that must predict ``targets[i]`` are those of position
 i - 1.
@@ -39,7 +38,7 @@ class SegmentKind(StrEnum):
     DEMO = "demo"
     EXECUTION = "execution"  # the header after which observations begin
     OBSERVATION = "observation"
-    TEXT = "text"  # T_yes and what it opens
+    TEXT = "text"  # T_yes and the text that it opens
     CARRIERS = "carriers"
 
 
@@ -58,7 +57,7 @@ class Segment:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Transition:
-    """Text of one transition query, as token ids; ``reasoning`` (DR) only at the first of a demo episode."""
+    """Text of one transition query, as token ids; ``reasoning`` (DR) only at a demo episode's first query."""
 
     subgoal: tuple[int, ...]
     reasoning: tuple[int, ...] | None = None
@@ -66,12 +65,12 @@ class Transition:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Row:
-    """Segments laid end to end: one causal training row, or the contents of a serving session."""
+    """Concatenated segments: one causal training row, or the contents of a serving session."""
 
     ids: tuple[int, ...]
     targets: tuple[int, ...]
     carrier_index: npt.NDArray[np.int64]
-    """(Q, K): where each query's carriers are; their final hidden states are C_t."""
+    """(Q, K): positions of each query's carriers; their final hidden states are C_t."""
     num_images: int
 
     @property
@@ -90,13 +89,13 @@ class ContextFormat:
     image_grid: tuple[int, int]
     """Tokens of one image as (rows, columns): (8, 8) for 256 px, patch 16, merge 2."""
     token_px: int = 32
-    """Side in pixels of what one image token covers: patch times merge."""
+    """Side in pixels of the square that one image token covers: patch times merge."""
     reader: ObservationReader = WHOLE_VIEWS
-    """Which images and tokens an observation gives."""
+    """Maps an observation to images and tokens."""
     speaks: bool = True
-    """False: trained without texts (RoboCasa-DC, w2 = 0), so its LM head knows none and serving asks it for none."""
+    """False if trained without texts (RoboCasa-DC, w2 = 0): its LM head is untrained, and serving generates no text."""
     demonstrations: DemoSampling = PAPER_SAMPLING
-    """How demonstrations were sampled in training, and so how they are to be shown."""
+    """How demonstrations were sampled in training; serving must sample them alike."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.num_carriers <= 16:
@@ -136,22 +135,22 @@ class ContextFormat:
         return self._seen(SegmentKind.DEMO, num_views)
 
     def execution(self) -> Segment:
-        """Ends the user's turn and opens the assistant's: from here on the episode runs."""
+        """Ends the user's turn and opens the assistant's, which holds the running episode."""
         v = self.vocabulary
         ids = (v.im_end, *v.encode("\n"), v.im_start, *v.encode("assistant\n"))
         return _unsupervised(SegmentKind.EXECUTION, ids)
 
     def observation(self, num_cameras: int, proprio: ArrayLike | None = None) -> Segment:
-        """O_t: the images of one frame per camera, then the tokens of ``proprio`` (8,) if the reader has any.
+        """O_t: the images of one frame per camera, then the tokens of ``proprio`` (8,) if the reader makes any.
 
-        Raises ValueError if it needs ``proprio`` and none came.
+        Raises ValueError if the reader needs ``proprio`` and it is None.
         """
         seen = self._seen(SegmentKind.OBSERVATION, num_cameras)
         ids = (*seen.ids, *self.reader.state_ids(proprio))
         return _unsupervised(SegmentKind.OBSERVATION, ids, num_images=seen.num_images)
 
     def text(self, transition: Transition) -> Segment:
-        """``[T_yes, S]`` or ``[T_yes, DR, T_yes, S]``; every token of it is a target."""
+        """``[T_yes, S]`` or ``[T_yes, DR, T_yes, S]``; every token is a target."""
         t_yes = self.vocabulary.t_yes
         ids = (t_yes, *transition.subgoal)
         if transition.reasoning is not None:
@@ -170,12 +169,12 @@ class ContextFormat:
     def query(
         self, num_cameras: int, transition: Transition | None = None, proprio: ArrayLike | None = None
     ) -> tuple[Segment, ...]:
-        """One query, with text exactly if it is a transition; ``proprio`` as in :meth:`observation`."""
+        """One query, with text if and only if it is a transition; ``proprio`` as in :meth:`observation`."""
         text = () if transition is None else (self.text(transition),)
         return (self.observation(num_cameras, proprio), *text, self.carriers())
 
     def row(self, segments: Iterable[Segment]) -> Row:
-        """Lays segments end to end."""
+        """Concatenates segments."""
         ids: list[int] = []
         targets: list[int] = []
         carriers: list[range] = []
@@ -199,8 +198,8 @@ class ContextFormat:
         """Positions of tokens appended to ``first_index`` others, and the mRoPE position after them.
 
         Returns (4, T) int64, rows [cache index; t; h; w], as transformers' Qwen3.5 text model takes them. An
-        image occupies ``image_grid`` in h and w at one instant t, and moves the position on by its longer side, not by
-        its number of tokens. Left to itself the model would continue an appended image with text positions and a
+        image occupies ``image_grid`` in h and w at one instant t, and advances the position by its longer side, not by
+        its number of tokens. Without explicit positions the model would give an appended image text positions, and a
         ``rope_deltas`` shared by all contexts of the process. Source: Qwen3.5 ``get_rope_index``.
 
         Raises ValueError if an image does not have ``image_grid`` tokens.
@@ -235,7 +234,7 @@ def _unsupervised(kind: SegmentKind, ids: tuple[int, ...], num_images: int = 0) 
 
 
 def in_groups(segments: Sequence[Segment], max_tokens: int) -> list[list[Segment]]:
-    """Consecutive segments in groups of at most ``max_tokens``, or of one that is longer."""
+    """Groups consecutive segments into at most ``max_tokens`` tokens each; a longer segment is its own group."""
     groups: list[list[Segment]] = []
     num_tokens = 0
     for segment in segments:

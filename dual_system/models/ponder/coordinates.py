@@ -1,9 +1,8 @@
 """Grounded coordinates: ``<y, x>`` in image pixels to normalised ``[x, y]`` in 0..1000, and back.
 
-PONDER's pretrained grounding speaks normalised [x, y] of 0..1000; the simulator's templates speak <y, x>
-pixels of a 256 px image (paper, appendix A.2). Both directions round half up in integers, so no platform's
-float decides a token. Because 1000 > 256, pixels -> normalised -> pixels is the identity for images of up to
-1000 px.
+PONDER's pretrained grounding uses normalised [x, y] in 0..1000; the simulator's templates use <y, x> pixels of a
+256 px image (paper, appendix A.2). Both directions round half up in integers, so no token depends on a platform's
+floats. Because 1000 > 256, pixels -> normalised -> pixels is the identity for images of up to 1000 px.
 """
 
 import re
@@ -33,7 +32,7 @@ def yx_px_from_xy_1000(xy_1000: tuple[int, int], image_px: tuple[int, int] = (25
 
 
 def normalised_text(text: str, image_px: tuple[int, int] = (256, 256)) -> str:
-    """Every ``<y, x>`` in ``text`` rewritten as ``[x, y]``: what PONDER is trained to say."""
+    """Rewrites every ``<y, x>`` in ``text`` as ``[x, y]``, the form that PONDER is trained to generate."""
 
     def rewrite(match: re.Match[str]) -> str:
         x, y = xy_1000_from_yx_px((int(match[1]), int(match[2])), image_px)
@@ -43,7 +42,7 @@ def normalised_text(text: str, image_px: tuple[int, int] = (256, 256)) -> str:
 
 
 def pixel_text(text: str, image_px: tuple[int, int] = (256, 256)) -> str:
-    """Every ``[x, y]`` in ``text`` rewritten as ``<y, x>``: what the task texts and the viewer show."""
+    """Rewrites every ``[x, y]`` in ``text`` as ``<y, x>``, the form of the task texts and the viewer."""
 
     def rewrite(match: re.Match[str]) -> str:
         y, x = yx_px_from_xy_1000((int(match[1]), int(match[2])), image_px)

@@ -1,6 +1,6 @@
-"""How a demonstration is sampled for PONDER: as in its training, so a part of its checkpoint.
+"""Which frames of a demonstration PONDER reads: as in its training, so its checkpoint declares them.
 
-PONDER says it in its contract, and the robot's side samples the video accordingly.
+PONDER's contract carries the declaration, and the robot's side samples the video accordingly.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ FASTEST_HZ = 20
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DemoSampling:
-    """Which frames of a demonstration PONDER reads; the default is the paper's (B.1).
+    """Sampling of a demonstration; the default is the paper's (B.1).
 
     Raises:
         ValueError: ``hz`` does not divide 20.
     """
 
     hz: int = 1
-    """Frames a second, from the first one on; a divisor of 20."""
+    """Frames per second, from the first one on; a divisor of 20."""
     to_its_end: bool = False
-    """Also the last frame, whenever it is: a movement often ends between two samples."""
+    """Also sample the last frame: a movement often ends between two samples."""
 
     def __post_init__(self) -> None:
         if self.hz < 1 or FASTEST_HZ % self.hz:

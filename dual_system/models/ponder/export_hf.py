@@ -1,11 +1,11 @@
-"""``pp-export hf``: trained models as the public folders that they came from, read back before they count as written.
+"""``pp-export hf``: writes trained models as public folders, and verifies them by reading them back.
 
-    PONDER          transformers' Qwen3.5 folder; ponder.json beside it, which others leave alone, says what PONDER adds
+    PONDER          transformers' Qwen3.5 folder; ponder.json, which other software ignores, says what PONDER adds
     POUNCE, pi0.5   openpi's PyTorch names, or lerobot's; float32
-    POUNCE, GR00T   NVIDIA's folder: its names, and the config.json with what sizes do not tell
+    POUNCE, GR00T   NVIDIA's folder: its names, and the config.json with all that tensor shapes do not show
 
-No public layout has a place for the cognition prefix: it goes into ``pounce_prefix.safetensors``, which others leave
-alone. What a robot's numbers mean (statistics) is no part of these folders either: it stays with the checkpoint.
+No public layout has a place for the cognition prefix: it goes into ``pounce_prefix.safetensors``, which other software
+ignores. The robot's statistics are not part of these folders either; they stay with the checkpoint.
 """
 
 from __future__ import annotations
@@ -69,11 +69,12 @@ def main(argv: list[str] | None = None, prog: str = "pp-export hf") -> int:
 
 
 def export_folder(options: ExportOptions) -> None:
-    """Writes the folder; nothing is left of one that cannot be read back.
+    """Writes the folder, and removes it if it cannot be read back.
 
     Raises:
         ValueError: neither or both models are given, or the model has parts that the layout has no place for.
-        FileNotFoundError, FileExistsError: no checkpoint there, or a folder that is there already.
+        FileNotFoundError: the checkpoint does not exist.
+        FileExistsError: the output folder exists already.
     """
     if (options.ponder is None) == (options.pounce is None):
         raise ValueError("give one of --ponder and --pounce; each is a folder of its own")
@@ -114,10 +115,10 @@ def _export_pounce(bundle: PounceBundle, out: Path, layout: Layout) -> None:
 
 
 def _set_prefix_apart(path: Path, prefix_path: Path, leading: str) -> None:
-    """Only public names stay in ``path``, behind ``leading``.
+    """Moves the cognition prefix from ``path`` to ``prefix_path``; the other names get the prefix ``leading``.
 
     Raises:
-        ValueError: the state enters as a token, which public pi0.5 does not know.
+        ValueError: the state enters as a token, which public pi0.5 does not support.
     """
     tensors = read_tensors(path)
     ours = {name: tensor for name, tensor in tensors.items() if name.startswith(COGNITION)}
@@ -132,7 +133,7 @@ def _set_prefix_apart(path: Path, prefix_path: Path, leading: str) -> None:
 
 
 def _check_groot(model: GrootPounce, out: Path) -> None:
-    """Raises ValueError unless the folder tells the network: SigLIP's head count, for one, stands nowhere in it."""
+    """Raises ValueError unless the folder determines the network; SigLIP's head count, for one, is not in it."""
     shapes, values = tensor_shapes(out / WEIGHTS_FILE), json.loads((out / CONFIG_FILE).read_text())
     found = groot_config_of(shapes, values, str(out))
     if found != (model.config.groot, model.config.num_steps):
@@ -143,7 +144,7 @@ def _check_groot(model: GrootPounce, out: Path) -> None:
 
 
 def _check_tensors(model: Pounce | GrootPounce, path: Path) -> None:
-    """Raises ValueError unless every public tensor reads back as it is in the model."""
+    """Raises ValueError unless every public tensor reads back equal to the model's."""
     if isinstance(model, Pounce):
         found, public_name = pi05_weights.read_weights(path), pi05_weights.public_name
     else:

@@ -1,7 +1,7 @@
-"""PONDER's attention over whole rows in float32 on a GPU, by a fused kernel.
+"""PONDER's attention over whole rows in float32 on a GPU, with a fused kernel.
 
-transformers hands grouped heads to torch as they are. Of its fused kernels only those for 16-bit numbers know groups:
-in float32 torch then makes the whole table of weights. Here every head is given keys and values of its own first.
+transformers passes grouped-query heads to torch unexpanded, but only torch's 16-bit fused kernels support groups: in
+float32 torch would materialise the attention matrix. Here keys and values are repeated for every query head first.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ NAME = "pp_fused"
 
 
 def fuse_attention(ponder: Ponder) -> None:
-    """From now on all attention layers of ``ponder`` do so, in place, wherever no mask is given."""
+    """Switches all attention layers of ``ponder`` to the fused kernel, in place."""
     AttentionInterface.register(NAME, _attended)
     for layer in ponder.qwen.model.language_model.layers:
         if hasattr(layer, "self_attn"):
@@ -35,7 +35,7 @@ def _attended(
     scaling: float | None = None,
     **_: Any,
 ) -> tuple[Tensor, None]:
-    """transformers' signature: (B, heads, T, D) and fewer heads of keys and values; returns (B, T, heads, D)."""
+    """transformers' attention interface: queries (B, h, T, D), fewer key and value heads; returns (B, T, h, D)."""
     groups = query_BhTD.shape[1] // key_BkTD.shape[1]
     keys, values = (each.repeat_interleave(groups, dim=1) for each in (key_BkTD, value_BkTD))
     is_causal = attention_mask is None and query_BhTD.shape[2] > 1

@@ -1,10 +1,9 @@
-"""Gated DeltaNet in plain torch for training: transformers' result, with less for autograd to do.
+"""Gated DeltaNet in plain torch for training: transformers' result with a cheaper backward pass.
 
-transformers' own loop over chunks reads and writes slices of whole tensors, and the backward pass of a slice is a zero
-tensor of the whole: its cost grows with the square of the number of chunks. Here the chunks are unbound once, only the
-state's recurrence is in the loop, and what chunks read is computed for all of them at once. The chunk's triangular
-system is solved by substitution: a product of its powers, (I + N)(I + N^2)..., would cancel large terms wherever keys
-repeat.
+transformers' own loop over chunks reads and writes slices of whole tensors, and the gradient of a slice is a zero
+tensor of full size: its cost grows with the square of the number of chunks. Here the chunks are unbound once, only the
+state's recurrence is in the loop, and the outputs of all chunks are computed at once. The chunk's triangular system is
+solved by substitution: a product of its powers, (I + N)(I + N^2)..., would cancel large terms wherever keys repeat.
 
 # B rows, T tokens, K key heads, V value heads, G = V / K, N chunks, C tokens of a chunk, D key and E value dimensions
 """
@@ -20,7 +19,7 @@ from dual_system.models.ponder import mixers as mixers
 
 CHUNK = 32
 _GPU_CHUNK = 64
-"""Half as many turns of a loop that only waits for its launches."""
+"""Twice the CPU's: on a GPU the loop is bound by kernel launches, so fewer iterations are faster."""
 
 
 def gated_delta_rule(
@@ -36,7 +35,7 @@ def gated_delta_rule(
 ) -> tuple[Tensor, Tensor | None]:
     """S_t = exp(g_t) (I - beta_t k_t k_t^T) S_{t-1} + beta_t k_t v_t^T, read by q_t; float32 inside, autocast or not.
 
-    Names and order of the arguments are those of transformers' ``torch_chunk_gated_delta_rule``, the twin of the tests.
+    Arguments as in transformers' ``torch_chunk_gated_delta_rule``, with which the tests compare it.
 
     Args:
         query, key: (B, T, K, D); value head h reads key head h // G.
@@ -44,10 +43,10 @@ def gated_delta_rule(
         g: log decay (B, T, V), at most 0.
         beta: (B, T, V).
         initial_state: (B, V, D, E); zero if None.
-        use_qk_l2norm_in_kernel: queries and keys are brought to length 1 first.
+        use_qk_l2norm_in_kernel: normalise queries and keys to length 1 first.
 
     Returns:
-        What is read, (B, T, V, E) in the dtype of ``query``, and the last state, float32, if it was asked for.
+        Outputs (B, T, V, E) in the dtype of ``query``, and the final float32 state, or None unless requested.
     """
     with torch.autocast(query.device.type, enabled=False):
         read, state = _rule(
@@ -66,7 +65,7 @@ def _rule(
     num_chunks = (length + padding) // chunk
 
     def chunks(x_BTHD: Tensor, heads: tuple[int, int]) -> Tensor:
-        """(N, B, K, G or 1, C, D). Pads are zero: they write nothing and forget nothing."""
+        """Returns (N, B, K, G or 1, C, D). Padding is zero: it neither writes to the state nor decays it."""
         padded = F.pad(x_BTHD, (0, 0, 0, 0, 0, padding)).view(batch, num_chunks, chunk, *heads, -1)
         return padded.permute(1, 0, 3, 4, 2, 5).contiguous()
 
@@ -79,7 +78,7 @@ def _rule(
     since_start = chunks(g[..., None], grouped).cumsum(-2)
     until_end = since_start[..., -1:, :] - since_start
     future = torch.ones(chunk, chunk, dtype=torch.bool, device=key.device).triu(1)
-    # Masked before exp: what lies ahead would grow, and infinity times zero is no zero.
+    # Masked before exp: future entries could overflow, and infinity times zero is NaN.
     decay = (since_start - since_start.transpose(-1, -2)).masked_fill(future, float("-inf")).exp()
 
     system = (keys @ keys.transpose(-1, -2)) * decay * betas
@@ -107,7 +106,7 @@ def _rule(
 
 
 class GatedDelta(Qwen3_5GatedDeltaNet):  # type: ignore[misc]  # transformers is untyped here
-    """transformers' layer, its weights and names; whole rows without a cache run through :func:`gated_delta_rule`."""
+    """transformers' layer with its parameter names; whole rows without a cache use :func:`gated_delta_rule`."""
 
     def forward(
         self, hidden_states: Tensor, cache_params: Any = None, attention_mask: Tensor | None = None, **kwargs: Any

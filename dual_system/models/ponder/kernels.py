@@ -1,7 +1,7 @@
-"""The functions of transformers' Qwen3.5 that a forward needs besides its modules, under typed names.
+"""The functions of transformers' Qwen3.5 that a forward pass needs besides its modules, under typed names.
 
-The two delta rules are the one function of Gated DeltaNet, over many tokens and over one. transformers takes fla's
-kernels for them where that package is installed, and plain torch elsewhere.
+Both delta rules compute Gated DeltaNet's recurrence, one over many tokens and one over a single token. transformers
+takes fla's kernels for them where that package is installed, and plain torch elsewhere.
 
 # B rows, T tokens, K key heads, V value heads, D head dimensions
 """
@@ -23,9 +23,9 @@ if not torch.cuda.is_available():  # transformers recommends fla at every start,
 
 DeltaRule: TypeAlias = Callable[..., tuple[Tensor, Tensor]]
 """(queries (B, T, K, D), keys, values (B, T, V, D), g=log decay (B, T, V), beta=(B, T, V), initial_state=(B, V, D, D))
-to (what is read (B, T, V, D), the next state)."""
+-> (outputs (B, T, V, D), next state)."""
 
 delta_rule_of_many: DeltaRule = torch_chunk_gated_delta_rule
 delta_rule_of_one: DeltaRule = torch_recurrent_gated_delta_rule
 rotate: Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]] = apply_rotary_pos_emb
-"""(queries (B, heads, T, D), keys, cos, sin (B, T, rotary dim)) to both, rotated by their positions."""
+"""(queries (B, heads, T, D), keys, cos, sin (B, T, rotary dim)) -> queries and keys with rotary positions."""

@@ -1,11 +1,9 @@
-"""What Qwen3.5's attention and Gated DeltaNet do with one token by itself, before and after tokens are mixed.
+"""The per-token parts of Qwen3.5's attention and Gated DeltaNet: input projections, norms, gates, output projection.
 
-A layer's own modules, in the order of transformers' forward; who mixes the tokens, and over what memory, differs:
-training reads whole rows (`gated_delta`), serving a few tokens behind a cache (``ponder_server/decoder.py``). Both come
-here for the rest.
+They call a layer's own modules in the order of transformers' forward. The mixing of tokens differs and is elsewhere:
+training mixes whole rows (`gated_delta`), serving a few tokens against a cache (``ponder_server/decoder.py``).
 
-# ... any axes of tokens, H hidden, h heads, g heads of keys, D head dimension, C conv channels
-# V value heads, E their size
+# ... any token axes, H hidden, h heads, g key heads, D head dimension, C conv channels, V value heads of size E
 """
 
 from __future__ import annotations
@@ -17,12 +15,12 @@ from torch.nn import functional as F
 
 
 class Asked(NamedTuple):
-    """Of attention, before positions are told."""
+    """Projections of one attention layer, before RoPE."""
 
     queries: Tensor
-    """(..., h, D), normed."""
+    """(..., h, D), after q_norm."""
     keys: Tensor
-    """(..., g, D), normed."""
+    """(..., g, D), after k_norm."""
     values: Tensor
     """(..., g, D)."""
     gate: Tensor
@@ -30,7 +28,7 @@ class Asked(NamedTuple):
 
 
 def ask(attention: Any, hidden: Tensor) -> Asked:
-    """Of hidden states (..., H)."""
+    """Projects hidden states (..., H)."""
     size = attention.head_dim
     queries, gate = attention.q_proj(hidden).unflatten(-1, (-1, 2 * size)).chunk(2, dim=-1)
     keys = attention.k_norm(attention.k_proj(hidden).unflatten(-1, (-1, size)))
@@ -39,27 +37,27 @@ def ask(attention: Any, hidden: Tensor) -> Asked:
 
 
 def attended(attention: Any, seen: Tensor, gate: Tensor) -> Tensor:
-    """(..., H) of what was seen, (..., h, D)."""
+    """Gates the attention's output ``seen`` (..., h, D) and projects it to (..., H)."""
     mixed: Tensor = attention.o_proj((seen * gate.sigmoid()).flatten(-2))
     return mixed
 
 
 class Written(NamedTuple):
-    """Of Gated DeltaNet, before the convolution."""
+    """Projections of one Gated DeltaNet layer, before the convolution."""
 
     inputs: Tensor
-    """(..., C): queries, keys and values, to be convolved."""
+    """(..., C): queries, keys and values, the convolution's input."""
     decay: Tensor
-    """(..., V): its logarithm, float32."""
+    """(..., V): log decay, float32."""
     beta: Tensor
     """(..., V)."""
     gate: Tensor
-    """(..., V E), for the norm of what is read."""
+    """(..., V E), gate of the output norm."""
 
 
 def write(delta: Any, hidden: Tensor, num_rows: int | None = None) -> Written:
-    """Of hidden states (..., H); of their first ``num_rows`` alone, all of which are multiplied (bits of a product, and
-    of a softplus, depend on how many numbers there are)."""
+    """Projects hidden states (..., H) and keeps the first ``num_rows``. Padding rows are multiplied too, because the
+    last bits of a matrix product and of a softplus depend on the number of rows."""
     projections = (delta.in_proj_qkv, delta.in_proj_a, delta.in_proj_b, delta.in_proj_z)
     inputs, speed, beta, gate = (projection(hidden)[:num_rows] for projection in projections)
     decay = -delta.A_log.float().exp() * F.softplus(speed.float() + delta.dt_bias)
@@ -67,7 +65,7 @@ def write(delta: Any, hidden: Tensor, num_rows: int | None = None) -> Written:
 
 
 def heads(delta: Any, mixed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Queries, keys (..., heads, D) and values (..., V, E) of what was convolved, (..., C)."""
+    """Splits the convolution's output (..., C) into queries, keys (..., heads, D) and values (..., V, E)."""
     queries, keys, values = mixed.split([delta.key_dim, delta.key_dim, delta.value_dim], dim=-1)
     size = delta.head_k_dim
     return (
@@ -78,6 +76,6 @@ def heads(delta: Any, mixed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def normed(delta: Any, read: Tensor, gate: Tensor) -> Tensor:
-    """(..., V E) of what was read, (..., V, E): what the layer's last projection takes."""
+    """Applies the gated output norm: ``read`` (..., V, E) -> (..., V E), the input of the output projection."""
     size = delta.head_v_dim
     return delta.norm(read.reshape(-1, size), gate.reshape(-1, size)).reshape(gate.shape)  # type: ignore[no-any-return]

@@ -1,9 +1,9 @@
-"""Qwen3.5's multi-token prediction: one more attention layer, which guesses the token after the one that is known.
+"""Qwen3.5's multi-token prediction: an extra attention layer that predicts the token after a known one.
 
-A projection makes one input of a token and the network's hidden state before it, the layer looks back over such inputs,
-and the network's own LM head reads from its output which token follows. Fed with its own output it goes on guessing.
-Source: the tensors of public Qwen3.5 checkpoints (``mtp.*``), and how vLLM puts them together; transformers leaves them
-out.
+A projection merges a token's embedding with the network's hidden state before it, the layer attends causally over
+these inputs, and the network's own LM head predicts the next token from its output. Fed with its own output it
+predicts further tokens. Source: the tensors of public Qwen3.5 checkpoints (``mtp.*``), and vLLM's implementation;
+transformers omits it.
 """
 
 # T tokens, H hidden
@@ -20,13 +20,12 @@ from dual_system.models.ponder.network import Ponder
 
 
 class MtpHead(nn.Module):
-    """A checkpoint's block as modules; beyond ``merge`` it is a text stack of one layer, as Qwen3.5's is of many."""
+    """A checkpoint's MTP block as modules; after ``merge`` it is a text stack like Qwen3.5's, with one layer."""
 
     def __init__(self, ponder: Ponder) -> None:
-        """Copies ``ponder.mtp`` to the device and into the dtype of ``ponder``.
+        """Copies ``ponder.mtp`` to the device and dtype of ``ponder``.
 
-        Raises ValueError if it is not one block of one layer: what a second one would be fed with, no public
-        checkpoint tells.
+        Raises ValueError unless the block has exactly one layer: no public checkpoint shows a second one's inputs.
         """
         super().__init__()
         num_layers = len({name.split(".")[2] for name in ponder.mtp if name.startswith(f"{MTP_PREFIX}layers.")})
@@ -48,7 +47,7 @@ class MtpHead(nn.Module):
         self.rotary_emb: Any = ponder.qwen.model.language_model.rotary_emb
 
     def merge(self, embeds_TH: Tensor, hidden_TH: Tensor) -> Tensor:
-        """What the layer reads (T, H): of each token its embedding, and the last hidden state before it."""
+        """Input of the layer (T, H), from each token's embedding and the last hidden state before it."""
         both = (self.pre_fc_norm_embedding(embeds_TH), self.pre_fc_norm_hidden(hidden_TH))
         merged_TH: Tensor = self.fc(torch.cat(both, dim=-1))
         return merged_TH

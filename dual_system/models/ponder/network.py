@@ -1,11 +1,11 @@
 """PONDER: Qwen3.5 read as a context engine; its hidden states at the carrier positions are the cognition C_t.
 
 Paper, section 3.1. The network is transformers' ``Qwen3_5ForConditionalGeneration`` (Gated DeltaNet and
-attention layers, vision tower); this file only decides how it is called: explicit positions, whole rows,
-and the LM head at asked positions only (at 248,320 rows, logits of a whole episode are gigabytes). Serving runs
-the same modules over a few tokens at a time; how is the daemon's business (``ponder_server/decoder.py``).
+attention layers, vision tower); this file defines how it is called: explicit positions, whole rows, and the
+LM head at selected positions only (at 248,320 rows, logits of a whole episode are gigabytes). Serving runs
+the same modules over a few tokens at a time (``ponder_server/decoder.py``).
 
-# B batch, T tokens, H hidden, N positions asked for, V vocabulary
+# B batch, T tokens, H hidden, N selected positions, V vocabulary
 """
 
 from collections.abc import Sequence
@@ -30,12 +30,12 @@ from dual_system.models.ponder.vision import image_tokens
 from dual_system.models.ponder.vocabulary import Vocabulary
 
 FLOAT32_PARAMETERS = ("linear_attn.A_log", "linear_attn.norm.weight")
-"""Ends of the names of what stays float32 in every dtype, as in public Qwen3.5 checkpoints: A_log is the decay, which
-accumulates over thousands of tokens."""
+"""Name suffixes of parameters that stay float32 in every dtype, as in public Qwen3.5 checkpoints: A_log is the decay,
+whose error accumulates over thousands of tokens."""
 
 
 class Ponder(nn.Module):
-    """System 2. Build it with :meth:`random`, or with ``ponder_checkpoint.load_ponder``."""
+    """System 2. Build it with :meth:`random`, or with ``checkpoint.load_ponder``."""
 
     def __init__(
         self,
@@ -49,7 +49,7 @@ class Ponder(nn.Module):
         """Allocates the network and leaves its weights undefined, for :meth:`random` or a checkpoint to fill.
 
         Raises ValueError if the carriers or the state's tokens do not fit into the embedding table, or if ``image_px``
-        is not what ``context_format`` says.
+        contradicts ``context_format``.
         """
         super().__init__()
         text: Any = qwen_config.text_config
@@ -69,16 +69,16 @@ class Ponder(nn.Module):
         self.format = context_format
         self.image_px = image_px
         self.is_random = True
-        """The carriers were never trained: cognition is noise. A trainer sets it False, checkpoints keep it."""
+        """True if the carriers were never trained: cognition is noise. Training sets it False; checkpoints store it."""
         self.mtp: dict[str, Tensor] = {}
-        """The checkpoint's multi-token prediction block, by name: a draft for serving, and written back as it came."""
+        """The checkpoint's multi-token prediction block, by name: a draft for serving, saved unchanged."""
         qwen: Any = skeleton(qwen_config).to(dtype=dtype)
         for name, parameter in qwen.named_parameters():
             if name.endswith(FLOAT32_PARAMETERS):
                 parameter.data = parameter.data.float()
         qwen.to_empty(device=device)
-        qwen.tie_weights()  # to_empty makes a separate tensor of every name
-        # Frequencies are buffers that no checkpoint holds; to_empty left them undefined.
+        qwen.tie_weights()  # to_empty gives every name its own tensor
+        # Rotary frequencies are buffers that no checkpoint holds; to_empty left them undefined.
         qwen.model.language_model.rotary_emb = Qwen3_5TextRotaryEmbedding(text).to(device)
         qwen.model.visual.rotary_pos_emb = Qwen3_5VisionRotaryEmbedding(vision).to(device)
         self.qwen: Any = qwen.eval()
@@ -93,9 +93,9 @@ class Ponder(nn.Module):
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float32,
     ) -> Self:
-        """A network whose weights depend on ``config`` and ``seed`` alone; no global random state moves.
+        """A network whose weights depend on ``config`` and ``seed`` alone; global random state is untouched.
 
-        Without a ``vocabulary`` it speaks the tiny one.
+        Without a ``vocabulary`` it uses :meth:`Vocabulary.tiny`.
         """
         if vocabulary is None:
             vocabulary = Vocabulary.tiny()
@@ -122,7 +122,7 @@ class Ponder(nn.Module):
 
     @property
     def layers(self) -> list[Any]:
-        """Of the vision tower, then of the language model."""
+        """Layers of the vision tower, then of the language model."""
         model = self.qwen.model
         return [*model.visual.blocks, *model.language_model.layers]
 
@@ -152,7 +152,7 @@ class Ponder(nn.Module):
     def embed(self, ids_T: Sequence[int] | npt.NDArray[np.integer], frames_NHW3: Tensor | None = None) -> Tensor:
         """Input embeddings (T, H): rows of the table, with the frames' vision tokens at the image positions.
 
-        Raises ValueError if the frames have another number of tokens than ``ids`` has image positions.
+        Raises ValueError unless the frames have as many tokens as ``ids`` has image positions.
         """
         ids = np.asarray(ids_T, np.int64)
         index_T = torch.from_numpy(ids).to(self.device)
@@ -170,25 +170,25 @@ class Ponder(nn.Module):
     def forward(self, embeds_BTH: Tensor, positions_4BT: Tensor) -> Tensor:
         """Final hidden states (B, T, H), after the last norm, of whole contexts; causal.
 
-        Rows may be padded on the right, where nothing follows.
+        Rows may be padded on the right: causality keeps padding from affecting real tokens.
         """
         output = self.qwen.model.language_model(
             inputs_embeds=embeds_BTH,
             position_ids=positions_4BT,
             use_cache=False,
-            # A dict goes to the layers as it is: transformers neither builds a mask nor guesses that rows are packed.
+            # A dict is passed to the layers unchanged: transformers builds no mask and does not detect packed rows.
             attention_mask={"full_attention": None, "linear_attention": None},
         )
         hidden_BTH: Tensor = output.last_hidden_state
         return hidden_BTH
 
     def logits(self, hidden_NH: Tensor) -> Tensor:
-        """LM logits (N, V) at the positions whose hidden states are given."""
+        """LM logits (N, V) for the hidden states of selected positions."""
         logits_NV: Tensor = self.qwen.lm_head(hidden_NH)
         return logits_NV
 
     def encode_row(self, row: Row, frames_NHW3: Tensor | None) -> Tensor:
-        """Final hidden states (T, H) of a whole row in one cacheless pass: how training sees an episode."""
+        """Final hidden states (T, H) of a whole row in one pass without a cache, as in training."""
         positions_4T, _ = self.format.positions(row.ids)
         positions_4BT = torch.from_numpy(positions_4T)[:, None].to(self.device)
         hidden_BTH: Tensor = self(self.embed(row.ids, frames_NHW3)[None], positions_4BT)
@@ -196,13 +196,13 @@ class Ponder(nn.Module):
 
 
 def token_px(qwen_config: Qwen3_5Config) -> int:
-    """Side in pixels of what one image token covers."""
+    """Side in pixels of the square that one image token covers."""
     vision: Any = qwen_config.vision_config
     return int(vision.patch_size * vision.spatial_merge_size)
 
 
 def image_grid(qwen_config: Qwen3_5Config, image_px: tuple[int, int]) -> tuple[int, int]:
-    """Tokens of one frame as (rows, columns). ValueError if they do not come out even."""
+    """Tokens of one frame as (rows, columns). ValueError if ``image_px`` is no multiple of the token's side."""
     side_px = token_px(qwen_config)
     height, width = image_px
     if height < side_px or width < side_px or height % side_px or width % side_px:
@@ -215,7 +215,7 @@ def skeleton(qwen_config: Qwen3_5Config) -> nn.Module:
     build: Any = Qwen3_5ForConditionalGeneration._from_config
     with torch.device("meta"):
         model: Any = build(qwen_config, attn_implementation="sdpa")
-        if find_spec("fla") is None:  # whose kernels transformers' own layer calls
+        if find_spec("fla") is None:  # with fla, transformers' own layer is fast already
             text: Any = qwen_config.text_config
             for index, layer in enumerate(model.model.language_model.layers):
                 if text.layer_types[index] == "linear_attention":
@@ -225,11 +225,11 @@ def skeleton(qwen_config: Qwen3_5Config) -> nn.Module:
 
 @torch.no_grad()
 def fill_randomly(qwen: nn.Module, *, seed: int) -> None:
-    """Fills every parameter from one generator: a network that has no training but a working memory.
+    """Fills every parameter from one generator: an untrained network whose hidden states depend on its whole context.
 
-    Unlike the usual std of 0.02, activations keep their size through the layers, and the recurrent layers get
-    decays from "hardly ever" to "within a few tokens", so that hidden states depend on images and on the past
-    and a wrong cache shows. Drawn on the CPU in float32, in order of name: the same weights on any device.
+    Unlike with the usual std of 0.02, activations keep their scale through the layers, and the recurrent layers' decay
+    times range from a few tokens to almost endless, so that hidden states depend on images and on the past, and tests
+    detect a wrong cache. Drawn on the CPU in float32, in order of name: the same weights on any device.
     """
     generator = torch.Generator().manual_seed(seed)
     for name, parameter in sorted(qwen.named_parameters()):

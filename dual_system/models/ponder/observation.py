@@ -1,11 +1,11 @@
-"""What PONDER reads of one observation: which images, of which size, and tokens for the robot's state, if any.
+"""PONDER's inputs from one observation: images of the network's size, and tokens for the robot's state, if any.
 
 The paper's PONDER reads the whole picture of every camera and nothing else (`WHOLE_VIEWS`). A checkpoint that was
-trained to read otherwise declares it in its ponder.json (`checkpoint`); training, serving and the clock's opening all
-go through the same reader. Pure numpy, because the daemon's node needs no torch.
+trained on other inputs declares them in its ponder.json (`checkpoint`); training, serving and the clock's opening all
+use the same reader. Pure numpy, because the daemon's node needs no torch.
 """
 
-# V views (one per camera), E images that the network reads, h w its image_px
+# V views (one per camera), E images for the network, h w its image_px
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Size: TypeAlias = tuple[int, int]
 
 
 class ObservationReader(Protocol):
-    """How one observation becomes images and tokens."""
+    """Maps one observation to images and tokens."""
 
     @property
     def state_rows(self) -> range:
@@ -31,33 +31,33 @@ class ObservationReader(Protocol):
         ...
 
     def num_images(self, num_views: int) -> int:
-        """E for so many views."""
+        """E for ``num_views`` views."""
         ...
 
     def images(self, views: Sequence[Pictures], image_px: Size) -> Pictures:
         """The views (height, width, 3) uint8, in camera order, as (E, h, w, 3) uint8.
 
         Raises:
-            ValueError: a camera is missing, a view is no uint8 RGB picture, or its size is not readable.
+            ValueError: a camera is missing, a view is no uint8 RGB picture, or its size is not supported.
         """
         ...
 
     def state_ids(self, proprio: ArrayLike | None) -> tuple[int, ...]:
-        """The tokens of the robot's state (8,), always as many. Raises ValueError if they need one and none came."""
+        """Tokens of the robot's state (8,), a fixed number. Raises ValueError if it reads the state and got None."""
         ...
 
     def readable_sizes(self, image_px: Size) -> list[Size]:
-        """Camera sizes that can be read, smallest first; never empty."""
+        """Supported camera sizes, smallest first; never empty."""
         ...
 
     def unreadable(self, sizes: Sequence[Size], image_px: Size) -> tuple[int, str] | None:
-        """The first camera, by index, whose pictures cannot be read at its size, and the sizes that can."""
+        """Index of the first camera whose size is not supported, and the supported sizes as text; None if all are."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class WholeViews:
-    """Every camera's whole picture, at exactly the network's size: the paper's PONDER."""
+    """Reads every camera's whole picture, at exactly the network's size: the paper's PONDER."""
 
     @property
     def state_rows(self) -> range:
@@ -85,7 +85,7 @@ WHOLE_VIEWS = WholeViews()
 
 
 def check_pictures(views: Sequence[Pictures], size: Size | None = None) -> None:
-    """Raises ValueError unless every view is a uint8 RGB picture, and of ``size`` if one is given."""
+    """Raises ValueError unless every view is a uint8 RGB picture, of ``size`` if given."""
     for index, view in enumerate(views):
         is_picture = view.dtype == np.uint8 and view.ndim == 3 and view.shape[2] == 3
         if not is_picture or (size is not None and view.shape[:2] != size):
@@ -94,7 +94,7 @@ def check_pictures(views: Sequence[Pictures], size: Size | None = None) -> None:
 
 
 def check_cameras(sizes: Sequence[Size], reader: ObservationReader, image_px: Size) -> None:
-    """Raises ValueError, naming the sizes that would do, unless PONDER can read cameras of these sizes."""
+    """Raises ValueError, naming the supported sizes, unless PONDER can read cameras of these sizes."""
     found = reader.unreadable(sizes, image_px)
     if found is not None:
         camera, wanted = found

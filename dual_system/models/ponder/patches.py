@@ -1,7 +1,7 @@
 """Camera frames to Qwen3.5's patches, in torch, so that it runs where the model runs.
 
-Equal to the public image processor (transformers' ``Qwen2VLImageProcessorPil`` with mean = std = 0.5) to the
-last bit for frames it does not resize. Nothing is resized here: pictures come as ``eyes.see`` gives them.
+Bit-identical to the public image processor (transformers' ``Qwen2VLImageProcessorPil`` with mean = std = 0.5) for
+frames that it does not resize. Nothing is resized here: frames come from ``ObservationReader.images``.
 """
 
 import torch

@@ -1,8 +1,8 @@
-"""Activation checkpointing for PONDER: a layer keeps what came in, and is run again on the way back.
+"""Activation checkpointing for PONDER: a layer stores only its input and is run again in the backward pass.
 
-An episode of some minutes is tens of thousands of tokens, and what 32 layers leave of each for the way back is most
-of a GPU's memory. Recomputed, a layer leaves its input alone; a step takes its forward once more, and its numbers are
-the same. POUNCE's invocations are short, and are not recomputed: `pp-train --max-invocations` bounds them.
+An episode of some minutes is tens of thousands of tokens, and the activations of 32 layers take most of a GPU's
+memory. Checkpointing costs a second forward pass per step; the gradients are the same. POUNCE's invocations are short
+and are not recomputed: `pp-train --max-invocations` bounds them.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from dual_system.models.ponder.network import Ponder
 
 
 def recompute_layers(ponder: Ponder) -> None:
-    """From now on the language model's layers do so whenever gradients are wanted.
+    """Turns on activation checkpointing for the language model's layers, in place.
 
     Raises:
-        TypeError: transformers' layers cannot any more.
+        TypeError: transformers' layers no longer support it.
     """
     for layer in ponder.qwen.model.language_model.layers:
         if not isinstance(layer, GradientCheckpointingLayer):
             raise TypeError(f"expected a GradientCheckpointingLayer of transformers, came {type(layer).__name__}")
         layer._gradient_checkpointing_func = partial(checkpoint, use_reentrant=False)
         layer.gradient_checkpointing = True
-        # transformers asks for it. Of the layer alone: what is inside stays as in serving, without dropout.
+        # transformers checkpoints only in training mode. Its submodules stay in eval mode, without dropout.
         layer.training = True

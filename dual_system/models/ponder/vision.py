@@ -1,8 +1,8 @@
 """Qwen3.5's vision tower over many frames of one size at once.
 
-transformers packs frames of any size into one long row and attends to each in a Python loop. Ours are alike: the same
-modules run over a batch of frames, with one product for all their attention. Only the calling is ours; the weights,
-their names and the result are transformers' (held equal in tests).
+transformers packs frames of any size into one long row and attends to each in a Python loop. Our frames have one size,
+so the same modules run over a batch of frames with one attention product. The weights, their names and the result are
+transformers' (a test compares them).
 """
 
 # N frames, P patches of a frame (in blocks of m x m, as they are merged), C vision width, h heads, D head dim
@@ -28,7 +28,7 @@ def image_tokens(tower: Any, patches: Tensor, grid: tuple[int, int]) -> Tensor:
     """
     rows, columns = grid
     merge, heads = int(tower.config.spatial_merge_size), int(tower.config.num_heads)
-    embedding = tower.patch_embed.proj  # its kernel covers one patch and is moved by one patch: a product
+    embedding = tower.patch_embed.proj  # kernel size and stride are one patch: a matrix product
     x_NPC = F.linear(patches, embedding.weight.flatten(1), embedding.bias).unflatten(0, (-1, rows * columns))
     x_NPC = x_NPC + _position_embeddings(tower, rows, columns, merge).to(x_NPC.dtype)
     head_dim = x_NPC.shape[-1] // heads
@@ -46,7 +46,7 @@ def image_tokens(tower: Any, patches: Tensor, grid: tuple[int, int]) -> Tensor:
 def _attended(q_NhPD: Tensor, k_NhPD: Tensor, v_NhPD: Tensor) -> Tensor:
     if q_NhPD.device.type != "cpu":
         return F.scaled_dot_product_attention(q_NhPD, k_NhPD, v_NhPD)
-    # On a CPU the fused kernel's way back takes several times as long as two plain products.
+    # On a CPU the fused kernel's backward pass takes several times as long as two plain products.
     weights = (q_NhPD @ k_NhPD.transpose(-1, -2) * q_NhPD.shape[-1] ** -0.5).softmax(dim=-1, dtype=torch.float32)
     return weights.to(v_NhPD.dtype) @ v_NhPD
 
@@ -72,9 +72,9 @@ def _position_embeddings(tower: Any, rows: int, columns: int, merge: int) -> Ten
 
 
 @functools.lru_cache(maxsize=16)
-@torch.inference_mode(False)  # what is kept may later meet a gradient
+@torch.inference_mode(False)  # the cached tensors may later be used with autograd
 def _rotation(rows: int, columns: int, merge: int, head_dim: int) -> tuple[Tensor, Tensor]:
-    """Cosines and sines (P, D): the first half of the frequencies turns with the row, the second with the column."""
+    """Cosines and sines (P, D): the first half of the frequencies encodes the row, the second the column."""
     spatial = head_dim // 2
     frequencies = 1.0 / _ROPE_BASE ** (torch.arange(0, spatial, 2, dtype=torch.float32) / spatial)
     places = torch.stack(torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij"), dim=-1)
@@ -84,7 +84,7 @@ def _rotation(rows: int, columns: int, merge: int, head_dim: int) -> tuple[Tenso
 
 
 def _in_blocks(grid_RCX: Tensor, merge: int) -> Tensor:
-    """(rows, columns, X) -> (P, X), the order in which patches come."""
+    """(rows, columns, X) -> (P, X), in the order of the patches."""
     rows, columns, _ = grid_RCX.shape
     blocks = grid_RCX.unflatten(1, (columns // merge, merge)).unflatten(0, (rows // merge, merge))
     return blocks.transpose(1, 2).flatten(0, 3)

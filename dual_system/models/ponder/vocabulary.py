@@ -1,8 +1,8 @@
-"""Which ids stand for which tokens: Qwen's tokenizer, with every control token looked up by name.
+"""Qwen's tokenizer, with every control token looked up by name.
 
-A checkpoint brings its own ``tokenizer.json``. Where there is none (tests, the demo), :meth:`Vocabulary.tiny`
-trains a small byte-level BPE on the spot with the same control tokens in the same order, so no id may be
-written down anywhere: T_yes is 248060 in one tokenizer and 400 in the other.
+A checkpoint has its own ``tokenizer.json``. Where there is none (tests, the demo), :meth:`Vocabulary.tiny` trains a
+small byte-level BPE with the same control tokens in the same order. So never hard-code an id: T_yes is 248060 in one
+tokenizer and 400 in the other.
 
 Source: Qwen3.5's public tokenizer files; T_yes and T_no: paper, appendix A.2.
 """
@@ -59,7 +59,7 @@ _TINY_NUM_BPE_TOKENS = 384
 
 
 class Vocabulary:
-    """A tokenizer whose control tokens are attributes and can never be smuggled in through text."""
+    """A tokenizer whose control tokens are attributes and cannot be injected through text."""
 
     def __init__(self, tokenizer: Tokenizer) -> None:
         missing = [name for name in REQUIRED_TOKENS if tokenizer.token_to_id(name) is None]
@@ -85,7 +85,7 @@ class Vocabulary:
 
     @classmethod
     def load(cls, directory: Path) -> Self:
-        """Reads ``tokenizer.json`` of a checkpoint folder; FileNotFoundError when it is not there."""
+        """Reads ``tokenizer.json`` of a checkpoint folder. Raises FileNotFoundError if it is missing."""
         path = directory / "tokenizer.json"
         if not path.is_file():
             raise FileNotFoundError(f"{path}: a checkpoint needs its tokenizer.json beside config.json.")
@@ -93,15 +93,15 @@ class Vocabulary:
 
     @classmethod
     def tiny(cls) -> Self:
-        """About 400 tokens, trained on a few subgoal texts."""
+        """A tokenizer of about 400 tokens, trained on a few subgoal texts."""
         return cls.trained_on(_TINY_CORPUS, num_tokens=_TINY_NUM_BPE_TOKENS + len(CONTROL_TOKENS))
 
     @classmethod
     def trained_on(cls, texts: Iterable[str], num_tokens: int) -> Self:
         """A byte-level BPE of at most ``num_tokens``, control tokens included: any UTF-8 text round-trips.
 
-        A small PONDER says the subgoals of its tasks in fewer tokens if these are the texts. Texts that hold few
-        different pairs give fewer tokens than asked for. Equal texts give the same tokenizer.
+        Trained on the subgoals of its tasks, a small PONDER generates them in fewer tokens. Texts with few distinct
+        pairs give fewer than ``num_tokens``. Deterministic in ``texts``.
 
         Raises ValueError if ``num_tokens`` has no room for the 256 bytes and the control tokens.
         """
@@ -128,10 +128,10 @@ class Vocabulary:
         return cls(tokenizer)
 
     def extended(self, texts: Iterable[str], num_tokens: int) -> Self:
-        """The same with as many pieces more as fit below id ``num_tokens``, of what ``texts`` say most often.
+        """A copy with more pieces, ids up to ``num_tokens``, merged from the most frequent pairs in ``texts``.
 
-        Every id keeps its meaning, control tokens included. A text whose words are single pieces already is encoded as
-        before. Equal texts give the same tokenizer. Only for tokenizers of `trained_on`.
+        Every id keeps its meaning, control tokens included. Texts whose words are single pieces already are encoded as
+        before. Deterministic in ``texts``. Only for tokenizers from `trained_on`.
         """
         split, normalise = self._tokenizer.pre_tokenizer.pre_tokenize_str, self._tokenizer.normalizer.normalize_str
         counts = Counter(word for text in texts for word, _ in split(normalise(text)))
@@ -152,7 +152,7 @@ class Vocabulary:
                 next_id += 1
             model["merges"].append([first, second])
             words = {word: _merged(pieces, first, second) for word, pieces in words.items()}
-        # Loaded without, they would be numbered anew behind the pieces.
+        # Without this, loading would renumber the control tokens behind the pieces.
         model["vocab"] |= {each["content"]: each["id"] for each in state["added_tokens"]}
         return type(self)(Tokenizer.from_str(json.dumps(state)))
 
@@ -161,7 +161,7 @@ class Vocabulary:
         self._tokenizer.save(str(directory / "tokenizer.json"))
 
     def id_of(self, name: str) -> int:
-        """Id of one token by its exact name; KeyError when the tokenizer has no such token."""
+        """Id of one token by its exact name. Raises KeyError if the tokenizer has no such token."""
         token_id = self._tokenizer.token_to_id(name)
         if token_id is None:
             raise KeyError(f"the tokenizer has no token {name!r}")
@@ -170,8 +170,8 @@ class Vocabulary:
     def encode(self, text: str) -> tuple[int, ...]:
         """Ids of plain text. Raises ValueError if the text spells a control token.
 
-        Qwen's tokenizers extract control tokens from ordinary text, so an instruction that contains
-        ``<|fim_prefix|>`` would otherwise open a payload.
+        Qwen's tokenizers parse control tokens in ordinary text, so an instruction could otherwise inject
+        ``<|fim_prefix|>``.
         """
         ids = tuple(self._tokenizer.encode(text, add_special_tokens=False).ids)
         smuggled = self.control_ids.intersection(ids)
@@ -181,16 +181,16 @@ class Vocabulary:
         return ids
 
     def decode(self, ids: Sequence[int]) -> str:
-        """Text of ``ids``, control tokens included by name; bytes that are no UTF-8 become U+FFFD."""
+        """Text of ``ids``, with control tokens by name; bytes that are not UTF-8 become U+FFFD."""
         return str(self._tokenizer.decode(list(ids), skip_special_tokens=False))
 
     def names(self) -> Mapping[str, int]:
-        """Every token name with its id."""
+        """All token names and their ids."""
         return dict(self._tokenizer.get_vocab(with_added_tokens=True))
 
 
 def _merged(pieces: Sequence[str], first: str, second: str) -> list[str]:
-    """Every ``first`` that is followed by ``second``, in one piece with it."""
+    """Merges every ``first`` that is followed by ``second``."""
     merged: list[str] = []
     for piece in pieces:
         if piece == second and merged and merged[-1] == first:

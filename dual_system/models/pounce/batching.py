@@ -1,4 +1,4 @@
-"""Several moments as one batch: what may be padded is, what may not is kept apart."""
+"""Batches of POUNCE inputs: pi0.5's are padded; GR00T's are grouped by length, because it attends to padding."""
 
 # B moments, T text tokens
 
@@ -11,11 +11,11 @@ from dual_system.models.groot.pounce import GrootInputs
 from dual_system.models.pi05.pounce import PounceInputs
 
 PADDING_ID = 0
-"""Any token will do: pi0.5 masks it."""
+"""Any token id would do: pi0.5 masks it."""
 
 
 def joined_pi05(inputs: Sequence[PounceInputs]) -> PounceInputs:
-    """One batch of all. Shorter prompts are padded on the right: pi0.5 neither sees nor counts padding."""
+    """Batches all inputs. Shorter prompts are padded on the right: pi0.5 masks padding and gives it no position."""
     num_tokens = max(one.token_ids.shape[1] for one in inputs)
     cognition, is_null = _joined_cognition([one.cognition for one in inputs])
     states = [one.state for one in inputs]
@@ -32,7 +32,7 @@ def joined_pi05(inputs: Sequence[PounceInputs]) -> PounceInputs:
 
 
 def joined_groot(inputs: Sequence[GrootInputs]) -> GrootInputs:
-    """One batch of `of_equal_length` moments."""
+    """Batches inputs of one group of `of_equal_length`."""
     cognition, is_null = _joined_cognition([one.cognition for one in inputs])
     return GrootInputs(
         images=torch.cat([one.images for one in inputs]),
@@ -47,7 +47,7 @@ def joined_groot(inputs: Sequence[GrootInputs]) -> GrootInputs:
 
 
 def of_equal_length(inputs: Sequence[GrootInputs]) -> list[list[int]]:
-    """Indices of the moments that may share a batch: GR00T attends to padding, so there must be none."""
+    """Groups the indices of inputs with equal prompt length, which may share a batch without padding."""
     groups: dict[int, list[int]] = {}
     for index, one in enumerate(inputs):
         groups.setdefault(one.token_ids.shape[1], []).append(index)
@@ -55,12 +55,12 @@ def of_equal_length(inputs: Sequence[GrootInputs]) -> list[list[int]]:
 
 
 def _padded(values_1T: Tensor, num_tokens: int) -> Tensor:
-    """False for masks, as 0 is."""
+    """Pads on the right with `PADDING_ID`, which is False in a mask."""
     return torch.nn.functional.pad(values_1T, (0, num_tokens - values_1T.shape[1]), value=PADDING_ID)
 
 
 def _joined_cognition(cognitions: Sequence[Tensor | None]) -> tuple[Tensor | None, Tensor | None]:
-    """Cognition and which of it is null; zeros stand where the learned null will."""
+    """Cognition (B, K, H) and a mask of its null samples; a null sample is zeros, which the learned null replaces."""
     given = next((one for one in cognitions if one is not None), None)
     if given is None:
         return None, None

@@ -1,6 +1,6 @@
 """A POUNCE checkpoint folder: config.json, model.safetensors and a tokenizer, all that acting needs.
 
-The format in config.json says which family is inside; a public folder is told by its tensor names.
+The format in config.json names the family; a public folder's family is recognised by its tensor names.
 """
 
 import hashlib
@@ -71,15 +71,15 @@ AnyStoredConfig: TypeAlias = StoredConfig | StoredGrootConfig
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PounceBundle:
-    """A model with what surrounds it: how to read text, and what its numbers mean on the robot."""
+    """A model with its tokenizer and the statistics that map its numbers to the robot."""
 
     model: AnyPounce
     tokenizer: AnyTokenizer
     statistics: RobotStatistics = ROBOMME
     is_random: bool
-    """True where the weights were drawn, not trained: nothing it does is skill."""
+    """True if the weights are random, not trained."""
     has_fresh_prefix: bool
-    """True where the cognition prefix is untrained, though pi0.5 itself may be."""
+    """True if the cognition prefix is untrained, even if the rest is trained."""
 
     def __post_init__(self) -> None:
         config = self.model.config
@@ -134,7 +134,7 @@ def random_bundle(
     statistics: RobotStatistics = ROBOMME,
     tokenizer: AnyTokenizer | None = None,
 ) -> PounceBundle:
-    """A bundle that needs no file: seeded random weights and a tiny tokenizer, unless another is given."""
+    """A bundle without files: seeded random weights, and a tiny tokenizer unless another is given."""
     if tokenizer is None:
         is_pi05 = isinstance(config, PounceConfig)
         tokenizer = tiny_tokenizer_for_random_weights() if is_pi05 else tiny_eagle_tokenizer_for_random_weights()
@@ -156,7 +156,7 @@ def save_bundle(bundle: PounceBundle, folder: Path) -> None:
 
 
 def declares_config(folder: Path) -> bool:
-    """Whether a folder is ours: its config.json says what POUNCE reads. A public folder's does not."""
+    """Whether a folder's config.json is in our format; a public folder's is not."""
     return _read_config(folder / CONFIG_FILE) is not None
 
 
@@ -168,16 +168,16 @@ def load_bundle(
     tokenizer: Path | None = None,
     prefix_seed: int = 0,
 ) -> PounceBundle:
-    """Reads our own folder, or a public one, which acts with RoboMME's statistics unless others are given.
+    """Reads our own folder, or a public one, which gets RoboMME's statistics unless others are given.
 
     Public folders: openpi's pi0.5 (PyTorch, or JAX in ``params/``) and lerobot's; NVIDIA's GR00T N1.5, in shards or
     not, and lerobot's ``groot``.
 
     Args:
-        config: for a public folder; default `pi05_base()`, or for GR00T what the folder itself says.
+        config: for a public folder; default `pi05_base()`, or for GR00T the folder's own.
         statistics: for a public folder; ``config`` must be in their action space.
-        tokenizer: its file; default the folder's tokenizer.model (pi0.5) or tokenizer.json (GR00T).
-        prefix_seed: draws the cognition prefix where the folder has none.
+        tokenizer: tokenizer file; default the folder's tokenizer.model (pi0.5) or tokenizer.json (GR00T).
+        prefix_seed: seed of the cognition prefix if the folder has none.
 
     Raises:
         FileNotFoundError: no weights, or no tokenizer anywhere.
@@ -187,7 +187,7 @@ def load_bundle(
     """
     is_jax = (folder / JAX_FOLDER / METADATA_FILE).is_file()
     if not is_jax:
-        weights_files(folder / WEIGHTS_FILE)  # a folder without any is told so before anything else of it is judged
+        weights_files(folder / WEIGHTS_FILE)  # a folder without weights fails here, before other checks
     stored = _read_config(folder / CONFIG_FILE)
     if stored is not None:
         for name, given in (("config", config), ("statistics", statistics)):
@@ -209,7 +209,7 @@ def load_bundle(
 
 
 def _load_jax(model: AnyPounce, folder: Path) -> bool:
-    """Returns False: openpi knows no cognition prefix."""
+    """Returns False: openpi has no cognition prefix."""
     if not isinstance(model, Pounce):
         raise ValueError(f"checkpoint {folder} is openpi's JAX pi0.5, its config is GR00T's")
     load_jax_weights(model, folder / JAX_FOLDER)

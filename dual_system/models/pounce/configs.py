@@ -21,9 +21,9 @@ ROBOMME_HORIZON = 20
 """One second of 20 Hz playback (paper B.1)."""
 GROOT_HORIZON = 16
 GROOT_PROJECTOR_STD = 1e-3
-"""Of a fresh W_c (the paper gives it for GR00T)."""
+"""Initial std of W_c (the paper gives it for GR00T)."""
 TINY_IMAGE_TOKEN_ID = 261
-"""Of ``<IMG_CONTEXT>`` in `groot_prompt.tiny_eagle_tokenizer_for_random_weights`."""
+"""Id of ``<IMG_CONTEXT>`` in `groot.prompt.tiny_eagle_tokenizer_for_random_weights`."""
 
 
 def pi05_base(*, num_carriers: int = 1, cognition_size: int = 4096, horizon: int = ROBOMME_HORIZON) -> PounceConfig:
@@ -42,8 +42,8 @@ def pi05_base(*, num_carriers: int = 1, cognition_size: int = 4096, horizon: int
 def tiny_cpu(*, num_carriers: int = 1, cognition_size: int = 64, horizon: int = ROBOMME_HORIZON) -> PounceConfig:
     """A network of the same parts that one CPU thread runs at 20 Hz; for random weights and tests.
 
-    Frames are resized to the public 224 px but cut into 28 px patches, 64 a view. With the public 14 px,
-    256 a view, attention doubles the time of an invocation.
+    Frames are resized to the public 224 px but cut into 28 px patches, 64 per view. With the public 14 px,
+    256 per view, attention doubles the time of an invocation.
     """
     return PounceConfig(
         pi05=Pi05Config(
@@ -76,7 +76,7 @@ def groot_n1_5(*, num_carriers: int = 1, cognition_size: int = 4096, horizon: in
 
 
 def tiny_groot(*, num_carriers: int = 1, cognition_size: int = 64, horizon: int = ROBOMME_HORIZON) -> GrootPounceConfig:
-    """`tiny_cpu` with GR00T's parts. Twenty rows, so that it plays the same schedules."""
+    """`tiny_cpu` with GR00T's parts, and the same horizon, so that it fits the same schedules."""
     return GrootPounceConfig(
         groot=GrootConfig(
             eagle=EagleConfig(
@@ -102,5 +102,5 @@ def tiny_groot(*, num_carriers: int = 1, cognition_size: int = 64, horizon: int 
 
 
 def in_space(config: Config, space: ActionSpace) -> Config:
-    """Returns the configuration for a network that answers in an action space; no weight has another shape."""
+    """Returns the configuration for another action space; the shapes of the weights do not change."""
     return replace(config, robot_action_dim=num_dims(space), robot_state_dim=num_dims(space))

@@ -1,4 +1,4 @@
-"""The action models behind one set of names: built, drawn, loaded and saved by what their config is."""
+"""One interface to both action models, pi0.5 and GR00T: build, initialise, load and save by the config's type."""
 
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -19,7 +19,7 @@ Family: TypeAlias = Literal["pi05", "groot"]
 AnyPounce: TypeAlias = Pounce | GrootPounce
 AnyPounceConfig: TypeAlias = PounceConfig | GrootPounceConfig
 
-# Part of a name that every file of the family holds, whatever policy class wrote it.
+# Part of a tensor name in every file of the family, whatever policy class wrote it.
 _MARKS: dict[Family, str] = {"pi05": "paligemma_with_expert.", "groot": "backbone.eagle_model."}
 
 
@@ -28,7 +28,7 @@ def family_of_config(config: AnyPounceConfig) -> Family:
 
 
 def blank_model(config: AnyPounceConfig) -> AnyPounce:
-    """Returns the model on the meta device, to be loaded into."""
+    """Returns the model on the meta device, for loading."""
     with torch.device("meta"):
         return Pounce(config) if isinstance(config, PounceConfig) else GrootPounce(config)
 
@@ -47,7 +47,7 @@ def action_loss(
 ) -> torch.Tensor:
     """Returns the scalar L_fm over the robot's action dims. Raises TypeError for the other family's inputs.
 
-    ``num_committed_B``: how many of the first rows are given (`committed`); pi0.5 only.
+    ``num_committed_B``: number of committed first rows (`committed`); pi0.5 only.
     """
     if isinstance(model, Pounce) and isinstance(inputs, PounceInputs):
         return model.loss(inputs, actions_BNA, noise_BNA, time_B, num_committed_B=num_committed_B)
@@ -57,18 +57,18 @@ def action_loss(
 
 
 def sample_times(model: AnyPounce, count: int, generator: torch.Generator) -> torch.Tensor:
-    """Draws training times, (count,) float32, as the family was pretrained with; their directions are opposite."""
+    """Draws training times, (count,) float32, from the family's distribution; the families' t run in opposite ways."""
     draw = flow.sample_times if isinstance(model, Pounce) else groot_flow.sample_times
     return draw(count, generator)
 
 
 def max_committed_rows(config: AnyPounceConfig) -> int:
-    """The most rows that a chunk is given to continue, in training and by ``--continuity trained``; 0 for GR00T."""
+    """Largest number of committed rows, in training and with ``--continuity trained``; 0 for GR00T."""
     return config.max_committed_rows if isinstance(config, PounceConfig) else 0
 
 
 def load_weights(model: AnyPounce, path: Path) -> bool:
-    """Loads a public file; returns whether it held a cognition prefix. See `pi05_weights` and `groot_weights`."""
+    """Loads a public file; returns whether it held a cognition prefix. See `pi05.weights` and `groot.weights`."""
     if isinstance(model, Pounce):
         return pi05_weights.load_weights(model, path)
     return groot_weights.load_weights(model, path)
@@ -100,10 +100,10 @@ def tensor_shapes(path: Path) -> dict[str, tuple[int, ...]]:
 
 
 def family_of(path: Path) -> Family:
-    """Tells from its tensor names which model a file holds.
+    """Recognises by tensor names which model a file holds.
 
     Raises:
-        WeightsError: neither.
+        WeightsError: it holds neither.
     """
     names = list(tensor_shapes(path))
     for family, mark in _MARKS.items():

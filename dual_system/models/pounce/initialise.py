@@ -15,7 +15,7 @@ _FAINT = 0.1
 
 
 def random_pounce(config: PounceConfig, seed: int) -> Pounce:
-    """Returns a CPU float32 model with seeded random weights: moves the arm, knows nothing.
+    """Returns a CPU float32 model with seeded random weights.
 
     Built on the meta device first, because the constructors of torch.nn draw from the global generator.
     """
@@ -32,8 +32,8 @@ def random_pounce(config: PounceConfig, seed: int) -> Pounce:
 
 @torch.no_grad()
 def open_gates(model: Pounce | GrootPounce) -> None:
-    """For training from scratch: every adaRMS norm of pi0.5's expert begins as a plain one with its residual let
-    through, and hardly listens to the time. Drawn like the rest, gates are as often negative as positive."""
+    """Prepares training from scratch: sets every adaRMS gate of pi0.5's expert to 1, with faint dependence on time.
+    Drawn like the other weights, gates would be negative as often as positive."""
     if not isinstance(model, Pounce):
         return
     for module in model.pi05.expert.modules():
@@ -44,7 +44,7 @@ def open_gates(model: Pounce | GrootPounce) -> None:
 
 
 def random_groot_pounce(config: GrootPounceConfig, seed: int) -> GrootPounce:
-    """`random_pounce` with GR00T inside."""
+    """`random_pounce` for GR00T."""
     with torch.device("meta"):
         model = GrootPounce(config)
     model.to_empty(device="cpu")
@@ -55,7 +55,7 @@ def random_groot_pounce(config: GrootPounceConfig, seed: int) -> GrootPounce:
 
 
 def initialise_prefix(model: Pounce | GrootPounce, generator: torch.Generator) -> None:
-    """Draws a fresh cognition prefix to the scale of the model's text embeddings; nothing to do at K = 0."""
+    """Draws a fresh cognition prefix at the scale of the model's text embeddings; does nothing at K = 0."""
     if model.cognition_prefix is None:
         return
     if isinstance(model, Pounce):
@@ -70,16 +70,16 @@ def initialise_prefix(model: Pounce | GrootPounce, generator: torch.Generator) -
 
 
 def initialise_pi05(pi05: Pi05, generator: torch.Generator) -> None:
-    """Keeps the variance of activations: weights N(0, 1 / fan-in), biases 0, norms the identity.
+    """Preserves the variance of activations: weights N(0, 1 / fan-in), biases 0, norms the identity.
 
-    The adaRMS layers are drawn like the rest. Public training starts them at zero, which shuts every gate:
-    such a model does not look at its images, and a test on it would show nothing.
+    The adaRMS layers are drawn like the rest. Public training starts them at zero, which closes every gate: such a
+    model ignores its images, and a test on it would show nothing.
     """
     _draw(pi05, generator)
 
 
 def initialise_groot(groot: Groot, generator: torch.Generator) -> None:
-    """As `initialise_pi05`; every embodiment gets weights of its own."""
+    """As `initialise_pi05`; every embodiment gets different weights."""
     _draw(groot, generator)
 
 

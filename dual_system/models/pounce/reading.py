@@ -1,4 +1,4 @@
-"""From one moment to the network's own batch of one, for each action model. Serving and training both read here."""
+"""Converts one observation to a batch of one for each action model; shared by serving and training."""
 
 # P image side in px
 
@@ -22,13 +22,13 @@ from dual_system.models.pi05.prompt import Tokenizer
 
 
 class Moment(Protocol):
-    """What an invocation is about: what the robot sees and is told, and which cognition it has."""
+    """Inputs of one invocation: instruction, frames, proprioception, and the cognition with its age."""
 
     @property
     def instruction(self) -> str: ...
     @property
     def frames(self) -> Sequence[NDArray[np.uint8] | None]:
-        """(h, w, 3) uint8 per camera; None for one that did not deliver."""
+        """(h, w, 3) uint8 per camera; None for a missing one."""
         ...
 
     @property
@@ -38,21 +38,21 @@ class Moment(Protocol):
 
     @property
     def cognition(self) -> Floats | None:
-        """(K, H); None in training, where it is on the graph, and for the learned null."""
+        """(K, H); None for the learned null, and in training, where it stays in the autograd graph."""
         ...
 
     @property
     def age_ns(self) -> int: ...
     @property
     def subgoal(self) -> str:
-        """What PONDER last told itself to do; empty before it did. Models with ``reads_subgoal`` read it."""
+        """PONDER's newest subgoal; empty before the first. Models with ``reads_subgoal`` read it."""
         ...
 
 
 def pi05_inputs(
     moment: Moment, config: PounceConfig, tokenizer: Tokenizer, statistics: RobotStatistics, device: torch.device
 ) -> PounceInputs:
-    """No mask hides anything but a missing camera.
+    """Inputs for pi0.5; its view mask is False only for missing cameras.
 
     Raises:
         ValueError: the prompt is too long.
@@ -61,7 +61,7 @@ def pi05_inputs(
     state = statistics.normalise_states(moment.proprio)
     has_token = config.state_input == "token"
     text = prompt.stateless_prompt_text if has_token else partial(prompt.prompt_text, state=state)
-    token_ids = tokenizer.encode(text(_told(moment, config.reads_subgoal)))
+    token_ids = tokenizer.encode(text(_instruction(moment, config.reads_subgoal)))
     _check_length(len(token_ids), config.max_prompt_tokens, moment.instruction)
     return PounceInputs(
         images=images.to(device),
@@ -81,15 +81,15 @@ def groot_inputs(
     statistics: RobotStatistics,
     device: torch.device,
 ) -> GrootInputs:
-    """A missing camera is a black picture: GR00T tells cameras apart by their order only, so none is left out.
+    """Inputs for GR00T. A missing camera is a black picture: GR00T identifies cameras by their order only.
 
     Raises:
         ValueError: the prompt is too long.
     """
     images, _ = camera_batch(moment.frames, config.image_px)
     num_patches = config.groot.eagle.vision.num_patches
-    told = _told(moment, config.reads_subgoal)
-    token_ids = tokenizer.encode(groot_prompt.prompt_text(told, config.num_cameras, num_patches))
+    instruction = _instruction(moment, config.reads_subgoal)
+    token_ids = tokenizer.encode(groot_prompt.prompt_text(instruction, config.num_cameras, num_patches))
     num_text = len(token_ids) - config.num_cameras * num_patches
     _check_length(num_text, config.max_prompt_tokens, moment.instruction)
     state = torch.zeros(1, config.groot.state_dim)
@@ -105,14 +105,14 @@ def groot_inputs(
     )
 
 
-def _told(moment: Moment, reads_subgoal: bool) -> str:
+def _instruction(moment: Moment, reads_subgoal: bool) -> str:
     return prompt.with_subgoal(moment.instruction, moment.subgoal) if reads_subgoal else moment.instruction
 
 
 def _cognition(moment: Moment, device: torch.device) -> Tensor | None:
     if moment.cognition is None:
         return None
-    # Copied into aligned memory: where a NumPy array happens to lie changes the last bit of a product.
+    # Copied into aligned memory: a NumPy array's alignment changes the last bit of a product.
     return torch.tensor(moment.cognition, device=device)[None]
 
 

@@ -1,5 +1,5 @@
-"""What `checkpoints/small` needs beyond the paper; imported only where one of its folders declares it.
+"""Extensions beyond the paper for `checkpoints/small`; imported only if one of its folders declares them.
 
-The demo's pair learned from scratch, so it reads one crop, tokens of the robot's state and cognition that is the code
-of a place. Nothing else in the project may depend on this package, and it goes with that pair.
+The demo's pair was trained from scratch, so it reads one crop, tokens of the robot's state, and cognition that encodes
+a place. Nothing else in the project may depend on this package; it is to be deleted with that pair.
 """

@@ -1,8 +1,8 @@
-"""How the demo's PONDER reads an observation: one crop of one camera, and two tokens of the robot's state.
+"""Observation reader of the demo's PONDER: one crop of one camera, and two tokens of the robot's state.
 
-The crop is brought to the network's size by an exact mean over whole pixels, so one checkpoint reads cameras of 256 px
-and of 128 px; where no exact mean exists the picture is refused, never interpolated. The state's tokens are rows of
-the embedding table that no real token uses: how far the gripper is open, and how high the tool is above the table.
+The crop is reduced to the network's size by an exact mean over whole pixels, so one checkpoint reads cameras of 256 px
+and of 128 px; a size without an exact mean is refused, never interpolated. The state's tokens are rows of the
+embedding table that no real token uses: the gripper's opening, and the tool's height above the table.
 
 Pure numpy. # h w the network's image_px
 """
@@ -20,21 +20,21 @@ from dual_system.models.arm import NUM_ARM_JOINTS, tool_poses
 from dual_system.models.ponder.observation import Pictures, Size, check_pictures, px
 
 MAX_SHRINK = 16
-"""A pixel that PONDER reads is the mean of at most 16 x 16 of the camera's."""
+"""An input pixel is the mean of at most 16 x 16 camera pixels."""
 MAX_FINGER_M, MAX_HEIGHT_M = 0.04, 0.32
-"""Of one finger, and of the tool above the table. Beyond these the last bin counts."""
+"""Upper ends of the bins: one finger's opening, and the tool's height above the table. Larger values clip."""
 _NUM_SIZES_SHOWN = 4
 _ROUNDING = 1e-6  # px: 0.1 has no exact binary form, yet a tenth of 320 px is 32 px
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CropReader:
-    """An `ObservationReader`, as `ponder.json` declares it under ``small_pair``."""
+    """The `ObservationReader` that a `ponder.json` declares under ``small_pair``."""
 
     camera: int
     """Index into the robot's cameras."""
     box: tuple[float, float, float, float]
-    """Top, left, bottom, right as fractions of the picture. Edges must fall between two pixels."""
+    """Top, left, bottom, right as fractions of the picture. Edges must lie on pixel borders."""
     first_state_id: int
     """First embedding row of the state's tokens: the finger's bins, then the height's."""
     num_finger_bins: int
@@ -91,7 +91,7 @@ class CropReader:
         return self.camera, self._listed(image_px)
 
     def _crop(self, size: Size, image_px: Size) -> tuple[slice, slice, int] | None:
-        """Rows, columns and shrinking factor of the crop in a picture of this size; None if there is no exact one."""
+        """Rows, columns and reduction factor of the crop in a picture of this size; None if there is no exact one."""
         edges = [fraction * length for fraction, length in zip(self.box, (*size, *size), strict=True)]
         top, left, bottom, right = (round(edge) for edge in edges)
         if any(abs(edge - round(edge)) > _ROUNDING for edge in edges):
@@ -113,8 +113,8 @@ class CropReader:
         part = view[rows, columns]
         if shrink == 1:
             return part
-        # Half up, in integers: 16 x 16 x 255 and the half fit into 16 bits. Strided sums are 10 times as fast as a
-        # reduction over two axes.
+        # Integer mean, rounded half up: 16 x 16 x 255 plus the half fits into 16 bits. Strided sums are 10 times as
+        # fast as a reduction over two axes.
         total = np.full((*image_px, 3), shrink**2 // 2, np.uint16)
         for row in range(shrink):
             for column in range(shrink):

@@ -1,7 +1,7 @@
-"""BinFill: put so many cubes of each color into the bin, then press the button.
+"""BinFill: put a given number of cubes of each color into the bin, then press the button.
 
-Cubes vanish as they land in the bin, so nothing but memory tells how many are in. In half of the scenes the table fills
-up as time passes: the second cube of a color appears at step 50, the third at step 100, and so on.
+Cubes vanish as they land in the bin, so their number must be remembered. In half of the scenes the table fills up as
+time passes: the second cube of a color appears at step 50, the third at step 100, and so on.
 Source: RoboMME's BinFill at 598e3b4, rules restated.
 
 Kept from upstream on purpose: any cube counts as picked and as put in. A cube too many or of the wrong color fails only
@@ -42,7 +42,7 @@ _CUBES = tuple(f"cube_{i}" for i in range(12))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
-    """One BinFill scene; ``wanted`` says how many of which color, in the order the oracle puts them in."""
+    """One BinFill scene; ``wanted`` holds the number per color, in the order in which the oracle puts them in."""
 
     button_xy_m: tuple[float, float]
     bin: Footprint

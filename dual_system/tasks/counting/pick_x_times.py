@@ -1,9 +1,9 @@
-"""PickXtimes: pick up a cube and place it on the target, so many times, no more and no less; then press the button.
+"""PickXtimes: pick up a cube and place it on the target exactly a given number of times; then press the button.
 
 Source: RoboMME's PickXtimes at 598e3b4, rules restated.
 
 The order is kept by the list of subtasks alone, so there is no memory. Once too many is one pick in the last stage:
-upstream does not look whether the cube is placed again.
+upstream does not check whether the cube is placed again.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ class Layout:
     visit: int
 
     def cube_pose(self, elapsed_steps: int) -> Array:
-        """Pose (7,) of the running cube so many control steps after reset."""
+        """Pose (7,) of the running cube after ``elapsed_steps`` control steps."""
         num_passed, within = divmod(min(elapsed_steps, NUM_PASSES * self.pass_steps), self.pass_steps)
         way = smoothstep(within / self.pass_steps)
         along_m = _LINE_HALF_M * (2 * (way if num_passed % 2 == 0 else 1 - way) - 1)
@@ -63,17 +63,17 @@ class Layout:
         return self.pass_steps * self.visit
 
     def num_visited(self, elapsed_steps: int) -> int:
-        """How often the running cube has crossed the target so many control steps after reset."""
+        """Number of times that the running cube has crossed the target after ``elapsed_steps`` control steps."""
         return (2 * elapsed_steps + self.pass_steps) // (2 * self.pass_steps)
 
     @property
     def checkpoint_steps(self) -> tuple[int, ...]:
-        """When the subtasks of waiting end, in control steps since reset."""
+        """Ends of the waiting subtasks, in control steps since reset."""
         return (*range(_CHECKPOINT_STEPS, self.press_step, _CHECKPOINT_STEPS), self.press_step)
 
     @property
     def press_step(self) -> int:
-        """When the oracle begins to press."""
+        """Control step at which the oracle begins to press."""
         return self.last_step - self.pass_steps // 2 - PRESS_STEPS
 
 
@@ -154,7 +154,7 @@ class StopCube(Task[Layout, Memory]):
         )
 
     def reasoning(self, layout: Layout, index: int) -> Reasoning:
-        # A subtask's number says when it ends, not when it began: how long the arm took to get there is another matter.
+        # A subtask's index determines when it ends, not when it began, which depends on the arm.
         waits = layout.checkpoint_steps
         is_waiting = 0 < index <= len(waits)
         ends_step = 0 if index == 0 else waits[min(index, len(waits)) - 1]
@@ -171,7 +171,7 @@ class StopCube(Task[Layout, Memory]):
         if memory is None:
             return Memory(is_near=is_near)
         if memory.stopped_step is None and predicates.is_pressed(physics, _BUTTON):
-            # Upstream looks where the cube was a step before the press, and where the press has stopped it.
+            # Upstream checks where the cube was a step before the press, and where the press has stopped it.
             is_stopped_well = is_near and memory.is_near
             return Memory(is_near=is_near, stopped_step=physics.elapsed_steps(), is_stopped_well=is_stopped_well)
         return Memory(is_near=is_near, stopped_step=memory.stopped_step, is_stopped_well=memory.is_stopped_well)

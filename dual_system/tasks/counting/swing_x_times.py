@@ -1,4 +1,4 @@
-"""SwingXtimes: carry a cube to and fro between two targets so many times, put it down, and press the button.
+"""SwingXtimes: carry a cube to and fro between two targets a given number of times, put it down, press the button.
 
 A target turns red while the cube is over it and for 20 steps after. Every arrival of the cube over a target counts, and
 more than two per round is a failure. Source: RoboMME's SwingXtimes at 598e3b4, rules restated.

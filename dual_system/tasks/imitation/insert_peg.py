@@ -41,14 +41,14 @@ NUM_PEGS = 3
 ENDS = {"head": "far", "tail": "near"}  # seen from the robot
 SIDES = {"left": 1.0, "right": -1.0}  # the sign of y
 LIT_STEPS = 20
-STILL_STEPS = 100  # nobody sees them: the robot is at home, the pegs have been put back
+STILL_STEPS = 100  # not recorded: the robot is at home, the pegs have been put back
 
 _BOX_REACH_M, _BOX_YAW_RAD = 0.1, np.deg2rad(20.0)
 _PEG_REACH_M, _PEG_YAW_RAD = (0.2, 0.3), np.pi / 4
 _PEG_FROM_BOX_M, _PEG_FROM_PEG_M, _MAX_TRIES = 0.06, 0.075, 512
 _PEG_HALF_LENGTH_M = 0.05
 _BETWEEN_ENDS_M = 0.05  # their centres
-# Of the leading end: out of the box, above the hole, beside it.
+# Offsets of the leading end from the hole: out of the box, above it, beside it.
 _APPROACH = ((0.2, 0.15, 0.0), (0.2, 0.0, 0.0), (0.15, 0.0, 0.0), (0.025, 0.0, 0.0))
 _STRAYING = ((0.1, 0.0, 0.015), (0.1, 0.0, 0.0))
 _ARM_REACH_M = 0.78  # from the base to a tool that points straight down

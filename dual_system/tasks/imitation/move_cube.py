@@ -45,7 +45,7 @@ _TAIL, _HEAD = f"{_PEG}/tail", f"{_PEG}/head"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scene:
-    """Where things lie at first, in the video or in the execution."""
+    """Initial poses of the objects, in the video or in the execution."""
 
     cube: PlacedCube
     target_xy_m: Point
@@ -142,7 +142,7 @@ def _draw(rng: np.random.Generator, area_half_m: float) -> Scene:
 
 
 def _way_of(cube_xy_m: Point, target_xy_m: Point) -> Footprint:
-    """What cube and hand cover of the table from before the first push to the last."""
+    """The area of the table that cube and hand cover from before the first push to the last."""
     way_m = np.subtract(target_xy_m, cube_xy_m)
     length_m = float(np.linalg.norm(way_m))
     first_m, last_m = -_HAND_BEHIND_M / length_m, 1.0 + _CUBE_REACH_M / length_m

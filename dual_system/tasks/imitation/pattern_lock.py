@@ -3,8 +3,8 @@
 The tip touches a button when it is within 1 cm of its centre seen from above, and lower than 10 cm. The robot begins
 with its tip over the pattern's first button. Source: RoboMME's PatternLock at 598e3b4, rules restated.
 
-Not kept: upstream also compares the sequence of touched buttons with the pattern when all is done. Whoever comes that
-far has touched nothing else, because any other button is a failure at once.
+Not kept: upstream also compares the sequence of touched buttons with the pattern at the end. It is then always equal,
+because any other button is an immediate failure.
 
 "Left" is the robot's: towards larger y, and on the right of the front camera's picture. "Forward" is away from it.
 """
@@ -43,7 +43,7 @@ class Layout:
     """
 
     side: int  # buttons per row and per column
-    pattern: tuple[int, ...]  # buttons in order, each a neighbour of the one before and none twice
+    pattern: tuple[int, ...]  # buttons in order, each a neighbour of the previous one and none twice
 
     def xy_m(self, button: int) -> tuple[float, float]:
         """Where a button is on the table."""
@@ -155,7 +155,7 @@ def _wander(rng: np.random.Generator, side: int, start: int, end: int) -> tuple[
 
 
 def _turned_away(side: int, pattern: tuple[int, ...], shared: int) -> list[tuple[int, ...]]:
-    """The patterns that part from this one after so many buttons, with the same rest in other poses within the grid."""
+    """The patterns that diverge from this one after ``shared`` buttons, with the same rest in other poses."""
     kept, rest = pattern[:shared], np.array([divmod(button, side) for button in pattern[shared - 1 :]])
     found = []
     for flips, is_transposed in product(product((1, -1), (1, -1)), (False, True)):

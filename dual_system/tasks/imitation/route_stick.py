@@ -55,7 +55,7 @@ class Layout:
 
     turn_rad: float  # of the whole row about the world's origin
     post_colors: tuple[RGB, ...]  # linear, as upstream states them
-    route: tuple[int, ...]  # targets in order, each a neighbour of the one before
+    route: tuple[int, ...]  # targets in order, each a neighbour of the previous one
     sides: tuple[str, ...]  # of each move
 
     def xy_m(self, slot: int) -> tuple[float, float]:

@@ -1,7 +1,7 @@
-"""What the stick leaves behind: targets it touched are red for two seconds, and white dots show where its tip has been.
+"""Traces of the stick: targets that it touched are red for two seconds, and white dots mark the path of its tip.
 
-Source: RoboMME's PatternLock and RouteStick at 598e3b4, rules restated. A touch is seen in the next observation, as
-upstream; a dot is seen at once, upstream one observation later.
+Source: RoboMME's PatternLock and RouteStick at 598e3b4, rules restated. A touch is visible in the next observation, as
+upstream; a dot is visible immediately, upstream one observation later.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def show_touches(physics: Physics, targets: Sequence[str], touches: Touches) -> 
 
 
 def leave_dot(physics: Physics, step: int) -> None:
-    """Puts the oldest dot where the tip is; if that is too high, the dot goes away. To be called once per step."""
+    """Moves the oldest dot to the tip, or out of sight if the tip is too high. Call it once per step."""
     x_m, y_m, z_m = physics.tcp_transform()[:3, 3]
     dot = _dot(step % TRAIL_STEPS)
     if z_m < LOW_Z_M:

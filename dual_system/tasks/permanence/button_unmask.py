@@ -1,6 +1,6 @@
 """ButtonUnmask: cubes are covered while the robot is on its way to a button.
 
-The button only says what comes first: the cubes are covered by the clock, whether or not anything has been pressed.
+The button only fixes the order of subtasks: the cubes are covered at a fixed time, whether or not it was pressed.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ _JITTER_HALF_M, _SHUFFLED_GAP_M = 0.07, 0.02
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hidden:
-    """Which container a cube is under."""
+    """A cube and the container over it."""
 
     color: str
     container: int
@@ -39,7 +39,7 @@ class Hidden:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
-    """One scene: where things stand at first, what hides what, and which containers change places when."""
+    """One scene: initial places, the cubes' containers, and the containers' swaps."""
 
     buttons_xy_m: tuple[tuple[float, float], ...] = ()
     containers: tuple[Spot, ...]
@@ -49,7 +49,7 @@ class Layout:
 
     @property
     def last_event_step(self) -> int:
-        """The first observation from which on nothing moves by itself."""
+        """The first observation after all scripted motion."""
         return SWAP_STEP + SWAP_STEPS * len(self.swaps)
 
 

@@ -1,11 +1,11 @@
-"""What the four unmasking tasks share: cubes are seen, covered, perhaps shuffled; then one must know which is where.
+"""Base of the four unmasking tasks: cubes are shown, covered, perhaps shuffled; then their places must be remembered.
 
-Everything follows the clock. Cubes lie bare in observations 0 to 31 and under containers from 32; swaps, if any,
+All events have fixed times. Cubes lie bare in observations 0 to 31 and under containers from 32; swaps, if any,
 begin at 64. While containers swap they are held in place by script and the cubes are away; each returns under its own
 container when the last swap ends. Source: RoboMME's *Unmask tasks at 598e3b4, rules restated.
 
-Kept from upstream on purpose: before observation 32 the containers hover in the sky, and count as lifted. Whoever gets
-a button pressed by then has failed.
+Kept from upstream on purpose: before observation 32 the containers hover in the sky, and count as lifted. An episode
+whose button is pressed by then has failed.
 
 Not kept: a swap starts from where the layout put the containers, and pairs the nearest of those places. Upstream reads
 where they are at that instant, which differs only if something has pushed them in the 1.6 s since they were put down.
@@ -139,7 +139,7 @@ def container_name(index: int) -> str:
 def cube_name(container: int) -> str:
     """Returns the name of the cube under a container, one of the first three.
 
-    It goes by its place: the same cubes painted otherwise are, to the last bit, the same world.
+    The name depends on the place alone, so cubes with other colors give the same physics to the last bit.
     """
     return f"cube_{container}"
 
@@ -156,7 +156,7 @@ def _stand_over_cubes(physics: Physics, layout: Layout, spots: Sequence[Spot]) -
 
 
 def _letter(layout: Layout, index: int) -> str:
-    """What texts call a container, by where it first stood."""
+    """A container's letter in texts, by its initial place."""
     return captions.letter(index, [spot.y_m for spot in layout.containers])
 
 

@@ -1,6 +1,6 @@
 """VideoUnmaskSwap: cubes are covered in a video, and then containers change places.
 
-What must be remembered is not a place but which container has gone where.
+Not a place must be remembered, but each container's path.
 """
 
 from __future__ import annotations

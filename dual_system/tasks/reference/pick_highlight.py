@@ -49,7 +49,7 @@ class Layout:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Memory:
-    """Which cubes have ever been lifted, and which one is lifted now."""
+    """The cubes that have ever been lifted, and those that are lifted now."""
 
     ever_picked: frozenset[str]
     picked_now: frozenset[str]

@@ -1,7 +1,7 @@
-"""Things that change places in a demonstration, as soon as the arm has rested for a second.
+"""Objects that change places in a demonstration, as soon as the arm has rested for a second.
 
-When that is depends on how long the motions before took, so it is remembered, not scheduled; so is where things stood,
-for some have been carried about. Source: RoboMME at 598e3b4, rules restated.
+The time depends on the duration of the previous motions, so it is remembered, not scheduled; so are the places of the
+objects, because some have been carried. Source: RoboMME at 598e3b4, rules restated.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _LEAD_STEPS = 2  # from the observation that completes the rest to the one at wh
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rest:
-    """How long the arm has rested in the demonstration; once long enough, when things begin to move and whence."""
+    """Steps that the arm has rested in the demonstration; after `REST_STEPS`, the first swap's step and places."""
 
     num_steps: int = 0
     first_swap_step: int | None = None
@@ -34,7 +34,7 @@ class Rest:
 
 
 def rest(motions: Motions) -> Actions:
-    """What a demonstration does before things move: the arm rests where it hides nothing, and long enough."""
+    """The motion before objects move: the arm rests long enough, where it hides nothing."""
     yield from motions.rest()
     yield from motions.wait(REST_STEPS)
 
@@ -69,7 +69,7 @@ def move(
     lane_m: float,
     z_m: float,
 ) -> None:
-    """Puts things where the observation of ``step`` shall show them; ``pairs`` change places one after the other.
+    """Places objects for the observation of ``step``; ``pairs`` change places one after the other.
 
     Before and after that nothing is touched. ``lane_m`` is as in `swaps.spots_after`, ``z_m`` their origins' height.
     """
@@ -83,7 +83,7 @@ def move(
 
 
 def in_words(pairs: Sequence[Swap], y_m: Sequence[float]) -> str:
-    """Returns the swaps by letter, as in "swaps A <-> C, A <-> B"; ``y_m`` is where things first stood."""
+    """Returns the swaps by letter, as in "swaps A <-> C, A <-> B"; ``y_m`` holds the objects' initial places."""
     if not pairs:
         return "no swaps"
     return "swaps " + ", ".join(f"{letter(first, y_m)} <-> {letter(second, y_m)}" for first, second in pairs)

@@ -1,11 +1,11 @@
-"""What VideoPlaceButton and VideoPlaceOrder share: a video of placing, and one of its places to be found again.
+"""Base of VideoPlaceButton and VideoPlaceOrder: a video of placing, and one of its places to be found again.
 
 In the video a cube is carried from target to target, the button is pressed at some point between, and at last the cube
 is put aside on the bare table. Where the scene is hard, two targets then change places. Source: RoboMME's VideoPlace*
 at 598e3b4, rules restated.
 
 Upstream keeps a scene if its planner solves it. Ours are drawn so that other cubes leave room where the cube is put
-aside; upstream's do not look at that place.
+aside; upstream's ignore that place.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ _TARGETS = tuple(f"target_{i}" for i in range(_MAX_TARGETS))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
-    """One scene: where things are at first, what the video shows of it, and which of its places is asked for."""
+    """One scene: initial places, the video's actions, and the place to be found."""
 
     button_xy_m: Point
     parking_xy_m: Point  # where the cube is put aside
@@ -81,7 +81,7 @@ class Layout:
 
 
 class VideoPlace(Task[Layout, Rest | None]):
-    """Place a cube on the target that a video tells by its place in the course of things.
+    """Place a cube on the target that a video identifies by its place in the sequence of events.
 
     The memory is the arm's rest in the demonstration; there is none after it.
     """
@@ -108,7 +108,7 @@ class VideoPlace(Task[Layout, Rest | None]):
 
     @abstractmethod
     def which(self, layout: Layout) -> str:
-        """Returns the words that tell the target asked for from the others."""
+        """Returns the words that identify the target."""
 
     def instruction(self, layout: Layout) -> str:
         return f"watch the video carefully, then place the {layout.color} cube on the {self.which(layout)}"

@@ -19,7 +19,7 @@ _PARKING_RADIUS_M = 0.1
 
 @task(family="reference")
 class VideoPlaceOrder(VideoPlace):
-    """Place a cube on the target that it was placed on as the so many-th."""
+    """Place a cube on the n-th target on which it was placed in the video."""
 
     def sample(self, rng: np.random.Generator, difficulty: str) -> Layout:
         return until_it_fits(lambda: _draw(rng, difficulty))

@@ -1,4 +1,4 @@
-"""VideoRepick: a cube is picked up in a video; pick up the same one again, so many times, then press the button.
+"""VideoRepick: a cube is picked up in a video; pick it up again, a given number of times, then press the button.
 
 Cubes look alike. Where the scene is easy or medium there are three, and they change places before the video ends; where
 it is hard there are fifteen, five of each colour, and none moves. Source: RoboMME's VideoRepick at 598e3b4, rules
