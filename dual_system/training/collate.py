@@ -62,7 +62,7 @@ class _TrainingMoment:
     @property
     def subgoal(self) -> str:
         query = self.invocation.reference.query
-        return "" if query is None else self.example.said[query]
+        return "" if query is None else self.example.written[query]
 
 
 def collate_ponder(examples: Sequence[Example]) -> PonderBatch:

@@ -38,7 +38,7 @@ from dual_system.training.collate import collate_ponder, collate_pounce
 from dual_system.training.data import PictureSizes, TrainingSet
 from dual_system.training.example import Example, ExampleConfig, make_example
 from dual_system.training.joint import NO_QUERY, PounceBatch, encode_rows, gather_cognition
-from protocol.command_line import parse
+from protocol.command_line import flat, parse
 
 STALE_BY = (0, 1, 2, 4)
 """k of C_{t-k}, in queries; at 1 Hz also in seconds."""
@@ -124,7 +124,7 @@ def diagnose(options: DiagnoseOptions) -> dict[str, Any]:
     return {
         "schema": SCHEMA,
         "stale_by": STALE_BY,
-        "config": {name: _as_json(getattr(options, name)) for name in options.__slots__ if name != "progress"},
+        "config": {name: value for name, value in flat(options).items() if name != "progress"},
         "data_hash": data.hash,
         "models": {
             "ponder": {"model_hash": weights_hash(ponder), "is_untrained": ponder.is_random},
@@ -249,7 +249,3 @@ def _means(losses: Mapping[str, Tensor], counts_I: Tensor) -> dict[str, Any]:
     count = int(counts_I.sum())
     means = {name: float(each[counts_I].double().mean()) for name, each in losses.items()} if count else {}
     return {"num_ticks": count, "loss": means}
-
-
-def _as_json(value: Any) -> Any:
-    return str(value) if isinstance(value, Path) else value

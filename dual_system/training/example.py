@@ -42,7 +42,7 @@ class Example:
     schedule: SampledSchedule
     invocations: tuple[SampledInvocation, ...]
     """The invocations drawn from the schedule."""
-    said: tuple[str, ...]
+    written: tuple[str, ...]
     """PONDER's newest subgoal at every query; empty texts without grounding."""
 
 
@@ -54,14 +54,14 @@ def make_example(
     imitated = [each for each in schedule.invocations if each.tick >= episode.imitated_from]
     count = min(config.max_invocations, len(imitated))
     chosen = np.sort(rng.choice(len(imitated), size=count, replace=False)) if count else np.empty(0, np.intp)
-    said = subgoals_by_query(episode, schedule) if config.is_grounded else ("",) * len(schedule.queries)
+    written = subgoals_by_query(episode, schedule) if config.is_grounded else ("",) * len(schedule.queries)
     return Example(
         episode=episode,
         row=episode_row(episode, form, schedule, config),
         images=row_images(episode, schedule),
         schedule=schedule,
         invocations=tuple(imitated[index] for index in chosen),
-        said=said,
+        written=written,
     )
 
 

@@ -158,7 +158,7 @@ class JointLoss(NamedTuple):
     total: Tensor
     flow_matching: Tensor
     grounding: Tensor
-    said_N: Tensor
+    predicted_N: Tensor
     """int64: PONDER's most likely token at every supervised position, row after row."""
     num_null: int
     """Number of invocations with null cognition."""
@@ -167,7 +167,7 @@ class JointLoss(NamedTuple):
 
     @property
     def num_supervised(self) -> int:
-        return len(self.said_N)
+        return len(self.predicted_N)
 
 
 class JointModel(nn.Module):
@@ -210,14 +210,14 @@ class JointModel(nn.Module):
     def forward(self, episodes: PonderBatch, invocations: PounceBatch, draws: Draws) -> JointLoss:
         zero = torch.zeros((), device=invocations.actions_INA.device)
         matching, grounding, num_null, num_rows = zero, zero, 0, 0
-        said_N = torch.zeros(0, dtype=torch.int64)
+        predicted_N = torch.zeros(0, dtype=torch.int64)
         cognition_QKH, first_query = None, None
         if self.runs_ponder:
             with torch.set_grad_enabled(self.trains != "pounce"):
                 hidden = encode_rows(self.ponder, episodes, together=self.reads_together, num_groups=self.num_groups)
                 cognition_QKH, first_query = gather_cognition(episodes.rows, hidden)
             if self.trains != "pounce":
-                grounding, said_N = self._grounding(episodes, hidden)
+                grounding, predicted_N = self._grounding(episodes, hidden)
         if self.trains != "ponder":
             is_null_I = (invocations.query_I == NO_QUERY) | draws.is_dropped_I
             num_null, num_rows = int(is_null_I.sum()), draws.num_counted_rows
@@ -229,7 +229,12 @@ class JointModel(nn.Module):
                 self.pounce, inputs, invocations.actions_INA, draws.noise_SNA, draws.time_S, draws.num_committed_S
             )
         return JointLoss(
-            self.weigh(matching, grounding), matching, grounding, said_N=said_N, num_null=num_null, num_rows=num_rows
+            self.weigh(matching, grounding),
+            matching,
+            grounding,
+            predicted_N=predicted_N,
+            num_null=num_null,
+            num_rows=num_rows,
         )
 
     def weigh(self, matching: Tensor, grounding: Tensor) -> Tensor:
@@ -244,8 +249,8 @@ class JointModel(nn.Module):
         wanted = [np.asarray(row.targets)[places + 1] for row, places in zip(episodes.rows, index, strict=True)]
         targets_N = torch.from_numpy(np.concatenate(wanted)).to(hidden[0].device)
         logits_NV = self.ponder.logits(_taken(hidden, index))
-        said_N = logits_NV.detach().argmax(dim=-1)
-        return F.cross_entropy(logits_NV.float(), targets_N) if len(targets_N) else logits_NV.sum(), said_N
+        predicted_N = logits_NV.detach().argmax(dim=-1)
+        return F.cross_entropy(logits_NV.float(), targets_N) if len(targets_N) else logits_NV.sum(), predicted_N
 
 
 def runs_ponder(trains: Trains, num_carriers: int) -> bool:

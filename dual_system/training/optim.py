@@ -16,7 +16,6 @@ from torch.distributed.tensor import DTensor
 from dual_system.training.parallel import local, whole
 from dual_system.training.shards import RowReader
 
-_LEAST_RATE = 0.02
 _ADAM_STATE = ("step", "exp_avg", "exp_avg_sq")  # AdamW's state of a parameter
 _EMA_MEMORY = 10  # after n steps the average's time constant is at most n / 10 steps
 
@@ -27,8 +26,6 @@ class OptimConfig:
 
     learning_rate: float = 2e-5
     warmup_steps: int = 100
-    decay: tuple[int, int] | None = None
-    """First and last step of a linear decay of the rate, to a fiftieth; None: no decay."""
     betas: tuple[float, float] = (0.9, 0.95)
     eps: float = 1e-8
     weight_decay: float = 1e-10
@@ -41,17 +38,11 @@ class OptimConfig:
             raise ValueError("learning_rate and clip_norm must be above 0, warmup_steps at least 0")
         if not 0 <= self.ema_decay < 1:
             raise ValueError(f"ema_decay must be in [0, 1), came {self.ema_decay}")
-        if self.decay is not None and not 0 <= self.decay[0] < self.decay[1]:
-            raise ValueError(f"decay must be two steps in order, came {self.decay}")
 
 
 def learning_rate(config: OptimConfig, step: int) -> float:
     """Rate of the ``step``-th update, counted from 0; it is above 0 from the first one on."""
-    rate = config.learning_rate * min(1.0, (step + 1) / max(1, config.warmup_steps))
-    if config.decay is None:
-        return rate
-    first, last = config.decay
-    return rate * min(1.0, max(_LEAST_RATE, (last - step) / (last - first)))
+    return config.learning_rate * min(1.0, (step + 1) / max(1, config.warmup_steps))
 
 
 class Optimiser:

@@ -1,7 +1,7 @@
 """``pp-train``: trains both systems together on a collected dataset, and leaves folders that the servers load.
 
     OUT/checkpoint/     weights, optimiser and step, from which a killed run resumes
-    OUT/log.jsonl       one line per step; OUT/run.png plots it at the end
+    OUT/log.jsonl       one line per step
     OUT/samples.jsonl   PONDER's predicted texts at intervals, beside their targets
     OUT/ponder, pounce  at the end: checkpoints for ponder-serve and pounce-serve --checkpoint
 
@@ -43,12 +43,11 @@ from dual_system.training.data import PictureSizes, TrainingSet
 from dual_system.training.example import make_example
 from dual_system.training.joint import JointModel, PonderBatch, PounceBatch, Trains
 from dual_system.training.parallel import World, gather, joined, require_alike, shard
-from dual_system.training.plot import plot_log
 from dual_system.training.prefetch import Prefetcher
 from dual_system.training.recipe import Recipe
 from dual_system.training.recipes import recipe
 from dual_system.training.trainer import CheckpointError, SaveError, Trainer
-from dual_system.training.watch import LOG_FILE, Watch
+from dual_system.training.watch import Watch
 from protocol.command_line import parse
 
 DONE, REFUSED, INTERRUPTED = 0, 2, 130
@@ -287,8 +286,6 @@ def _write(
         gather(model, None if whole is None else whole[0])
         if whole is not None:
             export(*whole, options.out, trained=run.trains)
-    if world.is_first:
-        plot_log(options.out / LOG_FILE, options.out / "run.png")
 
 
 def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointModel, PounceBundle]:

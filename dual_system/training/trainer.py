@@ -128,12 +128,12 @@ class Trainer:
             num_null=num_null,
         )
         self.step += 1
-        self._latest = episodes, loss.said_N
+        self._latest = episodes, loss.predicted_N
         return report
 
     @property
     def latest(self) -> tuple[PonderBatch, Tensor]:
-        """This process's episodes of the last update, and PONDER's predictions in them (``JointLoss.said_N``).
+        """This process's episodes of the last update, and PONDER's predictions in them (``JointLoss.predicted_N``).
 
         Raises:
             RuntimeError: there was no update yet.

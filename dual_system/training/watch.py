@@ -32,9 +32,9 @@ _TAGS = {
 class Sample:
     """A supervised span of a row as text, with control tokens by name."""
 
-    wanted: str
+    target: str
     """The targets."""
-    said: str
+    predicted: str
     """The most likely token at each position under teacher forcing; free decoding could differ."""
 
 
@@ -73,32 +73,32 @@ class Watch:
             file.flush()
 
     def _show(self, step: int, trainer: Trainer) -> None:
-        episodes, said_N = trainer.latest
+        episodes, predicted_N = trainer.latest
         if not episodes.rows:  # PONDER is not run
             return
         row, frames = episodes.rows[0], episodes.frames[0]
-        samples = samples_of(row, said_N, trainer.model.ponder.format.vocabulary)
+        samples = samples_of(row, predicted_N, trainer.model.ponder.format.vocabulary)
         for sample in samples:
             self._samples.write(json.dumps({"step": step} | asdict(sample), ensure_ascii=False) + "\n")
         if self._board is None:
             return
-        text = "\n\n".join(f"wanted: {sample.wanted}\n\nsaid: {sample.said}" for sample in samples)
-        self._board.add_text("ponder/said", text, step)
+        text = "\n\n".join(f"target: {sample.target}\n\npredicted: {sample.predicted}" for sample in samples)
+        self._board.add_text("ponder/text", text, step)
         if frames is not None:
             self._board.add_image("ponder/last_picture", frames[-1].cpu().numpy(), step, dataformats="HWC")
 
 
-def samples_of(row: Row, said_N: Tensor, vocabulary: Vocabulary) -> list[Sample]:
-    """The row's distinct supervised spans. ``said_N``: see ``JointLoss.said_N``; this row's positions come first."""
+def samples_of(row: Row, predicted_N: Tensor, vocabulary: Vocabulary) -> list[Sample]:
+    """The row's distinct supervised spans. ``predicted_N``: see ``JointLoss.predicted_N``; this row's positions come first."""
     places = np.flatnonzero(np.asarray(row.targets) != IGNORE)
-    said = said_N[: len(places)].tolist()
-    if not len(said):
+    predicted = predicted_N[: len(places)].tolist()
+    if not len(predicted):
         return []
     found: dict[Sample, None] = {}
     starts = [0, *(np.flatnonzero(np.diff(places) > 1) + 1).tolist(), len(places)]
     for start, stop in pairwise(starts):
-        wanted = vocabulary.decode([row.targets[place] for place in places[start:stop].tolist()])
-        found[Sample(wanted=wanted, said=vocabulary.decode(said[start:stop]))] = None
+        target = vocabulary.decode([row.targets[place] for place in places[start:stop].tolist()])
+        found[Sample(target=target, predicted=vocabulary.decode(predicted[start:stop]))] = None
     return list(found)
 
 

@@ -227,8 +227,8 @@ def test_the_texts_of_a_set_are_all_that_pounce_will_read(folder: Path) -> None:
     prompts, form = data.instructions_with_subgoals(), Ponder.random(replace(tiny_cpu(), num_layers=4), seed=0).format
     for number in range(len(data)):
         example = make_example(data[number], form, ExampleConfig(clocks=ROBOMME), np.random.default_rng(number))
-        assert example.said[-1]
-        assert {with_subgoal(example.episode.instruction, text) for text in ("", *example.said)} <= set(prompts)
+        assert example.written[-1]
+        assert {with_subgoal(example.episode.instruction, text) for text in ("", *example.written)} <= set(prompts)
     assert set(data.instructions()) < set(prompts)
 
 

@@ -144,7 +144,7 @@ def test_an_episode_that_ponder_does_not_read_gives_no_images(episode_of_noise: 
 def test_without_grounding_the_row_has_no_text(episode_of_noise: MakeEpisode) -> None:
     example = example_of(episode_of_noise(45, num_demo=2), replace(AT_1_HZ, is_grounded=False))
     assert FORM.vocabulary.t_yes not in example.row.ids
-    assert set(example.said) == {""}
+    assert set(example.written) == {""}
 
 
 def test_reasoning_can_be_left_out_of_the_row(episode_of_noise: MakeEpisode) -> None:
@@ -159,7 +159,7 @@ def test_reasoning_can_be_left_out_of_the_row(episode_of_noise: MakeEpisode) -> 
 def test_the_newest_subgoal_at_a_query_is_the_last_one_that_the_row_wrote(
     episode_of_noise: MakeEpisode, num_ticks: int, changes: frozenset[int], seed: int
 ) -> None:
-    """``said`` is read off the schedule; here it is read off the tokens, segment by segment."""
+    """``written`` is read off the schedule; here it is read off the tokens, segment by segment."""
     recorded = episode_of_noise(num_ticks, changes=(0, *changes))
     example = example_of(recorded, ExampleConfig(clocks=ROBOMME), seed)
     v, ids = FORM.vocabulary, list(example.row.ids)
@@ -169,7 +169,7 @@ def test_the_newest_subgoal_at_a_query_is_the_last_one_that_the_row_wrote(
         begin = max((index for index in range(end) if ids[index] == v.vision_end), default=0) + 1
         if begin < end:
             newest = v.decode(ids[begin + 1 : end])
-        assert example.said[query] == newest != ""
+        assert example.written[query] == newest != ""
 
 
 @given(num_ticks=st.integers(2, 120), data=st.data())

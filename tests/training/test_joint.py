@@ -211,7 +211,7 @@ def test_both_systems_alone_lose_what_they_lose_together(model: JointModel) -> N
     assert torch.equal(alone["pounce"].flow_matching, together.flow_matching)
     assert torch.equal(alone["ponder"].grounding, together.grounding)
     assert (alone["pounce"].num_null, alone["pounce"].num_rows) == (together.num_null, together.num_rows)
-    assert torch.equal(alone["ponder"].said_N, together.said_N)
+    assert torch.equal(alone["ponder"].predicted_N, together.predicted_N)
     for name, part in (("pounce", "grounding"), ("ponder", "flow_matching")):
         assert float(getattr(alone[name], part)) == 0.0
 

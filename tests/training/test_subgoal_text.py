@@ -75,7 +75,7 @@ def test_training_reads_the_subgoal_of_the_query_it_refers_to() -> None:
             cognition=None,
             age_ns=0,
             seed=0,
-            subgoal=seen.said[asked.reference.query],
+            subgoal=seen.written[asked.reference.query],
         )
         served = pi05_inputs(request, POUNCE, TOKENIZER, STATISTICS, CPU)
         num_tokens = served.token_ids.shape[1]
@@ -104,7 +104,7 @@ def test_without_a_subgoal_the_prompt_is_the_ordinary_one(family: str) -> None:
 
 
 def test_without_grounding_there_is_nothing_to_read() -> None:
-    assert set(example(is_grounded=False).said) == {""}
+    assert set(example(is_grounded=False).written) == {""}
 
 
 def test_action_loss_does_not_reach_ponder_through_text_and_grounding_does() -> None:

@@ -132,14 +132,6 @@ def test_warm_up_is_linear_then_constant() -> None:
     assert [learning_rate(config, step) for step in range(6)] == [0.25, 0.5, 0.75, 1.0, 1.0, 1.0]
 
 
-def test_a_falling_rate_is_whole_until_it_falls_and_never_nothing() -> None:
-    config = OptimConfig(learning_rate=1.0, warmup_steps=1, decay=(10, 20))
-    assert [learning_rate(config, step) for step in (0, 10, 15, 19)] == [1.0, 1.0, 0.5, 0.1]
-    assert 0 < learning_rate(config, 20) == learning_rate(config, 1000) < 0.1
-    with pytest.raises(ValueError, match="two steps in order"):
-        OptimConfig(decay=(20, 10))
-
-
 def test_frozen_parameters_stay() -> None:
     model = joint()
     model.ponder.requires_grad_(False)
