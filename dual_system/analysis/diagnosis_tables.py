@@ -45,8 +45,8 @@ def by_age(diagnoses: Sequence[Diagnosis]) -> str:
         fresh = losses.names[0]
         row = [each.label, f"{losses.total_ticks} of {losses.num_episodes}", _loss(absolute(losses, fresh))]
         rows.append(row + [_times(ratio(losses, name, fresh)) for name in losses.names])
-    for interval, told in paper.FIGURE_4.items():
-        known = [f"{told[float(age_s)]:.2f}x" if float(age_s) in told else "" for age_s in ages_s]
+    for interval, loss in paper.FIGURE_4.items():
+        known = [f"{loss[float(age_s)]:.2f}x" if float(age_s) in loss else "" for age_s in ages_s]
         label = f"trained at {interval} ({paper.MARK})"
         rows.append([label, "757 of 80", f"{paper.FIGURE_4_FRESH[interval]:.3f}", *known])
     return markdown(["checkpoint", "ticks of episodes", "loss at 0.3 s", *(f"{age} s" for age in ages_s)], rows)

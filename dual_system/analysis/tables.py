@@ -161,8 +161,8 @@ def _condition(results: Results) -> tuple[str, str, str, str]:
     if config.get("subgoal_text") is not None:
         gets = {"ponder": "PONDER's subgoal text", "oracle": "the oracle's subgoal text"}[config["subgoal_text"]]
     if config.get("deliver") == "held-transition":
-        told = config.get("held_age_ms", 0)
-        gets += f" held at transitions, told {f'{told} ms' if told else 'its true age'}"
+        reported_ms = config.get("held_age_ms", 0)
+        gets += f" held at transitions, with {f'age {reported_ms} ms' if reported_ms else 'its true age'}"
     carriers = "" if results.num_carriers is None else str(results.num_carriers)
     return gets, _ms(config.get("query_period_ms")), _ms(config.get("delay_ms")), carriers
 

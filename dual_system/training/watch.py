@@ -89,7 +89,7 @@ class Watch:
 
 
 def samples_of(row: Row, predicted_N: Tensor, vocabulary: Vocabulary) -> list[Sample]:
-    """The row's distinct supervised spans. ``predicted_N`` is `JointLoss.predicted_N`; this row's positions come first."""
+    """The row's distinct supervised spans. ``predicted_N``: see `JointLoss`; this row's positions come first."""
     places = np.flatnonzero(np.asarray(row.targets) != IGNORE)
     predicted = predicted_N[: len(places)].tolist()
     if not len(predicted):

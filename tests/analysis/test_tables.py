@@ -88,7 +88,7 @@ def test_of_all_sixteen_tasks_the_paper_s_interventions_stand_below(tmp_path: Pa
     every = {task: ["01"] for task in paper.TASKS}
     results = read_comparable([write(tmp_path / name, every) for name in ("a", "b")])
     last = between_conditions(results).splitlines()[-1]
-    assert last.startswith(f"| Table 4: transitions only, told 300 ms {MARK} |")
+    assert last.startswith(f"| Table 4: transitions only, age reported as 300 ms {MARK} |")
     assert "| 0.17 | 0.17 | 0.67 | 6.33 | 1.83 |" in last
 
 
@@ -96,8 +96,8 @@ def test_of_all_sixteen_tasks_the_paper_s_interventions_stand_below(tmp_path: Pa
     ("config", "told"),
     [
         ({}, "C_t"),
-        ({"deliver": "held-transition", "held_age_ms": 300}, "C_t held at transitions, told 300 ms"),
-        ({"deliver": "held-transition"}, "C_t held at transitions, told its true age"),
+        ({"deliver": "held-transition", "held_age_ms": 300}, "C_t held at transitions, with age 300 ms"),
+        ({"deliver": "held-transition"}, "C_t held at transitions, with its true age"),
         ({"cognition": "other-episode"}, "another episode's cognition"),
         ({"cognition": "stand-in"}, "the task's own subgoal"),
         ({"policy": "oracle"}, "nothing: the oracle played"),
