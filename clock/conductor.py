@@ -73,7 +73,7 @@ class _Pending:
 
     @property
     def due_ns(self) -> int:
-        """The first instant that depends on the answer."""
+        """Lower bound of the instants that depend on the answer."""
         return self.source_ns + (self.delay_ns or 0)
 
 

@@ -1,8 +1,9 @@
 """The bus over zenoh; the only file that imports zenoh.
 
 Peers have explicit endpoints, no multicast and no gossip, so that other processes on the host cannot join. Endpoints
-that other hosts can reach are refused without TLS. Shared memory is on: zenoh sends raw frames between processes of one
-host through it. The lease is 500 ms (default: 10 s): a frozen peer's token is gone in half a second.
+are loopback by default; one that other hosts can reach is refused without TLS. Shared memory is on: zenoh sends raw
+frames between processes of one host through it. The lease is 500 ms (default: 10 s): a frozen peer's token is gone in
+half a second.
 """
 
 from __future__ import annotations
