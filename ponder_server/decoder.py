@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from dual_system.models.ponder import mixers as mixers
+from dual_system.models.ponder import mixers
 from dual_system.models.ponder.gated_delta import gated_delta_rule
 from dual_system.models.ponder.kernels import DeltaRule, delta_rule_of_many, delta_rule_of_one, rotate
 from ponder_server.attention import attend
@@ -82,9 +82,9 @@ def project(
     attention: Any, hidden_BTH: Tensor, cos_sin: tuple[Tensor, Tensor]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Queries, keys and values (B, heads, T, D), rotated by their positions, and the output gate (B, T, heads, D)."""
-    asked = mixers.ask(attention, hidden_BTH)
-    queries, keys, values = (each.transpose(1, 2) for each in asked[:3])
-    return *rotate(queries, keys, *cos_sin), values, asked.gate
+    projected = mixers.attention_inputs(attention, hidden_BTH)
+    queries, keys, values = (each.transpose(1, 2) for each in projected[:3])
+    return *rotate(queries, keys, *cos_sin), values, projected.gate
 
 
 def _attention(
@@ -125,7 +125,7 @@ def gated_delta(delta: Any, memory: RecurrentMemory, slot_B: Tensor, num_new_B: 
     """
     batch, length = len(slot_B), hidden_BTH.shape[1]
     width = delta.conv_kernel_size
-    new_BTC, decay, beta, gate = mixers.write(delta, hidden_BTH, batch)
+    new_BTC, decay, beta, gate = mixers.delta_inputs(delta, hidden_BTH, batch)
     inputs_BCT = torch.cat([memory.conv[slot_B], new_BTC.transpose(1, 2)], dim=-1)
     # The last W inputs of each row end at its last valid token, not at its padding.
     kept_BW = num_new_B[:, None] + torch.arange(width, device=hidden_BTH.device)

@@ -23,7 +23,7 @@ class Draft(Protocol):
     """Proposes tokens. It must be a pure function: a draft decides which tokens share a forward, thus the last bits."""
 
     parts: Sequence[nn.Module]
-    """Modules that a proposal runs in turn, for heartbeats (``audible``)."""
+    """Modules that a proposal runs in turn, for heartbeats (``heartbeats``)."""
 
     def propose(self, written: Sequence[int], max_tokens: int, hidden_TH: Tensor | None = None) -> tuple[int, ...]:
         """At most ``max_tokens`` text tokens, without an end token, that may follow those ``written`` in this text.

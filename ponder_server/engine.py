@@ -25,7 +25,6 @@ from dual_system.models.ponder.checkpoint import weights_hash
 from dual_system.models.ponder.context import SegmentKind
 from dual_system.models.ponder.network import Ponder
 from dual_system.models.ponder.observation import Pictures, check_cameras
-from ponder_server.audible import audible
 from ponder_server.batching import Batch
 from ponder_server.context_policy import POLICIES, Span
 from ponder_server.contract import (
@@ -44,6 +43,7 @@ from ponder_server.contract import (
 from ponder_server.draft import Draft, NoDraft
 from ponder_server.engine_config import EngineConfig
 from ponder_server.episode import Episode, Query
+from ponder_server.heartbeats import heartbeats
 from ponder_server.narrow import check_weights, quantise
 from ponder_server.opening import Opener
 from ponder_server.runner import NUM_SAVED_STATES, Append, Runner, Session, fitted
@@ -157,7 +157,7 @@ class QwenEngine:
         demo = [self._see(views, f"demo instant {n}") for n, views in enumerate(opening.demo_frames)]
         context = self._runner.open(session)
         try:
-            with audible(self._parts, progress):
+            with heartbeats(self._parts, progress):
                 pictures = [picture for instant in demo for picture in instant]
                 self._opener.encode(context, opening, segments, pictures, progress)
         except BaseException as error:
@@ -231,7 +231,7 @@ class QwenEngine:
     @torch.inference_mode()
     def step(self, progress: Progress = no_progress) -> list[Outcome[Fire]]:
         """Runs one forward; returns the queries that it answered. See ``BatchingEngine.step``."""
-        with audible(self._parts, progress):
+        with heartbeats(self._parts, progress):
             # At most as many as share a forward: more would lengthen the vision tower's pass and exceed CPU caches.
             begun = {session: self._begun.pop(session) for session in [*self._begun][: self._config.max_batch_rows]}
             if begun:

@@ -16,7 +16,7 @@ from dual_system.models.ponder.mtp import MtpHead
 from dual_system.models.ponder.network import Ponder
 from ponder_server.decoder import Place, decode
 from ponder_server.slots import SlotMemory
-from ponder_server.writer import MAX_CHECKED_TOKENS, ends_of_text, sayable
+from ponder_server.writer import MAX_CHECKED_TOKENS, allowed_tokens, ends_of_text
 
 WINDOW = 64
 """Tokens of the text to which the head attends; they are recomputed for every proposal."""
@@ -35,7 +35,7 @@ class MtpDraft:
         self._head = MtpHead(ponder)
         max_tokens, config = WINDOW + num_tokens, self._head.text_config
         self._memory = SlotMemory(config, num_slots=1, max_tokens=max_tokens, device=ponder.device, dtype=ponder.dtype)
-        self._may_end_V = sayable(ponder, ends=True)
+        self._may_end_V = allowed_tokens(ponder, ends=True)
         self._ends = ends_of_text(ponder.format.vocabulary)
         self.parts: Sequence[nn.Module] = [layer.mlp for layer in self._head.layers]  # type: ignore[misc]
 

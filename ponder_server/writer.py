@@ -31,7 +31,7 @@ def ends_of_text(vocabulary: Vocabulary) -> frozenset[int]:
     return frozenset({vocabulary.t_yes, vocabulary.t_no, vocabulary.end_of_text, vocabulary.im_end})
 
 
-def sayable(ponder: Ponder, *, ends: bool) -> Tensor:
+def allowed_tokens(ponder: Ponder, *, ends: bool) -> Tensor:
     """Tokens allowed in a text, (V,) bool: no control tokens, carriers or unused rows; end tokens if ``ends``."""
     vocabulary = ponder.format.vocabulary
     is_text_V = torch.zeros(ponder.vocab_size, dtype=torch.bool)
@@ -54,7 +54,7 @@ class TransitionWriter:
         self._max_text_tokens = max_text_tokens
         self._t_yes = ponder.format.vocabulary.t_yes
         self._ends = ends_of_text(ponder.format.vocabulary)
-        self._is_text_V, self._may_end_V = sayable(ponder, ends=False), sayable(ponder, ends=True)
+        self._is_text_V, self._may_end_V = allowed_tokens(ponder, ends=False), allowed_tokens(ponder, ends=True)
 
     def wants_to_write(self, hidden_1H: Tensor) -> bool:
         """Whether T_yes is the most likely of all next tokens."""
@@ -117,12 +117,12 @@ class TransitionWriter:
         A draft is appended after the known token. If part of it is wrong the state is restored, which also undoes the
         right tokens: they become ``pending`` and are appended again with the next forward.
         """
-        sayable_V = self._may_end_V if exactly is None else self._is_text_V
+        allowed_V = self._may_end_V if exactly is None else self._is_text_V
         ids: list[int] = []
         hidden_before = [hidden_NH]  # each token of the text, and the next one
         pending: list[int] = []
         end: int | None = None
-        (token,) = self._greedy(hidden_NH, sayable_V)
+        (token,) = self._greedy(hidden_NH, allowed_V)
         while True:
             if token in self._ends:
                 end = token
@@ -135,7 +135,7 @@ class TransitionWriter:
             draft = self._draft.propose(ids, room, torch.cat(hidden_before)) if room > 0 else ()
             before_draft = context.save(context.before_draft) if draft else None
             hidden_NH = yield self._append(context, [*pending, *draft], num_wanted=1 + len(draft))
-            predicted = self._greedy(hidden_NH, sayable_V)
+            predicted = self._greedy(hidden_NH, allowed_V)
             num_right = next((i for i, guess in enumerate(draft) if guess != predicted[i]), len(draft))
             ids += draft[:num_right]
             hidden_before.append(hidden_NH[: num_right + 1])
@@ -158,7 +158,7 @@ class TransitionWriter:
     def _append(self, context: Session, ids: Sequence[int], *, num_wanted: int) -> Append:
         return Append(session=context, ids=ids, embeds_TH=self._ponder.embed(ids), num_wanted=num_wanted)
 
-    def _greedy(self, hidden_NH: Tensor, sayable_V: Tensor) -> list[int]:
+    def _greedy(self, hidden_NH: Tensor, allowed_V: Tensor) -> list[int]:
         """The most likely allowed token after each of N."""
-        logits_NV = self._ponder.logits(hidden_NH).masked_fill(~sayable_V, float("-inf"))
+        logits_NV = self._ponder.logits(hidden_NH).masked_fill(~allowed_V, float("-inf"))
         return logits_NV.argmax(dim=-1).tolist()  # type: ignore[no-any-return]

@@ -15,7 +15,7 @@ import numpy as np
 from protocol.messages import Floats
 from sim_client.gateway import reading
 from sim_client.gateway.arrays import pack
-from sim_client.gateway.exchange import Answer, Asked, Finish, Packet, Refused, Seen, Step, Terms
+from sim_client.gateway.exchange import Answer, ClientRequest, Finish, Observed, Packet, Refused, Step, Terms
 from sim_client.gateway.openpi import actions_of, metadata
 
 CAMERAS = {"front": "front_rgb_list", "wrist": "wrist_rgb_list"}
@@ -32,10 +32,10 @@ class ChallengeDialect:
     def greeting(self) -> bytes:
         return pack(metadata(self._terms), "openpi")
 
-    def read(self, packet: Packet) -> Asked:
+    def read(self, packet: Packet) -> ClientRequest:
         message = reading.message(packet)
         if message.get("reset"):
-            return Asked(Finish(), reply=pack(RESET_FINISHED, "openpi"))
+            return ClientRequest(Finish(), reply=pack(RESET_FINISHED, "openpi"))
         begins = bool(reading.field(message, "is_first_step", "whether an episode begins"))
         lists = {name: _list(message, key) for name, key in self._terms.cameras.items()}
         seen = reading.videos(lists)
@@ -49,7 +49,7 @@ class ChallengeDialect:
             )
         instruction = reading.text(message, "task_goal")
         if begins:  # the states of the video are ignored
-            return Asked(
+            return ClientRequest(
                 Step(
                     instruction=instruction,
                     frames=seen[-1],
@@ -59,10 +59,12 @@ class ChallengeDialect:
                 )
             )
         states = _states(message, len(seen), self._terms.num_proprio)
-        since = tuple(Seen(frames, state) for frames, state in zip(seen[:-1], states, strict=False))
-        return Asked(Step(instruction=instruction, frames=seen[-1], state=states[-1], begins=False, since=since))
+        since = tuple(Observed(frames, state) for frames, state in zip(seen[:-1], states, strict=False))
+        return ClientRequest(
+            Step(instruction=instruction, frames=seen[-1], state=states[-1], begins=False, since=since)
+        )
 
-    def answer(self, asked: Asked, answer: Answer) -> bytes:
+    def answer(self, asked: ClientRequest, answer: Answer) -> bytes:
         return pack(actions_of(answer), "openpi")
 
     def refuse(self, sentence: str) -> str:

@@ -25,7 +25,7 @@ class Busy(Refused):
     """Another client has the robot."""
 
 
-class Seen(NamedTuple):
+class Observed(NamedTuple):
     """Observation of the client's robot at one tick."""
 
     frames: Frames
@@ -47,7 +47,7 @@ class Step:
     begins: bool
     may_begin: bool = False
     demo: Sequence[Frames] = ()
-    since: Sequence[Seen] = ()
+    since: Sequence[Observed] = ()
     task: str = ""
 
 
@@ -68,7 +68,7 @@ class Answer:
     levels: tuple[Level, ...]
 
 
-class Asked(NamedTuple):
+class ClientRequest(NamedTuple):
     """One message of a client: its request to the robot, if any, and a reply that needs no answer, if any."""
 
     request: Step | Finish | None
@@ -99,11 +99,11 @@ class Dialect(Protocol):
         """The message to send before the client's first one."""
         ...
 
-    def read(self, packet: Packet) -> Asked:
+    def read(self, packet: Packet) -> ClientRequest:
         """Parses a packet. Raises Refused if it is not of this dialect or is incomplete."""
         ...
 
-    def answer(self, asked: Asked, answer: Answer) -> Packet: ...
+    def answer(self, asked: ClientRequest, answer: Answer) -> Packet: ...
 
     def refuse(self, sentence: str) -> Packet:
         """The sentence in the dialect's own form of an error, for the packet read last."""

@@ -12,7 +12,7 @@ from typing import Any
 from protocol.messages import Mode
 from sim_client.gateway import reading
 from sim_client.gateway.arrays import pack
-from sim_client.gateway.exchange import Answer, Asked, Finish, Packet, Step, Terms
+from sim_client.gateway.exchange import Answer, ClientRequest, Finish, Packet, Step, Terms
 
 CAMERAS = {"front": "observation/image", "wrist": "observation/wrist_image"}
 STATE_KEY = "observation/state"
@@ -29,11 +29,11 @@ class OpenpiDialect:
     def greeting(self) -> bytes:
         return pack(metadata(self._terms), "openpi")
 
-    def read(self, packet: Packet) -> Asked:
+    def read(self, packet: Packet) -> ClientRequest:
         message = reading.message(packet)
         if message.get("reset"):
             self._instruction = None
-            return Asked(Finish(), reply=pack({"reset_finished": True}, "openpi"))
+            return ClientRequest(Finish(), reply=pack({"reset_finished": True}, "openpi"))
         instruction = reading.text(message, PROMPT_KEY)
         state = reading.field(message, self._terms.state_key, "the measured joints")
         step = Step(
@@ -44,9 +44,9 @@ class OpenpiDialect:
             may_begin=True,
         )
         self._instruction = instruction
-        return Asked(step)
+        return ClientRequest(step)
 
-    def answer(self, asked: Asked, answer: Answer) -> bytes:
+    def answer(self, asked: ClientRequest, answer: Answer) -> bytes:
         return pack(actions_of(answer), "openpi")
 
     def refuse(self, sentence: str) -> str:

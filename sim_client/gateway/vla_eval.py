@@ -14,7 +14,7 @@ from typing import Any
 from protocol.messages import Mode, TaskStatus
 from sim_client.gateway import reading
 from sim_client.gateway.arrays import pack
-from sim_client.gateway.exchange import Answer, Asked, Finish, Frames, Packet, Refused, Step, Terms
+from sim_client.gateway.exchange import Answer, ClientRequest, Finish, Frames, Packet, Refused, Step, Terms
 
 PROTOCOL_VERSION = 1
 CAMERAS = {"front": "", "wrist": ""}  # by order: every benchmark names them after its own simulator
@@ -41,7 +41,7 @@ class VlaEvalDialect:
     def greeting(self) -> None:
         return None
 
-    def read(self, packet: Packet) -> Asked:
+    def read(self, packet: Packet) -> ClientRequest:
         self._seq = 0
         message = reading.message(packet)
         kind, payload, seq = (message.get(key) for key in ("type", "payload", "seq"))
@@ -53,15 +53,15 @@ class VlaEvalDialect:
         if kind == "episode_start":
             return self._start(payload)
         if kind == "observation":
-            return Asked(self._observation(payload), seq)
+            return ClientRequest(self._observation(payload), seq)
         if kind == "episode_end":
             self._in_episode = False
-            return Asked(_outcome(payload), seq)
+            return ClientRequest(_outcome(payload), seq)
         if kind == "error":
-            return Asked(None, seq)
+            return ClientRequest(None, seq)
         raise Refused(f"expected a message of vla-eval 0.8, came type {kind[:80]!r}")
 
-    def answer(self, asked: Asked, answer: Answer) -> bytes:
+    def answer(self, asked: ClientRequest, answer: Answer) -> bytes:
         payload = {
             "actions": answer.rows_NA[0],
             "tick": answer.tick,
@@ -72,7 +72,7 @@ class VlaEvalDialect:
     def refuse(self, sentence: str) -> bytes:
         return _message("error", {"error": sentence}, self._seq)
 
-    def _hello(self, payload: Mapping[Any, Any]) -> Asked:
+    def _hello(self, payload: Mapping[Any, Any]) -> ClientRequest:
         theirs = payload.get("protocol_version", PROTOCOL_VERSION)
         if theirs != PROTOCOL_VERSION:
             raise Refused(f"expected protocol version {PROTOCOL_VERSION} (vla-eval 0.8), came {theirs!r}")
@@ -84,9 +84,9 @@ class VlaEvalDialect:
             "observation_params": OBSERVATION_PARAMS,
             **_SPECS,
         }
-        return Asked(None, self._seq, reply=_message("hello", hello, self._seq))
+        return ClientRequest(None, self._seq, reply=_message("hello", hello, self._seq))
 
-    def _start(self, payload: Mapping[Any, Any]) -> Asked:
+    def _start(self, payload: Mapping[Any, Any]) -> ClientRequest:
         """Nothing opens yet: the instruction and the video come with the first observation."""
         task = payload.get("task")
         name = task.get("name", "") if isinstance(task, Mapping) else ""
@@ -98,7 +98,7 @@ class VlaEvalDialect:
             self._objection = f"the harness runs {theirs}, this gateway {ours}: start pp-gateway with --mode {way_out}"
         was_open, self._in_episode, self._begins = self._in_episode, True, True
         self._task = name if isinstance(name, str) else ""
-        return Asked(Finish() if was_open else None, self._seq)
+        return ClientRequest(Finish() if was_open else None, self._seq)
 
     def _observation(self, payload: Mapping[Any, Any]) -> Step:
         if not self._in_episode:

@@ -18,7 +18,7 @@ from websockets.http11 import Request, Response
 
 from protocol.errors import TransportError
 from protocol.messages import Mode
-from sim_client.gateway.exchange import Answer, Asked, Dialect, Finish, Packet, Refused, Terms
+from sim_client.gateway.exchange import Answer, ClientRequest, Dialect, Finish, Packet, Refused, Terms
 from sim_client.gateway.machine import Machine
 from sim_client.gateway.openpi import metadata
 
@@ -101,7 +101,7 @@ class WebsocketSide:
             log.info("client=%s left", client)
 
     async def _reply(
-        self, connection: ServerConnection, dialect: Dialect, asked: Asked, future: Future[Answer | None] | None
+        self, connection: ServerConnection, dialect: Dialect, asked: ClientRequest, future: Future[Answer | None] | None
     ) -> None:
         try:
             answer = await asyncio.wrap_future(future) if future is not None else None

@@ -30,7 +30,7 @@ from ponder_server.draft import Draft, FirstOf, NoDraft, TrieDraft
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
 from ponder_server.mtp import MAX_DRAFT_TOKENS, WINDOW, MtpDraft
-from ponder_server.writer import TransitionWriter, sayable
+from ponder_server.writer import TransitionWriter, allowed_tokens
 
 VOCABULARY = Vocabulary.tiny()
 MODEL = replace(tiny_cpu(), num_layers=4, hidden_size=48, ffn_size=96, image_px=(64, 64))
@@ -181,7 +181,7 @@ def test_the_writer_hands_over_the_state_before_every_token() -> None:
     """Also of tokens that were right in a forward that was undone: greedy decoding of each state is the token."""
     ponder = foreseen(0.3)
     draft = MtpDraft(ponder, num_tokens=3)
-    is_text_V = sayable(ponder, ends=False)
+    is_text_V = allowed_tokens(ponder, ends=False)
     asked: list[int] = []
 
     class Watched:

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn import functional as F
 from transformers.models.qwen3_5.modeling_qwen3_5 import Qwen3_5GatedDeltaNet, causal_conv1d_fn
 
-from dual_system.models.ponder import mixers as mixers
+from dual_system.models.ponder import mixers
 
 CHUNK = 32
 _GPU_CHUNK = 64
@@ -114,7 +114,7 @@ class GatedDelta(Qwen3_5GatedDeltaNet):  # type: ignore[misc]  # transformers is
         """(B, T, H) to (B, T, H), causal; rows may be padded on the right."""
         if cache_params is not None or attention_mask is not None:
             return super().forward(hidden_states, cache_params, attention_mask, **kwargs)
-        inputs_BTC, decay, beta, gate = mixers.write(self, hidden_states)
+        inputs_BTC, decay, beta, gate = mixers.delta_inputs(self, hidden_states)
         weight = self.conv1d.weight.squeeze(1)
         mixed_BCT = causal_conv1d_fn(inputs_BTC.transpose(1, 2), weight, self.conv1d.bias, activation=self.activation)
         read, _ = gated_delta_rule(

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 
-class Asked(NamedTuple):
+class AttentionInputs(NamedTuple):
     """Projections of one attention layer, before RoPE."""
 
     queries: Tensor
@@ -27,13 +27,13 @@ class Asked(NamedTuple):
     """(..., h, D), before its sigmoid."""
 
 
-def ask(attention: Any, hidden: Tensor) -> Asked:
+def attention_inputs(attention: Any, hidden: Tensor) -> AttentionInputs:
     """Projects hidden states (..., H)."""
     size = attention.head_dim
     queries, gate = attention.q_proj(hidden).unflatten(-1, (-1, 2 * size)).chunk(2, dim=-1)
     keys = attention.k_norm(attention.k_proj(hidden).unflatten(-1, (-1, size)))
     values = attention.v_proj(hidden).unflatten(-1, (-1, size))
-    return Asked(attention.q_norm(queries), keys, values, gate)
+    return AttentionInputs(attention.q_norm(queries), keys, values, gate)
 
 
 def attended(attention: Any, seen: Tensor, gate: Tensor) -> Tensor:
@@ -42,7 +42,7 @@ def attended(attention: Any, seen: Tensor, gate: Tensor) -> Tensor:
     return mixed
 
 
-class Written(NamedTuple):
+class DeltaInputs(NamedTuple):
     """Projections of one Gated DeltaNet layer, before the convolution."""
 
     inputs: Tensor
@@ -55,13 +55,13 @@ class Written(NamedTuple):
     """(..., V E), gate of the output norm."""
 
 
-def write(delta: Any, hidden: Tensor, num_rows: int | None = None) -> Written:
+def delta_inputs(delta: Any, hidden: Tensor, num_rows: int | None = None) -> DeltaInputs:
     """Projects hidden states (..., H) and keeps the first ``num_rows``. Padding rows are multiplied too, because the
     last bits of a matrix product and of a softplus depend on the number of rows."""
     projections = (delta.in_proj_qkv, delta.in_proj_a, delta.in_proj_b, delta.in_proj_z)
     inputs, speed, beta, gate = (projection(hidden)[:num_rows] for projection in projections)
     decay = -delta.A_log.float().exp() * F.softplus(speed.float() + delta.dt_bias)
-    return Written(inputs, decay, beta.sigmoid(), gate)
+    return DeltaInputs(inputs, decay, beta.sigmoid(), gate)
 
 
 def heads(delta: Any, mixed: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -102,7 +102,7 @@ class PounceBundle:
         if table.num_dims != expected:
             raise ValueError(
                 f"statistics describe {table.num_dims} {what} dims, the config {expected}; with their action space "
-                f"{self.statistics.space!r} its robot_{what}_dim must be {table.num_dims} (pounce_configs.in_space)"
+                f"{self.statistics.space!r} its robot_{what}_dim must be {table.num_dims} (`pounce.configs.in_space`)"
             )
 
     def stored_config(self) -> AnyStoredConfig:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from protocol import messages as m
 from sim_client.gateway import challenge, openpi, vla_eval
 from sim_client.gateway.arrays import pack, unpack
-from sim_client.gateway.exchange import Answer, Asked, Finish, Refused, Step, Terms
+from sim_client.gateway.exchange import Answer, ClientRequest, Finish, Refused, Step, Terms
 
 PictureOf = Callable[[int], np.ndarray]
 TermsWith = Callable[..., Terms]
@@ -35,7 +35,7 @@ def speak_vla_eval(terms_with: TermsWith) -> vla_eval.VlaEvalDialect:
     return vla_eval.VlaEvalDialect(terms_with(cameras=vla_eval.CAMERAS, state_key="states"))
 
 
-def understood(asked: Asked) -> Step:
+def understood(asked: ClientRequest) -> Step:
     assert isinstance(asked.request, Step)
     return asked.request
 
@@ -46,10 +46,10 @@ def test_an_answer_reaches_every_client_bit_for_bit(rows: list[list[float]], tic
     answer = Answer(rows_NA=values, tick=tick, levels=(m.Level.PLAY,) * len(rows))
     terms: Any = None
     for dialect in (openpi.OpenpiDialect(terms), challenge.ChallengeDialect(terms)):
-        told = unpack(dialect.answer(Asked(None), answer))
+        told = unpack(dialect.answer(ClientRequest(None), answer))
         assert (told["actions"].tobytes(), told["actions"].shape) == (values.tobytes(), values.shape)
         assert (told["tick"], told["levels"]) == (tick, ["PLAY"] * len(rows))
-    told = unpack(vla_eval.VlaEvalDialect(terms).answer(Asked(None, seq=7), answer))
+    told = unpack(vla_eval.VlaEvalDialect(terms).answer(ClientRequest(None, seq=7), answer))
     assert (told["type"], told["seq"]) == ("action", 7)
     assert told["payload"]["actions"].tobytes() == values[0].tobytes()
 

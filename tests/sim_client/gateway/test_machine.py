@@ -15,7 +15,7 @@ from clock.check import disagreements
 from protocol import messages as m
 from protocol.mcap_log import read_log
 from protocol.topics import QUERY, TICK
-from sim_client.gateway.exchange import Busy, Finish, Refused, Seen, Step
+from sim_client.gateway.exchange import Busy, Finish, Observed, Refused, Step
 
 StepOf = Callable[..., Step]
 
@@ -56,7 +56,7 @@ def test_a_client_that_tells_all_it_saw_gets_that_episode_in_chunks_too(
     _, world = twin.run(episode_info(schedules.paper(), instruction=instruction, seed=0), num_ticks)
     bench = bench_with(num_rows=20)
     replayed = type(world)(num_ticks)
-    seen = [Seen(replayed.look().frames, replayed.look().state)]
+    seen = [Observed(replayed.look().frames, replayed.look().state)]
     while len(replayed.commands) < num_ticks:
         begins = not replayed.commands
         step = step_of(
@@ -65,7 +65,7 @@ def test_a_client_that_tells_all_it_saw_gets_that_episode_in_chunks_too(
         seen = []
         for row in bench.ask(step).rows_NA:
             snapshot = replayed.step(row)
-            seen.append(Seen(snapshot.frames, snapshot.state))
+            seen.append(Observed(snapshot.frames, snapshot.state))
     assert replayed.commands[:num_ticks] == world.commands
 
 

@@ -13,7 +13,7 @@ from ponder_server.contract import Progress, no_progress
 
 
 @contextmanager
-def audible(modules: Iterable[nn.Module], progress: Progress) -> Iterator[None]:
+def heartbeats(modules: Iterable[nn.Module], progress: Progress) -> Iterator[None]:
     """Calls ``progress`` whenever one of the modules has run; its exceptions abort the forward pass."""
     handles = []
     if progress is not no_progress:
