@@ -127,8 +127,12 @@ def storages() -> Iterator[Tensor]:
         if not issubclass(type(each), Tensor) or each.is_meta:  # isinstance would trigger deprecation warnings
             continue
         storage = each.untyped_storage()
-        if storage.data_ptr() not in seen:
-            seen.add(storage.data_ptr())
+        try:
+            address = storage.data_ptr()
+        except RuntimeError:  # torch.compile's fake tensors have no memory
+            continue
+        if address not in seen:
+            seen.add(address)
             yield torch.empty(0, dtype=torch.uint8, device=each.device).set_(storage)
 
 

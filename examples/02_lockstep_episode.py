@@ -17,12 +17,12 @@ from pounce_server import in_process as pounce
 from protocol.bus import LocalBus
 from protocol.link import Link
 from protocol.mcap_log import read_log
-from sim_client.config import SimOptions
+from sim_client.config import ScheduleOptions, SimOptions
 from sim_client.suite import Suite
 
 
 def main(out: Path) -> None:
-    options = SimOptions(in_process=True, max_steps=60, out=out)
+    options = SimOptions(in_process=True, schedule=ScheduleOptions(max_steps=60), out=out)
 
     # Four participants on one bus. Each has a step function; whoever waits for an answer lets the others take steps.
     bus = LocalBus()

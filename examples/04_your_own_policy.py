@@ -86,7 +86,7 @@ def episode(out: Path) -> None:
     from clock.service import ClockService, ServiceConfig
     from ponder_server import in_process as ponder
     from protocol.mcap_log import read_log
-    from sim_client.config import SimOptions
+    from sim_client.config import ScheduleOptions, SimOptions
     from sim_client.suite import Suite
 
     bus = LocalBus()
@@ -94,7 +94,7 @@ def episode(out: Path) -> None:
     bus.add_participant(server_on(bus).step)
     clock = ClockService(Link(bus, robot="r0", proc="clock"), ServiceConfig(watches=False))
     bus.add_participant(clock.step)
-    options = SimOptions(in_process=True, max_steps=40, out=out)
+    options = SimOptions(in_process=True, schedule=ScheduleOptions(max_steps=40), out=out)
     suite = Suite(options, Link(bus, robot="r0", proc="sim"), clock, check_servers=lambda: "")
     (played,) = suite.run()["episodes"]
     first_joint = np.array([tick.state[0] for tick in read_log(out / played["mcap"]).ticks])

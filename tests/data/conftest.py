@@ -14,7 +14,7 @@ from dual_system.data.episode import CAMERAS, About, EpisodeWriter, Package, Row
 from dual_system.data.jobs import Job
 from protocol.bus import LocalBus
 from protocol.link import Link
-from sim_client.config import SimOptions
+from sim_client.config import LogOptions, SimOptions
 from sim_client.suite import Suite
 
 PX = 16
@@ -75,9 +75,9 @@ def work_out(job: Job) -> Package:
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
     """Records what sim-client writes of an easy oracle episode; returns the log."""
 
-    def record(task: str, seed: int, **changes: Any) -> Path:
+    def record(task: str, seed: int, log: LogOptions) -> Path:
         out = tmp_path_factory.mktemp("recorded")
-        options = SimOptions(task=task, seed=seed, difficulty="easy", policy="oracle", out=out, **changes)
+        options = SimOptions(task=task, seed=seed, difficulty="easy", policy="oracle", out=out, log=log)
         bus = LocalBus()
         results = Suite(options, Link(bus, robot="r0", proc="sim"), None, lambda: "").run()
         bus.close()

@@ -20,6 +20,7 @@ from dual_system.models.ponder.network import Ponder
 from dual_system.training.data import TrainingSet
 from dual_system.training.example import ExampleConfig, make_example
 from protocol.mcap_log import EpisodeRecord, read_log
+from sim_client.config import LogOptions
 
 PARTS = 4
 
@@ -40,7 +41,7 @@ class HereAndNow:
 @pytest.fixture(scope="module")
 def log(recorded: Callable[..., Path]) -> Path:
     """Of an episode whose pictures nobody keeps."""
-    return recorded("PickXtimes", 6, record_hz=1)
+    return recorded("PickXtimes", 6, LogOptions(record_hz=1))
 
 
 @pytest.fixture(scope="module")

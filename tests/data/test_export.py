@@ -17,6 +17,7 @@ from dual_system.data.jobs import Job, Look
 from dual_system.data.rollout import play
 from dual_system.tasks.environment import make_environment
 from protocol.mcap_log import EpisodeRecord, read_log
+from sim_client.config import LogOptions
 
 SEED, TASK = 3, "VideoUnmask"
 JOB = Job(task=TASK, slot=0, image_px=256, max_steps=1300, look=Look())
@@ -26,7 +27,7 @@ pytestmark = pytest.mark.sim
 
 @pytest.fixture(scope="module")
 def log(recorded: Callable[..., Path]) -> Path:
-    return recorded(TASK, SEED, pixels="exact")
+    return recorded(TASK, SEED, LogOptions(pixels="exact"))
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +64,7 @@ def test_every_row_is_the_collected_one(exported: Dataset, collected: list[Row])
 @pytest.fixture(scope="module")
 def rounds(recorded: Callable[..., Path]) -> Path:
     """Of a task with several subgoals."""
-    return recorded("PickXtimes", SEED, pixels="exact")
+    return recorded("PickXtimes", SEED, LogOptions(pixels="exact"))
 
 
 @pytest.mark.parametrize("name", ["log", "rounds"])

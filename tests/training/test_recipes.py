@@ -29,7 +29,7 @@ def test_robomme_is_the_papers() -> None:
     optim = run.train.optim
     assert (run.num_steps, run.batch_episodes, run.train.seed, run.w1, run.w2) == (4320, 32, 42, 1.0, 0.1)
     assert (optim.learning_rate, optim.warmup_steps, optim.betas) == (2e-5, 100, (0.9, 0.95))
-    assert (optim.eps, optim.weight_decay, optim.clip_norm, optim.decay) == (1e-8, 1e-10, 1.0, None)
+    assert (optim.eps, optim.weight_decay, optim.clip_norm, optim.ema_decay) == (1e-8, 1e-10, 1.0, 0.0)
     assert (run.pounce.horizon, run.pounce.cognition.num_carriers, run.pounce.cognition.gradient_scale) == (20, 1, 0.5)
     assert (run.train.dropout, run.freeze, run.from_scratch, run.trains) == (0.0, "vlm", False, "both")
     assert (run.ponder, run.demo_hz, run.space) == (ponder_configs.qwen35_9b(), 1, "joint_delta")

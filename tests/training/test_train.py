@@ -188,7 +188,7 @@ def test_the_processes_share_one_batch_and_rows_of_like_length(folder: Path, tmp
         assert drawn == sorted(drawn, reverse=True)
         long, short = (sum(drawn[place] for place in share._places) for share in shares)
         assert 0 <= long - short <= drawn[0]  # in any other order it could be far more
-        seen.update(one.tolist())
+        seen.update(one)
     assert seen == set(range(len(lengths)))
 
 
