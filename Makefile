@@ -53,7 +53,7 @@ demo: setup
 	@echo "logs            all $$(find out/demo -name '*.mcap' | wc -l) agree with the schedule"
 	@echo "to watch one    $(BIN)/pp-replay $$(find out/demo/realtime -name '*.mcap')"
 
-## make test    everything that needs no GPU; make unit: without processes and long runs
+## make test    the tests that need no GPU, but those of make accept; make unit: without processes and long runs
 # Files share the cores; a test that starts processes of its own has them all.
 test: setup
 	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile -m "not gpu and not acceptance and not e2e" --durations=10
@@ -65,7 +65,7 @@ unit: setup
 accept: setup
 	$(BIN)/python -m pytest -q -m acceptance
 
-## make lint    style, types, import contracts, generated code up to date
+## make lint    style, types, import contracts
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -76,7 +76,7 @@ lint: setup
 proto: setup
 	$(BIN)/python -m grpc_tools.protoc -I . --python_out=. --pyi_out=. $(PB)/common.proto $(PB)/stream.proto $(PB)/episode.proto
 
-## make bench   every benchmark, then the tables (about ten minutes on a quiet machine)
+## make bench   most benchmarks, then the tables (about forty minutes on two cores)
 bench: setup
 	$(BIN)/python -m benchmarks.bus_latency
 	$(BIN)/python -m benchmarks.ponder_latency

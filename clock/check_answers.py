@@ -91,7 +91,7 @@ def answers_of(record: EpisodeRecord) -> Answers:
 
 
 def check_queries(record: EpisodeRecord) -> Iterator[Disagreement]:
-    """Checks that queries are numbered without gaps, name existing observations, and come once per query period."""
+    """Checks that queries are numbered without gaps, name existing observations, and come at most once per period."""
     schedule, queries = record.info.schedule, record.queries
     sources: dict[int, set[int]] = {}
     for observation in record.observations:

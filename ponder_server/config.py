@@ -50,8 +50,8 @@ class SpeedOptions:
     """Speed and memory; texts and cognitions stay the same up to rounding."""
 
     weights: WeightsName = "float"
-    """Precision of the layers' weights. int8 (CPU) and fp8 (GPU of compute capability 8.9 or more) take one byte each;
-    the change of cognition is measured at start and logged."""
+    """Precision of the layers' weights. int8 (CPU) and fp8 (CPU or CUDA GPU) take one byte each; the change of
+    cognition is measured at start and logged. fp8 products need a GPU of compute capability 8.9 or more."""
     graphs: bool = True
     """Do not record forwards as CUDA graphs at start, on a GPU."""
     attention_threads: int = 1

@@ -1,7 +1,7 @@
 """Pixels on the wire: raw if every peer shares the host, JPEG over a network.
 
 On loopback JPEG costs 0.4 ms and saves nothing; at 100 Mbit/s it saves about 29 ms per pair of 256 px views
-(measured and computed in the project's transport notes). The codec is part of every image, because JPEG changes the
+(the former measured, the latter computed). The codec is part of every image, because JPEG changes the
 models' input.
 """
 
