@@ -1,4 +1,4 @@
-"""Which cognition does an invocation see, and how old is it told that it is? No model, no bus, no clock: arithmetic.
+"""The cognition that an invocation is conditioned on, and its age: the reference rule without model, bus or clock.
 
 python examples/01_reference_rule.py
 """
@@ -9,7 +9,7 @@ from clock.reference import Ready, refer
 from clock.timebase import NS_PER_MS
 from protocol.messages import Delivery, DeliveryKind
 
-# PONDER looks once a second. Its first two answers take 300 ms; the third writes a subgoal to itself and takes 870 ms.
+# PONDER is queried once a second. The first two answers take 300 ms; the third generates a subgoal and takes 870 ms.
 QUERIES = [
     Ready(query=0, source_ns=0, ready_ns=300 * NS_PER_MS),
     Ready(query=1, source_ns=1000 * NS_PER_MS, ready_ns=1300 * NS_PER_MS),

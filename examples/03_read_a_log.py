@@ -1,4 +1,4 @@
-"""What a log holds, and how it is read: every message of an episode as the dataclass that was sent.
+"""Reads a log: every message of an episode, as the dataclass that was sent.
 
 python examples/03_read_a_log.py LOG.mcap
 """

@@ -1,4 +1,4 @@
-"""Your own action model behind POUNCE's contract: three names, arrays in, rows out. Here it is a few lines of NumPy.
+"""Your own action model behind POUNCE's contract (`spec`, `invoke`, `warm_up`); here a few lines of NumPy.
 
 python examples/04_your_own_policy.py                                 # a short lockstep episode, in this process
 python examples/04_your_own_policy.py --serve tcp/127.0.0.1:7449      # in the place of pounce-serve, over zenoh

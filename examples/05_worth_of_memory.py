@@ -1,4 +1,4 @@
-"""What memory was worth: the same scenes with PONDER's cognition and with the null, from two folders of pp-eval.
+"""Compares two folders of pp-eval scene by scene: with PONDER's cognition, and with the learned null.
 
 python examples/05_worth_of_memory.py REAL NULL
 """

@@ -1,7 +1,7 @@
 """Action spaces of POUNCE. Outside this module a chunk is always absolute joint targets; the network may use deltas.
 
-- ``joint_delta`` (the paper's), 8 dims: the seven joints relative to the chunk's first state, then the gripper.
-  The network reads the raw state: seven joints [rad], finger opening [m].
+- ``joint_delta`` (as in RoboMME's released pi0.5), 8 dims: the seven joints relative to the chunk's first state, then
+  the gripper. The network reads the raw state: seven joints [rad], finger opening [m].
 - ``ee_delta``, 7 dims: the tool pose at the commanded joints relative to the tool pose at the chunk's first state, as
   translation [m] and rotation vector [rad], then the gripper. Both parts are in the table's frame, not the tool's, and
   separate (no screw motion): a tool that moves straight and turns about a fixed axis gives actions linear in time.

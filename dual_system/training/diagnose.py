@@ -5,7 +5,7 @@ There are two comparisons; ticks, targets, pictures and flow draws are the same 
 - *Staleness* (paper, Figure 4): C_{t-k} in place of C_t, k = 0, 1, 2, 4 queries at 1 Hz, with its true age 0.3 + k s.
 - *Cognition*: the real one, the learned null, or that of the next episode of the same task at the same query. Means are
   over all ticks, and over branch points: the first invocation after each start of a subgoal, where the motion does not
-  yet show which way to go. The mean over all ticks does not predict success; that over branch points does.
+  yet show which way to go. Neither mean predicts success.
 
 PONDER's row has the recorded texts, as in training. ``pp-tables`` makes tables and a plot of the result.
 """

@@ -125,7 +125,7 @@ def robomme_0p8b() -> Recipe:
 
 
 def robocasa_dc() -> Recipe:
-    """The paper's RoboCasa-DC run (B.2): GR00T N1.5, actions only, cognition dropout 0.15.
+    """The paper's RoboCasa-DC run (B.2): GR00T N1.5, actions only, cognition dropout 0.15; on the Panda's 8 dims.
 
     The paper gives no seed for it: 42 here.
     """

@@ -116,7 +116,7 @@ class TrainOptions:
 
     recipe: str
     """Name of a recipe: robomme and robocasa_dc are the paper's runs, robomme_* its ablations; tiny, tiny_groot and
-    tiny_subgoal_text are for a try."""
+    tiny_subgoal_text are small ones for a CPU."""
     data: tuple[Path, ...]
     """Folders that pp-collect or pp-export made."""
     out: Path
