@@ -266,8 +266,6 @@ def main(argv: list[str] | None = None) -> int:
         "clock_lost from the robot's side). back: from restart or SIGCONT to ponder_back, start of Python and loading "
         "included. playing again: to the first row made with a new cognition.",
         "logs agree: pp-check derives every decision of the log again and finds no difference.",
-        "openpi's frozen server: a longer measurement of this project (its transport notes, section 5) saw its client "
-        "raise after 49 s; that number is from there, not from this run.",
     ]
     findings = sorted({t.finding for each in trials.values() for t in each if t.finding})
     report.notes += [f"pp-check found: {finding}" for finding in findings]

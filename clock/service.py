@@ -372,7 +372,7 @@ class ClockService:
             raise EpisodeRefused(
                 m.Refusal.ROBOT,
                 f"POUNCE gives chunks of ({pounce.horizon}, {pounce.action_dim}), the episode was opened for "
-                f"({info.schedule.horizon}, {info.robot.action_dim}). Set --horizon, or load another checkpoint.",
+                f"({info.schedule.horizon}, {info.robot.action_dim}). Load another checkpoint.",
             )
         if self._config.residual is not None:
             try:

@@ -61,7 +61,11 @@ def serve_model(
             print(f"{proc}-serve: {error}", file=sys.stderr)  # noqa: T201
             return 2
         server = make(link, engine, heartbeat, version())
-        server.warm_up()
+        try:
+            server.warm_up()
+        except Exception as error:  # whatever a kernel or the capture of a graph raises
+            heartbeat.set(state=ServingState.FAILED, detail=f"warm-up: {error}"[:2000])
+            raise
         server.ready()
         run(bus, server.step, should_stop)
         heartbeat.set(state=ServingState.CLOSING)

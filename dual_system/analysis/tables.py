@@ -148,7 +148,6 @@ def between_conditions(results: Sequence[Results]) -> str:
 _GIVEN = {
     "null": "the null cognition",
     "other-episode": "another episode's cognition",
-    "stand-in": "the task's own subgoal",
 }
 
 
@@ -176,8 +175,6 @@ def _about(results: Results) -> str:
     size = [_count(len(results.tasks), "task"), _count(scenes, "scene"), _count(results.num_runs, "run")]
     mode, steps = results.config.get("mode", "unknown mode"), results.config.get("max_steps", "?")
     untrained = " **Untrained weights: motion, not skill.**" if results.is_untrained else ""
-    if _cognition(results.config) == "stand-in":
-        untrained = " **In PONDER's place: the task's own subgoals.**"
     return f"- `{results.label}`: {', '.join(size)}; {mode}, at most {steps} steps.{untrained}"
 
 

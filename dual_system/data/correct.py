@@ -54,7 +54,7 @@ class CorrectOptions:
     """Folder of the new dataset."""
     per_episode: int = 2
     """Number of corrected episodes per log, each taken over at another tick."""
-    look_hz: Literal[1, 2, 4, 5, 10, 20] = 5
+    record_hz: Literal[1, 2, 4, 5, 10, 20] = 5
     """Rate of rendered pictures in Hz."""
     image_px: int = 256
     """Side of the pictures in pixels, an even number (paper and benchmark: 256)."""
@@ -157,7 +157,7 @@ def work_out(job: Job) -> Outcome:
         record.info.task, options.image_px, options.max_steps, texts_follow=True
     )
     writer = EpisodeWriter(options.image_px)
-    scribe = Scribe(environment, writer.add, Look(execution_hz=options.look_hz))
+    scribe = Scribe(environment, writer.add, Look(execution_hz=options.record_hz))
     first = environment.reset(record.info.seed, record.info.difficulty)
     scribe.begin()
     at = _taken_over_at(record.info.seed, job.part, options.per_episode, len(actions))

@@ -170,7 +170,7 @@ def main(argv: list[str] | None = None, prog: str = "pp-collect pairs") -> int:
         sys.stderr.write(f"{prog}: {', '.join(strangers)}: not of the {options.family} family\n")
         return 2
     if not tasks:
-        sys.stderr.write(f"{prog}: no task of the {options.family} family can be forked yet; see docs/tasks.md\n")
+        sys.stderr.write(f"{prog}: no task of the {options.family} family can be forked; see docs/tasks.md\n")
         return 2
     options.out.mkdir(parents=True, exist_ok=True)
     entries: list[dict[str, Any]] = []

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import sys
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -232,7 +232,9 @@ def _update(
         if options.machine.loaders:
             prefetcher = Prefetcher(batches.on_cpu, world.device, options.machine.loaders)
             stack.callback(prefetcher.close)
-        trainer = Trainer(model, prefetcher or batches, run.train, data_hash=data_hash, world=world)
+        # The number of steps is left out: a run may go on for longer.
+        made_with = {name: value for name, value in asdict(run).items() if name != "num_steps"}
+        trainer = Trainer(model, prefetcher or batches, run.train, data_hash=data_hash, recipe=made_with, world=world)
         options.out.mkdir(parents=True, exist_ok=True)
         trainer.resume(checkpoint)
         shows = log.progress and world.is_first

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -75,9 +76,10 @@ class Trainer:
         config: TrainConfig,
         *,
         data_hash: str = "",
+        recipe: Mapping[str, Any] | None = None,
         world: World | None = None,
     ) -> None:
-        """``data_hash`` identifies the data: a checkpoint made with other data is refused.
+        """A checkpoint made with another ``config``, ``data_hash`` or ``recipe`` (what else fixes the run) is refused.
 
         With several processes, ``model`` must be sharded already, or equal on all of them.
         """
@@ -85,7 +87,8 @@ class Trainer:
         self.config = config
         self.step = 0
         self._batches = batches
-        self._data_hash = data_hash
+        made_with = {"train": asdict(config), "data": data_hash, **(recipe or {})}
+        self._made_with: dict[str, Any] = json.loads(json.dumps(made_with))  # as a checkpoint's facts come back
         self._world = world or World()
         self._optimiser = Optimiser(model, config.optim)
         self._latest: tuple[PonderBatch, Tensor] | None = None
@@ -181,7 +184,7 @@ class Trainer:
             write_rows(_weights(self.model), fresh, _WEIGHTS, world)
             write_rows(self._optimiser.tensors(), fresh, _OPTIMISER, world)
             if world.is_first:
-                facts = {"step": self.step, "config": asdict(self.config), "data_hash": self._data_hash}
+                facts = {"step": self.step, "made_with": self._made_with}
                 (fresh / _FACTS).write_text(json.dumps(facts, indent=1) + "\n")
                 disk.sync(fresh / _FACTS)
         except (OSError, SafetensorError) as error:
@@ -208,12 +211,10 @@ class Trainer:
         if not folder.exists():
             return False
         facts = json.loads((folder / _FACTS).read_text())
-        for name, now in (("config", json.loads(json.dumps(asdict(self.config)))), ("data_hash", self._data_hash)):
-            if facts[name] != now:
-                raise CheckpointError(
-                    f"{folder}: made with {name} {facts[name]}, this run has {now}. Use another folder, or the same "
-                    "data and recipe."
-                )
+        if differs := list(_differences(facts.get("made_with", {}), self._made_with)):
+            raise CheckpointError(
+                f"{folder}: made with {'; '.join(differs[:5])}. Use another folder, or the same data and recipe."
+            )
         mine = _weights(self.model)
         with RowReader(folder, _WEIGHTS, self._world) as stored, torch.no_grad():
             shapes = {name: stored.shape(name) for name in stored.names()}
@@ -232,6 +233,15 @@ class Trainer:
 def _weights(model: JointModel) -> dict[str, Tensor]:
     """Every parameter once, tied ones under their first name."""
     return {name: parameter.detach() for name, parameter in model.named_parameters()}
+
+
+def _differences(then: Any, now: Any, name: str = "") -> Iterator[str]:
+    """Dotted names of the values that differ, with both values."""
+    if isinstance(then, dict) and isinstance(now, dict):
+        for key in sorted(then.keys() | now.keys()):
+            yield from _differences(then.get(key), now.get(key), f"{name}.{key}".lstrip("."))
+    elif then != now:
+        yield f"{name} {then}, this run has {now}"
 
 
 def _replace(folder: Path, fresh: Path, old: Path) -> None:

@@ -99,7 +99,6 @@ def test_of_all_sixteen_tasks_the_paper_s_interventions_stand_below(tmp_path: Pa
         ({"deliver": "held-transition", "held_age_ms": 300}, "C_t held at transitions, with age 300 ms"),
         ({"deliver": "held-transition"}, "C_t held at transitions, with its true age"),
         ({"cognition": "other-episode"}, "another episode's cognition"),
-        ({"cognition": "stand-in"}, "the task's own subgoal"),
         ({"policy": "oracle"}, "nothing: the oracle played"),
         ({"subgoal_text": "oracle"}, "the oracle's subgoal text"),
     ],

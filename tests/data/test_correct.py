@@ -50,7 +50,7 @@ def record(log: Path) -> EpisodeRecord:
 
 
 def options(log: Path, out: Path) -> CorrectOptions:
-    return CorrectOptions(files=(log,), out=out, per_episode=PARTS, look_hz=1, workers=1, progress=False)
+    return CorrectOptions(files=(log,), out=out, per_episode=PARTS, record_hz=1, workers=1, progress=False)
 
 
 @pytest.fixture(scope="module")

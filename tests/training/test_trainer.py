@@ -103,14 +103,18 @@ def test_a_kill_while_saving_loses_nothing(tmp_path: Path, killed: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "data_hash", "said"),
-    [({"seed": 2}, "a", "made with config"), ({}, "b", "made with data_hash a, this run has b")],
+    ("config", "data_hash", "w2", "said"),
+    [
+        (replace(TRAIN, seed=2), "a", 0.1, "made with train.seed 1, this run has 2"),
+        (TRAIN, "b", 0.1, "made with data a, this run has b"),
+        (TRAIN, "a", 0.0, "made with w2 0.1, this run has 0.0"),
+    ],
 )
 def test_a_checkpoint_of_another_run_is_refused(
-    tmp_path: Path, changes: dict[str, int], data_hash: str, said: str
+    tmp_path: Path, config: TrainConfig, data_hash: str, w2: float, said: str
 ) -> None:
-    Trainer(joint(), batch, TRAIN, data_hash="a").save(tmp_path / "checkpoint")
-    other = Trainer(joint(), batch, replace(TRAIN, **changes), data_hash=data_hash)  # type: ignore[arg-type]
+    Trainer(joint(), batch, TRAIN, data_hash="a", recipe={"w2": 0.1}).save(tmp_path / "checkpoint")
+    other = Trainer(joint(), batch, config, data_hash=data_hash, recipe={"w2": w2})
     with pytest.raises(CheckpointError, match=said):
         other.resume(tmp_path / "checkpoint")
 

@@ -1,0 +1,51 @@
+"""A model server that cannot start says so in its heartbeat before it ends."""
+
+from __future__ import annotations
+
+import pytest
+
+from model_server import daemon
+from protocol import topics
+from protocol.bus import LocalBus
+from protocol.link import Link, Stream
+from protocol.messages import Health, ServingState
+from protocol.options import LinkOptions
+
+
+class Broken:
+    """A server whose kernels do not run on this machine."""
+
+    def warm_up(self) -> None:
+        raise RuntimeError("no kernel image is available")
+
+    def ready(self) -> None:
+        raise AssertionError("not warm")
+
+    def step(self) -> bool:
+        raise AssertionError("not warm")
+
+
+def unreadable() -> object:
+    raise ValueError("not a folder")
+
+
+@pytest.fixture
+def healths(monkeypatch: pytest.MonkeyPatch) -> Stream[Health]:
+    bus = LocalBus()
+    monkeypatch.setattr(daemon, "open_bus", lambda options: bus)
+    monkeypatch.setattr(bus, "close", lambda: None)  # the robot's side outlives the server
+    monkeypatch.setattr(daemon, "set_up_logging", lambda: None)
+    return Link(bus, robot="r0", proc="sim").subscribe(topics.HEALTH)
+
+
+def test_a_checkpoint_that_cannot_be_loaded_is_reported(healths: Stream[Health]) -> None:
+    assert daemon.serve_model("ponder", LinkOptions(), "random", unreadable, lambda *_: Broken()) == 2
+    last = healths.drain()[-1]
+    assert (last.state, last.detail) == (ServingState.FAILED, "not a folder")
+
+
+def test_a_warm_up_that_fails_is_reported(healths: Stream[Health]) -> None:
+    with pytest.raises(RuntimeError, match="no kernel image"):
+        daemon.serve_model("ponder", LinkOptions(), "random", object, lambda *_: Broken())
+    last = healths.drain()[-1]
+    assert (last.state, last.detail) == (ServingState.FAILED, "warm-up: no kernel image is available")
