@@ -54,10 +54,10 @@ demo: setup
 	@echo "to watch one    $(BIN)/pp-replay $$(find out/demo/realtime -name '*.mcap')"
 
 ## make test    the tests that need no GPU, but those of make accept; make unit: without processes and long runs
-# Files share the cores; a test that starts processes of its own has them all.
+# Files share the cores; a test that keeps real time has them all.
 test: setup
-	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile -m "not gpu and not acceptance and not e2e" --durations=10
-	$(BIN)/python -m pytest -q -m "e2e and not gpu and not acceptance" --durations=10
+	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile -m "not gpu and not acceptance and not realtime" --durations=10
+	$(BIN)/python -m pytest -q -m "realtime and not gpu and not acceptance" --durations=10
 unit: setup
 	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile -m "not gpu and not acceptance and not e2e and not slow"
 

@@ -30,7 +30,7 @@ def main(out: Path) -> None:
     bus.add_participant(pounce.build(bus, "r0", checkpoint=None))
     clock = ClockService(Link(bus, robot="r0", proc="clock"), ServiceConfig(watches=False))
     bus.add_participant(clock.step)
-    suite = Suite(options, Link(bus, robot="r0", proc="sim"), clock, check_servers=lambda: "")
+    suite = Suite(options, Link(bus, robot="r0", proc="sim"), clock, dead_server=lambda: "")
 
     (episode,) = suite.run()["episodes"]
     log = out / episode["mcap"]

@@ -95,7 +95,7 @@ def episode(out: Path) -> None:
     clock = ClockService(Link(bus, robot="r0", proc="clock"), ServiceConfig(watches=False))
     bus.add_participant(clock.step)
     options = SimOptions(in_process=True, schedule=ScheduleOptions(max_steps=40), out=out)
-    suite = Suite(options, Link(bus, robot="r0", proc="sim"), clock, check_servers=lambda: "")
+    suite = Suite(options, Link(bus, robot="r0", proc="sim"), clock, dead_server=lambda: "")
     (played,) = suite.run()["episodes"]
     first_joint = np.array([tick.state[0] for tick in read_log(out / played["mcap"]).ticks])
     print(f"{played['steps']} ticks; joint 1 went from {first_joint.min():+.3f} to {first_joint.max():+.3f} rad")

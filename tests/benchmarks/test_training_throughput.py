@@ -13,7 +13,7 @@ from benchmarks import report, training_throughput
 @pytest.mark.parametrize("recipe", ["tiny", "tiny_groot"])
 def test_every_part_is_timed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recipe: str) -> None:
     monkeypatch.setattr(report, "REPORTS", tmp_path)
-    few = ["--steps", "1", "--ticks", "5", "45", "--demo", "0", "--peak-size", "64"]
+    few = ["--steps", "1", "--ticks", "5", "85", "--demo", "0", "--peak-size", "64"]
     assert training_throughput.main([*few, "--recipe", recipe]) == 0
     (table,) = json.loads((tmp_path / "training_throughput_cpu.json").read_text())["tables"]
     whole, together, apart, pounce = table["rows"]

@@ -18,7 +18,6 @@ from dual_system.data.video import read_frames
 from dual_system.tasks.engine import Status
 from dual_system.tasks.environment import Environment, make_environment
 from dual_system.tasks.oracle import FailedGrasp
-from dual_system.tasks.task import task_names
 
 
 def job(task: str, slot: int = 6, **changes: object) -> Job:
@@ -73,7 +72,7 @@ def test_an_episode_without_a_demonstration_has_nothing_to_reason_about() -> Non
     assert {(row.is_demonstration, row.demonstration_reasoning) for row in found} == {(False, "")}
 
 
-@pytest.mark.parametrize("task", task_names())
+@pytest.mark.parametrize("task", ["PickXtimes", "RouteStick", "VideoUnmask", "InsertPeg"])  # the first two repeat words
 def test_a_transition_is_where_the_next_subtask_is_spoken_of(task: str) -> None:
     """The texts follow the engine by one step, and two subtasks in a row may have the same words."""
     found: list[Row] = []

@@ -15,7 +15,7 @@ from clock.check import disagreements
 from protocol import messages as m
 from protocol.mcap_log import EpisodeRecord
 
-pytestmark = [pytest.mark.e2e, pytest.mark.sim, pytest.mark.slow]
+pytestmark = [pytest.mark.e2e, pytest.mark.realtime, pytest.mark.sim, pytest.mark.slow]
 
 PLAYED = (m.Level.PLAY, m.Level.STALE)
 LADDER = ["PLAY", "HOLD", "DECELERATE", "STOPPED"]

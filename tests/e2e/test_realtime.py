@@ -11,7 +11,7 @@ import pytest
 from clock.check import disagreements
 from protocol import messages as m
 
-pytestmark = [pytest.mark.e2e, pytest.mark.sim, pytest.mark.slow]
+pytestmark = [pytest.mark.e2e, pytest.mark.realtime, pytest.mark.sim, pytest.mark.slow]
 
 NUM_TICKS = 100
 

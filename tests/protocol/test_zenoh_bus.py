@@ -14,7 +14,7 @@ from protocol.errors import CallFailed, TransportError
 from protocol.topics import Priority
 from protocol.zenoh_bus import Endpoints, ZenohBus
 
-pytestmark = pytest.mark.e2e
+pytestmark = [pytest.mark.e2e, pytest.mark.realtime]
 
 PATIENCE_S = 5.0
 MS = 1_000_000

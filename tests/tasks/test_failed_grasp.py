@@ -15,8 +15,10 @@ SEED = 6
 Play = Callable[[Environment, Iterable[np.ndarray]], Snapshot]
 
 
-@pytest.mark.parametrize("offset", [(0, 0, 1), (1, 0, 0), (-1, 1, 0)])
-@pytest.mark.parametrize("task", ["PickHighlight", "VideoUnmask", "InsertPeg"])  # a cube, a container, a bar
+@pytest.mark.parametrize(
+    ("task", "offset"),  # a cube, a container, a bar
+    [("PickHighlight", (0, 0, 1)), ("PickHighlight", (-1, 1, 0)), ("VideoUnmask", (1, 0, 0)), ("InsertPeg", (0, 0, 1))],
+)
 def test_it_lifts_nothing_and_recovers(
     environment: Callable[[str], Environment], task: str, offset: tuple[int, int, int]
 ) -> None:

@@ -163,7 +163,7 @@ def test_stepping_before_reset_is_refused() -> None:
         env.step(HOME)
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_the_oracle_solves_98_of_100_seeds_in_upstreams_time(pick_highlight: Environment) -> None:
     steps: dict[str, list[int]] = {difficulty: [] for difficulty in DIFFICULTIES}
     for seed in range(100):
