@@ -36,7 +36,7 @@ from protocol.link import Link
 from protocol.topics import OBSERVATION
 from sim_client.episode import Outcome, RobotSide, always
 
-hypothesis.settings.register_profile("house", deadline=None)  # a deadline reads the wall clock
+hypothesis.settings.register_profile("house", deadline=None, max_examples=30)  # a deadline reads the wall clock
 hypothesis.settings.load_profile("house")
 
 ROBOT, CAMERAS, PX, DIM, NUM_PROPRIO = "r0", ("front", "wrist"), 4, 3, 3

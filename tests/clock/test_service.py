@@ -83,7 +83,11 @@ def serve_time(rig: Any, skew_ns: int = 0, clock_id: str = "robot/monotonic") ->
     [
         ({"num_carriers": 3}, {}, "carriers K: PONDER gives 3, POUNCE expects 2. Load checkpoints trained together."),
         ({"hidden_size": 9}, {}, "hidden size H: PONDER gives 9, POUNCE expects 8. Load checkpoints trained together."),
-        ({}, {"horizon": 16}, "POUNCE gives chunks of (16, 3), the episode was opened for (20, 3). Set --horizon"),
+        (
+            {},
+            {"horizon": 16},
+            "POUNCE gives chunks of (16, 3), the episode was opened for (20, 3). Load another checkpoint.",
+        ),
         ({}, {"action_dim": 8}, "POUNCE gives chunks of (20, 8), the episode was opened for (20, 3)."),
         ({}, {"proprio_dim": 8}, "pounce refuses the episode: POUNCE reads 8 joint values, the robot has 3"),
     ],

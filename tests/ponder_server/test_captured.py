@@ -341,7 +341,7 @@ def test_the_paper_s_context_has_five_lengths() -> None:
     assert position_buckets(16_384) == (1024, 2048, 4096, 8192, 16_384)
 
 
-@pytest.mark.parametrize(("num_tokens", "max_rows", "num_graphs"), [(16, 2, 15), (40, 8, 27), (1, 1, 9), (999, 1, 9)])
+@pytest.mark.parametrize(("num_tokens", "max_rows", "num_graphs"), [(16, 2, 15), (1, 1, 9), (999, 1, 9)])
 @torch.inference_mode()
 def test_what_is_prepared_is_all_that_can_be_needed(num_tokens: int, max_rows: int, num_graphs: int) -> None:
     """Three numbers of positions; lengths that are shared for as many rows as there may be, the others for one."""

@@ -140,7 +140,7 @@ def test_only_the_videos_of_a_pair_differ(pair_of: Callable[[str], Pair], name: 
     assert own.shape != twin.shape or not np.array_equal(own, twin)
 
 
-@every_video
+@pytest.mark.parametrize("name", ["PatternLock", "MoveCube", "InsertPeg"])
 def test_after_either_video_the_robot_finds_the_same_world(environment: EnvironmentOf, play: Play, name: str) -> None:
     """From the first observation on it is the same to the bit, and each branch's script succeeds in it."""
     env = environment(name)

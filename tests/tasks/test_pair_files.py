@@ -96,4 +96,4 @@ def test_a_family_without_forks_says_so(
 ) -> None:
     monkeypatch.setattr(Task, "can_be_forked", classmethod(lambda cls: False))
     assert main(["--family", "imitation", "--out", str(tmp_path)]) == 2
-    assert "no task of the imitation family can be forked yet" in capsys.readouterr().err
+    assert "no task of the imitation family can be forked" in capsys.readouterr().err
