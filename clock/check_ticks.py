@@ -14,10 +14,8 @@ import numpy as np
 
 from clock.check_answers import Answers
 from clock.check_findings import Disagreement, compare
-from clock.ladder import Ladder
-from clock.limits import Hit, within_limits
+from clock.commander import Commander
 from clock.playback import Chunk, covering, deadline_ns, row_of, seam_policy, tick_at
-from clock.report import PLAYED
 from clock.residual import Due, ResidualHead, corrected
 from clock.timebase import NS_PER_MS
 from protocol.mcap_log import EpisodeRecord
@@ -60,7 +58,7 @@ def check_rows(record: EpisodeRecord, answers: Answers, residual: ResidualHead |
             continue
         while engaged and engaged[0] <= index:
             engaged.pop(0)
-            playing.ladder.engage()
+            playing.commander.engage()
         if tick.observation_tick in states:
             bits = {state.tobytes() for state in states[tick.observation_tick]}
             if tick.state.tobytes() not in bits:
@@ -86,13 +84,10 @@ class _Playing:
 
     info: EpisodeInfo
     residual: ResidualHead | None
-    ladder: Ladder = field(init=False)
-    last_command: Floats = field(init=False)
-    played_invocation: int | None = None
+    commander: Commander = field(init=False)
 
     def __post_init__(self) -> None:
-        self.ladder = Ladder(self.info.schedule)
-        self.last_command = self.info.robot.initial_command
+        self.commander = Commander(self.info)
 
     @property
     def stale_limit_ns(self) -> int:
@@ -100,24 +95,14 @@ class _Playing:
 
     def step(self, tick: Tick, usable: list[Chunk]) -> dict[str, tuple[Any, Any]]:
         """(expected, found) of every field of ``tick``; ``usable``: chunks with a row for it, oldest first."""
-        raw, row, hit = _NO_FLOATS, None, Hit.NONE
+        newest, raw = None, _NO_FLOATS
         if usable:
             joined, newest = seam_policy(self.info.schedule.seam)(usable, tick.tick), usable[-1]
             due = Due(row_A=joined, state=tick.state, row=tick.tick - newest.t_row0, age_ns=newest.age_ns)
             raw = corrected(self.residual, due)
-            row, hit = within_limits(raw, self.last_command, self.info.robot)
-        is_stale = bool(usable) and usable[-1].age_ns > self.info.schedule.max_age_ns
-        command = self.ladder.step(row, is_stale, self.last_command, tick.state)
-        level = self.ladder.level
-        if level in (Level.DECELERATE, Level.STOPPED):
-            limited, _ = within_limits(command, self.last_command, self.info.robot)
-            command = self.last_command if limited is None else limited
-        chunk = usable[-1] if level in PLAYED else None
-        jump = 0.0
-        if chunk is not None and chunk.invocation != self.played_invocation:
-            self.played_invocation = chunk.invocation
-            jump = float(np.abs(raw[:-1] - self.last_command[:-1]).max(initial=0.0))
-        self.last_command = command
+        state, state_ticks = tick.state if len(tick.state) else None, tick.tick - tick.observation_tick
+        decided = self.commander.step(raw, newest, state, tick.robot_state, state_ticks=state_ticks)
+        chunk = decided.chunk
         age_ns = chunk.age_ns if chunk else 0
         return {
             "invocation": (chunk.invocation if chunk else None, tick.invocation),
@@ -127,10 +112,10 @@ class _Playing:
             "age_ns": (age_ns, tick.age_ns),
             "age_ms": (age_ns / NS_PER_MS, tick.age_ms),
             "raw_row": (raw, tick.raw_row),
-            "limits_hit": (int(hit), tick.limits_hit),
-            "level": (level, tick.level),
-            "action": (command, tick.action),
-            "seam_jump": (jump, tick.seam_jump),
+            "limits_hit": (int(decided.hit), tick.limits_hit),
+            "level": (decided.level, tick.level),
+            "action": (decided.command, tick.action),
+            "seam_jump": (decided.seam_jump, tick.seam_jump),
         }
 
 

@@ -17,9 +17,10 @@ from enum import Enum
 
 import numpy as np
 
+from clock.commander import NO_ROW, Commander, Decision
 from clock.delays import in_order, modelled_ns
 from clock.ladder import Ladder
-from clock.limits import Hit, within_limits
+from clock.limits import Hit, out_of_range
 from clock.playback import Chunk, Join, covering, deadline_ns, row_of, seam_policy, tick_at
 from clock.reference import Ready, Reference, latest_ready, refer
 from clock.residual import Due, ResidualHead, corrected
@@ -37,6 +38,7 @@ from protocol.messages import (
     Mode,
     Observation,
     Query,
+    RobotState,
     Severity,
     Stamp,
     StampKind,
@@ -48,7 +50,8 @@ from protocol.messages import (
 Effect = Query | Stamp | Invocation | Action | Tick | Event
 
 _NO_CARRIERS: Floats = np.zeros((0, 0), np.float32)
-_NO_FLOATS: Floats = np.zeros(0, np.float32)
+_SKIPPED = Decision(command=NO_ROW, level=Level.SKIPPED, hit=Hit.NONE, chunk=None, seam_jump=0.0)
+_STATE_MAX_AGE_NS = 200_000_000  # older joints do not say where a stopped arm is
 
 
 class Stage(Enum):
@@ -99,8 +102,6 @@ class Conductor:
     tick: int = 0
     num_queries: int = 0
     num_invocations: int = 0
-    ladder: Ladder = field(init=False)
-    last_command: Floats = field(init=False)
     _absent: set[str] = field(default_factory=set)
     _newest: Observation | None = None
     _queries: list[_Pending] = field(default_factory=list)
@@ -114,15 +115,15 @@ class Conductor:
     _queried_tick: int = -1
     _queried_in: int = -1  # tick
     _invoked_in: int = -1
-    _played_invocation: int | None = None
+    _told_state: RobotState = RobotState.UNSPECIFIED
     _emitted: set[str] = field(default_factory=set)
     _join: Join = field(init=False)
+    _commander: Commander = field(init=False)
     _query_rng: np.random.Generator = field(init=False)
     _invoke_rng: np.random.Generator = field(init=False)
 
     def __post_init__(self) -> None:
-        self.ladder = Ladder(self.info.schedule)
-        self.last_command = self.info.robot.initial_command
+        self._commander = Commander(self.info)
         self._join = seam_policy(self.info.schedule.seam)
         streams = np.random.SeedSequence(self.info.schedule.seed).spawn(2)
         self._query_rng, self._invoke_rng = (np.random.default_rng(s) for s in streams)
@@ -162,8 +163,29 @@ class Conductor:
     def on_back(self, proc: str) -> None:
         self._absent.discard(proc)
 
-    def engage(self) -> None:
-        self.ladder.engage()
+    @property
+    def ladder(self) -> Ladder:
+        return self._commander.ladder
+
+    @property
+    def last_command(self) -> Floats:
+        return self._commander.last_command
+
+    def engage(self, now_ns: int) -> str:
+        """Allows motion again, from where the arm is; returns why not, or ""."""
+        newest = self._newest
+        if newest is None:
+            return "no observation has come yet: nobody knows where the arm is"
+        if not newest.robot_state.obeys:
+            return f"the robot says {newest.robot_state.name} {newest.robot_text}".strip() + ": clear that first"
+        if why_not := out_of_range(newest.proprio, self.info.robot):
+            return why_not
+        age_ns = now_ns - newest.source_ns
+        if not self._is_lockstep and age_ns > _STATE_MAX_AGE_NS:
+            limit_ms = _STATE_MAX_AGE_NS / 1e6
+            return f"the newest observation is {age_ns / 1e6:.0f} ms old; at most {limit_ms:.0f} ms are allowed"
+        self._commander.engage()
+        return ""
 
     # -- outputs
 
@@ -246,6 +268,16 @@ class Conductor:
         return ticks * NS_PER_S // schedule.control_hz
 
     @property
+    def newest_tick(self) -> int:
+        """Tick of the newest observation; 0 before the first."""
+        return 0 if self._newest is None else self._newest.tick
+
+    @property
+    def newest_source_ns(self) -> int | None:
+        """Instant of the newest observation."""
+        return None if self._newest is None else self._newest.source_ns
+
+    @property
     def owed_query(self) -> int | None:
         """The oldest query without an answer."""
         return next((a.index for a in self._queries if a.answer is None), None)
@@ -292,7 +324,7 @@ class Conductor:
             text = f"ticks {self.tick}..{newest - 1} passed unplayed: the clock service was not running"
             self._tell(effects, Severity.ERROR, "ticks_skipped", text, always=True)
         for tick in range(self.tick, newest):
-            effects.append(self._account(tick, now_ns, Level.SKIPPED, None, _NO_FLOATS, _NO_FLOATS, Hit.NONE, 0.0))
+            effects.append(self._account(tick, now_ns, _SKIPPED, NO_ROW))
         self.tick = max(self.tick, newest)
 
     def _ask_ponder_if_due(self, effects: list[Effect]) -> None:
@@ -405,79 +437,71 @@ class Conductor:
             del self._vectors[query]
 
     def _play(self, now_ns: int, effects: list[Effect]) -> None:
-        schedule, robot = self.info.schedule, self.info.robot
         self._chunks = [c if c.first_tick is not None else replace(c, first_tick=self.tick) for c in self._chunks]
-        usable = [c for c in covering(self._chunks, self.tick) if c.age_ns <= schedule.stale_limit_ns]
-        raw, row, hit = _NO_FLOATS, None, Hit.NONE
-        proprio = self._newest.proprio if self._newest is not None else self.last_command
+        usable = [c for c in covering(self._chunks, self.tick) if c.age_ns <= self.info.schedule.stale_limit_ns]
+        newest, chunk, raw = self._newest, None, NO_ROW
+        state = None if newest is None else newest.proprio
+        robot_state = RobotState.UNSPECIFIED if newest is None else newest.robot_state
         if usable:
-            chunk, raw = usable[-1], self._join(usable, self.tick)
-            due = Due(row_A=raw, state=proprio, row=self.tick - chunk.t_row0, age_ns=chunk.age_ns)
+            chunk, row_A = usable[-1], self._join(usable, self.tick)
+            known = self.last_command if state is None else state
+            due = Due(row_A=row_A, state=known, row=self.tick - chunk.t_row0, age_ns=chunk.age_ns)
             raw = corrected(self.residual, due)
-            row, hit = within_limits(raw, self.last_command, robot)
-        if Hit.NON_FINITE in hit:
-            self._tell(
-                effects,
-                Severity.ERROR,
-                "non_finite_row",
-                f"chunk {usable[-1].invocation} has a NaN row: held",
-            )
-        elif hit:
-            self._tell(effects, Severity.WARNING, "limit_hit", f"first row clipped to the robot's limits: {hit.name}")
-        before = self.ladder.level
-        was_playing = self.ladder.has_played
-        is_stale = bool(usable) and usable[-1].age_ns > schedule.max_age_ns
-        command = self.ladder.step(row, is_stale, self.last_command, proprio)
-        level = self.ladder.level
-        if level in (Level.DECELERATE, Level.STOPPED):  # the interpolation must respect the limits too
-            command = _limited(command, self.last_command, self.info)
-        played = usable[-1] if level in (Level.PLAY, Level.STALE) else None
-        jump = self._seam_jump(played, raw)
-        self.last_command = command
-        if level != before and (was_playing or level != Level.PLAY):
-            self._tell_level(effects, before, level)
-        effects.append(Action(tick=self.tick, deadline_ns=self.deadline_ns(self.tick), level=level, values=command))
-        effects.append(self._account(self.tick, now_ns, level, played, command, raw, hit, jump))
+        before, was_playing, was_blocked = self.ladder.level, self.ladder.has_played, self._commander.is_blocked
+        state_ticks = self.tick - self.newest_tick
+        decided = self._commander.step(raw, chunk, state, robot_state, state_ticks=state_ticks)
+        self._tell_limits(effects, decided.hit, chunk, was_blocked)
+        self._tell_robot(effects, robot_state)
+        if decided.level != before and (was_playing or decided.level != Level.PLAY):
+            self._tell_level(effects, before, decided.level)
+        due_ns = self.deadline_ns(self.tick)
+        effects.append(Action(tick=self.tick, deadline_ns=due_ns, level=decided.level, values=decided.command))
+        effects.append(self._account(self.tick, now_ns, decided, raw))
 
-    def _seam_jump(self, chunk: Chunk | None, raw: Floats) -> float:
-        """Distance of a new chunk's first row from the last command; 0 between switches."""
-        if chunk is None or chunk.invocation == self._played_invocation or not np.isfinite(raw).all():
-            return 0.0
-        self._played_invocation = chunk.invocation
-        return float(np.abs(raw[:-1] - self.last_command[:-1]).max(initial=0.0))
+    def _tell_limits(self, effects: list[Effect], hit: Hit, chunk: Chunk | None, was_blocked: bool) -> None:
+        robot, newest = self.info.robot, self._newest
+        if Hit.NON_FINITE in hit and chunk is not None:
+            self._tell(effects, Severity.ERROR, "non_finite_row", f"chunk {chunk.invocation} has a NaN row: held")
+        elif clipped := hit & ~Hit.STATE:
+            text = f"first row clipped to the robot's limits: {clipped.name}"
+            self._tell(effects, Severity.WARNING, "limit_hit", text)
+        if Hit.STATE in hit and newest is not None:
+            text = f"{out_of_range(newest.proprio, robot)} Held."
+            self._tell(effects, Severity.ERROR, "state_out_of_range", text)
+        if self._commander.is_blocked and not was_blocked:
+            text = "the arm does not follow its commands: held. Is it blocked, or is max_lead too small?"
+            self._tell(effects, Severity.ERROR, "blocked", text, always=True)
 
-    def _account(
-        self,
-        tick: int,
-        now_ns: int,
-        level: Level,
-        chunk: Chunk | None,
-        command: Floats,
-        raw: Floats,
-        hit: Hit,
-        jump: float,
-    ) -> Tick:
-        due_ns = self.deadline_ns(tick)
+    def _tell_robot(self, effects: list[Effect], state: RobotState) -> None:
+        if state != self._told_state and not (state.obeys and self._told_state.obeys):
+            said = f": {self._newest.robot_text}" if self._newest is not None and self._newest.robot_text else ""
+            name, severity = ("robot_ok", Severity.INFO) if state.obeys else ("robot_stopped", Severity.ERROR)
+            self._tell(effects, severity, name, f"the robot says {state.name}{said}", always=True)
+        self._told_state = state
+
+    def _account(self, tick: int, now_ns: int, decided: Decision, raw: Floats) -> Tick:
+        due_ns, chunk = self.deadline_ns(tick), decided.chunk
         row = row_of(chunk, tick) if chunk is not None else None
         return Tick(
             tick=tick,
             deadline_ns=due_ns,
             decided_ns=now_ns,
             late_ns=now_ns - due_ns,
-            level=level,
+            level=decided.level,
             invocation=chunk.invocation if chunk is not None else None,
             t_row0=chunk.t_row0 if chunk is not None else 0,
             row=row or 0,
             ref_query=chunk.ref_query if chunk is not None else None,
             age_ns=chunk.age_ns if chunk is not None else 0,
             observation_tick=self._newest.tick if self._newest is not None else 0,
-            state=self._newest.proprio if self._newest is not None else _NO_FLOATS,
-            action=command,
+            state=self._newest.proprio if self._newest is not None else NO_ROW,
+            action=decided.command,
             raw_row=raw,
-            limits_hit=int(hit),
-            seam_jump=jump,
+            limits_hit=int(decided.hit),
+            seam_jump=decided.seam_jump,
             age_ms=chunk.age_ns / 1e6 if chunk is not None else 0.0,
             late_ms=(now_ns - due_ns) / 1e6,
+            robot_state=self._newest.robot_state if self._newest is not None else RobotState.UNSPECIFIED,
         )
 
     def _tell_level(self, effects: list[Effect], before: Level, level: Level) -> None:
@@ -501,11 +525,6 @@ class Conductor:
 def invocation_seed(episode_seed: int, invocation: int) -> int:
     """Seed of the flow noise, a function of the episode's seed and the invocation's number alone."""
     return int(np.random.SeedSequence([episode_seed, invocation]).generate_state(1, np.uint64)[0] >> 1)
-
-
-def _limited(command: Floats, last_command: Floats, info: EpisodeInfo) -> Floats:
-    limited, _ = within_limits(command, last_command, info.robot)
-    return last_command if limited is None else limited
 
 
 def _take(

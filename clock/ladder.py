@@ -33,14 +33,18 @@ class Ladder:
         """Allows motion again: back to HOLD, then playing as soon as there is a row."""
         self.level, self.held_ticks, self.slowing_ticks = Level.HOLD, 0, 0
 
-    def step(self, row: Floats | None, is_stale: bool, last_command: Floats, proprio: Floats) -> Floats:
+    def stop(self) -> None:
+        """Stops at once, until somebody engages."""
+        self.level = Level.STOPPED
+
+    def step(self, row: Floats | None, is_stale: bool, last_command: Floats, standing: Floats) -> Floats:
         """Returns the command of this tick and sets ``level`` to its rung.
 
         Args:
             row: (action_dim,) within limits, from a chunk; None if no chunk has one.
             is_stale: the cognition behind ``row`` is older than ``max_age_ns``.
-            last_command: (action_dim,); its last dim, the gripper, is kept while decelerating.
-            proprio: (num_proprio,) newest measured joints.
+            last_command: (action_dim,).
+            standing: (action_dim,), where a deceleration ends: the measured joints, and the gripper as it is.
         """
         if not self.is_latched:
             if row is not None:
@@ -56,8 +60,7 @@ class Ladder:
                 self.level = Level.HOLD
                 return last_command
             self.level, self.slowing_ticks = Level.DECELERATE, 0
-            self._from = last_command
-            self._to = np.append(proprio[: len(last_command) - 1], last_command[-1]).astype(np.float32)
+            self._from, self._to = last_command, standing
         if self.level == Level.STOPPED or self._from is None or self._to is None:
             return last_command
         self.slowing_ticks += 1

@@ -16,7 +16,7 @@ from clock.conductor import Conductor, Stage
 from clock.feasibility import check_feasible
 from clock.offset import Offset, from_exchange, narrowest
 from clock.residual import RESIDUAL_EVENT, ResidualHead, check_head
-from clock.timebase import MonotonicClock, VirtualClock
+from clock.timebase import NS_PER_S, MonotonicClock, VirtualClock
 from clock.watch import HEARTBEAT_TIMEOUT_NS, Watch
 from protocol import messages as m
 from protocol.drops import DropReason
@@ -85,6 +85,10 @@ class _Episode:
     journal_bytes: int = 0
     newest_payload: bytes = b""
     phase: str = ""
+    contracts: dict[str, m.Contract] = field(default_factory=dict)
+    """Terms of both servers by process; empty if nobody but the oracle plays."""
+    others: set[int] = field(default_factory=set)
+    """Boot ids of processes that answered with other models."""
 
     @property
     def now_ns(self) -> int:
@@ -162,16 +166,49 @@ class ClockService:
         episode = self._episode
         for observation, sample in self._observations.receive():
             if episode is not None and is_of_episode(self._link, observation.header):
-                worked |= self._on_observation(episode, observation, sample.payload)
+                source = _source(observation.header)
+                worked |= bool(self._link.survive(source, self._on_observation, episode, observation, sample.payload))
         for cognition in self._cognitions.drain():
             if episode is not None and is_of_episode(self._link, cognition.header):
-                taken = episode.conductor.on_cognition(cognition, episode.now_ns)
-                worked |= taken or self._unasked("cognition", cognition.query, cognition.header)
+                worked |= bool(self._link.survive(_source(cognition.header), self._on_cognition, episode, cognition))
         for chunk in self._chunks.drain():
             if episode is not None and is_of_episode(self._link, chunk.header):
-                taken = episode.conductor.on_chunk(chunk, episode.now_ns)
-                worked |= taken or self._unasked("chunk", chunk.invocation, chunk.header)
+                worked |= bool(self._link.survive(_source(chunk.header), self._on_chunk, episode, chunk))
         return worked
+
+    def _on_cognition(self, episode: _Episode, cognition: m.Cognition) -> bool:
+        contract = episode.contracts.get("ponder")
+        if contract is None or not self._is_agreed(episode, "ponder", cognition):
+            return False
+        expected = (contract.num_carriers, contract.hidden_size)
+        if cognition.vector.shape != expected:
+            detail = f"expected a cognition of {expected}, came {cognition.vector.shape}"
+            self._link.drop(_source(cognition.header), DropReason.WRONG_SHAPE, detail)
+            return False
+        taken = episode.conductor.on_cognition(cognition, episode.now_ns)
+        return taken or self._unasked("cognition", cognition.query, cognition.header)
+
+    def _on_chunk(self, episode: _Episode, chunk: m.ActionChunk) -> bool:
+        if not self._is_agreed(episode, "pounce", chunk):
+            return False
+        taken = episode.conductor.on_chunk(chunk, episode.now_ns)
+        return taken or self._unasked("chunk", chunk.invocation, chunk.header)
+
+    def _is_agreed(self, episode: _Episode, proc: str, answer: m.Cognition | m.ActionChunk) -> bool:
+        """Whether an answer is from the model that the episode was opened with; another one is never played."""
+        contract = episode.contracts.get(proc)
+        if contract is None:
+            return False
+        if (answer.model_hash, answer.is_fake) == (contract.model_hash, contract.is_fake):
+            return True
+        header, agreed = answer.header, _named(contract.model_hash, contract.is_fake)
+        came = _named(answer.model_hash, answer.is_fake)
+        self._link.drop(_source(header), DropReason.OTHER_MODEL, f"the episode was opened with {agreed}, came {came}")
+        if header.boot_id not in episode.others and len(episode.others) < 16:
+            episode.others.add(header.boot_id)
+            text = f"{proc} answers with {came}; the episode was opened with {agreed}: its answers are not played"
+            self._event(m.Severity.ERROR, "other_model", text)
+        return False
 
     def _on_observation(self, episode: _Episode, observation: m.Observation, payload: bytes) -> bool:
         if len(observation.proprio) != episode.request.info.robot.num_proprio:
@@ -186,6 +223,9 @@ class ClockService:
                 return False
             zero_ns = episode.clock.zero_ns if isinstance(episode.clock, MonotonicClock) else self._host.now_ns()
             observation = replace(observation, source_ns=offset.to_ours(observation.source_ns) - zero_ns)
+        if why_not := self._out_of_time(episode, observation):
+            self._link.drop(_source(observation.header), DropReason.WRONG_INSTANT, why_not)
+            return False
         self._robot_heard_ns = self._host.now_ns()
         if episode.clock is None:
             episode.clock = VirtualClock() if episode.is_lockstep else MonotonicClock()
@@ -193,8 +233,26 @@ class ClockService:
             episode.newest_payload = payload
         return True
 
+    def _out_of_time(self, episode: _Episode, observation: m.Observation) -> str:
+        """Why an observation cannot be of this episode's present; "" if it can.
+
+        A robot shows the next tick, whose instant may lie one period ahead, and never an earlier instant than before.
+        """
+        conductor, schedule = episode.conductor, episode.request.info.schedule
+        may_count = conductor.stage != Stage.RUNNING and not episode.is_lockstep  # before tick 0 a robot may stream
+        early = schedule.control_hz if may_count else 0
+        if observation.tick > conductor.tick + early:
+            return f"tick {observation.tick} before tick {conductor.tick} was commanded"
+        ahead_ns = observation.source_ns - episode.now_ns
+        if ahead_ns > 2 * NS_PER_S // schedule.control_hz:
+            return f"tick {observation.tick} is dated {ahead_ns / 1e6:.0f} ms ahead of the episode's clock"
+        oldest_ns = conductor.newest_source_ns if conductor.newest_source_ns is not None else -NS_PER_S
+        if observation.tick >= conductor.newest_tick and observation.source_ns < oldest_ns:
+            return f"tick {observation.tick} is dated {observation.source_ns} ns, before {oldest_ns} ns"
+        return ""
+
     def _unasked(self, what: str, index: int, header: m.Header) -> bool:
-        self._link.drop(f"{header.proc}#{header.boot_id}", DropReason.UNASKED, f"{what} {index}")
+        self._link.drop(_source(header), DropReason.UNASKED, f"{what} {index}")
         return False
 
     def _check_liveness(self) -> None:
@@ -222,7 +280,13 @@ class ClockService:
         if episode is None or episode.clock is None:
             return False
         now_ns = episode.now_ns
-        effects = episode.conductor.poll(now_ns)
+        try:
+            effects = episode.conductor.poll(now_ns)
+        except Exception as error:  # a bug: without commands the robot's side holds and ends the episode
+            log.exception("the schedule failed episode=%s", self._link.episode)
+            self._event(m.Severity.ERROR, "schedule_failed", f"the episode is over: {error!r}"[:1000])
+            self._finish(None)
+            return True
         for effect in effects:
             if isinstance(effect, m.Query):
                 self._keep(episode, effect)
@@ -296,7 +360,8 @@ class ClockService:
         self._link.enter_episode(header.session, header.episode, header.epoch)
         self._last_epoch[header.session] = header.epoch
         head = self._config.residual if request.info.policy == "servers" else None
-        self._episode = _Episode(request, Conductor(request.info, committed_ticks=committed_ticks, residual=head))
+        conductor = Conductor(request.info, committed_ticks=committed_ticks, residual=head)
+        self._episode = _Episode(request, conductor, contracts=dict(zip(SERVERS, contracts, strict=False)))
         self._watch.forget_losses()
         self._robot_heard_ns = self._host.now_ns()
         self._link.publish(INFO, request.info, at_ns=0)
@@ -438,6 +503,15 @@ class ClockService:
     def _on_engage(self, request: m.EngageRequest) -> m.EngageReply:
         if self._episode is None:
             return m.EngageReply(error="no episode is open")
-        self._episode.conductor.engage()
+        if why_not := self._episode.conductor.engage(self._episode.now_ns):
+            return m.EngageReply(error=why_not)
         self._event(m.Severity.WARNING, "engaged", f"motion may start again, says {request.operator}")
         return m.EngageReply(level=self._episode.conductor.ladder.level.name)
+
+
+def _source(header: m.Header) -> str:
+    return f"{header.proc}#{header.boot_id}"
+
+
+def _named(model_hash: str, is_fake: bool) -> str:
+    return f"{model_hash or 'weights without a hash'}{' (untrained)' if is_fake else ''}"

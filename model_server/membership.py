@@ -111,6 +111,9 @@ class Membership:
             self._leave()
             refusal = error.refusal if isinstance(error, EpisodeRefused) else m.Refusal.REQUEST
             return m.OpenReply(error=str(error), refusal=refusal)
+        except Exception:  # a bug: the episode is not half open afterwards
+            self._leave()
+            raise
         if announce:
             self.announce()
         return m.OpenReply(contract=contract)

@@ -107,10 +107,10 @@ class ModelShell(ABC):
     def _take_observations(self) -> None:
         for observation in self._observations.drain():
             if is_of_episode(self._link, observation.header):
+                source = f"{observation.header.proc}#{observation.header.boot_id}"
                 try:
-                    self._on_observation(observation)
+                    self._link.survive(source, self._on_observation, observation)
                 except MalformedMessage as error:
-                    source = f"{observation.header.proc}#{observation.header.boot_id}"
                     self._link.drop(source, DropReason.WRONG_SHAPE, str(error))
 
     def _begin_inference(self, phase: str) -> int:

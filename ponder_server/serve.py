@@ -53,7 +53,7 @@ class PonderServer(ModelShell):
             if query.header.episode != self._link.episode:
                 worked |= self.rejoin()  # unknown episode: this process restarted, or another one opened it
             if is_of_episode(self._link, query.header):
-                self._node.on_query(query)
+                self._link.survive("query", self._node.on_query, query)
         for query in self._node.missed():
             self._tell(m.Severity.ERROR, "observation_missed", f"query {query.query}: tick {query.tick} never came")
         return worked

@@ -44,12 +44,12 @@ class PounceServer(ModelShell):
         self._take_observations()
         for subgoal in self._subgoals.drain() if self._subgoals is not None else ():
             if is_of_episode(self._link, subgoal.header):
-                self._node.on_subgoal(subgoal)
+                self._link.survive("subgoal", self._node.on_subgoal, subgoal)
         for invocation in self._invocations.drain():
             if invocation.header.episode != self._link.episode:
                 worked |= self.rejoin()
             if is_of_episode(self._link, invocation.header):
-                self._node.on_invocation(invocation)
+                self._link.survive("invocation", self._node.on_invocation, invocation)
         for invocation in self._node.missed():
             text = f"invocation {invocation.invocation}: tick {invocation.tick} never came"
             self._tell(m.Severity.ERROR, "observation_missed", text)

@@ -141,7 +141,7 @@ def check_observation(o: m.Observation) -> None:
     _instant(o, "source_ns")
     _vector(o, "proprio", low=1)
     _chosen(o, "status")
-    _text(o, "reason")
+    _text(o, "reason", "robot_text")
     _images(o, o.images)
 
 
@@ -276,6 +276,16 @@ def check_robot(r: m.Robot) -> None:
         _vector(r, name, low=max(dim, 1), high=max(dim, 1))
     _require(bool((r.command_low <= r.command_high).all()), r, "command_low", "<= command_high", "the opposite")
     _require(bool((r.max_step >= 0).all()), r, "max_step", ">= 0", "a negative step")
+    inside = (r.command_low <= r.initial_command) & (r.initial_command <= r.command_high)
+    _require(bool(inside.all()), r, "initial_command", "within command_low and command_high", r.initial_command)
+    _vector(r, "max_lead", low=0 if r.is_simulated else dim, high=dim)
+    _require(len(r.max_lead) in (0, dim) and bool((r.max_lead >= 0).all()), r, "max_lead", f"{dim} >= 0", r.max_lead)
+    for name in ("state_low", "state_high"):
+        _vector(r, name, low=0 if r.is_simulated else r.num_proprio)
+        size = len(getattr(r, name))
+        _require(size in (0, r.num_proprio), r, name, f"{r.num_proprio} numbers", size)
+    is_range = len(r.state_low) == len(r.state_high) and bool((r.state_low <= r.state_high).all())
+    _require(is_range, r, "state_low", "<= state_high", "the opposite")
     _require(len(r.cameras) <= MAX_IMAGES, r, "cameras", f"at most {MAX_IMAGES}", len(r.cameras))
     _index(r, "image_height", "image_width", "num_proprio")
 

@@ -130,6 +130,22 @@ class Link:
             self._reported.add((source, reason))
             log.warning("dropped source=%s reason=%s detail=%r (later ones are only counted)", source, reason, detail)
 
+    def survive(self, source: str, handler: Callable[..., T], *args: Any) -> T | None:
+        """Returns ``handler(*args)``; None if it fails unexpectedly, which drops the message and ends no process.
+
+        Raises:
+            ProtocolError: the handler refuses the message.
+        """
+        try:
+            return handler(*args)
+        except ProtocolError:
+            raise
+        except Exception as error:  # whatever a message may lead to
+            if (source, DropReason.FAILED) not in self._reported:
+                log.exception("unexpected error in handling a message source=%s", source)
+            self.drop(source, DropReason.FAILED, repr(error)[:500])
+            return None
+
 
 class Stream(Generic[T]):
     """Checked messages of one topic, oldest first."""
@@ -202,7 +218,7 @@ class Service:
     def answer(self, handler: Callable[[Any], Any]) -> int:
         """Answers every waiting call with ``handler(request)``; returns how many there were.
 
-        If a request does not decode, or the handler raises ProtocolError, the reply's ``error`` is that message.
+        If a request does not decode, or the handler raises, the reply's ``error`` is that message.
         """
         requests = self._inbox.drain()
         for request in requests:
@@ -211,6 +227,10 @@ class Service:
             except ProtocolError as error:
                 self._link.drop(f"call {self._call.name}", DropReason.REFUSED_CALL, str(error))
                 reply = self._call.reply(error=str(error))
+            except Exception as error:  # whatever a request may lead to
+                log.exception("unexpected error in call %s", self._call.name)
+                self._link.drop(f"call {self._call.name}", DropReason.FAILED, repr(error)[:500])
+                reply = self._call.reply(error=f"unexpected error, see the log: {error!r}"[:1000])
             request.reply(codec.encode(reply))
         return len(requests)
 

@@ -59,6 +59,22 @@ class Level(IntEnum):
     SKIPPED = 6
 
 
+class RobotState(IntEnum):
+    """What the robot says of itself."""
+
+    UNSPECIFIED = 0
+    OK = 1
+    USER_STOP = 2
+    PROTECTIVE_STOP = 3
+    FAULT = 4
+    TORQUE_OFF = 5
+
+    @property
+    def obeys(self) -> bool:
+        """Whether commands are carried out, as far as the robot says."""
+        return self in (RobotState.UNSPECIFIED, RobotState.OK)
+
+
 class SubgoalKind(IntEnum):
     UNSPECIFIED = 0
     SUBGOAL = 1
@@ -165,6 +181,8 @@ class Observation:
     images: tuple[Image, ...] = ()
     status: TaskStatus = TaskStatus.ONGOING
     reason: str = ""
+    robot_state: RobotState = RobotState.UNSPECIFIED
+    robot_text: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -275,6 +293,7 @@ class Tick:
     seam_jump: float = 0.0
     age_ms: float = 0.0
     late_ms: float = 0.0
+    robot_state: RobotState = RobotState.UNSPECIFIED
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -374,6 +393,9 @@ class Robot:
     image_width: int
     num_proprio: int
     is_simulated: bool
+    max_lead: Floats = field(default_factory=_no_floats)
+    state_low: Floats = field(default_factory=_no_floats)
+    state_high: Floats = field(default_factory=_no_floats)
 
     @property
     def action_dim(self) -> int:

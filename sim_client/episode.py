@@ -23,6 +23,7 @@ from protocol.link import Link, is_of_episode
 from protocol.topics import ACTION, EVENT, OBSERVATION, PHASE, SUBGOAL, TICK
 from sim_client.recorder import Recorder
 from sim_client.robot import observation, status_of
+from sim_client.robot_end import is_sound
 
 CLOCK_SILENCE_NS = 500 * NS_PER_MS
 """Real time: commands that stay away this long mean that the clock service is gone. The servos hold meanwhile."""
@@ -78,6 +79,8 @@ class RobotSide:
             self.recorder.step()
             for action in actions.drain():
                 if not is_of_episode(self.link, action.header) or action.tick < self._tick:
+                    continue
+                if not is_sound(self.link, action, info.robot, self._tick):
                     continue
                 heard_ns = time.monotonic_ns()
                 snapshot = self._obey(info, action)

@@ -14,6 +14,7 @@ from clock.report import statistics, stream_sha256
 from clock.service import ClockService
 from dual_system.models.ponder.demo_sampling import PAPER_SAMPLING, DemoSampling
 from protocol import messages as m
+from protocol.drops import DropReason
 from protocol.errors import CallFailed, EpisodeRefused, TransportError
 from protocol.link import Link
 from protocol.topics import CLOSE, CONTRACT, OPEN, alive_key
@@ -26,7 +27,25 @@ _ASK_AGAIN_NS = 200_000_000
 _LAST_TICKS_NS = 1_000_000_000
 _TURN_NS = 1_000_000
 
+MAX_SKIPPED_TICKS = 200
+"""Ticks (ten seconds) that the clock service may have skipped between two commands."""
+
 Reply = TypeVar("Reply", m.ContractReply, m.OpenReply)
+
+
+def is_sound(link: Link, action: m.Action, robot: m.Robot, next_tick: int) -> bool:
+    """Whether this robot may be given a command: it has the last word on its own limits. If not, it is counted."""
+    values = action.values
+    if values.shape != robot.command_low.shape:
+        why_not = f"expected {robot.action_dim} values, came {len(values)}"
+    elif not ((robot.command_low <= values) & (values <= robot.command_high)).all():
+        why_not = f"expected values within the joint limits, came {values.tolist()}"
+    elif action.tick - next_tick > MAX_SKIPPED_TICKS:
+        why_not = f"expected tick {next_tick} or a few later, came {action.tick}"
+    else:
+        return True
+    link.drop(f"{action.header.proc}#{action.header.boot_id}", DropReason.OUT_OF_LIMITS, why_not)
+    return False
 
 
 class RobotEnd:

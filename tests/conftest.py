@@ -194,6 +194,9 @@ def make_robot(**changes: Any) -> m.Robot:
         "image_width": PX,
         "num_proprio": NUM_PROPRIO,
         "is_simulated": True,
+        "max_lead": np.full(DIM, 3, np.float32),
+        "state_low": np.full(NUM_PROPRIO, -4, np.float32),
+        "state_high": np.full(NUM_PROPRIO, 4, np.float32),
     }
     return m.Robot(**(values | changes))
 

@@ -17,6 +17,7 @@ from protocol.messages import Floats, Robot
 from sim_client.robot import simulated_robot
 
 _OPTIONAL = {"initial_command"}
+_LIMITS = ("command_low", "command_high", "max_step", "max_lead", "state_low", "state_high")
 _MEASURED = {"image_height", "image_width"}
 
 
@@ -63,7 +64,7 @@ def read_body(path: Path) -> Body:
 
 
 def _robot(given: dict[str, Any], state: Floats, image_px: tuple[int, int]) -> Robot:
-    limits = {name: np.asarray(given[name], np.float32) for name in ("command_low", "command_high", "max_step")}
+    limits = {name: np.asarray(given[name], np.float32) for name in _LIMITS}
     initial = given.get("initial_command")
     if initial is None:
         initial = np.clip(state[: len(limits["command_low"])], limits["command_low"], limits["command_high"])

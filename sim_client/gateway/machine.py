@@ -15,10 +15,13 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypeVar
 
+import numpy as np
+
+from clock.limits import out_of_range
 from clock.service import ClockService
 from clock.timebase import MonotonicClock
 from protocol import images
@@ -35,7 +38,7 @@ from sim_client.gateway.node import LiveNode, LockstepNode, Measurement, Node
 from sim_client.gateway.pictures import resized
 from sim_client.gateway.rule import sampled
 from sim_client.recorder import Recorder
-from sim_client.robot_end import RobotEnd
+from sim_client.robot_end import RobotEnd, is_sound
 from sim_client.suite import versions
 
 log = logging.getLogger("pp-gateway")
@@ -194,6 +197,8 @@ class Machine:
             raise Refused("no episode is open: expected the first observation of one, after a reset")
         if episode.over:
             raise Refused(f"the episode is over: {episode.over}. Reset, and begin another one.")
+        for state in (*(seen.state for seen in step.since), step.state):
+            _check_state(state, episode.info.robot)
         height, width = episode.info.robot.image_height, episode.info.robot.image_width
         for name, frame in frames.items():
             if frame.shape[:2] != (height, width):
@@ -215,7 +220,7 @@ class Machine:
         asked_ns = time.monotonic_ns()
         while True:
             self._take_background(node)
-            for action in self._of_episode(self._actions):
+            for action in self._commands(episode):
                 if (shown := node.on_action(action)) is not None:
                     self._show(shown)
             if (answer := node.answer()) is not None:
@@ -239,7 +244,7 @@ class Machine:
         if episode is None or not isinstance(episode.node, LiveNode) or episode.over:
             return
         self._take_background(episode.node)
-        for action in self._of_episode(self._actions):
+        for action in self._commands(episode):
             episode.node.on_action(action)
             episode.heard_ns = episode.clock.now_ns()
         answer = episode.node.answer()
@@ -273,6 +278,10 @@ class Machine:
         for chunk in self._of_episode(self._chunks):
             node.commands.on_chunk(chunk)
 
+    def _commands(self, episode: _Episode) -> list[m.Action]:
+        robot, tick = episode.info.robot, episode.node.tick
+        return [each for each in self._of_episode(self._actions) if is_sound(self._link, each, robot, tick)]
+
     def _of_episode(self, stream: Stream[T]) -> list[T]:
         return [each for each in stream.drain() if is_of_episode(self._link, each.header)]  # type: ignore[attr-defined]
 
@@ -287,12 +296,18 @@ class Machine:
 
     def _begin(self, client: str, step: Step, frames: Frames) -> _Episode:
         """Raises Refused, TransportError: the servers do not take this episode."""
+        image_px = next(iter(frames.values())).shape[:2]
+        robot = self._plan.body.describe(step.state, (image_px[0], image_px[1]))
+        _check_state(step.state, robot)
+        seed = self._plan.seed + self._num_episodes
+        schedule = self._plan.schedule(seed)
+        if schedule.mode == m.Mode.LOCKSTEP and self._plan.num_rows > 1:
+            # A client may not say what it saw between its requests: the last state is repeated, and has no lead.
+            robot = replace(robot, max_lead=np.zeros(0, np.float32))
         self._end(m.TaskStatus.ONGOING, "another episode was begun")
         self._num_episodes += 1
-        seed = self._plan.seed + self._num_episodes - 1
         task = _id_of(step.task) or self._plan.task
         self._link.enter_episode(self._session, f"{task}-{seed}-{secrets.token_hex(3)}", self._num_episodes)
-        image_px = next(iter(frames.values())).shape[:2]
         info = m.EpisodeInfo(
             header=self._link.header("info", 0),
             task=task,
@@ -300,8 +315,8 @@ class Machine:
             seed=seed,
             difficulty="",
             instruction=step.instruction,
-            schedule=self._plan.schedule(seed),
-            robot=self._plan.body.describe(step.state, (image_px[0], image_px[1])),
+            schedule=schedule,
+            robot=robot,
             t0_unix_ns=time.time_ns(),
             versions=versions(),
             has_demo=bool(step.demo),
@@ -367,6 +382,12 @@ class Machine:
 def _refuse(future: Future[Answer | None], sentence: str) -> None:
     if not future.done():  # what failed may have come after the answer
         future.set_exception(Refused(sentence))
+
+
+def _check_state(state: m.Floats, robot: m.Robot) -> None:
+    """Raises Refused: the robot cannot have measured this."""
+    if why_not := out_of_range(state, robot):
+        raise Refused(f"{why_not} Another robot needs --robot-file.")
 
 
 def _id_of(name: str) -> str:

@@ -29,7 +29,7 @@ def ahead(command: Action, chunk: ActionChunk | None, robot: Robot, num_rows: in
         due_tick = command.tick + len(rows)
         row: Floats | None = None
         if chunk is not None and is_playing and 0 <= due_tick - chunk.t_row0 < chunk.horizon:
-            row, _ = within_limits(chunk.rows_NA[due_tick - chunk.t_row0], rows[-1], robot)
+            row, _ = within_limits(chunk.rows_NA[due_tick - chunk.t_row0], rows[-1], robot, None)
         levels.append(Level.HOLD if is_playing and row is None else command.level)
         rows.append(rows[-1] if row is None else row)
     return np.stack(rows), tuple(levels)

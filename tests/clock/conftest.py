@@ -258,7 +258,7 @@ def run_realtime(
                 conductor.on_lost("pounce")
                 conductor.on_back("pounce")
             elif what == "engage":
-                conductor.engage()
+                assert not conductor.engage(now_ns)
                 text = "motion may start again"
                 engaged = m.Event(severity=m.Severity.WARNING, name="engaged", text=text, tick=conductor.tick)
                 episode.say(engaged, now_ns)
@@ -295,6 +295,11 @@ def hear(conductor: Conductor, episode: Episode, message: Any, now_ns: int) -> N
 @pytest.fixture(scope="session")
 def timing() -> Callable[..., m.Schedule]:
     return schedule
+
+
+@pytest.fixture(scope="session")
+def info_of() -> Callable[[m.Schedule], m.EpisodeInfo]:
+    return episode_info
 
 
 @pytest.fixture(scope="session")

@@ -358,7 +358,7 @@ def test_one_request_at_a_time_is_under_way_at_each_server(live_info: m.EpisodeI
 
 def test_a_lost_chunk_does_not_silence_pounce_for_ever(live_info: m.EpisodeInfo) -> None:
     play = realtime(live_info, 8_000, pounce_ms=lambda invocation: NEVER if invocation == 2 else 40,
-                    at={4_000: lambda c: c.engage()})  # fmt: skip
+                    at={4_000: lambda c: c.engage(4_000 * MS)})  # fmt: skip
     assert [i.invocation for i in play.of(m.Invocation)][:4] == [0, 1, 2, 3]
     assert play.levels[-1] == "PLAY"
 
@@ -415,7 +415,7 @@ def test_a_stopped_robot_stays_stopped_when_pounce_is_back(live_info: m.EpisodeI
 def test_engage_starts_motion_again(live_info: m.EpisodeInfo) -> None:
     play = realtime(live_info, 9_000, pounce_ms=lambda invocation: NEVER if invocation == 2 else 40,
                     at={1_500: lambda c: c.on_lost("pounce"), 4_500: lambda c: c.on_back("pounce"),
-                        6_000: lambda c: c.engage()})  # fmt: skip
+                        6_000: lambda c: c.engage(6_000 * MS)})  # fmt: skip
     assert play.levels[-1] == "PLAY"
 
 

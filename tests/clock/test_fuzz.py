@@ -237,7 +237,7 @@ def test_every_way_of_refusing_is_reached(
     reasons = {"malformed", "wrong_encoding", "wrong_robot", "wrong_episode", "other_episode"}
     reached = {proc: set(link.dropped) for proc, link in rig.links.items()}
     assert reached == {
-        "clock": reasons | {"wrong_shape", "unasked"},
+        "clock": reasons | {"wrong_shape", "other_model"},
         "ponder": reasons | {"wrong_shape"},
         "pounce": reasons | {"wrong_shape"},
         "sim": reasons,

@@ -16,7 +16,7 @@ HOLD_LIMIT, DECELERATE = 4, 5  # as in the schedule of conftest
 P, S, H, D, X = Level.PLAY, Level.STALE, Level.HOLD, Level.DECELERATE, Level.STOPPED
 ROW = np.array([1, 2, 1], np.float32)
 LAST = np.array([0.5, 0.5, -1], np.float32)
-PROPRIO = np.array([0, 0.25, 0.04], np.float32)
+STANDING = np.array([0, 0.25, -1], np.float32)
 
 fresh, stale, nothing, engage = "fresh", "stale", "nothing", "engage"
 
@@ -32,7 +32,7 @@ def climb(ladder: Ladder, moves: list[str]) -> list[Level]:
         if move == engage:
             ladder.engage()
         else:
-            ladder.step(ROW if move != nothing else None, move == stale, LAST, PROPRIO)
+            ladder.step(ROW if move != nothing else None, move == stale, LAST, STANDING)
             levels.append(ladder.level)
     return levels
 
@@ -75,7 +75,7 @@ def test_a_command_is_a_row_the_last_command_or_between_it_and_the_joints(
             ladder.engage()
             continue
         was = ladder.level
-        command = ladder.step(ROW if move != nothing else None, False, last, PROPRIO)
+        command = ladder.step(ROW if move != nothing else None, False, last, STANDING)
         if ladder.level == Level.PLAY:
             expected = (command == ROW).all()
         elif ladder.level == Level.HOLD:
@@ -83,7 +83,7 @@ def test_a_command_is_a_row_the_last_command_or_between_it_and_the_joints(
         else:
             line = last if was == Level.HOLD else line  # where slowing down began
             assert line is not None
-            target = np.append(PROPRIO[:2], line[-1])
+            target = STANDING
             expected = (command >= np.minimum(line, target)).all() and (command <= np.maximum(line, target)).all()
         assert expected
         last = command
@@ -98,24 +98,24 @@ def test_nothing_but_engage_ends_a_stop(timing: Callable[..., Schedule], moves: 
 
 def test_slowing_down_ends_at_the_measured_joints(ladder: Ladder) -> None:
     climb(ladder, [fresh, *[nothing] * HOLD_LIMIT])
-    commands = [ladder.step(None, False, LAST, PROPRIO) for _ in range(DECELERATE)]
-    assert commands[-1] == pytest.approx([PROPRIO[0], PROPRIO[1], LAST[2]])
+    commands = [ladder.step(None, False, LAST, STANDING) for _ in range(DECELERATE)]
+    assert commands[-1] == pytest.approx(STANDING)
 
 
 def test_slowing_down_is_a_straight_line(ladder: Ladder) -> None:
     climb(ladder, [fresh, *[nothing] * HOLD_LIMIT])
-    commands = np.stack([LAST, *(ladder.step(None, False, LAST, PROPRIO) for _ in range(DECELERATE))])
+    commands = np.stack([LAST, *(ladder.step(None, False, LAST, STANDING) for _ in range(DECELERATE))])
     assert np.diff(commands, n=2, axis=0) == pytest.approx(0, abs=1e-6)
 
 
 def test_the_gripper_keeps_what_it_holds(ladder: Ladder) -> None:
     climb(ladder, [fresh, *[nothing] * HOLD_LIMIT])
-    assert {ladder.step(None, False, LAST, PROPRIO)[-1] for _ in range(DECELERATE + 3)} == {LAST[-1]}
+    assert {ladder.step(None, False, LAST, STANDING)[-1] for _ in range(DECELERATE + 3)} == {LAST[-1]}
 
 
 def test_later_joints_do_not_move_the_end_of_the_line(ladder: Ladder) -> None:
     """The joints measured when slowing down began: a robot that is pushed is not followed."""
     climb(ladder, [fresh, *[nothing] * (HOLD_LIMIT + 1)])
     for _ in range(DECELERATE - 1):
-        command = ladder.step(None, False, LAST, PROPRIO + 1)
-    assert command[:2] == pytest.approx(PROPRIO[:2])
+        command = ladder.step(None, False, LAST, STANDING + 1)
+    assert command[:2] == pytest.approx(STANDING[:2])

@@ -25,28 +25,28 @@ COMMANDS = st.tuples(*(st.floats(-1, 1, width=32),) * DIM).map(lambda values: np
 
 
 def gate(row: Any, last: Any = (0, 0, 0)) -> tuple[Floats | None, Hit]:
-    return within_limits(np.array(row, np.float32), np.array(last, np.float32), ROBOT)
+    return within_limits(np.array(row, np.float32), np.array(last, np.float32), ROBOT, None)
 
 
 @given(row=ANY_ROW, last=COMMANDS)
 def test_a_command_is_within_the_joint_limits(row: Floats, last: Floats) -> None:
-    command, _ = within_limits(row, last, ROBOT)
+    command, _ = within_limits(row, last, ROBOT, None)
     assert command is not None
     assert ((command >= ROBOT.command_low) & (command <= ROBOT.command_high)).all()
 
 
 @given(row=ANY_ROW, last=COMMANDS)
 def test_a_command_is_within_one_step_of_the_last(row: Floats, last: Floats) -> None:
-    command, _ = within_limits(row, last, ROBOT)
+    command, _ = within_limits(row, last, ROBOT, None)
     assert command is not None
     assert (np.abs(command - last)[:2] <= ROBOT.max_step[:2] + 1e-6).all()
 
 
 @given(row=ANY_ROW, last=COMMANDS)
 def test_a_command_passes_the_gate_unchanged(row: Floats, last: Floats) -> None:
-    command, _ = within_limits(row, last, ROBOT)
+    command, _ = within_limits(row, last, ROBOT, None)
     assert command is not None
-    again, hit = within_limits(command, last, ROBOT)
+    again, hit = within_limits(command, last, ROBOT, None)
     assert again is not None
     assert (again == command).all()
     assert hit == Hit.NONE
@@ -54,7 +54,7 @@ def test_a_command_passes_the_gate_unchanged(row: Floats, last: Floats) -> None:
 
 @given(row=ANY_ROW, last=COMMANDS)
 def test_a_hit_is_told_exactly_when_the_row_was_changed(row: Floats, last: Floats) -> None:
-    command, hit = within_limits(row, last, ROBOT)
+    command, hit = within_limits(row, last, ROBOT, None)
     assert (hit != Hit.NONE) == (command != row).any()
 
 
@@ -63,7 +63,7 @@ def test_a_hit_is_told_exactly_when_the_row_was_changed(row: Floats, last: Float
 def test_a_row_that_is_not_finite_is_no_command(bad: float, position: int) -> None:
     row = np.zeros(DIM, np.float32)
     row[position] = bad
-    assert within_limits(row, np.zeros(DIM, np.float32), ROBOT) == (None, Hit.NON_FINITE)
+    assert within_limits(row, np.zeros(DIM, np.float32), ROBOT, None) == (None, Hit.NON_FINITE)
 
 
 @pytest.mark.parametrize(
@@ -89,6 +89,6 @@ def test_no_step_limit_means_no_step_limit() -> None:
 
 def test_the_gate_leaves_its_arguments_alone() -> None:
     row, last = np.full(DIM, 9, np.float32), np.zeros(DIM, np.float32)
-    within_limits(row, last, ROBOT)
+    within_limits(row, last, ROBOT, None)
     assert (row == 9).all()
     assert (last == 0).all()

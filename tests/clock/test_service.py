@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from clock import schedules
+from clock.conductor import Conductor
 from clock.service import ROBOT_SILENCE_NS, ClockService, ServiceConfig
 from model_server import membership
 from protocol import codec, topics
@@ -336,11 +337,101 @@ def test_an_observation_with_other_joints_is_dropped(rig: Any, episode_info: Inf
     assert dict(rig.links["clock"].dropped) == {"wrong_shape": 1}
 
 
+@pytest.mark.parametrize(
+    ("tick", "source_ns"), [(2**53, 0), (21, 0), (0, 10**17), (0, 2_000 * MS), (0, 101 * MS), (0, -(10**18))]
+)
+def test_an_observation_that_cannot_be_of_now_is_dropped(
+    rig: Any, episode_info: Info, paper: m.Schedule, tick: int, source_ns: int
+) -> None:
+    rig.enter(episode_info(paper))
+    rig.show(tick, source_ns)
+    rig.clock.step()
+    assert dict(rig.links["clock"].dropped) == {"wrong_instant": 1}
+    assert rig.clock.conductor.num_queries == 0
+
+
+def test_impossible_observations_change_nothing_in_the_schedule(
+    rig: Any, episode_info: Info, paper: m.Schedule
+) -> None:
+    info, take = episode_info(paper), rig.listen(topics.QUERY)
+    stranger = Link(rig.bus, robot="r0", proc="sim")
+    stranger.enter_episode("s1", info.header.episode, 1)
+
+    def lie() -> None:
+        newest = rig.clock.conductor.newest_tick if rig.clock.conductor else 0
+        for tick, source_ns in ((newest + 2, 0), (2**53, 0), (newest, 10**17), (newest, -(10**17))):
+            stranger.publish(topics.OBSERVATION, rig.observation(tick, source_ns), at_ns=0)
+
+    rig.meanwhile = lie
+    outcome, _ = rig.run(info, 60)
+    take()
+    assert outcome.status == m.TaskStatus.SUCCESS
+    assert [(query.tick, query.source_ns // MS) for query in rig.said[m.Query]] == [
+        (0, 0),
+        (14, 1_000),
+        (34, 2_000),
+        (54, 3_000),
+    ]
+
+
+@pytest.mark.parametrize("changes", [{"model_hash": "other"}, {"is_random": True}])
+@pytest.mark.parametrize("proc", ["ponder", "pounce"])
+def test_a_server_that_comes_back_with_other_weights_is_not_played(
+    rig: Any, fake_ponder: Any, fake_pounce: Any, episode_info: Info, paper: m.Schedule, proc: str,
+    changes: dict[str, Any],
+) -> None:  # fmt: skip
+    take = rig.listen(topics.EVENT)
+    rig.enter(episode_info(paper))
+    engine = {"ponder": fake_ponder, "pounce": fake_pounce}[proc]
+    engine.spec = dataclasses.replace(engine.spec, **changes)
+    start = {"ponder": rig.start_ponder, "pounce": rig.start_pounce}[proc]
+    setattr(rig, proc, start(Link(rig.bus, robot="r0", proc=proc), engine))
+    rig.show(0, 0)
+    rig.settle()
+    take()
+    (event,) = [event for event in rig.said[m.Event] if event.name == "other_model"]
+    assert f"{proc} answers with" in event.text
+    assert rig.links["clock"].dropped["other_model"] >= 1
+    assert not rig.clock.conductor.ladder.has_played
+
+
+def test_a_failing_handler_drops_the_message_and_a_failing_call_is_answered(
+    rig: Any, episode_info: Info, paper: m.Schedule, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*arguments: Any, **options: Any) -> Any:
+        raise KeyError("a bug")
+
+    rig.enter(episode_info(paper))
+    monkeypatch.setattr(rig.clock.conductor.__class__, "on_observation", fail)
+    rig.show(0, 0)
+    rig.clock.step()
+    assert dict(rig.links["clock"].dropped) == {"failed": 1}
+    monkeypatch.setattr(rig.clock.conductor.__class__, "engage", fail)
+    reply = rig.listener.call(topics.ENGAGE, "clock", m.EngageRequest(operator="jane"), timeout_ns=1)
+    assert reply.error == "unexpected error, see the log: KeyError('a bug')"
+
+
+def test_a_failing_schedule_ends_the_episode_and_not_the_process(
+    rig: Any, episode_info: Info, paper: m.Schedule, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*arguments: Any) -> Any:
+        raise ZeroDivisionError("a bug")
+
+    take = rig.listen(topics.EVENT)
+    rig.enter(episode_info(paper))
+    monkeypatch.setattr(rig.clock.conductor.__class__, "poll", fail)
+    rig.show(0, 0)
+    rig.settle()
+    take()
+    assert rig.clock.conductor is None
+    assert "schedule_failed" in {event.name for event in rig.said[m.Event]}
+
+
 # -- what is remembered
 
 
-def test_a_journal_entry_holds_the_observation_its_query_names(rig: Any, episode_info: Info, paper: m.Schedule) -> None:
-    rig.enter(episode_info(paper))
+def test_a_journal_entry_holds_the_observation_its_query_names(rig: Any, episode_info: Info) -> None:
+    rig.enter(episode_info(schedules.realtime()))  # in lockstep no robot is ahead of the clock
     for tick in (5, 4):  # the older one comes late
         rig.show(tick, 0)
     rig.clock.step()
@@ -436,11 +527,42 @@ def test_engage_needs_an_episode(rig: Any) -> None:
 def test_engage_is_told_with_who_said_so(rig: Any, episode_info: Info, paper: m.Schedule) -> None:
     take = rig.listen(topics.EVENT)
     rig.enter(episode_info(paper))
+    rig.show(0, 0)
+    rig.clock.step()
     rig.clock.conductor.ladder.level = m.Level.STOPPED
     reply = rig.listener.call(topics.ENGAGE, "clock", m.EngageRequest(operator="jane"), timeout_ns=1)
     take()
     assert (reply.error, reply.level) == ("", "HOLD")
     assert "motion may start again, says jane" in {event.text for event in rig.said[m.Event]}
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"robot_state": m.RobotState.PROTECTIVE_STOP, "robot_text": "joint 4"}, "PROTECTIVE_STOP joint 4: clear that"),
+        ({"proprio": np.full(3, 45, np.float32)}, "state 0 is 45, which arm cannot measure"),
+    ],
+)
+def test_engage_is_refused_while_the_robot_cannot_move_safely(
+    rig: Any, episode_info: Info, paper: m.Schedule, changes: dict[str, Any], why: str
+) -> None:
+    rig.enter(episode_info(paper))
+    rig.show(0, 0, **changes)
+    rig.clock.step()
+    rig.clock.conductor.ladder.level = m.Level.STOPPED
+    reply = rig.listener.call(topics.ENGAGE, "clock", m.EngageRequest(operator="jane"), timeout_ns=1)
+    assert why in reply.error
+    assert rig.clock.conductor.ladder.level == m.Level.STOPPED
+
+
+def test_engage_is_refused_if_nobody_knows_where_the_arm_is_now(episode_info: Info) -> None:
+    live_info = episode_info(schedules.realtime())
+    conductor = Conductor(live_info)
+    assert conductor.engage(0) == "no observation has come yet: nobody knows where the arm is"
+    zeros = np.zeros(live_info.robot.num_proprio, np.float32)
+    conductor.on_observation(m.Observation(tick=0, source_ns=0, proprio=zeros))
+    assert conductor.engage(200 * MS) == ""
+    assert conductor.engage(201 * MS) == "the newest observation is 201 ms old; at most 200 ms are allowed"
 
 
 def test_closing_an_episode_closes_it_everywhere(rig: Any, episode_info: Info, paper: m.Schedule) -> None:

@@ -114,19 +114,23 @@ def chunks(draw: st.DrawFn) -> m.ActionChunk:
 
 @st.composite
 def robots(draw: st.DrawFn) -> m.Robot:
-    dim = draw(st.integers(1, 8))
+    dim, num_proprio = draw(st.integers(1, 8)), draw(st.integers(0, 8))
     bounds = np.sort(np.stack([draw(floats(dim, dim)), draw(floats(dim, dim))]), axis=0)
+    states = np.sort(np.stack([draw(floats(num_proprio, num_proprio)) for _ in range(2)]), axis=0)
     return m.Robot(
         name=draw(TEXT),
         command_low=bounds[0],
         command_high=bounds[1],
         max_step=np.abs(draw(floats(dim, dim))),
-        initial_command=draw(floats(dim, dim)),
+        initial_command=bounds[draw(st.integers(0, 1))],
         cameras=draw(tuples_of(TEXT)),
         image_height=draw(U32),
         image_width=draw(U32),
-        num_proprio=draw(U32),
+        num_proprio=num_proprio,
         is_simulated=draw(st.booleans()),
+        max_lead=np.abs(draw(floats(dim, dim))),
+        state_low=states[0],
+        state_high=states[1],
     )
 
 

@@ -143,7 +143,7 @@ class Schedule(_message.Message):
     def __init__(self, mode: _Optional[_Union[Mode, str]] = ..., control_hz: _Optional[int] = ..., horizon: _Optional[int] = ..., query_period_ns: _Optional[int] = ..., invoke_period_ticks: _Optional[int] = ..., query_delay: _Optional[_Union[Delay, _Mapping]] = ..., invoke_delay: _Optional[_Union[Delay, _Mapping]] = ..., delivery: _Optional[_Union[Delivery, _Mapping]] = ..., wait: _Optional[_Union[WaitKind, str]] = ..., seam: _Optional[_Union[Seam, _Mapping]] = ..., max_age_ns: _Optional[int] = ..., stale_limit_ns: _Optional[int] = ..., hold_limit_ticks: _Optional[int] = ..., decelerate_ticks: _Optional[int] = ..., max_ticks: _Optional[int] = ..., seed: _Optional[int] = ...) -> None: ...
 
 class Robot(_message.Message):
-    __slots__ = ("name", "command_low", "command_high", "max_step", "initial_command", "cameras", "image_height", "image_width", "num_proprio", "is_simulated")
+    __slots__ = ("name", "command_low", "command_high", "max_step", "initial_command", "cameras", "image_height", "image_width", "num_proprio", "is_simulated", "max_lead", "state_low", "state_high")
     NAME_FIELD_NUMBER: _ClassVar[int]
     COMMAND_LOW_FIELD_NUMBER: _ClassVar[int]
     COMMAND_HIGH_FIELD_NUMBER: _ClassVar[int]
@@ -154,6 +154,9 @@ class Robot(_message.Message):
     IMAGE_WIDTH_FIELD_NUMBER: _ClassVar[int]
     NUM_PROPRIO_FIELD_NUMBER: _ClassVar[int]
     IS_SIMULATED_FIELD_NUMBER: _ClassVar[int]
+    MAX_LEAD_FIELD_NUMBER: _ClassVar[int]
+    STATE_LOW_FIELD_NUMBER: _ClassVar[int]
+    STATE_HIGH_FIELD_NUMBER: _ClassVar[int]
     name: str
     command_low: _containers.RepeatedScalarFieldContainer[float]
     command_high: _containers.RepeatedScalarFieldContainer[float]
@@ -164,7 +167,10 @@ class Robot(_message.Message):
     image_width: int
     num_proprio: int
     is_simulated: bool
-    def __init__(self, name: _Optional[str] = ..., command_low: _Optional[_Iterable[float]] = ..., command_high: _Optional[_Iterable[float]] = ..., max_step: _Optional[_Iterable[float]] = ..., initial_command: _Optional[_Iterable[float]] = ..., cameras: _Optional[_Iterable[str]] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., num_proprio: _Optional[int] = ..., is_simulated: _Optional[bool] = ...) -> None: ...
+    max_lead: _containers.RepeatedScalarFieldContainer[float]
+    state_low: _containers.RepeatedScalarFieldContainer[float]
+    state_high: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, name: _Optional[str] = ..., command_low: _Optional[_Iterable[float]] = ..., command_high: _Optional[_Iterable[float]] = ..., max_step: _Optional[_Iterable[float]] = ..., initial_command: _Optional[_Iterable[float]] = ..., cameras: _Optional[_Iterable[str]] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., num_proprio: _Optional[int] = ..., is_simulated: _Optional[bool] = ..., max_lead: _Optional[_Iterable[float]] = ..., state_low: _Optional[_Iterable[float]] = ..., state_high: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class EpisodeInfo(_message.Message):
     __slots__ = ("header", "task", "suite", "seed", "difficulty", "instruction", "schedule", "robot", "t0_unix_ns", "versions", "policy", "has_demo")

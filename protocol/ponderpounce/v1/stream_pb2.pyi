@@ -8,6 +8,15 @@ from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 
 DESCRIPTOR: _descriptor.FileDescriptor
 
+class RobotState(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    ROBOT_STATE_UNSPECIFIED: _ClassVar[RobotState]
+    ROBOT_STATE_OK: _ClassVar[RobotState]
+    ROBOT_STATE_USER_STOP: _ClassVar[RobotState]
+    ROBOT_STATE_PROTECTIVE_STOP: _ClassVar[RobotState]
+    ROBOT_STATE_FAULT: _ClassVar[RobotState]
+    ROBOT_STATE_TORQUE_OFF: _ClassVar[RobotState]
+
 class StampKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     STAMP_KIND_UNSPECIFIED: _ClassVar[StampKind]
@@ -53,6 +62,12 @@ class ServingState(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     SERVING_STATE_READY: _ClassVar[ServingState]
     SERVING_STATE_FAILED: _ClassVar[ServingState]
     SERVING_STATE_CLOSING: _ClassVar[ServingState]
+ROBOT_STATE_UNSPECIFIED: RobotState
+ROBOT_STATE_OK: RobotState
+ROBOT_STATE_USER_STOP: RobotState
+ROBOT_STATE_PROTECTIVE_STOP: RobotState
+ROBOT_STATE_FAULT: RobotState
+ROBOT_STATE_TORQUE_OFF: RobotState
 STAMP_KIND_UNSPECIFIED: StampKind
 STAMP_KIND_COGNITION: StampKind
 STAMP_KIND_CHUNK: StampKind
@@ -83,7 +98,7 @@ SERVING_STATE_FAILED: ServingState
 SERVING_STATE_CLOSING: ServingState
 
 class Observation(_message.Message):
-    __slots__ = ("header", "tick", "source_ns", "proprio", "images", "status", "reason")
+    __slots__ = ("header", "tick", "source_ns", "proprio", "images", "status", "reason", "robot_state", "robot_text")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     TICK_FIELD_NUMBER: _ClassVar[int]
     SOURCE_NS_FIELD_NUMBER: _ClassVar[int]
@@ -91,6 +106,8 @@ class Observation(_message.Message):
     IMAGES_FIELD_NUMBER: _ClassVar[int]
     STATUS_FIELD_NUMBER: _ClassVar[int]
     REASON_FIELD_NUMBER: _ClassVar[int]
+    ROBOT_STATE_FIELD_NUMBER: _ClassVar[int]
+    ROBOT_TEXT_FIELD_NUMBER: _ClassVar[int]
     header: _common_pb2.Header
     tick: int
     source_ns: int
@@ -98,7 +115,9 @@ class Observation(_message.Message):
     images: _containers.RepeatedCompositeFieldContainer[_common_pb2.Image]
     status: _common_pb2.TaskStatus
     reason: str
-    def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ..., tick: _Optional[int] = ..., source_ns: _Optional[int] = ..., proprio: _Optional[_Iterable[float]] = ..., images: _Optional[_Iterable[_Union[_common_pb2.Image, _Mapping]]] = ..., status: _Optional[_Union[_common_pb2.TaskStatus, str]] = ..., reason: _Optional[str] = ...) -> None: ...
+    robot_state: RobotState
+    robot_text: str
+    def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ..., tick: _Optional[int] = ..., source_ns: _Optional[int] = ..., proprio: _Optional[_Iterable[float]] = ..., images: _Optional[_Iterable[_Union[_common_pb2.Image, _Mapping]]] = ..., status: _Optional[_Union[_common_pb2.TaskStatus, str]] = ..., reason: _Optional[str] = ..., robot_state: _Optional[_Union[RobotState, str]] = ..., robot_text: _Optional[str] = ...) -> None: ...
 
 class Query(_message.Message):
     __slots__ = ("header", "query", "tick", "source_ns")
@@ -241,7 +260,7 @@ class Action(_message.Message):
     def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ..., tick: _Optional[int] = ..., deadline_ns: _Optional[int] = ..., level: _Optional[_Union[Level, str]] = ..., values: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Tick(_message.Message):
-    __slots__ = ("header", "tick", "deadline_ns", "decided_ns", "late_ns", "level", "invocation", "t_row0", "row", "ref_query", "age_ns", "observation_tick", "state", "action", "raw_row", "limits_hit", "seam_jump", "age_ms", "late_ms")
+    __slots__ = ("header", "tick", "deadline_ns", "decided_ns", "late_ns", "level", "invocation", "t_row0", "row", "ref_query", "age_ns", "observation_tick", "state", "action", "raw_row", "limits_hit", "seam_jump", "age_ms", "late_ms", "robot_state")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     TICK_FIELD_NUMBER: _ClassVar[int]
     DEADLINE_NS_FIELD_NUMBER: _ClassVar[int]
@@ -261,6 +280,7 @@ class Tick(_message.Message):
     SEAM_JUMP_FIELD_NUMBER: _ClassVar[int]
     AGE_MS_FIELD_NUMBER: _ClassVar[int]
     LATE_MS_FIELD_NUMBER: _ClassVar[int]
+    ROBOT_STATE_FIELD_NUMBER: _ClassVar[int]
     header: _common_pb2.Header
     tick: int
     deadline_ns: int
@@ -280,7 +300,8 @@ class Tick(_message.Message):
     seam_jump: float
     age_ms: float
     late_ms: float
-    def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ..., tick: _Optional[int] = ..., deadline_ns: _Optional[int] = ..., decided_ns: _Optional[int] = ..., late_ns: _Optional[int] = ..., level: _Optional[_Union[Level, str]] = ..., invocation: _Optional[int] = ..., t_row0: _Optional[int] = ..., row: _Optional[int] = ..., ref_query: _Optional[int] = ..., age_ns: _Optional[int] = ..., observation_tick: _Optional[int] = ..., state: _Optional[_Iterable[float]] = ..., action: _Optional[_Iterable[float]] = ..., raw_row: _Optional[_Iterable[float]] = ..., limits_hit: _Optional[int] = ..., seam_jump: _Optional[float] = ..., age_ms: _Optional[float] = ..., late_ms: _Optional[float] = ...) -> None: ...
+    robot_state: RobotState
+    def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ..., tick: _Optional[int] = ..., deadline_ns: _Optional[int] = ..., decided_ns: _Optional[int] = ..., late_ns: _Optional[int] = ..., level: _Optional[_Union[Level, str]] = ..., invocation: _Optional[int] = ..., t_row0: _Optional[int] = ..., row: _Optional[int] = ..., ref_query: _Optional[int] = ..., age_ns: _Optional[int] = ..., observation_tick: _Optional[int] = ..., state: _Optional[_Iterable[float]] = ..., action: _Optional[_Iterable[float]] = ..., raw_row: _Optional[_Iterable[float]] = ..., limits_hit: _Optional[int] = ..., seam_jump: _Optional[float] = ..., age_ms: _Optional[float] = ..., late_ms: _Optional[float] = ..., robot_state: _Optional[_Union[RobotState, str]] = ...) -> None: ...
 
 class Subgoal(_message.Message):
     __slots__ = ("header", "kind", "text", "tick", "query", "token_ids", "is_truncated")

@@ -155,6 +155,19 @@ def test_pictures_that_change_their_size_are_refused_and_the_episode_goes_on(ben
     assert bench.ask(step_of()).tick == 1
 
 
+@pytest.mark.parametrize("state", [[45, 0, 0], [0, -1e30, 0]])
+def test_a_state_in_other_units_is_refused_and_the_episode_goes_on(
+    bench: Any, step_of: StepOf, state: list[float]
+) -> None:
+    wrong = np.array(state, np.float32)
+    with pytest.raises(Refused, match=r"which arm cannot measure: expected -4 to 4\..*--robot-file"):
+        bench.ask(step_of(begins=True, state=wrong))
+    bench.ask(step_of(begins=True))
+    with pytest.raises(Refused, match="in its units and order"):
+        bench.ask(step_of(state=wrong))
+    assert bench.ask(step_of()).tick == 1
+
+
 @pytest.mark.parametrize("schedule", [schedules.paper(), schedules.realtime()])
 def test_pictures_that_a_server_cannot_read_are_refused_with_a_hint(
     bench_with: Callable[..., Any], step_of: StepOf, schedule: m.Schedule

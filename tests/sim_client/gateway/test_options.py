@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dual_system.tasks.panda import HOME_QPOS
 from protocol.errors import TransportError
 from protocol.messages import DelayKind, Mode
 from sim_client.gateway.body import PANDA, read_body
@@ -18,8 +19,11 @@ name = "arm"
 command_low = [-1.0, -1.0]
 command_high = [1.0, 0.5]
 max_step = [0.1, 0.0]
+max_lead = [0.3, 0.0]
 cameras = ["front"]
 num_proprio = 3
+state_low = [-1.1, -1.1, 0.0]
+state_high = [1.1, 1.1, 9.0]
 is_simulated = true
 """
 
@@ -98,10 +102,10 @@ def test_a_key_file_must_hold_a_word(tmp_path: Path) -> None:
 
 
 def test_the_panda_holds_where_it_is_until_its_first_command() -> None:
-    state = np.append(np.full(7, 0.3), 0.04).astype(np.float32)
+    state = np.append(HOME_QPOS, 0.04).astype(np.float32)
     robot = PANDA.describe(state, (224, 224))
     assert (robot.image_height, robot.image_width, robot.num_proprio) == (224, 224, PANDA.num_proprio)
-    assert robot.initial_command.tolist() == pytest.approx([0.3] * 7 + [1.0])
+    assert robot.initial_command.tolist() == pytest.approx([*HOME_QPOS, 1.0])
 
 
 def test_a_robot_can_be_told_by_a_file(tmp_path: Path) -> None:
@@ -122,6 +126,8 @@ def test_a_robot_can_be_told_by_a_file(tmp_path: Path) -> None:
         (ROBOT.replace("max_step", "max_stop"), "expected .*max_step"),
         (ROBOT.replace("[0.1, 0.0]", "[0.1]"), "max_step"),
         (ROBOT.replace("[1.0, 0.5]", "[-2.0, 0.5]"), "command_low"),
+        (ROBOT.replace("max_lead = [0.3, 0.0]", ""), "expected .*max_lead"),
+        (ROBOT.replace("[0.3, 0.0]", "[]").replace("= true", "= false"), "max_lead: expected 2"),
         (ROBOT.replace("num_proprio = 3", 'num_proprio = "three"'), "robot.toml"),
     ],
 )

@@ -1,0 +1,113 @@
+"""The command of each tick: a chunk's row within the robot's limits, or what the ladder makes of having none.
+
+The rule carries a few values from tick to tick and reads no clock; the conductor and ``pp-check`` apply the same one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from clock.ladder import Ladder
+from clock.limits import Hit, following, is_in_range, standing, within_limits
+from clock.playback import Chunk
+from protocol.messages import EpisodeInfo, Floats, Level, RobotState
+
+BLOCKED_TICKS = 10
+"""Ticks (half a second at 20 Hz) at the lead over the measured joints after which a blocked arm is held."""
+
+MAX_STATE_TICKS = 2
+"""Largest age of a measured state, in ticks, from which the lead is taken."""
+
+NO_ROW: Floats = np.zeros(0, np.float32)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Decision:
+    """What is commanded at a tick, and why."""
+
+    command: Floats
+    level: Level
+    hit: Hit
+    chunk: Chunk | None
+    """The chunk whose row is played, if one is."""
+    seam_jump: float
+    """Largest joint difference between the last command and the first row of a new chunk; 0 between switches."""
+
+
+@dataclass(slots=True)
+class Commander:
+    """One episode's commands. Call ``step`` once per commanded tick, in order."""
+
+    info: EpisodeInfo
+    ladder: Ladder = field(init=False)
+    last_command: Floats = field(init=False)
+    blocked_ticks: int = 0
+    _is_engaging: bool = False
+    _played_invocation: int | None = None
+
+    def __post_init__(self) -> None:
+        self.ladder = Ladder(self.info.schedule)
+        self.last_command = self.info.robot.initial_command
+
+    @property
+    def is_blocked(self) -> bool:
+        return self.blocked_ticks > BLOCKED_TICKS
+
+    def engage(self) -> None:
+        """Allows motion again, from where the arm is at the next tick: somebody may have moved it."""
+        self.ladder.engage()
+        self._is_engaging, self.blocked_ticks = True, 0
+
+    def step(
+        self, raw: Floats, chunk: Chunk | None, state: Floats | None, robot_state: RobotState, *, state_ticks: int = 0
+    ) -> Decision:
+        """Decides one tick.
+
+        Args:
+            raw: (action_dim,), the row of ``chunk`` for this tick before the limits; (0,) if there is none.
+            chunk: the newest usable chunk.
+            state: (num_proprio,), the newest measured values; None before the first observation.
+            robot_state: what the robot says of itself.
+            state_ticks: age of ``state`` in ticks. An old one says nothing of an arm's lead: it has moved since.
+        """
+        robot = self.info.robot
+        measured = state if state is not None and is_in_range(state, robot) else None
+        if self._is_engaging and measured is not None:
+            self.last_command, self._is_engaging = standing(self.last_command, robot, measured), False
+        if not robot_state.obeys:
+            self.ladder.stop()
+        row, hit = None, Hit.NONE
+        if chunk is not None:
+            is_fresh = state_ticks <= MAX_STATE_TICKS
+            row, hit = within_limits(raw, self.last_command, robot, measured if is_fresh else None)
+        self.blocked_ticks = self.blocked_ticks + 1 if Hit.LEAD in hit else 0
+        if state is not None and measured is None:
+            hit |= Hit.STATE
+        if Hit.STATE in hit or self.is_blocked:
+            row = None
+        command = self._on_ladder(row, chunk, measured)
+        level = self.ladder.level
+        played = chunk if level in (Level.PLAY, Level.STALE) else None
+        jump = self._jump(played, raw)
+        self.last_command = command
+        return Decision(command=command, level=level, hit=hit, chunk=played, seam_jump=jump)
+
+    def _on_ladder(self, row: Floats | None, chunk: Chunk | None, measured: Floats | None) -> Floats:
+        robot, last = self.info.robot, self.last_command
+        is_stale = chunk is not None and chunk.age_ns > self.info.schedule.max_age_ns
+        stands = last if measured is None else standing(last, robot, measured)
+        command = self.ladder.step(row, is_stale, last, stands)
+        if not self.ladder.is_latched:
+            return command
+        if self.ladder.level == Level.STOPPED and measured is not None:
+            command = following(command, robot, measured)
+        limited, _ = within_limits(command, last, robot, None)
+        return last if limited is None else limited
+
+    def _jump(self, chunk: Chunk | None, raw: Floats) -> float:
+        if chunk is None or chunk.invocation == self._played_invocation or not np.isfinite(raw).all():
+            return 0.0
+        self._played_invocation = chunk.invocation
+        return float(np.abs(raw[:-1] - self.last_command[:-1]).max(initial=0.0))
