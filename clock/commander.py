@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from clock.ladder import Ladder
-from clock.limits import Hit, following, is_in_range, standing, within_limits
+from clock.limits import Hit, following, in_place, is_in_range, within_limits
 from clock.playback import Chunk
 from protocol.messages import EpisodeInfo, Floats, Level, RobotState
 
@@ -75,7 +75,7 @@ class Commander:
         robot = self.info.robot
         measured = state if state is not None and is_in_range(state, robot) else None
         if self._is_engaging and measured is not None:
-            self.last_command, self._is_engaging = standing(self.last_command, robot, measured), False
+            self.last_command, self._is_engaging = in_place(self.last_command, robot, measured), False
         if not robot_state.obeys:
             self.ladder.stop()
         row, hit = None, Hit.NONE
@@ -97,8 +97,8 @@ class Commander:
     def _on_ladder(self, row: Floats | None, chunk: Chunk | None, measured: Floats | None) -> Floats:
         robot, last = self.info.robot, self.last_command
         is_stale = chunk is not None and chunk.age_ns > self.info.schedule.max_age_ns
-        stands = last if measured is None else standing(last, robot, measured)
-        command = self.ladder.step(row, is_stale, last, stands)
+        target = last if measured is None else in_place(last, robot, measured)
+        command = self.ladder.step(row, is_stale, last, target)
         if not self.ladder.is_latched:
             return command
         if self.ladder.level == Level.STOPPED and measured is not None:

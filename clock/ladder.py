@@ -37,14 +37,14 @@ class Ladder:
         """Stops at once, until somebody engages."""
         self.level = Level.STOPPED
 
-    def step(self, row: Floats | None, is_stale: bool, last_command: Floats, standing: Floats) -> Floats:
+    def step(self, row: Floats | None, is_stale: bool, last_command: Floats, in_place: Floats) -> Floats:
         """Returns the command of this tick and sets ``level`` to its rung.
 
         Args:
             row: (action_dim,) within limits, from a chunk; None if no chunk has one.
             is_stale: the cognition behind ``row`` is older than ``max_age_ns``.
             last_command: (action_dim,).
-            standing: (action_dim,), where a deceleration ends: the measured joints, and the gripper as it is.
+            in_place: (action_dim,), where a deceleration ends: the measured joints, and the gripper as it is.
         """
         if not self.is_latched:
             if row is not None:
@@ -60,7 +60,7 @@ class Ladder:
                 self.level = Level.HOLD
                 return last_command
             self.level, self.slowing_ticks = Level.DECELERATE, 0
-            self._from, self._to = last_command, standing
+            self._from, self._to = last_command, in_place
         if self.level == Level.STOPPED or self._from is None or self._to is None:
             return last_command
         self.slowing_ticks += 1

@@ -61,11 +61,11 @@ def following(last_command: Floats, robot: Robot, state: Floats) -> Floats:
     return last_command if followed is None else followed
 
 
-def standing(last_command: Floats, robot: Robot, state: Floats) -> Floats:
+def in_place(last_command: Floats, robot: Robot, state: Floats) -> Floats:
     """The command that leaves the arm where it was measured, within the absolute limits; the gripper, last, stays."""
     arm = state[: len(last_command) - 1]
-    stands = np.concatenate([arm, last_command[len(arm) :]])
-    return np.clip(stands, robot.command_low, robot.command_high).astype(np.float32)
+    measured = np.concatenate([arm, last_command[len(arm) :]])
+    return np.clip(measured, robot.command_low, robot.command_high).astype(np.float32)
 
 
 def is_in_range(state: Floats, robot: Robot) -> bool:

@@ -84,25 +84,25 @@ def test_key_encoding_and_attachment_travel_along() -> None:
     assert subscription.drain() == [Sample("a", b"1", "e", b"a")]
 
 
-def test_a_call_is_answered_by_the_party_that_serves_it() -> None:
+def test_a_call_is_answered_by_the_participant_that_serves_it() -> None:
     bus = LocalBus()
     inbox = bus.serve("twice")
 
-    def party() -> bool:
+    def participant() -> bool:
         requests = inbox.drain()
         for request in requests:
             request.reply(request.payload * 2)
         return bool(requests)
 
-    bus.add_participant(party)
+    bus.add_participant(participant)
     assert bus.call("twice", b"ab", timeout_ns=1) == b"abab"
 
 
-def test_a_call_waits_for_a_party_that_needs_several_steps() -> None:
+def test_a_call_waits_for_a_participant_that_needs_several_steps() -> None:
     bus = LocalBus()
     inbox, waiting = bus.serve("slow"), [b"think", b"think"]
 
-    def party() -> bool:
+    def participant() -> bool:
         if waiting:
             waiting.pop()
             return True
@@ -110,7 +110,7 @@ def test_a_call_waits_for_a_party_that_needs_several_steps() -> None:
             request.reply(b"done")
         return True
 
-    bus.add_participant(party)
+    bus.add_participant(participant)
     assert bus.call("slow", b"", timeout_ns=1) == b"done"
 
 
@@ -127,7 +127,7 @@ def test_a_call_whose_server_is_idle_fails() -> None:
         bus.call("mute", b"", timeout_ns=1)
 
 
-def test_a_party_that_waits_for_an_answer_is_not_stepped_meanwhile() -> None:
+def test_a_participant_that_waits_for_an_answer_is_not_stepped_meanwhile() -> None:
     bus, steps = LocalBus(), []
     inbox = bus.serve("other")
 
@@ -147,7 +147,7 @@ def test_a_party_that_waits_for_an_answer_is_not_stepped_meanwhile() -> None:
     assert steps == ["asking"]
 
 
-def test_every_party_gets_its_turn_whoever_was_busy() -> None:
+def test_every_participant_gets_its_turn_whoever_was_busy() -> None:
     bus, turns = LocalBus(), []
     for name in "abc":
         bus.add_participant(lambda name=name: turns.append(name) is None)  # type: ignore[misc]
