@@ -194,11 +194,11 @@ def make_robot(**changes: Any) -> m.Robot:
         "image_width": PX,
         "num_proprio": NUM_PROPRIO,
         "is_simulated": True,
-        "max_lead": np.full(DIM, 3, np.float32),
-        "state_low": np.full(NUM_PROPRIO, -4, np.float32),
-        "state_high": np.full(NUM_PROPRIO, 4, np.float32),
     }
-    return m.Robot(**(values | changes))
+    values |= changes
+    values["max_lead"] = np.full(len(values["command_low"]), 3, np.float32)
+    values["state_low"] = np.full(values["num_proprio"], -4, np.float32)
+    return m.Robot(**values, state_high=-values["state_low"])
 
 
 def make_info(schedule: m.Schedule, *, epoch: int = 1, session: str = "s1", **changes: Any) -> m.EpisodeInfo:
