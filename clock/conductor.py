@@ -282,6 +282,11 @@ class Conductor:
         """The oldest query without an answer."""
         return next((a.index for a in self._queries if a.answer is None), None)
 
+    @property
+    def owed_invocation(self) -> int | None:
+        """The oldest invocation without a chunk."""
+        return next((a.index for a in self._invocations if a.answer is None), None)
+
     def _start(self, now_ns: int) -> None:
         self.stage, self.start_ns = Stage.RUNNING, now_ns
 

@@ -15,13 +15,15 @@ from typing import Any
 from clock.conductor import Conductor, Stage
 from clock.feasibility import check_feasible
 from clock.offset import Offset, from_exchange, narrowest
+from clock.report import ADMITTED_EVENT
 from clock.residual import RESIDUAL_EVENT, ResidualHead, check_head
 from clock.timebase import NS_PER_S, MonotonicClock, VirtualClock
 from clock.watch import HEARTBEAT_TIMEOUT_NS, Watch
+from protocol import codec
 from protocol import messages as m
 from protocol.drops import DropReason
 from protocol.errors import CallFailed, EpisodeRefused, ProtocolError
-from protocol.link import Link, Service, is_of_episode
+from protocol.link import Link, Service, source_of
 from protocol.process import host_clock_id
 from protocol.topics import (
     ACTION,
@@ -49,6 +51,7 @@ from protocol.topics import (
 log = logging.getLogger(__name__)
 
 SERVERS = ("ponder", "pounce")
+ROBOT = "sim"
 NUM_TIME_EXCHANGES = 8
 ROBOT_SILENCE_NS = 1_000_000_000
 _CALL_NS = 2_000_000_000
@@ -84,6 +87,8 @@ class _Episode:
     journal: list[m.JournalEntry] = field(default_factory=list)
     journal_bytes: int = 0
     newest_payload: bytes = b""
+    invoked: m.Invocation | None = None
+    """The newest invocation, for a POUNCE that restarts before it has answered."""
     phase: str = ""
     contracts: dict[str, m.Contract] = field(default_factory=dict)
     """Terms of both servers by process; empty if nobody but the oracle plays."""
@@ -148,8 +153,8 @@ class ClockService:
             return False
         self._is_stepping = True
         try:
-            worked = any([service.answer(handler) > 0 for service, handler in self._services])  # a list: all answer
-            worked |= self._take_messages()
+            worked = self._take_messages()  # first: the last words of a server count although its successor asks
+            worked |= any([service.answer(handler) > 0 for service, handler in self._services])  # a list: all answer
             self._check_liveness()
             return self._conduct() or worked
         finally:
@@ -165,15 +170,18 @@ class ClockService:
             self._watch.on_token(sample.key.rpartition("/")[2], bool(sample.payload))
         episode = self._episode
         for observation, sample in self._observations.receive():
-            if episode is not None and is_of_episode(self._link, observation.header):
-                source = _source(observation.header)
+            if episode is not None and self._link.is_from(observation.header, ROBOT):
+                source = source_of(observation.header)
                 worked |= bool(self._link.survive(source, self._on_observation, episode, observation, sample.payload))
         for cognition in self._cognitions.drain():
-            if episode is not None and is_of_episode(self._link, cognition.header):
-                worked |= bool(self._link.survive(_source(cognition.header), self._on_cognition, episode, cognition))
+            if episode is not None and self._link.is_from(cognition.header, "ponder"):
+                worked |= bool(self._link.survive(source_of(cognition.header), self._on_cognition, episode, cognition))
         for chunk in self._chunks.drain():
-            if episode is not None and is_of_episode(self._link, chunk.header):
-                worked |= bool(self._link.survive(_source(chunk.header), self._on_chunk, episode, chunk))
+            if episode is not None and self._link.is_from(chunk.header, "pounce"):
+                worked |= bool(self._link.survive(source_of(chunk.header), self._on_chunk, episode, chunk))
+        if episode is not None and self._link.second_sender:  # nobody can say which of the two is meant
+            self._event(m.Severity.ERROR, DropReason.SECOND_SENDER, f"the episode is over: {self._link.second_sender}")
+            self._finish(None)
         return worked
 
     def _on_cognition(self, episode: _Episode, cognition: m.Cognition) -> bool:
@@ -183,7 +191,7 @@ class ClockService:
         expected = (contract.num_carriers, contract.hidden_size)
         if cognition.vector.shape != expected:
             detail = f"expected a cognition of {expected}, came {cognition.vector.shape}"
-            self._link.drop(_source(cognition.header), DropReason.WRONG_SHAPE, detail)
+            self._link.drop(source_of(cognition.header), DropReason.WRONG_SHAPE, detail)
             return False
         taken = episode.conductor.on_cognition(cognition, episode.now_ns)
         return taken or self._unasked("cognition", cognition.query, cognition.header)
@@ -203,7 +211,7 @@ class ClockService:
             return True
         header, agreed = answer.header, _named(contract.model_hash, contract.is_fake)
         came = _named(answer.model_hash, answer.is_fake)
-        self._link.drop(_source(header), DropReason.OTHER_MODEL, f"the episode was opened with {agreed}, came {came}")
+        self._link.drop(source_of(header), DropReason.OTHER_MODEL, f"the episode was opened with {agreed}, came {came}")
         if header.boot_id not in episode.others and len(episode.others) < 16:
             episode.others.add(header.boot_id)
             text = f"{proc} answers with {came}; the episode was opened with {agreed}: its answers are not played"
@@ -224,7 +232,7 @@ class ClockService:
             zero_ns = episode.clock.zero_ns if isinstance(episode.clock, MonotonicClock) else self._host.now_ns()
             observation = replace(observation, source_ns=offset.to_ours(observation.source_ns) - zero_ns)
         if why_not := self._out_of_time(episode, observation):
-            self._link.drop(_source(observation.header), DropReason.WRONG_INSTANT, why_not)
+            self._link.drop(source_of(observation.header), DropReason.WRONG_INSTANT, why_not)
             return False
         self._robot_heard_ns = self._host.now_ns()
         if episode.clock is None:
@@ -252,7 +260,7 @@ class ClockService:
         return ""
 
     def _unasked(self, what: str, index: int, header: m.Header) -> bool:
-        self._link.drop(_source(header), DropReason.UNASKED, f"{what} {index}")
+        self._link.drop(source_of(header), DropReason.UNASKED, f"{what} {index}")
         return False
 
     def _check_liveness(self) -> None:
@@ -268,10 +276,13 @@ class ClockService:
             else:
                 episode.conductor.on_back(change.proc)
                 self._event(m.Severity.INFO, f"{change.proc}_back", f"{change.proc} is back: {change.why}")
-        silent_ns = self._host.now_ns() - self._robot_heard_ns
-        if self._watch.is_gone("sim") and silent_ns > ROBOT_SILENCE_NS:  # a starved process loses its token first
+        if self._is_robot_gone():
             self._event(m.Severity.ERROR, "sim_lost", "the robot side is gone: the episode is over")
             self._finish(None)
+
+    def _is_robot_gone(self) -> bool:
+        silent_ns = self._host.now_ns() - self._robot_heard_ns
+        return self._watch.is_gone(ROBOT) and silent_ns > ROBOT_SILENCE_NS  # a starved process loses its token first
 
     # -- outputs
 
@@ -290,7 +301,9 @@ class ClockService:
         for effect in effects:
             if isinstance(effect, m.Query):
                 self._keep(episode, effect)
-            self._link.publish(_TOPIC_OF[type(effect)], effect, at_ns=now_ns)
+            sent = self._link.publish(_TOPIC_OF[type(effect)], effect, at_ns=now_ns)
+            if isinstance(sent, m.Invocation):
+                episode.invoked = sent
         self._show_phase(episode, now_ns)
         if isinstance(episode.clock, VirtualClock) and not episode.conductor.is_waiting(now_ns):
             due_ns = episode.conductor.next_ns(now_ns)
@@ -331,7 +344,7 @@ class ClockService:
             last = self._last_epoch[header.session]
             error = f"epoch {header.epoch} of session {header.session} is not after {last}"
             return m.OpenReply(error=error, refusal=m.Refusal.REQUEST)
-        if self._episode is not None and self._episode.request.info.header.session != header.session:
+        if self._episode is not None and self._link.members[ROBOT] != header.boot_id:
             error = f"robot {self._link.robot} is busy with episode {self._link.episode}"
             return m.OpenReply(error=error, refusal=m.Refusal.BUSY, try_again=True)
         if self._episode is not None:
@@ -342,27 +355,30 @@ class ClockService:
         if not_ready:
             return m.OpenReply(error=not_ready, refusal=m.Refusal.NOT_READY, try_again=True)
         try:
-            self._link.enter_episode(header.session, header.episode, header.epoch)
-            self._measure_offsets(SERVERS if info.robot.is_simulated else (*SERVERS, "sim"))
+            self._enter(header)
+            self._measure_offsets(SERVERS if info.robot.is_simulated else (*SERVERS, ROBOT))
             contracts = tuple(self._open_at(proc, request) for proc in SERVERS)
             warnings, committed_ticks = self._agree(info, contracts)
         except (CallFailed, ProtocolError) as error:
             self._close_servers(None)
             self._link.leave_episode()
-            refusal = error.refusal if isinstance(error, EpisodeRefused) else m.Refusal.UNSPECIFIED
-            return m.OpenReply(error=str(error), refusal=refusal)
+            if not isinstance(error, EpisodeRefused):
+                return m.OpenReply(error=str(error))
+            return m.OpenReply(error=str(error), refusal=error.refusal, try_again=error.try_again)
         return self._begin(request, contracts, warnings, committed_ticks)
 
     def _begin(
         self, request: m.OpenRequest, contracts: Sequence[m.Contract], warnings: Sequence[str], committed_ticks: int
     ) -> m.OpenReply:
         header = request.info.header
-        self._link.enter_episode(header.session, header.episode, header.epoch)
+        if not contracts:
+            self._enter(header)
         self._last_epoch[header.session] = header.epoch
         head = self._config.residual if request.info.policy == "servers" else None
         conductor = Conductor(request.info, committed_ticks=committed_ticks, residual=head)
         self._episode = _Episode(request, conductor, contracts=dict(zip(SERVERS, contracts, strict=False)))
         self._watch.forget_losses()
+        self._watch.members = {proc: self._link.members[proc] for proc in SERVERS if contracts}
         self._robot_heard_ns = self._host.now_ns()
         self._link.publish(INFO, request.info, at_ns=0)
         if head is not None:
@@ -373,7 +389,14 @@ class ClockService:
         for proc, offset in self._offsets.items():
             text = f"{proc}: {offset.offset_ns / 1e6:+.3f} ms, known to {offset.bound_ns / 1e6:.3f} ms"
             self._event(m.Severity.INFO, "clock_offset", text, proc=proc)
-        return m.OpenReply(contracts=tuple(contracts), warnings=tuple(warnings))
+        return m.OpenReply(contracts=tuple(contracts), warnings=tuple(warnings), members=self._members())
+
+    def _enter(self, header: m.Header) -> None:
+        robot = m.Member(proc=ROBOT, boot_id=header.boot_id)
+        self._link.enter_episode(header.session, header.episode, header.epoch, (robot,))
+
+    def _members(self) -> tuple[m.Member, ...]:
+        return tuple(m.Member(proc=proc, boot_id=boot_id) for proc, boot_id in self._link.members.items())
 
     def _not_ready(self) -> str:
         for proc in SERVERS:
@@ -410,11 +433,17 @@ class ClockService:
 
     def _open_at(self, proc: str, request: m.OpenRequest) -> m.Contract:
         """Opens the episode at a server. Raises EpisodeRefused if it refuses, CallFailed if it does not answer."""
-        reply = self._link.call(OPEN, proc, request, timeout_ns=_OPEN_NS)
-        if reply.error or reply.contract is None:
+        reply = self._link.call(OPEN, proc, replace(request, members=self._members()), timeout_ns=_OPEN_NS)
+        contract = reply.contract
+        if reply.error or contract is None:
             why = reply.error or "it sent no contract"
-            raise EpisodeRefused(reply.refusal, f"{proc} refuses the episode: {why}")
-        return reply.contract
+            raise EpisodeRefused(reply.refusal, f"{proc} refuses the episode: {why}", try_again=reply.try_again)
+        health = self._watch.health_of(proc) if self._config.watches else None
+        if health is not None and health.header.boot_id != contract.boot_id:
+            why = f"two processes answer to the name of {proc}: {health.header.boot_id} and {contract.boot_id}"
+            raise EpisodeRefused(m.Refusal.NOT_READY, f"{why}. Stop one of them.", try_again=True)
+        self._link.admit(m.Member(proc=proc, boot_id=contract.boot_id))
+        return contract
 
     def _agree(self, info: m.EpisodeInfo, contracts: Sequence[m.Contract]) -> tuple[list[str], int]:
         """Checks that the parts fit; returns warnings and the ticks that an invocation takes.
@@ -461,6 +490,8 @@ class ClockService:
         """Ends the episode here and at the servers."""
         if self._episode is None or request.header.episode != self._link.episode:
             return m.CloseReply(error=f"episode {request.header.episode!r} is not open here")
+        if not self._link.is_from(request.header, ROBOT):
+            return m.CloseReply(error="only the robot that opened an episode can close it")
         self._finish(request.result)
         return m.CloseReply()
 
@@ -469,6 +500,7 @@ class ClockService:
         if episode is not None and episode.request.info.policy == "servers":
             self._close_servers(result)
         self._watch.forget_losses()  # a server that restarts between episodes is not lost
+        self._watch.members = {}
         self._link.leave_episode()
 
     def _close_servers(self, result: m.EpisodeResult | None) -> None:
@@ -485,14 +517,38 @@ class ClockService:
             return m.ActiveReply()
         if self._episode.journal_bytes > self._config.journal_limit_bytes:
             return m.ActiveReply(error="the journal of this episode outgrew its limit: its context cannot be rebuilt")
-        conductor = self._episode.conductor
+        if why_not := self._admit(request.header):
+            return m.ActiveReply(error=why_not)
+        conductor, invoked = self._episode.conductor, self._episode.invoked
+        is_owed = invoked is not None and invoked.invocation == conductor.owed_invocation
         return m.ActiveReply(
-            open=self._episode.request, num_queries=len(self._episode.journal), owed_query=conductor.owed_query
+            open=replace(self._episode.request, members=self._members()),
+            num_queries=len(self._episode.journal),
+            owed_query=conductor.owed_query,
+            owed_invocation=codec.encode(invoked) if is_owed else b"",
+            observation=self._episode.newest_payload,
         )
 
+    def _admit(self, asking: m.Header) -> str:
+        """Lets a restarted server take the place of the one that is lost; returns why not, or ""."""
+        proc = asking.proc
+        if proc not in SERVERS:
+            return f"{proc} has no part in an episode; expected {' or '.join(SERVERS)}"
+        if self._link.members[proc] == asking.boot_id:
+            return ""
+        if self._config.watches and not self._watch.is_lost(proc):
+            return f"the {proc} of episode {self._link.episode} is there: {asking.boot_id} is a second one"
+        self._link.admit(m.Member(proc=proc, boot_id=asking.boot_id))
+        self._watch.members[proc] = asking.boot_id
+        text = f"{source_of(asking)} takes the place of the {proc} that is lost"
+        self._event(m.Severity.INFO, ADMITTED_EVENT, text, proc=proc, boot_id=str(asking.boot_id))
+        return ""
+
     def _on_journal(self, request: m.JournalRequest) -> m.JournalReply:
-        if self._episode is None or request.header.episode != self._link.episode:
-            return m.JournalReply(error=f"episode {request.header.episode!r} is not open here")
+        if self._episode is None or not self._link.is_member(request.header):
+            return m.JournalReply(
+                error=f"episode {request.header.episode!r} is not open here for {request.header.proc}"
+            )
         first = request.first_query
         return m.JournalReply(entries=tuple(self._episode.journal[first : first + request.max_queries]))
 
@@ -507,10 +563,6 @@ class ClockService:
             return m.EngageReply(error=why_not)
         self._event(m.Severity.WARNING, "engaged", f"motion may start again, says {request.operator}")
         return m.EngageReply(level=self._episode.conductor.ladder.level.name)
-
-
-def _source(header: m.Header) -> str:
-    return f"{header.proc}#{header.boot_id}"
 
 
 def _named(model_hash: str, is_fake: bool) -> str:

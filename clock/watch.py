@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from protocol.messages import Health, ServingState
 
 HEARTBEAT_TIMEOUT_NS = 700_000_000
+TOKEN_GRACE_NS = 250_000_000
+"""A lost token means a dead process only if its heartbeat stays away as well: anybody can declare and withdraw one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,9 +31,13 @@ class Watch:
     """Detects within a second that a server died, froze or hangs, and that it is back *and in the episode*."""
 
     timeout_ns: int = HEARTBEAT_TIMEOUT_NS
+    members: dict[str, int] = field(default_factory=dict)
+    """Boot ids of the running episode's servers; heartbeats of others under their names say nothing."""
     _seen: dict[str, _Seen] = field(default_factory=dict)
 
     def on_health(self, health: Health, now_ns: int) -> None:
+        if self.members.get(health.header.proc, health.header.boot_id) != health.header.boot_id:
+            return
         seen = self._seen.setdefault(health.header.proc, _Seen())
         seen.health, seen.heard_ns, seen.has_token = health, now_ns, True
 
@@ -45,6 +51,11 @@ class Watch:
         """The newest heartbeat of a present server; None if it is absent."""
         seen = self._seen.get(proc)
         return seen.health if seen and seen.has_token and not seen.is_lost else None
+
+    def is_lost(self, proc: str) -> bool:
+        """Whether the last poll found trouble with ``proc``."""
+        seen = self._seen.get(proc)
+        return seen is not None and seen.is_lost
 
     def is_gone(self, proc: str) -> bool:
         """Whether ``proc`` had a liveliness token and lost it."""
@@ -70,9 +81,9 @@ class Watch:
         return changes
 
     def _trouble(self, seen: _Seen, episode: str, now_ns: int) -> str:
-        if not seen.has_token:
-            return "its liveliness token is gone: the process died, or does not run"
         silent_ns = now_ns - seen.heard_ns
+        if not seen.has_token and silent_ns > TOKEN_GRACE_NS:
+            return "its liveliness token is gone: the process died, is cut off, or does not run"
         if silent_ns > self.timeout_ns:
             return f"no heartbeat for {silent_ns / 1e6:.0f} ms: it is frozen, or its inference loop hangs"
         if seen.health is None:

@@ -8,19 +8,21 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 from protocol import messages as m
 from protocol.errors import CallFailed, EpisodeRefused, ProtocolError
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
 from protocol.process import host_clock_id
-from protocol.topics import ACTIVE, CLOSE, CONTRACT, JOURNAL, OPEN, TIME
+from protocol.topics import ACTIVE, CLOSE, CONTRACT, JOURNAL, OPEN, TIME, alive_key
 
 log = logging.getLogger(__name__)
 
 JOURNAL_PAGE = 4  # observations per call: 1.6 MB of two raw 256 px views
 _CALL_NS = 2_000_000_000
 _ASK_AGAIN_NS = 1_000_000_000
+_CLOCK_SILENCE_NS = 2_000_000_000
 
 Describe = Callable[[], m.Contract]
 Open = Callable[[m.OpenRequest], m.Contract]
@@ -49,11 +51,20 @@ class Membership:
         self._closing = link.serve(CLOSE)
         self._timing = link.serve(TIME)
         self._ask_again_ns = 0
+        self._clocks = link.bus.watch_alive(alive_key(link.robot, "clock"))
+        self._is_clock_there = False
 
     def step(self) -> bool:
         """Answers waiting calls; returns whether there were any."""
+        for sample in self._clocks.drain():
+            self._is_clock_there = bool(sample.payload)
         answered = self._opening.answer(self._on_open) + self._closing.answer(self._on_close)
         return answered + self._asking.answer(self._on_contract) + self._timing.answer(_on_time) > 0
+
+    @property
+    def may_have_missed_one(self) -> bool:
+        """Whether an episode may run without this server: it is in none, and there is a clock service."""
+        return self._is_clock_there and not self._link.episode
 
     def rejoin(self) -> m.ActiveReply | None:
         """Asks the clock service for the running episode, at most once a second, and opens it here.
@@ -64,6 +75,8 @@ class Membership:
         if now_ns < self._ask_again_ns:
             return None
         self._ask_again_ns = now_ns + _ASK_AGAIN_NS
+        if self._link.episode and not self._is_clock_gone():
+            return None  # what another clock says of its episode is no reason to leave this one
         try:
             reply = self._link.call(ACTIVE, "clock", m.ActiveRequest(), timeout_ns=_CALL_NS)
         except CallFailed:
@@ -102,11 +115,14 @@ class Membership:
 
     def _on_open(self, request: m.OpenRequest, *, announce: bool = True) -> m.OpenReply:
         header = request.info.header
+        if self._link.episode and not self._may_end(_clock_of(request.members)):
+            error = f"it is in episode {self._link.episode}, whose clock is there"
+            return m.OpenReply(error=error, refusal=m.Refusal.BUSY, try_again=True)
         if self._link.episode:
             self._leave()
         try:
-            self._link.enter_episode(header.session, header.episode, header.epoch)
-            contract = self._open_episode(request)
+            self._link.enter_episode(header.session, header.episode, header.epoch, request.members)
+            contract = replace(self._open_episode(request), boot_id=self._link.boot_id)
         except ValueError as error:
             self._leave()
             refusal = error.refusal if isinstance(error, EpisodeRefused) else m.Refusal.REQUEST
@@ -127,14 +143,27 @@ class Membership:
     def _on_close(self, request: m.CloseRequest) -> m.CloseReply:
         if request.header.episode != self._link.episode:
             return m.CloseReply(error=f"episode {request.header.episode!r} is not open here")
+        if self._link.episode and not self._may_end(request.header.boot_id):
+            return m.CloseReply(error="only the clock that opened an episode can close it")
         if self._link.episode:
             self._leave()
         return m.CloseReply()
+
+    def _may_end(self, boot_id: int) -> bool:
+        """Whether the running episode may be ended by this clock: its own, or any once its own is gone."""
+        return boot_id == self._link.members.get("clock") or self._is_clock_gone()
+
+    def _is_clock_gone(self) -> bool:
+        return not self._is_clock_there and self._link.silent_ns("clock") > _CLOCK_SILENCE_NS
 
     def _leave(self) -> None:
         self._close_episode()
         self._link.leave_episode()
         self._heartbeat.set(open_episode="")
+
+
+def _clock_of(members: tuple[m.Member, ...]) -> int:
+    return next((member.boot_id for member in members if member.proc == "clock"), 0)
 
 
 def _on_time(request: m.TimeRequest) -> m.TimeReply:

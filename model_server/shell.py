@@ -10,12 +10,12 @@ from collections.abc import Iterator
 from typing import Protocol
 
 from model_server.membership import Membership
+from protocol import codec, topics
 from protocol import messages as m
-from protocol import topics
 from protocol.drops import DropReason
 from protocol.errors import MalformedMessage
 from protocol.heartbeat import Heartbeat
-from protocol.link import Link, is_of_episode
+from protocol.link import Link, source_of
 from protocol.process import host_clock_id
 
 log = logging.getLogger(__name__)
@@ -104,14 +104,29 @@ class ModelShell(ABC):
         self._heartbeat.set(state=m.ServingState.READY)
         log.info("ready infer_p50_ms=%.1f", self._heartbeat.health.infer_p50_ns / 1e6)
 
+    def _take_calls(self) -> bool:
+        """Answers the clock service, and asks it in case an episode began or goes on without this server."""
+        worked = self._membership.step()
+        if self._membership.may_have_missed_one and self._heartbeat.health.state == m.ServingState.READY:
+            worked |= self.rejoin()
+        return worked
+
     def _take_observations(self) -> None:
         for observation in self._observations.drain():
-            if is_of_episode(self._link, observation.header):
-                source = f"{observation.header.proc}#{observation.header.boot_id}"
-                try:
-                    self._link.survive(source, self._on_observation, observation)
-                except MalformedMessage as error:
-                    self._link.drop(source, DropReason.WRONG_SHAPE, str(error))
+            if self._link.is_from(observation.header, "sim"):
+                self._take(observation)
+
+    def _take_newest(self, rejoined: m.ActiveReply) -> None:
+        """Takes the observation that came before this server did: the next request may name it."""
+        if rejoined.observation:
+            self._take(codec.decode(m.Observation, rejoined.observation))
+
+    def _take(self, observation: m.Observation) -> None:
+        source = source_of(observation.header)
+        try:
+            self._link.survive(source, self._on_observation, observation)
+        except MalformedMessage as error:
+            self._link.drop(source, DropReason.WRONG_SHAPE, str(error))
 
     def _begin_inference(self, phase: str) -> int:
         """Reports that an answer is being computed; returns the start (monotonic ns)."""

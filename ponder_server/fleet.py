@@ -127,6 +127,7 @@ class RobotServer(PonderServer):
         if rejoined is None:
             return False
         self._node.open(next_query=rejoined.num_queries)
+        self._take_newest(rejoined)
         self._rebuild = _Rebuild(self._missed_work(rejoined.num_queries), rejoined.num_queries, rejoined.owed_query)
         return True
 

@@ -16,7 +16,7 @@ from protocol import messages as m
 from protocol.drops import DropReason
 from protocol.errors import CallFailed, EpisodeRefused, MalformedMessage, ProtocolError
 from protocol.heartbeat import Heartbeat
-from protocol.link import Link, is_of_episode
+from protocol.link import Link
 from protocol.process import host_clock_id
 
 log = logging.getLogger(__name__)
@@ -47,12 +47,12 @@ class PonderServer(ModelShell):
     def _listen(self) -> bool:
         """Reads all pending messages; returns whether there was a call among them."""
         self._heartbeat.beat()
-        worked = self._membership.step()
+        worked = self._take_calls()
         self._take_observations()
         for query in self._queries.drain():
             if query.header.episode != self._link.episode:
                 worked |= self.rejoin()  # unknown episode: this process restarted, or another one opened it
-            if is_of_episode(self._link, query.header):
+            if self._link.is_from(query.header, "clock"):
                 self._link.survive("query", self._node.on_query, query)
         for query in self._node.missed():
             self._tell(m.Severity.ERROR, "observation_missed", f"query {query.query}: tick {query.tick} never came")
@@ -74,6 +74,7 @@ class PonderServer(ModelShell):
         if rejoined is None:
             return False
         self._node.open(next_query=rejoined.num_queries)
+        self._take_newest(rejoined)
         try:
             for work in self._missed_work(rejoined.num_queries):
                 if work.query.query == rejoined.owed_query:

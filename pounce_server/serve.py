@@ -9,12 +9,12 @@ from model_server.shell import ModelShell
 from pounce_server.contract import PounceEngine, check_robot
 from pounce_server.node import PounceNode, Work
 from pounce_server.subgoal_text import Source, SubgoalText
-from protocol import images, topics
+from protocol import codec, images, topics
 from protocol import messages as m
 from protocol.drops import DropReason
 from protocol.errors import EpisodeRefused, MalformedMessage
 from protocol.heartbeat import Heartbeat
-from protocol.link import Link, is_of_episode
+from protocol.link import Link
 from protocol.process import host_clock_id
 
 
@@ -40,15 +40,15 @@ class PounceServer(ModelShell):
 
     def step(self) -> bool:
         self._heartbeat.beat()
-        worked = self._membership.step()
+        worked = self._take_calls()
         self._take_observations()
         for subgoal in self._subgoals.drain() if self._subgoals is not None else ():
-            if is_of_episode(self._link, subgoal.header):
+            if self._link.is_member(subgoal.header):
                 self._link.survive("subgoal", self._node.on_subgoal, subgoal)
         for invocation in self._invocations.drain():
             if invocation.header.episode != self._link.episode:
                 worked |= self.rejoin()
-            if is_of_episode(self._link, invocation.header):
+            if self._link.is_from(invocation.header, "clock"):
                 self._link.survive("invocation", self._node.on_invocation, invocation)
         for invocation in self._node.missed():
             text = f"invocation {invocation.invocation}: tick {invocation.tick} never came"
@@ -66,9 +66,13 @@ class PounceServer(ModelShell):
         self._node.on_observation(observation)
 
     def rejoin(self) -> bool:
-        """After a restart: asks for the running episode. There is nothing to rebuild."""
-        if self._membership.rejoin() is None:
+        """After a restart: asks for the running episode, and for the invocation that its predecessor did not answer."""
+        rejoined = self._membership.rejoin()
+        if rejoined is None:
             return False
+        self._take_newest(rejoined)
+        if rejoined.owed_invocation:
+            self._node.on_invocation(codec.decode(m.Invocation, rejoined.owed_invocation))
         self._membership.announce()
         return True
 

@@ -27,6 +27,7 @@ MAX_ID = 128
 MAX_INSTANT_NS = 10**18  # 31 years: more is a unit mistake
 MAX_INDEX = 2**53
 MAX_DEMO_FRAMES = 600
+MAX_MEMBERS = 16
 DEMO_VIDEO_HZ = 20
 MAX_DECAY = 10  # per chunk: exp(-10) is negligible
 MAX_JOURNAL_ENTRIES = 64
@@ -92,6 +93,12 @@ def _text(message: Any, *names: str, limit: int = MAX_TEXT) -> None:
         value = getattr(message, name)
         if len(value) > limit:
             raise _broken(message, name, f"at most {limit} characters", len(value))
+
+
+def _members(message: Any, members: tuple[m.Member, ...]) -> None:
+    _require(len(members) <= MAX_MEMBERS, message, "members", f"at most {MAX_MEMBERS}", len(members))
+    for member in members:
+        _text(member, "proc", limit=MAX_ID)
 
 
 def _chosen(message: Any, *names: str) -> None:
@@ -312,6 +319,7 @@ def check_open_request(r: m.OpenRequest) -> None:
     _require(len(r.demo) <= MAX_DEMO_FRAMES, r, "demo", f"at most {MAX_DEMO_FRAMES} instants", len(r.demo))
     for frame in r.demo:
         _images(frame, frame.images)
+    _members(r, r.members)
 
 
 def check_contract(c: m.Contract) -> None:
@@ -333,6 +341,7 @@ def check_open_reply(r: m.OpenReply) -> None:
     for contract in (r.contract, *r.contracts):
         if contract is not None:
             check_contract(contract)
+    _members(r, r.members)
 
 
 def check_close_request(r: m.CloseRequest) -> None:

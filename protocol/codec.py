@@ -210,10 +210,18 @@ def _kind(field: Any, default: Any) -> tuple[_Put | None, _Get | None]:
     if field.type == FieldDescriptor.TYPE_ENUM:
         cls = getattr(m, field.enum_type.name)
         members = {int(member): member for member in cls}
-        return None, lambda proto, value: members.get(value, cls.UNSPECIFIED)  # a newer peer's value, or a reserved one
+        return None, lambda proto, value: members[value] if value in members else _unknown(cls, value)
     if field.has_presence:
         return None, lambda proto, value: value if proto.HasField(name) else None
     return (bytes, None) if field.type == FieldDescriptor.TYPE_BYTES else (None, None)
+
+
+def _unknown(cls: Any, value: int) -> Any:
+    """What a newer peer's value, or a reserved one, counts as."""
+    try:
+        return cls(value)
+    except ValueError:
+        return cls.UNSPECIFIED
 
 
 def _get_scalars(proto: Proto, value: Any) -> tuple[Any, ...]:

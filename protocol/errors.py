@@ -19,11 +19,12 @@ class MalformedMessage(ProtocolError):
 
 
 class EpisodeRefused(ProtocolError):
-    """An episode that cannot be opened: a code for programs and a sentence for the user."""
+    """An episode that cannot be opened: a code for programs, a sentence for the user, and whether it may pass."""
 
-    def __init__(self, refusal: Refusal, sentence: str) -> None:
+    def __init__(self, refusal: Refusal, sentence: str, *, try_again: bool = False) -> None:
         super().__init__(sentence)
         self.refusal = refusal
+        self.try_again = try_again
 
 
 class TransportError(RuntimeError):

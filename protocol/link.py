@@ -1,7 +1,8 @@
 """A process's typed end of the bus: it adds headers to sent messages and validates received ones.
 
 A message that does not decode, breaks a rule of ``checks``, names another robot, or whose header disagrees with its key
-is counted, logged once per source and reason, and dropped. No peer's message can make ``Stream.drain`` raise.
+is counted, logged once per source and reason, and dropped. No peer's message can make ``Stream.drain`` raise. In an
+episode only its members are heard: the processes, each with the id of its start, that the opening named.
 """
 
 from __future__ import annotations
@@ -10,8 +11,9 @@ import dataclasses
 import logging
 import secrets
 import struct
+import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -19,7 +21,8 @@ from protocol import codec, topics
 from protocol.bus import Bus, Inbox, Sample, Subscription
 from protocol.drops import DropReason
 from protocol.errors import CallFailed, ProtocolError
-from protocol.messages import EPISODE_CLOCK, Header
+from protocol.messages import EPISODE_CLOCK, Event, Header, Member, Severity
+from protocol.process import host_clock_id
 from protocol.topics import Call, Topic
 
 T = TypeVar("T")
@@ -27,6 +30,7 @@ T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 _ATTACHMENT = struct.Struct("<QqQ")  # seq, source_ns, boot_id
+_MAX_ALARMS = 16  # per episode: a flood of names must not fill its log
 
 
 class Received(NamedTuple, Generic[T]):
@@ -40,6 +44,10 @@ class Link:
     """A process's identity on a bus.
 
     ``enter_episode`` sets the episode of all messages published afterwards.
+
+    Attributes:
+        members: boot ids of the running episode's processes, by name. Others are not obeyed.
+        second_sender: a sentence, once two processes send under one member's ids; "" until then.
     """
 
     def __init__(self, bus: Bus, *, robot: str, proc: str, boot_id: int | None = None) -> None:
@@ -50,12 +58,16 @@ class Link:
         self.session = ""
         self.episode = ""
         self.epoch = 0
+        self.members: dict[str, int] = {}
+        self.second_sender = ""
+        self._heard_ns: dict[str, int] = {}
+        self._strangers: set[int] = set()
         self.dropped: Counter[DropReason] = Counter()
         self._seqs: Counter[str] = Counter()
         self._reported: set[tuple[str, str]] = set()
 
-    def enter_episode(self, session: str, episode: str, epoch: int) -> None:
-        """Sets the episode in the headers and keys of further messages.
+    def enter_episode(self, session: str, episode: str, epoch: int, members: Iterable[Member] = ()) -> None:
+        """Sets the episode in the headers and keys of further messages, and who is in it besides this process.
 
         Raises:
             ProtocolError: an id cannot be part of a key.
@@ -63,9 +75,18 @@ class Link:
         self.session = topics.checked_id(session, "session")
         self.episode = topics.checked_id(episode, "episode")
         self.epoch = epoch
+        self.members, self.second_sender = {}, ""
+        self._heard_ns.clear()
+        self._strangers.clear()
+        self.admit(*members, Member(proc=self.proc, boot_id=self.boot_id))
+
+    def admit(self, *members: Member) -> None:
+        """Lets processes take part in the running episode, each in the place of the last one of its name."""
+        self.members |= {member.proc: member.boot_id for member in members}
 
     def leave_episode(self) -> None:
         self.episode, self.epoch = "", 0
+        self.members = {}
 
     def header(self, topic: str, at_ns: int, clock_id: str = EPISODE_CLOCK) -> Header:
         seq = self._seqs[topic]
@@ -99,6 +120,61 @@ class Link:
             priority=topic.priority,
         )
         return signed  # type: ignore[no-any-return]
+
+    def is_member(self, header: Header) -> bool:
+        """Whether a message belongs to this episode and one of its members sent it; if not, it is counted."""
+        return self.is_from(header, header.proc)
+
+    def is_from(self, header: Header, proc: str) -> bool:
+        """Whether a message belongs to this episode and its member ``proc`` sent it; if not, it is counted.
+
+        A stranger's message is an alarm too, and nothing else.
+        """
+        if not self._is_of_episode(header):
+            return False
+        if header.proc == proc and self.members.get(proc) == header.boot_id:
+            self._heard_ns[proc] = time.monotonic_ns()
+            return True
+        self._alarm(header, proc)
+        return False
+
+    def silent_ns(self, proc: str) -> int:
+        """Time since the last message of a member (monotonic); since the machine started if there was none."""
+        return time.monotonic_ns() - self._heard_ns.get(proc, 0)
+
+    def _is_of_episode(self, header: Header) -> bool:
+        if header.episode == self.episode and header.epoch == self.epoch:
+            return True
+        if not self.episode:  # between episodes: late messages of the last one are no fault
+            self.dropped[DropReason.NO_EPISODE] += 1
+            return False
+        if header.session == self.session and header.epoch < self.epoch:  # the tail of an earlier one, nobody's fault
+            self.dropped[DropReason.OTHER_EPISODE] += 1
+            return False
+        came = f"{header.episode} epoch {header.epoch}"
+        self.drop(source_of(header), DropReason.OTHER_EPISODE, f"in {self.episode} epoch {self.epoch}, came {came}")
+        return False
+
+    def _alarm(self, header: Header, proc: str) -> None:
+        """Counts a stranger's message; the first one per sender is an event of the episode."""
+        text = f"{source_of(header)} is not the {proc} that this episode was opened with: it is not obeyed"
+        self.drop(source_of(header), DropReason.STRANGER, text)
+        if header.boot_id not in self._strangers and len(self._strangers) < _MAX_ALARMS:
+            self._strangers.add(header.boot_id)
+            event = Event(severity=Severity.ERROR, name=DropReason.STRANGER, text=f"{self.proc} heard that {text}")
+            self.publish(topics.EVENT, event, at_ns=time.monotonic_ns(), clock_id=host_clock_id())
+
+    def in_order(self, header: Header, last_seq: int) -> bool:
+        """Whether a member's message is after its last one on the same topic; if not, it is counted.
+
+        The bus keeps a sender's order, so two messages of one number are two senders: ``second_sender`` says so.
+        """
+        if header.seq > last_seq:
+            return True
+        came = f"message {header.seq} after message {last_seq}"
+        self.drop(source_of(header), DropReason.SECOND_SENDER, came)
+        self.second_sender = f"two processes send as {source_of(header)}: {came}"
+        return False
 
     def subscribe(self, topic: Topic[T], *, keep: int | None = None, proc: str = "*") -> Stream[T]:
         """Subscribes to ``topic`` for this robot, in all episodes; the nodes filter by episode."""
@@ -154,6 +230,7 @@ class Stream(Generic[T]):
         self._link = link
         self._topic = topic
         self._encoding = _encoding(topic.cls)  # type: ignore[arg-type]
+        self._last_seq: dict[int, int] = {}  # by boot id, of members
         self.subscription = subscription
 
     def drain(self) -> list[T]:
@@ -191,6 +268,10 @@ class Stream(Generic[T]):
                 _source(sample), DropReason.WRONG_EPISODE, f"key says {episode}, header says {header.episode}"
             )
             return None
+        if episode and self._link.members.get(header.proc) == header.boot_id:
+            if not self._link.in_order(header, self._last_seq.get(header.boot_id, -1)):
+                return None
+            self._last_seq[header.boot_id] = header.seq
         return message
 
 
@@ -235,20 +316,6 @@ class Service:
         return len(requests)
 
 
-def is_of_episode(link: Link, header: Header) -> bool:
-    """Whether a message belongs to this process's episode; if not, it is counted as dropped."""
-    if header.episode == link.episode and header.epoch == link.epoch:
-        return True
-    if not link.episode:  # between episodes: late messages of the last one are no fault
-        link.dropped[DropReason.NO_EPISODE] += 1
-        return False
-    if header.session == link.session and header.epoch < link.epoch:  # the tail of an earlier one, nobody's fault
-        link.dropped[DropReason.OTHER_EPISODE] += 1
-        return False
-    came = f"{header.episode} epoch {header.epoch}"
-    link.drop(
-        f"{header.proc}#{header.boot_id}",
-        DropReason.OTHER_EPISODE,
-        f"in {link.episode} epoch {link.epoch}, came {came}",
-    )
-    return False
+def source_of(header: Header) -> str:
+    """The sender of a message, for logs."""
+    return f"{header.proc}#{header.boot_id}"

@@ -74,6 +74,10 @@ class RobotState(IntEnum):
         """Whether commands are carried out, as far as the robot says."""
         return self in (RobotState.UNSPECIFIED, RobotState.OK)
 
+    @classmethod
+    def _missing_(cls, value: object) -> RobotState:
+        return cls.FAULT  # a newer robot's word for something: no leave to move
+
 
 class SubgoalKind(IntEnum):
     UNSPECIFIED = 0
@@ -435,9 +439,16 @@ class DemoFrame:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Member:
+    proc: str
+    boot_id: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OpenRequest:
     info: EpisodeInfo
     demo: tuple[DemoFrame, ...] = ()
+    members: tuple[Member, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -462,6 +473,7 @@ class Contract:
     context_tokens: int = 0
     max_context_tokens: int = 0
     demonstrations: DemoSampling | None = None
+    boot_id: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -483,6 +495,7 @@ class OpenReply:
     warnings: tuple[str, ...] = ()
     try_again: bool = False
     refusal: Refusal = Refusal.UNSPECIFIED
+    members: tuple[Member, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -507,6 +520,8 @@ class ActiveReply:
     open: OpenRequest | None = None
     num_queries: int = 0
     owed_query: int | None = None
+    owed_invocation: bytes = b""
+    observation: bytes = b""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -19,7 +19,8 @@ from dual_system.tasks.engine import Status
 from dual_system.tasks.environment import Environment, Snapshot
 from protocol import images
 from protocol import messages as m
-from protocol.link import Link, is_of_episode
+from protocol.drops import DropReason
+from protocol.link import Link
 from protocol.topics import ACTION, EVENT, OBSERVATION, PHASE, SUBGOAL, TICK
 from sim_client.recorder import Recorder
 from sim_client.robot import observation, status_of
@@ -78,7 +79,7 @@ class RobotSide:
         while True:
             self.recorder.step()
             for action in actions.drain():
-                if not is_of_episode(self.link, action.header) or action.tick < self._tick:
+                if not self.link.is_from(action.header, "clock") or action.tick < self._tick:
                     continue
                 if not is_sound(self.link, action, info.robot, self._tick):
                     continue
@@ -89,6 +90,10 @@ class RobotSide:
                     return Outcome(status=status_of(snapshot), reason=snapshot.reason, num_ticks=self._tick)
                 if self._stopped_ticks > STOPPED_TICKS:
                     return self._abort("stopped by the ladder, and nobody engaged it again")
+            if self.link.second_sender:  # nobody can say which of the two is meant
+                self._tell(DropReason.SECOND_SENDER, f"holding the last command: {self.link.second_sender}")
+                self._hold()
+                return self._abort(self.link.second_sender)
             silent_ns = time.monotonic_ns() - heard_ns
             if silent_ns > self._limit_ns(info):
                 if self._tick == 0:

@@ -10,7 +10,7 @@ from model_server.membership import Membership
 from protocol import messages as m
 from protocol import topics
 from protocol.heartbeat import Heartbeat
-from protocol.link import Link, is_of_episode
+from protocol.link import Link
 from protocol.process import host_clock_id
 from protocol.version import version
 
@@ -62,7 +62,7 @@ class PonderDouble(ABC):
         self._heartbeat.beat()
         worked = self._membership.step()
         for query in self._queries.drain():
-            if is_of_episode(self.link, query.header):
+            if self.link.is_from(query.header, "clock"):
                 self._publish(query, self.answer(query))
                 worked = True
         return worked

@@ -9,10 +9,11 @@ import time
 from pathlib import Path
 from typing import Literal
 
+from clock.report import ADMITTED_EVENT
 from protocol import messages as m
 from protocol.link import Link, Received, Stream
 from protocol.mcap_log import EpisodeLog
-from protocol.topics import INFO, OBSERVATION, RESULT, STREAMS, Topic
+from protocol.topics import EVENT, HEALTH, INFO, OBSERVATION, PHASE, RESULT, STREAMS, Topic
 
 KEEP = 512  # per topic, between two drains; drains come every tick
 
@@ -25,7 +26,7 @@ class Recorder:
         self._pixels: Literal["jpeg", "exact"] = pixels
         self._streams: list[tuple[Topic[object], Stream[object]]] = [
             (topic, link.subscribe(topic, keep=8 if topic is OBSERVATION else KEEP))
-            for topic in STREAMS
+            for topic in sorted(STREAMS, key=lambda topic: topic is not EVENT)  # events say who is admitted
             if topic is not INFO
         ]
         self._log: EpisodeLog | None = None
@@ -41,11 +42,14 @@ class Recorder:
 
     def step(self) -> None:
         """Takes what has come since the last call."""
-        received = [(topic, each) for topic, stream in self._streams for each in stream.receive()]
+        received = []
+        for topic, stream in self._streams:
+            for each in stream.receive():
+                if self._is_of_log(topic, each.message.header):  # type: ignore[attr-defined]
+                    self._admit(each.message)
+                    received.append((topic, each))
         received.sort(key=lambda pair: _episode_ns(pair[1]))  # per topic the order is kept: sort is stable
         for topic, (message, sample) in received:
-            if topic.name not in ("health", "phase") and not self._is_ours(message):
-                continue
             self._remember(message)
             if self._log is not None:
                 self._log.write(topic, message, sample.payload, time.time_ns())
@@ -64,9 +68,18 @@ class Recorder:
                 missing.append(f"log {closing.path.name}: dropped {closing.dropped}")
         return missing
 
-    def _is_ours(self, message: object) -> bool:
-        header: m.Header = message.header  # type: ignore[attr-defined]
-        return (header.episode, header.epoch) == (self._link.episode, self._link.epoch)
+    def _is_of_log(self, topic: Topic[object], header: m.Header) -> bool:
+        """Whether a message belongs into this episode's log: nobody outside of it can write there."""
+        if topic is HEALTH or topic is PHASE:  # of the process, not of the episode
+            return self._link.members.get(header.proc) == header.boot_id
+        is_ours = (header.episode, header.epoch) == (self._link.episode, self._link.epoch)
+        return is_ours and self._link.is_member(header)
+
+    def _admit(self, message: object) -> None:
+        """Hears a restarted server from now on, if this is the clock service's word that it may take part."""
+        if isinstance(message, m.Event) and message.name == ADMITTED_EVENT and message.header.proc == "clock":
+            proc, boot_id = message.attributes["proc"], int(message.attributes["boot_id"])
+            self._link.admit(m.Member(proc=proc, boot_id=boot_id))
 
     def _remember(self, message: object) -> None:
         if isinstance(message, m.Tick):

@@ -16,7 +16,7 @@ from dual_system.models.ponder.demo_sampling import PAPER_SAMPLING, DemoSampling
 from protocol import messages as m
 from protocol.drops import DropReason
 from protocol.errors import CallFailed, EpisodeRefused, TransportError
-from protocol.link import Link
+from protocol.link import Link, source_of
 from protocol.topics import CLOSE, CONTRACT, OPEN, alive_key
 from sim_client.recorder import Recorder
 
@@ -44,7 +44,7 @@ def is_sound(link: Link, action: m.Action, robot: m.Robot, next_tick: int) -> bo
         why_not = f"expected tick {next_tick} or a few later, came {action.tick}"
     else:
         return True
-    link.drop(f"{action.header.proc}#{action.header.boot_id}", DropReason.OUT_OF_LIMITS, why_not)
+    link.drop(source_of(action.header), DropReason.OUT_OF_LIMITS, why_not)
     return False
 
 
@@ -96,7 +96,9 @@ class RobotEnd:
             EpisodeRefused: a server does not take it.
             TransportError: not ready within the patience.
         """
-        return self._patiently(lambda: self._ask_clock(request))
+        reply = self._patiently(lambda: self._ask_clock(request))
+        self._link.admit(*(member for member in reply.members if member.proc != self._link.proc))
+        return reply
 
     def take_turn(self, longest_ns: int) -> None:
         """Gives the other participants one turn; with an embedded clock, at most until it has something to do."""

@@ -225,6 +225,7 @@ class Rig:
     ponder_engine: FakePonder = field(default_factory=FakePonder)
     pounce_engine: FakePounce = field(default_factory=FakePounce)
     px: int = PX
+    patience_ns: int = 20_000_000_000
     said: dict[type, list[Any]] = field(default_factory=dict)
     meanwhile: Callable[[], None] = lambda: None
 
@@ -267,14 +268,15 @@ class Rig:
             pass
 
     def open(self, info: m.EpisodeInfo, demo: tuple[m.DemoFrame, ...] = ()) -> m.OpenReply:
-        return self.clock.open(m.OpenRequest(info=info, demo=demo))
+        header = dataclasses.replace(info.header, boot_id=self.links["sim"].boot_id)
+        return self.clock.open(m.OpenRequest(info=dataclasses.replace(info, header=header), demo=demo))
 
     def enter(self, info: m.EpisodeInfo) -> m.OpenReply:
         """Opens an episode that must not be refused, and lets the robot join it."""
         reply = self.open(info)
         assert reply.error == ""
         header = info.header
-        self.links["sim"].enter_episode(header.session, header.episode, header.epoch)
+        self.links["sim"].enter_episode(header.session, header.episode, header.epoch, reply.members)
         return reply
 
     def run(
@@ -288,7 +290,7 @@ class Rig:
             self.meanwhile()
             self.bus.run_participants()
 
-        side = RobotSide(self.links["sim"], world, NoRecorder(), let_others, 20_000_000_000, looks)  # type: ignore[arg-type]
+        side = RobotSide(self.links["sim"], world, NoRecorder(), let_others, self.patience_ns, looks)  # type: ignore[arg-type]
         outcome = side.run(info, world.look(), lambda tick: None)
         self.settle()
         return outcome, world

@@ -28,7 +28,7 @@ from protocol import images
 from protocol import messages as m
 from protocol.drops import DropReason
 from protocol.errors import EpisodeRefused, ProtocolError, TransportError
-from protocol.link import Link, Stream, is_of_episode
+from protocol.link import Link, Stream
 from protocol.topics import ACTION, CHUNK, HEALTH, OBSERVATION, TICK
 from sim_client.episode import CLOCK_SILENCE_NS
 from sim_client.gateway.body import Body
@@ -264,8 +264,12 @@ class Machine:
             self._end(m.TaskStatus.ABORTED, why, keep=episode)
 
     def _objection(self) -> str:
-        """A sentence if a server drops what it is shown: it was built for other pictures or joints."""
+        """A sentence if an episode cannot go on: a server was built for other pictures or joints, or has a double."""
+        if self._link.second_sender:
+            return self._link.second_sender
         for health in self._healths.drain():
+            if self._link.members.get(health.header.proc) != health.header.boot_id:
+                continue
             if health.dropped.get(DropReason.WRONG_SHAPE, 0) > self._misshapen.get(health.header.proc, 0):
                 proc = health.header.proc
                 return f"{proc} was built for other pictures, and says in its log for which. See --image-px"
@@ -273,17 +277,17 @@ class Machine:
 
     def _take_background(self, node: Node) -> None:
         """Reads the sources of forecast rows: the records of ticks, and chunks."""
-        for account in self._of_episode(self._accounts):
+        for account in self._from("clock", self._accounts):
             node.commands.on_account(account)
-        for chunk in self._of_episode(self._chunks):
+        for chunk in self._from("pounce", self._chunks):
             node.commands.on_chunk(chunk)
 
     def _commands(self, episode: _Episode) -> list[m.Action]:
         robot, tick = episode.info.robot, episode.node.tick
-        return [each for each in self._of_episode(self._actions) if is_sound(self._link, each, robot, tick)]
+        return [each for each in self._from("clock", self._actions) if is_sound(self._link, each, robot, tick)]
 
-    def _of_episode(self, stream: Stream[T]) -> list[T]:
-        return [each for each in stream.drain() if is_of_episode(self._link, each.header)]  # type: ignore[attr-defined]
+    def _from(self, proc: str, stream: Stream[T]) -> list[T]:
+        return [each for each in stream.drain() if self._link.is_from(each.header, proc)]  # type: ignore[attr-defined]
 
     def _turn(self, longest_ns: int) -> None:
         self._recorder.step()

@@ -15,6 +15,7 @@ import pytest
 from clock import schedules
 from clock.conductor import Conductor
 from clock.service import ROBOT_SILENCE_NS, ClockService, ServiceConfig
+from clock.watch import TOKEN_GRACE_NS
 from model_server import membership
 from protocol import codec, topics
 from protocol import messages as m
@@ -168,7 +169,7 @@ def test_in_lockstep_a_starving_schedule_is_a_warning(rig: Any, episode_info: In
 
 def test_another_session_finds_the_robot_busy(rig: Any, episode_info: Info, paper: m.Schedule) -> None:
     rig.enter(episode_info(paper))
-    reply = rig.open(episode_info(paper, session="s2"))
+    reply = rig.clock.open(m.OpenRequest(info=episode_info(paper, session="s2")))
     assert (reply.error, reply.try_again) == ("robot r0 is busy with episode ep-1", True)
 
 
@@ -249,7 +250,9 @@ def test_a_lost_server_is_told_and_told_when_it_is_back(watchful: Any, episode_i
     watchful.enter(episode_info(paper))
     key = topics.alive_key("r0", "pounce")
     watchful.bus.end_alive(key)
-    watchful.clock.step()
+    deadline_ns = time.monotonic_ns() + 2 * TOKEN_GRACE_NS
+    while time.monotonic_ns() < deadline_ns:
+        watchful.clock.step()
     watchful.bus.declare_alive(key)
     watchful.links["pounce"].publish(
         topics.HEALTH, m.Health(state=m.ServingState.READY, open_episode="ep-1"), at_ns=0, clock_id="host/monotonic"
@@ -435,16 +438,18 @@ def test_a_journal_entry_holds_the_observation_its_query_names(rig: Any, episode
     for tick in (5, 4):  # the older one comes late
         rig.show(tick, 0)
     rig.clock.step()
-    rig.listener.enter_episode("s1", "ep-1", 1)
     request = m.JournalRequest(first_query=0, max_queries=4)
-    (entry,) = rig.listener.call(topics.JOURNAL, "clock", request, timeout_ns=1).entries
+    (entry,) = rig.links["ponder"].call(topics.JOURNAL, "clock", request, timeout_ns=1).entries
     assert entry.tick == codec.decode(m.Observation, entry.observation).tick == 5
 
 
 def test_the_journal_of_another_episode_is_not_here(rig: Any, episode_info: Info, paper: m.Schedule) -> None:
     rig.enter(episode_info(paper))
     reply = rig.listener.call(topics.JOURNAL, "clock", m.JournalRequest(first_query=0, max_queries=4), timeout_ns=1)
-    assert reply.error == "episode '' is not open here"
+    assert reply.error == "episode '' is not open here for listener"
+    rig.listener.enter_episode("s1", "ep-1", 1)
+    reply = rig.listener.call(topics.JOURNAL, "clock", m.JournalRequest(first_query=0, max_queries=4), timeout_ns=1)
+    assert reply.error == "episode 'ep-1' is not open here for listener"
 
 
 def test_without_an_episode_none_is_active(rig: Any) -> None:
@@ -580,7 +585,7 @@ def test_a_late_query_does_not_bring_a_closed_episode_back(
     rig.run(info, 30)
     monotonic.now_ns += 2_000 * MS  # a server asks for its episode once a second at most
     rig.links["clock"].publish(topics.QUERY, m.Query(query=9, tick=29, source_ns=0), at_ns=0)
-    assert rig.clock.close(m.CloseRequest(header=info.header)).error == ""
+    assert rig.clock.close(m.CloseRequest(header=rig.links["sim"].header("close", 0))).error == ""
     rig.settle()
     assert rig.ponder_engine.contexts == {}
 

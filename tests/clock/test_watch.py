@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from clock.watch import HEARTBEAT_TIMEOUT_NS, Change, Watch
+from clock.watch import HEARTBEAT_TIMEOUT_NS, TOKEN_GRACE_NS, Change, Watch
 from protocol.messages import Header, Health, ServingState
 
 MS = 1_000_000
 PROCS = ("ponder",)
 READY = ServingState.READY
+GONE_NS = TOKEN_GRACE_NS + 1
 
 
 def health(state: ServingState = READY, episode: str = "e1", detail: str = "", proc: str = "ponder") -> Health:
@@ -43,8 +46,27 @@ def test_a_silent_server_is_lost_after_its_timeout_and_not_before(watch: Watch) 
 
 def test_a_dead_process_is_lost_with_its_token(watch: Watch) -> None:
     watch.on_token("ponder", False)
-    (change,) = watch.poll(PROCS, "e1", 1)
+    assert watch.poll(PROCS, "e1", TOKEN_GRACE_NS) == []
+    (change,) = watch.poll(PROCS, "e1", TOKEN_GRACE_NS + 1)
     assert (change.is_lost, "liveliness token is gone" in change.why) == (True, True)
+
+
+def test_a_token_that_anybody_withdraws_loses_no_server_that_beats(watch: Watch) -> None:
+    for now_ms in range(0, 5_000, 100):
+        watch.on_token("ponder", now_ms % 200 == 0)
+        watch.on_health(health(), now_ms * MS)
+        watch.on_token("ponder", False)
+        assert watch.poll(PROCS, "e1", (now_ms + 99) * MS) == []
+
+
+def test_what_a_process_outside_of_the_episode_says_under_a_servers_name_is_nothing(watch: Watch) -> None:
+    watch.members = {"ponder": 0}
+    watch.on_health(replace(health(ServingState.FAILED), header=Header(proc="ponder", boot_id=7)), 1)
+    assert watch.poll(PROCS, "e1", 1) == []
+    watch.members = {"ponder": 7}
+    watch.on_health(health(), 2)  # nor what its predecessor says
+    (change,) = watch.poll(PROCS, "e1", HEARTBEAT_TIMEOUT_NS + 1)
+    assert "no heartbeat" in change.why
 
 
 def test_a_hung_loop_is_lost_although_its_token_lives(watch: Watch) -> None:
@@ -66,15 +88,15 @@ def test_a_server_that_is_not_ready_is_lost(watch: Watch, state: ServingState) -
 
 def test_a_loss_is_told_once(watch: Watch) -> None:
     watch.on_token("ponder", False)
-    assert [len(watch.poll(PROCS, "e1", now_ns)) for now_ns in (1, 2, 10**10)] == [1, 0, 0]
+    assert [len(watch.poll(PROCS, "e1", now_ns)) for now_ns in (GONE_NS, GONE_NS + 1, 10**10)] == [1, 0, 0]
 
 
 def test_a_server_is_back_only_when_it_knows_the_episode(watch: Watch) -> None:
     watch.on_token("ponder", False)
-    watch.poll(PROCS, "e1", 1)
+    watch.poll(PROCS, "e1", GONE_NS)
     steps = [health(ServingState.LOADING, ""), health(ServingState.WARMING, ""), health(READY, ""), health()]
     told = []
-    for now_ns, beat in enumerate(steps, 2):
+    for now_ns, beat in enumerate(steps, GONE_NS):
         watch.on_health(beat, now_ns)
         told.append([change.is_lost for change in watch.poll(PROCS, "e1", now_ns)])
     assert told == [[], [], [], [False]]
@@ -89,25 +111,25 @@ def test_a_server_never_heard_is_lost_after_the_timeout() -> None:
 def test_a_successors_token_is_no_sign_that_it_knows_the_episode(watch: Watch) -> None:
     """The token of a restarted process comes before its first heartbeat; its predecessor's says nothing about it."""
     watch.on_token("ponder", False)
-    watch.poll(PROCS, "e1", 1)
+    watch.poll(PROCS, "e1", GONE_NS)
     watch.on_token("ponder", True)
-    assert watch.poll(PROCS, "e1", 2) == []
-    watch.on_health(health(episode="e1"), 3)
-    assert [change.is_lost for change in watch.poll(PROCS, "e1", 3)] == [False]
+    assert watch.poll(PROCS, "e1", GONE_NS) == []
+    watch.on_health(health(episode="e1"), GONE_NS)
+    assert [change.is_lost for change in watch.poll(PROCS, "e1", GONE_NS)] == [False]
 
 
 def test_a_new_episode_forgets_old_losses(watch: Watch) -> None:
     watch.on_token("ponder", False)
-    watch.poll(PROCS, "e1", 1)
+    watch.poll(PROCS, "e1", GONE_NS)
     watch.forget_losses()
-    watch.on_health(health(episode="e2"), 2)
-    assert watch.poll(PROCS, "e2", 2) == []
+    watch.on_health(health(episode="e2"), GONE_NS)
+    assert watch.poll(PROCS, "e2", GONE_NS) == []
 
 
 def test_one_loss_is_not_the_others(watch: Watch) -> None:
     watch.on_health(health(proc="pounce"), 0)
     watch.on_token("pounce", False)
-    assert [change.proc for change in watch.poll(("ponder", "pounce"), "e1", 1)] == ["pounce"]
+    assert [change.proc for change in watch.poll(("ponder", "pounce"), "e1", GONE_NS)] == ["pounce"]
 
 
 def test_a_server_nobody_opened_is_nobodys_loss(watch: Watch) -> None:

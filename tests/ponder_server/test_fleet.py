@@ -68,6 +68,7 @@ class Hall:
 
     def __post_init__(self) -> None:
         self.clocks = {robot: Link(self.bus, robot=robot, proc="clock") for robot in ROBOTS}
+        self.sims = {robot: Link(self.bus, robot=robot, proc="sim") for robot in ROBOTS}
         self.streams = {
             (robot, topic.cls): link.subscribe(topic, keep=100)
             for robot, link in self.clocks.items()
@@ -104,9 +105,11 @@ class Hall:
     def open(self, robot: str, info: m.EpisodeInfo) -> m.OpenReply:
         clock = self.clocks[robot]
         header = dataclasses.replace(info.header, robot=robot)
-        clock.enter_episode(header.session, header.episode, header.epoch)
+        for link in (clock, self.sims[robot]):
+            link.enter_episode(header.session, header.episode, header.epoch)
+        members = tuple(m.Member(proc=link.proc, boot_id=link.boot_id) for link in (clock, self.sims[robot]))
         cameras = dataclasses.replace(info.robot, image_height=self.px, image_width=self.px)
-        request = m.OpenRequest(info=dataclasses.replace(info, header=header, robot=cameras))
+        request = m.OpenRequest(info=dataclasses.replace(info, header=header, robot=cameras), members=members)
         self.requests[robot] = request
         return clock.call(topics.OPEN, "ponder", request, timeout_ns=1)  # type: ignore[no-any-return]
 
@@ -118,7 +121,7 @@ class Hall:
         seen = m.Observation(tick=query, source_ns=query, proprio=np.zeros(3, np.float32), images=pictures)
         entry = m.JournalEntry(query=query, tick=query, source_ns=query, observation=codec.encode(seen))
         self.journals[robot].append(entry)
-        clock.publish(topics.OBSERVATION, seen, at_ns=query)
+        self.sims[robot].publish(topics.OBSERVATION, seen, at_ns=query)
         clock.publish(topics.QUERY, m.Query(query=query, tick=query, source_ns=query), at_ns=query)
 
     def forget(self, robot: str) -> None:

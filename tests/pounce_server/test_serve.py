@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -171,6 +172,7 @@ def test_a_restarted_pounce_is_as_good_as_one_that_never_died(
 
     def restart() -> None:
         if died.clock.conductor.num_invocations == 2 and not fake_pounce.requests:
+            died.pounce = SimpleNamespace(step=lambda: False)  # dead, with its last chunk on the way
             died.pounce = died.start_pounce(Link(died.bus, robot="r0", proc="pounce"), fake_pounce)
 
     died.meanwhile = restart

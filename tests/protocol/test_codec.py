@@ -172,7 +172,8 @@ RESULT = st.builds(
     num_ticks=INDEX, stream_sha256=TEXT, statistics=maps(DOUBLE),
 )  # fmt: skip
 DEMO_FRAME = st.builds(m.DemoFrame, images=tuples_of(pictures()))
-OPEN_REQUEST = st.builds(m.OpenRequest, info=INFO, demo=tuples_of(DEMO_FRAME, 2))
+MEMBER = st.builds(m.Member, proc=TEXT, boot_id=U64)
+OPEN_REQUEST = st.builds(m.OpenRequest, info=INFO, demo=tuples_of(DEMO_FRAME, 2), members=tuples_of(MEMBER, 4))
 DEMO_SAMPLING = st.builds(m.DemoSampling, hz=st.sampled_from([1, 2, 4, 5, 10, 20]), to_its_end=st.booleans())
 CONTRACT = st.builds(
     m.Contract, proc=TEXT, num_carriers=U32, hidden_size=U32, horizon=U32, action_dim=U32,
@@ -232,6 +233,7 @@ MESSAGES: dict[type, st.SearchStrategy[Any]] = {
     m.EpisodeResult: RESULT,
     m.DemoFrame: DEMO_FRAME,
     m.OpenRequest: OPEN_REQUEST,
+    m.Member: MEMBER,
     m.DemoSampling: DEMO_SAMPLING,
     m.Contract: CONTRACT,
     m.ContractRequest: st.builds(m.ContractRequest, header=HEADER),

@@ -14,7 +14,7 @@ from protocol import codec, topics
 from protocol import messages as m
 from protocol.bus import ATTACHMENT_BYTES, LocalBus
 from protocol.errors import CallFailed, MalformedMessage, ProtocolError
-from protocol.link import Link, Stream, is_of_episode
+from protocol.link import Link, Stream
 from protocol.topics import Priority
 
 QUERY = m.Query(query=3, tick=4, source_ns=5)
@@ -36,7 +36,7 @@ def sender(bus: LocalBus) -> Link:
 @pytest.fixture
 def receiver(bus: LocalBus) -> Link:
     link = Link(bus, robot="r0", proc="ponder", boot_id=8)
-    link.enter_episode("s1", "e1", 2)
+    link.enter_episode("s1", "e1", 2, [m.Member(proc="clock", boot_id=7)])
     return link
 
 
@@ -195,22 +195,26 @@ def test_a_broken_attachment_harms_nothing(bus: LocalBus, queries: Stream[m.Quer
 @pytest.mark.parametrize(
     ("header", "expected", "reason"),
     [
-        (m.Header(episode="e1", epoch=2), True, None),
-        (m.Header(episode="e1", epoch=1), False, "other_episode"),
-        (m.Header(episode="e2", epoch=2), False, "other_episode"),
+        (m.Header(episode="e1", epoch=2, proc="clock", boot_id=7), True, None),
+        (m.Header(episode="e1", epoch=1, proc="clock", boot_id=7), False, "other_episode"),
+        (m.Header(episode="e2", epoch=2, proc="clock", boot_id=7), False, "other_episode"),
         (m.Header(), False, "other_episode"),
+        (m.Header(episode="e1", epoch=2, proc="clock", boot_id=6), False, "stranger"),
+        (m.Header(episode="e1", epoch=2, proc="sim", boot_id=7), False, "stranger"),
+        (m.Header(episode="e1", epoch=2, proc="pounce", boot_id=5), False, "stranger"),
     ],
 )
-def test_a_message_belongs_to_one_episode_and_epoch(
+def test_a_message_belongs_to_one_episode_and_is_its_members(
     receiver: Link, header: m.Header, expected: bool, reason: str | None
 ) -> None:
-    assert is_of_episode(receiver, header) is expected
+    receiver.admit(m.Member(proc="pounce", boot_id=4), m.Member(proc="sim", boot_id=3))
+    assert receiver.is_from(header, "clock") is expected
     assert dict(receiver.dropped) == ({reason: 1} if reason else {})
 
 
 def test_between_episodes_a_late_message_is_nobodys_fault(receiver: Link, caplog: pytest.LogCaptureFixture) -> None:
     receiver.leave_episode()
-    assert not is_of_episode(receiver, m.Header(episode="e1", epoch=2))
+    assert not receiver.is_member(m.Header(episode="e1", epoch=2))
     assert dict(receiver.dropped) == {"no_episode": 1}
     assert caplog.records == []
 
@@ -228,9 +232,45 @@ def test_what_is_left_of_an_earlier_episode_is_counted_and_nobodys_fault(
     receiver: Link, header: m.Header, is_logged: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
     receiver.enter_episode("s", "e1", 2)
-    assert not is_of_episode(receiver, header)
+    assert not receiver.is_member(header)
     assert dict(receiver.dropped) == {"other_episode": 1}
     assert bool(caplog.records) is is_logged
+
+
+def test_a_stranger_is_one_alarm_however_much_it_says(bus: LocalBus, sender: Link, receiver: Link) -> None:
+    alarms = sender.subscribe(topics.EVENT)
+    stranger = Link(bus, robot="r0", proc="clock", boot_id=9)
+    stranger.enter_episode("s1", "e1", 2)
+    queries = receiver.subscribe(topics.QUERY)
+    for _ in range(8):
+        stranger.publish(topics.QUERY, QUERY, at_ns=0)
+    assert [receiver.is_from(query.header, "clock") for query in queries.drain()] == [False] * 8
+    (alarm,) = alarms.drain()
+    assert (alarm.name, alarm.severity) == ("stranger", m.Severity.ERROR)
+    assert "clock#9 is not the clock that this episode was opened with" in alarm.text
+    assert receiver.dropped["stranger"] == 8
+
+
+def test_two_senders_under_one_name_are_noticed_and_the_second_is_not_heard(
+    bus: LocalBus, sender: Link, receiver: Link
+) -> None:
+    double = Link(bus, robot="r0", proc="clock", boot_id=sender.boot_id)
+    double.enter_episode("s1", "e1", 2)
+    queries = receiver.subscribe(topics.QUERY)
+    for link in (sender, sender, double):
+        link.publish(topics.QUERY, QUERY, at_ns=0)
+    assert [query.header.seq for query in queries.drain()] == [0, 1]
+    assert receiver.second_sender == "two processes send as clock#7: message 0 after message 1"
+    receiver.enter_episode("s1", "e2", 3)
+    assert receiver.second_sender == ""
+
+
+def test_what_a_ring_lost_is_no_second_sender(sender: Link, receiver: Link) -> None:
+    queries = receiver.subscribe(topics.QUERY, keep=2)
+    for _ in range(10):
+        sender.publish(topics.QUERY, QUERY, at_ns=0)
+    assert [query.header.seq for query in queries.drain()] == [8, 9]
+    assert receiver.second_sender == ""
 
 
 def test_our_own_malformed_message_is_a_bug_here(sender: Link) -> None:

@@ -238,13 +238,23 @@ class DemoFrame(_message.Message):
     images: _containers.RepeatedCompositeFieldContainer[_common_pb2.Image]
     def __init__(self, images: _Optional[_Iterable[_Union[_common_pb2.Image, _Mapping]]] = ...) -> None: ...
 
+class Member(_message.Message):
+    __slots__ = ("proc", "boot_id")
+    PROC_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    proc: str
+    boot_id: int
+    def __init__(self, proc: _Optional[str] = ..., boot_id: _Optional[int] = ...) -> None: ...
+
 class OpenRequest(_message.Message):
-    __slots__ = ("info", "demo")
+    __slots__ = ("info", "demo", "members")
     INFO_FIELD_NUMBER: _ClassVar[int]
     DEMO_FIELD_NUMBER: _ClassVar[int]
+    MEMBERS_FIELD_NUMBER: _ClassVar[int]
     info: EpisodeInfo
     demo: _containers.RepeatedCompositeFieldContainer[DemoFrame]
-    def __init__(self, info: _Optional[_Union[EpisodeInfo, _Mapping]] = ..., demo: _Optional[_Iterable[_Union[DemoFrame, _Mapping]]] = ...) -> None: ...
+    members: _containers.RepeatedCompositeFieldContainer[Member]
+    def __init__(self, info: _Optional[_Union[EpisodeInfo, _Mapping]] = ..., demo: _Optional[_Iterable[_Union[DemoFrame, _Mapping]]] = ..., members: _Optional[_Iterable[_Union[Member, _Mapping]]] = ...) -> None: ...
 
 class DemoSampling(_message.Message):
     __slots__ = ("hz", "to_its_end")
@@ -255,7 +265,7 @@ class DemoSampling(_message.Message):
     def __init__(self, hz: _Optional[int] = ..., to_its_end: _Optional[bool] = ...) -> None: ...
 
 class Contract(_message.Message):
-    __slots__ = ("proc", "num_carriers", "hidden_size", "horizon", "action_dim", "preferred_codec", "infer_p50_ns", "infer_p99_ns", "model_hash", "is_fake", "version", "context_tokens", "max_context_tokens", "demonstrations")
+    __slots__ = ("proc", "num_carriers", "hidden_size", "horizon", "action_dim", "preferred_codec", "infer_p50_ns", "infer_p99_ns", "model_hash", "is_fake", "version", "context_tokens", "max_context_tokens", "demonstrations", "boot_id")
     PROC_FIELD_NUMBER: _ClassVar[int]
     NUM_CARRIERS_FIELD_NUMBER: _ClassVar[int]
     HIDDEN_SIZE_FIELD_NUMBER: _ClassVar[int]
@@ -270,6 +280,7 @@ class Contract(_message.Message):
     CONTEXT_TOKENS_FIELD_NUMBER: _ClassVar[int]
     MAX_CONTEXT_TOKENS_FIELD_NUMBER: _ClassVar[int]
     DEMONSTRATIONS_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
     proc: str
     num_carriers: int
     hidden_size: int
@@ -284,7 +295,8 @@ class Contract(_message.Message):
     context_tokens: int
     max_context_tokens: int
     demonstrations: DemoSampling
-    def __init__(self, proc: _Optional[str] = ..., num_carriers: _Optional[int] = ..., hidden_size: _Optional[int] = ..., horizon: _Optional[int] = ..., action_dim: _Optional[int] = ..., preferred_codec: _Optional[_Union[_common_pb2.ImageCodec, str]] = ..., infer_p50_ns: _Optional[int] = ..., infer_p99_ns: _Optional[int] = ..., model_hash: _Optional[str] = ..., is_fake: _Optional[bool] = ..., version: _Optional[str] = ..., context_tokens: _Optional[int] = ..., max_context_tokens: _Optional[int] = ..., demonstrations: _Optional[_Union[DemoSampling, _Mapping]] = ...) -> None: ...
+    boot_id: int
+    def __init__(self, proc: _Optional[str] = ..., num_carriers: _Optional[int] = ..., hidden_size: _Optional[int] = ..., horizon: _Optional[int] = ..., action_dim: _Optional[int] = ..., preferred_codec: _Optional[_Union[_common_pb2.ImageCodec, str]] = ..., infer_p50_ns: _Optional[int] = ..., infer_p99_ns: _Optional[int] = ..., model_hash: _Optional[str] = ..., is_fake: _Optional[bool] = ..., version: _Optional[str] = ..., context_tokens: _Optional[int] = ..., max_context_tokens: _Optional[int] = ..., demonstrations: _Optional[_Union[DemoSampling, _Mapping]] = ..., boot_id: _Optional[int] = ...) -> None: ...
 
 class ContractRequest(_message.Message):
     __slots__ = ("header",)
@@ -301,20 +313,22 @@ class ContractReply(_message.Message):
     def __init__(self, error: _Optional[str] = ..., contract: _Optional[_Union[Contract, _Mapping]] = ...) -> None: ...
 
 class OpenReply(_message.Message):
-    __slots__ = ("error", "contract", "contracts", "warnings", "try_again", "refusal")
+    __slots__ = ("error", "contract", "contracts", "warnings", "try_again", "refusal", "members")
     ERROR_FIELD_NUMBER: _ClassVar[int]
     CONTRACT_FIELD_NUMBER: _ClassVar[int]
     CONTRACTS_FIELD_NUMBER: _ClassVar[int]
     WARNINGS_FIELD_NUMBER: _ClassVar[int]
     TRY_AGAIN_FIELD_NUMBER: _ClassVar[int]
     REFUSAL_FIELD_NUMBER: _ClassVar[int]
+    MEMBERS_FIELD_NUMBER: _ClassVar[int]
     error: str
     contract: Contract
     contracts: _containers.RepeatedCompositeFieldContainer[Contract]
     warnings: _containers.RepeatedScalarFieldContainer[str]
     try_again: bool
     refusal: Refusal
-    def __init__(self, error: _Optional[str] = ..., contract: _Optional[_Union[Contract, _Mapping]] = ..., contracts: _Optional[_Iterable[_Union[Contract, _Mapping]]] = ..., warnings: _Optional[_Iterable[str]] = ..., try_again: _Optional[bool] = ..., refusal: _Optional[_Union[Refusal, str]] = ...) -> None: ...
+    members: _containers.RepeatedCompositeFieldContainer[Member]
+    def __init__(self, error: _Optional[str] = ..., contract: _Optional[_Union[Contract, _Mapping]] = ..., contracts: _Optional[_Iterable[_Union[Contract, _Mapping]]] = ..., warnings: _Optional[_Iterable[str]] = ..., try_again: _Optional[bool] = ..., refusal: _Optional[_Union[Refusal, str]] = ..., members: _Optional[_Iterable[_Union[Member, _Mapping]]] = ...) -> None: ...
 
 class CloseRequest(_message.Message):
     __slots__ = ("header", "result")
@@ -337,16 +351,20 @@ class ActiveRequest(_message.Message):
     def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ...) -> None: ...
 
 class ActiveReply(_message.Message):
-    __slots__ = ("error", "open", "num_queries", "owed_query")
+    __slots__ = ("error", "open", "num_queries", "owed_query", "owed_invocation", "observation")
     ERROR_FIELD_NUMBER: _ClassVar[int]
     OPEN_FIELD_NUMBER: _ClassVar[int]
     NUM_QUERIES_FIELD_NUMBER: _ClassVar[int]
     OWED_QUERY_FIELD_NUMBER: _ClassVar[int]
+    OWED_INVOCATION_FIELD_NUMBER: _ClassVar[int]
+    OBSERVATION_FIELD_NUMBER: _ClassVar[int]
     error: str
     open: OpenRequest
     num_queries: int
     owed_query: int
-    def __init__(self, error: _Optional[str] = ..., open: _Optional[_Union[OpenRequest, _Mapping]] = ..., num_queries: _Optional[int] = ..., owed_query: _Optional[int] = ...) -> None: ...
+    owed_invocation: bytes
+    observation: bytes
+    def __init__(self, error: _Optional[str] = ..., open: _Optional[_Union[OpenRequest, _Mapping]] = ..., num_queries: _Optional[int] = ..., owed_query: _Optional[int] = ..., owed_invocation: _Optional[bytes] = ..., observation: _Optional[bytes] = ...) -> None: ...
 
 class JournalRequest(_message.Message):
     __slots__ = ("header", "first_query", "max_queries")
