@@ -377,9 +377,9 @@ class ClockService:
         head = self._config.residual if request.info.policy == "servers" else None
         conductor = Conductor(request.info, committed_ticks=committed_ticks, residual=head)
         self._episode = _Episode(request, conductor, contracts=dict(zip(SERVERS, contracts, strict=False)))
-        self._watch.forget_losses()
-        self._watch.members = {proc: self._link.members[proc] for proc in SERVERS if contracts}
         self._robot_heard_ns = self._host.now_ns()
+        members = {proc: self._link.members[proc] for proc in SERVERS if contracts}
+        self._watch.enter(members, self._robot_heard_ns)
         self._link.publish(INFO, request.info, at_ns=0)
         if head is not None:
             text = f"every row is corrected by {head.digest}"
@@ -499,13 +499,12 @@ class ClockService:
         episode, self._episode = self._episode, None  # first, so that a server with a late query cannot rejoin it
         if episode is not None and episode.request.info.policy == "servers":
             self._close_servers(result)
-        self._watch.forget_losses()  # a server that restarts between episodes is not lost
-        self._watch.members = {}
+        self._watch.enter({}, self._host.now_ns())  # a server that restarts between episodes is not lost
         self._link.leave_episode()
 
     def _close_servers(self, result: m.EpisodeResult | None) -> None:
         for proc in SERVERS:
-            if self._config.watches and self._watch.health_of(proc) is None:
+            if self._config.watches and (self._watch.is_lost(proc) or self._watch.is_gone(proc)):
                 continue
             try:
                 self._link.call(CLOSE, proc, m.CloseRequest(result=result), timeout_ns=_CALL_NS)

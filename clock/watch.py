@@ -62,10 +62,13 @@ class Watch:
         seen = self._seen.get(proc)
         return seen is not None and not seen.has_token
 
-    def forget_losses(self) -> None:
-        """Resets losses: a new episode starts from the current state."""
+    def enter(self, members: dict[str, int], now_ns: int) -> None:
+        """Begins an episode with servers that have just answered, or ends it (no members): losses are forgotten."""
         for seen in self._seen.values():
             seen.is_lost = False
+        self.members = members
+        for proc in members:  # what was heard before says nothing of this episode
+            self._seen[proc] = _Seen(heard_ns=now_ns)
 
     def poll(self, procs: tuple[str, ...], episode: str, now_ns: int) -> list[Change]:
         """Changes of ``procs``, which have all opened ``episode``, since the last poll."""
