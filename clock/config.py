@@ -8,6 +8,7 @@ from pathlib import Path
 from clock.residual import DEFAULT_LOADER, load_head
 from clock.service import ServiceConfig
 from protocol.options import LinkOptions
+from protocol.sockets import endpoint
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -16,7 +17,7 @@ class ClockOptions:
 
     link: LinkOptions = field(
         default_factory=lambda: LinkOptions(
-            listen=("tcp/127.0.0.1:7447",), connect=("tcp/127.0.0.1:7448", "tcp/127.0.0.1:7449")
+            listen=(endpoint("clock"),), connect=(endpoint("ponder"), endpoint("pounce"))
         )
     )
     allow_starved: bool = False

@@ -11,6 +11,7 @@ from protocol.errors import TransportError
 from protocol.link import Link
 from protocol.messages import EngageRequest
 from protocol.options import LinkOptions
+from protocol.sockets import endpoint
 from protocol.topics import ENGAGE
 from protocol.zenoh_bus import open_bus
 
@@ -21,7 +22,7 @@ _CALL_NS = 2_000_000_000
 class EngageOptions:
     """Lets a stopped robot move again; the operator is logged."""
 
-    link: LinkOptions = field(default_factory=lambda: LinkOptions(connect=("tcp/127.0.0.1:7447",)))
+    link: LinkOptions = field(default_factory=lambda: LinkOptions(connect=(endpoint("clock"),)))
     operator: str = field(default_factory=getpass.getuser)
     """Name of the person who engages the robot; it is logged."""
 

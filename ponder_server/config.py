@@ -11,6 +11,7 @@ import tyro
 from ponder_server.context_policy import PolicyName
 from ponder_server.contract import WeightsName
 from protocol.options import LinkOptions
+from protocol.sockets import endpoint
 
 SizeName = Literal["tiny_cpu", "qwen35_0p8b", "qwen35_2b", "qwen35_4b", "qwen35_9b"]
 """Names of functions in ``dual_system.models.ponder.configs``."""
@@ -88,7 +89,7 @@ class PonderOptions:
     """Device of the network: cpu, cuda or cuda:N."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Number format of weights and activations."""
-    link: LinkOptions = field(default_factory=lambda: LinkOptions(listen=("tcp/127.0.0.1:7448",)))
+    link: LinkOptions = field(default_factory=lambda: LinkOptions(listen=(endpoint("ponder"),)))
     context: tyro.conf.OmitArgPrefixes[ContextOptions] = field(default_factory=ContextOptions)
     speed: tyro.conf.OmitArgPrefixes[SpeedOptions] = field(default_factory=SpeedOptions)
     robots: tyro.conf.OmitArgPrefixes[RobotsOptions] = field(default_factory=RobotsOptions)

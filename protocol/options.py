@@ -10,12 +10,12 @@ from protocol.errors import TransportError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkOptions:
-    """Connections to the other processes. Loopback needs no TLS files; other hosts need all three."""
+    """Connections to the other processes. Between hosts all three TLS files are needed."""
 
     robot: str = "r0"
     """Name of the robot; part of every key."""
     listen: tuple[str, ...] = ()
-    """Zenoh endpoints to listen on, e.g. tcp/127.0.0.1:7448 or tls/0.0.0.0:7448."""
+    """Zenoh endpoints to listen on, e.g. unixsock-stream/PATH, tcp/127.0.0.1:7448 or tls/0.0.0.0:7448."""
     connect: tuple[str, ...] = ()
     """Zenoh endpoints of the other processes; connecting is retried until they are there."""
     tls_ca: Path | None = None

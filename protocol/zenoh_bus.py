@@ -1,8 +1,8 @@
 """The bus over zenoh; the only file that imports zenoh.
 
-Peers have explicit endpoints, no multicast and no gossip, so that other processes on the host cannot join. Endpoints
-are loopback by default; one that other hosts can reach is refused without TLS. Shared memory is on: zenoh sends raw
-frames between processes of one host through it. The lease is 500 ms (default: 10 s): a frozen peer's token is gone in
+Peers have explicit endpoints, no multicast and no gossip. Endpoints are Unix sockets by default, in a folder of one
+user's; one that other hosts can reach is refused without TLS. Shared memory is on: zenoh sends raw frames between
+processes of one host through it. The lease is 500 ms (default: 10 s): a frozen peer's token is gone in
 half a second.
 """
 
@@ -22,6 +22,7 @@ from protocol.bus import Bell, Inbox, Request, Sample, Subscription
 from protocol.errors import CallFailed, TransportError
 from protocol.memory import keep_freed_memory
 from protocol.options import LinkOptions
+from protocol.sockets import make_private, socket_path
 from protocol.topics import Priority
 
 LEASE_MS = 500
@@ -52,7 +53,7 @@ class Tls:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Endpoints:
-    """Endpoints to listen on and to connect to, in zenoh's form: ``tcp/127.0.0.1:7448``."""
+    """Endpoints to listen on and to connect to, in zenoh's form: ``unixsock-stream/PATH`` or ``tcp/127.0.0.1:7448``."""
 
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
@@ -79,10 +80,10 @@ def is_loopback(endpoint: str) -> bool:
     Raises:
         TransportError: it is not of the form ``PROTOCOL/ADDRESS``.
     """
-    protocol, slash, address = endpoint.partition("/")
+    _, slash, address = endpoint.partition("/")
     if not slash or not address:
         raise TransportError(f"endpoint {endpoint!r}: expected PROTOCOL/ADDRESS, for example tcp/127.0.0.1:7447")
-    if protocol == "unixsock-stream":
+    if socket_path(endpoint):
         return True
     host = address.split("?")[0].split("#")[0].rpartition(":")[0].strip("[]")
     if host == "localhost":
@@ -132,18 +133,20 @@ class ZenohBus:
     Zenoh's threads only append to rings and ring the bell; the owner of the bus drains and works in its own thread.
 
     Raises:
-        TransportError: the listen endpoint is taken or cannot be opened.
+        TransportError: the listen endpoint is taken, cannot be opened, or is a socket that other users can reach.
     """
 
     def __init__(self, endpoints: Endpoints) -> None:
         os.environ.setdefault(_RUNTIME_VARIABLE, _ONE_RUNTIME)  # zenoh's only way to set it; read once per process
         zenoh.init_log_from_env_or("error")
         keep_freed_memory()
+        for socket in filter(None, map(socket_path, (*endpoints.listen, *endpoints.connect))):
+            make_private(socket)
         try:
             self._session = zenoh.open(zenoh_config(endpoints))
         except zenoh.ZError as error:
             where = ", ".join(endpoints.listen) or "no listen endpoint"
-            raise TransportError(f"zenoh does not open ({where}): {error}. Is the port taken?") from None
+            raise TransportError(f"zenoh does not open ({where}): {error}. Is another one there?") from None
         self.is_local = endpoints.are_local
         self._bell = Bell()
         self._publishers: dict[str, Any] = {}

@@ -13,6 +13,7 @@ from clock.timebase import NS_PER_MS
 from dual_system.tasks.difficulty import Difficulty
 from protocol.messages import Delay, DelayKind, Delivery, DeliveryKind, Schedule, Seam, SeamKind, WaitKind
 from protocol.options import LinkOptions
+from protocol.sockets import endpoint
 
 ModeName = Literal["lockstep", "realtime"]
 
@@ -130,7 +131,7 @@ class SimOptions:
     servers: tyro.conf.OmitArgPrefixes[ServersOptions] = field(default_factory=ServersOptions)
     log: tyro.conf.OmitArgPrefixes[LogOptions] = field(default_factory=LogOptions)
     link: LinkOptions = field(
-        default_factory=lambda: LinkOptions(connect=("tcp/127.0.0.1:7447", "tcp/127.0.0.1:7448", "tcp/127.0.0.1:7449"))
+        default_factory=lambda: LinkOptions(connect=tuple(map(endpoint, ("clock", "ponder", "pounce"))))
     )
 
     @property

@@ -55,7 +55,7 @@ def probes(config: DoctorConfig) -> list[Probe]:
         Probe(name=f"gl {backend}", look=partial(look.gl, backend), roles=("robot",)),
         Probe(name="robosuite", look=look.robosuite, roles=("robot",)),
         Probe(name="disk", look=partial(look.disk, config.out), roles=("robot",)),
-        Probe(name="ports", look=look.ports, is_required=False),
+        Probe(name="sockets", look=look.sockets, is_required=False),
         Probe(name="cpu", look=look.cpu, is_required=False),
         Probe(name="clock", look=look.clock, is_required=False),
         Probe(name=f"gl {other}", look=partial(look.gl, other), is_required=False, roles=("robot",)),

@@ -10,7 +10,6 @@ import importlib.util
 import os
 import re
 import shutil
-import socket
 import subprocess
 import sys
 import time
@@ -30,7 +29,6 @@ GL_PACKAGES = {
 }
 VULKAN_PACKAGE = "mesa-vulkan-drivers"
 VULKAN_FOLDERS = (Path("/usr/share/vulkan/icd.d"), Path("/etc/vulkan/icd.d"))
-DEFAULT_PORTS = {7447: "clock-serve", 7448: "ponder-serve", 7449: "pounce-serve"}
 ROBOSUITE = "1.5.2"
 FRAME_BYTES = 2 * 256 * 256 * 3  # one observation's two cameras
 LEAST_FREE_BYTES = 1 << 30  # an episode of 1300 ticks logged with --pixels exact (8 MB/s) is half of it
@@ -284,26 +282,12 @@ def torch(run: Run = run) -> Finding:
     return Finding("torch", Level.OK, versions)
 
 
-def _is_free(port: int) -> bool:
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(("127.0.0.1", port))
-        except OSError:
-            return False
-    return True
-
-
-def _who_is_alive(port: int) -> str:
-    """The liveliness tokens behind ``port``: "clock of r0"; "" if there is none."""
-    from protocol.errors import TransportError
+def _who_is_alive(endpoint: str) -> str:
+    """The liveliness tokens behind ``endpoint``: "clock of r0"; "" if there is none."""
     from protocol.topics import alive_key
     from protocol.zenoh_bus import Endpoints, ZenohBus
 
-    try:
-        bus = ZenohBus(Endpoints(connect=(f"tcp/127.0.0.1:{port}",)))
-    except TransportError:
-        return ""
+    bus = ZenohBus(Endpoints(connect=(endpoint,)))
     try:
         tokens, deadline_s = bus.watch_alive(alive_key("*", "*")), time.monotonic() + 1.0
         while time.monotonic() < deadline_s:
@@ -316,23 +300,21 @@ def _who_is_alive(port: int) -> str:
         bus.close()
 
 
-def ports(is_free: Callable[[int], bool] = _is_free, who_is_alive: Callable[[int], str] = _who_is_alive) -> Finding:
-    """The daemons' default ports: free, or whose. ``sim-client --local`` takes other ones and never minds."""
-    ours, strangers = [], []
-    for port, program in DEFAULT_PORTS.items():
-        if is_free(port):
-            continue
-        alive = who_is_alive(port)
-        if alive:
-            ours.append(f"{port}: {alive}")
-        else:
-            strangers.append((port, program))
-    if strangers:
-        text = ", ".join(f"{port} ({program}) is taken by a stranger" for port, program in strangers)
-        way_out = f"ss -ltnp shows whose; or {strangers[0][1]} --link.listen tcp/127.0.0.1:PORT, and connect there"
-        return Finding("ports", Level.WARNING, text, way_out)
-    text = "alive on " + "; ".join(ours) if ours else f"{min(DEFAULT_PORTS)}-{max(DEFAULT_PORTS)} are free"
-    return Finding("ports", Level.OK, text)
+def sockets(folder: Path | None = None, who_is_alive: Callable[[str], str] = _who_is_alive) -> Finding:
+    """The daemons' default sockets: usable, and whose. ``sim-client --local`` takes other ones and never minds."""
+    from protocol.errors import TransportError
+    from protocol.sockets import FOLDER, endpoint, make_private
+
+    folder, alive = folder or FOLDER, []
+    try:
+        for proc in ("clock", "ponder", "pounce"):
+            path = folder / f"{proc}.sock"
+            make_private(path)
+            if path.exists() and (who := who_is_alive(endpoint(proc, folder))):
+                alive.append(who)
+    except TransportError as error:
+        return Finding("sockets", Level.WARNING, str(error), f"rm -r {folder}, or see why it is there: ls -ld {folder}")
+    return Finding("sockets", Level.OK, f"in {folder}: " + (", ".join(alive) or "nobody is there"))
 
 
 def _vulkan_drivers() -> list[str]:

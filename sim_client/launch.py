@@ -6,9 +6,11 @@ They are started by module name: this package imports no other server's code, so
 from __future__ import annotations
 
 import os
+import shutil
 import socket
 import subprocess
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
@@ -16,6 +18,7 @@ from typing import IO
 
 from protocol.options import LinkOptions
 from protocol.process import PARENT_VARIABLE
+from protocol.sockets import endpoint
 
 _GRACE_S = 5.0
 
@@ -38,6 +41,7 @@ class Daemons:
     def __init__(self, logs: Path) -> None:
         self._logs = logs
         self._files: list[IO[bytes]] = []
+        self._sockets: Path | None = None
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
 
     def start(self, name: str, module: str, arguments: Sequence[str]) -> subprocess.Popen[bytes]:
@@ -53,6 +57,12 @@ class Daemons:
         command = [sys.executable, "-m", module, *arguments]
         self.processes[name] = subprocess.Popen(command, stdout=file, stderr=file, env=environment)
         return self.processes[name]
+
+    def sockets(self) -> Path:
+        """A folder for sockets that only this user may enter, and that goes with the daemons."""
+        if self._sockets is None:
+            self._sockets = Path(tempfile.mkdtemp(prefix="ponderpounce-", dir="/tmp"))
+        return self._sockets
 
     def dead(self) -> str:
         """A sentence about the first daemon that left on its own; "" if all run."""
@@ -80,6 +90,8 @@ class Daemons:
                 process.wait()
         for file in self._files:
             file.close()
+        if self._sockets is not None:
+            shutil.rmtree(self._sockets, ignore_errors=True)
 
 
 def start_local(
@@ -91,13 +103,12 @@ def start_local(
     ponder: Sequence[str],
     pounce: Sequence[str],
 ) -> tuple[str, ...]:
-    """Starts the servers on free loopback ports; returns the endpoints to connect to.
+    """Starts the servers on sockets of their own; returns the endpoints to connect to.
 
-    Every process listens on its own port and connects to the servers it talks to, so that the death of one leaves
+    Every process listens on its own socket and connects to the servers it talks to, so that the death of one leaves
     the links among the others alone.
     """
-    ports = free_ports(3)
-    at_clock, at_ponder, at_pounce = (f"tcp/127.0.0.1:{port}" for port in ports)
+    at_clock, at_ponder, at_pounce = (endpoint(proc, daemons.sockets()) for proc in ("clock", "ponder", "pounce"))
     common = ["--link.robot", robot]
     daemons.start("ponder", "ponder_server", [*common, "--link.listen", at_ponder, *ponder])
     daemons.start("pounce", "pounce_server", [*common, "--link.listen", at_pounce, *pounce])

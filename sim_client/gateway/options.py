@@ -15,6 +15,7 @@ from clock.timebase import NS_PER_MS
 from protocol.errors import TransportError
 from protocol.messages import Delay, DelayKind, Schedule, WaitKind
 from protocol.options import LinkOptions
+from protocol.sockets import endpoint
 from protocol.version import version
 from sim_client.gateway import body, challenge, openpi, vla_eval
 from sim_client.gateway.exchange import Dialect, Terms
@@ -122,7 +123,7 @@ class GatewayOptions:
     servers: tyro.conf.OmitArgPrefixes[ServersOptions] = field(default_factory=ServersOptions)
     log: tyro.conf.OmitArgPrefixes[LogOptions] = field(default_factory=LogOptions)
     link: LinkOptions = field(
-        default_factory=lambda: LinkOptions(connect=("tcp/127.0.0.1:7447", "tcp/127.0.0.1:7448", "tcp/127.0.0.1:7449"))
+        default_factory=lambda: LinkOptions(connect=tuple(map(endpoint, ("clock", "ponder", "pounce"))))
     )
 
     def check(self) -> None:

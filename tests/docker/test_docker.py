@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,7 +43,12 @@ ROLES = {
     "pounce": Role("pounce-serve", PounceOptions, frozenset({"serve"}), "pounce_server"),
     "sim": Role("sim-client", SimOptions, frozenset({"sim", "replay"}), "sim_client"),
 }
-LISTENING = {"clock": ClockOptions().link, "ponder": PonderOptions().link, "pounce": PounceOptions().link}
+DEFAULTS = {"clock": ClockOptions().link, "ponder": PonderOptions().link, "pounce": PounceOptions().link}
+
+
+def link_of(compose: dict[str, Any], name: str) -> Any:
+    """The endpoints that a service's command gives its program."""
+    return tyro.cli(ROLES[name].options, args=[str(a) for a in compose["services"][name]["command"]]).link
 
 
 def instructions(name: str) -> list[tuple[str, str]]:
@@ -138,23 +144,28 @@ def test_all_share_the_clock_s_loopback_and_memory(name: str) -> None:
     assert "ports" not in service
 
 
-def test_the_programs_own_endpoints_are_loopback_and_find_each_other() -> None:
-    """What the shared namespace rests on: the defaults need no option."""
-    listened = [endpoint for link in LISTENING.values() for endpoint in link.listen]
+@pytest.mark.parametrize("link", [lambda name: ROLES[name].options().link, lambda name: link_of(COMPOSE, name)])
+def test_the_endpoints_are_local_and_find_each_other(link: Callable[[str], Any]) -> None:
+    listened = [endpoint for name in DEFAULTS for endpoint in link(name).listen]
     assert all(map(is_loopback, listened))
-    assert len(set(listened)) == len(LISTENING)
-    assert set(ClockOptions().link.connect) == {*PonderOptions().link.listen, *PounceOptions().link.listen}
-    assert set(SimOptions().link.connect) == set(listened)
+    assert len(set(listened)) == len(DEFAULTS)
+    assert set(link("clock").connect) == {*link("ponder").listen, *link("pounce").listen}
+    assert set(link("sim").connect) == set(listened)
 
 
-@pytest.mark.parametrize("name", LISTENING)
+@pytest.mark.parametrize("name", GPU["services"])
+def test_with_a_gpu_a_server_listens_at_the_same_place(name: str) -> None:
+    assert link_of(GPU, name).listen == link_of(COMPOSE, name).listen
+
+
+@pytest.mark.parametrize("name", DEFAULTS)
 def test_a_health_check_asks_its_own_process_where_it_listens(name: str) -> None:
     kind, python, dash_m, module, *arguments = COMPOSE["services"][name]["healthcheck"]["test"]
     assert (kind, python, dash_m, module) == ("CMD", "python", "-m", "protocol.probe")
     options = tyro.cli(ProbeOptions, args=arguments)
     assert options.proc == name
-    assert options.link.connect == LISTENING[name].listen
-    assert options.link.robot == LISTENING[name].robot
+    assert options.link.connect == link_of(COMPOSE, name).listen
+    assert options.link.robot == link_of(COMPOSE, name).robot
     assert options.within_ms < 1000 * int(COMPOSE["services"][name]["healthcheck"]["timeout"].removesuffix("s"))
 
 

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import json
-import socket
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import pytest
 
 from protocol.errors import TransportError
+from protocol.sockets import endpoint
 from protocol.topics import alive_key
 from protocol.zenoh_bus import Endpoints, ZenohBus
 from sim_client import doctor
 from sim_client import doctor_probes as look
 from sim_client.doctor import DoctorConfig, Probe, examine, probes, table
 from sim_client.doctor_probes import Finding, Level, Passed, Ran
-from sim_client.launch import free_ports
 
 OK, WARNING, FAILED = Level.OK, Level.WARNING, Level.FAILED
 
@@ -119,31 +119,27 @@ def test_requirements_of_other_roles_are_not_asked_for() -> None:
     assert list(look._requirements(lines, ["sim"])) == [("numpy", ">=1.26"), ("mujoco", "<3.10,>=3.4")]
 
 
-# -- ports
+# -- sockets
 
 
-def test_free_ports_are_not_asked_who_they_are() -> None:
-    assert look.ports(lambda port: True, lambda port: str(never(port))).level is OK
+def test_sockets_that_are_not_there_are_not_asked_who_they_are(tmp_path: Path) -> None:
+    finding = look.sockets(tmp_path / "sockets", lambda endpoint: str(never(endpoint)))
+    assert finding.level is OK
+    assert "nobody is there" in finding.text
 
 
-def test_our_own_daemon_on_a_port_is_good_news() -> None:
-    finding = look.ports(lambda port: port != 7447, lambda port: "clock of r0")
-    assert (finding.level, finding.text) == (OK, "alive on 7447: clock of r0")
+def test_our_own_daemon_on_a_socket_is_good_news(tmp_path: Path) -> None:
+    (tmp_path / "clock.sock").touch()
+    tmp_path.chmod(0o700)
+    finding = look.sockets(tmp_path, lambda endpoint: "clock of r0")
+    assert (finding.level, finding.text) == (OK, f"in {tmp_path}: clock of r0")
 
 
-def test_a_stranger_on_a_port_is_named_with_the_daemon_it_blocks() -> None:
-    finding = look.ports(lambda port: port != 7449, lambda port: "")
+def test_a_folder_that_others_may_enter_is_named(tmp_path: Path) -> None:
+    tmp_path.chmod(0o755)
+    finding = look.sockets(tmp_path)
     assert finding.level is WARNING
-    assert "7449 (pounce-serve)" in finding.text
-    assert "pounce-serve --link.listen" in finding.way_out
-
-
-def test_a_listening_port_is_not_free() -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        assert not look._is_free(taken.getsockname()[1])
-    assert look._is_free(free_ports(1)[0])
+    assert f"{tmp_path} of a socket: expected a folder of yours with mode 0700, came 0755" in finding.text
 
 
 # -- the report
@@ -167,10 +163,10 @@ def test_a_probe_that_raises_has_failed_and_the_next_one_is_still_asked() -> Non
 @pytest.mark.parametrize(
     ("config", "has", "lacks"),
     [
-        (DoctorConfig(), {"torch", "gl egl", "rerun", "ports"}, {"ponder checkpoint"}),
+        (DoctorConfig(), {"torch", "gl egl", "rerun", "sockets"}, {"ponder checkpoint"}),
         (DoctorConfig(role="robot"), {"gl egl", "rerun"}, {"torch"}),
         (DoctorConfig(role="models"), {"torch"}, {"gl egl", "gl osmesa", "robosuite", "rerun", "disk"}),
-        (DoctorConfig(required_only=True), {"torch", "gl egl"}, {"rerun", "ports", "gl osmesa", "cpu", "clock"}),
+        (DoctorConfig(required_only=True), {"torch", "gl egl"}, {"rerun", "sockets", "gl osmesa", "cpu", "clock"}),
         (DoctorConfig(ponder_checkpoint=Path("x")), {"ponder checkpoint"}, {"pounce checkpoint"}),
     ],
 )
@@ -251,12 +247,11 @@ def test_a_frame_really_passes_between_two_sessions() -> None:
 
 
 @pytest.mark.e2e
-def test_a_daemon_on_a_port_is_recognised_by_its_token() -> None:
-    port = free_ports(1)[0]
-    bus = ZenohBus(Endpoints(listen=(f"tcp/127.0.0.1:{port}",)))
-    try:
-        bus.declare_alive(alive_key("r7", "clock"))
-        assert not look._is_free(port)
-        assert look._who_is_alive(port) == "clock of r7"
-    finally:
-        bus.close()
+def test_a_daemon_on_a_socket_is_recognised_by_its_token() -> None:
+    with tempfile.TemporaryDirectory() as folder:  # short: pytest's own are too long for a socket
+        bus = ZenohBus(Endpoints(listen=(endpoint("clock", Path(folder)),)))
+        try:
+            bus.declare_alive(alive_key("r7", "clock"))
+            assert look.sockets(Path(folder)).text == f"in {folder}: clock of r7"
+        finally:
+            bus.close()
