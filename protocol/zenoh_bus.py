@@ -13,16 +13,17 @@ import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import zenoh
 
+from protocol.access import access_control
 from protocol.bus import Bell, Inbox, Request, Sample, Subscription
 from protocol.errors import CallFailed, TransportError
 from protocol.memory import keep_freed_memory
 from protocol.options import LinkOptions
 from protocol.sockets import make_private, socket_path
+from protocol.tls import Tls, check_files
 from protocol.topics import Priority
 
 LEASE_MS = 500
@@ -40,15 +41,6 @@ _ONE_RUNTIME = (
     "(" + ", ".join(f"{n}: (handover: app)" for n in ("rx", "tx", "net", "acc")) + ", app: (worker_threads: 2))"
 )
 """Zenoh's threads: two for all work instead of six that wake each other; a fifth less time per message (measured)."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Tls:
-    """PEM files for mutual TLS, which authenticates both sides; access control by certificate is zenoh's config."""
-
-    ca: Path
-    certificate: Path
-    key: Path
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,6 +112,7 @@ def zenoh_config(endpoints: Endpoints) -> zenoh.Config:
             "transport/link/tls/listen_private_key": str(tls.key),
             "transport/link/tls/connect_certificate": str(tls.certificate),
             "transport/link/tls/connect_private_key": str(tls.key),
+            "access_control": access_control(),
         }
     config = zenoh.Config()
     for path, value in settings.items():
@@ -133,13 +126,16 @@ class ZenohBus:
     Zenoh's threads only append to rings and ring the bell; the owner of the bus drains and works in its own thread.
 
     Raises:
-        TransportError: the listen endpoint is taken, cannot be opened, or is a socket that other users can reach.
+        TransportError: the TLS files do not fit, or the listen endpoint is taken, cannot be opened, or is a socket
+            that other users can reach.
     """
 
     def __init__(self, endpoints: Endpoints) -> None:
         os.environ.setdefault(_RUNTIME_VARIABLE, _ONE_RUNTIME)  # zenoh's only way to set it; read once per process
         zenoh.init_log_from_env_or("error")
         keep_freed_memory()
+        if endpoints.tls is not None:
+            check_files(endpoints.tls)
         for socket in filter(None, map(socket_path, (*endpoints.listen, *endpoints.connect))):
             make_private(socket)
         try:

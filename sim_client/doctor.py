@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 
 from protocol.command_line import parse
+from sim_client import certs
 from sim_client import doctor_probes as look
 from sim_client.doctor_probes import Finding, Level, Role
 
@@ -27,7 +28,7 @@ class Probe:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DoctorConfig:
-    """Checks this computer and reports what is missing. Exit code 0: everything required is there, 1: it is not."""
+    """Checks this computer; exit code 1: something required is missing. `pp-doctor certs` makes TLS certificates."""
 
     role: Role = "all"
     """Role of this computer. robot: simulator and logs, no torch; models: PONDER and POUNCE, no MuJoCo; all: both."""
@@ -100,7 +101,10 @@ def table(findings: Sequence[Finding]) -> str:
 
 
 def main(argv: list[str] | None = None) -> int:
-    config = parse(DoctorConfig, argv, prog="pp-doctor")
+    arguments = sys.argv[1:] if argv is None else argv
+    if arguments[:1] == ["certs"]:
+        return certs.main(arguments[1:])
+    config = parse(DoctorConfig, arguments, prog="pp-doctor")
     findings = list(examine(probes(config)))
     is_fit = not any(finding.level is Level.FAILED for finding in findings)
     if config.json:
