@@ -46,8 +46,8 @@ class Rig:
         names = ("clock", "ponder", "pounce") if with_clock else ("ponder", "pounce")
         self._endpoints = dict(zip(names, endpoints, strict=True))
         self._at_ear = f"tcp/127.0.0.1:{free_ports(1)[0]}"
-        self._bus = ZenohBus(Endpoints(listen=(self._at_ear,), connect=endpoints))
-        link = Link(self._bus, robot=ROBOT, proc="ear")
+        self.bus = ZenohBus(Endpoints(listen=(self._at_ear,), connect=endpoints))
+        link = Link(self.bus, robot=ROBOT, proc="ear")
         self._streams = [link.subscribe(TICK, keep=_KEEP), link.subscribe(EVENT, keep=_KEEP)]
 
     def play(self, arguments: Sequence[str], out: Path) -> subprocess.Popen[bytes]:
@@ -81,7 +81,7 @@ class Rig:
         while not is_enough():
             if time.monotonic() > deadline_s:
                 return False
-            self._bus.wait(5_000_000)
+            self.bus.wait(5_000_000)
             now_ns = time.monotonic_ns()
             for stream in self._streams:
                 self.heard += [Heard(message, now_ns) for message in stream.drain() if self._is_new(message)]
@@ -107,5 +107,5 @@ class Rig:
         for player in self._players:
             player.kill()
             player.wait()
-        self._bus.close()
+        self.bus.close()
         self.daemons.__exit__(kind, error, trace)

@@ -174,6 +174,8 @@ class Conductor:
     def engage(self, now_ns: int) -> str:
         """Allows motion again, from where the arm is; returns why not, or ""."""
         newest = self._newest
+        if not self.ladder.is_latched:
+            return f"the robot is not stopped: its level is {self.ladder.level.name}"
         if newest is None:
             return "no observation has come yet: nobody knows where the arm is"
         if not newest.robot_state.obeys:

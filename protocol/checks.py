@@ -52,6 +52,14 @@ def _index(message: Any, *names: str) -> None:
             raise _broken(message, name, f"0..{MAX_INDEX}", value)
 
 
+def _ordinal(message: Any, *names: str) -> None:
+    """Numbers that count on from here: the next one must be an index as well."""
+    for name in names:
+        value = getattr(message, name)
+        if not 0 <= value < MAX_INDEX:
+            raise _broken(message, name, f"0..{MAX_INDEX - 1}", value)
+
+
 def _instant(message: Any, *names: str) -> None:
     for name in names:
         value = getattr(message, name)
@@ -144,7 +152,7 @@ def check_header(h: m.Header) -> None:
 
 
 def check_observation(o: m.Observation) -> None:
-    _index(o, "tick")
+    _ordinal(o, "tick")
     _instant(o, "source_ns")
     _vector(o, "proprio", low=1)
     _chosen(o, "status")
@@ -153,12 +161,13 @@ def check_observation(o: m.Observation) -> None:
 
 
 def check_query(q: m.Query) -> None:
-    _index(q, "query", "tick")
+    _ordinal(q, "query", "tick")
     _instant(q, "source_ns")
 
 
 def check_cognition(c: m.Cognition) -> None:
-    _index(c, "query", "tick", "context_tokens")
+    _ordinal(c, "query", "tick")
+    _index(c, "context_tokens")
     _instant(c, "source_ns", "ready_ns")
     _duration(c, "infer_ns")
     _carriers(c, "vector", may_be_empty=False)
@@ -173,7 +182,8 @@ def check_stamp(s: m.Stamp) -> None:
 
 
 def check_invocation(i: m.Invocation) -> None:
-    _index(i, "invocation", "tick", "committed_rows", "num_samples")
+    _ordinal(i, "invocation", "tick")
+    _index(i, "committed_rows", "num_samples")
     _instant(i, "now_ns")
     _duration(i, "age_ns")
     _carriers(i, "cognition", may_be_empty=True)
@@ -190,7 +200,8 @@ def check_invocation(i: m.Invocation) -> None:
 
 
 def check_action_chunk(c: m.ActionChunk) -> None:
-    _index(c, "invocation", "t_row0", "committed_rows")
+    _ordinal(c, "invocation", "t_row0")
+    _index(c, "committed_rows")
     _instant(c, "source_ns")
     _duration(c, "age_ns", "infer_ns")
     if not 1 <= c.horizon <= MAX_HORIZON:
@@ -208,7 +219,7 @@ def check_action_chunk(c: m.ActionChunk) -> None:
 
 
 def check_action(a: m.Action) -> None:
-    _index(a, "tick")
+    _ordinal(a, "tick")
     _instant(a, "deadline_ns")
     _chosen(a, "level")
     _vector(a, "values", low=1)
@@ -365,7 +376,7 @@ def check_journal_reply(r: m.JournalReply) -> None:
     _text(r, "error")
     _require(len(r.entries) <= MAX_JOURNAL_ENTRIES, r, "entries", f"at most {MAX_JOURNAL_ENTRIES}", len(r.entries))
     for entry in r.entries:
-        _index(entry, "query", "tick")
+        _ordinal(entry, "query", "tick")
         _instant(entry, "source_ns")
 
 

@@ -317,5 +317,5 @@ class Service:
 
 
 def source_of(header: Header) -> str:
-    """The sender of a message, for logs."""
-    return f"{header.proc}#{header.boot_id}"
+    """The sender of a message, for logs: a name that is none stays out of them."""
+    return f"{header.proc if topics.is_id(header.proc) else '?'}#{header.boot_id}"

@@ -84,13 +84,18 @@ TIME = Call("time", m.TimeRequest, m.TimeReply)
 ENGAGE = Call("engage", m.EngageRequest, m.EngageReply)
 
 
+def is_id(value: str) -> bool:
+    """Whether ``value`` can be one chunk of a key."""
+    return _ID.fullmatch(value) is not None
+
+
 def checked_id(value: str, what: str) -> str:
     """Returns ``value`` if it can be one chunk of a key.
 
     Raises:
         ProtocolError: it is empty, too long, or has a character with a meaning in keys.
     """
-    if not _ID.fullmatch(value):
+    if not is_id(value):
         raise ProtocolError(
             f"{what} {value!r}: use 1 to 128 letters, digits, '_', '-' and '.', not starting with '-' or '.'"
         )

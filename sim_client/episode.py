@@ -111,9 +111,12 @@ class RobotSide:
         """One commanded tick; before it, the ticks that the clock skipped, in which the servos held."""
         if self._tick == 0 and action.tick == 0:
             self._start_ns = action.deadline_ns
-        for _ in range(action.tick - self._tick):
-            if self.environment.step(self._command).status is not Status.ONGOING:
-                break
+        for tick in range(self._tick, action.tick):
+            snapshot = self.environment.step(self._command)
+            if snapshot.status is not Status.ONGOING:  # it ended before the tick that is commanded
+                self._tick = tick + 1
+                self._show(snapshot, deadline_ns(self._start_ns, self._tick, info.schedule.control_hz))
+                return snapshot
         self._command = action.values
         self._stopped_ticks = self._stopped_ticks + 1 if action.level == m.Level.STOPPED else 0
         self._tick = action.tick + 1

@@ -258,10 +258,12 @@ def run_realtime(
                 conductor.on_lost("pounce")
                 conductor.on_back("pounce")
             elif what == "engage":
-                assert not conductor.engage(now_ns)
-                text = "motion may start again"
-                engaged = m.Event(severity=m.Severity.WARNING, name="engaged", text=text, tick=conductor.tick)
-                episode.say(engaged, now_ns)
+                is_stopped = conductor.ladder.is_latched
+                assert (not conductor.engage(now_ns)) is is_stopped
+                if is_stopped:
+                    text = "motion may start again"
+                    engaged = m.Event(severity=m.Severity.WARNING, name="engaged", text=text, tick=conductor.tick)
+                    episode.say(engaged, now_ns)
             elif what != "poll":
                 hear(conductor, episode, what, now_ns)
         for effect in conductor.poll(now_ns):
@@ -271,6 +273,7 @@ def run_realtime(
             elif isinstance(effect, m.Invocation) and effect.invocation in silence:
                 post(now_ns + 900 * MS, "lost")
                 post(now_ns + 1_100 * MS, "engage")
+                post(now_ns + 1_700 * MS, "engage")
             elif isinstance(effect, m.Invocation):
                 post(now_ns + rng.integers(10 * MS, 250 * MS), act(signed, episode.info, rng))
         due_ns = conductor.next_ns(now_ns)

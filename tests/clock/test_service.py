@@ -341,7 +341,7 @@ def test_an_observation_with_other_joints_is_dropped(rig: Any, episode_info: Inf
 
 
 @pytest.mark.parametrize(
-    ("tick", "source_ns"), [(2**53, 0), (21, 0), (0, 10**17), (0, 2_000 * MS), (0, 101 * MS), (0, -(10**18))]
+    ("tick", "source_ns"), [(2**53 - 1, 0), (21, 0), (0, 10**17), (0, 2_000 * MS), (0, 101 * MS), (0, -(10**18))]
 )
 def test_an_observation_that_cannot_be_of_now_is_dropped(
     rig: Any, episode_info: Info, paper: m.Schedule, tick: int, source_ns: int
@@ -362,7 +362,7 @@ def test_impossible_observations_change_nothing_in_the_schedule(
 
     def lie() -> None:
         newest = rig.clock.conductor.newest_tick if rig.clock.conductor else 0
-        for tick, source_ns in ((newest + 2, 0), (2**53, 0), (newest, 10**17), (newest, -(10**17))):
+        for tick, source_ns in ((newest + 2, 0), (2**53 - 1, 0), (newest, 10**17), (newest, -(10**17))):
             stranger.publish(topics.OBSERVATION, rig.observation(tick, source_ns), at_ns=0)
 
     rig.meanwhile = lie
@@ -563,10 +563,13 @@ def test_engage_is_refused_while_the_robot_cannot_move_safely(
 def test_engage_is_refused_if_nobody_knows_where_the_arm_is_now(episode_info: Info) -> None:
     live_info = episode_info(schedules.realtime())
     conductor = Conductor(live_info)
+    conductor.ladder.level = m.Level.STOPPED
     assert conductor.engage(0) == "no observation has come yet: nobody knows where the arm is"
     zeros = np.zeros(live_info.robot.num_proprio, np.float32)
     conductor.on_observation(m.Observation(tick=0, source_ns=0, proprio=zeros))
     assert conductor.engage(200 * MS) == ""
+    assert conductor.engage(200 * MS) == "the robot is not stopped: its level is HOLD"
+    conductor.ladder.level = m.Level.STOPPED
     assert conductor.engage(201 * MS) == "the newest observation is 201 ms old; at most 200 ms are allowed"
 
 

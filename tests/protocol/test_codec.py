@@ -24,7 +24,7 @@ CLASSES = [cls for cls in vars(m).values() if dataclasses.is_dataclass(cls)]
 ENUMS = [cls for cls in vars(m).values() if isinstance(cls, type) and issubclass(cls, IntEnum) and cls is not IntEnum]
 WIRE_ONLY = {"Tensor", "DType"}  # how arrays travel; inside they are numpy arrays
 
-INDEX = st.integers(0, MAX_INDEX)
+INDEX = st.integers(0, MAX_INDEX - 1)
 U32 = st.integers(0, 2**32 - 1)
 U64 = st.integers(0, 2**64 - 1)
 INSTANT = st.integers(-MAX_INSTANT_NS, MAX_INSTANT_NS)
