@@ -11,7 +11,7 @@ export MUJOCO_GL ?= egl
 export OMP_NUM_THREADS ?= 1
 
 # `make help` lists the rest.
-.PHONY: help setup demo test unit accept lint types proto bench clean
+.PHONY: help setup demo test unit accept soak lint types proto bench clean
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
 
@@ -64,6 +64,10 @@ unit: setup
 ## make accept  a hundred oracle episodes of every task (about ten minutes)
 accept: setup
 	$(BIN)/python -m pytest -q -m acceptance
+
+## make soak    a million mutated messages, in lockstep and in real time (about half an hour)
+soak: setup
+	$(BIN)/python -m benchmarks.fuzz
 
 ## make lint    style, types, import contracts
 lint: setup

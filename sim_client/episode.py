@@ -28,6 +28,8 @@ from sim_client.robot_end import is_sound
 
 CLOCK_SILENCE_NS = 500 * NS_PER_MS
 """Real time: commands that stay away this long mean that the clock service is gone. The servos hold meanwhile."""
+STALL_NS = 200 * NS_PER_MS
+"""Real time: a turn of 20 ms that takes this long means that this process stood still, and heard nobody meanwhile."""
 HOLD_TICKS = 10
 """Ticks (half a second) for which the robot then holds before it ends the episode."""
 STOPPED_TICKS = 60
@@ -91,17 +93,32 @@ class RobotSide:
                 if self._stopped_ticks > STOPPED_TICKS:
                     return self._abort("stopped by the ladder, and nobody engaged it again")
             if self.link.second_sender:  # nobody can say which of the two is meant
-                self._tell(DropReason.SECOND_SENDER, f"holding the last command: {self.link.second_sender}")
+                self._tell(
+                    m.Severity.ERROR, DropReason.SECOND_SENDER, f"holding the last command: {self.link.second_sender}"
+                )
                 self._hold()
                 return self._abort(self.link.second_sender)
             silent_ns = time.monotonic_ns() - heard_ns
             if silent_ns > self._limit_ns(info):
                 if self._tick == 0:
                     return self._abort(f"no command came within {silent_ns / 1e9:.0f} s")
-                self._tell(CLOCK_LOST_EVENT, f"no command for {silent_ns / 1e6:.0f} ms: holding the last one")
+                text = f"no command for {silent_ns / 1e6:.0f} ms: holding the last one"
+                self._tell(m.Severity.ERROR, CLOCK_LOST_EVENT, text)
                 self._hold()
                 return self._abort("clock lost")
-            self.let_others(20 * NS_PER_MS)
+            heard_ns += self._rest(info)
+
+    def _rest(self, info: m.EpisodeInfo) -> int:
+        """Lets the others run; returns for how long this process stood still, which is nobody's silence but its own."""
+        left_ns = time.monotonic_ns()
+        self.let_others(20 * NS_PER_MS)
+        away_ns = time.monotonic_ns() - left_ns
+        if info.schedule.mode == m.Mode.LOCKSTEP or away_ns < STALL_NS:
+            return 0
+        self._tell(
+            m.Severity.WARNING, "robot_stalled", f"the robot's own process stood still for {away_ns / 1e6:.0f} ms"
+        )
+        return away_ns
 
     def _limit_ns(self, info: m.EpisodeInfo) -> int:
         waits = info.schedule.mode == m.Mode.LOCKSTEP or self._tick == 0
@@ -144,8 +161,8 @@ class RobotSide:
     def _abort(self, reason: str) -> Outcome:
         return Outcome(status=m.TaskStatus.ABORTED, reason=reason, num_ticks=self._tick)
 
-    def _tell(self, name: str, text: str) -> None:
-        event = m.Event(severity=m.Severity.ERROR, name=name, text=text, tick=self._tick)
+    def _tell(self, severity: m.Severity, name: str, text: str) -> None:
+        event = m.Event(severity=severity, name=name, text=text, tick=self._tick)
         self.link.publish(EVENT, event, at_ns=self._start_ns + self._tick * 50 * NS_PER_MS)
 
 

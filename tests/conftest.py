@@ -327,6 +327,11 @@ def episode_info() -> Callable[..., m.EpisodeInfo]:
 
 
 @pytest.fixture(scope="session")
+def number_world() -> type[NumberWorld]:
+    return NumberWorld
+
+
+@pytest.fixture(scope="session")
 def robot_with() -> Callable[..., m.Robot]:
     return make_robot
 

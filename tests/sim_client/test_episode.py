@@ -1,0 +1,81 @@
+"""The robot's side of an episode: what it does when commands stop, skip or come from two."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from clock import schedules
+from protocol import messages as m
+from protocol import topics
+from sim_client.episode import CLOCK_SILENCE_NS, RobotSide
+
+MS = 1_000_000
+
+
+class Robot:
+    """One side of an episode, whose turns take as long as a test says."""
+
+    def __init__(self, rig: Any, info: m.EpisodeInfo, world: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.clock, self.robot = rig.links["clock"], rig.links["sim"]
+        members = [m.Member(proc="clock", boot_id=self.clock.boot_id)]
+        for link in (self.clock, self.robot):
+            link.enter_episode("s1", info.header.episode, 1, members)
+        self.events = rig.listener.subscribe(topics.EVENT)
+        self.turns_ns: list[int] = []
+        self._now_ns, self._info, self._world = 10**12, info, world
+        self._recorder = type("Recorder", (), {"step": lambda self: None})()
+        monkeypatch.setattr(time, "monotonic_ns", lambda: self._now_ns)
+
+    def command(self, tick: int) -> None:
+        action = m.Action(tick=tick, deadline_ns=tick * 50 * MS, level=m.Level.PLAY, values=np.zeros(3, np.float32))
+        self.clock.publish(topics.ACTION, action, at_ns=0)
+
+    def run(self, turns: list[Callable[[], int]]) -> Any:
+        """Plays; each turn does something and says how long it took [ns]."""
+        coming = iter(turns)
+
+        def let_others(longest_ns: int) -> None:
+            self._now_ns += next(coming, lambda: 20 * MS)()
+
+        side = RobotSide(self.robot, self._world, self._recorder, let_others, 10**10)  # type: ignore[arg-type]
+        return side.run(self._info, self._world.look(), lambda tick: None)
+
+
+@pytest.fixture
+def robot(rig: Any, episode_info: Any, number_world: Any, monkeypatch: pytest.MonkeyPatch) -> Robot:
+    return Robot(rig, episode_info(schedules.realtime()), number_world(30), monkeypatch)
+
+
+def after(robot: Robot, tick: int, took_ns: int = 20 * MS) -> Callable[[], int]:
+    """A turn in which a command comes."""
+
+    def turn() -> int:
+        robot.command(tick)
+        return took_ns
+
+    return turn
+
+
+def test_a_clock_that_is_silent_is_lost(robot: Robot) -> None:
+    outcome = robot.run([after(robot, 0)])
+    assert (outcome.status, outcome.reason, outcome.num_ticks) == (m.TaskStatus.ABORTED, "clock lost", 1)
+    (event,) = robot.events.drain()
+    assert event.name == "clock_lost"
+
+
+def test_a_robot_that_stood_still_blames_nobody_else(robot: Robot) -> None:
+    turns = [after(robot, 0), lambda: CLOCK_SILENCE_NS + 200 * MS, after(robot, 14)]
+    outcome = robot.run(turns)
+    assert outcome.num_ticks == 15
+    names = [(event.name, event.severity) for event in robot.events.drain()]
+    assert names[0] == ("robot_stalled", m.Severity.WARNING)
+
+
+def test_an_episode_that_ends_in_ticks_that_the_clock_skipped_is_over_there(robot: Robot) -> None:
+    outcome = robot.run([after(robot, 0), after(robot, 60)])
+    assert (outcome.status, outcome.num_ticks) == (m.TaskStatus.SUCCESS, 30)
