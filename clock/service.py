@@ -403,6 +403,8 @@ class ClockService:
             health = self._watch.health_of(proc)
             if health is None:
                 return f"{proc} is not there: start {proc}-serve, or check its endpoint"
+            if self._watch.has_rival(proc, self._host.now_ns()):
+                return f"two processes answer to the name of {proc}: stop one of them"
             if health.state == m.ServingState.FAILED:
                 return f"{proc} failed: {health.detail}"
             if health.state != m.ServingState.READY:
@@ -438,10 +440,6 @@ class ClockService:
         if reply.error or contract is None:
             why = reply.error or "it sent no contract"
             raise EpisodeRefused(reply.refusal, f"{proc} refuses the episode: {why}", try_again=reply.try_again)
-        health = self._watch.health_of(proc) if self._config.watches else None
-        if health is not None and health.header.boot_id != contract.boot_id:
-            why = f"two processes answer to the name of {proc}: {health.header.boot_id} and {contract.boot_id}"
-            raise EpisodeRefused(m.Refusal.NOT_READY, f"{why}. Stop one of them.", try_again=True)
         self._link.admit(m.Member(proc=proc, boot_id=contract.boot_id))
         return contract
 

@@ -23,6 +23,7 @@ class _Seen:
     health: Health | None = None
     heard_ns: int = 0
     has_token: bool = True
+    rival_ns: int | None = None  # when a second process of this name was heard
     is_lost: bool = False
 
 
@@ -39,6 +40,8 @@ class Watch:
         if self.members.get(health.header.proc, health.header.boot_id) != health.header.boot_id:
             return
         seen = self._seen.setdefault(health.header.proc, _Seen())
+        if seen.health is not None and seen.health.header.boot_id != health.header.boot_id:
+            seen.rival_ns = now_ns
         seen.health, seen.heard_ns, seen.has_token = health, now_ns, True
 
     def on_token(self, proc: str, is_alive: bool) -> None:
@@ -51,6 +54,11 @@ class Watch:
         """The newest heartbeat of a present server; None if it is absent."""
         seen = self._seen.get(proc)
         return seen.health if seen and seen.has_token and not seen.is_lost else None
+
+    def has_rival(self, proc: str, now_ns: int) -> bool:
+        """Whether two processes of one name were heard in turn, outside of an episode."""
+        seen = self._seen.get(proc)
+        return seen is not None and seen.rival_ns is not None and now_ns - seen.rival_ns <= self.timeout_ns
 
     def is_lost(self, proc: str) -> bool:
         """Whether the last poll found trouble with ``proc``."""

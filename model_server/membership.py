@@ -53,6 +53,7 @@ class Membership:
         self._ask_again_ns = 0
         self._clocks = link.bus.watch_alive(alive_key(link.robot, "clock"))
         self._is_clock_there = False
+        self._refused = ""
 
     def step(self) -> bool:
         """Answers waiting calls; returns whether there were any."""
@@ -81,8 +82,9 @@ class Membership:
             reply = self._link.call(ACTIVE, "clock", m.ActiveRequest(), timeout_ns=_CALL_NS)
         except CallFailed:
             return None  # no clock service, hence no episode
-        if reply.error:
-            log.error("rejoin %s", reply.error)
+        if reply.error != self._refused:
+            self._refused = reply.error
+            log.log(logging.ERROR if reply.error else logging.INFO, "rejoin %s", reply.error or "is possible again")
         if reply.open is None or reply.open.info.header.episode == self._link.episode:
             return None
         opened = self._on_open(reply.open, announce=False)
