@@ -362,9 +362,12 @@ class ClockService:
         except (CallFailed, ProtocolError) as error:
             self._close_servers(None)
             self._link.leave_episode()
-            if not isinstance(error, EpisodeRefused):
-                return m.OpenReply(error=str(error))
-            return m.OpenReply(error=str(error), refusal=error.refusal, try_again=error.try_again)
+            if isinstance(error, EpisodeRefused):
+                return m.OpenReply(error=str(error), refusal=error.refusal, try_again=error.try_again)
+            was_lost = (
+                isinstance(error, CallFailed) and self._config.watches
+            )  # whether it still is there is seen next time
+            return m.OpenReply(error=str(error), try_again=was_lost)
         return self._begin(request, contracts, warnings, committed_ticks)
 
     def _begin(

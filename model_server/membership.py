@@ -23,6 +23,8 @@ JOURNAL_PAGE = 4  # observations per call: 1.6 MB of two raw 256 px views
 _CALL_NS = 2_000_000_000
 _ASK_AGAIN_NS = 1_000_000_000
 _CLOCK_SILENCE_NS = 2_000_000_000
+_LOST_REQUEST_NS = 1_000_000_000
+"""Lockstep: silence of the clock service after which a request may have been lost on its way, or its answer."""
 
 Describe = Callable[[], m.Contract]
 Open = Callable[[m.OpenRequest], m.Contract]
@@ -54,6 +56,7 @@ class Membership:
         self._clocks = link.bus.watch_alive(alive_key(link.robot, "clock"))
         self._is_clock_there = False
         self._refused = ""
+        self._is_lockstep = False
 
     def step(self) -> bool:
         """Answers waiting calls; returns whether there were any."""
@@ -94,14 +97,30 @@ class Membership:
         log.info("rejoin episode=%s queries=%d", self._link.episode, reply.num_queries)
         return reply  # type: ignore[no-any-return]
 
-    def journal(self, num_queries: int) -> Iterator[m.JournalEntry]:
-        """The episode's queries with their observations, oldest first.
+    def owed(self) -> m.ActiveReply | None:
+        """What the clock service waits for from this server; None if it does not, or cannot be asked now.
+
+        Only in lockstep does the world wait for an answer that a broken link swallowed; in real time it asks anew.
+        """
+        now_ns = time.monotonic_ns()
+        is_silent = self._link.silent_ns("clock") > _LOST_REQUEST_NS and now_ns >= self._ask_again_ns
+        if not (self._link.episode and self._is_lockstep and self._is_clock_there and is_silent):
+            return None
+        self._ask_again_ns = now_ns + _ASK_AGAIN_NS
+        try:
+            reply = self._link.call(ACTIVE, "clock", m.ActiveRequest(), timeout_ns=_CALL_NS)
+        except CallFailed:
+            return None
+        is_ours = reply.open is not None and reply.open.info.header.episode == self._link.episode
+        return reply if is_ours else None  # type: ignore[no-any-return]
+
+    def journal(self, num_queries: int, first: int = 0) -> Iterator[m.JournalEntry]:
+        """The episode's queries from ``first`` up to ``num_queries``, with their observations, oldest first.
 
         Raises:
             CallFailed: the clock service stopped answering.
             ProtocolError: it no longer runs this episode.
         """
-        first = 0
         while first < num_queries:
             # Not beyond num_queries: the journal grows, and newer queries arrive as messages.
             request = m.JournalRequest(first_query=first, max_queries=min(JOURNAL_PAGE, num_queries - first))
@@ -125,6 +144,7 @@ class Membership:
         try:
             self._link.enter_episode(header.session, header.episode, header.epoch, request.members)
             contract = replace(self._open_episode(request), boot_id=self._link.boot_id)
+            self._is_lockstep = request.info.schedule.mode == m.Mode.LOCKSTEP
         except ValueError as error:
             self._leave()
             refusal = error.refusal if isinstance(error, EpisodeRefused) else m.Refusal.REQUEST

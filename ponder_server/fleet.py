@@ -119,7 +119,7 @@ class RobotServer(PonderServer):
         worked = self._listen()
         while len(self._waiting) < KEEP_QUERIES and (work := self._next_work()) is not None:
             self._waiting.append(work)  # taken early: the node keeps observations for ticks, not for seconds
-        return self._finish() or self._begin() or worked
+        return self._finish() or self._begin() or worked or (not self.is_busy and self._resume())
 
     def rejoin(self) -> bool:
         """Asks for the running episode, and begins to rebuild its context."""

@@ -35,11 +35,12 @@ class PonderNode:
         self._spec = spec
         self._rendezvous: Rendezvous[m.Query] = Rendezvous(keep_requests=KEEP_QUERIES)
         self.next_query = 0
+        self._next_asked = 0
 
     def open(self, next_query: int = 0) -> None:
         """Starts an episode; after a rebuild, queries before ``next_query`` are in the context already."""
         self._rendezvous.clear()
-        self.next_query = next_query
+        self.next_query = self._next_asked = next_query
 
     def on_observation(self, observation: m.Observation) -> None:
         """Keeps an observation for queries; without pictures it is ignored, as no query names it (`will_look`).
@@ -53,7 +54,9 @@ class PonderNode:
         self._rendezvous.on_observation(observation)
 
     def on_query(self, query: m.Query) -> None:
-        if query.query >= self.next_query:
+        """Keeps a query until its observation is there; one that was taken before is ignored."""
+        if query.query >= self._next_asked:
+            self._next_asked = query.query + 1
             self._rendezvous.on_request(query)
 
     def next_work(self) -> Work | None:

@@ -30,6 +30,7 @@ class PonderServer(ModelShell):
         self._engine = engine
         self._node = PonderNode(engine.spec)
         self._queries = link.subscribe(topics.QUERY)
+        self._last: m.Cognition | None = None
 
     def _weights_note(self) -> str:
         spec = self._engine.spec
@@ -42,7 +43,7 @@ class PonderServer(ModelShell):
         work = self._next_work()
         if work is not None:
             self._fire(work)
-        return worked or work is not None
+        return worked or work is not None or self._resume()
 
     def _listen(self) -> bool:
         """Reads all pending messages; returns whether there was a call among them."""
@@ -87,6 +88,23 @@ class PonderServer(ModelShell):
         self._rebuilt(rejoined.num_queries)
         return True
 
+    def _resume(self) -> bool:
+        """Takes the query that the clock waits for although it did not arrive, or sends its answer again."""
+        owed = self._membership.owed()
+        if owed is None or owed.owed_query is None:
+            return False
+        if self._last is not None and self._last.query == owed.owed_query:
+            self._link.publish(topics.COGNITION, self._last, at_ns=time.monotonic_ns(), clock_id=host_clock_id())
+            return True
+        try:
+            (entry,) = self._membership.journal(owed.owed_query + 1, first=owed.owed_query)
+            self._take(codec.decode(m.Observation, entry.observation))
+        except (CallFailed, ProtocolError, ValueError) as error:
+            log.error("query %d: %s", owed.owed_query, error)
+            return False
+        self._node.on_query(m.Query(query=entry.query, tick=entry.tick, source_ns=entry.source_ns))
+        return True
+
     def _missed_work(self, num_queries: int) -> Iterator[Work]:
         """The first queries of the running episode, from the clock service's journal.
 
@@ -127,7 +145,7 @@ class PonderServer(ModelShell):
     def _answer(self, work: Work, fire: Fire, start_ns: int) -> None:
         ready_ns = time.monotonic_ns()
         cognition, subgoals = self._node.answer(work, fire, ready_ns=ready_ns, infer_ns=ready_ns - start_ns)
-        self._link.publish(topics.COGNITION, cognition, at_ns=ready_ns, clock_id=host_clock_id())
+        self._last = self._link.publish(topics.COGNITION, cognition, at_ns=ready_ns, clock_id=host_clock_id())
         for subgoal in subgoals:
             self._link.publish(topics.SUBGOAL, subgoal, at_ns=ready_ns, clock_id=host_clock_id())
         self._answered(self._node.next_query)
@@ -163,3 +181,4 @@ class PonderServer(ModelShell):
         with contextlib.suppress(SessionError):  # the engine may have refused to open it
             self._engine.close(self._link.episode)
         self._node.open()
+        self._last = None

@@ -36,6 +36,7 @@ class PounceNode:
         self._texts = texts
         self._rendezvous: Rendezvous[m.Invocation] = Rendezvous(keep_requests=KEEP_INVOCATIONS)
         self._info: m.EpisodeInfo | None = None
+        self._next_asked = 0
 
     @property
     def num_superseded(self) -> int:
@@ -45,6 +46,7 @@ class PounceNode:
         """Starts an episode; None ends it."""
         self._rendezvous.clear()
         self._info = info
+        self._next_asked = 0
         if self._texts is not None:
             self._texts.clear()
 
@@ -68,7 +70,10 @@ class PounceNode:
             self._texts.on_subgoal(subgoal)
 
     def on_invocation(self, invocation: m.Invocation) -> None:
-        self._rendezvous.on_request(invocation)
+        """Keeps an invocation until its observation is there; one that was taken before is ignored."""
+        if invocation.invocation >= self._next_asked:
+            self._next_asked = invocation.invocation + 1
+            self._rendezvous.on_request(invocation)
 
     def missed(self) -> list[m.Invocation]:
         """Invocations whose observation was lost in transit."""

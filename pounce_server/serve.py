@@ -30,6 +30,7 @@ class PounceServer(ModelShell):
         self._has_subgoals = subgoals is not None
         self._node = PounceNode(engine.spec, None if subgoals is None else SubgoalText(subgoals))
         self._invocations = link.subscribe(topics.INVOCATION)
+        self._last: m.ActionChunk | None = None
         self._subgoals = link.subscribe(topics.SUBGOAL) if self._has_subgoals else None
 
     def _weights_note(self) -> str:
@@ -60,7 +61,7 @@ class PounceServer(ModelShell):
             return True
         if work is not None:
             self._invoke(work)
-        return worked or work is not None
+        return worked or work is not None or self._resume()
 
     def _on_observation(self, observation: m.Observation) -> None:
         self._node.on_observation(observation)
@@ -76,6 +77,19 @@ class PounceServer(ModelShell):
         self._membership.announce()
         return True
 
+    def _resume(self) -> bool:
+        """Takes the invocation that the clock waits for although it did not arrive, or sends its chunk again."""
+        owed = self._membership.owed()
+        if owed is None or not owed.owed_invocation:
+            return False
+        invocation = codec.decode(m.Invocation, owed.owed_invocation)
+        if self._last is not None and self._last.invocation == invocation.invocation:
+            self._link.publish(topics.CHUNK, self._last, at_ns=time.monotonic_ns(), clock_id=host_clock_id())
+        else:
+            self._take_newest(owed)
+            self._node.on_invocation(invocation)
+        return True
+
     def _invoke(self, work: Work) -> None:
         with self._inferring("invoke") as start_ns:
             try:
@@ -88,7 +102,7 @@ class PounceServer(ModelShell):
         ready_ns = time.monotonic_ns()
         chunk = self._node.answer(work, rows_NA, infer_ns=ready_ns - start_ns)
         try:
-            self._link.publish(topics.CHUNK, chunk, at_ns=ready_ns, clock_id=host_clock_id())
+            self._last = self._link.publish(topics.CHUNK, chunk, at_ns=ready_ns, clock_id=host_clock_id())
         except MalformedMessage as error:
             self._tell(m.Severity.ERROR, "chunk_refused", f"invocation {work.invocation.invocation}: {error}")
         self._answered(work.invocation.invocation + 1)
@@ -143,3 +157,4 @@ class PounceServer(ModelShell):
 
     def _close(self) -> None:
         self._node.open(None)
+        self._last = None

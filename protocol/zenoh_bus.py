@@ -11,6 +11,7 @@ from __future__ import annotations
 import ipaddress
 import json
 import os
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -186,12 +187,14 @@ class ZenohBus:
 
     def call(self, key: str, payload: bytes, *, timeout_ns: int) -> bytes:
         timeout_ms = timeout_ns / 1e6
-        why = "nobody serves it (is the process up, are the endpoints right?)"
+        why, start_ns = "nobody serves it (is the process up, are the endpoints right?)", time.monotonic_ns()
         for reply in self._session.get(key, payload=payload, timeout=timeout_ns / 1e9):
             if reply.ok is not None:
                 return bytes(reply.ok.payload.to_bytes())
             why = reply.err.payload.to_string() if reply.err is not None else why
-        raise CallFailed(key, timeout_ms, why)  # zenoh gives no error for an absent server, only no reply
+        if time.monotonic_ns() - start_ns >= timeout_ns:  # for an absent server zenoh gives no reply, and at once
+            why = "it is served, and the reply did not come in time"
+        raise CallFailed(key, timeout_ms, why)
 
     def declare_alive(self, key: str) -> None:
         self._declared.append(self._session.liveliness().declare_token(key))

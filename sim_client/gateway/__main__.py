@@ -34,9 +34,12 @@ def main(argv: list[str] | None = None) -> int:
     should_stop = StopFlag()
     try:
         options.check()
-        with Daemons(options.out) as daemons, _machine(options, daemons) as machine, _serving(options, machine):
-            log.info("ready dialect=%s listen=%s mode=%s", options.dialect, options.listen, options.mode)
-            machine.run(should_stop)
+        with Daemons(options.out) as daemons, _machine(options, daemons) as machine:
+            if options.local:
+                machine.await_servers(should_stop)  # a client that finds the door open expects to be served
+            with _serving(options, machine):
+                log.info("ready dialect=%s listen=%s mode=%s", options.dialect, options.listen, options.mode)
+                machine.run(should_stop)
     except TransportError as error:
         print(f"pp-gateway: {error}", file=sys.stderr)
         return 2

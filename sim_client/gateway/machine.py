@@ -22,7 +22,7 @@ from typing import Literal, TypeVar
 import numpy as np
 
 from clock.limits import out_of_range
-from clock.service import ClockService
+from clock.service import SERVERS, ClockService
 from clock.timebase import MonotonicClock
 from protocol import images
 from protocol import messages as m
@@ -144,6 +144,31 @@ class Machine:
         return job.future
 
     # -- the working thread
+
+    def await_servers(self, should_stop: Callable[[], bool]) -> None:
+        """Waits until both model servers are ready, and tells how far they are.
+
+        Raises:
+            TransportError: a server that we started is dead, or they are not ready within the patience.
+        """
+        states: dict[str, str] = {}
+        deadline_ns = time.monotonic_ns() + self._plan.patience_ns
+        while set(states.values()) != {"ready"} or len(states) < len(SERVERS):
+            for health in self._healths.drain():
+                state = (
+                    f"{health.state.name.lower()} ({health.progress:.0%})"
+                    if health.state != m.ServingState.READY
+                    else "ready"
+                )
+                if states.get(health.header.proc) != state:
+                    log.info("server=%s state=%s %s", health.header.proc, state, health.detail)
+                states[health.header.proc] = state
+            if (why := self._dead_server()) or should_stop():
+                raise TransportError(why or _STOPPED)
+            if time.monotonic_ns() > deadline_ns:
+                missing = ", ".join(f"{proc} is {states.get(proc, 'not there')}" for proc in SERVERS)
+                raise TransportError(f"not ready within {self._plan.patience_ns / 1e9:.0f} s (--patience-s): {missing}")
+            self._turn(_IDLE_NS)
 
     def run(self, should_stop: Callable[[], bool]) -> None:
         """Works until ``should_stop()``, then ends an open episode."""

@@ -13,8 +13,9 @@ import pytest
 from clock import schedules
 from clock.check import disagreements
 from protocol import messages as m
+from protocol.errors import TransportError
 from protocol.mcap_log import read_log
-from protocol.topics import QUERY, TICK
+from protocol.topics import HEALTH, QUERY, TICK
 from sim_client.gateway.exchange import Busy, Finish, Observed, Refused, Step
 
 StepOf = Callable[..., Step]
@@ -256,3 +257,29 @@ def test_what_comes_after_the_end_is_refused(bench: Any, step_of: StepOf, workin
     with pytest.raises(Refused, match="the gateway was stopped"):
         bench.machine.submit("anna", step_of())
     assert bench.rig.clock.conductor is None
+
+
+def test_a_gateway_waits_for_its_servers_and_tells_how_far_they_are(
+    bench: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    pounce = bench.rig.links["pounce"]
+    bench.rig.links["ponder"].publish(HEALTH, m.Health(state=m.ServingState.READY), at_ns=0)
+    progress = iter([0.25, 0.5, 1.0])
+
+    def never_stops() -> bool:
+        share = next(progress, 1.0)
+        state = m.ServingState.READY if share == 1.0 else m.ServingState.WARMING
+        pounce.publish(HEALTH, m.Health(state=state, progress=share), at_ns=0)
+        return False
+
+    with caplog.at_level("INFO"):
+        bench.machine.await_servers(never_stops)
+    told = [record.getMessage() for record in caplog.records if "server=pounce" in record.getMessage()]
+    assert [line.strip().split("state=")[1] for line in told] == ["warming (25%)", "warming (50%)", "ready"]
+
+
+def test_a_gateway_whose_servers_are_never_ready_says_what_is_missing(bench_with: Callable[..., Any]) -> None:
+    machine = bench_with(patience_ns=0).machine
+    machine._healths.drain()
+    with pytest.raises(TransportError, match=r"--patience-s\): ponder is not there, pounce is not there"):
+        machine.await_servers(lambda: False)
