@@ -17,16 +17,17 @@ from protocol.messages import Delay, DelayKind, Schedule, WaitKind
 from protocol.options import LinkOptions
 from protocol.sockets import endpoint
 from protocol.version import version
-from sim_client.gateway import body, challenge, openpi, vla_eval
+from sim_client.gateway import body, challenge, mme_vla, openpi, vla_eval
 from sim_client.gateway.exchange import Dialect, Terms
 from sim_client.gateway.machine import Plan
 
-DialectName = Literal["openpi", "challenge", "challenge-http", "vla-eval"]
+DialectName = Literal["openpi", "challenge", "challenge-http", "mme-vla", "vla-eval"]
 _SPOKEN: dict[DialectName, tuple[type[Dialect], Mapping[str, str], str, int]] = {
     # by name: who speaks it, where it has the cameras and the state, and how many rows an answer usually has
     "openpi": (openpi.OpenpiDialect, openpi.CAMERAS, openpi.STATE_KEY, 1),
     "challenge": (challenge.ChallengeDialect, challenge.CAMERAS, challenge.JOINTS_KEY, schedules.HORIZON),
     "challenge-http": (challenge.ChallengeDialect, challenge.CAMERAS, challenge.JOINTS_KEY, schedules.HORIZON),
+    "mme-vla": (mme_vla.MmeVlaDialect, openpi.CAMERAS, openpi.STATE_KEY, mme_vla.ROWS),
     "vla-eval": (vla_eval.VlaEvalDialect, vla_eval.CAMERAS, "states", 1),
 }
 
@@ -90,7 +91,7 @@ class LogOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GatewayOptions:
-    """Lets clients of other protocols drive PONDER and POUNCE: openpi's, the RoboMME challenge's, vla-eval's."""
+    """Lets clients of other protocols drive PONDER and POUNCE: openpi's, RoboMME's two evaluators', vla-eval's."""
 
     dialect: DialectName
     """Protocol of the clients."""

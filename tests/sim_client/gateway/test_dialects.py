@@ -1,4 +1,4 @@
-"""Three dialects say the same things: what their clients send is understood, and what they cannot mean is refused."""
+"""All dialects say the same things: what their clients send is understood, and what they cannot mean is refused."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protocol import messages as m
-from sim_client.gateway import challenge, openpi, vla_eval
+from sim_client.gateway import challenge, mme_vla, openpi, vla_eval
 from sim_client.gateway.arrays import pack, unpack
 from sim_client.gateway.exchange import Answer, ClientRequest, Finish, Refused, Step, Terms
 
@@ -31,6 +31,11 @@ def speak_challenge(terms_with: TermsWith) -> challenge.ChallengeDialect:
 
 
 @pytest.fixture
+def speak_mme_vla(terms_with: TermsWith) -> mme_vla.MmeVlaDialect:
+    return mme_vla.MmeVlaDialect(terms_with(cameras=openpi.CAMERAS, state_key=openpi.STATE_KEY, rows=2))
+
+
+@pytest.fixture
 def speak_vla_eval(terms_with: TermsWith) -> vla_eval.VlaEvalDialect:
     return vla_eval.VlaEvalDialect(terms_with(cameras=vla_eval.CAMERAS, state_key="states"))
 
@@ -45,7 +50,7 @@ def test_an_answer_reaches_every_client_bit_for_bit(rows: list[list[float]], tic
     values = np.array(rows, np.float32)
     answer = Answer(rows_NA=values, tick=tick, levels=(m.Level.PLAY,) * len(rows))
     terms: Any = None
-    for dialect in (openpi.OpenpiDialect(terms), challenge.ChallengeDialect(terms)):
+    for dialect in (openpi.OpenpiDialect(terms), challenge.ChallengeDialect(terms), mme_vla.MmeVlaDialect(terms)):
         told = unpack(dialect.answer(ClientRequest(None), answer))
         assert (told["actions"].tobytes(), told["actions"].shape) == (values.tobytes(), values.shape)
         assert (told["tick"], told["levels"]) == (tick, ["PLAY"] * len(rows))
@@ -296,3 +301,72 @@ def test_vla_eval_s_own_library_reads_and_writes_the_same(
     rows = np.ones((1, 3), np.float32)
     told = theirs.unpack_message(speak_vla_eval.answer(asked, Answer(rows_NA=rows, tick=0, levels=(m.Level.PLAY,))))
     assert (told.type, told.seq, told.payload["actions"].tolist()) == (theirs.MessageType.ACTION, 2, [1.0, 1.0, 1.0])
+
+
+# -- RoboMME's policy repository
+
+
+def mme_vla_buffer(picture_of: PictureOf, shades: list[int], **changes: Any) -> bytes:
+    images = np.stack([picture_of(shade)[None] for shade in shades])
+    state = np.array([[shade, 0, 0] for shade in shades], np.float32)
+    return pack({"images": images, "state": state, "add_buffer": True, "exec_start_idx": 0} | changes, "openpi")
+
+
+def test_mme_vla_an_episode_begins_with_a_reset_and_its_video(
+    speak_mme_vla: mme_vla.MmeVlaDialect, picture_of: PictureOf
+) -> None:
+    asked = speak_mme_vla.read(pack({"reset": True}, "openpi"))
+    assert isinstance(asked.request, Finish)
+    assert unpack(asked.reply) == {"reset_finished": True}  # type: ignore[arg-type]
+    filled = speak_mme_vla.read(mme_vla_buffer(picture_of, [7, 8, 9], exec_start_idx=2))
+    assert (filled.request, unpack(filled.reply)) == (None, {"add_buffer_finished": True})  # type: ignore[arg-type]
+    step = understood(speak_mme_vla.read(openpi_packet(picture_of)))
+    assert step.begins
+    assert [(sorted(frames), int(frames["front"][0, 0, 0])) for frames in step.demo] == [(["front"], 7), (["front"], 8)]
+    assert len(step.since) == 0
+
+
+def test_mme_vla_what_was_seen_since_comes_with_the_wrists_last_picture(
+    speak_mme_vla: mme_vla.MmeVlaDialect, picture_of: PictureOf
+) -> None:
+    speak_mme_vla.read(pack({"reset": True}, "openpi"))
+    speak_mme_vla.read(openpi_packet(picture_of))
+    speak_mme_vla.read(mme_vla_buffer(picture_of, [5, 6]))
+    step = understood(speak_mme_vla.read(openpi_packet(picture_of, **{"observation/image": picture_of(6)})))
+    assert not step.begins
+    (seen,) = step.since
+    assert [int(seen.frames[name][0, 0, 0]) for name in ("front", "wrist")] == [5, 2]
+    assert seen.state.tolist() == [5, 0, 0]
+
+
+def test_mme_vla_without_its_history_is_understood_too(
+    speak_mme_vla: mme_vla.MmeVlaDialect, picture_of: PictureOf
+) -> None:
+    steps = [understood(speak_mme_vla.read(openpi_packet(picture_of))) for _ in range(2)]
+    assert [(step.begins, len(step.demo), len(step.since)) for step in steps] == [(True, 0, 0), (False, 0, 0)]
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"images": np.zeros((2, 4, 4, 3), np.uint8)}, r"expected \(T, 1, height, width, 3\)"),
+        ({"images": np.zeros((0, 1, 4, 4, 3), np.uint8)}, r"expected \(T, 1, height, width, 3\)"),
+        ({"state": np.zeros((3, 3))}, r"came \(2, 1, 4, 4, 3\) and \(3, 3\)"),
+        ({"exec_start_idx": 2}, "exec_start_idx: expected 0 to 1"),
+        ({"exec_start_idx": "0"}, "exec_start_idx: expected 0 to 1"),
+        ({"images": np.zeros((2, 1, 4, 4, 3), np.float32)}, "expected a picture"),
+    ],
+)
+def test_mme_vla_a_buffer_that_is_none_is_refused(
+    speak_mme_vla: mme_vla.MmeVlaDialect, picture_of: PictureOf, changes: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(Refused, match=sentence):
+        speak_mme_vla.read(mme_vla_buffer(picture_of, [1, 2], **changes))
+
+
+def test_mme_vla_a_client_that_plays_other_numbers_of_rows_is_told(
+    speak_mme_vla: mme_vla.MmeVlaDialect, picture_of: PictureOf
+) -> None:
+    speak_mme_vla.read(openpi_packet(picture_of))
+    with pytest.raises(Refused, match="start pp-gateway with --rows 3"):
+        speak_mme_vla.read(mme_vla_buffer(picture_of, [1, 2, 3]))
