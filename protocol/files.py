@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 MAX_JSON_BYTES = 16 * 2**20
+MAX_TOKENIZER_BYTES = 100 * 2**20
+"""Largest tokenizer that is parsed; Qwen3.5's and Gemma's have 12 and 34 MB."""
 _LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 
 
