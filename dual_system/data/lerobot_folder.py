@@ -29,6 +29,8 @@ from protocol.files import read_object, require_file
 EPISODES_GLOB = "meta/episodes/chunk-*/file-*.parquet"
 MAX_FILE_ROWS, MAX_FILE_BYTES = 20_000_000, 4 * 2**30
 """Largest parquet file that is read, by what its footer declares; LeRobot writes 100 MB."""
+MAX_TEXT_BYTES = 500_000_000
+"""Most text that is read at once: one episode's, or a file of meta/episodes."""
 _NUMBERING = ("index", "episode_index", "frame_index", "timestamp")
 _OLDER = "LeRobot converts older ones: python -m lerobot.datasets.v30.convert_dataset_v21_to_v30"
 
@@ -97,7 +99,7 @@ class LeRobotFolder:
             begin, end = place.first_row, place.first_row + place.length
             table = table.filter(pc.and_(pc.greater_equal(numbers, begin), pc.less(numbers, end)))
             self._check_rows(episode, place, table)
-        return table.select(list(columns))
+            return _spelled_out(table.select(list(columns)))
 
     def frames(self, episode: int, camera: str, rows: Sequence[int]) -> NDArray[np.uint8]:
         """Returns the frames (n, height, width, 3) of one camera at ascending rows of an episode.
@@ -134,7 +136,7 @@ class LeRobotFolder:
             with reading(path):
                 file = _opened(path)
                 names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
-                rows = file.read(columns=names).to_pylist()
+                rows = _spelled_out(file.read(columns=names)).to_pylist()
             yield from rows
 
     def _place(self, listed: dict[str, Any]) -> Place:
@@ -249,7 +251,32 @@ def _opened(path: Path) -> pq.ParquetFile:
             f"{path} declares {about.num_rows} rows of {num_bytes} bytes; at most {MAX_FILE_ROWS} and {MAX_FILE_BYTES} "
             "are read"
         )
-    return file
+    texts = [column.path for column in map(about.schema.column, range(about.num_columns)) if _is_text(column)]
+    return pq.ParquetFile(path, metadata=about, read_dictionary=texts)
+
+
+def _is_text(column: Any) -> bool:
+    return bool(column.physical_type == "BYTE_ARRAY")
+
+
+def _spelled_out(table: pa.Table) -> pa.Table:
+    """The table with texts in place of dictionaries, as which `_opened` reads them.
+
+    Raises ValueError if there are too many: a file of a megabyte may repeat one text until memory is full.
+    """
+    num_bytes, kinds = 0, []
+    for field, column in zip(table.schema, table.columns, strict=True):
+        is_list = pa.types.is_list(field.type)
+        for chunk in column.chunks:
+            values = chunk.flatten() if is_list else chunk
+            if isinstance(values, pa.DictionaryArray):
+                num_bytes += pc.sum(pc.binary_length(values.dictionary).take(values.indices)).as_py() or 0
+        kind = field.type.value_type if is_list else field.type
+        kind = kind.value_type if pa.types.is_dictionary(kind) else kind
+        kinds.append(field.with_type(pa.list_(kind) if is_list else kind))
+    if num_bytes > MAX_TEXT_BYTES:
+        raise ValueError(f"its texts have {num_bytes} bytes, at most {MAX_TEXT_BYTES} are read")
+    return table.cast(pa.schema(kinds))
 
 
 def _groups(file: pq.ParquetFile, place: Place) -> Iterator[int]:
@@ -265,4 +292,4 @@ def _groups(file: pq.ParquetFile, place: Place) -> Iterator[int]:
 
 @lru_cache(maxsize=1)  # one group may hold many episodes, which are often read one after the other
 def _read(path: Path, changed_ns: int, groups: tuple[int, ...], columns: tuple[str, ...]) -> pa.Table:
-    return pq.ParquetFile(path).read_row_groups(list(groups), columns=list(columns))
+    return _opened(path).read_row_groups(list(groups), columns=list(columns))

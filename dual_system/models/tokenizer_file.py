@@ -7,7 +7,9 @@ def parsed_tokenizer(content: bytes) -> Tokenizer:
     """Parses a tokenizer; raises ValueError if it is none, or none that is read here."""
     try:
         tokenizer = Tokenizer.from_buffer(content)
-    except Exception as error:  # tokenizers raises no other
+    except BaseException as error:
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":  # Rust's, not importable
+            raise
         raise ValueError(f"no tokenizer.json, or one that was cut short: {error}") from None
     # Qwen3.5's and Eagle's have NFC or none; others may blow a text up without end, or panic.
     if tokenizer.normalizer is not None and not isinstance(tokenizer.normalizer, normalizers.NFC):

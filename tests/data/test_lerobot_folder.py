@@ -258,3 +258,16 @@ def test_a_parquet_file_that_declares_too_much_is_not_read(folder: Path, monkeyp
     monkeypatch.setattr("dual_system.data.lerobot_folder.MAX_FILE_ROWS", 17)
     with pytest.raises(DatasetError, match=r"declares 18 rows of \d+ bytes; at most 17"):
         Dataset(folder)
+
+
+@pytest.mark.parametrize("name", [v3.EPISODES_PATH, DATA])
+def test_a_text_that_is_repeated_without_end_is_not_spelled_out(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setattr("dual_system.data.lerobot_folder.MAX_TEXT_BYTES", 2000)
+    table = pq.read_table(folder / name)
+    column = "difficulty" if name == v3.EPISODES_PATH else "subgoal"
+    texts = pa.array(["x" * 1000] * len(table))
+    pq.write_table(table.set_column(table.column_names.index(column), column, texts), folder / name)
+    with pytest.raises(DatasetError, match=r"its texts have \d+ bytes, at most 2000"):
+        Dataset(folder).rows(0)
