@@ -79,7 +79,9 @@ class LeRobotFolder:
                 )
         self.cameras = tuple(name for name, feature in self.features.items() if feature.get("dtype") == "video")
         self.listed = list(self._listed())
-        self._places = {each["episode_index"]: self._place(each) for each in self.listed}
+        if not self.listed:
+            raise DatasetError(f"{root}: meta/episodes lists no episode")
+        self._places = {self._number(each, "episode_index"): self._place(each) for each in self.listed}
         self._check_places()
 
     def rows(self, episode: int, columns: Sequence[str]) -> pa.Table:
@@ -214,7 +216,7 @@ class LeRobotFolder:
 
     def _check_rows(self, episode: int, place: Place, table: pa.Table) -> None:
         """Raises ValueError if the rows with an episode's numbers are too few or too many, or another episode's."""
-        numbers, episodes, frames, times_s = (table[name].to_numpy() for name in _NUMBERING)
+        numbers, episodes, frames, times_s = (table[name].cast(pa.float64()).to_numpy() for name in _NUMBERING)
         expected = np.arange(place.length)
         told = f"{place.data}: episode {episode} has the rows {place.first_row} to {place.first_row + place.length - 1}"
         if len(numbers) != place.length:
@@ -222,7 +224,7 @@ class LeRobotFolder:
         if not np.array_equal(numbers, place.first_row + expected):
             raise ValueError(f"{told}; their index does not ascend by one")
         if others := sorted({*episodes.tolist()} - {episode}):
-            raise ValueError(f"{told}; these are of episode {', '.join(map(str, others[:5]))}")
+            raise ValueError(f"{told}; these are of episode {', '.join(f'{other:.0f}' for other in others[:5])}")
         if not np.array_equal(frames, expected):
             raise ValueError(f"{told}; their frame_index is not 0 to {place.length - 1}")
         late_s = np.abs(times_s - expected / self.fps)
@@ -236,7 +238,7 @@ def reading(path: Path) -> Iterator[None]:
     """Turns whatever a library says of a broken file into a `DatasetError` that names the file."""
     try:
         yield
-    except (pa.ArrowException, OSError, ValueError, IndexError, MemoryError) as error:
+    except (pa.ArrowException, OSError, ValueError, TypeError, IndexError, MemoryError) as error:
         told = (getattr(error, "strerror", None) or str(error)).partition("\n")[0]
         raise DatasetError(told if str(path) in told else f"{path} cannot be read: {told}") from None
 

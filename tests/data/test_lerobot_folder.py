@@ -177,6 +177,7 @@ def double(rows: list[dict[str, Any]]) -> None:
         (lambda rows: rows[2].update(length=None), "expected a number for length, came None"),
         (lambda rows: rows[2].update({"data/file_index": 3}), "file-003.parquet cannot be read: No such file"),
         (lambda rows: rows[2].update(num_demonstration_rows=4), "4 of 4 rows of episode 2 are a demonstration"),
+        (lambda rows: rows.clear(), "lists no episode"),
         (lambda rows: rows[1].update(tasks=[]), "expected tasks of type list"),
     ],
 )
@@ -195,6 +196,7 @@ def test_a_listing_that_cannot_be_is_refused(
         ("index", lambda values: values + 2, "episode 0 has the rows 0 to 4, which are 5; there are 3"),
         ("index", lambda values: values[[1, 0, *range(2, 18)]], "their index does not ascend by one"),
         ("frame_index", lambda values: values + 1, "their frame_index is not 0 to 4"),
+        ("timestamp", lambda values: ["soon"] * len(values), "cannot be read: .*'soon'"),
         ("timestamp", lambda values: values * np.float32(0.5), r"number 4 is at 0\.100 s, not 0\.200 s"),
     ],
 )
@@ -223,6 +225,16 @@ def test_rows_that_are_not_the_listed_ones_are_refused(
 def test_an_info_json_of_something_else_is_refused(folder: Path, changes: dict[str, Any], said: str) -> None:
     edit_info(folder, **changes)
     with pytest.raises(DatasetError, match=said):
+        Dataset(folder)
+
+
+@pytest.mark.parametrize(
+    "column", ["episode_index", "dataset_to_index", f"videos/{v3.video_key('wrist')}/from_timestamp"]
+)
+def test_a_listing_without_lerobot_s_columns_is_refused(folder: Path, column: str) -> None:
+    table = pq.read_table(folder / v3.EPISODES_PATH)
+    pq.write_table(table.drop_columns([column]), folder / v3.EPISODES_PATH)
+    with pytest.raises(DatasetError, match=f"expected a number for {column}, came None"):
         Dataset(folder)
 
 
