@@ -21,6 +21,7 @@ from clock.residual import Due
 from clock.timebase import NS_PER_S
 from protocol.messages import Floats
 
+MAX_FILE_BYTES = 100 * 2**20  # unpacked
 _ARRAYS = ("inner", "outer", "limit_rad")
 _TICKS_PER_UNIT = 20.0
 RIDGE = 1e-3
@@ -101,6 +102,9 @@ def load(path: Path) -> ResidualMlp:
         OSError: it cannot be read.
     """
     try:
+        with zipfile.ZipFile(path) as archive:
+            if (num_bytes := sum(each.file_size for each in archive.infolist())) > MAX_FILE_BYTES:
+                raise ValueError(f"unpacked it has {num_bytes} bytes, at most {MAX_FILE_BYTES} are read")
         with np.load(path, allow_pickle=False) as arrays:
             return ResidualMlp(**{name: arrays[name].astype(np.float32) for name in _ARRAYS})
     except (KeyError, ValueError, zipfile.BadZipFile, EOFError) as error:

@@ -22,11 +22,13 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     """Loads or randomly initialises the model.
 
     Raises:
-        FileNotFoundError, ValueError: the folder is no checkpoint or does not fit; the message says why.
+        OSError, ValueError: the folder is no checkpoint or does not fit, or there is no such device; the message says
+            why.
     """
     import torch  # here, so that --help and a mistyped option respond immediately
 
     from dual_system.models.bfloat16 import warn_of_slow
+    from dual_system.models.device import require_device
     from dual_system.models.ponder import configs
     from dual_system.models.ponder.checkpoint import load_ponder
     from dual_system.models.ponder.demo_sampling import DemoSampling
@@ -45,6 +47,7 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     num_cores = num_usable_cores()
     if speed.attention_threads > num_cores:
         log.warning("--attention-threads %d: this process may use %d core(s)", speed.attention_threads, num_cores)
+    require_device(options.device)
     if warning := warn_of_slow(options.dtype, options.device):
         log.warning("%s", warning)
     dtype = {"float32": torch.float32, "bfloat16": torch.bfloat16}[options.dtype]

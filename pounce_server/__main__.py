@@ -18,11 +18,13 @@ def build_engine(options: PounceOptions) -> PounceEngine:
     """Loads or randomly initialises the model.
 
     Raises:
-        FileNotFoundError, ValueError: the folder is no checkpoint or does not fit; the message says why.
+        OSError, ValueError: the folder is no checkpoint or does not fit, or there is no such device; the message says
+            why.
     """
     import torch
 
     from dual_system.models.bfloat16 import warn_of_slow
+    from dual_system.models.device import require_device
     from dual_system.models.ponder.configs import tiny_cpu as tiny_ponder
     from dual_system.models.pounce.checkpoint import load_bundle, random_bundle
     from dual_system.models.pounce.configs import tiny_cpu, tiny_groot
@@ -30,6 +32,7 @@ def build_engine(options: PounceOptions) -> PounceEngine:
     from pounce_server.engine import EagerEngine
 
     torch.set_num_threads(NUM_TORCH_THREADS)
+    require_device(options.device)
     if warning := warn_of_slow(options.dtype, options.device):
         log.warning("%s", warning)
     if options.checkpoint is not None:

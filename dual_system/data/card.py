@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -16,9 +15,11 @@ from PIL import Image, ImageDraw
 
 from dual_system.data.dataset import Dataset, Entry
 from dual_system.data.errors import DatasetError
+from dual_system.data.lerobot_folder import reading
 from dual_system.data.lerobot_v3 import COLLECTION_PATH
 from dual_system.data.video import FPS
 from protocol.command_line import parse
+from protocol.files import read_object
 
 CARD, SHEET = "README.md", "contact_sheet.jpg"
 PICTURES_PER_TASK, PICTURE_PX, LABEL_PX = 8, 128, 14
@@ -37,7 +38,7 @@ def main(argv: list[str] | None = None, prog: str = "pp-collect card") -> int:
     options = parse(CardOptions, argv, prog=prog)
     try:
         write_card(options.folder)
-    except DatasetError as error:
+    except (DatasetError, OSError) as error:
         sys.stderr.write(f"{prog}: {error}\n")
         return REFUSED
     sys.stdout.write(f"{options.folder / CARD}, {options.folder / SHEET}\n")
@@ -126,7 +127,10 @@ def _origin(dataset: Dataset) -> list[str]:
     lines = ["Origin: " + ", ".join(f"{count} episodes by {origin}" for origin, count in sorted(origins.items())) + "."]
     path = dataset.root / COLLECTION_PATH
     if path.exists():
-        settings = json.loads(path.read_text())["settings"]
+        with reading(path):
+            settings = read_object(path).get("settings", {})
+        if missing := {"look", "first_seed", "versions"} - settings.keys():
+            raise DatasetError(f"{path}: settings lack {', '.join(sorted(missing))}; pp-collect writes them")
         look = settings["look"]
         lines.append(
             f"Pictures were rendered {look['demonstration_hz']} times a second in demonstrations, once more at "

@@ -24,6 +24,7 @@ from dual_system.data.dart import DART, NoiseKind
 from dual_system.data.episode import Package, Rejection, unpack
 from dual_system.data.errors import DatasetError
 from dual_system.data.jobs import DIFFICULTY_CYCLE, RECOVERY_SHARE, Job, Look, jobs_of
+from dual_system.data.lerobot_folder import reading
 from dual_system.data.lerobot_v3 import COLLECTION_PATH, INFO_PATH, DatasetWriter
 from dual_system.data.rollout import UNSOLVED, work_out
 from dual_system.data.seeds import TRAIN_SEED
@@ -33,6 +34,7 @@ from dual_system.data.workers import LocalWorkers, RayWorkers, Workers
 from dual_system.tasks.difficulty import Difficulty
 from dual_system.tasks.task import TaskError, chosen_tasks
 from protocol.command_line import parse
+from protocol.files import read_object
 from protocol.version import DISTRIBUTION
 
 SCALES = {"1x": 1, "9x": 9}
@@ -282,7 +284,8 @@ def _present(store: Store, jobs: Sequence[Job]) -> list[Job]:
 def _claim(path: Path, settings: dict[str, Any]) -> None:
     """Records the settings that a folder was begun with. Raises DatasetError if they differ now."""
     if path.exists():
-        _require_equal(json.loads(path.read_text()), settings, path.parent.parent)
+        with reading(path):
+            _require_equal(read_object(path), settings, path.parent.parent)
         return
     partial = path.with_suffix(".partial")
     partial.write_text(json.dumps(settings, indent=1) + "\n")
@@ -305,7 +308,10 @@ def _finished(out: Path, wanted: dict[str, Any]) -> Report | None:
         return None
     if not (out / COLLECTION_PATH).exists():
         raise DatasetError(f"{out} holds a dataset that pp-collect did not make; use another --out")
-    there = json.loads((out / COLLECTION_PATH).read_text())
+    with reading(out / COLLECTION_PATH):
+        there = read_object(out / COLLECTION_PATH)
+    if missing := {"settings", "tasks", "episodes", "unsolved", "num_rejected"} - there.keys():
+        raise DatasetError(f"{out / COLLECTION_PATH} lacks {', '.join(sorted(missing))}; use another --out")
     _require_equal(there["settings"], wanted["settings"], out)
     if there["episodes"] == wanted["episodes"] and tuple(there["tasks"]) == wanted["tasks"]:
         return Report(

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import json
-from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from dual_system.data import lerobot_v3 as v3
-from dual_system.data.episode import Rows, from_table
+from dual_system.data.episode import CAMERAS, OPTIONAL, Rows, from_table
 from dual_system.data.errors import DatasetError
-from dual_system.data.video import FPS, read_frames
+from dual_system.data.lerobot_folder import LeRobotFolder
+from dual_system.data.video import FPS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,71 +38,95 @@ class Entry:
 
 
 class Dataset:
-    """A v3 folder that `pp-collect` or `pp-export` made.
+    """A v3 folder that `pp-collect` or `pp-export` made, or LeRobot's tools from such folders.
+
+    Episodes are known by their ``episode_index``, which need not count from 0.
 
     Raises:
-        DatasetError: the folder holds no such dataset.
+        DatasetError: the folder holds no such dataset, or a broken one (`LeRobotFolder`).
     """
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        try:
-            self.described: dict[str, Any] = json.loads((root / v3.INFO_PATH).read_text())
-            listed = pq.read_table(root / v3.EPISODES_PATH)
-        except FileNotFoundError as error:
-            raise DatasetError(f"{root} holds no dataset (no {error.filename}); pp-collect makes one") from None
-        if self.described["codebase_version"] != v3.VERSION or "num_demonstration_rows" not in listed.column_names:
-            raise DatasetError(f"{root} is a dataset of {self.described['codebase_version']}, but not one of ours")
-        self.image_px: int = self.described["features"][v3.video_key("front")]["shape"][0]
-        wanted = [name for name in listed.column_names if not name.startswith("stats/")]
-        self._listed = listed.select(wanted).to_pylist()
-        self.episodes = tuple(map(_entry, self._listed))
-        self._row_groups = _row_groups(self._listed)
+        self._folder = LeRobotFolder(root)
+        self.described = self._folder.info
+        missing = sorted({*_LISTED} - self._folder.listed[0].keys())
+        if missing:
+            raise DatasetError(
+                f"{root} is a LeRobot {v3.VERSION} dataset, but not one of ours: meta/episodes lacks "
+                f"{', '.join(missing)}; pp-collect and pp-export write ours"
+            )
+        if self._folder.fps != FPS:
+            raise DatasetError(f"{root} has {self._folder.fps} rows a second; datasets here have {FPS}")
+        shapes = {camera: self._folder.features.get(v3.video_key(camera), {}).get("shape") for camera in CAMERAS}
+        self.image_px = _side_px(root, shapes)
+        self.episodes = tuple(_entry(root, listed) for listed in self._folder.listed)
 
     def rows(self, episode: int) -> Rows:
-        """The rows of an episode."""
-        listed = self._listed[episode]
-        path = v3.DATA_PATH.format(chunk_index=listed["data/chunk_index"], file_index=listed["data/file_index"])
-        table = pq.ParquetFile(self.root / path).read_row_group(self._row_groups[episode])
-        return from_table(table.rename_columns([v3.OUR_NAMES.get(name, name) for name in table.column_names]))
+        """The rows of an episode.
+
+        Raises:
+            DatasetError: the file is broken, or its rows are not those that ``meta/episodes`` lists.
+        """
+        theirs = {ours: name for name, ours in v3.OUR_NAMES.items()}
+        wanted = [each.name for each in fields(Rows) if each.name not in OPTIONAL or each.name in self._folder.features]
+        table = self._folder.rows(episode, [theirs.get(name, name) for name in wanted]).rename_columns(wanted)
+        try:
+            rows = from_table(table)
+        except ValueError as error:
+            raise DatasetError(f"{self.root}: episode {episode}: {error}") from None
+        return rows
 
     def frames(self, episode: int, camera: str, rows: Sequence[int]) -> NDArray[np.uint8]:
         """The pictures (n, image_px, image_px, 3) that one camera took in some rows, which ascend.
 
         Raises:
             IndexError: the episode has no such row.
+            DatasetError: the video is broken.
         """
-        listed, key = self._listed[episode], v3.video_key(camera)
-        if rows and not 0 <= rows[0] <= rows[-1] < listed["length"]:
-            raise IndexError(f"rows {rows[0]} to {rows[-1]} of an episode of {listed['length']} rows")
-        path = v3.VIDEO_PATH.format(
-            video_key=key,
-            chunk_index=listed[f"videos/{key}/chunk_index"],
-            file_index=listed[f"videos/{key}/file_index"],
+        return self._folder.frames(episode, v3.video_key(camera), rows)
+
+
+_SAME = ("task", "seed", "difficulty", "origin", "is_success", "recovery", "num_rejected", "num_demonstration_rows")
+_LISTED = {
+    "tasks": list,
+    "seed": int,
+    "is_success": bool,
+    "num_rejected": int,
+    "num_demonstration_rows": int,
+} | dict.fromkeys(("task", "difficulty", "origin", "recovery"), str)
+"""Our columns of ``meta/episodes`` that every dataset of ours has, and the type of their values."""
+
+
+def _side_px(root: Path, shapes: Mapping[str, Any]) -> int:
+    """Side of the pictures of all cameras. Raises DatasetError unless there is one."""
+    for camera, shape in shapes.items():
+        is_square = isinstance(shape, list) and len(shape) == 3 and shape[0] == shape[1] and type(shape[0]) is int
+        if not is_square or shape != next(iter(shapes.values())):
+            raise DatasetError(
+                f"{root / v3.INFO_PATH}: the video {v3.video_key(camera)} has the shape {shape}; expected square "
+                f"pictures [px, px, 3], of one size in {' and '.join(map(v3.video_key, shapes))}"
+            )
+    return int(next(iter(shapes.values()))[0])
+
+
+def _entry(root: Path, listed: dict[str, Any]) -> Entry:
+    for name, kind in _LISTED.items():
+        if not isinstance(listed.get(name), kind) or listed[name] == []:
+            raise DatasetError(
+                f"{root}: meta/episodes: expected {name} of type {kind.__name__}, came {listed.get(name)!r}"
+            )
+    if not 0 <= listed["num_demonstration_rows"] < listed["length"]:
+        raise DatasetError(
+            f"{root}: meta/episodes: {listed['num_demonstration_rows']} of {listed['length']} rows of episode "
+            f"{listed['episode_index']} are a demonstration; some must follow"
         )
-        begin = round(listed[f"videos/{key}/from_timestamp"] * FPS)
-        return np.stack(list(read_frames(self.root / path, [begin + row for row in rows])))
-
-
-def _entry(listed: dict[str, Any]) -> Entry:
-    same = ("task", "seed", "difficulty", "origin", "is_success", "recovery", "num_rejected", "num_demonstration_rows")
     return Entry(
         index=listed["episode_index"],
         instruction=listed["tasks"][0],
         num_rows=listed["length"],
         first_row=listed["dataset_from_index"],
-        noise_rad=listed.get("noise_rad", 0.0),
-        corrected_from=listed.get("corrected_from", 0),
-        **{name: listed[name] for name in same},
+        noise_rad=listed.get("noise_rad") or 0.0,
+        corrected_from=listed.get("corrected_from") or 0,
+        **{name: listed[name] for name in _SAME},
     )
-
-
-def _row_groups(listed: Sequence[dict[str, Any]]) -> list[int]:
-    """Returns each episode's row group within its file; episodes were written one by one."""
-    seen: Counter[tuple[int, int]] = Counter()
-    groups = []
-    for each in listed:
-        place = (each["data/chunk_index"], each["data/file_index"])
-        groups.append(seen[place])
-        seen[place] += 1
-    return groups

@@ -27,6 +27,15 @@ EXECUTED = "executed_action"
 OPTIONAL = (EXECUTED,)
 """Columns that only some datasets have: those collected under noise."""
 
+_TYPES = {
+    **{
+        name: pa.list_(pa.float32(), size)
+        for name, size in (("state", 8), ("action", 8), ("tcp_pose", 7), (EXECUTED, 8))
+    },
+    **dict.fromkeys(("is_demonstration", "is_transition", "is_rendered"), pa.bool_()),
+}
+"""Arrow types of the columns; the others are texts."""
+
 Package = dict[str, bytes]  # file name -> content
 Recovery = Literal["none", "z", "xy"]
 
@@ -168,9 +177,14 @@ def to_table(rows: Rows) -> pa.Table:
 
 
 def from_table(table: pa.Table) -> Rows:
-    """Returns the rows of an Arrow table; unknown columns are ignored, and optional ones may be missing."""
+    """Returns the rows of an Arrow table; unknown columns are ignored, and optional ones may be missing.
+
+    Raises:
+        ValueError: a column cannot be of its type in `Rows`, or a value is null. Other widths are cast: pandas, with
+            which LeRobot's tools rewrite rows, has its own.
+    """
     names = [each.name for each in fields(Rows) if each.name not in OPTIONAL or each.name in table.column_names]
-    return Rows(**{name: _from_arrow(table.column(name).combine_chunks()) for name in names})
+    return Rows(**{name: _from_arrow(name, table.column(name).combine_chunks()) for name in names})
 
 
 def _executed(rows: list[Row]) -> NDArray[np.float32] | None:
@@ -188,9 +202,16 @@ def _to_arrow(column: Any) -> Any:
     return pa.FixedSizeListArray.from_arrays(pa.array(column.reshape(-1)), column.shape[1])
 
 
-def _from_arrow(column: Any) -> Any:
-    if pa.types.is_string(column.type):
+def _from_arrow(name: str, column: Any) -> Any:
+    kind = _TYPES.get(name, pa.string())
+    try:
+        column = column.cast(kind)
+    except pa.ArrowException as error:
+        raise ValueError(f"column {name} has the type {column.type}, expected {kind}: {error}") from None
+    if column.null_count or (pa.types.is_nested(kind) and column.flatten().null_count):
+        raise ValueError(f"column {name} has values that are null")
+    if pa.types.is_string(kind):
         return tuple(column.to_pylist())
-    if pa.types.is_fixed_size_list(column.type):
-        return column.flatten().to_numpy().reshape(len(column), -1)
+    if pa.types.is_nested(kind):
+        return column.flatten().to_numpy().reshape(len(column), kind.list_size)
     return column.to_numpy(zero_copy_only=False)

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -100,26 +102,66 @@ class VideoJoiner:
         self._container.close()
 
 
-def read_frames(path: Path, indices: Sequence[int]) -> Iterator[Frame]:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VideoHeader:
+    """What a video file says of itself before anything is decoded."""
+
+    num_frames: int  # 0: the container does not tell
+    fps: float
+    height_px: int
+    width_px: int
+
+
+def read_header(path: Path) -> VideoHeader:
+    """Raises ValueError if the file cannot be opened or is no video."""
+    with _opened(path) as (_, stream):
+        return VideoHeader(
+            num_frames=stream.frames,
+            fps=float(stream.average_rate or 0),
+            height_px=stream.height,
+            width_px=stream.width,
+        )
+
+
+def read_frames(path: Path, indices: Sequence[int], *, fps: float = FPS) -> Iterator[Frame]:
     """Yields the frames with ascending numbers ``indices``, decoding from the key frame before each where that saves.
 
+    Any codec and any distance of key frames will do; frame k is the one shown at k / ``fps``.
+
     Raises:
-        OSError: the file cannot be opened.
+        ValueError: the file cannot be opened, is no video, or is damaged.
         IndexError: it has no frame of such a number.
     """
-    with av.open(str(path), "r") as container:
-        stream: Any = container.streams.video[0]
+    with _opened(path) as (container, stream):
         stream.codec_context.thread_count = 1
-        decoded: Iterator[Any] = iter(())
-        at = -1  # number of the frame decoded last
+
+        def decoded_from(index: int) -> Iterator[tuple[int, Any]]:
+            container.seek(round(index / fps / stream.time_base), stream=stream)
+            return ((round(frame.pts * stream.time_base * fps), frame) for frame in container.decode(stream))
+
+        decoded: Iterator[tuple[int, Any]] = iter(())
+        at, frame = -1 - FRAMES_PER_KEY, None  # number of the frame decoded last
         for index in indices:
-            if at < 0 or index > at + FRAMES_PER_KEY:
-                container.seek(round(index * _TIME_BASE / stream.time_base), stream=stream)
-                decoded = container.decode(stream)
-            for frame in decoded:
-                at = round(frame.pts * stream.time_base / _TIME_BASE)
-                if at >= index:
-                    break
-            if at != index:
-                raise IndexError(f"{path} has no frame {index}; it ends at frame {at}")
+            if index > at + FRAMES_PER_KEY:
+                decoded = decoded_from(index)
+                at, frame = next(decoded, (at, None))
+                if at > index:  # some files lead past the key frame
+                    decoded = decoded_from(0)
+                    at, frame = next(decoded)
+            while at < index and frame is not None:
+                at, frame = next(decoded, (at, None))
+            if at != index or frame is None:
+                raise IndexError(f"{path} has no frame {index}; it has {stream.frames} frames")
             yield frame.to_ndarray(format="rgb24")
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
+    """A video's container and stream; FFmpeg's errors, also those of decoding, become ValueErrors that name it."""
+    try:
+        with av.open(str(path), "r") as container:
+            if not container.streams.video:
+                raise ValueError(f"{path} has no video stream")
+            yield container, container.streams.video[0]
+    except av.FFmpegError as error:
+        raise ValueError(f"{path} cannot be decoded: {error.strerror}") from None

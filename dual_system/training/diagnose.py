@@ -29,6 +29,7 @@ from tqdm import tqdm
 from clock.sampling import EVALUATION
 from dual_system.analysis.diagnosis import DIAGNOSIS, SCHEMA
 from dual_system.data.errors import DatasetError
+from dual_system.models.device import require_device
 from dual_system.models.pi05.pounce import Pounce
 from dual_system.models.ponder.checkpoint import load_ponder, weights_hash
 from dual_system.models.ponder.network import Ponder
@@ -99,6 +100,7 @@ def diagnose(options: DiagnoseOptions) -> dict[str, Any]:
     Raises:
         DatasetError, FileNotFoundError, ValueError: the inputs do not fit together; the message says why.
     """
+    require_device(options.device)
     ponder = load_ponder(options.ponder, device=options.device)
     bundle = load_bundle(options.pounce)
     pounce = bundle.model.to(options.device).eval()

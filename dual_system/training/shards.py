@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import Any, Self
 
 import torch
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 from torch.distributed.tensor import DTensor
 
 from dual_system.training.parallel import World, local
 from protocol import disk
+from protocol.files import require_file
 
 
 def write_rows(tensors: Mapping[str, Tensor], folder: Path, stem: str, world: World) -> None:
@@ -49,7 +50,13 @@ class RowReader:
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
-        self._files = [self._stack.enter_context(safe_open(path, framework="pt")) for path in self._paths]
+        """Raises OSError or ValueError if a file may not be read or is damaged."""
+        for path in self._paths:
+            require_file(path)
+            try:
+                self._files.append(self._stack.enter_context(safe_open(path, framework="pt")))
+            except SafetensorError as error:
+                raise ValueError(f"{path} was cut short: {error}; take the checkpoint out of the way") from error
         return self
 
     def __exit__(self, *_: object) -> None:

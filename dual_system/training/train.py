@@ -27,7 +27,7 @@ from tqdm import tqdm
 from dual_system.data.episode import CAMERAS
 from dual_system.data.errors import DatasetError
 from dual_system.models.bfloat16 import warn_of_slow
-from dual_system.models.normalisation import ROBOMME
+from dual_system.models.device import require_device
 from dual_system.models.pi05.pounce import PounceConfig, freeze
 from dual_system.models.pi05.prompt import Tokenizer, tokenizer_of_instructions
 from dual_system.models.ponder.checkpoint import load_ponder, save_ponder
@@ -199,6 +199,7 @@ def train(options: TrainOptions) -> None:
     machine, run = options.machine, _adjusted(recipe(options.recipe), options.instead)
     if _is_finished(options.out):
         raise CheckpointError(f"{options.out} holds a finished run; use another --out")
+    require_device(machine.device)
     if machine.tf32 and machine.device == "cpu":
         raise ValueError("--tf32 is for GPUs; on a CPU leave it out")
     data = TrainingSet(*options.data, tasks=options.tasks, demo_hz=run.demo_hz)
@@ -321,10 +322,10 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
         bundle = random_bundle(run.pounce, seed, statistics=measured(), tokenizer=_own_tokenizer(run, data))
         open_gates(bundle.model)
     else:
-        # A public folder has neither a cognition prefix nor a declaration of POUNCE's inputs; the recipe has both.
-        bundle = load_bundle(options.pounce, config=None if declares_config(options.pounce) else run.pounce)
-        if bundle.statistics == ROBOMME:  # a public folder; our own keep the statistics that they were trained with
-            bundle = replace(bundle, statistics=measured())
+        if declares_config(options.pounce):
+            bundle = load_bundle(options.pounce)
+        else:  # a public folder has no cognition prefix and declares no inputs, and its statistics are of other data
+            bundle = load_bundle(options.pounce, config=run.pounce, statistics=measured())
     pounce = bundle.model.to(device)
     if type(pounce.config) is not type(run.pounce):
         raise ValueError(f"recipe {run.name} is of another action model than {options.pounce} holds")

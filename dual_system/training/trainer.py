@@ -25,6 +25,7 @@ from dual_system.training.optim import OptimConfig, Optimiser
 from dual_system.training.parallel import World, average_gradients, local
 from dual_system.training.shards import RowReader, write_rows
 from protocol import disk
+from protocol.files import read_object
 
 Batches = Callable[[int], tuple[PonderBatch, PounceBatch]]
 """This process's share of the batch of a step (``World.share``); a pure function of the step's number."""
@@ -210,7 +211,7 @@ class Trainer:
         self._world.wait()
         if not folder.exists():
             return False
-        facts = json.loads((folder / _FACTS).read_text())
+        facts = read_object(folder / _FACTS)
         if differs := list(_differences(facts.get("made_with", {}), self._made_with)):
             raise CheckpointError(
                 f"{folder}: made with {'; '.join(differs[:5])}. Use another folder, or the same data and recipe."

@@ -12,7 +12,6 @@ from typing import Any, Literal
 
 import msgpack
 import numpy as np
-from numpy.typing import NDArray
 
 from sim_client.gateway.exchange import Refused
 from sim_client.gateway.pictures import EncodedPicture
@@ -22,6 +21,8 @@ Spelling = Literal["openpi", "vla-eval"]
 MAX_DIMENSIONS = 8
 _DTYPE = re.compile(r"[<>|=]?(?:[iu][1248]|f[248]|b1)")
 """Numbers and truth values. A dtype is only made of a text that matches: others can mean objects or structures."""
+_TEXT_DTYPE = re.compile(r"[<>=]?U[1-9][0-9]{0,3}")
+"""Texts of up to so many characters, as numpy holds them: some clients send the prompt in an array."""
 _MAX_ITEMS = 1_000_000
 
 
@@ -41,7 +42,7 @@ def pack(value: Any, spelling: Spelling) -> bytes:
 
 
 def unpack(data: bytes) -> Any:
-    """The value in ``data``; arrays are read-only views.
+    """The value in ``data``; arrays are read-only views, arrays of texts are texts in lists.
 
     Raises:
         Refused: not msgpack, an array whose shape, type and bytes disagree, or a structure beyond any real message's.
@@ -63,7 +64,7 @@ def _unspell(item: dict[Any, Any]) -> Any:
     return item
 
 
-def _picture(item: dict[Any, Any]) -> NDArray[Any] | EncodedPicture:
+def _picture(item: dict[Any, Any]) -> Any:
     kind, data, shape = item.get("format"), item.get("data"), item.get("shape")
     if kind == "raw":
         return _array(data, item.get("dtype"), shape)
@@ -72,15 +73,23 @@ def _picture(item: dict[Any, Any]) -> NDArray[Any] | EncodedPicture:
     return EncodedPicture(kind, data, _shape(shape))
 
 
-def _array(data: Any, dtype: Any, shape: Any) -> NDArray[Any]:
-    if not isinstance(data, bytes) or not isinstance(dtype, str) or not _DTYPE.fullmatch(dtype):
-        raise Refused(f"an array of type {dtype!r}: expected the bytes of numbers or truth values")
+def _array(data: Any, dtype: Any, shape: Any) -> Any:
+    is_text = isinstance(dtype, str) and _TEXT_DTYPE.fullmatch(dtype) is not None
+    if not isinstance(data, bytes) or not isinstance(dtype, str) or not (is_text or _DTYPE.fullmatch(dtype)):
+        raise Refused(f"an array of type {dtype!r}: expected the bytes of numbers, truth values or texts")
     sides, kind = _shape(shape), np.dtype(dtype)
     if math.prod(sides) * kind.itemsize != len(data):
         raise Refused(
             f"an array {sides} of {dtype}: expected {math.prod(sides) * kind.itemsize} bytes, {len(data)} came"
         )
-    return np.frombuffer(data, kind).reshape(sides)
+    array = np.frombuffer(data, kind).reshape(sides)
+    if not is_text:
+        return array
+    try:  # numpy does not check that they are characters
+        data.decode("utf-32-be" if dtype.startswith(">") else "utf-32-le")
+    except UnicodeDecodeError as error:
+        raise Refused(f"an array of type {dtype!r}: expected texts, came other bytes: {error.reason}") from None
+    return array.tolist()
 
 
 def _shape(shape: Any) -> tuple[int, ...]:

@@ -100,6 +100,13 @@ def test_a_head_survives_its_file(tmp_path: Path) -> None:
     np.testing.assert_array_equal(loaded.correction(due), head.correction(due))
 
 
+def test_a_head_that_unpacks_without_end_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("clock.residual_mlp.MAX_FILE_BYTES", 10_000)
+    np.savez_compressed(tmp_path / "head.npz", inner=np.zeros(10_000))
+    with pytest.raises(ValueError, match=r"unpacked it has 80\d+ bytes, at most 10000 are read"):
+        load_head(tmp_path / "head.npz")
+
+
 def test_files_and_loaders_that_are_none_are_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "other.npz", inner=np.zeros(3))
     (tmp_path / "text.npz").write_text("not a head")

@@ -25,7 +25,11 @@ HOMES: dict[str, tuple[str, ...]] = {
     "torch": ("dual_system/models/", "dual_system/training/", "ponder_server/", "pounce_server/"),
     "transformers": ("dual_system/models/",),
     "safetensors": ("dual_system/models/", "dual_system/training/"),
-    "tokenizers": ("dual_system/models/ponder/vocabulary.py", "dual_system/models/groot/prompt.py"),
+    "tokenizers": (
+        "dual_system/models/ponder/vocabulary.py",
+        "dual_system/models/groot/prompt.py",
+        "dual_system/models/tokenizer_file.py",
+    ),
     "sentencepiece": ("dual_system/models/pi05/prompt.py",),
 }
 """Package -> the only files or folders that may import it. An import by name, in a string, counts as well."""

@@ -14,9 +14,9 @@ from dual_system.models.groot.weights import load_weights, public_name, save_wei
 from dual_system.models.pi05.weights import save_weights as save_pi05
 from dual_system.models.pounce.checkpoint import load_bundle, random_bundle, save_bundle
 from dual_system.models.pounce.configs import groot_n1_5, tiny_cpu, tiny_groot
-from dual_system.models.pounce.family import family_of, tensor_shapes
+from dual_system.models.pounce.family import family_of
 from dual_system.models.pounce.initialise import random_groot_pounce, random_pounce
-from dual_system.models.public_layout import WeightsError
+from dual_system.models.stored_tensors import StoredTensors, WeightsError
 
 VISION = "backbone.eagle_model.vision_model.vision_model."
 LANGUAGE = "backbone.eagle_model.language_model."
@@ -174,7 +174,7 @@ def test_the_token_embedding_is_not_the_lm_head(model: GrootPounce, saved: Path)
 
 def test_lerobots_leading_name_is_accepted(model: GrootPounce, saved: Path) -> None:
     save_file({f"_groot_model.{name}": tensor for name, tensor in load_file(saved).items()}, saved)
-    assert family_of(saved) == "groot"
+    assert family_of(StoredTensors.of(saved).shapes, "x") == "groot"
     loaded = _blank()
     load_weights(loaded, saved)
     _assert_same(loaded, model)
@@ -201,7 +201,9 @@ def test_shards_are_one_checkpoint(model: GrootPounce, saved: Path) -> None:
     load_weights(loaded, saved)
     _assert_same(loaded, model)
     shards[1].unlink()
-    with pytest.raises(FileNotFoundError, match=r"index\.json lists model-00002-of-00002\.safetensors, not there"):
+    with pytest.raises(
+        FileNotFoundError, match=r"index\.json lists model-00002-of-00002\.safetensors, which is not there"
+    ):
         load_weights(_blank(), saved)
 
 
@@ -315,17 +317,17 @@ def test_our_own_folder_survives(tmp_path: Path) -> None:
 
 
 def test_the_family_is_told_by_the_tensors(saved: Path, tmp_path: Path) -> None:
-    assert family_of(saved) == "groot"
+    assert family_of(StoredTensors.of(saved).shapes, "x") == "groot"
     pi05 = tmp_path / "pi05.safetensors"
     save_pi05(random_pounce(tiny_cpu(), seed=0), pi05)
-    assert family_of(pi05) == "pi05"
+    assert family_of(StoredTensors.of(pi05).shapes, "x") == "pi05"
     save_file({"conv1.weight": torch.zeros(1)}, pi05)
     with pytest.raises(WeightsError, match=r"1 tensors, none of them pi0\.5's .* or GR00T N1\.5's .*: conv1\.weight"):
-        family_of(pi05)
+        family_of(StoredTensors.of(pi05).shapes, "x")
 
 
 def test_shapes_are_read_without_the_numbers(saved: Path, model: GrootPounce) -> None:
-    shapes = tensor_shapes(saved)
+    shapes = StoredTensors.of(saved).shapes
     assert shapes["action_head.vlln.weight"] == (64,)
     assert len(shapes) == len(model.state_dict()) + len(unused_shapes(model.config.groot))
 

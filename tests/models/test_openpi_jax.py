@@ -17,7 +17,8 @@ from dual_system.models.pi05.weights import public_name
 from dual_system.models.pounce.checkpoint import load_bundle
 from dual_system.models.pounce.configs import tiny_cpu, tiny_groot
 from dual_system.models.pounce.initialise import random_pounce
-from dual_system.models.public_layout import WeightsError, assign
+from dual_system.models.public_layout import assign
+from dual_system.models.stored_tensors import WeightsError
 
 LAYERS = "PaliGemma/llm/layers/"
 BLOCKS = "PaliGemma/img/Transformer/encoderblock/"

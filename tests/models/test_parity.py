@@ -21,7 +21,7 @@ from dual_system.models.pi05.pounce import PounceInputs
 from dual_system.models.pi05.weights import save_weights as save_pi05
 from dual_system.models.pounce.configs import tiny_cpu, tiny_groot
 from dual_system.models.pounce.initialise import random_groot_pounce, random_pounce
-from dual_system.models.public_layout import WeightsError
+from dual_system.models.stored_tensors import WeightsError
 
 COMMITTED = Path(__file__).parent / "data" / "goldens"
 SHARED = Path(__file__).parents[3] / "shared" / "goldens"

@@ -8,9 +8,10 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from dual_system.models.pi05.pounce import Pounce
-from dual_system.models.pi05.weights import WeightsError, load_weights, public_name, save_weights, unused_shapes
+from dual_system.models.pi05.weights import load_weights, public_name, save_weights, unused_shapes
 from dual_system.models.pounce.configs import pi05_base, tiny_cpu
 from dual_system.models.pounce.initialise import random_pounce
+from dual_system.models.stored_tensors import WeightsError
 
 LM_HEAD = "paligemma_with_expert.paligemma.lm_head.weight"
 EMBED = "paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"

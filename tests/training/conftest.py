@@ -43,10 +43,10 @@ def noise_episode(
 
 
 def noise_package(
-    seed: int, num_demo: int = 0, *, unrendered: Collection[int] = (), num_rows: int = NUM_ROWS
+    seed: int, num_demo: int = 0, *, unrendered: Collection[int] = (), num_rows: int = NUM_ROWS, px: int = PX
 ) -> Package:
     """An episode as it lies on disk; the brightness of its pictures counts its rows."""
-    rng, episode = np.random.default_rng(seed), EpisodeWriter(PX)
+    rng, episode = np.random.default_rng(seed), EpisodeWriter(px)
     for index in range(num_demo + num_rows):
         row = Row(
             state=rng.uniform(-0.2, 0.2, 8).astype(np.float32),
@@ -58,11 +58,11 @@ def noise_package(
             is_transition=index in (num_demo, CHANGE_ROW),
             demonstration_reasoning="Demo selected <3, 4>." if num_demo and index == num_demo else "",
         )
-        picture = np.full((PX, PX, 3), 20 + index, np.uint8)
+        picture = np.full((px, px, 3), 20 + index, np.uint8)
         episode.add(row, {} if index in unrendered else {"front": picture, "wrist": 255 - picture})
     about = About(
         task="PickHighlight", instruction="pick what was shown", seed=seed, difficulty="easy", origin="oracle",
-        is_success=True, image_px=PX,
+        is_success=True, image_px=px,
     )  # fmt: skip
     return episode.pack(about)
 

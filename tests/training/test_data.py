@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
-import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -15,8 +13,7 @@ import torch
 
 from clock.sampling import EVALUATION, ROBOMME
 from dual_system.data.dataset import Dataset
-from dual_system.data.episode import CAMERAS, Package, unpack
-from dual_system.data.lerobot_v3 import video_key
+from dual_system.data.episode import Package, unpack
 from dual_system.models.action_space import ActionSpace, num_dims
 from dual_system.models.arm import tool_poses
 from dual_system.models.images import resized
@@ -206,13 +203,13 @@ def test_a_full_disk_stores_nothing_and_loses_nothing(
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
 
 
-def test_pictures_of_two_sizes_are_refused(folder: Path, tmp_path: Path) -> None:
-    larger = shutil.copytree(folder, tmp_path / "larger")
-    info = larger / "meta" / "info.json"
-    described = json.loads(info.read_text())
-    for camera in CAMERAS:
-        described["features"][video_key(camera)]["shape"][:2] = [128, 128]
-    info.write_text(json.dumps(described))
+def test_pictures_of_two_sizes_are_refused(
+    folder: Path,
+    tmp_path: Path,
+    package_of_noise: Callable[..., Package],
+    write_dataset: Callable[[Path, Iterable[Package]], Path],
+) -> None:
+    larger = write_dataset(tmp_path / "larger", [package_of_noise(0, num_rows=5, px=128)])
     with pytest.raises(ValueError, match=r"pictures of \[64, 128\] px in .*larger; .*--image-px"):
         TrainingSet(folder, larger)
 

@@ -11,6 +11,9 @@ from pathlib import Path
 from tokenizers import Tokenizer as Pieces
 from tokenizers import decoders, models, pre_tokenizers
 
+from dual_system.models.tokenizer_file import parsed_tokenizer
+from protocol.files import MAX_TOKENIZER_BYTES, require_file
+
 IM_START, IM_END = "<|im_start|>", "<|im_end|>"
 IMAGE_START, IMAGE_END, IMAGE_CONTEXT = "<img>", "</img>", "<IMG_CONTEXT>"
 CONTROL_TOKENS = ("<|endoftext|>", IM_START, IM_END, IMAGE_START, IMAGE_END, IMAGE_CONTEXT)
@@ -37,22 +40,23 @@ class EagleTokenizer:
 
     def __init__(self, model_bytes: bytes) -> None:
         self.model_bytes = model_bytes
-        try:
-            self._pieces = Pieces.from_buffer(model_bytes)
-        except ValueError as error:
-            raise ValueError(f"tokenizer of {len(model_bytes)} bytes is no tokenizer.json: {error}") from error
+        self._pieces = parsed_tokenizer(model_bytes)
         lacking = [name for name in CONTROL_TOKENS if self._pieces.token_to_id(name) is None]
         if lacking:
             raise ValueError(f"tokenizer lacks {', '.join(lacking)}; GR00T N1.5 reads with Eagle's tokenizer.json")
 
     @classmethod
     def from_file(cls, path: Path) -> "EagleTokenizer":
-        if not path.is_file():
+        if not path.exists() and not path.is_symlink():
             raise FileNotFoundError(
                 f"no tokenizer at {path}. GR00T N1.5 folders come without one; save Eagle's as tokenizer.json "
                 "(AutoTokenizer.save_pretrained writes it) and give its path with --tokenizer."
             )
-        return cls(path.read_bytes())
+        require_file(path, MAX_TOKENIZER_BYTES)
+        try:
+            return cls(path.read_bytes())
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
 
     @property
     def vocab_size(self) -> int:

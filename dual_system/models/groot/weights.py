@@ -15,7 +15,8 @@ from torch import Tensor
 
 from dual_system.models.groot.network import GrootConfig
 from dual_system.models.groot.pounce import GrootPounce
-from dual_system.models.public_layout import COGNITION, assign, read_tensors, renamed, write_tensors
+from dual_system.models.public_layout import COGNITION, assign, renamed, require_fit, write_tensors
+from dual_system.models.stored_tensors import StoredTensors
 
 _EAGLE = "backbone.eagle_model."
 _VISION = _EAGLE + "vision_model.vision_model."
@@ -81,19 +82,25 @@ def save_weights(model: GrootPounce, path: Path) -> None:
 
 def read_weights(path: Path) -> dict[str, Tensor]:
     """Reads a file (or shards) in the public layout without its unused tensors; keys are NVIDIA's names."""
-
-    def is_used(name: str) -> bool:
-        name = name.removeprefix(LEROBOT_PREFIX)
-        return name != _LM_HEAD and not name.startswith(_POOLING_HEAD)
-
-    return {name.removeprefix(LEROBOT_PREFIX): tensor for name, tensor in read_tensors(path, is_used).items()}
+    return dict(_stored(path).read())
 
 
 def load_weights(model: GrootPounce, path: Path) -> bool:
     """Loads ``path`` into ``model``, float32 throughout; returns whether the file held a cognition prefix.
 
     Raises:
-        FileNotFoundError: neither the file nor an index of shards is there.
-        WeightsError: a tensor is missing, unknown or of another shape.
+        OSError: neither the file nor an index of shards is there, or it may not be read.
+        CheckpointError: as `StoredTensors`; WeightsError: a tensor is missing, unknown or of another shape.
     """
+    require_fit(model, _stored(path).shapes, public_name, str(path))
     return assign(model, read_weights(path), public_name, str(path))
+
+
+def _stored(path: Path) -> StoredTensors:
+    """The tensors that are used, without lerobot's prefix."""
+
+    def used(name: str) -> str | None:
+        name = name.removeprefix(LEROBOT_PREFIX)
+        return None if name == _LM_HEAD or name.startswith(_POOLING_HEAD) else name
+
+    return StoredTensors.of(path).named(used)

@@ -7,7 +7,6 @@ which is no dependency of this project because nothing else uses it.
 # W width, h heads, g key heads, D head dim, M mlp width
 
 import importlib
-import json
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -18,7 +17,9 @@ from torch import Tensor
 
 from dual_system.models.pi05.pounce import Pounce
 from dual_system.models.pi05.weights import public_name
-from dual_system.models.public_layout import WeightsError, assign
+from dual_system.models.public_layout import assign
+from dual_system.models.stored_tensors import WeightsError, require_finite
+from protocol.files import read_object
 
 METADATA_FILE = "_METADATA"
 
@@ -141,7 +142,7 @@ def read_params(folder: Path) -> dict[str, Tensor]:
     Raises:
         FileNotFoundError: the folder is no orbax checkpoint.
         ValueError: tensorstore is not installed.
-        WeightsError: an array cannot be read.
+        WeightsError: an array cannot be read; CheckpointError: it has numbers that are not finite.
     """
     if not (folder / METADATA_FILE).is_file():
         raise FileNotFoundError(f"{folder} is no orbax checkpoint (no {METADATA_FILE}); openpi's is called params/")
@@ -149,10 +150,9 @@ def read_params(folder: Path) -> dict[str, Tensor]:
         tensorstore = importlib.import_module("tensorstore")
     except ModuleNotFoundError as error:
         raise ValueError(f"{folder} is a JAX checkpoint; pip install tensorstore to read it") from error
-    leaves = json.loads((folder / METADATA_FILE).read_text())["tree_metadata"].values()
+    paths = _leaves(folder / METADATA_FILE)
     arrays = {}
-    for leaf in leaves:
-        path = [str(key["key"]) for key in leaf["key_metadata"]]
+    for path in paths:
         store = {"driver": "ocdbt", "base": f"file://{folder.resolve()}", "path": ".".join(path) + "/"}
         try:
             array = (
@@ -162,7 +162,17 @@ def read_params(folder: Path) -> dict[str, Tensor]:
             raise WeightsError(str(folder), {"unreadable": [f"{'/'.join(path)}: {error}"]}) from error
         name = "/".join(path).removeprefix("params/").removesuffix("/value")
         arrays[name] = torch.from_numpy(np.ascontiguousarray(array, np.float32))
+        require_finite(arrays[name], name, folder)
     return arrays
+
+
+def _leaves(path: Path) -> list[list[str]]:
+    """Paths of the arrays. Raises ValueError if orbax's metadata does not list them."""
+    try:
+        leaves = read_object(path)["tree_metadata"].values()
+        return [[str(key["key"]) for key in leaf["key_metadata"]] for leaf in leaves]
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path} lists no arrays (tree_metadata, key_metadata): {error!r}") from None
 
 
 def load_jax_weights(model: Pounce, folder: Path) -> None:

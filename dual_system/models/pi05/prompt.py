@@ -14,6 +14,8 @@ import numpy as np
 import sentencepiece
 from numpy.typing import ArrayLike
 
+from protocol.files import MAX_TOKENIZER_BYTES, require_file
+
 NUM_BINS = 256
 TINY_VOCAB_SIZE = 512
 _MAX_PIECE = 64  # characters
@@ -82,12 +84,16 @@ class Tokenizer:
 
     @classmethod
     def from_file(cls, path: Path) -> "Tokenizer":
-        if not path.is_file():
+        if not path.exists() and not path.is_symlink():
             raise FileNotFoundError(
                 f"no tokenizer at {path}. Public pi0.5 weights need PaliGemma's SentencePiece file "
                 "(gs://big_vision/paligemma_tokenizer.model, 257152 ids); give its path with --tokenizer."
             )
-        return cls(path.read_bytes())
+        require_file(path, MAX_TOKENIZER_BYTES)
+        try:
+            return cls(path.read_bytes())
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
 
     @property
     def vocab_size(self) -> int:

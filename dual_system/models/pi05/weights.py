@@ -16,9 +16,8 @@ from torch import Tensor
 
 from dual_system.models.pi05.network import Pi05Config
 from dual_system.models.pi05.pounce import Pounce
-from dual_system.models.public_layout import COGNITION, WeightsError, assign, read_tensors, renamed, write_tensors
-
-__all__ = ["WeightsError", "load_weights", "public_name", "read_weights", "save_weights", "unused_shapes"]
+from dual_system.models.public_layout import COGNITION, assign, renamed, require_fit, write_tensors
+from dual_system.models.stored_tensors import StoredTensors, WeightsError
 
 _ROOT = "paligemma_with_expert."
 _PALIGEMMA = _ROOT + "paligemma.model."
@@ -61,10 +60,12 @@ def save_weights(model: Pounce, path: Path) -> None:
 
 
 def read_weights(path: Path) -> dict[str, Tensor]:
-    """Reads a file (or shards) in the public layout and undoes its peculiarities; keys are canonical public names."""
-    tensors = read_tensors(path, lambda name: not name.endswith(_UNUSED_HEAD))
-    if any(name.startswith(_LEROBOT_PREFIX + _ROOT) for name in tensors):
-        tensors = {name.removeprefix(_LEROBOT_PREFIX): tensor for name, tensor in tensors.items()}
+    """Reads a file (or shards) in the public layout and undoes its peculiarities; keys are canonical public names.
+
+    Raises:
+        CheckpointError: as `StoredTensors`; WeightsError: the embedding and the head that is tied to it differ.
+    """
+    tensors = dict(_stored(path).read())
     embedding = tensors.pop(_EMBEDDING, None)
     if embedding is not None:
         tied = tensors.setdefault(_TIED_HEAD, embedding)
@@ -79,7 +80,20 @@ def load_weights(model: Pounce, path: Path) -> bool:
     A public pi0.5 file has none: the model then keeps its own prefix parameters.
 
     Raises:
-        FileNotFoundError: neither the file nor an index of shards is there.
-        WeightsError: a tensor is missing, unknown or of another shape.
+        OSError: neither the file nor an index of shards is there, or it may not be read.
+        CheckpointError: as `StoredTensors`; WeightsError: a tensor is missing, unknown or of another shape.
     """
+    shapes = _stored(path).shapes
+    if _EMBEDDING in shapes:
+        shapes.setdefault(_TIED_HEAD, shapes.pop(_EMBEDDING))
+    require_fit(model, shapes, public_name, str(path))
     return assign(model, read_weights(path), public_name, str(path))
+
+
+def _stored(path: Path) -> StoredTensors:
+    """The tensors that are used, without lerobot's prefix."""
+
+    def used(name: str) -> str | None:
+        return None if name.endswith(_UNUSED_HEAD) else name.removeprefix(_LEROBOT_PREFIX)
+
+    return StoredTensors.of(path).named(used)

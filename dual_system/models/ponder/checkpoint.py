@@ -11,13 +11,13 @@ the dtype it was written in, it is written back bit for bit, multi-token predict
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, cast
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 from transformers.models.qwen3_5 import Qwen3_5Config
@@ -28,6 +28,15 @@ from dual_system.models.ponder.demo_sampling import PAPER_SAMPLING, DemoSampling
 from dual_system.models.ponder.network import Ponder, image_grid, skeleton, token_px
 from dual_system.models.ponder.observation import WHOLE_VIEWS, ObservationReader
 from dual_system.models.ponder.vocabulary import Vocabulary
+from dual_system.models.stored_tensors import (
+    CheckpointError,
+    StoredTensors,
+    WeightsError,
+    refuse_quantised,
+    require_layers,
+    require_shapes,
+)
+from protocol.files import read_object
 
 CONFIG_NAME = "config.json"
 OWN_NAME = "ponder.json"
@@ -37,11 +46,7 @@ SMALL_PAIR = "small_pair"
 """Key of ponder.json under which the demo's PONDER declares its `CropReader`."""
 MTP_PREFIX = "mtp."  # multi-token prediction: in public checkpoints, not in transformers' Qwen3.5
 MAX_SHARD_BYTES = 5_000_000_000
-MAX_NAMES_SHOWN = 5
-
-
-class CheckpointError(ValueError):
-    """A checkpoint folder does not hold the network its config.json describes."""
+_HEAD, _EMBEDDING = "lm_head.weight", "model.language_model.embed_tokens.weight"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,25 +67,36 @@ class StoredPonder:
 def load_ponder(directory: Path, *, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Ponder:
     """Reads a checkpoint folder.
 
-    Raises FileNotFoundError for a missing file, CheckpointError naming every missing, extra or misshapen tensor,
-    and ValueError for an inconsistent configuration.
+    Raises:
+        OSError: a file is missing or may not be read.
+        CheckpointError: tensors are missing, unknown, misshapen, quantised or not finite; the message names them.
+        ValueError: a file is broken or a Git LFS pointer, or the configuration is inconsistent.
     """
     config_path = directory / CONFIG_NAME
-    if not config_path.is_file():
+    if not config_path.exists() and not config_path.is_symlink():
         raise FileNotFoundError(f"{config_path}: not a checkpoint folder (--checkpoint DIR needs config.json).")
-    raw = _read_json(config_path)
+    raw = read_object(config_path)
     if raw.get("model_type") != "qwen3_5":
         raise CheckpointError(f"{config_path}: model_type is {raw.get('model_type')!r}; PONDER reads 'qwen3_5'.")
-    qwen_config = Qwen3_5Config.from_dict(raw)
+    refuse_quantised(raw, config_path)
+    tensors = StoredTensors.of(directory / SINGLE_NAME)
+    require_layers(raw, tensors, config_path)
     vocabulary = Vocabulary.load(directory)
     stored, reader = _read_stored(directory)
+    with _describing_a_network(config_path):
+        _require_dtypes(raw)
+        qwen_config = Qwen3_5Config.from_dict(raw)
+        shapes = {name: tuple(tensor.shape) for name, tensor in _own_tensors(skeleton(qwen_config)).items()}
+        if any(name.startswith(MTP_PREFIX) for name in tensors.shapes):
+            shapes |= mtp_shapes(qwen_config.text_config, shapes)
+        grid, side_px = image_grid(qwen_config, stored.image_px), token_px(qwen_config)
     first_carrier_id = stored.first_carrier_id
     context_format = ContextFormat(
         vocabulary=vocabulary,
         num_carriers=stored.num_carriers,
         first_carrier_id=vocabulary.num_tokens if first_carrier_id is None else first_carrier_id,
-        image_grid=image_grid(qwen_config, stored.image_px),
-        token_px=token_px(qwen_config),
+        image_grid=grid,
+        token_px=side_px,
         reader=reader,
         speaks=stored.speaks,
         demonstrations=stored.demonstrations,
@@ -90,14 +106,12 @@ def load_ponder(directory: Path, *, device: torch.device | str = "cpu", dtype: t
             f"{config_path}: image_token_id is {qwen_config.image_token_id}, but tokenizer.json says "
             f"<|image_pad|> is {vocabulary.image_pad}; the two files are from different checkpoints."
         )
-    files = _files_by_tensor(directory)
-    shapes = {name: tuple(tensor.shape) for name, tensor in _own_tensors(skeleton(qwen_config)).items()}
-    if any(name.startswith(MTP_PREFIX) for name in files):
-        shapes |= mtp_shapes(qwen_config.text_config, shapes)
-    _check_tensors(directory, files, shapes, tied=qwen_config.tie_word_embeddings)
+    is_tied = bool(qwen_config.tie_word_embeddings)
+    found = {name: shape for name, shape in tensors.shapes.items() if not (is_tied and name == _HEAD)}
+    require_shapes(shapes, found, str(directory))
     ponder = Ponder(qwen_config, context_format, image_px=stored.image_px, device=device, dtype=dtype)
     ponder.is_random = stored.is_random
-    _read_tensors(files, ponder)
+    _fill(ponder, tensors, directory)
     return ponder
 
 
@@ -185,26 +199,31 @@ def _own_tensors(module: nn.Module) -> dict[str, Tensor]:
     return own
 
 
-def _read_json(path: Path) -> Any:
+@contextmanager
+def _describing_a_network(config_path: Path) -> Iterator[None]:
+    """Turns whatever transformers and torch raise of sizes that fit no network into a `CheckpointError`."""
     try:
-        return json.loads(path.read_text())
-    except ValueError as error:
-        raise CheckpointError(f"{path} is no JSON: {error}") from error
+        yield
+    except Exception as error:
+        told = " ".join(str(error).split())[:300]
+        raise CheckpointError(f"{config_path} describes no Qwen3.5 network: {type(error).__name__}: {told}") from error
 
 
-def _open(path: Path) -> Any:
-    try:
-        return safe_open(path, framework="pt")
-    except SafetensorError as error:
-        raise CheckpointError(f"{path} is no safetensors file, or was cut short: {error}") from error
+def _require_dtypes(values: dict[str, Any]) -> None:
+    """Raises ValueError if a dtype is none of torch's: transformers looks it up as any attribute of torch."""
+    for name, value in values.items():
+        if isinstance(value, dict):
+            _require_dtypes(value)
+        elif name in ("dtype", "torch_dtype") and value not in (None, "float32", "bfloat16", "float16", "float64"):
+            raise ValueError(f"{name} is {value!r}, expected a floating dtype")
 
 
 def _read_stored(directory: Path) -> tuple[StoredPonder, ObservationReader]:
     path = directory / OWN_NAME
     if not path.is_file():
         return StoredPonder(), WHOLE_VIEWS
-    values = _read_json(path)
-    declared = values.pop(SMALL_PAIR, None) if isinstance(values, dict) else None
+    values = read_object(path)
+    declared = values.pop(SMALL_PAIR, None)
     stored = from_json(StoredPonder, values, str(path))
     if declared is None:
         return stored, WHOLE_VIEWS
@@ -213,51 +232,18 @@ def _read_stored(directory: Path) -> tuple[StoredPonder, ObservationReader]:
     return stored, from_json(CropReader, declared, f"{path}: {SMALL_PAIR}")
 
 
-def _files_by_tensor(directory: Path) -> dict[str, Path]:
-    """Tensor name -> the safetensors file that holds it."""
-    index_path = directory / INDEX_NAME
-    if index_path.is_file():
-        weight_map: dict[str, str] = _read_json(index_path)["weight_map"]
-        for file_name in sorted(set(weight_map.values())):
-            if not (directory / file_name).is_file():
-                raise FileNotFoundError(f"{directory / file_name}: named by {INDEX_NAME}, but not there.")
-        return {name: directory / file_name for name, file_name in weight_map.items()}
-    single = directory / SINGLE_NAME
-    if not single.is_file():
-        raise FileNotFoundError(f"{directory}: neither {SINGLE_NAME} nor {INDEX_NAME} is there.")
-    with _open(single) as file:
-        return dict.fromkeys(file.keys(), single)
-
-
-def _check_tensors(
-    directory: Path, files: dict[str, Path], expected_shapes: dict[str, tuple[int, ...]], *, tied: bool
-) -> None:
-    found = set(files)
-    if tied:
-        found.discard("lm_head.weight")  # some exporters write the tied tensor twice
-    faults = [f"missing {name} {expected_shapes[name]}" for name in sorted(set(expected_shapes) - found)]
-    faults += [f"extra {name}" for name in sorted(found - set(expected_shapes))]
-    for path in sorted(set(files.values())):
-        with _open(path) as file:
-            in_file = set(file.keys())
-            for name in sorted(n for n in found & set(expected_shapes) if files[n] == path):
-                if name not in in_file:
-                    faults.append(f"missing {name}: {INDEX_NAME} places it in {path.name}, which lacks it")
-                elif (shape := tuple(file.get_slice(name).get_shape())) != expected_shapes[name]:
-                    faults.append(f"misshapen {name}: {shape}, config.json says {expected_shapes[name]}")
-    if faults:
-        rest = len(faults) - MAX_NAMES_SHOWN
-        shown = "; ".join(faults[:MAX_NAMES_SHOWN]) + (f"; and {rest} more" if rest > 0 else "")
-        raise CheckpointError(f"{directory} does not match its config.json ({len(faults)} faults): {shown}.")
-
-
 @torch.no_grad()
-def _read_tensors(files: dict[str, Path], ponder: Ponder) -> None:
+def _fill(ponder: Ponder, tensors: StoredTensors, directory: Path) -> None:
+    """Copies the stored numbers. Raises WeightsError if a head that is tied to the embedding is stored and differs."""
     own = _own_tensors(ponder.qwen)
-    for path in sorted(set(files.values())):
-        with _open(path) as file:
-            for name in file.keys():  # noqa: SIM118 - safe_open is not a mapping
-                if name in own and files.get(name) == path:
-                    own[name].copy_(file.get_tensor(name))
-                elif name.startswith(MTP_PREFIX) and files.get(name) == path:
-                    ponder.mtp[name] = file.get_tensor(name)  # memory-mapped: costs no memory until it is used
+    head: Tensor | None = None
+    for name, tensor in tensors.read():
+        if name in own:
+            own[name].copy_(tensor)
+        elif name.startswith(MTP_PREFIX):
+            ponder.mtp[name] = tensor  # memory-mapped: it costs no memory of its own until it is used
+        else:
+            head = tensor  # some exporters write the tied tensor twice
+    embedding = own[_EMBEDDING]
+    if head is not None and not torch.equal(head.to(embedding.dtype), embedding.to("cpu")):
+        raise WeightsError(str(directory), {"tied tensors that differ (tie_word_embeddings)": [_HEAD, _EMBEDDING]})

@@ -34,8 +34,8 @@ from dual_system.models.pounce.checkpoint import (
     PounceBundle,
     load_bundle,
 )
-from dual_system.models.pounce.family import tensor_shapes
-from dual_system.models.public_layout import COGNITION, read_tensors, write_tensors
+from dual_system.models.public_layout import COGNITION, write_tensors
+from dual_system.models.stored_tensors import StoredTensors
 from protocol.command_line import parse
 
 PREFIX_FILE = "pounce_prefix.safetensors"
@@ -120,7 +120,7 @@ def _set_prefix_apart(path: Path, prefix_path: Path, leading: str) -> None:
     Raises:
         ValueError: the state enters as a token, which public pi0.5 does not support.
     """
-    tensors = read_tensors(path)
+    tensors = dict(StoredTensors.of(path).read())
     ours = {name: tensor for name, tensor in tensors.items() if name.startswith(COGNITION)}
     if any(name.startswith(_STATE_TOKEN) for name in tensors):
         raise ValueError(
@@ -134,7 +134,7 @@ def _set_prefix_apart(path: Path, prefix_path: Path, leading: str) -> None:
 
 def _check_groot(model: GrootPounce, out: Path) -> None:
     """Raises ValueError unless the folder determines the network; SigLIP's head count, for one, is not in it."""
-    shapes, values = tensor_shapes(out / WEIGHTS_FILE), json.loads((out / CONFIG_FILE).read_text())
+    shapes, values = StoredTensors.of(out / WEIGHTS_FILE).shapes, json.loads((out / CONFIG_FILE).read_text())
     found = groot_config_of(shapes, values, str(out))
     if found != (model.config.groot, model.config.num_steps):
         raise ValueError(

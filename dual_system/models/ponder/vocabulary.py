@@ -16,6 +16,9 @@ from typing import Any, Self
 
 from tokenizers import Regex, Tokenizer, decoders, models, normalizers, pre_tokenizers, trainers
 
+from dual_system.models.tokenizer_file import parsed_tokenizer
+from protocol.files import MAX_TOKENIZER_BYTES, require_file
+
 T_YES = "<|fim_prefix|>"
 T_NO = "<|fim_pad|>"
 END_OF_TEXT = "<|endoftext|>"
@@ -85,11 +88,20 @@ class Vocabulary:
 
     @classmethod
     def load(cls, directory: Path) -> Self:
-        """Reads ``tokenizer.json`` of a checkpoint folder. Raises FileNotFoundError if it is missing."""
+        """Reads ``tokenizer.json`` of a checkpoint folder.
+
+        Raises:
+            OSError: it is missing or may not be read.
+            ValueError: it is a Git LFS pointer, no tokenizer, or lacks a control token.
+        """
         path = directory / "tokenizer.json"
-        if not path.is_file():
+        if not path.exists() and not path.is_symlink():
             raise FileNotFoundError(f"{path}: a checkpoint needs its tokenizer.json beside config.json.")
-        return cls(Tokenizer.from_file(str(path)))
+        require_file(path, MAX_TOKENIZER_BYTES)
+        try:
+            return cls(parsed_tokenizer(path.read_bytes()))
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
 
     @classmethod
     def tiny(cls) -> Self:

@@ -5,6 +5,7 @@ The format in config.json names the family; a public folder's family is recognis
 
 import hashlib
 import json
+import logging
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias
@@ -28,10 +29,13 @@ from dual_system.models.pounce.family import (
     load_weights,
     random_model,
     save_weights,
-    tensor_shapes,
 )
 from dual_system.models.pounce.initialise import initialise_prefix
-from dual_system.models.public_layout import weights_files
+from dual_system.models.public_statistics import read_statistics, statistics_files
+from dual_system.models.stored_tensors import CheckpointError, StoredTensors, refuse_quantised, require_layers
+from protocol.files import read_object
+
+log = logging.getLogger(__name__)
 
 AnyTokenizer: TypeAlias = Tokenizer | EagleTokenizer
 
@@ -157,7 +161,7 @@ def save_bundle(bundle: PounceBundle, folder: Path) -> None:
 
 def declares_config(folder: Path) -> bool:
     """Whether a folder's config.json is in our format; a public folder's is not."""
-    return _read_config(folder / CONFIG_FILE) is not None
+    return _read_config(folder / CONFIG_FILE)[1] is not None
 
 
 def load_bundle(
@@ -168,33 +172,41 @@ def load_bundle(
     tokenizer: Path | None = None,
     prefix_seed: int = 0,
 ) -> PounceBundle:
-    """Reads our own folder, or a public one, which gets RoboMME's statistics unless others are given.
+    """Reads our own folder, or a public one; the latter's statistics are its own, or else RoboMME's, and are logged.
 
     Public folders: openpi's pi0.5 (PyTorch, or JAX in ``params/``) and lerobot's; NVIDIA's GR00T N1.5, in shards or
     not, and lerobot's ``groot``.
 
     Args:
         config: for a public folder; default `pi05_base()`, or for GR00T the folder's own.
-        statistics: for a public folder; ``config`` must be in their action space.
+        statistics: for a public folder, in place of its own; ``config`` must be in their action space.
         tokenizer: tokenizer file; default the folder's tokenizer.model (pi0.5) or tokenizer.json (GR00T).
         prefix_seed: seed of the cognition prefix if the folder has none.
 
     Raises:
-        FileNotFoundError: no weights, or no tokenizer anywhere.
-        WeightsError: the tensors do not fit the configuration.
-        ValueError: our config.json does not parse, or ``config`` or ``statistics`` is given although the folder has
-            its own.
+        OSError: no weights, no tokenizer anywhere, or a file that may not be read.
+        CheckpointError: the tensors do not fit the configuration, are quantised, or not finite.
+        ValueError: a file is broken or a Git LFS pointer, a public folder's statistics are not of this robot, or
+            ``config`` or ``statistics`` is given although the folder has its own.
     """
     is_jax = (folder / JAX_FOLDER / METADATA_FILE).is_file()
-    if not is_jax:
-        weights_files(folder / WEIGHTS_FILE)  # a folder without weights fails here, before other checks
-    stored = _read_config(folder / CONFIG_FILE)
+    tensors = None if is_jax else StoredTensors.of(folder / WEIGHTS_FILE)
+    values, stored = _read_config(folder / CONFIG_FILE)
+    if tensors is not None:
+        require_layers(values, tensors, folder / CONFIG_FILE)
     if stored is not None:
         for name, given in (("config", config), ("statistics", statistics)):
             if given is not None:
                 raise ValueError(f"checkpoint {folder} has its own {CONFIG_FILE}; leave the {name} argument out")
         config, statistics = stored.config, stored.statistics
-    model = blank_model(config or (pi05_base() if is_jax else _public_config(folder)))
+    else:
+        statistics = _public_statistics(folder, statistics)
+    if config is None:
+        config = pi05_base() if tensors is None else _public_config(tensors, values, folder)
+    try:
+        model = blank_model(config)
+    except (ArithmeticError, RuntimeError) as error:
+        raise CheckpointError(f"{folder / CONFIG_FILE} describes no network: {error}") from error
     has_prefix = _load_jax(model, folder) if is_jax else load_weights(model, folder / WEIGHTS_FILE)
     if not has_prefix:
         initialise_prefix(model, torch.Generator().manual_seed(prefix_seed))
@@ -202,7 +214,7 @@ def load_bundle(
     return PounceBundle(
         model=model,
         tokenizer=_read_tokenizer(model.config, tokenizer or folder / _tokenizer_file(model.config)),
-        statistics=statistics or ROBOMME,
+        statistics=statistics,
         is_random=stored is not None and stored.is_random,
         has_fresh_prefix=model.cognition_prefix is not None and not is_prefix_trained,
     )
@@ -216,12 +228,24 @@ def _load_jax(model: AnyPounce, folder: Path) -> bool:
     return False
 
 
-def _public_config(folder: Path) -> AnyPounceConfig:
-    weights_path = folder / WEIGHTS_FILE
-    if family_of(weights_path) == "pi05":
+def _public_config(tensors: StoredTensors, values: dict[str, Any] | None, folder: Path) -> AnyPounceConfig:
+    if family_of(tensors.shapes, str(folder / WEIGHTS_FILE)) == "pi05":
         return pi05_base()
-    groot, num_steps = groot_config_of(tensor_shapes(weights_path), _json_of(folder / CONFIG_FILE), str(folder))
+    groot, num_steps = groot_config_of(tensors.shapes, values, str(folder))
     return replace(groot_n1_5(), groot=groot, num_steps=num_steps)
+
+
+def _public_statistics(folder: Path, given: RobotStatistics | None) -> RobotStatistics:
+    """Those given, else the folder's own, else RoboMME's; the log says which, since the policy depends on them."""
+    if given is not None:
+        if brought := statistics_files(folder):
+            log.warning("statistics: given ones in place of %s", ", ".join(map(str, brought)))
+        return given
+    if (found := read_statistics(folder)) is not None:
+        log.warning("statistics: from %s, taken as those of joint deltas and a gripper", statistics_files(folder)[0])
+        return found
+    log.warning("statistics: %s brings none; RoboMME's published table is used", folder)
+    return ROBOMME
 
 
 def _tokenizer_file(config: AnyPounceConfig) -> str:
@@ -232,19 +256,14 @@ def _read_tokenizer(config: AnyPounceConfig, path: Path) -> AnyTokenizer:
     return Tokenizer.from_file(path) if isinstance(config, PounceConfig) else EagleTokenizer.from_file(path)
 
 
-def _json_of(path: Path) -> dict[str, Any] | None:
-    if not path.is_file():
-        return None
-    values = json.loads(path.read_text())
-    return values if isinstance(values, dict) else None
-
-
-def _read_config(path: Path) -> AnyStoredConfig | None:
-    """Returns None for a public folder: no config.json, or one that is not in our format."""
-    values = _json_of(path)
-    if values is None or values.get("format") not in (FORMAT, GROOT_FORMAT):
-        return None
-    is_pi05 = values["format"] == FORMAT
-    if is_pi05:
-        return from_json(StoredConfig, values, path.name)
-    return from_json(StoredGrootConfig, values, path.name)
+def _read_config(path: Path) -> tuple[dict[str, Any] | None, AnyStoredConfig | None]:
+    """Returns the parsed config.json, None without one, and the config in it, None if it is not in our format."""
+    if not path.exists() and not path.is_symlink():
+        return None, None
+    values = read_object(path)
+    refuse_quantised(values, path)
+    if values.get("format") == FORMAT:
+        return values, from_json(StoredConfig, values, path.name)
+    if values.get("format") == GROOT_FORMAT:
+        return values, from_json(StoredGrootConfig, values, path.name)
+    return values, None

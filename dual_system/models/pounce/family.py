@@ -1,10 +1,10 @@
 """One interface to both action models, pi0.5 and GR00T: build, initialise, load and save by the config's type."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal, TypeAlias
 
 import torch
-from safetensors import SafetensorError, safe_open
 
 from dual_system.models import flow
 from dual_system.models.groot import flow as groot_flow
@@ -13,7 +13,7 @@ from dual_system.models.groot.pounce import GrootInputs, GrootPounce, GrootPounc
 from dual_system.models.pi05 import weights as pi05_weights
 from dual_system.models.pi05.pounce import Pounce, PounceConfig, PounceInputs
 from dual_system.models.pounce.initialise import random_groot_pounce, random_pounce
-from dual_system.models.public_layout import WeightsError, weights_files
+from dual_system.models.stored_tensors import WeightsError
 
 Family: TypeAlias = Literal["pi05", "groot"]
 AnyPounce: TypeAlias = Pounce | GrootPounce
@@ -81,34 +81,16 @@ def save_weights(model: AnyPounce, path: Path) -> None:
         groot_weights.save_weights(model, path)
 
 
-def tensor_shapes(path: Path) -> dict[str, tuple[int, ...]]:
-    """Returns the shapes in a file or its shards, without reading their numbers.
-
-    Raises:
-        FileNotFoundError: neither the file nor an index of shards is there.
-        WeightsError: a file does not parse.
-    """
-    shapes: dict[str, tuple[int, ...]] = {}
-    for file_path in weights_files(path):
-        try:
-            with safe_open(file_path, framework="pt") as file:
-                names = list(file.keys())
-                shapes |= {name: tuple(file.get_slice(name).get_shape()) for name in names}
-        except SafetensorError as error:
-            raise WeightsError(str(file_path), {"unreadable": [str(error)]}) from error
-    return shapes
-
-
-def family_of(path: Path) -> Family:
+def family_of(names: Iterable[str], source: str) -> Family:
     """Recognises by tensor names which model a file holds.
 
     Raises:
         WeightsError: it holds neither.
     """
-    names = list(tensor_shapes(path))
+    names = list(names)
     for family, mark in _MARKS.items():
         if any(mark in name for name in names):
             return family
     raise WeightsError(
-        str(path), {f"tensors, none of them pi0.5's ({_MARKS['pi05']}*) or GR00T N1.5's ({_MARKS['groot']}*)": names}
+        source, {f"tensors, none of them pi0.5's ({_MARKS['pi05']}*) or GR00T N1.5's ({_MARKS['groot']}*)": names}
     )

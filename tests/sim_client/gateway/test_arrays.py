@@ -66,6 +66,7 @@ def test_a_message_that_was_cut_off_is_refused(cut: int) -> None:
         {"__ndarray__": True, "data": b"12345678", "dtype": "|O", "shape": [1]},
         {"__ndarray__": True, "data": b"1234", "dtype": "f4,f4", "shape": [1]},
         {"__ndarray__": True, "data": b"1234", "dtype": "<U1", "shape": [1]},
+        {"__ndarray__": True, "data": b"", "dtype": "<U0", "shape": [2**40]},
         {"__ndarray__": True, "data": b"1234", "dtype": "<f4", "shape": [2]},
         {"__ndarray__": True, "data": b"1234", "dtype": "<f4", "shape": [2**40, 2**40]},
         {"__ndarray__": True, "data": b"1234", "dtype": "<f4", "shape": [-1]},
@@ -83,6 +84,12 @@ def test_an_array_that_is_not_what_it_says_is_refused(item: dict[str, Any]) -> N
     if "__ndarray__" in item:
         with pytest.raises(Refused, match="expected"):
             unpack(msgpack.packb({key.encode(): value for key, value in item.items()}))
+
+
+@pytest.mark.parametrize("texts", [np.asarray("press ●"), np.asarray(["press", "the button"])])
+def test_an_array_of_texts_is_texts(texts: np.ndarray) -> None:
+    fields = {"__ndarray__": True, "data": texts.tobytes(), "dtype": texts.dtype.str, "shape": texts.shape}
+    assert unpack(msgpack.packb({key.encode(): value for key, value in fields.items()})) == texts.tolist()
 
 
 def test_a_message_of_brackets_only_is_refused() -> None:
