@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import logging
 import sys
+import time
+from contextlib import ExitStack
 
 from clock.config import ClockOptions
 from clock.service import ClockService
+from clock.status import end_of
 from protocol.command_line import parse
 from protocol.errors import TransportError
 from protocol.link import Link
+from protocol.metrics import Metrics
 from protocol.process import IDLE_WAIT_NS, StopFlag, freeze_heap, set_up_logging
+from protocol.status import status_of
 from protocol.zenoh_bus import open_bus
 
 log = logging.getLogger("clock-serve")
@@ -18,23 +23,27 @@ log = logging.getLogger("clock-serve")
 
 def main(argv: list[str] | None = None) -> int:
     options = parse(ClockOptions, argv, prog="clock-serve")
-    set_up_logging()
+    operations, robot = options.operations, options.link.robot
     should_stop = StopFlag()
-    try:
-        config = options.service()
-        bus = open_bus(options.link)
-    except (TransportError, ValueError, OSError) as error:
-        print(f"clock-serve: {error}", file=sys.stderr)
-        return 2
-    service = ClockService(Link(bus, robot=options.link.robot, proc="clock"), config)
-    log.info("ready robot=%s listen=%s", options.link.robot, ",".join(options.link.listen))
-    freeze_heap()
-    try:
+    metrics = Metrics()
+    with ExitStack() as opened:
+        try:
+            set_up_logging()
+            opened.enter_context(status_of(metrics, operations))
+            config = options.service()
+            bus = open_bus(options.link)
+        except (TransportError, ValueError, OSError) as error:
+            print(f"clock-serve: {error}", file=sys.stderr)
+            return 2
+        opened.callback(bus.close)
+        link = Link(bus, robot=robot, proc="clock")
+        service = ClockService(link, config)
+        metrics.watch(end_of(service, link, lambda: time.monotonic_ns() - should_stop.asked_ns))
+        log.info("ready robot=%s listen=%s", robot, ",".join(options.link.listen))
+        freeze_heap()
         while not should_stop():
             if not service.step():
                 bus.wait(service.wait_ns(IDLE_WAIT_NS))
-    finally:
-        bus.close()
     return 0
 
 

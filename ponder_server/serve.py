@@ -31,6 +31,10 @@ class PonderServer(ModelShell):
         self._node = PonderNode(engine.spec)
         self._queries = link.subscribe(topics.QUERY)
 
+    @property
+    def num_superseded(self) -> int:
+        return self._node.num_superseded
+
     def _weights_note(self) -> str:
         spec = self._engine.spec
         if spec.weights == "float":

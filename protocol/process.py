@@ -8,6 +8,7 @@ import os
 import platform
 import signal
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
@@ -24,10 +25,15 @@ PARENT_VARIABLE = "PONDERPOUNCE_PARENT_PID"
 
 
 class StopFlag:
-    """True after SIGTERM or SIGINT, or once the parent process died; the loop then ends normally."""
+    """True after SIGTERM or SIGINT, or once the parent process died; the loop then ends normally.
+
+    Attributes:
+        asked_ns: when the loop last asked (monotonic), which shows that it turns.
+    """
 
     def __init__(self) -> None:
         self.is_set = False
+        self.asked_ns = time.monotonic_ns()
         self._parent_pid = int(os.environ.get(PARENT_VARIABLE, "0"))
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._set)
@@ -36,6 +42,7 @@ class StopFlag:
         self.is_set = True
 
     def __call__(self) -> bool:
+        self.asked_ns = time.monotonic_ns()
         return self.is_set or (self._parent_pid > 0 and os.getppid() != self._parent_pid)
 
 
