@@ -24,12 +24,12 @@ log = logging.getLogger("clock-serve")
 def main(argv: list[str] | None = None) -> int:
     options = parse(ClockOptions, argv, prog="clock-serve")
     operations, robot = options.operations, options.link.robot
-    should_stop = StopFlag()
+    should_stop = StopFlag(drains=True, sigterm_drains=operations.drain)
     metrics = Metrics()
     with ExitStack() as opened:
         try:
             set_up_logging()
-            opened.enter_context(status_of(metrics, operations))
+            opened.enter_context(status_of(metrics, operations, lambda: should_stop.is_draining))
             config = options.service()
             bus = open_bus(options.link)
         except (TransportError, ValueError, OSError) as error:
@@ -41,7 +41,7 @@ def main(argv: list[str] | None = None) -> int:
         metrics.watch(end_of(service, link, lambda: time.monotonic_ns() - should_stop.asked_ns))
         log.info("ready robot=%s listen=%s", robot, ",".join(options.link.listen))
         freeze_heap()
-        while not should_stop():
+        while not (should_stop() or (should_stop.is_draining and service.drain())):
             if not service.step():
                 bus.wait(service.wait_ns(IDLE_WAIT_NS))
     return 0

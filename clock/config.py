@@ -9,7 +9,7 @@ import tyro
 
 from clock.residual import DEFAULT_LOADER, load_head
 from clock.service import ServiceConfig
-from protocol.options import LinkOptions, OperationsOptions
+from protocol.options import DaemonOptions, LinkOptions
 from protocol.sockets import endpoint
 
 
@@ -31,7 +31,7 @@ class ClockOptions:
     residual_loader: str = DEFAULT_LOADER
     """Loader of --residual-head, as package.module:callable."""
 
-    operations: tyro.conf.OmitArgPrefixes[OperationsOptions] = field(default_factory=OperationsOptions)
+    operations: tyro.conf.OmitArgPrefixes[DaemonOptions] = field(default_factory=DaemonOptions)
 
     def service(self) -> ServiceConfig:
         """Loads the residual head. Raises ValueError or OSError if that fails."""

@@ -123,6 +123,7 @@ class ClockService:
         self._last_epoch: dict[str, int] = {}
         self._offsets: dict[str, Offset] = {}
         self._is_stepping = False
+        self._is_draining = False
         self._robot_heard_ns = 0
         self.models = ""
         self._observations = link.subscribe(OBSERVATION, keep=8)
@@ -151,6 +152,13 @@ class ClockService:
         if episode is None or due_ns is None or episode.is_lockstep:
             return longest_ns
         return max(0, min(longest_ns, due_ns - episode.now_ns))
+
+    def drain(self) -> bool:
+        """Opens no more episodes from now on; returns whether none runs."""
+        if not self._is_draining:
+            log.info("draining robot=%s episode=%s", self._link.robot, self._link.episode or "none")
+        self._is_draining = True
+        return self._episode is None
 
     def step(self) -> bool:
         if self._is_stepping:  # re-entered while waiting for a server on a LocalBus
@@ -353,6 +361,9 @@ class ClockService:
             return m.OpenReply(error=error, refusal=m.Refusal.BUSY, try_again=True)
         if self._episode is not None:
             self._finish(None)  # the same robot restarts: abandon its old episode
+        if self._is_draining:
+            error = "the clock service is draining: it leaves now, and another process takes its place"
+            return m.OpenReply(error=error, refusal=m.Refusal.NOT_READY, try_again=True)
         if info.policy != "servers":
             return self._begin(request, contracts=(), warnings=(), committed_ticks=0)
         not_ready = self.not_ready() if self._config.watches else ""

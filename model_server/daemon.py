@@ -13,7 +13,7 @@ from protocol.heartbeat import Heartbeat
 from protocol.link import Link
 from protocol.messages import ServingState
 from protocol.metrics import End, Metrics
-from protocol.options import LinkOptions, OperationsOptions
+from protocol.options import DaemonOptions, LinkOptions
 from protocol.process import StopFlag, host_clock_id, run, set_up_logging
 from protocol.status import status_of
 from protocol.version import version
@@ -41,7 +41,7 @@ def serve_model(
     weights: str,
     load: Callable[[], EngineT],
     make: Callable[[Link, EngineT, Heartbeat, str], ModelServer],
-    operations: OperationsOptions | None = None,
+    operations: DaemonOptions | None = None,
 ) -> int:
     """Runs a model server until SIGTERM or SIGINT; returns the exit status, 2 if it could not start.
 
@@ -52,15 +52,15 @@ def serve_model(
         weights: description of the weights, for logs.
         load: builds the engine; raises OSError or ValueError with a message for the user.
         make: builds the server around the engine.
-        operations: what it tells its operators; None: logs on standard error.
+        operations: what it tells its operators, and how it leaves; None: logs on standard error.
     """
-    operations = operations or OperationsOptions()
-    should_stop = StopFlag()
+    operations = operations or DaemonOptions()
+    should_stop = StopFlag(drains=True, sigterm_drains=operations.drain)
     metrics = Metrics()
     with ExitStack() as opened:
         try:
             set_up_logging()
-            opened.enter_context(status_of(metrics, operations))
+            opened.enter_context(status_of(metrics, operations, lambda: should_stop.is_draining))
             bus = open_bus(link_options)
         except TransportError as error:
             print(f"{proc}-serve: {error}", file=sys.stderr)  # noqa: T201
@@ -85,7 +85,7 @@ def serve_model(
         for shell in server.shells:
             metrics.watch(_end(shell.link, shell.heartbeat, lambda shell=shell: shell.num_superseded))  # type: ignore[misc]
         server.ready()
-        run(bus, server.step, should_stop)
+        run(bus, server.step, lambda: should_stop() or (should_stop.is_draining and _is_drained(server)))
         heartbeat.set(state=ServingState.CLOSING)
     return 0
 
@@ -93,3 +93,7 @@ def serve_model(
 def _end(link: Link, heartbeat: Heartbeat, num_superseded: Callable[[], int] = lambda: 0) -> End:
     health, silent_ns = (lambda: heartbeat.health), (lambda: heartbeat.silent_ns)
     return End(link=link, health=health, silent_ns=silent_ns, num_superseded=num_superseded)
+
+
+def _is_drained(server: ModelServer) -> bool:
+    return all([shell.drain() for shell in server.shells])  # a list: every robot is told

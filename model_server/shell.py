@@ -64,6 +64,10 @@ class ModelShell(ABC):
     def num_superseded(self) -> int:
         """Number of requests that a newer one replaced before the model read them."""
 
+    def drain(self) -> bool:
+        """Opens no more episodes from now on; returns whether none runs."""
+        return self._membership.drain()
+
     @abstractmethod
     def step(self) -> bool: ...
 

@@ -52,3 +52,12 @@ class OperationsOptions:
     """HOST:PORT for /metrics (Prometheus), /healthz and /readyz, e.g. 127.0.0.1:9448. None: no port is opened."""
     metrics_open_to_anyone: bool = False
     """Let --metrics listen beyond loopback: any host that reaches the port reads the numbers, without a password."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DaemonOptions(OperationsOptions):
+    """What a daemon tells its operators, and how it leaves."""
+
+    drain: bool = False
+    """At SIGTERM, open no more episodes and leave when the running one is over, as at SIGUSR1. A second SIGTERM, or
+    SIGINT, ends the process as usual."""

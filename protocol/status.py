@@ -5,7 +5,7 @@ from __future__ import annotations
 import ipaddress
 import logging
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http import HTTPStatus
 from http.server import ThreadingHTTPServer
@@ -24,7 +24,9 @@ _POLL_S = 0.1  # the longest that the process waits for the server when it leave
 
 
 @contextmanager
-def status_of(metrics: Metrics, options: OperationsOptions) -> Iterator[None]:
+def status_of(
+    metrics: Metrics, options: OperationsOptions, is_draining: Callable[[], bool] = lambda: False
+) -> Iterator[None]:
     """Answers at ``--metrics`` for as long as the block lasts; without the option nothing is opened.
 
     Raises:
@@ -33,7 +35,7 @@ def status_of(metrics: Metrics, options: OperationsOptions) -> Iterator[None]:
     if options.metrics is None:
         yield
         return
-    server = _Server(address_of(options), metrics)
+    server = _Server(address_of(options), metrics, is_draining)
     thread = threading.Thread(target=server.serve_forever, args=(_POLL_S,), name="status", daemon=True)
     thread.start()
     log.info("status listen=%s port=%d", *server.server_address[:2])
@@ -71,8 +73,8 @@ def _is_loopback(host: str) -> bool:
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
 
-    def __init__(self, address: tuple[str, int], metrics: Metrics) -> None:
-        self.metrics = metrics
+    def __init__(self, address: tuple[str, int], metrics: Metrics, is_draining: Callable[[], bool]) -> None:
+        self.metrics, self.is_draining = metrics, is_draining
         try:
             super().__init__(address, _Handler.factory(metrics))
         except OSError as error:
@@ -97,7 +99,8 @@ class _Handler(MetricsHandler):
         elif path == "/healthz":
             self._say([end.hang for end in ends])
         elif path == "/readyz":
-            self._say([end.unready for end in ends] if ends else ["starting"])
+            draining = "draining: no more episodes are opened here" if self.server.is_draining() else ""
+            self._say([draining, *(end.unready for end in ends)] if ends else ["starting"])
         else:
             self._say(["expected /metrics, /healthz or /readyz"], HTTPStatus.NOT_FOUND)
 

@@ -11,7 +11,7 @@ from protocol import topics
 from protocol.bus import LocalBus
 from protocol.link import Link, Stream
 from protocol.messages import Health, ServingState
-from protocol.options import LinkOptions, OperationsOptions
+from protocol.options import DaemonOptions, LinkOptions
 
 
 class Broken:
@@ -55,7 +55,7 @@ def test_a_warm_up_that_fails_is_reported(healths: Stream[Health]) -> None:
 
 def test_a_taken_metrics_port_is_a_sentence(healths: Stream[Health], capsys: pytest.CaptureFixture[str]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        options = OperationsOptions(metrics=f"127.0.0.1:{taken.getsockname()[1]}")
+        options = DaemonOptions(metrics=f"127.0.0.1:{taken.getsockname()[1]}")
         assert daemon.serve_model("ponder", LinkOptions(), "random", object, lambda *_: Broken(), options) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"ponder-serve: --metrics {options.metrics}: Address already in use")

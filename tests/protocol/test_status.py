@@ -26,6 +26,7 @@ class Process:
     def __init__(self) -> None:
         self.options = OperationsOptions(metrics=f"127.0.0.1:{free_ports(1)[0]}")
         self.health = Health(state=ServingState.READY)
+        self.is_draining = False
         self.silent_ns = 0
         self.metrics = Metrics()
 
@@ -45,7 +46,7 @@ class Process:
 @pytest.fixture
 def process() -> Iterator[Process]:
     process = Process()
-    with status_of(process.metrics, process.options):
+    with status_of(process.metrics, process.options, lambda: process.is_draining):
         yield process
 
 
@@ -74,9 +75,12 @@ def test_a_hung_server_is_not_healthy(process: Process) -> None:
     assert process.get("/healthz") == (503, "ponder of r0: its loop is silent for 12 s, limit 10 s\n")
 
 
-def test_a_ready_server_is_ready(process: Process) -> None:
+def test_a_draining_server_is_healthy_and_not_ready(process: Process) -> None:
     process.watch()
     assert process.get("/readyz") == (200, "ok\n")
+    process.is_draining = True
+    assert process.get("/readyz") == (503, "draining: no more episodes are opened here\n")
+    assert process.get("/healthz")[0] == 200
 
 
 def test_another_path_is_named(process: Process) -> None:
