@@ -13,8 +13,9 @@ from clock.status import end_of
 from protocol.command_line import parse
 from protocol.errors import TransportError
 from protocol.link import Link
+from protocol.logs import set_up_logging
 from protocol.metrics import Metrics
-from protocol.process import IDLE_WAIT_NS, StopFlag, freeze_heap, set_up_logging
+from protocol.process import IDLE_WAIT_NS, StopFlag, freeze_heap
 from protocol.status import status_of
 from protocol.zenoh_bus import open_bus
 
@@ -28,7 +29,7 @@ def main(argv: list[str] | None = None) -> int:
     metrics = Metrics()
     with ExitStack() as opened:
         try:
-            set_up_logging()
+            set_up_logging(options=operations)
             opened.enter_context(status_of(metrics, operations, lambda: should_stop.is_draining))
             config = options.service()
             bus = open_bus(options.link)

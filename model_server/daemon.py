@@ -11,10 +11,11 @@ from model_server.shell import ModelShell
 from protocol.errors import TransportError
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
+from protocol.logs import set_up_logging
 from protocol.messages import ServingState
 from protocol.metrics import End, Metrics
 from protocol.options import DaemonOptions, LinkOptions
-from protocol.process import StopFlag, host_clock_id, run, set_up_logging
+from protocol.process import StopFlag, host_clock_id, run
 from protocol.status import status_of
 from protocol.version import version
 from protocol.zenoh_bus import open_bus
@@ -59,7 +60,7 @@ def serve_model(
     metrics = Metrics()
     with ExitStack() as opened:
         try:
-            set_up_logging()
+            set_up_logging(options=operations)
             opened.enter_context(status_of(metrics, operations, lambda: should_stop.is_draining))
             bus = open_bus(link_options)
         except TransportError as error:

@@ -52,6 +52,12 @@ class OperationsOptions:
     """HOST:PORT for /metrics (Prometheus), /healthz and /readyz, e.g. 127.0.0.1:9448. None: no port is opened."""
     metrics_open_to_anyone: bool = False
     """Let --metrics listen beyond loopback: any host that reaches the port reads the numbers, without a password."""
+    log_json: bool = False
+    """Write each log line as a JSON object."""
+    log_file: Path | None = None
+    """File for log lines, instead of standard error. A full file moves to NAME.1 and on to NAME.4, the oldest goes."""
+    log_mb: int = 100
+    """Limit of all files of --log-file together, in MB; at least 5."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

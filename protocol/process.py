@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import gc
-import logging
 import os
 import platform
 import signal
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -75,11 +73,6 @@ def freeze_heap() -> None:
     """
     gc.collect()
     gc.freeze()
-
-
-def set_up_logging(level: str = "INFO") -> None:
-    """Logs to stderr, one line per fact, key=value."""
-    logging.basicConfig(stream=sys.stderr, level=level, format="%(asctime)s %(levelname)s %(name)s %(message)s")
 
 
 def host_clock_id() -> str:

@@ -18,9 +18,10 @@ from clock.status import end_of
 from protocol.command_line import parse
 from protocol.errors import TransportError
 from protocol.link import Link
+from protocol.logs import set_up_logging
 from protocol.messages import Health, ServingState
 from protocol.metrics import End, Metrics
-from protocol.process import StopFlag, set_up_logging
+from protocol.process import StopFlag
 from protocol.status import status_of
 from protocol.version import version
 from protocol.zenoh_bus import open_bus
@@ -37,7 +38,7 @@ def main(argv: list[str] | None = None) -> int:
     options = parse(GatewayOptions, argv, prog="pp-gateway")
     should_stop, metrics = StopFlag(), Metrics()
     try:
-        set_up_logging()
+        set_up_logging(options=options.operations)
         options.check()
         with (
             status_of(metrics, options.operations),

@@ -36,7 +36,7 @@ def healths(monkeypatch: pytest.MonkeyPatch) -> Stream[Health]:
     bus = LocalBus()
     monkeypatch.setattr(daemon, "open_bus", lambda options: bus)
     monkeypatch.setattr(bus, "close", lambda: None)  # the robot's side outlives the server
-    monkeypatch.setattr(daemon, "set_up_logging", lambda: None)
+    monkeypatch.setattr(daemon, "set_up_logging", lambda options: None)
     return Link(bus, robot="r0", proc="sim").subscribe(topics.HEALTH)
 
 
