@@ -15,6 +15,7 @@ from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector
 
 from protocol import messages as m
+from protocol.drops import DropReason
 from protocol.link import Link
 
 IDENTITY = ("proc", "robot", "model_hash", "build")
@@ -122,43 +123,44 @@ class Metrics(Collector):
 
 def _facts(ends: Sequence[End]) -> Iterator[Metric]:
     """What the ends know, read now."""
+    asked = [(end, end.identity, end.health()) for end in ends]
 
     def gauge(name: str, text: str, value: Callable[[End], float]) -> Metric:
         family = GaugeMetricFamily(PREFIX + name, text, labels=IDENTITY)
-        for end in ends:
-            family.add_metric(end.identity, value(end))
+        for end, identity, _ in asked:
+            family.add_metric(identity, value(end))
         return family
 
     def counter(name: str, text: str, label: str, values: Callable[[End], Iterable[tuple[str, int]]]) -> Metric:
         family = CounterMetricFamily(PREFIX + name, text, labels=(*IDENTITY, label))
-        for end in ends:
+        for end, identity, _ in asked:
             for key, value in values(end):
-                family.add_metric((*end.identity, key), value)
+                family.add_metric((*identity, key), value)
         return family
 
     yield gauge("ready", "1 if an episode could be opened here.", lambda end: not end.unready)
-    yield gauge("untrained", "1 if untrained weights answer.", lambda end: end.health().is_fake)
     yield gauge("episode_open", "1 while an episode runs here.", lambda end: bool(end.link.episode))
     yield gauge("silent_seconds", "Time since the working loop was seen at work.", lambda end: end.silent_ns() / 1e9)
     yield counter(
         "dropped_total", "Messages dropped, by reason.", "reason",
-        lambda end: [(reason.value, count) for reason, count in dict(end.link.dropped).items()],  # dict: atomic copy
+        lambda end: [(reason.value, end.link.dropped[reason]) for reason in DropReason],
     )  # fmt: skip
     yield counter(
         "superseded_total", "Messages and requests that newer ones replaced unread, by queue.", "queue",
         lambda end: (*end.link.num_superseded().items(), ("requests", end.num_superseded())),
     )  # fmt: skip
+    untrained = GaugeMetricFamily(f"{PREFIX}untrained", "1 if untrained weights answer.", labels=IDENTITY)
     warm = GaugeMetricFamily(
         f"{PREFIX}warm_infer_seconds", "Computing time of an answer at warm-up.", labels=(*IDENTITY, "quantile")
     )
     answered = CounterMetricFamily(f"{PREFIX}answered_total", "Queries or invocations answered.", labels=IDENTITY)
-    for end in ends:
-        if (health := end.health()).infer_p99_ns:  # a model server, and warm
-            warm.add_metric((*end.identity, "0.5"), health.infer_p50_ns / 1e9)
-            warm.add_metric((*end.identity, "0.99"), health.infer_p99_ns / 1e9)
-            answered.add_metric(end.identity, health.num_answered)
-    yield warm
-    yield answered
+    for _, identity, health in asked:
+        if health.infer_p99_ns:  # a model server, and warm
+            untrained.add_metric(identity, health.is_fake)
+            warm.add_metric((*identity, "0.5"), health.infer_p50_ns / 1e9)
+            warm.add_metric((*identity, "0.99"), health.infer_p99_ns / 1e9)
+            answered.add_metric(identity, health.num_answered)
+    yield from (untrained, warm, answered)
 
 
 class _Tally:
@@ -189,6 +191,9 @@ class _Tally:
             case m.EpisodeInfo():
                 self._has_played = False
                 to.episodes.labels(*self._end.identity).inc()
+                for level in filter(None, m.Level):  # from 0 on, so that the first tick of a rung is an increase
+                    to.ticks.labels(*self._end.identity, level.name.lower())
+                to.starved.labels(*self._end.identity)
             case m.Event():
                 to.events.labels(*self._end.identity, message.severity.name.lower(), message.name).inc()
 

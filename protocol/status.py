@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 import logging
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,6 +21,7 @@ from protocol.options import OperationsOptions
 log = logging.getLogger(__name__)
 
 _SILENT_S = 10.0  # a client that sends nothing does not keep its thread
+_SWITCH_S = 5e-4  # a scrape keeps the loop from the interpreter for that long, where Python's default is 5 ms
 _POLL_S = 0.1  # the longest that the process waits for the server when it leaves
 
 
@@ -36,6 +38,7 @@ def status_of(
         yield
         return
     server = _Server(address_of(options), metrics, is_draining)
+    sys.setswitchinterval(_SWITCH_S)
     thread = threading.Thread(target=server.serve_forever, args=(_POLL_S,), name="status", daemon=True)
     thread.start()
     log.info("status listen=%s port=%d", *server.server_address[:2])
