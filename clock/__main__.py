@@ -17,6 +17,7 @@ from protocol.logs import set_up_logging
 from protocol.metrics import Metrics
 from protocol.process import IDLE_WAIT_NS, StopFlag, freeze_heap
 from protocol.status import status_of
+from protocol.watchdog import watchdog
 from protocol.zenoh_bus import open_bus
 
 log = logging.getLogger("clock-serve")
@@ -37,6 +38,7 @@ def main(argv: list[str] | None = None) -> int:
             print(f"clock-serve: {error}", file=sys.stderr)
             return 2
         opened.callback(bus.close)
+        opened.enter_context(watchdog(metrics))
         link = Link(bus, robot=robot, proc="clock")
         service = ClockService(link, config)
         metrics.watch(end_of(service, link, lambda: time.monotonic_ns() - should_stop.asked_ns))

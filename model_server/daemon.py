@@ -18,6 +18,7 @@ from protocol.options import DaemonOptions, LinkOptions
 from protocol.process import StopFlag, host_clock_id, run
 from protocol.status import status_of
 from protocol.version import version
+from protocol.watchdog import watchdog
 from protocol.zenoh_bus import open_bus
 
 EngineT = TypeVar("EngineT")
@@ -67,6 +68,7 @@ def serve_model(
             print(f"{proc}-serve: {error}", file=sys.stderr)  # noqa: T201
             return 2
         opened.callback(bus.close)
+        opened.enter_context(watchdog(metrics))
         link = Link(bus, robot=link_options.robot, proc=proc)
         heartbeat = Heartbeat(link, version(), host_clock_id())
         metrics.watch(_end(link, heartbeat))
