@@ -68,15 +68,15 @@ def _machine(options: GatewayOptions, daemons: Daemons, metrics: Metrics) -> Ite
         )
     bus = open_bus(link)
     try:
+        robot = Link(bus, robot=link.robot, proc="sim")
+        health = Health(state=ServingState.READY, version=version())
+        metrics.watch(End(link=robot, health=lambda: health, silent_ns=lambda: 0))  # a request may wait for minutes
         clock = None
         if not options.runs_clock_daemon:
             config = ServiceConfig(allow_starved=options.timing.allow_starved)
             at_clock = Link(bus, robot=link.robot, proc="clock")
             clock = ClockService(at_clock, config)
             metrics.watch(end_of(clock, at_clock, lambda: 0))
-        robot = Link(bus, robot=link.robot, proc="sim")
-        health = Health(state=ServingState.READY, version=version())
-        metrics.watch(End(link=robot, health=lambda: health, silent_ns=lambda: 0))  # a request may wait for minutes
         yield Machine(plan, robot, clock, daemons.dead)
     finally:
         bus.close()
