@@ -28,7 +28,8 @@ from protocol import messages as m
 from protocol.command_line import parse
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
-from protocol.process import host_clock_id, run, set_up_logging
+from protocol.logs import set_up_logging
+from protocol.process import host_clock_id, run
 from protocol.topics import Priority
 from protocol.zenoh_bus import Endpoints, ZenohBus
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import tyro
+
 from clock.residual import DEFAULT_LOADER, load_head
 from clock.service import ServiceConfig
-from protocol.options import LinkOptions
+from protocol.options import DaemonOptions, LinkOptions
 from protocol.sockets import endpoint
 
 
@@ -28,6 +30,8 @@ class ClockOptions:
     """File of a residual head that corrects every row at 20 Hz (see docs/clock.md)."""
     residual_loader: str = DEFAULT_LOADER
     """Loader of --residual-head, as package.module:callable."""
+
+    operations: tyro.conf.OmitArgPrefixes[DaemonOptions] = field(default_factory=DaemonOptions)
 
     def service(self) -> ServiceConfig:
         """Loads the residual head. Raises ValueError or OSError if that fails."""

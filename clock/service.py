@@ -55,7 +55,7 @@ ROBOT = "sim"
 NUM_TIME_EXCHANGES = 8
 ROBOT_SILENCE_NS = 1_000_000_000
 _CALL_NS = 2_000_000_000
-_OPEN_NS = 120_000_000_000  # a long demonstration is encoded inside this call
+OPEN_NS = 120_000_000_000  # a long demonstration is encoded inside this call
 _TOPIC_OF: dict[type, Topic[object]] = {
     t.cls: t  # type: ignore[misc]
     for t in (QUERY, STAMP, INVOCATION, ACTION, TICK, EVENT)
@@ -109,6 +109,9 @@ class ClockService:
 
     One class, because calls and streams meet in one episode: a call opens or closes it, and the open episode decides
     what every message means.
+
+    Attributes:
+        models: hashes of the newest episode's models, PONDER's and POUNCE's with a "+" between; "" before the first.
     """
 
     def __init__(self, link: Link, config: ServiceConfig, *, host_clock: MonotonicClock | None = None) -> None:
@@ -120,7 +123,9 @@ class ClockService:
         self._last_epoch: dict[str, int] = {}
         self._offsets: dict[str, Offset] = {}
         self._is_stepping = False
+        self._is_draining = False
         self._robot_heard_ns = 0
+        self.models = ""
         self._observations = link.subscribe(OBSERVATION, keep=8)
         self._cognitions = link.subscribe(COGNITION)
         self._chunks = link.subscribe(CHUNK)
@@ -147,6 +152,13 @@ class ClockService:
         if episode is None or due_ns is None or episode.is_lockstep:
             return longest_ns
         return max(0, min(longest_ns, due_ns - episode.now_ns))
+
+    def drain(self) -> bool:
+        """Opens no more episodes from now on; returns whether none runs."""
+        if not self._is_draining:
+            log.info("draining robot=%s episode=%s", self._link.robot, self._link.episode or "none")
+        self._is_draining = True
+        return self._episode is None
 
     def step(self) -> bool:
         if self._is_stepping:  # re-entered while waiting for a server on a LocalBus
@@ -349,9 +361,12 @@ class ClockService:
             return m.OpenReply(error=error, refusal=m.Refusal.BUSY, try_again=True)
         if self._episode is not None:
             self._finish(None)  # the same robot restarts: abandon its old episode
+        if self._is_draining:
+            error = "the clock service is draining: it leaves now, and another process takes its place"
+            return m.OpenReply(error=error, refusal=m.Refusal.NOT_READY, try_again=True)
         if info.policy != "servers":
             return self._begin(request, contracts=(), warnings=(), committed_ticks=0)
-        not_ready = self._not_ready() if self._config.watches else ""
+        not_ready = self.not_ready() if self._config.watches else ""
         if not_ready:
             return m.OpenReply(error=not_ready, refusal=m.Refusal.NOT_READY, try_again=True)
         try:
@@ -377,6 +392,7 @@ class ClockService:
         if not contracts:
             self._enter(header)
         self._last_epoch[header.session] = header.epoch
+        self.models = "+".join(contract.model_hash for contract in contracts)
         head = self._config.residual if request.info.policy == "servers" else None
         conductor = Conductor(request.info, committed_ticks=committed_ticks, residual=head)
         self._episode = _Episode(request, conductor, contracts=dict(zip(SERVERS, contracts, strict=False)))
@@ -401,7 +417,8 @@ class ClockService:
     def _members(self) -> tuple[m.Member, ...]:
         return tuple(m.Member(proc=proc, boot_id=boot_id) for proc, boot_id in self._link.members.items())
 
-    def _not_ready(self) -> str:
+    def not_ready(self) -> str:
+        """Why no episode can be opened, unless one runs already; "" if one can."""
         for proc in SERVERS:
             health = self._watch.health_of(proc)
             if health is None:
@@ -438,7 +455,7 @@ class ClockService:
 
     def _open_at(self, proc: str, request: m.OpenRequest) -> m.Contract:
         """Opens the episode at a server. Raises EpisodeRefused if it refuses, CallFailed if it does not answer."""
-        reply = self._link.call(OPEN, proc, replace(request, members=self._members()), timeout_ns=_OPEN_NS)
+        reply = self._link.call(OPEN, proc, replace(request, members=self._members()), timeout_ns=OPEN_NS)
         contract = reply.contract
         if reply.error or contract is None:
             why = reply.error or "it sent no contract"

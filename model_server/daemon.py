@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from typing import Protocol, TypeVar
 
+from model_server.shell import ModelShell
 from protocol.errors import TransportError
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
+from protocol.logs import set_up_logging
 from protocol.messages import ServingState
-from protocol.options import LinkOptions
-from protocol.process import StopFlag, host_clock_id, run, set_up_logging
+from protocol.metrics import End, Metrics
+from protocol.options import DaemonOptions, LinkOptions
+from protocol.process import StopFlag, host_clock_id, run
+from protocol.status import status_of
 from protocol.version import version
+from protocol.watchdog import watchdog
 from protocol.zenoh_bus import open_bus
 
 EngineT = TypeVar("EngineT")
@@ -25,6 +31,11 @@ class ModelServer(Protocol):
     def ready(self) -> None: ...
     def step(self) -> bool: ...
 
+    @property
+    def shells(self) -> Sequence[ModelShell]:
+        """One per robot, once it is warm."""
+        ...
+
 
 def serve_model(
     proc: str,
@@ -32,6 +43,7 @@ def serve_model(
     weights: str,
     load: Callable[[], EngineT],
     make: Callable[[Link, EngineT, Heartbeat, str], ModelServer],
+    operations: DaemonOptions | None = None,
 ) -> int:
     """Runs a model server until SIGTERM or SIGINT; returns the exit status, 2 if it could not start.
 
@@ -42,17 +54,24 @@ def serve_model(
         weights: description of the weights, for logs.
         load: builds the engine; raises OSError or ValueError with a message for the user.
         make: builds the server around the engine.
+        operations: what it tells its operators, and how it leaves; None: logs on standard error.
     """
-    set_up_logging()
-    should_stop = StopFlag()
-    try:
-        bus = open_bus(link_options)
-    except TransportError as error:
-        print(f"{proc}-serve: {error}", file=sys.stderr)  # noqa: T201
-        return 2
-    link = Link(bus, robot=link_options.robot, proc=proc)
-    heartbeat = Heartbeat(link, version(), host_clock_id())
-    try:
+    operations = operations or DaemonOptions()
+    should_stop = StopFlag(drains=True, sigterm_drains=operations.drain)
+    metrics = Metrics()
+    with ExitStack() as opened:
+        try:
+            set_up_logging(options=operations)
+            opened.enter_context(status_of(metrics, operations, lambda: should_stop.is_draining))
+            bus = open_bus(link_options)
+        except TransportError as error:
+            print(f"{proc}-serve: {error}", file=sys.stderr)  # noqa: T201
+            return 2
+        opened.callback(bus.close)
+        opened.enter_context(watchdog(metrics))
+        link = Link(bus, robot=link_options.robot, proc=proc)
+        heartbeat = Heartbeat(link, version(), host_clock_id())
+        metrics.watch(_end(link, heartbeat))
         heartbeat.set(state=ServingState.LOADING, detail=weights)
         try:
             engine = load()
@@ -66,9 +85,18 @@ def serve_model(
         except Exception as error:  # whatever a kernel or the capture of a graph raises
             heartbeat.set(state=ServingState.FAILED, detail=f"warm-up: {error}"[:2000])
             raise
+        for shell in server.shells:
+            metrics.watch(_end(shell.link, shell.heartbeat, lambda shell=shell: shell.num_superseded))  # type: ignore[misc]
         server.ready()
-        run(bus, server.step, should_stop)
+        run(bus, server.step, lambda: should_stop() or (should_stop.is_draining and _is_drained(server)))
         heartbeat.set(state=ServingState.CLOSING)
-    finally:
-        bus.close()
     return 0
+
+
+def _end(link: Link, heartbeat: Heartbeat, num_superseded: Callable[[], int] = lambda: 0) -> End:
+    health, silent_ns = (lambda: heartbeat.health), (lambda: heartbeat.silent_ns)
+    return End(link=link, health=health, silent_ns=silent_ns, num_superseded=num_superseded)
+
+
+def _is_drained(server: ModelServer) -> bool:
+    return all([shell.drain() for shell in server.shells])  # a list: every robot is told

@@ -57,6 +57,14 @@ class Membership:
         self._is_clock_there = False
         self._refused = ""
         self._is_lockstep = False
+        self._is_draining = False
+
+    def drain(self) -> bool:
+        """Opens no more episodes from now on; returns whether none runs."""
+        if not self._is_draining:
+            log.info("draining robot=%s episode=%s", self._link.robot, self._link.episode or "none")
+        self._is_draining = True
+        return not self._link.episode or self._is_clock_gone()
 
     def step(self) -> bool:
         """Answers waiting calls; returns whether there were any."""
@@ -141,6 +149,9 @@ class Membership:
             return m.OpenReply(error=error, refusal=m.Refusal.BUSY, try_again=True)
         if self._link.episode:
             self._leave()
+        if self._is_draining:
+            error = "it is draining: it leaves after its last episode, and another process takes its place"
+            return m.OpenReply(error=error, refusal=m.Refusal.NOT_READY, try_again=True)
         try:
             self._link.enter_episode(header.session, header.episode, header.epoch, request.members)
             contract = replace(self._open_episode(request), boot_id=self._link.boot_id)

@@ -48,12 +48,25 @@ class ModelShell(ABC):
     """One model server on a bus. ``step`` does one piece of work and returns whether there was any."""
 
     def __init__(self, link: Link, engine: Engine, heartbeat: Heartbeat, version: str) -> None:
-        self._link = link
-        self._heartbeat = heartbeat
+        self.link = self._link = link
+        self.heartbeat = self._heartbeat = heartbeat
         self._version = version
         self._warmed_engine = engine
         self._membership = Membership(link, heartbeat, self._contract, self._open, self._close)
         self._observations = link.subscribe(topics.OBSERVATION, keep=KEEP_OBSERVATIONS)
+
+    @property
+    def shells(self) -> tuple[ModelShell, ...]:
+        return (self,)
+
+    @property
+    @abstractmethod
+    def num_superseded(self) -> int:
+        """Number of requests that a newer one replaced before the model read them."""
+
+    def drain(self) -> bool:
+        """Opens no more episodes from now on; returns whether none runs."""
+        return self._membership.drain()
 
     @abstractmethod
     def step(self) -> bool: ...

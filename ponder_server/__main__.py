@@ -96,7 +96,7 @@ def main(argv: list[str] | None = None) -> int:
             latency_budget_ns=options.robots.latency_budget_ms * 1_000_000,
         )
 
-    return serve_model("ponder", options.link, weights, lambda: build_engine(options), make)
+    return serve_model("ponder", options.link, weights, lambda: build_engine(options), make, options.operations)
 
 
 if __name__ == "__main__":

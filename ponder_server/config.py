@@ -10,7 +10,7 @@ import tyro
 
 from ponder_server.context_policy import PolicyName
 from ponder_server.contract import WeightsName
-from protocol.options import LinkOptions
+from protocol.options import DaemonOptions, LinkOptions
 from protocol.sockets import endpoint
 
 SizeName = Literal["tiny_cpu", "qwen35_0p8b", "qwen35_2b", "qwen35_4b", "qwen35_9b"]
@@ -90,6 +90,7 @@ class PonderOptions:
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Number format of weights and activations."""
     link: LinkOptions = field(default_factory=lambda: LinkOptions(listen=(endpoint("ponder"),)))
+    operations: tyro.conf.OmitArgPrefixes[DaemonOptions] = field(default_factory=DaemonOptions)
     context: tyro.conf.OmitArgPrefixes[ContextOptions] = field(default_factory=ContextOptions)
     speed: tyro.conf.OmitArgPrefixes[SpeedOptions] = field(default_factory=SpeedOptions)
     robots: tyro.conf.OmitArgPrefixes[RobotsOptions] = field(default_factory=RobotsOptions)

@@ -230,6 +230,10 @@ class PonderFleet:
             self._ends.append((other, Heartbeat(other, version, host_clock_id())))
         self._servers: list[RobotServer] = []
 
+    @property
+    def shells(self) -> tuple[RobotServer, ...]:
+        return tuple(self._servers)
+
     def warm_up(self) -> None:
         for _, heartbeat in self._ends:
             heartbeat.set(state=m.ServingState.WARMING)

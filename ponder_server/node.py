@@ -37,6 +37,10 @@ class PonderNode:
         self.next_query = 0
         self._next_asked = 0
 
+    @property
+    def num_superseded(self) -> int:
+        return self._rendezvous.num_superseded
+
     def open(self, next_query: int = 0) -> None:
         """Starts an episode; after a rebuild, queries before ``next_query`` are in the context already."""
         self._rendezvous.clear()

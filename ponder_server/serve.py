@@ -32,6 +32,10 @@ class PonderServer(ModelShell):
         self._queries = link.subscribe(topics.QUERY)
         self._last: m.Cognition | None = None
 
+    @property
+    def num_superseded(self) -> int:
+        return self._node.num_superseded
+
     def _weights_note(self) -> str:
         spec = self._engine.spec
         if spec.weights == "float":

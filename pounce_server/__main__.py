@@ -63,7 +63,7 @@ def build_engine(options: PounceOptions) -> PounceEngine:
 def main(argv: list[str] | None = None) -> int:
     options = parse(PounceOptions, argv, prog="pounce-serve")
     weights = str(options.checkpoint or "random weights")
-    return serve_model("pounce", options.link, weights, lambda: build_engine(options), PounceServer)
+    return serve_model("pounce", options.link, weights, lambda: build_engine(options), PounceServer, options.operations)
 
 
 if __name__ == "__main__":

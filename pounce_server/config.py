@@ -8,7 +8,7 @@ from typing import Literal
 
 import tyro
 
-from protocol.options import LinkOptions
+from protocol.options import DaemonOptions, LinkOptions
 from protocol.sockets import endpoint
 
 NUM_TORCH_THREADS = 1  # on a CPU one thread per process beats two: contention for the second core costs more
@@ -68,6 +68,7 @@ class PounceOptions:
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Number format of weights and activations."""
     link: LinkOptions = field(default_factory=lambda: LinkOptions(listen=(endpoint("pounce"),)))
+    operations: tyro.conf.OmitArgPrefixes[DaemonOptions] = field(default_factory=DaemonOptions)
     speed: tyro.conf.OmitArgPrefixes[SpeedOptions] = field(default_factory=SpeedOptions)
     chunks: tyro.conf.OmitArgPrefixes[ContinuityOptions] = field(default_factory=ContinuityOptions)
     random: tyro.conf.OmitArgPrefixes[RandomOptions] = field(default_factory=RandomOptions)

@@ -33,6 +33,10 @@ class PounceServer(ModelShell):
         self._last: m.ActionChunk | None = None
         self._subgoals = link.subscribe(topics.SUBGOAL) if self._has_subgoals else None
 
+    @property
+    def num_superseded(self) -> int:
+        return self._node.num_superseded
+
     def _weights_note(self) -> str:
         spec = self._engine.spec
         if spec.weights == "float":

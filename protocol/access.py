@@ -1,4 +1,4 @@
-"""Who may say what between hosts: zenoh's access control by the common names of certificates.
+"""Zenoh's access control between hosts: the common name of a certificate decides what its process may say.
 
 Every process checks what arrives from a peer, and what it lets out to it, against the name in the peer's certificate.
 What no rule allows is dropped by zenoh before this project sees it.

@@ -26,6 +26,12 @@ class Heartbeat:
         self.health = Health(state=ServingState.LOADING, version=version)
         link.bus.declare_alive(alive_key(link.robot, link.proc))
 
+    @property
+    def silent_ns(self) -> int:
+        """Time since the last beat; 0 until the server is ready, because loading does not beat."""
+        is_ready = self.health.state == ServingState.READY
+        return max(0, time.monotonic_ns() - self._next_ns + PERIOD_NS) if is_ready and self._next_ns else 0
+
     def set(self, **changes: object) -> None:
         """Changes the reported values; a change of state is sent immediately."""
         is_news = changes.keys() & {"state", "open_episode"}

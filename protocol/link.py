@@ -48,6 +48,7 @@ class Link:
     Attributes:
         members: boot ids of the running episode's processes, by name. Others are not obeyed.
         second_sender: a sentence, once two processes send under one member's ids; "" until then.
+        on_sent: is called with every message that was sent, by the thread that sent it.
     """
 
     def __init__(self, bus: Bus, *, robot: str, proc: str, boot_id: int | None = None) -> None:
@@ -65,6 +66,8 @@ class Link:
         self.dropped: Counter[DropReason] = Counter()
         self._seqs: Counter[str] = Counter()
         self._reported: set[tuple[str, str]] = set()
+        self._streams: list[Stream[Any]] = []
+        self.on_sent: Callable[[Any], None] | None = None
 
     def enter_episode(self, session: str, episode: str, epoch: int, members: Iterable[Member] = ()) -> None:
         """Sets the episode in the headers and keys of further messages, and who is in it besides this process.
@@ -119,6 +122,8 @@ class Link:
             attachment=_ATTACHMENT.pack(signed.header.seq, source_ns, self.boot_id),  # type: ignore[attr-defined]
             priority=topic.priority,
         )
+        if self.on_sent is not None:
+            self.on_sent(signed)
         return signed  # type: ignore[no-any-return]
 
     def is_member(self, header: Header) -> bool:
@@ -179,7 +184,16 @@ class Link:
     def subscribe(self, topic: Topic[T], *, keep: int | None = None, proc: str = "*") -> Stream[T]:
         """Subscribes to ``topic`` for this robot, in all episodes; the nodes filter by episode."""
         expression = topics.stream_key(topic, self.robot, "*", proc)
-        return Stream(self, topic, self.bus.subscribe(expression, keep=keep or topic.keep))
+        stream = Stream(self, topic, self.bus.subscribe(expression, keep=keep or topic.keep))
+        self._streams.append(stream)
+        return stream
+
+    def num_superseded(self) -> dict[str, int]:
+        """Number of unread messages that newer ones pushed out, by topic."""
+        counts: Counter[str] = Counter()
+        for stream in tuple(self._streams):
+            counts[stream.topic.name] += stream.subscription.num_superseded
+        return dict(counts)
 
     def serve(self, call: Call) -> Service:
         return Service(self, call, self.bus.serve(topics.call_key(call, self.robot, self.proc)))
@@ -228,7 +242,7 @@ class Stream(Generic[T]):
 
     def __init__(self, link: Link, topic: Topic[T], subscription: Subscription) -> None:
         self._link = link
-        self._topic = topic
+        self.topic = topic
         self._encoding = _encoding(topic.cls)  # type: ignore[arg-type]
         self._last_seq: dict[int, int] = {}  # by boot id, of members
         self.subscription = subscription
@@ -252,7 +266,7 @@ class Stream(Generic[T]):
             )
             return None
         try:
-            message = codec.decode(self._topic.cls, sample.payload)
+            message = codec.decode(self.topic.cls, sample.payload)
         except ProtocolError as error:
             self._link.drop(_source(sample), DropReason.MALFORMED, str(error))
             return None

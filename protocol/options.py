@@ -1,4 +1,4 @@
-"""Options of every daemon: the robot, and the endpoints to listen on and to connect to."""
+"""Options of every daemon: the robot, the endpoints to listen on and to connect to, and what operators read."""
 
 from __future__ import annotations
 
@@ -42,3 +42,28 @@ class LinkOptions:
                     f"--link.tls-{name} {file or '(missing)'} is not a file; mutual TLS needs all three"
                 )
         return files  # type: ignore[return-value]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OperationsOptions:
+    """What a process tells its operators."""
+
+    metrics: str | None = None
+    """HOST:PORT for /metrics (Prometheus), /healthz and /readyz, e.g. 127.0.0.1:9448. None: no port is opened."""
+    metrics_open_to_anyone: bool = False
+    """Let --metrics listen beyond loopback: any host that reaches the port reads the numbers, without a password."""
+    log_json: bool = False
+    """Write each log line as a JSON object."""
+    log_file: Path | None = None
+    """File for log lines, instead of standard error. A full file moves to NAME.1 and on to NAME.4, the oldest goes."""
+    log_mb: int = 100
+    """Limit of all files of --log-file together, in MB; at least 5."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DaemonOptions(OperationsOptions):
+    """What a daemon tells its operators, and how it leaves."""
+
+    drain: bool = False
+    """At SIGTERM, open no more episodes and leave when the running one is over, as at SIGUSR1. A second SIGTERM, or
+    SIGINT, ends the process as usual."""

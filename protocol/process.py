@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import gc
-import logging
 import os
 import platform
 import signal
-import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
@@ -24,18 +23,38 @@ PARENT_VARIABLE = "PONDERPOUNCE_PARENT_PID"
 
 
 class StopFlag:
-    """True after SIGTERM or SIGINT, or once the parent process died; the loop then ends normally."""
+    """True after SIGTERM or SIGINT, or once the parent process died; the loop then ends normally.
 
-    def __init__(self) -> None:
+    Args:
+        drains: whether SIGUSR1 sets ``is_draining``: no new episodes, and the process leaves after the running one.
+        sigterm_drains: whether the first SIGTERM does so too.
+
+    Attributes:
+        asked_ns: when the loop last asked (monotonic), which shows that it turns.
+    """
+
+    def __init__(self, *, drains: bool = False, sigterm_drains: bool = False) -> None:
         self.is_set = False
+        self.is_draining = False
+        self.asked_ns = time.monotonic_ns()
+        self._sigterm_drains = sigterm_drains
         self._parent_pid = int(os.environ.get(PARENT_VARIABLE, "0"))
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._set)
+        if drains:
+            signal.signal(signal.SIGUSR1, self._drain)
 
     def _set(self, number: int, frame: FrameType | None) -> None:
-        self.is_set = True
+        if number == signal.SIGTERM and self._sigterm_drains and not self.is_draining:
+            self.is_draining = True
+        else:
+            self.is_set = True
+
+    def _drain(self, number: int, frame: FrameType | None) -> None:
+        self.is_draining = True
 
     def __call__(self) -> bool:
+        self.asked_ns = time.monotonic_ns()
         return self.is_set or (self._parent_pid > 0 and os.getppid() != self._parent_pid)
 
 
@@ -54,11 +73,6 @@ def freeze_heap() -> None:
     """
     gc.collect()
     gc.freeze()
-
-
-def set_up_logging(level: str = "INFO") -> None:
-    """Logs to stderr, one line per fact, key=value."""
-    logging.basicConfig(stream=sys.stderr, level=level, format="%(asctime)s %(levelname)s %(name)s %(message)s")
 
 
 def host_clock_id() -> str:

@@ -14,7 +14,7 @@ import dual_system.tasks.headless  # noqa: F401 - before anything that imports m
 from dual_system.tasks.task import TaskError, make_task, task_names
 from protocol.command_line import parse
 from protocol.errors import TransportError
-from protocol.process import set_up_logging
+from protocol.logs import set_up_logging
 from sim_client.config import SimOptions
 from sim_client.harness import open_harness
 from sim_client.launch import Daemons

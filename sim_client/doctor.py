@@ -6,14 +6,19 @@ import json
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+import tyro
+
 from protocol.command_line import parse
-from sim_client import certs
+from protocol.options import LinkOptions
+from protocol.sockets import endpoint
+from sim_client import certs, doctor_schedule
 from sim_client import doctor_probes as look
 from sim_client.doctor_probes import Finding, Level, Role
+from sim_client.doctor_schedule import ScheduleProbeOptions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,10 +47,17 @@ class DoctorConfig:
     """Folder of a PONDER checkpoint, whose files are checked."""
     pounce_checkpoint: Path | None = None
     """Folder of a POUNCE checkpoint, whose files are checked."""
+    schedule: bool = False
+    """Check only whether running models are fast enough: d <= s <= H - d, see docs/clock.md."""
+    models: tyro.conf.OmitArgPrefixes[ScheduleProbeOptions] = field(default_factory=ScheduleProbeOptions)
+    link: LinkOptions = field(default_factory=lambda: LinkOptions(connect=(endpoint("ponder"), endpoint("pounce"))))
 
 
 def probes(config: DoctorConfig) -> list[Probe]:
     """Returns the checks that the configuration asks for."""
+    if config.schedule:
+        asked = doctor_schedule.probes(config.models, config.link)
+        return [Probe(name=name, look=answer) for name, answer in asked.items()]
     backend = os.environ.get("MUJOCO_GL", "egl")
     other = "osmesa" if backend == "egl" else "egl"
     found = [

@@ -30,7 +30,7 @@ from protocol.bus import Bus
 from protocol.command_line import parse
 from protocol.errors import TransportError
 from protocol.link import Link
-from protocol.process import set_up_logging
+from protocol.logs import set_up_logging
 from sim_client.condition import EvalOptions, EvaluationError, Job
 from sim_client.harness import BuildServer, ServerStep, open_harness
 from sim_client.launch import Daemons

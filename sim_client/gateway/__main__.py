@@ -14,10 +14,16 @@ import dual_system.tasks.headless  # noqa: F401 - before anything that imports m
 # isort: split
 
 from clock.service import ClockService, ServiceConfig
+from clock.status import end_of
 from protocol.command_line import parse
 from protocol.errors import TransportError
 from protocol.link import Link
-from protocol.process import StopFlag, set_up_logging
+from protocol.logs import set_up_logging
+from protocol.messages import Health, ServingState
+from protocol.metrics import End, Metrics
+from protocol.process import StopFlag
+from protocol.status import status_of
+from protocol.version import version
 from protocol.zenoh_bus import open_bus
 from sim_client.gateway.http_form import HttpSide
 from sim_client.gateway.machine import Machine
@@ -30,11 +36,15 @@ log = logging.getLogger("pp-gateway")
 
 def main(argv: list[str] | None = None) -> int:
     options = parse(GatewayOptions, argv, prog="pp-gateway")
-    set_up_logging()
-    should_stop = StopFlag()
+    should_stop, metrics = StopFlag(), Metrics()
     try:
+        set_up_logging(options=options.operations)
         options.check()
-        with Daemons(options.out) as daemons, _machine(options, daemons) as machine:
+        with (
+            status_of(metrics, options.operations),
+            Daemons(options.out) as daemons,
+            _machine(options, daemons, metrics) as machine,
+        ):
             if options.local:
                 machine.await_servers(should_stop)  # a client that finds the door open expects to be served
             with _serving(options, machine):
@@ -47,7 +57,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 @contextmanager
-def _machine(options: GatewayOptions, daemons: Daemons) -> Iterator[Machine]:
+def _machine(options: GatewayOptions, daemons: Daemons, metrics: Metrics) -> Iterator[Machine]:
     plan, link = options.plan(), options.link
     if options.local:
         link = local_link(
@@ -60,11 +70,16 @@ def _machine(options: GatewayOptions, daemons: Daemons) -> Iterator[Machine]:
         )
     bus = open_bus(link)
     try:
+        robot = Link(bus, robot=link.robot, proc="sim")
+        health = Health(state=ServingState.READY, version=version())
+        metrics.watch(End(link=robot, health=lambda: health, silent_ns=lambda: 0))  # a request may wait for minutes
         clock = None
         if not options.runs_clock_daemon:
             config = ServiceConfig(allow_starved=options.timing.allow_starved)
-            clock = ClockService(Link(bus, robot=link.robot, proc="clock"), config)
-        yield Machine(plan, Link(bus, robot=link.robot, proc="sim"), clock, daemons.dead)
+            at_clock = Link(bus, robot=link.robot, proc="clock")
+            clock = ClockService(at_clock, config)
+            metrics.watch(end_of(clock, at_clock, lambda: 0))
+        yield Machine(plan, robot, clock, daemons.dead)
     finally:
         bus.close()
 

@@ -7,7 +7,7 @@ come with ``infer`` alone, so the ticks between two requests have the wrist's la
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -55,10 +55,11 @@ class MmeVlaDialect:
             reading.field(message, key, "what was seen since the last call") for key in ("images", "state")
         )
         shape: tuple[int, ...] = getattr(images, "shape", ())
-        if len(shape) != 5 or shape[0] == 0 or shape[1] != 1 or len(states) != shape[0]:
+        num_states = len(states) if isinstance(states, Sequence | np.ndarray) else 0
+        if len(shape) != 5 or shape[0] == 0 or shape[1] != 1 or num_states != shape[0]:
             raise Refused(
-                f"images, state: expected (T, 1, height, width, 3) and (T, {self._terms.num_proprio}), "
-                f"came {shape} and {np.shape(states)}"
+                f"images, state: expected (T, 1, height, width, 3) and T states of {self._terms.num_proprio} numbers, "
+                f"came {shape} and {num_states}"
             )
         front = next(iter(self._terms.cameras))
         seen = [{front: reading.picture(frame, "images")} for frame in images[:, 0]]

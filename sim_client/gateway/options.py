@@ -14,7 +14,7 @@ from clock import schedules
 from clock.timebase import NS_PER_MS
 from protocol.errors import TransportError
 from protocol.messages import Delay, DelayKind, Schedule, WaitKind
-from protocol.options import LinkOptions
+from protocol.options import LinkOptions, OperationsOptions
 from protocol.sockets import endpoint
 from protocol.version import version
 from sim_client.gateway import body, challenge, mme_vla, openpi, vla_eval
@@ -123,6 +123,7 @@ class GatewayOptions:
     timing: tyro.conf.OmitArgPrefixes[ScheduleOptions] = field(default_factory=ScheduleOptions)
     servers: tyro.conf.OmitArgPrefixes[ServersOptions] = field(default_factory=ServersOptions)
     log: tyro.conf.OmitArgPrefixes[LogOptions] = field(default_factory=LogOptions)
+    operations: tyro.conf.OmitArgPrefixes[OperationsOptions] = field(default_factory=OperationsOptions)
     link: LinkOptions = field(
         default_factory=lambda: LinkOptions(connect=tuple(map(endpoint, ("clock", "ponder", "pounce"))))
     )

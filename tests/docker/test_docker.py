@@ -16,7 +16,6 @@ import yaml
 from clock.config import ClockOptions
 from ponder_server.config import PonderOptions
 from pounce_server.config import PounceOptions
-from protocol.probe import ProbeOptions
 from protocol.zenoh_bus import is_loopback
 from sim_client.config import SimOptions
 from sim_client.doctor_probes import GL_PACKAGES, ROBOSUITE, VULKAN_PACKAGE
@@ -46,9 +45,13 @@ ROLES = {
 DEFAULTS = {"clock": ClockOptions().link, "ponder": PonderOptions().link, "pounce": PounceOptions().link}
 
 
+def arguments_of(compose: dict[str, Any], name: str) -> Any:
+    """The options that a service's command gives its program."""
+    return tyro.cli(ROLES[name].options, args=[str(a) for a in compose["services"][name]["command"]])
+
+
 def link_of(compose: dict[str, Any], name: str) -> Any:
-    """The endpoints that a service's command gives its program."""
-    return tyro.cli(ROLES[name].options, args=[str(a) for a in compose["services"][name]["command"]]).link
+    return arguments_of(compose, name).link
 
 
 def instructions(name: str) -> list[tuple[str, str]]:
@@ -159,14 +162,30 @@ def test_with_a_gpu_a_server_listens_at_the_same_place(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", DEFAULTS)
-def test_a_health_check_asks_its_own_process_where_it_listens(name: str) -> None:
-    kind, python, dash_m, module, *arguments = COMPOSE["services"][name]["healthcheck"]["test"]
-    assert (kind, python, dash_m, module) == ("CMD", "python", "-m", "protocol.probe")
-    options = tyro.cli(ProbeOptions, args=arguments)
-    assert options.proc == name
-    assert options.link.connect == link_of(COMPOSE, name).listen
-    assert options.link.robot == link_of(COMPOSE, name).robot
-    assert options.within_ms < 1000 * int(COMPOSE["services"][name]["healthcheck"]["timeout"].removesuffix("s"))
+def test_a_health_check_asks_its_own_process_where_it_answers(name: str) -> None:
+    check = COMPOSE["services"][name]["healthcheck"]
+    kind, python, dash_c, code = check["test"]
+    assert (kind, python, dash_c) == ("CMD", "python", "-c")
+    path = "healthz" if name == "clock" else "readyz"  # the clock would wait for the others
+    for compose in (COMPOSE, GPU):
+        if name in compose["services"]:
+            assert f"http://{arguments_of(compose, name).operations.metrics}/{path}'" in code
+    limit_s = int(re.findall(r"timeout=(\d+)", code)[0])
+    assert limit_s < int(check["timeout"].removesuffix("s"))
+
+
+@pytest.mark.parametrize("name", ROLES)
+def test_a_container_writes_only_where_it_must(name: str) -> None:
+    service = COMPOSE["services"][name]
+    assert (service["read_only"], service["cap_drop"], service["tmpfs"]) == (True, ["ALL"], ["/tmp"])
+    assert service["security_opt"] == ["no-new-privileges:true"]
+    assert service["logging"]["options"] == {"max-size": "20m", "max-file": "5"}
+
+
+@pytest.mark.parametrize("name", DEFAULTS)
+def test_stopping_a_daemon_drains_it(name: str) -> None:
+    service = COMPOSE["services"][name]
+    assert (service["stop_signal"], service["stop_grace_period"]) == ("SIGUSR1", "5m")
 
 
 @pytest.mark.parametrize("compose", [COMPOSE, GPU], ids=["compose", "gpu"])

@@ -17,6 +17,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "foxglove_schemas_protobuf": ("protocol/mcap_log.py",),
     "google": ("protocol/codec.py", "protocol/mcap_log.py"),
     "simplejpeg": ("protocol/images.py",),
+    "prometheus_client": ("protocol/metrics.py", "protocol/status.py"),
     "rerun": ("sim_client/replay.py", "sim_client/blueprint.py"),
     "av": ("dual_system/data/video.py",),
     "pyarrow": ("dual_system/data/",),

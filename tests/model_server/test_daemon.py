@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import socket
+
 import pytest
 
 from model_server import daemon
@@ -9,7 +11,7 @@ from protocol import topics
 from protocol.bus import LocalBus
 from protocol.link import Link, Stream
 from protocol.messages import Health, ServingState
-from protocol.options import LinkOptions
+from protocol.options import DaemonOptions, LinkOptions
 
 
 class Broken:
@@ -34,7 +36,7 @@ def healths(monkeypatch: pytest.MonkeyPatch) -> Stream[Health]:
     bus = LocalBus()
     monkeypatch.setattr(daemon, "open_bus", lambda options: bus)
     monkeypatch.setattr(bus, "close", lambda: None)  # the robot's side outlives the server
-    monkeypatch.setattr(daemon, "set_up_logging", lambda: None)
+    monkeypatch.setattr(daemon, "set_up_logging", lambda options: None)
     return Link(bus, robot="r0", proc="sim").subscribe(topics.HEALTH)
 
 
@@ -49,3 +51,11 @@ def test_a_warm_up_that_fails_is_reported(healths: Stream[Health]) -> None:
         daemon.serve_model("ponder", LinkOptions(), "random", object, lambda *_: Broken())
     last = healths.drain()[-1]
     assert (last.state, last.detail) == (ServingState.FAILED, "warm-up: no kernel image is available")
+
+
+def test_a_taken_metrics_port_is_a_sentence(healths: Stream[Health], capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        options = DaemonOptions(metrics=f"127.0.0.1:{taken.getsockname()[1]}")
+        assert daemon.serve_model("ponder", LinkOptions(), "random", object, lambda *_: Broken(), options) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"ponder-serve: --metrics {options.metrics}: Address already in use")

@@ -351,7 +351,8 @@ def test_mme_vla_without_its_history_is_understood_too(
     [
         ({"images": np.zeros((2, 4, 4, 3), np.uint8)}, r"expected \(T, 1, height, width, 3\)"),
         ({"images": np.zeros((0, 1, 4, 4, 3), np.uint8)}, r"expected \(T, 1, height, width, 3\)"),
-        ({"state": np.zeros((3, 3))}, r"came \(2, 1, 4, 4, 3\) and \(3, 3\)"),
+        ({"state": np.zeros((3, 3))}, r"came \(2, 1, 4, 4, 3\) and 3"),
+        ({"state": 5}, r"came \(2, 1, 4, 4, 3\) and 0"),
         ({"exec_start_idx": 2}, "exec_start_idx: expected 0 to 1"),
         ({"exec_start_idx": "0"}, "exec_start_idx: expected 0 to 1"),
         ({"images": np.zeros((2, 1, 4, 4, 3), np.float32)}, "expected a picture"),
