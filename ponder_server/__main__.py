@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from model_server.daemon import serve_model
 from ponder_server.config import NUM_TORCH_THREADS, PonderOptions
-from ponder_server.contract import BatchingEngine
+from ponder_server.contract import BatchingEngine, PonderEngine
 from ponder_server.fleet import PonderFleet
 from ponder_server.serve import PonderServer
 from protocol.command_line import parse
@@ -29,7 +29,6 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     from dual_system.models.bfloat16 import warn_of_slow
     from dual_system.models.ponder import configs
     from dual_system.models.ponder.checkpoint import load_ponder
-    from dual_system.models.ponder.demo_sampling import DemoSampling
     from dual_system.models.ponder.network import Ponder
     from ponder_server.draft import Draft, FirstOf, TrieDraft
     from ponder_server.engine import QwenEngine
@@ -54,7 +53,8 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
         size = getattr(configs, options.random.size)()
         ponder = Ponder.random(size, seed=options.random.seed, device=options.device, dtype=dtype)
     trained = ponder.format.demonstrations
-    wanted = DemoSampling(hz=context.demo_hz or trained.hz, to_its_end=context.demo_to_its_end or trained.to_its_end)
+    to_its_end = context.demo_to_its_end or trained.to_its_end
+    wanted = replace(trained, hz=context.demo_hz or trained.hz, to_its_end=to_its_end)
     ponder.format = replace(ponder.format, demonstrations=wanted)
     config = EngineConfig(
         max_context_tokens=context.max_context_tokens,
@@ -77,9 +77,26 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     return QwenEngine(ponder, config, FirstOf(drafts))
 
 
+def build_official(options: PonderOptions) -> PonderEngine:
+    """Loads the official release with its own code.
+
+    Raises:
+        FileNotFoundError, ValueError: no folder is given, or the official package is not installed.
+    """
+    from ponder_server.official import OfficialPonder
+
+    if options.checkpoint is None:
+        raise ValueError("--backend official needs the official folder; give it with --checkpoint")
+    if options.robots.other_robots:
+        raise ValueError("--backend official serves one robot; leave --other-robots out")
+    return OfficialPonder(options.checkpoint, options.device)
+
+
 def main(argv: list[str] | None = None) -> int:
     options = parse(PonderOptions, argv, prog="ponder-serve")
     weights = str(options.checkpoint or f"random weights ({options.random.size})")
+    if options.backend == "official":
+        return serve_model("ponder", options.link, weights, lambda: build_official(options), PonderServer)
 
     def make(link: Link, engine: BatchingEngine, heartbeat: Heartbeat, version: str) -> PonderServer | PonderFleet:
         if not options.robots.other_robots:
