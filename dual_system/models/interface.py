@@ -21,6 +21,7 @@ MAX_CARRIERS = 16
 
 PrefixAttention = Literal["full", "isolated"]
 PrefixOrder = Literal["age_first", "cognition_first"]
+PrefixPlace = Literal["before_images", "after_text"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,6 +49,8 @@ class CognitionConfig:
     age_bias: bool = False
     """The age's projection has a bias."""
     order: PrefixOrder = "age_first"
+    place: PrefixPlace = "before_images"
+    """after_text: P ends the prefix, behind the state's token if there is one; for "full" attention only."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.num_carriers <= MAX_CARRIERS:
@@ -58,6 +61,8 @@ class CognitionConfig:
             raise ValueError(f"age_features must be even and at least 2, came {self.age_features}")
         if self.attention not in ("full", "isolated"):
             raise ValueError(f"attention must be 'full' or 'isolated', came {self.attention!r}")
+        if self.place == "after_text" and self.attention != "full":
+            raise ValueError("place 'after_text' needs attention 'full': an isolated P stands before the images")
 
     @property
     def num_tokens(self) -> int:

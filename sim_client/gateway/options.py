@@ -42,8 +42,8 @@ class ScheduleOptions:
     delay_ms: int = 300
     """PONDER's modelled delay in ms, in lockstep (paper: 300)."""
     wait: Literal["stand-still", "hold"] = "stand-still"
-    """Until the first chunk. stand-still: the first answer waits for it, so the client's world stands still. hold: ticks
-    count from the first observation and the arm is held, 6 ticks in the paper's schedule, as by the official server."""
+    """Behaviour until the first chunk. stand-still: the first answer waits for it. hold: ticks count from the first
+    observation and the arm is held, for 6 ticks in the paper's schedule, as by the official server."""
     max_age_ms: int = 2000
     """Age in ms from which a cognition is called stale (an alarm; its rows are still played)."""
     stale_limit_ms: int = 10_000

@@ -156,7 +156,7 @@ class Pounce(nn.Module):
         return Backbone(vision=(self.pi05.vision, self.pi05.projector), language=self.pi05.language)
 
     def embed_prefix(self, inputs: PounceInputs) -> Prefix:
-        """Embeds [P][images][text][state].
+        """Embeds [P][images][text][state], or P last (`CognitionConfig.place`).
 
         Raises:
             ValueError: ``state_input`` is "token" and the state is missing.
@@ -177,6 +177,7 @@ class Pounce(nn.Module):
             cognition_BPW=cognition_BPW,
             state_B1W=state_B1W,
             is_isolated=self.config.cognition.attention == "isolated",
+            is_cognition_last=self.config.cognition.place == "after_text",
         )
 
     def prefill(self, inputs: PounceInputs) -> PrefixCache:
