@@ -60,6 +60,9 @@ COMMANDS = {
             "import-official": Verb(
                 "dual_system.models.official.import_folder", "Import the official PonderPounce folder."
             ),
+            "answers": Verb(
+                "sim_client.parity_answers", "Run a stored episode through a pair, and compare with another's answers."
+            ),
         },
     ),
     "pp-diagnose": Command(

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from clock.check import disagreements
+from dual_system.commands import parity
 from ponder_server.__main__ import build_official as build_ponder
 from ponder_server.config import PonderOptions, RobotsOptions
 from ponder_server.contract import ContextFull, Opening, PonderEngine, SessionError
@@ -159,3 +160,20 @@ def test_an_episode_under_our_clock_follows_from_its_log(
     assert [each.age_ns for each in record.invocations] == [300_000_000] * len(record.invocations)
     assert len(record.invocations) >= 2
     assert next(disagreements(record), None) is None
+
+
+def test_their_answers_are_a_reference(
+    release: Any, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    episode = {
+        "instruction": np.array("go"),
+        "demo": np.stack(frames(1))[None],
+        "frames": np.stack([np.stack(frames(2)), np.stack(frames(3))]),
+        "states": np.zeros((2, 8), np.float32),
+    }
+    np.savez(tmp_path / "episode.npz", **episode)
+    folders = ["--ponder", str(folder), "--pounce", str(folder), "--backend", "official"]
+    arguments = ["answers", "--episode", str(tmp_path / "episode.npz"), *folders]
+    assert parity([*arguments, "--out", str(tmp_path / "one.npz")]) == 0
+    assert parity([*arguments, "--out", str(tmp_path / "two.npz"), "--against", str(tmp_path / "one.npz")]) == 0
+    assert "agrees   every answer" in capsys.readouterr().out

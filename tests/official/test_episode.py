@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from clock.check import disagreements
+from dual_system.commands import parity
 from dual_system.models.official.import_folder import import_official, sizes_like
 from dual_system.models.pi05.prompt import Tokenizer, task_only_prompt_text
 from dual_system.models.pounce.checkpoint import load_bundle
@@ -61,9 +62,32 @@ def test_pounce_reads_the_task_as_text_and_the_state_as_numbers(imported: Path) 
 def test_an_episode_follows_from_its_log(imported: Path, tmp_path: Path) -> None:
     out = tmp_path / "episodes"
     folders = ["--ponder-checkpoint", str(imported / "ponder"), "--pounce-checkpoint", str(imported / "pounce")]
-    arguments = ["--in-process", "--task", "VideoUnmask", "--max-steps", "40", "--no-progress", "--out", str(out)]
+    arguments = ["--in-process", "--task", "PickHighlight", "--max-steps", "25", "--no-progress", "--out", str(out)]
     assert simulate([*arguments, *folders]) == 0
     (path,) = out.rglob("*.mcap")
     record = read_log(path)
     assert len(record.invocations) == 2
     assert next(disagreements(record), None) is None
+
+
+def test_a_pair_agrees_with_itself_and_a_difference_is_found(
+    imported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng(0)
+    np.savez(
+        tmp_path / "episode.npz",
+        instruction=np.array("go"),
+        demo=rng.integers(0, 256, (1, 2, 256, 256, 3), dtype=np.uint8),
+        frames=rng.integers(0, 256, (2, 2, 256, 256, 3), dtype=np.uint8),
+        states=rng.normal(size=(2, 8)).astype(np.float32),
+    )
+    folders = ["--ponder", str(imported / "ponder"), "--pounce", str(imported / "pounce")]
+    shared = ["answers", "--episode", str(tmp_path / "episode.npz"), *folders]
+    one, other = str(tmp_path / "one.npz"), str(tmp_path / "other.npz")
+    assert parity([*shared, "--out", one]) == 0
+    assert parity([*shared, "--out", other, "--against", one]) == 0
+    assert "agrees   every answer" in capsys.readouterr().out
+    path = imported / "pounce" / "config.json"
+    path.write_text(path.read_text().replace('"age_max_period_s": 100.0', '"age_max_period_s": 10.0'))
+    assert parity([*shared, "--out", other, "--against", one]) == 1
+    assert "differs  invocation 0: rows: largest difference" in capsys.readouterr().out
