@@ -107,12 +107,12 @@ def _networks(num_carriers: int, is_tied: bool, age_bias: bool) -> tuple[Ponder,
     config = tiny_pounce(num_carriers=num_carriers, cognition_size=ponder.hidden_size)
     cognition = replace(config.cognition, age_features=32 + 2, age_bias=age_bias)
     pounce = random_pounce(replace(config, cognition=cognition, state_input="token", stateless_prompt="task"), seed=2)
+    prefix, generator = pounce.cognition_prefix, torch.Generator().manual_seed(3)
+    assert prefix is not None
     with torch.no_grad():  # a random one has zeros here, which would show nothing
-        assert pounce.cognition_prefix is not None
-        pounce.cognition_prefix.null_cognition.normal_()
-        pounce.cognition_prefix.projector.bias.normal_()
-        if age_bias:
-            pounce.cognition_prefix.age_projection.bias.normal_()
+        for zeros in (prefix.null_cognition, prefix.projector.bias, prefix.age_projection.bias):
+            if zeros is not None:
+                zeros.normal_(generator=generator)
     return ponder, pounce
 
 
