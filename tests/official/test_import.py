@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -14,10 +15,17 @@ import torch
 from dual_system import commands
 from dual_system.models.official.header import FolderError
 from dual_system.models.official.import_folder import import_official, sizes_like
+from dual_system.models.official.plan import expected
 from dual_system.models.ponder.checkpoint import load_ponder
+from dual_system.models.ponder.configs import qwen35_9b
 from dual_system.models.ponder.text_policy import OFFICIAL_TEXTS
 from dual_system.models.pounce.checkpoint import load_bundle
+from dual_system.models.pounce.configs import pi05_base
 
+STATISTICS = {
+    "state": {"q01": [-1.0] * 8, "q99": [1.0] * 8},
+    "action": {"q01": [-1.0] * 8, "q99": [1.0] * 8, "delta_mask": [True] * 7 + [False]},
+}
 PALIGEMMA_HEAD = "net.paligemma_with_expert.paligemma.lm_head.weight"
 
 
@@ -379,3 +387,34 @@ def test_a_file_that_was_cut_short_is_refused(make_release: Any, tmp_path: Path)
         file.truncate(path.stat().st_size - 10)
     with pytest.raises(FolderError, match="the header describes"):
         import_official(release.folder, tmp_path / "out", qwen=release.qwen, paligemma=release.paligemma)
+
+
+def test_a_header_of_the_real_size_is_explained_and_counts_as_published(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """14B on the hub, about 27 GB on the card: both networks, PaliGemma's embedding twice, the expert's unused head."""
+    tables = expected(qwen35_9b().qwen(), pi05_base())
+    shapes = {f"m.system2.vlm.{name}": shape for name, shape in tables.ponder_shapes.items()}
+    shapes |= {f"m.system1.pi05.{name}": shape for name, shape in tables.pounce_shapes.items()}
+    paligemma = "m.system1.pi05.paligemma_with_expert.paligemma."
+    shapes[paligemma + "model.language_model.embed_tokens.weight"] = (257_152, 2048)
+    shapes["m.system1.pi05.paligemma_with_expert.gemma_expert.lm_head.weight"] = (257_152, 1024)
+    shapes |= {"m.system2.carrier": (1, 4096), "m.system1.null_cognition": (1, 4096)}
+    shapes |= {"m.system1.cog.weight": (2048, 4096), "m.system1.age.weight": (2048, 256)}
+    shapes |= {"m.system1.state.weight": (2048, 8), "m.system1.state.bias": (2048,)}
+    header, end = {}, 0
+    for name, shape in shapes.items():
+        size = 2 * math.prod(shape)
+        header[name] = {"dtype": "BF16", "shape": shape, "data_offsets": (end, end + size)}
+        end += size
+    text = json.dumps(header).encode()
+    (tmp_path / "model.safetensors").write_bytes(len(text).to_bytes(8, "little") + text)
+    (tmp_path / "config.json").write_text("{}")
+    (tmp_path / "norm_stats.json").write_text(json.dumps(STATISTICS))
+    out = tmp_path / "facts.json"
+    assert commands.parity(["official", str(tmp_path), "--header-only", "--out", str(out)]) == 0
+    facts = json.loads(out.read_text())
+    assert facts["faults"] == []
+    assert round(facts["U3 tensors"]["num_parameters"] / 1e9, 2) == 13.56
+    assert round(end / 1e9, 1) == 27.1
+    capsys.readouterr()
