@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +29,10 @@ STATISTICS = {
 PALIGEMMA_HEAD = "net.paligemma_with_expert.paligemma.lm_head.weight"
 
 
-def imported(release: Any, out: Path) -> dict[str, Any]:
-    return import_official(
-        release.write(), out, qwen=release.qwen, paligemma=release.paligemma, pounce=sizes_like(release.pounce_like)
-    )
+def imported(release: Any, out: Path, roles: Sequence[str] = ()) -> dict[str, Any]:
+    like = sizes_like(release.pounce_like)
+    folder = release.write()
+    return import_official(folder, out, qwen=release.qwen, paligemma=release.paligemma, pounce=like, roles=roles)
 
 
 def as_bfloat16(tensor: torch.Tensor) -> torch.Tensor:
@@ -233,6 +233,44 @@ def test_what_cannot_be_explained_is_refused_by_name_and_nothing_is_written(
     with pytest.raises(FolderError, match=said):
         imported(release, tmp_path / "out")
     assert not [path for path in tmp_path.iterdir() if path.name.startswith("out")]
+
+
+def test_a_null_in_neither_half_is_found_by_elimination(make_release: Any, tmp_path: Path) -> None:
+    release = make_release()
+    rename("zq7.policy.nothing_yet", "top.null")(release)
+    assert imported(release, tmp_path / "out")["roles"]["null"]["name"] == "top.null"
+
+
+def ambiguous(make_release: Any) -> Any:
+    """An age of 32 features beside a state of 8 dims: by shape, either may be either."""
+    release = make_release()
+    release.tensors["zq7.policy.clock.weight"] = release.tensors["zq7.policy.clock.weight"][:, :32].clone()
+    return release
+
+
+def test_what_shapes_do_not_tell_apart_is_refused_until_it_is_given(make_release: Any, tmp_path: Path) -> None:
+    release = ambiguous(make_release)
+    with pytest.raises(FolderError, match=r"age: expected one tensor, came .*clock.*joints"):
+        imported(release, tmp_path / "out")
+    roles = ["age=zq7.policy.clock.weight", "state=zq7.policy.joints.weight"]
+    facts = imported(release, tmp_path / "out", roles=roles)
+    assert facts["roles"]["age"]["name"] == "zq7.policy.clock.weight"
+    assert facts["roles"]["age_bias"]["name"] == "zq7.policy.clock.bias"
+    config: Any = load_bundle(tmp_path / "out" / "pounce").model.config
+    assert config.cognition.age_features == 32
+
+
+@pytest.mark.parametrize(
+    ("role", "said"),
+    [
+        ("age=zq7.policy.nowhere", "age: given as zq7.policy.nowhere, which is no tensor"),
+        ("age=zq7.policy.bridge.weight", r"age: given as zq7\.policy\.bridge\.weight \(64, 96\), expected \(64, F\)"),
+        ("clock=zq7.policy.clock.weight", "expected ROLE=NAME with a role of carriers, null"),
+    ],
+)
+def test_a_given_role_must_fit(make_release: Any, tmp_path: Path, role: str, said: str) -> None:
+    with pytest.raises(FolderError, match=said):
+        imported(ambiguous(make_release), tmp_path / "out", roles=[role])
 
 
 def test_every_unexplained_tensor_is_named(make_release: Any, tmp_path: Path) -> None:

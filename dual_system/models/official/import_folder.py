@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,7 @@ from dual_system.models.official.plan import (
     ponder_json,
     pounce_config,
     read_config,
+    read_roles,
 )
 from dual_system.models.official.statistics import FILE as STATISTICS_FILE
 from dual_system.models.official.statistics import ReadStatistics, read_statistics
@@ -69,12 +71,25 @@ class ImportOptions:
     """PaliGemma's SentencePiece file, tokenizer.model."""
     pounce_like: Path | None = None
     """POUNCE folder of ours whose pi0.5 has the sizes to expect. None: the public pi0.5."""
+    roles: tuple[str, ...] = ()
+    """Pairs ROLE=NAME for tensors that shapes do not tell apart, e.g. age=system1.age.weight. Roles: carriers, null,
+    projector, age, state."""
 
 
 def import_official(
-    folder: Path, out: Path, *, qwen: Path, paligemma: Path, pounce: PounceConfig | None = None
+    folder: Path,
+    out: Path,
+    *,
+    qwen: Path,
+    paligemma: Path,
+    pounce: PounceConfig | None = None,
+    roles: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Writes ``out`` and returns the contents of import.json. ``pounce``: sizes of pi0.5; None: the public ones.
+    """Writes ``out`` and returns the contents of import.json.
+
+    Args:
+        pounce: sizes of pi0.5; None: the public ones.
+        roles: ROLE=NAME for tensors that shapes do not tell apart.
 
     Nothing is left behind if it is refused or interrupted.
 
@@ -93,7 +108,7 @@ def import_official(
     config, statistics = read_config(folder / CONFIG_FILE), read_statistics(folder / STATISTICS_FILE)
     vocabulary, tokenizer = Vocabulary.load(qwen), Tokenizer.from_file(paligemma)
     tables = expected(Qwen3_5Config.from_dict(read_config(qwen / CONFIG_FILE)), pounce or pi05_base())
-    plan = make_plan(header, config, tables)
+    plan = make_plan(header, config, tables, read_roles(roles))
     if not plan.faults:
         compare_copies(plan, tables)
         last = vocabulary.num_tokens + plan.num_carriers
@@ -201,7 +216,12 @@ def main(argv: list[str] | None = None, prog: str = "pp-parity import-official")
     try:
         pounce = None if options.pounce_like is None else sizes_like(options.pounce_like)
         facts = import_official(
-            options.folder, options.out, qwen=options.qwen, paligemma=options.paligemma, pounce=pounce
+            options.folder,
+            options.out,
+            qwen=options.qwen,
+            paligemma=options.paligemma,
+            pounce=pounce,
+            roles=options.roles,
         )
     except (FolderError, CheckpointError, OSError, ValueError) as error:
         sys.stderr.write(f"{prog}: {error}\n")
@@ -214,5 +234,6 @@ def main(argv: list[str] | None = None, prog: str = "pp-parity import-official")
         f"imported  {facts['num_tensors']} tensors, {facts['num_parameters']:,} numbers -> {options.out}\n"
         f"serve     ponder-serve --checkpoint {options.out}/ponder\n"
         f"          pounce-serve --checkpoint {options.out}/pounce\n"
+        "before    a robot moves: compare with the official code, `pp-parity answers`; see docs/official.md\n"
     )
     return DONE

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from itertools import permutations, takewhile
 from typing import Literal, TypeAlias
 
+from dual_system.models.interface import MAX_CARRIERS
 from dual_system.models.official.halves import POUNCE_EMBEDDING, Half
 from dual_system.models.official.header import Shape, Stored
 
@@ -26,7 +27,11 @@ BUFFERS = ("inv_freq", "position_ids")
 STATE_DIMS = (8, 32)
 """S: the robot's dims, or pi0.5's padded ones."""
 MAX_AGE_FEATURES = 1024
-ASK = "Attach the output of `pp-parity official FOLDER --header-only` to an issue."
+"""More columns are no sinusoid of one number."""
+ASK = (
+    "Attach the file of `pp-parity official FOLDER --header-only` to an issue. A tensor that could have two roles is given "
+    "its own with --roles ROLE=NAME."
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,8 +56,14 @@ class Leftovers:
     faults: list[str] = field(default_factory=list)
 
 
-def classify(tensors: Mapping[str, Stored], ponder: Half, pounce: Half, sizes: Sizes) -> Leftovers:
-    """Gives each tensor in neither half a role, or a fault that names it."""
+def classify(
+    tensors: Mapping[str, Stored], ponder: Half, pounce: Half, sizes: Sizes, given: Mapping[Role, str] | None = None
+) -> Leftovers:
+    """Gives each tensor in neither half a role, or a fault that names it.
+
+    ``given``: names of the tensors of some roles, where shapes do not tell; a shape must fit its role nevertheless.
+    """
+    given = given or {}
     left = Leftovers()
     rest = {name: tensor for name, tensor in tensors.items() if name not in ponder.names | pounce.names}
     near = {name: _nearest(name, ponder.names, pounce.names) for name in rest}
@@ -66,11 +77,15 @@ def classify(tensors: Mapping[str, Stored], ponder: Half, pounce: Half, sizes: S
             f"two layers {first.name} {first.shape}, then {then.name} {then.shape}: a network for {what}, and "
             "CognitionConfig has one matrix"
         )
-        rest.pop(first.name, None), rest.pop(then.name, None)
+        for layer in (first, then):
+            rest.pop(layer.name, None)
+    _take_given(given, rest, sizes, left)
+    _place_by_elimination(rest, near, sizes)
     claims: dict[Role, list[Stored]] = {}
-    for tensor in [*rest.values()]:
+    for tensor in rest.values():
         for role in _claims(tensor, near[tensor.name], sizes):
-            claims.setdefault(role, []).append(tensor)
+            if role not in given:
+                claims.setdefault(role, []).append(tensor)
     _settle_age_and_state(claims)
     for role, claimants in claims.items():
         if len(claimants) == 1:
@@ -110,22 +125,46 @@ def _unread(tensor: Stored, pounce: Half, sizes: Sizes) -> Role | None:
     return None
 
 
-def _claims(tensor: Stored, half: str | None, sizes: Sizes) -> Iterable[Role]:
-    shape = without_ones(tensor.shape)
+def _claims(tensor: Stored, half: str | None, sizes: Sizes) -> list[Role]:
+    """Roles that shape and half allow; carriers and null have one shape, so only the half tells them apart."""
     if tensor.name.endswith(".bias") or tensor.dtype not in ("BF16", "F16", "F32", "F64"):
-        return
-    if shape[-1:] == (sizes.carrier,) and len(shape) <= 2 and (len(shape) == 1 or shape[0] <= 16):
-        if half is not None:
-            yield "carriers" if half == "ponder" else "null"
-    elif half == "ponder" or len(shape) != 2:
-        return
-    elif shape == (sizes.language, sizes.carrier):
-        yield "projector"
-    elif shape[0] == sizes.language and shape[1] in STATE_DIMS:
-        yield "state"
-        yield "age"
-    elif shape[0] == sizes.language and shape[1] <= MAX_AGE_FEATURES and shape[1] % 2 == 0:
-        yield "age"
+        return []
+    allowed = {"ponder": ("carriers",), "pounce": COGNITION_ROLES[1:], None: COGNITION_ROLES[2:]}[half]
+    return [role for role in allowed if _fits(role, tensor.shape, sizes)]
+
+
+def _fits(role: Role, shape: Shape, sizes: Sizes) -> bool:
+    shape = without_ones(shape)
+    if role in ("carriers", "null"):
+        return shape[-1:] == (sizes.carrier,) and (len(shape) == 1 or (len(shape) == 2 and shape[0] <= MAX_CARRIERS))
+    if len(shape) != 2 or shape[0] != sizes.language:
+        return False
+    columns = shape[1]
+    if role == "projector":
+        return columns == sizes.carrier
+    if role == "state":
+        return columns in STATE_DIMS
+    return columns % 2 == 0 and columns <= MAX_AGE_FEATURES and columns != sizes.carrier
+
+
+def _place_by_elimination(rest: Mapping[str, Stored], near: dict[str, str | None], sizes: Sizes) -> None:
+    """If one of two tensors of the carriers' shape sits in a half and the other in none, the other half is its."""
+    alike = [name for name, tensor in rest.items() if _fits("null", tensor.shape, sizes)]
+    placed = [near[name] for name in alike if near[name] is not None]
+    if len(alike) == 2 and len(placed) == 1:
+        (lost,) = (name for name in alike if near[name] is None)
+        near[lost] = "pounce" if placed == ["ponder"] else "ponder"
+
+
+def _take_given(given: Mapping[Role, str], rest: dict[str, Stored], sizes: Sizes, left: Leftovers) -> None:
+    for role, name in given.items():
+        tensor = rest.pop(name, None)
+        if tensor is None:
+            left.faults.append(f"{role}: given as {name}, which is no tensor of the file that needs a role")
+        elif not _fits(role, tensor.shape, sizes):
+            left.faults.append(f"{role}: given as {name} {tensor.shape}, expected {_shape_of(role, sizes)}")
+        else:
+            left.roles[role] = tensor
 
 
 def _settle_age_and_state(claims: dict[Role, list[Stored]]) -> None:
@@ -134,7 +173,8 @@ def _settle_age_and_state(claims: dict[Role, list[Stored]]) -> None:
     if sure := [each for each in ages if each not in states]:
         claims["age"] = sure
     elif len(ages) == 1:  # nothing else can be the state: two roles for one tensor are a fault of both
-        claims.pop("age"), claims.pop("state", None)
+        del claims["age"]
+        claims.pop("state", None)
 
 
 def _take_bias(role: Role, of_bias: Role, rest: dict[str, Stored], left: Leftovers) -> None:

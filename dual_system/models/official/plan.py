@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from dual_system.models.official.halves import (
     find_pounce,
 )
 from dual_system.models.official.header import FolderError, Header, Shape, Stored, are_equal
-from dual_system.models.official.leftovers import Leftovers, Sizes, classify, without_ones
+from dual_system.models.official.leftovers import COGNITION_ROLES, Leftovers, Role, Sizes, classify, without_ones
 from dual_system.models.pi05.pounce import Pounce, PounceConfig
 from dual_system.models.pi05.weights import public_name
 from dual_system.models.ponder.checkpoint import StoredPonder, mtp_shapes
@@ -100,11 +100,13 @@ class Plan:
     """Name of a second copy -> whether it equals the one that is read."""
 
 
-def make_plan(header: Header, config: Mapping[str, Any], tables: Expected) -> Plan:
-    """Finds, classifies and checks; nothing raises here, faults are collected."""
+def make_plan(
+    header: Header, config: Mapping[str, Any], tables: Expected, given: Mapping[Role, str] | None = None
+) -> Plan:
+    """Finds, classifies and checks; nothing raises here, faults are collected. ``given``: as in `classify`."""
     ponder = find_ponder(header.tensors, tables.ponder_shapes, tables.mtp_shapes)
     pounce = find_pounce(header.tensors, tables.pounce_shapes)
-    leftovers = classify(header.tensors, ponder, pounce, tables.sizes)
+    leftovers = classify(header.tensors, ponder, pounce, tables.sizes, given)
     plan = Plan(header, ponder, pounce, leftovers, faults=[*ponder.faults, *pounce.faults, *leftovers.faults])
     read = [*ponder.found.values(), *pounce.found.values(), *leftovers.roles.values()]
     plan.faults += [
@@ -183,6 +185,18 @@ def pounce_config(plan: Plan, tables: Expected) -> PounceConfig:
         stateless_prompt="task",
         robot_state_dim=ROBOT_DIM,
     )
+
+
+def read_roles(pairs: Sequence[str]) -> dict[Role, str]:
+    """Roles from ROLE=NAME. Raises FolderError for another form or an unknown role."""
+    found: dict[Role, str] = {}
+    for pair in pairs:
+        word, _, name = pair.partition("=")
+        role = next((each for each in COGNITION_ROLES if each == word), None)
+        if role is None or not name:
+            raise FolderError(f"--roles {pair}: expected ROLE=NAME with a role of {', '.join(COGNITION_ROLES)}")
+        found[role] = name
+    return found
 
 
 def read_config(path: Path) -> dict[str, Any]:
