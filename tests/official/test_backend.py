@@ -153,7 +153,7 @@ def test_an_episode_under_our_clock_follows_from_its_log(
     monkeypatch.setattr("ponder_server.in_process.build_engine", lambda options: ponder)
     monkeypatch.setattr("pounce_server.in_process.build_engine", lambda options: pounce)
     out = tmp_path / "episodes"
-    arguments = ["--in-process", "--task", "VideoUnmask", "--max-steps", "50", "--no-progress", "--out", str(out)]
+    arguments = ["--in-process", "--task", "PickHighlight", "--max-steps", "25", "--no-progress", "--out", str(out)]
     assert simulate(arguments) == 0
     (path,) = out.rglob("*.mcap")
     record = read_log(path)

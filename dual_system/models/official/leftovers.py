@@ -29,7 +29,7 @@ STATE_DIMS = (8, 32)
 MAX_AGE_FEATURES = 1024
 """More columns are no sinusoid of one number."""
 ASK = (
-    "Attach the file of `pp-parity official FOLDER --header-only` to an issue. A tensor that could have two roles is given "
+    "Attach the file of `pp-parity official FOLDER --header-only` to an issue. If a tensor could have two roles, give "
     "its own with --roles ROLE=NAME."
 )
 
