@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -137,6 +138,16 @@ def test_another_commit_is_refused_by_the_names_it_lacks(
     monkeypatch.delattr(release.PonderPounceRoboMMEServer, "_dispense")
     with pytest.raises(ValueError, match=r"has no _dispense; the adapters expect commit 723df35"):
         build_pounce(PounceOptions(backend="official", checkpoint=folder))
+
+
+def test_the_adapters_need_nothing_of_our_networks() -> None:
+    """In the official environment transformers is another version, and safetensors or sentencepiece may be too."""
+    code = (
+        "import sys, ponder_server.official, pounce_server.official\n"
+        "print(sorted({'transformers', 'safetensors', 'sentencepiece'} & {*sys.modules}))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
+    assert done.stdout == "[]\n"
 
 
 def test_options_that_do_not_go_together_are_refused(folder: Path) -> None:

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
+CONFIG_FILE, WEIGHTS_FILE, STATISTICS_FILE = "config.json", "model.safetensors", "norm_stats.json"
+"""The official folder."""
 PIECE_BYTES = 8 * 2**20
 MAX_HEADER_BYTES = 100_000_000
 ITEM_BYTES = {

@@ -25,12 +25,17 @@ from transformers.models.qwen3_5 import Qwen3_5Config
 from dual_system.models.action_space import ROBOT_DIM
 from dual_system.models.config_json import from_json
 from dual_system.models.official.halves import PONDER_EMBEDDING, refuse
-from dual_system.models.official.header import ITEM_BYTES, FolderError, read_header
+from dual_system.models.official.header import (
+    CONFIG_FILE,
+    ITEM_BYTES,
+    STATISTICS_FILE,
+    WEIGHTS_FILE,
+    FolderError,
+    read_header,
+)
 from dual_system.models.official.leftovers import ASK
 from dual_system.models.official.plan import (
     ASSUMPTIONS,
-    CONFIG_FILE,
-    WEIGHTS_FILE,
     Expected,
     Plan,
     compare_copies,
@@ -41,7 +46,6 @@ from dual_system.models.official.plan import (
     read_config,
     read_roles,
 )
-from dual_system.models.official.statistics import FILE as STATISTICS_FILE
 from dual_system.models.official.statistics import ReadStatistics, read_statistics
 from dual_system.models.official.writing import Entry, raw, read, write
 from dual_system.models.pi05.pounce import PounceConfig

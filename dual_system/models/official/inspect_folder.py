@@ -17,18 +17,22 @@ from typing import Any
 import tyro
 from transformers.models.qwen3_5 import Qwen3_5Config
 
-from dual_system.models.official.header import FolderError, Header, read_header
+from dual_system.models.official.header import (
+    CONFIG_FILE,
+    STATISTICS_FILE,
+    WEIGHTS_FILE,
+    FolderError,
+    Header,
+    read_header,
+)
 from dual_system.models.official.import_folder import sizes_like
 from dual_system.models.official.plan import (
-    CONFIG_FILE,
-    WEIGHTS_FILE,
     Plan,
     compare_copies,
     expected,
     make_plan,
     read_config,
 )
-from dual_system.models.official.statistics import FILE as STATISTICS_FILE
 from dual_system.models.official.statistics import read_statistics
 from dual_system.models.ponder.configs import qwen35_9b
 from dual_system.models.pounce.configs import pi05_base

@@ -23,7 +23,7 @@ from dual_system.models.official.halves import (
     find_ponder,
     find_pounce,
 )
-from dual_system.models.official.header import FolderError, Header, Shape, Stored, are_equal
+from dual_system.models.official.header import CONFIG_FILE, FolderError, Header, Shape, Stored, are_equal
 from dual_system.models.official.leftovers import COGNITION_ROLES, Leftovers, Role, Sizes, classify, without_ones
 from dual_system.models.pi05.pounce import Pounce, PounceConfig
 from dual_system.models.pi05.weights import public_name
@@ -31,8 +31,6 @@ from dual_system.models.ponder.checkpoint import StoredPonder, mtp_shapes
 from dual_system.models.ponder.demo_sampling import FASTEST_HZ, DemoSampling
 from dual_system.models.ponder.network import skeleton
 from dual_system.models.ponder.text_policy import OFFICIAL_TEXTS
-
-CONFIG_FILE, WEIGHTS_FILE = "config.json", "model.safetensors"
 
 ASSUMPTIONS = {
     "age": "[sin | cos] at log-spaced periods of 0.1 to 100 s (U8)",

@@ -17,7 +17,6 @@ from dual_system.models.action_space import ROBOT_DIM
 from dual_system.models.normalisation import Quantiles, RobotStatistics
 from dual_system.models.official.header import FolderError
 
-FILE = "norm_stats.json"
 JOINT_DELTAS = (True,) * (ROBOT_DIM - 1) + (False,)
 UNREAD = {"mean", "std", "min", "max", "count", "var", "num_samples"}
 WAY_OUT = "Attach norm_stats.json to an issue; a guessed normalisation would move the robot wrongly."

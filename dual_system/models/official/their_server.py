@@ -19,8 +19,7 @@ import numpy as np
 
 from clock.schedules import CONTROL_HZ
 from dual_system.models.action_space import ROBOT_DIM
-from dual_system.models.official.header import read_header
-from dual_system.models.official.plan import WEIGHTS_FILE
+from dual_system.models.official.header import STATISTICS_FILE, WEIGHTS_FILE, read_header
 
 MODULE = "ponderpounce.eval.robomme_server"
 COMMIT = "723df35"
@@ -140,7 +139,7 @@ def weights_hash(folder: Path) -> str:
     """``official-`` and 12 hex digits over the header, statistics and the last MB of weights."""
     header = read_header(folder / WEIGHTS_FILE)
     digest = hashlib.sha256(header.sha256.encode())
-    for path in (folder / "norm_stats.json", header.path):
+    for path in (folder / STATISTICS_FILE, header.path):
         with path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - _HASHED_BYTES))
             digest.update(file.read(_HASHED_BYTES))

@@ -1,4 +1,4 @@
-"""The imported folders as ponder-serve and pounce-serve open them: official conventions, our clock."""
+"""The imported folders as ponder-serve and pounce-serve open them, with the official conventions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from clock.check import disagreements
 from dual_system.commands import parity
 from dual_system.models.official.import_folder import import_official, sizes_like
 from dual_system.models.pi05.prompt import Tokenizer, task_only_prompt_text
@@ -21,8 +20,6 @@ from ponder_server.contract import Opening
 from pounce_server.__main__ import build_engine as build_pounce
 from pounce_server.config import PounceOptions
 from pounce_server.contract import example_request
-from protocol.mcap_log import read_log
-from sim_client.__main__ import main as simulate
 
 
 @pytest.fixture
@@ -56,18 +53,6 @@ def test_pounce_reads_the_task_as_text_and_the_state_as_numbers(imported: Path) 
     assert inputs.token_ids.tolist() == [bundle.tokenizer.encode(text)]
     assert inputs.state is not None
     assert np.array_equal(inputs.state[0], bundle.statistics.normalise_states(request.proprio))
-
-
-@pytest.mark.sim
-def test_an_episode_follows_from_its_log(imported: Path, tmp_path: Path) -> None:
-    out = tmp_path / "episodes"
-    folders = ["--ponder-checkpoint", str(imported / "ponder"), "--pounce-checkpoint", str(imported / "pounce")]
-    arguments = ["--in-process", "--task", "PickHighlight", "--max-steps", "25", "--no-progress", "--out", str(out)]
-    assert simulate([*arguments, *folders]) == 0
-    (path,) = out.rglob("*.mcap")
-    record = read_log(path)
-    assert len(record.invocations) == 2
-    assert next(disagreements(record), None) is None
 
 
 def test_a_pair_agrees_with_itself_and_a_difference_is_found(
