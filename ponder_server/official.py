@@ -8,6 +8,7 @@ Their server builds the session, its context object answers every query. Only *w
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,8 @@ _NO_STATE = np.zeros(ROBOT_DIM, np.float32)
 @dataclass(slots=True)
 class _Session:
     instruction: str
+    is_open: bool = False
+    """Task and demonstration are encoded; from then on their context fires."""
     answer: Any = None
     """Their newest S2ContextResult."""
     failure: str = ""
@@ -152,26 +155,16 @@ class OfficialPonder:
         self._theirs.observe(session, self._sessions[session].instruction, frames, state, demo or ())
 
     def _on_query(self, episode: Any, observation: Any, now: int) -> None:
-        """Called by their server when System 2 is due: first to build the context, then to fire."""
-        if episode.s2_context is not None:
-            self._fire(episode, observation, now)
-            return
-        server, state = self._theirs.server, self._sessions[self._now]
-        context = self._theirs.module.SoftS2SessionContext(
-            session=episode.session,
-            system2=server._s2,
-            device=server._device,
-            dtype=server._dtype,
-            max_new_tokens=server._s2_max_new_tokens,
-        )
-        fire = context.fire
+        """Called by their server when System 2 is due. It builds the context at the first call and fires at each."""
+        state = self._sessions[self._now]
 
-        def heard(*arguments: Any, **named: Any) -> Any:
-            state.answer = fire(*arguments, **named)
+        def fired(fire: Callable[..., Any], *given: Any, **named: Any) -> Any:
+            state.answer = fire(*given, **named) if state.is_open else self._theirs.no_answer()
             return state.answer
 
-        context.fire = heard
-        episode.s2_context = context
+        with self._theirs.contexts_fire_through(fired):
+            self._fire(episode, observation, now)
+        state.is_open = True
 
     def _num_tokens(self, session: str) -> int:
         context = self._theirs.server._episodes[session].s2_context

@@ -46,9 +46,11 @@ class _System1:
         drawn = torch.randn(noise.shape, generator=torch.Generator().manual_seed(request.seed))
         given["noise"] = drawn.to(noise)
         if request.cognition is not None:
-            cognition, age_ms = given["cognition"], given["age_ms"]
-            given["cognition"] = torch.tensor(request.cognition).reshape(cognition.shape).to(cognition)
-            given["age_ms"] = torch.full_like(age_ms, request.age_ns / NS_PER_MS)
+            null, age_ms = given.get("cognition"), given.get("age_ms")
+            cognition = torch.tensor(request.cognition)[None]
+            given["cognition"] = cognition.to(noise) if null is None else cognition.reshape(null.shape).to(null)
+            ages = noise.new_zeros(1) if age_ms is None else age_ms
+            given["age_ms"] = torch.full_like(ages, request.age_ns / NS_PER_MS)
         return self._theirs.predict_action(**given)
 
 

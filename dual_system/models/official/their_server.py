@@ -8,14 +8,17 @@ start.
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import functools
 import hashlib
 import importlib
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from clock.schedules import CONTROL_HZ
 from dual_system.models.action_space import ROBOT_DIM
@@ -23,10 +26,10 @@ from dual_system.models.official.header import STATISTICS_FILE, WEIGHTS_FILE, re
 
 MODULE = "ponderpounce.eval.robomme_server"
 COMMIT = "723df35"
-MODULE_NAMES = ("PonderPounceRoboMMEServer", "SoftS2SessionContext", "ObsAdapter")
+MODULE_NAMES = ("PonderPounceRoboMMEServer", "SoftS2SessionContext", "S2ContextResult", "ObsAdapter")
 SERVER_NAMES = (
     "_s1", "_s2", "_adapter", "_camera_keys", "_device", "_dtype", "_dt_ns", "_episodes", "_norm_stats",
-    "_s1_period_ns", "_s2_period_ns", "_s2_max_new_tokens", "_wait_first_cognition", "_fire_s1", "_fire_s2",
+    "_s1_period_ns", "_s2_period_ns", "_wait_first_cognition", "_fire_s1", "_fire_s2",
     "_dispense", "_visible_cognition", "on_episode_start", "on_observation", "on_episode_end",
 )  # fmt: skip
 _HASHED_BYTES = 2**20
@@ -97,6 +100,33 @@ class TheirServer:
             norm_stats=self.server._norm_stats,
             demo_fps=0.0,
             env_fps=float(CONTROL_HZ),
+        )
+
+    @contextlib.contextmanager
+    def contexts_fire_through(self, fired: Callable[..., Any]) -> Iterator[None]:
+        """Each context that their server builds meanwhile calls ``fired(fire, ...)`` in place of ``fire(...)``."""
+        made = self.module.SoftS2SessionContext
+
+        def heard(*arguments: Any, **named: Any) -> Any:
+            context = made(*arguments, **named)
+            context.fire = functools.partial(fired, context.fire)
+            return context
+
+        self.module.SoftS2SessionContext = heard
+        try:
+            yield
+        finally:
+            self.module.SoftS2SessionContext = made
+
+    def no_answer(self) -> Any:
+        """Their result of a query that is not encoded."""
+        return self.module.S2ContextResult(
+            subgoal_tokens=None,
+            subgoal_text="",
+            cognition=torch.zeros(self.num_carriers, self.hidden_size, device=self.server._device),
+            kind="nontransition",
+            gate_score=None,
+            n_input_frames=0,
         )
 
     def start(self, name: str) -> None:
