@@ -377,13 +377,14 @@ def test_the_command_imports_and_says_how_to_serve(
     assert "exists" in capsys.readouterr().err
 
 
-def test_the_header_alone_answers_the_unknowns(
-    make_release: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("num_bytes_beyond", [0, 1000])
+def test_the_beginning_of_the_file_answers_the_unknowns(
+    make_release: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], num_bytes_beyond: int
 ) -> None:
     release = make_release()
     path = release.write() / "model.safetensors"
     with path.open("rb+") as file:
-        file.truncate(8 + int.from_bytes(file.read(8), "little"))
+        file.truncate(8 + int.from_bytes(file.read(8), "little") + num_bytes_beyond)
     out = tmp_path / "facts.json"
     assert commands.parity(["official", *arguments(release), "--header-only", "--out", str(out)]) == 0
     facts = json.loads(out.read_text())
@@ -391,7 +392,7 @@ def test_the_header_alone_answers_the_unknowns(
     assert facts["U2 statistics"]["file"]["delta_mask"] == [True] * 7 + [False]
     assert facts["U3 tensors"]["dtypes"] == {"BF16": len(release.tensors)}
     assert facts["U4 interface"]["carriers"]["name"] == "zq7.mllm.kk.soft_tokens"
-    assert facts["U5 copies"] == "the file is the header alone"
+    assert facts["U5 copies"] == "the file ends before its numbers"
     assert "attach it to an issue" in capsys.readouterr().out
 
 
@@ -423,7 +424,7 @@ def test_a_file_that_was_cut_short_is_refused(make_release: Any, tmp_path: Path)
     path = release.write() / "model.safetensors"
     with path.open("rb+") as file:
         file.truncate(path.stat().st_size - 10)
-    with pytest.raises(FolderError, match="the header describes"):
+    with pytest.raises(FolderError, match=r"expected \d+ bytes, as its header says; it is cut short"):
         import_official(release.folder, tmp_path / "out", qwen=release.qwen, paligemma=release.paligemma)
 
 
@@ -456,3 +457,11 @@ def test_a_header_of_the_real_size_is_explained_and_counts_as_published(
     assert round(facts["U3 tensors"]["num_parameters"] / 1e9, 2) == 13.56
     assert round(end / 1e9, 1) == 27.1
     capsys.readouterr()
+
+
+def test_a_file_longer_than_its_header_says_is_refused(make_release: Any, tmp_path: Path) -> None:
+    release = make_release()
+    with (release.write() / "model.safetensors").open("ab") as file:
+        file.write(b"more")
+    with pytest.raises(FolderError, match="the header describes"):
+        import_official(release.folder, tmp_path / "out", qwen=release.qwen, paligemma=release.paligemma)

@@ -1,6 +1,6 @@
 """A safetensors file by its header: what it holds is known before a tensor is read, and bytes are read in pieces.
 
-A file may be the header alone, as an HTTP range request brings it: everything but the numbers is then known.
+A file may end anywhere behind its header, as an HTTP range request brings it: everything but the numbers is then known.
 Layout: 8 bytes little-endian length n, n bytes of JSON, tensors. Source: the safetensors format's public description.
 """
 
@@ -57,8 +57,10 @@ class Header:
     sha256: str
     """sha256 over the header's JSON: equal for files of the same names, dtypes, shapes and order."""
     tensors: Mapping[str, Stored]
+    num_bytes: int
+    """Size of the whole file."""
     has_numbers: bool
-    """False if the file ends with its header."""
+    """False if this one ends before."""
 
 
 def read_header(path: Path) -> Header:
@@ -66,7 +68,7 @@ def read_header(path: Path) -> Header:
 
     Raises:
         FileNotFoundError: there is no such file.
-        FolderError: no safetensors file, cut short, or a name twice.
+        FolderError: no safetensors file, longer than its header says, or a name twice.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: not there. The official folder holds its weights in one model.safetensors.")
@@ -86,10 +88,14 @@ def read_header(path: Path) -> Header:
     values.pop("__metadata__", None)
     tensors = {name: _stored(path, name, value, 8 + length) for name, value in values.items()}
     wanted = max((tensor.end for tensor in tensors.values()), default=8 + length)
-    if size not in (wanted, 8 + length):
+    if size > wanted:
         raise FolderError(f"{path}: the header describes {wanted} bytes, the file has {size}. Fetch it again.")
     return Header(
-        path=path, sha256=hashlib.sha256(raw).hexdigest(), tensors=tensors, has_numbers=size == wanted and bool(tensors)
+        path=path,
+        sha256=hashlib.sha256(raw).hexdigest(),
+        tensors=tensors,
+        num_bytes=wanted,
+        has_numbers=size == wanted,
     )
 
 

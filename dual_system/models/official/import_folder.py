@@ -107,7 +107,8 @@ def import_official(
     header = read_header(folder / WEIGHTS_FILE)
     if not header.has_numbers:
         raise FolderError(
-            f"{header.path}: this is the header alone. Fetch the whole file, or use `pp-parity official`."
+            f"{header.path}: expected {header.num_bytes} bytes, as its header says; it is cut short. Fetch the whole "
+            "file; a beginning is enough for `pp-parity official` only."
         )
     config, statistics = read_config(folder / CONFIG_FILE), read_statistics(folder / STATISTICS_FILE)
     vocabulary, tokenizer = Vocabulary.load(qwen), Tokenizer.from_file(paligemma)

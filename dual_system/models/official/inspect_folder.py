@@ -47,7 +47,7 @@ class InspectOptions:
     """Says what an official PonderPounce folder holds. Exit code 0: all explained, 1: not, 2: unreadable."""
 
     folder: tyro.conf.Positional[Path]
-    """Official folder. model.safetensors may be cut off behind its header."""
+    """Official folder. The first MB of model.safetensors is enough: its header."""
     header_only: bool = False
     """Compare the first MB of matrices that are stored twice, and not all of them."""
     out: Path = Path("official_header.json")
@@ -82,7 +82,7 @@ def inspect(options: InspectOptions) -> dict[str, Any]:
             role: {"name": each.name, "dtype": each.dtype, "shape": each.shape}
             for role, each in sorted(plan.leftovers.roles.items())
         },
-        "U5 copies": plan.copies if header.has_numbers else "the file is the header alone",
+        "U5 copies": plan.copies if header.has_numbers else "the file ends before its numbers",
         "faults": plan.faults,
     }
 
