@@ -18,6 +18,7 @@ from dual_system.models.ponder.network import Ponder
 from dual_system.models.ponder.text_policy import OFFICIAL_TEXTS, TextPolicy
 from dual_system.models.ponder.vocabulary import Vocabulary
 from ponder_server.contract import Opening
+from ponder_server.draft import TrieDraft
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
 
@@ -165,3 +166,26 @@ def test_owed_reasoning_needs_masks() -> None:
 def test_no_view_at_all_is_refused() -> None:
     with pytest.raises(ValueError, match="num_views"):
         DemoSampling(num_views=0)
+
+
+def test_a_drafted_text_is_rolled_back_alike() -> None:
+    """The draft is appended several tokens a forward and is right: nothing of it is left either."""
+    letter = 78
+    rolled, silent = official(), scripted(official(), [[275], [275]])
+    answers = iter([272, *(letter,) * 8])  # the gate; then whatever number of tokens is asked for
+
+    def logits(hidden_NH: torch.Tensor) -> torch.Tensor:
+        ids = [next(answers, 275)] if len(hidden_NH) == 1 else [letter] * len(hidden_NH)
+        return 10.0 * torch.nn.functional.one_hot(torch.tensor(ids), rolled.vocab_size).float()
+
+    rolled.logits = logits  # type: ignore[method-assign]
+    config = EngineConfig(max_context_tokens=300, max_sessions=1, max_text_tokens=5)
+    engines = [QwenEngine(rolled, config, TrieDraft([(letter,) * 12])), QwenEngine(silent, config)]
+    for engine in engines:
+        engine.open("a", Opening(instruction="go"))
+    one, other = (engine.fire("a", frames(0)) for engine in engines)
+    assert (one.is_transition, one.context_tokens) == (False, other.context_tokens)
+    assert one.cognition.tobytes() == other.cognition.tobytes()
+    mine, theirs = (engine._episode("a").context for engine in engines)
+    pairs = zip(mine.save().tensors, theirs.save().tensors, strict=True)
+    assert all(torch.equal(now, then) for now, then in pairs)
