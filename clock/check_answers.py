@@ -176,14 +176,16 @@ def _check_kind(
 
 def check_invocations(record: EpisodeRecord, answers: Answers) -> Iterator[Disagreement]:
     """Checks the paper's rule: reference and age of every invocation, the vector it contains, and its chunk's copy."""
-    window = -1
+    window, first_tick = -1, 0
+    if record.ticks and record.invocations:  # the period counts from the first invocation
+        first_tick = max(0, _tick_of(record, record.invocations[0]))
     for index, invocation in enumerate(record.invocations):
         yield from _check_given(record, answers, index, invocation)
         if record.ticks and (tick := _tick_of(record, invocation)) >= 0:
             due_ns = deadline_ns(record.ticks[0].deadline_ns, tick, record.info.schedule.control_hz)
             yield from compare("Invocation", index, now_ns=(due_ns, invocation.now_ns))
             period = record.info.schedule.invoke_period_ticks
-            previous, window = window, tick // period
+            previous, window = window, (tick - first_tick) // period
             if window <= previous:
                 expected = f"the first of its {period} ticks, period {previous + 1} or later"
                 yield from compare("Invocation", index, period=(expected, f"period {window}"))

@@ -355,6 +355,8 @@ class Conductor:
                     "POUNCE is away: no invocations until it is back",
                 )
             elif self._is_lockstep or not self._is_busy(self._invocations, tau_ns, self._overdue_ns):
+                if not self.num_invocations:  # after a hold: the period counts from the first invocation
+                    self._invoke_due_tick = self.tick
                 self._ask_pounce(self.tick, tau_ns, effects)
                 while self._invoke_due_tick <= self.tick:
                     self._invoke_due_tick += self.info.schedule.invoke_period_ticks

@@ -1,4 +1,4 @@
-"""Commands with verbs: ``pp-collect``, ``pp-export`` and ``pp-diagnose``.
+"""Commands with verbs: ``pp-collect``, ``pp-export``, ``pp-parity`` and ``pp-diagnose``.
 
 ``pp-collect --out DIR`` runs the command's default module, ``pp-collect correct LOG...`` the module of a verb. Modules
 are imported by name when they run, so each needs only its own dependencies: pp-collect runs without torch, pp-export hf
@@ -51,6 +51,20 @@ COMMANDS = {
             )
         },
     ),
+    "pp-parity": Command(
+        "dual_system.models.parity",
+        {
+            "official": Verb(
+                "dual_system.models.official.inspect_folder", "Say what an official PonderPounce folder holds."
+            ),
+            "import-official": Verb(
+                "dual_system.models.official.import_folder", "Import the official PonderPounce folder."
+            ),
+            "answers": Verb(
+                "sim_client.parity_answers", "Run a stored episode through a pair, and compare with another's answers."
+            ),
+        },
+    ),
     "pp-diagnose": Command(
         "dual_system.training.diagnose",
         {
@@ -70,6 +84,11 @@ def collect(argv: list[str] | None = None) -> int:
 def export(argv: list[str] | None = None) -> int:
     """``pp-export``."""
     return _run("pp-export", sys.argv[1:] if argv is None else argv)
+
+
+def parity(argv: list[str] | None = None) -> int:
+    """``pp-parity``."""
+    return _run("pp-parity", sys.argv[1:] if argv is None else argv)
 
 
 def diagnose(argv: list[str] | None = None) -> int:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import logging
 import sys
 from dataclasses import replace
+from functools import partial
 
 from model_server.daemon import serve_model
 from ponder_server.config import NUM_TORCH_THREADS, PonderOptions
-from ponder_server.contract import BatchingEngine
+from ponder_server.contract import BatchingEngine, PonderEngine
 from ponder_server.fleet import PonderFleet
 from ponder_server.serve import PonderServer
 from protocol.command_line import parse
@@ -31,7 +32,6 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     from dual_system.models.device import require_device
     from dual_system.models.ponder import configs
     from dual_system.models.ponder.checkpoint import load_ponder
-    from dual_system.models.ponder.demo_sampling import DemoSampling
     from dual_system.models.ponder.network import Ponder
     from ponder_server.draft import Draft, FirstOf, TrieDraft
     from ponder_server.engine import QwenEngine
@@ -57,7 +57,8 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
         size = getattr(configs, options.random.size)()
         ponder = Ponder.random(size, seed=options.random.seed, device=options.device, dtype=dtype)
     trained = ponder.format.demonstrations
-    wanted = DemoSampling(hz=context.demo_hz or trained.hz, to_its_end=context.demo_to_its_end or trained.to_its_end)
+    to_its_end = context.demo_to_its_end or trained.to_its_end
+    wanted = replace(trained, hz=context.demo_hz or trained.hz, to_its_end=to_its_end)
     ponder.format = replace(ponder.format, demonstrations=wanted)
     config = EngineConfig(
         max_context_tokens=context.max_context_tokens,
@@ -80,9 +81,27 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     return QwenEngine(ponder, config, FirstOf(drafts))
 
 
+def build_official(options: PonderOptions) -> PonderEngine:
+    """Loads the official release with its own code.
+
+    Raises:
+        FileNotFoundError, ValueError: no folder is given, or the official package is not installed.
+    """
+    from ponder_server.official import OfficialPonder
+
+    if options.checkpoint is None:
+        raise ValueError("--backend official needs the official folder; give it with --checkpoint")
+    if options.robots.other_robots:
+        raise ValueError("--backend official serves one robot; leave --other-robots out")
+    return OfficialPonder(options.checkpoint, options.device)
+
+
 def main(argv: list[str] | None = None) -> int:
     options = parse(PonderOptions, argv, prog="ponder-serve")
     weights = str(options.checkpoint or f"random weights ({options.random.size})")
+    if options.backend == "official":
+        build = partial(build_official, options)
+        return serve_model("ponder", options.link, weights, build, PonderServer, options.operations)
 
     def make(link: Link, engine: BatchingEngine, heartbeat: Heartbeat, version: str) -> PonderServer | PonderFleet:
         if not options.robots.other_robots:

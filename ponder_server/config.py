@@ -85,6 +85,9 @@ class PonderOptions:
 
     checkpoint: Path | None = None
     """Folder in the Hugging Face layout. None: random weights, which are no policy."""
+    backend: Literal["own", "official"] = "own"
+    """Code that runs the network. official: the official PonderPounce package, in whose environment this then runs;
+    --checkpoint is its folder, and of the other options --device and --link apply."""
     device: str = "cpu"
     """Device of the network: cpu, cuda or cuda:N."""
     dtype: Literal["float32", "bfloat16"] = "float32"

@@ -147,6 +147,8 @@ class QwenEngine:
             )
         if not opening.instruction.strip():
             raise ValueError(f"session {session!r}: the instruction is empty; PONDER needs the task's text")
+        views = self._format.demonstrations.num_views
+        opening = replace(opening, demo_frames=tuple(cameras[:views] for cameras in opening.demo_frames))
         for instant, cameras in enumerate(opening.demo_frames):
             if not cameras:
                 raise ValueError(f"demo instant {instant} has no view")
@@ -154,7 +156,7 @@ class QwenEngine:
         wanted = sum(len(segment) for segment in segments)
         if wanted > self._config.max_context_tokens:
             raise ContextFull(session=session, used=0, wanted=wanted, limit=self._config.max_context_tokens)
-        demo = [self._see(views, f"demo instant {n}") for n, views in enumerate(opening.demo_frames)]
+        demo = [self._see(cameras, f"demo instant {n}") for n, cameras in enumerate(opening.demo_frames)]
         context = self._runner.open(session)
         try:
             with heartbeats(self._parts, progress):
@@ -253,9 +255,11 @@ class QwenEngine:
         try:
             texts: tuple[Text, ...] = ()
             is_transition = exactly is not None
+            at_once = Append(
+                session=context, ids=query.ids, embeds_TH=embeds_TH, num_wanted=1 + self._format.num_carriers
+            )
             if not is_transition:
-                wanted = 1 + self._format.num_carriers
-                hidden_NH = yield Append(session=context, ids=query.ids, embeds_TH=embeds_TH, num_wanted=wanted)
+                hidden_NH = yield at_once
                 is_transition = self._format.speaks and self._writer.wants_to_write(hidden_NH[:1])
                 hidden_KH = hidden_NH[1:]
             if is_transition:
@@ -268,7 +272,11 @@ class QwenEngine:
                     with_reasoning=episode.owes_reasoning and exactly is None,
                     exactly=exactly,
                 )
-                hidden_KH = yield Append(session=context, ids=self._format.carrier_ids, embeds_TH=carriers_KH)
+                if texts:
+                    hidden_KH = yield Append(session=context, ids=self._format.carrier_ids, embeds_TH=carriers_KH)
+                else:  # rolled back: the same forward as for a query without a transition, hence the same bits
+                    context.restore(before)
+                    hidden_KH = (yield at_once)[1:]
             answer = self._answer(context, hidden_KH, texts)
             num_written = len(context.ids) - before.num_ids - len(query.ids)
             episode.spans += [

@@ -36,7 +36,7 @@ class MtpDraft:
         max_tokens, config = WINDOW + num_tokens, self._head.text_config
         self._memory = SlotMemory(config, num_slots=1, max_tokens=max_tokens, device=ponder.device, dtype=ponder.dtype)
         self._may_end_V = allowed_tokens(ponder, ends=True)
-        self._ends = ends_of_text(ponder.format.vocabulary)
+        self._ends = ends_of_text(ponder.format.vocabulary, ponder.format.texts)
         self.parts: Sequence[nn.Module] = [layer.mlp for layer in self._head.layers]  # type: ignore[misc]
 
     def propose(self, written: Sequence[int], max_tokens: int, hidden_TH: Tensor | None = None) -> tuple[int, ...]:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.text_policy import OWN_TEXTS, TextPolicy
 from dual_system.models.ponder.vocabulary import Vocabulary
 from ponder_server.contract import ContextFull, Text
 from ponder_server.draft import Draft
@@ -22,30 +23,43 @@ Result = TypeVar("Result")
 Steps: TypeAlias = Generator[Append, Tensor, Result]
 """Yields appends, is sent their wanted hidden states (N, H), returns a result."""
 
+TextKind: TypeAlias = Literal["subgoal", "demo_reasoning"]
+
 MAX_CHECKED_TOKENS = 16
 """Largest number of tokens in a decoding forward: the bucket after that of a single token."""
 
 
-def ends_of_text(vocabulary: Vocabulary) -> frozenset[int]:
+def ends_of_text(vocabulary: Vocabulary, policy: TextPolicy = OWN_TEXTS) -> frozenset[int]:
     """Tokens that end a text and are not part of it."""
-    return frozenset({vocabulary.t_yes, vocabulary.t_no, vocabulary.end_of_text, vocabulary.im_end})
+    ends = {vocabulary.t_no}
+    if policy.reasoning == "owed":
+        ends.add(vocabulary.t_yes)
+    if policy.ends == "control":
+        ends |= {vocabulary.end_of_text, vocabulary.im_end}
+    return frozenset(ends)
 
 
 def allowed_tokens(ponder: Ponder, *, ends: bool) -> Tensor:
-    """Tokens allowed in a text, (V,) bool: no control tokens, carriers or unused rows; end tokens if ``ends``."""
-    vocabulary = ponder.format.vocabulary
+    """Tokens allowed in a text, (V,) bool: unless the policy masks nothing, no control tokens, carriers or unused rows;
+    end tokens if ``ends``."""
+    vocabulary, policy = ponder.format.vocabulary, ponder.format.texts
     is_text_V = torch.zeros(ponder.vocab_size, dtype=torch.bool)
     is_text_V[: vocabulary.num_tokens] = True
     is_text_V[list(vocabulary.control_ids)] = False
-    is_text_V[list(ends_of_text(vocabulary))] = ends
+    if not policy.masked:
+        is_text_V[:] = True
+        is_text_V[vocabulary.image_pad] = False  # the row's positions are derived from it
+    elif policy.reasoning == "any":
+        is_text_V[vocabulary.t_yes] = True
+    is_text_V[list(ends_of_text(vocabulary, policy))] = ends
     return is_text_V.to(ponder.device)
 
 
 class TransitionWriter:
     """Appends O_t and [T_yes, S], or [T_yes, DR, T_yes, S], and always leaves room for the carriers.
 
-    T_no ends a text, as the end-of-text and end-of-turn tokens do; none of them enters the context. Other control
-    tokens, carriers and unused rows are masked, because they are no text. A text that reaches its limit is cut.
+    Which tokens end a text, which are masked, and what becomes of a text at its limit: the checkpoint's `TextPolicy`.
+    An end token never enters the context.
     """
 
     def __init__(self, ponder: Ponder, draft: Draft, *, max_text_tokens: int) -> None:
@@ -53,7 +67,8 @@ class TransitionWriter:
         self._draft = draft
         self._max_text_tokens = max_text_tokens
         self._t_yes = ponder.format.vocabulary.t_yes
-        self._ends = ends_of_text(ponder.format.vocabulary)
+        self._policy = ponder.format.texts
+        self._ends = ends_of_text(ponder.format.vocabulary, self._policy)
         self._is_text_V, self._may_end_V = allowed_tokens(ponder, ends=False), allowed_tokens(ponder, ends=True)
 
     def wants_to_write(self, hidden_1H: Tensor) -> bool:
@@ -73,7 +88,8 @@ class TransitionWriter:
         """Generates a transition into ``context``, which is at ``before``; DR first if ``with_reasoning``.
 
         DR ends with the T_yes that opens S, or at its limit, and S follows in both cases; T_no after DR ends the
-        transition without S. ``exactly`` forces one text of this many tokens.
+        transition without S. ``exactly`` forces one text of this many tokens. Returns no text if one reached its limit
+        and the policy is to roll back; the caller must then restore ``before``.
 
         Raises ContextFull if not even one token of each text fits; the caller must restore ``before``.
         """
@@ -82,17 +98,34 @@ class TransitionWriter:
         opened = torch.cat([observation_TH, t_yes_TH])
         hidden_NH = yield Append(session=context, ids=[*observation_ids, self._t_yes], embeds_TH=opened, num_wanted=1)
         texts = []
-        if with_reasoning:
+        if with_reasoning and self._policy.reasoning == "owed":
             num_kept = 2 + num_carriers  # T_yes and one token of S
             limit = self._limit(context, before, num_kept, None)
             text, end = yield from self._decode(context, hidden_NH, "demo_reasoning", limit, None)
+            if self._is_rolled_back(text):
+                return ()
             texts.append(text)
             if end not in (self._t_yes, None):
                 return tuple(texts)
             hidden_NH = yield Append(session=context, ids=[self._t_yes], embeds_TH=t_yes_TH)
         limit = self._limit(context, before, num_carriers, exactly)
         text, _ = yield from self._decode(context, hidden_NH, "subgoal", limit, exactly)
-        return (*texts, text)
+        if self._is_rolled_back(text):
+            return ()
+        return (*texts, *self._split(text))
+
+    def _is_rolled_back(self, text: Text) -> bool:
+        return text.truncated and self._policy.on_limit == "roll_back"
+
+    def _split(self, text: Text) -> tuple[Text, ...]:
+        """DR and S where the text has a T_yes inside; it stays in the context, and in neither text."""
+        if self._t_yes not in text.token_ids:
+            return (text,)
+        at = text.token_ids.index(self._t_yes)
+        return (
+            self._text("demo_reasoning", text.token_ids[:at], truncated=False),
+            self._text("subgoal", text.token_ids[at + 1 :], truncated=text.truncated),
+        )
 
     def _limit(self, context: Session, before: SavedState, num_kept: int, exactly: int | None) -> int:
         """Limit of the next text's tokens if ``num_kept`` positions stay free. Raises ContextFull if that is < 1."""
@@ -108,7 +141,7 @@ class TransitionWriter:
         self,
         context: Session,
         hidden_NH: Tensor,
-        kind: Literal["subgoal", "demo_reasoning"],
+        kind: TextKind,
         limit: int,
         exactly: int | None,
     ) -> Steps[tuple[Text, int | None]]:
@@ -147,13 +180,11 @@ class TransitionWriter:
                 pending = []
         if pending:
             yield self._append(context, pending, num_wanted=0)
-        text = Text(
-            kind=kind,
-            text=self._ponder.format.vocabulary.decode(ids),
-            token_ids=tuple(ids),
-            truncated=end is None and exactly is None,
-        )
-        return text, end
+        return self._text(kind, tuple(ids), truncated=end is None and exactly is None), end
+
+    def _text(self, kind: TextKind, ids: tuple[int, ...], *, truncated: bool) -> Text:
+        text = self._ponder.format.vocabulary.decode(ids)
+        return Text(kind=kind, text=text, token_ids=ids, truncated=truncated)
 
     def _append(self, context: Session, ids: Sequence[int], *, num_wanted: int) -> Append:
         return Append(session=context, ids=ids, embeds_TH=self._ponder.embed(ids), num_wanted=num_wanted)

@@ -60,10 +60,24 @@ def build_engine(options: PounceOptions) -> PounceEngine:
     )
 
 
+def build_official(options: PounceOptions) -> PounceEngine:
+    """Loads the official release with its own code.
+
+    Raises:
+        FileNotFoundError, ValueError: no folder is given, or the official package is not installed.
+    """
+    from pounce_server.official import OfficialPounce
+
+    if options.checkpoint is None:
+        raise ValueError("--backend official needs the official folder; give it with --checkpoint")
+    return OfficialPounce(options.checkpoint, options.device)
+
+
 def main(argv: list[str] | None = None) -> int:
     options = parse(PounceOptions, argv, prog="pounce-serve")
     weights = str(options.checkpoint or "random weights")
-    return serve_model("pounce", options.link, weights, lambda: build_engine(options), PounceServer, options.operations)
+    build = build_official if options.backend == "official" else build_engine
+    return serve_model("pounce", options.link, weights, lambda: build(options), PounceServer, options.operations)
 
 
 if __name__ == "__main__":

@@ -63,6 +63,9 @@ class PounceOptions:
     N1.5. None: random weights, which are no policy."""
     tokenizer: Path | None = None
     """tokenizer.model (pi0.5) or tokenizer.json (GR00T), if the checkpoint folder has none."""
+    backend: Literal["own", "official"] = "own"
+    """Code that runs the network. official: the official PonderPounce package, in whose environment this then runs;
+    --checkpoint is its folder, and of the other options --device and --link apply."""
     device: str = "cpu"
     """Device of the network: cpu, cuda or cuda:N."""
     dtype: Literal["float32", "bfloat16"] = "float32"

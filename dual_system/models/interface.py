@@ -20,6 +20,8 @@ from dual_system.models.sinusoid import sinusoid
 MAX_CARRIERS = 16
 
 PrefixAttention = Literal["full", "isolated"]
+PrefixOrder = Literal["age_first", "cognition_first"]
+PrefixPlace = Literal["before_images", "after_text"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,6 +46,11 @@ class CognitionConfig:
     age_features: int = 64
     age_min_period_s: float = 0.1
     age_max_period_s: float = 100.0
+    age_bias: bool = False
+    """The age's projection has a bias."""
+    order: PrefixOrder = "age_first"
+    place: PrefixPlace = "before_images"
+    """after_text: P ends the prefix, behind the state's token if there is one; for "full" attention only."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.num_carriers <= MAX_CARRIERS:
@@ -54,6 +61,8 @@ class CognitionConfig:
             raise ValueError(f"age_features must be even and at least 2, came {self.age_features}")
         if self.attention not in ("full", "isolated"):
             raise ValueError(f"attention must be 'full' or 'isolated', came {self.attention!r}")
+        if self.place == "after_text" and self.attention != "full":
+            raise ValueError("place 'after_text' needs attention 'full': an isolated P stands before the images")
 
     @property
     def num_tokens(self) -> int:
@@ -94,7 +103,7 @@ class CognitionPrefix(nn.Module):
             raise ValueError("K = 0 has no cognition prefix; leave the module out")
         self.config = config
         self.projector = nn.Linear(config.cognition_size, width)
-        self.age_projection = nn.Linear(config.age_features, width, bias=False)
+        self.age_projection = nn.Linear(config.age_features, width, bias=config.age_bias)
         self.null_cognition = nn.Parameter(torch.empty(config.num_carriers, config.cognition_size))
 
     @torch.no_grad()
@@ -112,6 +121,8 @@ class CognitionPrefix(nn.Module):
         # sin^2 + cos^2 = 1 per period: the features' squared length is age_features / 2 at every age.
         age_std = text_rms * (self.config.age_features / 2) ** -0.5
         self.age_projection.weight.normal_(std=age_std, generator=generator)
+        if self.age_projection.bias is not None:
+            self.age_projection.bias.zero_()
         self.null_cognition.zero_()
 
     def forward(self, cognition_BKH: Tensor | None, age_ns_B: Tensor, is_null_B: Tensor | None = None) -> Tensor:
@@ -149,4 +160,5 @@ class CognitionPrefix(nn.Module):
             min_period=self.config.age_min_period_s,
             max_period=self.config.age_max_period_s,
         )
-        return torch.cat([self.age_projection(age_features)[:, None], self.projector(source_BKH)], dim=1)
+        tokens = [self.age_projection(age_features)[:, None], self.projector(source_BKH)]
+        return torch.cat(tokens if self.config.order == "age_first" else tokens[::-1], dim=1)

@@ -6,7 +6,7 @@ rule (``clock.reference``); tests compare the two.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -49,7 +49,10 @@ class Example:
 def make_example(
     episode: TrainingEpisode, form: ContextFormat, config: ExampleConfig, rng: np.random.Generator
 ) -> Example:
-    """Samples a schedule and builds the example under it."""
+    """Samples a schedule and builds the example under it, with the demonstration's views that the format reads."""
+    if (num_views := form.demonstrations.num_views) is not None:
+        num_images = form.reader.num_images(num_views)
+        episode = replace(episode, demo=tuple(images[:num_images] for images in episode.demo))
     schedule = sample_schedule(rng, config.clocks, episode.num_ticks, transition_ticks=episode.transition_ticks)
     imitated = [each for each in schedule.invocations if each.tick >= episode.imitated_from]
     count = min(config.max_invocations, len(imitated))

@@ -315,7 +315,8 @@ def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointM
         wanted_px = ponder.format.reader.readable_sizes(ponder.image_px)[0][0]
         raise ValueError(f"{', '.join(map(str, options.data))}: {error}; collect with --image-px {wanted_px}") from None
     if run.trains != "pounce":
-        demonstrations = data.demo_sampling() or ponder.format.demonstrations
+        declared = ponder.format.demonstrations
+        demonstrations = replace(data.demo_sampling() or declared, num_views=declared.num_views)
         ponder.format = replace(ponder.format, speaks=run.w2 > 0, demonstrations=demonstrations)
     measured = partial(data.statistics, run.pounce.horizon, run.space, by_row=run.statistics_by_row)
     if options.pounce is None:

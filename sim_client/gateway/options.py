@@ -43,6 +43,9 @@ class ScheduleOptions:
     real time."""
     delay_ms: int = 300
     """PONDER's modelled delay in ms, in lockstep (paper: 300)."""
+    wait: Literal["stand-still", "hold"] = "stand-still"
+    """Behaviour until the first chunk. stand-still: the first answer waits for it. hold: ticks count from the first
+    observation and the arm is held, for 6 ticks in the paper's schedule, as by the official server."""
     max_age_ms: int = 2000
     """Age in ms from which a cognition is called stale (an alarm; its rows are still played)."""
     stale_limit_ms: int = 10_000
@@ -142,6 +145,10 @@ class GatewayOptions:
                 f"--invoke-every-ticks {every_ticks} is no multiple of --rows {rows}: a new chunk would break the "
                 "promise of rows that the client is still playing"
             )
+        if self.mode == "lockstep" and self.timing.wait == "hold" and rows != 1:
+            raise TransportError(
+                f"--wait hold ends within --rows {rows}, whose last rows it would change; take --rows 1"
+            )
         if not self.clients.api_key_file and not self.clients.open_to_anyone and not _is_loopback(host):
             raise TransportError(
                 f"--listen {self.listen} can be reached from other hosts: give --api-key-file, or say --open-to-anyone"
@@ -205,7 +212,7 @@ class GatewayOptions:
             query_period_ns=self.timing.query_period_ms * NS_PER_MS,
             invoke_period_ticks=self.timing.invoke_every_ticks or every_ticks,
             query_delay=base.query_delay if self.mode == "realtime" else fixed,
-            wait=WaitKind.STAND_STILL,
+            wait=WaitKind.HOLD if self.timing.wait == "hold" else WaitKind.STAND_STILL,
             max_age_ns=self.timing.max_age_ms * NS_PER_MS,
             stale_limit_ns=self.timing.stale_limit_ms * NS_PER_MS,
             seed=seed,

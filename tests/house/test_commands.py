@@ -15,7 +15,12 @@ import pytest
 from dual_system import commands
 from dual_system.commands import COMMANDS, REFUSED
 
-ENTRIES = {"pp-collect": commands.collect, "pp-export": commands.export, "pp-diagnose": commands.diagnose}
+ENTRIES = {
+    "pp-collect": commands.collect,
+    "pp-export": commands.export,
+    "pp-parity": commands.parity,
+    "pp-diagnose": commands.diagnose,
+}
 VERBS = [(name, verb) for name, command in COMMANDS.items() for verb in command.verbs]
 
 every_command = pytest.mark.parametrize("name", COMMANDS)

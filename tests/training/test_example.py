@@ -135,6 +135,16 @@ def test_images_stand_in_the_order_of_the_row(episode_of_noise: MakeEpisode) -> 
     assert np.array_equal(images[4 + 2], recorded.images[schedule.queries[1].tick][0])
 
 
+def test_a_format_of_fewer_views_shows_the_first_ones_of_a_demonstration(episode_of_noise: MakeEpisode) -> None:
+    recorded = episode_of_noise(45, num_demo=2)
+    form = replace(FORM, demonstrations=replace(FORM.demonstrations, num_views=1))
+    example = make_example(recorded, form, AT_1_HZ, np.random.default_rng(0))
+    assert example.images is not None
+    assert len(example.images) == example.row.num_images
+    for instant, images in enumerate(recorded.demo):
+        assert np.array_equal(example.images[instant], images[0])
+
+
 def test_an_episode_that_ponder_does_not_read_gives_no_images(episode_of_noise: MakeEpisode) -> None:
     recorded = episode_of_noise(45, num_demo=2)
     unread = replace(recorded, images=[()] * 45, demo=((), ()))

@@ -70,6 +70,8 @@ class GrootPounceConfig:
 
     def __post_init__(self) -> None:
         check_channel(self.cognition, self.reads_subgoal)
+        if self.cognition.place != "before_images":
+            raise ValueError(f"GR00T reads P before the images only, came place {self.cognition.place!r}")
         groot = self.groot
         for name, limit in (("robot_action_dim", groot.action_dim), ("robot_state_dim", groot.state_dim)):
             if not 0 < getattr(self, name) <= limit:

@@ -152,8 +152,11 @@ class Pi05(nn.Module):
         cognition_BPW: Tensor | None = None,
         state_B1W: Tensor | None = None,
         is_isolated: bool = False,
+        is_cognition_last: bool = False,
     ) -> Prefix:
-        """Assembles [P][views][text][state]. A missing camera keeps its slots but is masked and takes no positions.
+        """Assembles [P][views][text][state], or [views][text][state][P] if ``is_cognition_last``.
+
+        A missing camera keeps its slots but is masked and takes no positions.
 
         ``cognition_BPW`` and ``state_B1W`` are not multiplied by sqrt(W): like image tokens and unlike text.
         """
@@ -166,9 +169,10 @@ class Pi05(nn.Module):
             parts.append(state_B1W)
             is_real.append(is_token_BT.new_ones(state_B1W.shape[:2]))
         if cognition_BPW is not None:
-            num_cognition = cognition_BPW.shape[1]
-            parts.insert(0, cognition_BPW)
-            is_real.insert(0, is_token_BT.new_ones(cognition_BPW.shape[:2]))
+            at = len(parts) if is_cognition_last else 0
+            num_cognition = 0 if is_cognition_last else cognition_BPW.shape[1]  # at the end: positions like any other's
+            parts.insert(at, cognition_BPW)
+            is_real.insert(at, is_token_BT.new_ones(cognition_BPW.shape[:2]))
         return Prefix(
             embeds=torch.cat([part.to(self.stream_dtype) for part in parts], dim=1),
             is_real=torch.cat(is_real, dim=1),

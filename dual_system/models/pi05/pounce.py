@@ -16,6 +16,7 @@ from dual_system.models.pi05.network import Pi05, Pi05Config, Prefix, PrefixCach
 
 Freeze = Literal["none", "vision", "vlm"]
 StateInput = Literal["prompt", "token"]
+StatelessPrompt = Literal["instruction", "task"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -59,6 +60,9 @@ class PounceConfig:
     would first have to learn to read digits."""
     robot_state_dim: int = 8
     """S, for ``state_input`` "token"; a prompt takes any size."""
+    stateless_prompt: StatelessPrompt = "instruction"
+    """Prompt for ``state_input`` "token". instruction: the instruction and a newline, as pi0's. task: ``Task: ...;``, a
+    newline and ``Action: ``, as the official PonderPounce's."""
     max_committed_rows: int = 0
     """Largest number of committed rows in training (`committed`); 0 if it was not trained with any."""
     reads_subgoal: bool = False
@@ -152,7 +156,7 @@ class Pounce(nn.Module):
         return Backbone(vision=(self.pi05.vision, self.pi05.projector), language=self.pi05.language)
 
     def embed_prefix(self, inputs: PounceInputs) -> Prefix:
-        """Embeds [P][images][text][state].
+        """Embeds [P][images][text][state], or P last (`CognitionConfig.place`).
 
         Raises:
             ValueError: ``state_input`` is "token" and the state is missing.
@@ -173,6 +177,7 @@ class Pounce(nn.Module):
             cognition_BPW=cognition_BPW,
             state_B1W=state_B1W,
             is_isolated=self.config.cognition.attention == "isolated",
+            is_cognition_last=self.config.cognition.place == "after_text",
         )
 
     def prefill(self, inputs: PounceInputs) -> PrefixCache:

@@ -54,6 +54,11 @@ def stateless_prompt_text(instruction: str) -> str:
     return _cleaned(instruction) + "\n"
 
 
+def task_only_prompt_text(instruction: str) -> str:
+    """Returns the official PonderPounce's prompt: the task without the state, which enters beside it as numbers."""
+    return f"Task: {_cleaned(instruction)};\nAction: "
+
+
 def _cleaned(instruction: str) -> str:
     return instruction.strip().replace("_", " ").replace("\n", " ")
 

@@ -23,10 +23,11 @@ from torch import Tensor, nn
 from transformers.models.qwen3_5 import Qwen3_5Config
 
 from dual_system.models.config_json import from_json
-from dual_system.models.ponder.context import ContextFormat
+from dual_system.models.ponder.context import ContextFormat, OpeningForm
 from dual_system.models.ponder.demo_sampling import PAPER_SAMPLING, DemoSampling
 from dual_system.models.ponder.network import Ponder, image_grid, skeleton, token_px
 from dual_system.models.ponder.observation import WHOLE_VIEWS, ObservationReader
+from dual_system.models.ponder.text_policy import OWN_TEXTS, TextPolicy
 from dual_system.models.ponder.vocabulary import Vocabulary
 from dual_system.models.stored_tensors import (
     CheckpointError,
@@ -60,6 +61,8 @@ class StoredPonder:
     image_px: tuple[int, int] = (256, 256)
     speaks: bool = True
     demonstrations: DemoSampling = PAPER_SAMPLING
+    opening: OpeningForm = "chat"
+    texts: TextPolicy = OWN_TEXTS
     is_random: bool = True
     """True if the carriers were never trained."""
 
@@ -100,6 +103,8 @@ def load_ponder(directory: Path, *, device: torch.device | str = "cpu", dtype: t
         reader=reader,
         speaks=stored.speaks,
         demonstrations=stored.demonstrations,
+        opening_form=stored.opening,
+        texts=stored.texts,
     )
     if qwen_config.image_token_id != vocabulary.image_pad:
         raise CheckpointError(
@@ -131,6 +136,8 @@ def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_S
         image_px=ponder.image_px,
         speaks=ponder.format.speaks,
         demonstrations=ponder.format.demonstrations,
+        opening=ponder.format.opening_form,
+        texts=ponder.format.texts,
         is_random=ponder.is_random,
     )
     values = asdict(stored)

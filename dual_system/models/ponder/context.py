@@ -3,7 +3,7 @@
 The row is built from segments and is append-only: training concatenates them, serving appends them one by one, and
 both get them from here (the official chat template rewrites earlier turns, so it cannot be used). One episode is
 
-    <|im_start|>user\\n Ins [demo frames, 1 Hz] <|im_end|>\\n<|im_start|>assistant\\n     once, at opening
+    <|im_start|>user\\n Ins [demo frames, 1 Hz] <|im_end|>\\n<|im_start|>assistant\\n     once, at opening ("chat")
     O_t  [ T_yes S_t | T_yes DR T_yes S_t ]  K carriers                               per query t
 
 where a frame is ``<|vision_start|> <|image_pad|> * n <|vision_end|>`` (n = 64 at 256 px), one per image that the
@@ -20,6 +20,7 @@ Pure: integers in, integers out. # T tokens of a row, K carriers, Q queries
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +28,11 @@ from numpy.typing import ArrayLike
 
 from dual_system.models.ponder.demo_sampling import PAPER_SAMPLING, DemoSampling
 from dual_system.models.ponder.observation import WHOLE_VIEWS, ObservationReader
+from dual_system.models.ponder.text_policy import OWN_TEXTS, TextPolicy
 from dual_system.models.ponder.vocabulary import Vocabulary
+
+OpeningForm: TypeAlias = Literal["chat", "bare"]
+"""chat: the user's turn is closed and the assistant's opened. bare: observations follow the demonstration directly."""
 
 IGNORE = -100
 """Target of a position that is not supervised (the ignore index of torch's cross-entropy)."""
@@ -96,6 +101,8 @@ class ContextFormat:
     """False if trained without texts (RoboCasa-DC, w2 = 0): its LM head is untrained, and serving generates no text."""
     demonstrations: DemoSampling = PAPER_SAMPLING
     """How demonstrations were sampled in training; serving must sample them alike."""
+    opening_form: OpeningForm = "chat"
+    texts: TextPolicy = OWN_TEXTS
 
     def __post_init__(self) -> None:
         if not 1 <= self.num_carriers <= 16:
@@ -164,7 +171,8 @@ class ContextFormat:
 
     def opening(self, instruction: str, demo_views: Sequence[int] = ()) -> tuple[Segment, ...]:
         """Everything before the first query; ``demo_views``: the number of views at each demo instant."""
-        return (self.instruction(instruction), *(self.demo(n) for n in demo_views), self.execution())
+        header = () if self.opening_form == "bare" else (self.execution(),)
+        return (self.instruction(instruction), *(self.demo(n) for n in demo_views), *header)
 
     def query(
         self, num_cameras: int, transition: Transition | None = None, proprio: ArrayLike | None = None

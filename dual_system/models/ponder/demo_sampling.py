@@ -16,17 +16,21 @@ class DemoSampling:
     """Sampling of a demonstration; the default is the paper's (B.1).
 
     Raises:
-        ValueError: ``hz`` does not divide 20.
+        ValueError: ``hz`` does not divide 20, or no view is left.
     """
 
     hz: int = 1
     """Frames per second, from the first one on; a divisor of 20."""
     to_its_end: bool = False
     """Also sample the last frame: a movement often ends between two samples."""
+    num_views: int | None = None
+    """Views of each instant that PONDER reads, the first of the robot's cameras (1: front only); None: all."""
 
     def __post_init__(self) -> None:
         if self.hz < 1 or FASTEST_HZ % self.hz:
             raise ValueError(f"hz must divide {FASTEST_HZ}, came {self.hz}")
+        if self.num_views is not None and self.num_views < 1:
+            raise ValueError(f"num_views must be at least 1, or None for all; came {self.num_views}")
 
     def indices(self, num_frames: int, video_hz: int = FASTEST_HZ) -> list[int]:
         """Indices of the sampled frames of a video of ``num_frames``; ``hz`` divides ``video_hz``."""

@@ -60,7 +60,7 @@ def pi05_inputs(
     images, has_view = camera_batch(moment.frames, config.image_px)
     state = statistics.normalise_states(moment.proprio)
     has_token = config.state_input == "token"
-    text = prompt.stateless_prompt_text if has_token else partial(prompt.prompt_text, state=state)
+    text = _STATELESS[config.stateless_prompt] if has_token else partial(prompt.prompt_text, state=state)
     token_ids = tokenizer.encode(text(_instruction(moment, config.reads_subgoal)))
     _check_length(len(token_ids), config.max_prompt_tokens, moment.instruction)
     return PounceInputs(
@@ -103,6 +103,9 @@ def groot_inputs(
         age_ns=torch.tensor([moment.age_ns], device=device),
         cognition=_cognition(moment, device),
     )
+
+
+_STATELESS = {"instruction": prompt.stateless_prompt_text, "task": prompt.task_only_prompt_text}
 
 
 def _instruction(moment: Moment, reads_subgoal: bool) -> str:

@@ -17,6 +17,7 @@ from protocol.errors import TransportError
 from protocol.mcap_log import read_log
 from protocol.topics import HEALTH, QUERY, TICK
 from sim_client.gateway.exchange import Busy, Finish, Observed, Refused, Step
+from sim_client.gateway.options import GatewayOptions, ScheduleOptions
 
 StepOf = Callable[..., Step]
 
@@ -90,6 +91,22 @@ def test_the_log_of_an_episode_follows_from_itself(
     assert record.result is not None
     assert (record.result.status, record.result.is_success) == (m.TaskStatus.SUCCESS, True)
     assert len(record.invocations) == (3 if num_rows == 1 else 4)
+
+
+def test_held_the_first_six_steps_count_as_by_the_official_server(
+    bench_with: Callable[..., Any], step_of: StepOf, tmp_path: Path
+) -> None:
+    """Its System 1 first fires at the seventh observation: 300 ms after the first."""
+    options = GatewayOptions(dialect="vla-eval", timing=ScheduleOptions(wait="hold"))
+    bench = bench_with(options.schedule(0), out=tmp_path)
+    answers = play(bench, step_of, 30)
+    assert [answer.tick for answer in answers] == [*range(30)]
+    assert [answer.levels[0] for answer in answers] == [m.Level.HOLD] * 6 + [m.Level.PLAY] * 24
+    bench.tell(Finish())
+    (path,) = tmp_path.rglob("*.mcap")
+    record = read_log(path)
+    assert [(each.tick, each.age_ns) for each in record.invocations] == [(6, 300_000_000), (26, 300_000_000)]
+    assert next(disagreements(record), None) is None
 
 
 def _every(num_ticks: int) -> m.Schedule:

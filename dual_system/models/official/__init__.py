@@ -1,0 +1,1 @@
+"""The official PonderPounce release: reads its checkpoint folder and writes ours."""
