@@ -9,7 +9,6 @@ the same modules over a few tokens at a time (``ponder_server/decoder.py``).
 """
 
 from collections.abc import Sequence
-from importlib.util import find_spec
 from typing import Any, Self
 
 import numpy as np
@@ -215,11 +214,10 @@ def skeleton(qwen_config: Qwen3_5Config) -> nn.Module:
     build: Any = Qwen3_5ForConditionalGeneration._from_config
     with torch.device("meta"):
         model: Any = build(qwen_config, attn_implementation="sdpa")
-        if find_spec("fla") is None:  # with fla, transformers' own layer is fast already
-            text: Any = qwen_config.text_config
-            for index, layer in enumerate(model.model.language_model.layers):
-                if text.layer_types[index] == "linear_attention":
-                    layer.linear_attn = GatedDelta(text, index)
+        text: Any = qwen_config.text_config
+        for index, layer in enumerate(model.model.language_model.layers):
+            if text.layer_types[index] == "linear_attention":
+                layer.linear_attn = GatedDelta(text, index)
     return model
 
 
