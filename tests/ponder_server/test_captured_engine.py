@@ -131,7 +131,6 @@ def test_on_a_cpu_nothing_is_captured_whatever_the_option_says(graphs: bool) -> 
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_replayed_graphs_answer_as_the_eager_engine_does(dtype: torch.dtype) -> None:
     eager, plain, replayed = (

@@ -1,9 +1,6 @@
 """The fast path on a GPU: compiled kernels and CUDA graphs act as the eager model does there."""
 
-import os
-
 import pytest
-import torch
 
 from dual_system.models.pounce.checkpoint import random_bundle
 from dual_system.models.pounce.configs import tiny_cpu
@@ -14,8 +11,6 @@ MAX_MEAN_ERROR = {"float32": 1e-4, "bfloat16": 4e-3}  # TF32 stays off by defaul
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-@pytest.mark.skipif(os.environ.get("TRITON_INTERPRET") != "0", reason="compiles kernels: set TRITON_INTERPRET=0")
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 def test_a_replayed_graph_gives_the_eager_engine_s_rows(dtype: DTypeName) -> None:
     eager, fused = (
