@@ -34,12 +34,13 @@ dtype. The eager path is no yardstick: in bfloat16 two right evaluations of 32 l
 
 
 def position_buckets(max_tokens: int, least: int = LEAST_POSITIONS) -> tuple[int, ...]:
-    """``least`` times powers of two, then ``max_tokens``; a context of at least ``least`` fills half of its bucket."""
+    """``least`` times powers of two, then ``max_tokens`` up to a multiple of 64; a context of at least ``least`` fills
+    half of its bucket. torch's memory-efficient kernel errs at some other lengths with shared keys (pytorch#191937)."""
     buckets = []
     while least < max_tokens:
         buckets.append(least)
         least *= 2
-    return (*buckets, max_tokens)
+    return (*buckets, -(-max_tokens // 64) * 64)
 
 
 def check_captured(replayed_KH: Tensor, direct_KH: Tensor) -> None:

@@ -28,7 +28,7 @@ from pounce_server.kernels.rms_norm import Style
 BUCKET_TOKENS = 64
 """Prompts of at most 200 tokens need four or five buckets; 63 unseen tokens cost less than half a millisecond."""
 SLOT_MULTIPLE = 16
-"""Of the keys that an action attends to: torch would pad a bias of another width, with more kernels in every layer."""
+"""Divides the number of keys that an action attends to: torch would pad a bias of another width in every layer."""
 
 
 class FusedPounce:

@@ -109,20 +109,9 @@ class VisionTower(nn.Module):
 
         Patch and position embeddings are added in float32; the layers run in ``stream_dtype``, their weights' dtype.
         """
-        # On a GPU a convolution would be TF32; on a CPU its bits are those of every committed result.
-        embed = self._product if images_B3PP.is_cuda else self._convolution
-        x_BSW = (embed(images_B3PP) + self.position_embedding.weight).to(stream_dtype)
+        patches_BSW = self.patch_embedding(images_B3PP).flatten(2).transpose(1, 2)
+        x_BSW = (patches_BSW + self.position_embedding.weight).to(stream_dtype)
         for layer in self.layers:
             x_BSW = layer(x_BSW)
         out_BSW: Tensor = self.post_layernorm(x_BSW)
         return out_BSW
-
-    def _convolution(self, images_B3PP: Tensor) -> Tensor:
-        patches_BSW: Tensor = self.patch_embedding(images_B3PP).flatten(2).transpose(1, 2)
-        return patches_BSW
-
-    def _product(self, images_B3PP: Tensor) -> Tensor:
-        """`_convolution` as one matrix product: its stride is its size."""
-        px, embedding = self.config.patch_px, self.patch_embedding
-        patches = images_B3PP.unflatten(3, (-1, px)).unflatten(2, (-1, px)).permute(0, 2, 4, 1, 3, 5)
-        return F.linear(patches.flatten(3).flatten(1, 2), embedding.weight.flatten(1), embedding.bias)

@@ -9,8 +9,6 @@ import torch
 from dual_system.models.graphs import Capture, Work, directly
 from dual_system.models.ponder.configs import tiny_cpu
 from dual_system.models.ponder.network import Ponder
-from ponder_server.__main__ import build_engine
-from ponder_server.config import ContextOptions, PonderOptions, SpeedOptions
 from ponder_server.contract import Fire, Frame, Opening, WeightsName
 from ponder_server.decoder import decode
 from ponder_server.draft import TrieDraft
@@ -129,8 +127,19 @@ def test_the_eager_path_is_no_yardstick_of_a_capture(monkeypatch: pytest.MonkeyP
     engine.warm_up()
 
 
+def test_weights_are_hashed_once_however_many_engines_run_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    ponder, hashed = Ponder.random(MODEL, seed=1), []
+    monkeypatch.setattr("ponder_server.engine.weights_hash", lambda one: hashed.append(one) or "abc")  # type: ignore[func-returns-value]
+    assert [QwenEngine(ponder, CONFIG).spec.model_hash for _ in range(2)] == ["abc"] * 2
+    assert len(hashed) == 1
+
+
 @pytest.mark.parametrize("graphs", [True, False])
 def test_on_a_cpu_nothing_is_captured_whatever_the_option_says(graphs: bool) -> None:
+    # Here, because a GPU's image, where this file's other tests run, may lack the command line's packages.
+    from ponder_server.__main__ import build_engine
+    from ponder_server.config import ContextOptions, PonderOptions, SpeedOptions
+
     engine = build_engine(
         PonderOptions(context=ContextOptions(max_context_tokens=400), speed=SpeedOptions(graphs=graphs))
     )

@@ -18,7 +18,7 @@ from torch import Tensor
 
 _ROPE_BASE = 10_000.0
 _rotations: WeakKeyDictionary[Any, dict[tuple[Any, ...], tuple[Tensor, Tensor]]] = WeakKeyDictionary()
-"""Of each tower, by grid and device: a tower that copied them to its GPU could not be captured."""
+"""Kept for each tower by grid and device: a tower that copied them to its GPU could not be captured."""
 
 
 def image_tokens(tower: Any, patches: Tensor, grid: tuple[int, int]) -> Tensor:
