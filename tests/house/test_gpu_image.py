@@ -15,7 +15,7 @@ import importlib, importlib.util, pkgutil, sys
 from pathlib import Path
 for name in {LACKING}:
     sys.modules[name] = None
-import dual_system.models, ponder_server, pounce_server
+import benchmarks.gpu_day, dual_system.models, ponder_server, pounce_server
 for room in (dual_system.models, ponder_server, pounce_server):
     for module in pkgutil.walk_packages(room.__path__, room.__name__ + "."):
         if module.name.rsplit(".", 1)[-1] not in {NEED_THEM}:
