@@ -117,6 +117,7 @@ class Day:
         self.dtype: DTypeName = "bfloat16" if device.type == "cuda" else "float32"
         self.rows: dict[str, Any] = {}
         self._path = path
+        self._of = f"{size} on {device.type}"
         self._predicted = PREDICTED_MS if size == "full" else {}
 
     def row(self, name: str, work: Callable[[], Result]) -> Result | None:
@@ -139,7 +140,8 @@ class Day:
         self.rows[name] = {"FAILED": what, "at": f"{where.name}:{where.lineno}"}
 
     def write(self, *, is_over: bool = False) -> None:
-        self._path.write_text(json.dumps({"is_over": is_over, "rows": self.rows}, indent=1) + "\n")
+        stage = {"of": self._of, "is_over": is_over, "rows": self.rows}
+        self._path.write_text(json.dumps(stage, indent=1) + "\n")
 
     def ms(self, call: Callable[[], object], count: int | None = None, after: Callable[[], None] = lambda: None) -> Any:
         """Durations of ``call``, to the end of the device's work; ``after`` each one runs uncounted."""
@@ -435,33 +437,45 @@ def _pounce(day: Day, config: AnyPounceConfig) -> tuple[Any, Any, Tensor]:
 # -- the day
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DayOptions:
+    """One call. A command line without tyro, which a GPU's image lacks, so the help texts are ``main``'s."""
+
+    stage: str = "all"
+    device: str = "cuda"
+    size: str = "full"
+    seconds: float = 570.0
+    out: Path = Path("out/gpu_day")
+    again: bool = False
+
+
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="gpu-day", description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--stage", default="all", help=f"all, or some of {','.join(STAGES)}")
-    parser.add_argument("--device", default="cuda", help="cuda, cuda:N or cpu")
-    parser.add_argument("--size", default="full", choices=("full", "tiny"), help="networks; tiny is for a CPU")
-    parser.add_argument("--seconds", type=float, default=570.0, help="time of this call [s]")
-    parser.add_argument(
-        "--out", type=Path, default=Path("out/gpu_day"), help="folder of the stages' files and the JSON"
-    )
+    parser.set_defaults(**asdict(DayOptions()))
+    parser.add_argument("--stage", help=f"all, or some of {','.join(STAGES)}")
+    parser.add_argument("--device", help="cuda, cuda:N or cpu")
+    parser.add_argument("--size", choices=("full", "tiny"), help="networks; tiny is for a CPU")
+    parser.add_argument("--seconds", type=float, help="time of this call [s]")
+    parser.add_argument("--out", type=Path, help="folder of the stages' files and the JSON")
     parser.add_argument("--again", action="store_true", help="run stages again that ended before")
-    options = parser.parse_args(argv)
+    options = DayOptions(**vars(parser.parse_args(argv)))
     names = list(STAGES) if options.stage == "all" else options.stage.split(",")
     if unknown := set(names) - set(STAGES):
         parser.error(f"--stage {','.join(sorted(unknown))}: expected all, or some of {','.join(STAGES)}")
-    return run(names, torch.device(options.device), options.size, options.seconds, options.out, again=options.again)
+    return run(options, names)
 
 
-def run(names: list[str], device: torch.device, size: str, seconds: float, out: Path, *, again: bool = False) -> int:
+def run(options: DayOptions, names: list[str]) -> int:
     """Runs stages that have not ended; returns 1 if a row failed or a stage had no time, else 0."""
+    device, size, out = torch.device(options.device), options.size, options.out
     settle(device)
     out.mkdir(parents=True, exist_ok=True)
     report = out / "gpu_day.json"
-    end_s = time.monotonic() + seconds
+    end_s = time.monotonic() + options.seconds
     _gather(report, device, size)
     for name in names:
         path, left_s = out / f"{name}.json", end_s - time.monotonic()
-        if not again and path.exists() and json.loads(path.read_text())["is_over"]:
+        if not options.again and _has_ended(path, device, size):
             print(f"{name}: ended before; --again runs it again")
             continue
         if device.type == "cuda" and left_s < STAGES[name].budget_s:
@@ -489,9 +503,15 @@ def run(names: list[str], device: torch.device, size: str, seconds: float, out: 
         for name, row in found["rows"].items()
         if isinstance(row, dict) and "FAILED" in row
     ]
-    lacking = [name for name in names if not stages.get(name, {}).get("is_over")]
+    lacking = [name for name in names if not _has_ended(out / f"{name}.json", device, size)]
     print(f"written: {report.name}. Failed: {failed or 'nothing'}. Without time: {lacking or 'none'}")
     return int(bool(failed or lacking))
+
+
+def _has_ended(path: Path, device: torch.device, size: str) -> bool:
+    """Whether this stage ended, of this size and on this kind of device."""
+    stage = json.loads(path.read_text()) if path.exists() else {}
+    return bool(stage.get("is_over")) and stage["of"] == f"{size} on {device.type}"
 
 
 def _gather(report: Path, device: torch.device, size: str) -> None:

@@ -82,7 +82,7 @@ def main(argv: list[str] | None = None) -> int:
         warm_up="two fires per context length and round; one encode of each kind; one text.",
     )
     tables: dict[str, list[Row]] = {}
-    for dtype in options.dtypes or (("bfloat16",) if _is_on_gpu(options) else ("float32", "bfloat16")):
+    for dtype in _dtypes(options):
         with torch.inference_mode():
             for title, rows in _measured(dtype, options, report).items():
                 tables.setdefault(title, []).extend({"dtype": dtype} | row for row in rows)
@@ -156,6 +156,12 @@ def _measured(dtype: str, options: LatencyOptions, report: Report) -> dict[str, 
             _demonstration(ponder, name, tokens, options) for name, tokens in WAYS_TO_ENCODE.items()
         ],
     }
+
+
+def _dtypes(options: LatencyOptions) -> tuple[str, ...]:
+    if options.dtypes is not None:
+        return options.dtypes
+    return ("bfloat16",) if _is_on_gpu(options) else ("float32", "bfloat16")
 
 
 def _is_on_gpu(options: LatencyOptions) -> bool:

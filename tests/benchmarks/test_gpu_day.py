@@ -69,9 +69,16 @@ def test_what_fails_is_a_row_and_the_rest_goes_on(tmp_path: Path) -> None:
 
     assert day.row("one", broken) is None
     assert day.row("two", lambda: 2) == 2
-    (tmp_path / "probe.json").write_text(json.dumps({"is_over": True, "rows": day.rows}))
+    day.write(is_over=True)
     assert day.rows["one"]["FAILED"] == "ValueError: no such thing"
     assert main(["--stage", "probe", *CPU, "--out", str(tmp_path)]) == 1
+
+
+def test_what_a_cpu_measured_is_not_taken_for_a_gpu_s(tmp_path: Path) -> None:
+    Day(torch.device("cpu"), "tiny", tmp_path / "probe.json").write(is_over=True)
+    assert gpu_day._has_ended(tmp_path / "probe.json", torch.device("cpu"), "tiny")
+    assert not gpu_day._has_ended(tmp_path / "probe.json", torch.device("cpu"), "full")
+    assert not gpu_day._has_ended(tmp_path / "probe.json", torch.device("cuda", 0), "tiny")
 
 
 def test_a_stage_that_is_none_is_refused(capsys: pytest.CaptureFixture[str]) -> None:

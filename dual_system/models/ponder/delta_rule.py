@@ -17,7 +17,8 @@ from torch.nn import functional as F
 
 CHUNK = 32
 GPU_CHUNK = 64
-"""Twice the CPU's: on a GPU the loop is bound by kernel launches, so fewer iterations are faster."""
+"""Twice the CPU's: on a GPU the loop is bound by kernel launches, so fewer iterations are faster. A short append is one
+chunk without padding."""
 
 
 def gated_delta_rule(
@@ -45,7 +46,7 @@ def gated_delta_rule(
         Outputs (B, T, V, E) in the dtype of ``query``, and the final state (B, V, D, E) float32.
     """
     if chunk_size is None:
-        chunk_size = GPU_CHUNK if query.is_cuda else CHUNK
+        chunk_size = min(GPU_CHUNK, query.shape[1]) if query.is_cuda else CHUNK
     with _without_autocast(query.device):
         read, state = _rule(
             _of_length_1(query), _of_length_1(key), value.float(), g.float(), beta.float(), chunk_size, initial_state
