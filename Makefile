@@ -11,7 +11,7 @@ export MUJOCO_GL ?= egl
 export OMP_NUM_THREADS ?= 1
 
 # `make help` lists the rest.
-.PHONY: help setup demo test unit accept soak lint types proto bench clean
+.PHONY: help setup demo test unit oldest accept soak lint types proto bench clean
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
 
@@ -60,6 +60,13 @@ test: setup
 	$(BIN)/python -m pytest -q -m "realtime and not gpu and not acceptance" --durations=10
 unit: setup
 	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile -m "not gpu and not acceptance and not e2e and not slow"
+
+## make oldest  the models' tests under the oldest transformers that pyproject.toml allows
+OLDEST := $(VENV)/oldest
+oldest: setup
+	test -d $(OLDEST)/transformers || $(BIN)/pip install --quiet --no-deps --target $(OLDEST) transformers==5.17.0
+	test -d $(OLDEST)/httpx || $(BIN)/pip install --quiet --target $(OLDEST) 'huggingface-hub<2' httpx
+	PYTHONPATH=$(OLDEST) $(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile -m "not gpu" tests/models tests/ponder_server
 
 ## make accept  a hundred oracle episodes of every task (about ten minutes)
 accept: setup

@@ -29,6 +29,7 @@ import torch
 from torch import Tensor, nn
 
 from benchmarks.report import Report, Row, show, spread
+from benchmarks.roofline import product_flops_per_s
 from dual_system.models.ponder import configs as ponder_configs
 from dual_system.models.ponder.checkpoint import mtp_shapes
 from dual_system.models.ponder.context import Row as EpisodeRow
@@ -55,8 +56,9 @@ class LatencyOptions:
 
     size: Literal["tiny_cpu", "qwen35_0p8b", "qwen35_2b", "qwen35_4b", "qwen35_9b"] = "tiny_cpu"
     device: str = "cpu"
-    dtypes: tuple[Literal["float32", "bfloat16"], ...] = ("float32", "bfloat16")
-    """Number formats of the same network, one after the other."""
+    dtypes: tuple[Literal["float32", "bfloat16"], ...] | None = None
+    """Number formats of the same network, one after the other. None: both on a CPU, bfloat16 on a GPU, whose memory
+    two 9B networks in float32 would fill."""
     attention_threads: tuple[int, ...] = (1, 2)
     """Threads for attention, one run of fires each; torch and all other measurements use one thread."""
     contexts: tuple[int, ...] = (800, 4_000, 14_000)
@@ -80,12 +82,14 @@ def main(argv: list[str] | None = None) -> int:
         warm_up="two fires per context length and round; one encode of each kind; one text.",
     )
     tables: dict[str, list[Row]] = {}
-    for dtype in options.dtypes:
+    for dtype in _dtypes(options):
         with torch.inference_mode():
             for title, rows in _measured(dtype, options, report).items():
                 tables.setdefault(title, []).extend({"dtype": dtype} | row for row in rows)
-    for title, rows in tables.items():
-        report.add_table(title, rows)
+        report.tables.clear()
+        for title, rows in tables.items():
+            report.add_table(title, rows)
+        report.write()  # already here: a run that is cut short leaves what it measured
     report.notes += [
         "The draft knows the text beforehand, which is the best a draft can do. In bfloat16 one token and sixteen are "
         "rounded further apart than a random network's likeliest tokens lie: its text goes another way than the draft.",
@@ -152,6 +156,12 @@ def _measured(dtype: str, options: LatencyOptions, report: Report) -> dict[str, 
             _demonstration(ponder, name, tokens, options) for name, tokens in WAYS_TO_ENCODE.items()
         ],
     }
+
+
+def _dtypes(options: LatencyOptions) -> tuple[str, ...]:
+    if options.dtypes is not None:
+        return options.dtypes
+    return ("bfloat16",) if _is_on_gpu(options) else ("float32", "bfloat16")
 
 
 def _is_on_gpu(options: LatencyOptions) -> bool:
@@ -221,7 +231,7 @@ def _floor(engine: QwenEngine, options: LatencyOptions, fires: list[Row], thread
     # Two products, queries x keys and weights x values, with a multiplication and an addition each.
     flop = 4 * sum(num_queries) * num_keys * text.num_attention_heads * text.head_dim
     torch.set_num_threads(threads)
-    flop_per_ms = _product_flop_per_ms(engine)
+    flop_per_ms = product_flops_per_s(engine._ponder.device, engine._ponder.dtype) / 1e3
     torch.set_num_threads(NUM_TORCH_THREADS)
     first_ms, longest_ms = (float(fires[at]["p50_ms"] or 0) for at in (0, -1))
     return {
@@ -232,17 +242,6 @@ def _floor(engine: QwenEngine, options: LatencyOptions, fires: list[Row], thread
         "products_ms": round(flop / flop_per_ms, 2),
         "least_p50_against_first": round(1 + flop / flop_per_ms / first_ms, 2),
     }
-
-
-def _product_flop_per_ms(engine: QwenEngine, size: int = 1024) -> float:
-    """Rate of the fastest of twenty products of square matrices in the network's precision."""
-    left, right = torch.randn(2, size, size, device=engine._ponder.device, dtype=engine._ponder.dtype)
-    took_ms = []
-    for _ in range(20):
-        start_ns = time.perf_counter_ns()
-        (left @ right)[0, 0].item()
-        took_ms.append((time.perf_counter_ns() - start_ns) / 1e6)
-    return 2 * size**3 / min(took_ms)
 
 
 class _Watched:

@@ -198,14 +198,14 @@ def _measure(
 ) -> tuple[list[Row], list[Row], list[Row]]:
     """The rows of the three tables."""
     device = torch.device(options.device)
-    bundle = random_bundle(shape.config(family, options.size), 0)
+    bundle = random_bundle(shape.config(family, options.size), 0, device=device)
     model = bundle.model.to(device).eval()
     exact = {batch: Ways(model, batch, device).eager() for batch in options.batches}
     cast_for_serving(model, options.dtype)
-    without = random_model(shape.config(family, options.size, has_cognition=False), 0).to(device).eval()
+    without = random_model(shape.config(family, options.size, has_cognition=False), 0, device).eval()
     cast_for_serving(without, options.dtype)
     engine = EagerEngine(bundle, device=options.device, dtype=options.dtype)
-    narrow = random_model(shape.config(family, options.size), 0).to(device).eval() if device.type == "cpu" else None
+    narrow = random_model(shape.config(family, options.size), 0, device).eval() if device.type == "cpu" else None
     if narrow is not None:
         quantise(narrow)
         cast_for_serving(narrow, options.dtype)

@@ -41,13 +41,18 @@ class Piece:
 
 def measure_ceilings(device: torch.device, dtype: torch.dtype) -> Ceilings:
     """Measures one product and one copy, large enough for the device (on a CPU a second or two)."""
-    side, num_bytes = (1024, 1 << 28) if device.type == "cpu" else (8192, 1 << 31)
-    left, right = (torch.randn(side, side, device=device).to(dtype) for _ in range(2))
-    source = torch.ones(num_bytes // 4, device=device)
+    num_bytes = 1 << 28 if device.type == "cpu" else 1 << 31
+    source = torch.randn(num_bytes // 4, device=device)  # constant data would take less power, and so less time
     target = torch.empty_like(source)
-    product_s = _best_s(lambda: torch.mm(left, right), device)
     copy_s = _best_s(lambda: target.copy_(source), device)
-    return Ceilings(flops_per_s=2 * side**3 / product_s, bytes_per_s=2 * num_bytes / copy_s)
+    return Ceilings(flops_per_s=product_flops_per_s(device, dtype), bytes_per_s=2 * num_bytes / copy_s)
+
+
+def product_flops_per_s(device: torch.device, dtype: torch.dtype) -> float:
+    """Rate of the best of a few products, large enough for the device not to be measured by its launches."""
+    side = 1024 if device.type == "cpu" else 8192
+    left, right = (torch.randn(side, side, device=device).to(dtype) for _ in range(2))
+    return 2 * side**3 / _best_s(lambda: torch.mm(left, right), device)
 
 
 def piece_of(call: Callable[[], Any]) -> Piece:

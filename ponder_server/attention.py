@@ -125,10 +125,16 @@ def attend_in_windows(
 
 
 def attend_masked(queries_HMD: Tensor, keys_GSD: Tensor, values_GSD: Tensor) -> Tensor:
-    """`attend` in one call of the public function, for devices whose kernels read a mask cheaply."""
+    """`attend` in one call of the public function, for devices whose kernels read a mask cheaply.
+
+    The heads that share a key head become rows of one: torch's kernels with masks do not support grouped heads.
+    """
     num_queries, num_positions = queries_HMD.shape[1], keys_GSD.shape[1]
+    group = len(queries_HMD) // len(keys_GSD)
     visible_MS = torch.ones(num_queries, num_positions, dtype=torch.bool, device=queries_HMD.device)
     visible_MS = visible_MS.tril_(diagonal=num_positions - num_queries)
-    return F.scaled_dot_product_attention(
-        queries_HMD[None], keys_GSD[None], values_GSD[None], attn_mask=visible_MS, enable_gqa=True
-    )[0]
+    rows_GRD = queries_HMD.reshape(len(keys_GSD), group * num_queries, -1)
+    seen_1GRD = F.scaled_dot_product_attention(
+        rows_GRD[None], keys_GSD[None], values_GSD[None], attn_mask=visible_MS.repeat(group, 1)
+    )
+    return seen_1GRD[0].unflatten(1, (group, num_queries)).flatten(0, 1)

@@ -9,15 +9,14 @@ positions only. The modules are transformers'; the tests compare this file with 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from dual_system.models.ponder import mixers
-from dual_system.models.ponder.gated_delta import gated_delta_rule
-from dual_system.models.ponder.kernels import DeltaRule, delta_rule_of_many, delta_rule_of_one, rotate
+from dual_system.models.ponder.delta_rule import gated_delta_rule, gated_delta_step
 from ponder_server.attention import attend
 from ponder_server.slots import AttentionMemory, RecurrentMemory, SlotMemory
 from ponder_server.threads import ALONE, Threads
@@ -84,7 +83,7 @@ def project(
     """Queries, keys and values (B, heads, T, D), rotated by their positions, and the output gate (B, T, heads, D)."""
     projected = mixers.attention_inputs(attention, hidden_BTH)
     queries, keys, values = (each.transpose(1, 2) for each in projected[:3])
-    return *rotate(queries, keys, *cos_sin), values, projected.gate
+    return *mixers.rotate(queries, keys, *cos_sin), values, projected.gate
 
 
 def _attention(
@@ -111,13 +110,6 @@ def _attention(
     return mixers.attended(attention, seen, gate)
 
 
-def _rule(length: int, device: torch.device) -> DeltaRule:
-    """transformers' functions (fla's kernels if installed); on a CPU our own, which is faster."""
-    if length == 1:
-        return delta_rule_of_one
-    return cast(DeltaRule, gated_delta_rule) if device.type == "cpu" else delta_rule_of_many
-
-
 def gated_delta(delta: Any, memory: RecurrentMemory, slot_B: Tensor, num_new_B: Tensor, hidden_BTH: Tensor) -> Tensor:
     """Advances every row's states by its valid tokens; output (B, T, H), garbage in rows beyond the slots.
 
@@ -133,13 +125,12 @@ def gated_delta(delta: Any, memory: RecurrentMemory, slot_B: Tensor, num_new_B: 
     mixed_BCT = F.silu(F.conv1d(inputs_BCT, delta.conv1d.weight, delta.conv1d.bias, groups=inputs_BCT.shape[1]))
     # With beta 0 and decay exp(0), padding leaves the state unchanged to the last bit.
     is_valid_BT1 = (torch.arange(length, device=hidden_BTH.device) < num_new_B[:, None])[..., None]
-    read, state = _rule(length, hidden_BTH.device)(
+    rule = gated_delta_step if length == 1 else gated_delta_rule
+    read, state = rule(
         *mixers.heads(delta, mixed_BCT[..., -length:].transpose(1, 2)),
         g=decay * is_valid_BT1,
         beta=beta * is_valid_BT1,
         initial_state=memory.state[slot_B],
-        output_final_state=True,
-        use_qk_l2norm_in_kernel=True,
     )
     memory.state[slot_B] = state
     normed_BTX = mixers.normed(delta, read, gate)

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from dual_system.models.action_space import ROBOT_DIM
+from dual_system.models.gpu import settle
 from dual_system.models.graphs import Capture, graphs_for
 from dual_system.models.ponder.checkpoint import weights_hash
 from dual_system.models.ponder.context import SegmentKind
@@ -84,6 +85,8 @@ class QwenEngine:
         reader = self._format.reader
         self._frame_px = reader.readable_sizes(ponder.image_px)[0]
         check_cameras([self._frame_px] * config.num_cameras, reader, ponder.image_px)
+        settle(ponder.device)
+        ponder.served_hash = ponder.served_hash or weights_hash(ponder)
         size = slot_size(ponder.qwen.config.text_config, ponder.dtype)
         session_bytes = size.slot_bytes(config.max_context_tokens) + NUM_SAVED_STATES * size.state_bytes
         try:
@@ -108,7 +111,7 @@ class QwenEngine:
             reader=reader,
             demonstrations=self._format.demonstrations,
             max_context_tokens=config.max_context_tokens,
-            model_hash=weights_hash(ponder),
+            model_hash=ponder.served_hash,
             is_random=ponder.is_random,
             dtype=str(ponder.dtype).removeprefix("torch."),
             session_bytes=session_bytes,

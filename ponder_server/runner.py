@@ -120,13 +120,11 @@ class Runner:
         return len(self._captured)
 
     def check(self, appended: Callable[[], Tensor]) -> None:
-        """Raises RuntimeError if ``appended`` returns another result with captured forwards than without."""
-        with_it, captured = appended(), self._captured
-        self._captured = None
-        try:
-            check_captured(with_it, appended(), self._ponder.dtype)
-        finally:
-            self._captured = captured
+        """Raises RuntimeError if ``appended`` returns another result by replays than by the captured work itself."""
+        assert self._captured is not None, "nothing is captured"
+        replayed = appended()
+        with self._captured.unrecorded():
+            check_captured(replayed, appended())
 
     def open(self, name: str) -> "Session":
         """Opens an empty context in a free slot. Raises SessionError if no slot is free."""

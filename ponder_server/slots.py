@@ -74,24 +74,27 @@ class SlotMemory:
         self.attention: dict[int, AttentionMemory] = {}
         self.recurrent: dict[int, RecurrentMemory] = {}
         kv_shape = (num_slots, text_config.num_key_value_heads, max_tokens, text_config.head_dim)
-        conv_shape = (num_slots, _conv_channels(text_config), text_config.linear_conv_kernel_dim)
+        conv_shape = (_conv_channels(text_config), text_config.linear_conv_kernel_dim)
         state_shape = (
-            num_slots,
             text_config.linear_num_value_heads,
             text_config.linear_key_head_dim,
             text_config.linear_value_head_dim,
         )
+        # A slot's states lie side by side: to save or restore them takes two copies, however many layers there are.
+        num_recurrent = sum(kind != "full_attention" for kind in text_config.layer_types)
+        self._conv = torch.zeros(num_slots, num_recurrent, *conv_shape, device=device, dtype=dtype)
+        self._state = torch.zeros(num_slots, num_recurrent, *state_shape, device=device)
         for index, kind in enumerate(text_config.layer_types):
             if kind == "full_attention":
                 keys, values = (torch.empty(kv_shape, device=device, dtype=dtype) for _ in range(2))
                 self.attention[index] = AttentionMemory(keys, values)
             else:
-                conv = torch.zeros(conv_shape, device=device, dtype=dtype)
-                self.recurrent[index] = RecurrentMemory(conv, torch.zeros(state_shape, device=device))
+                own = len(self.recurrent)
+                self.recurrent[index] = RecurrentMemory(self._conv[:, own], self._state[:, own])
 
     def states(self, slot: int) -> list[Tensor]:
-        """Views of all tensors in a slot that an append overwrites."""
-        return [tensor[slot] for layer in self.recurrent.values() for tensor in (layer.conv, layer.state)]
+        """Views of all that an append overwrites in a slot: (layers, C, W) and (layers, V, key dim, value dim)."""
+        return [self._conv[slot], self._state[slot]]
 
     def keys_and_values(self, slot: int, num_tokens: int) -> list[Tensor]:
         """Views (G, num_tokens, D) of a slot's keys and values, which an append only extends."""

@@ -46,7 +46,9 @@ def build_engine(options: PounceOptions) -> PounceEngine:
         hidden_size = options.random.hidden_size or tiny_ponder().hidden_size
         tiny = tiny_groot if options.random.family == "groot" else tiny_cpu
         bundle = random_bundle(
-            tiny(num_carriers=options.random.num_carriers, cognition_size=hidden_size), options.random.seed
+            tiny(num_carriers=options.random.num_carriers, cognition_size=hidden_size),
+            options.random.seed,
+            device=options.device,
         )
     return EagerEngine(
         bundle,

@@ -16,6 +16,7 @@ from torch import Tensor
 from dual_system.models import flow
 from dual_system.models.action_space import ROBOT_DIM
 from dual_system.models.flow import EulerStep
+from dual_system.models.gpu import current, settle
 from dual_system.models.groot.pounce import GrootInputs, GrootPounce
 from dual_system.models.groot.prompt import EagleTokenizer
 from dual_system.models.pi05 import rtc as rtc
@@ -91,6 +92,7 @@ class EagerEngine:
         self._statistics = bundle.statistics
         self._network_action_dim, self._padded_action_dim = config.robot_action_dim, config.padded_action_dim
         self._device = torch.device(device)
+        settle(self._device)
         self.spec = EngineSpec(
             horizon=config.horizon,
             action_dim=ROBOT_DIM,
@@ -168,11 +170,14 @@ class EagerEngine:
     def _network_actions(self, requests: Sequence[Request], progress: Progress) -> Tensor:
         """Normalised actions (B, N, D)."""
         noise_BNA = torch.cat([self._noise(request.seed) for request in requests])
-        actions_BNA = noise_BNA.clone()
-        for moved, step in self._sample(requests, noise_BNA):
-            actions_BNA[moved] = step.actions
-            progress()
-        return actions_BNA[..., : self._network_action_dim].cpu()
+        last: dict[tuple[int, ...], Tensor] = {}
+        with current(self._device):
+            for moved, step in self._sample(requests, noise_BNA):
+                last[tuple(moved)] = step.actions
+                progress()
+            actions = {moved: part[..., : self._network_action_dim].cpu() for moved, part in last.items()}
+        rows = {index: row_ND for moved, part in actions.items() for index, row_ND in zip(moved, part, strict=True)}
+        return torch.stack([rows[index] for index in range(len(requests))])
 
     def _planned(self, requests: Sequence[Request], progress: Progress) -> list[NDArray[np.float32]]:
         robot_actions_BND = self._network_actions(requests, progress).numpy()

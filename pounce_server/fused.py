@@ -1,11 +1,12 @@
 """POUNCE's fast path for pi0.5: packed weights, static buffers, fused operations, and a graph per shape of the prefix.
 
-The prefix is padded to a multiple of 16 tokens; padding is masked and takes no position, so it changes nothing but
+The prefix is padded to a multiple of 64 tokens; padding is masked and takes no position, so it changes nothing but
 rounding. A bucket's work is captured once: the prefill, and each flow step with its own styles, so that heartbeats
-fit between steps.
+fit between steps. The first sample, which is the warm-up's, captures all buckets that any prompt may need: the prompt
+spells the state in digits, so its length changes from one invocation to the next.
 """
 
-# B batch, T prefix tokens with padding, N horizon, A padded action dim, E expert width, S = T + N slots
+# B batch, T prefix tokens with padding, N horizon, A padded action dim, E expert width, S slots of keys
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -15,7 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dual_system.models.flow import EulerStep
-from dual_system.models.graphs import Capture, Work, cuda_graph, directly
+from dual_system.models.graphs import Capture, Work, cuda_graphs, directly
 from dual_system.models.pi05.gemma import RmsNorm
 from dual_system.models.pi05.network import Pi05, Prefix
 from dual_system.models.pi05.pounce import Pounce, PounceInputs
@@ -24,7 +25,10 @@ from pounce_server.kernels.choice import Choices, ChosenProduct, cuda_time_ms, d
 from pounce_server.kernels.launch import missing_for
 from pounce_server.kernels.rms_norm import Style
 
-BUCKET_TOKENS = 16
+BUCKET_TOKENS = 64
+"""Prompts of at most 200 tokens need four or five buckets; 63 unseen tokens cost less than half a millisecond."""
+SLOT_MULTIPLE = 16
+"""Divides the number of keys that an action attends to: torch would pad a bias of another width in every layer."""
 
 
 class FusedPounce:
@@ -43,16 +47,25 @@ class FusedPounce:
 
     def sample(self, inputs: PounceInputs, noise_BNA: Tensor) -> Iterator[EulerStep]:
         """Yields the sampler's steps. Their tensors are the bucket's buffers, which the next step overwrites."""
-        prefix = _padded(self._model.embed_prefix(inputs))
-        key = (prefix.is_real.shape[0], prefix.is_real.shape[1])
+        prefix = self._model.embed_prefix(inputs)
+        batch_size, num_tokens = prefix.is_real.shape
+        prefix = _padded(prefix, _bucket_tokens(num_tokens))
+        key = (batch_size, prefix.is_real.shape[1])
         if key not in self._buckets:  # captured before loading, because capturing overwrites the buffers
-            self._buckets[key] = Bucket(self._network, prefix, self._capture)
+            self._capture_all(prefix, num_tokens - inputs.token_ids.shape[1])
         bucket = self._buckets[key]
         bucket.load(prefix, noise_BNA)
         bucket.prefill()
         for index, step in enumerate(bucket.steps):
             step()
             yield EulerStep(index, bucket.velocity.view_as(noise_BNA), bucket.actions.view_as(noise_BNA))
+
+    def _capture_all(self, prefix: Prefix, num_beside_text: int) -> None:
+        """The buckets of all prompts, the longest first so that the others reuse its memory in the pool."""
+        most = _bucket_tokens(num_beside_text + self._model.config.max_prompt_tokens)
+        for length in range(most, num_beside_text, -BUCKET_TOKENS):
+            bucket = Bucket(self._network, _padded(prefix, length), self._capture)
+            self._buckets[prefix.is_real.shape[0], length] = bucket
 
 
 def fused_for(model: Pounce, device: torch.device, *, autotune: bool = False) -> FusedPounce:
@@ -71,11 +84,16 @@ def fused_for(model: Pounce, device: torch.device, *, autotune: bool = False) ->
     if autotune:
         chosen = ChosenProduct(Choices(default_cache(), machine_name(device)), cuda_time_ms, preferring)
         operations = replace(KERNELS, product=chosen)
-    return FusedPounce(model, operations, cuda_graph)
+    return FusedPounce(model, operations, cuda_graphs(device))
 
 
-def _padded(prefix: Prefix) -> Prefix:
-    count = -prefix.is_real.shape[1] % BUCKET_TOKENS
+def _bucket_tokens(num_tokens: int) -> int:
+    return -(-num_tokens // BUCKET_TOKENS) * BUCKET_TOKENS
+
+
+def _padded(prefix: Prefix, length: int) -> Prefix:
+    """``prefix`` with unseen tokens up to ``length``, or cut to it."""
+    count = length - prefix.is_real.shape[1]
     return Prefix(
         embeds=F.pad(prefix.embeds, (0, 0, 0, count)),
         is_real=F.pad(prefix.is_real, (0, count)),
@@ -125,8 +143,10 @@ class Bucket:
             seen = slice(first, first + stream.is_real.shape[1])
             self._prefix_runs.append(Run(config.language, batch_size, stream.is_real.shape[1], seen, embeds))
             first = seen.stop
-        self._action_run = Run(config.expert, batch_size, horizon, slice(0, num_prefix + horizon), embeds)
-        cache_shape = (batch_size, config.expert.num_kv_heads, num_prefix + horizon, config.expert.head_dim)
+        self._num_gap = -(num_prefix + horizon) % SLOT_MULTIPLE
+        num_slots = num_prefix + self._num_gap + horizon
+        self._action_run = Run(config.expert, batch_size, horizon, slice(0, num_slots), embeds)
+        cache_shape = (batch_size, config.expert.num_kv_heads, num_slots, config.expert.head_dim)
         self._cache = [
             (embeds.new_zeros(cache_shape), embeds.new_zeros(cache_shape)) for _ in range(config.expert.depth)
         ]
@@ -141,8 +161,9 @@ class Bucket:
             run.place(stream.positions(), stream.is_real)
         next_position_B = prefix.is_real.sum(dim=1) - prefix.num_cognition
         offsets_N = torch.arange(noise_BNA.shape[1], device=noise_BNA.device)
-        is_action_BN = prefix.is_real.new_ones(noise_BNA.shape[:2])
-        self._action_run.place(next_position_B[:, None] + offsets_N, torch.cat([prefix.is_real, is_action_BN], dim=1))
+        is_seen_BS = F.pad(prefix.is_real, (0, self._num_gap))
+        is_seen_BS = F.pad(is_seen_BS, (0, noise_BNA.shape[1]), value=True)
+        self._action_run.place(next_position_B[:, None] + offsets_N, is_seen_BS)
         self.actions.copy_(noise_BNA.flatten(0, 1))
 
     def _prefill(self) -> None:

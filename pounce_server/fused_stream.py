@@ -75,7 +75,7 @@ def _joined(*projections: nn.Linear) -> Tensor:
 class Run:
     """Static buffers of T tokens that go through a stream together.
 
-    The caller must fill ``x``, ``rotation`` and ``visible`` before running the stream.
+    The caller must fill ``x``, ``rotation`` and ``bias`` before running the stream.
     """
 
     def __init__(self, config: GemmaConfig, batch_size: int, num_tokens: int, seen: slice, like: Tensor) -> None:
@@ -93,14 +93,15 @@ class Run:
         self.activated = like.new_empty(num_rows, config.mlp_width)
         pairs = torch.zeros(batch_size, 1, num_tokens, head_dim // 2, device=device)
         self.rotation = Rotation(pairs, pairs.clone())
-        self.visible = torch.ones(batch_size, 1, 1, seen.stop - seen.start, dtype=torch.bool, device=device)
+        self.bias = like.new_zeros(batch_size, 1, 1, seen.stop - seen.start)
+        """0 for slots that are seen, else -inf; from a bool torch would make it again in every layer."""
 
     def place(self, positions_BT: Tensor, visible_BS: Tensor) -> None:
         """Loads the tokens' positions, and which of the attended slots are real."""
         rotation = Rotation.at(positions_BT, 2 * self.rotation.cos.shape[-1])
         self.rotation.cos.copy_(rotation.cos)
         self.rotation.sin.copy_(rotation.sin)
-        self.visible.copy_(visible_BS[:, None, None, :])
+        self.bias.zero_().masked_fill_(~visible_BS[:, None, None, :], float("-inf"))
 
 
 class FusedStream:
@@ -124,7 +125,7 @@ class FusedStream:
             self._do.rope(run.qkv, run.rotation, run.queries, Slots(keys, values, run.first))
             if index == len(self._layers) - 1 and len(norms) == 2 * len(self._layers):
                 return
-            mixed = attend(run.queries, keys[:, :, run.seen], values[:, :, run.seen], run.visible)
+            mixed = attend(run.queries, keys[:, :, run.seen], values[:, :, run.seen], run.bias)
             self._do.product(mixed.flatten(0, 1), layer.attention_out, run.branch)
             self._do.norm(run.x, run.normed, before_mlp.style, Residual(run.branch, before_attention.gate))
             self._do.product(run.normed, layer.gate_up, run.gate_up)

@@ -10,11 +10,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: one thread beats two on two shared cores
-os.environ.setdefault("TRITON_INTERPRET", "1")  # before Triton is imported: kernels run on the CPU
 
 import hypothesis
 import numpy as np
 import pytest
+import torch
+
+# Before Triton is imported. Without a GPU kernels run in its interpreter; with one they are compiled, and so tested.
+os.environ.setdefault("TRITON_INTERPRET", "0" if torch.cuda.is_available() else "1")
 
 import dual_system.tasks.headless  # noqa: F401 - before mujoco is imported
 
@@ -38,6 +41,17 @@ from sim_client.episode import Outcome, RobotSide, always
 
 hypothesis.settings.register_profile("house", deadline=None, max_examples=30)  # a deadline reads the wall clock
 hypothesis.settings.load_profile("house")
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """A test marked gpu needs one: where `-m gpu` asked for it, its absence is a failure and no skip."""
+    if item.get_closest_marker("gpu") is None or torch.cuda.is_available():
+        return
+    lack = f"expected a CUDA device, came torch {torch.__version__} without one"
+    if "gpu" in item.config.getoption("-m").replace("not gpu", ""):
+        pytest.fail(f"{lack}; leave -m gpu out to skip what needs it")
+    pytest.skip(lack)
+
 
 ROBOT, CAMERAS, PX, DIM, NUM_PROPRIO = "r0", ("front", "wrist"), 4, 3, 3
 K, H = 2, 8

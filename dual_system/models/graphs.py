@@ -5,8 +5,7 @@ nothing, and has no control flow that depends on tensor values. The servers deci
 """
 
 from collections.abc import Callable
-from functools import partial
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import torch
 
@@ -23,34 +22,30 @@ def directly(work: Work) -> Work:
     return work
 
 
-def cuda_graph(work: Work, *, pool: Any = None, stream: torch.cuda.Stream | None = None) -> Work:
-    """Records ``work`` on the current CUDA device; a replay is one launch, in the current stream.
-
-    Args:
-        pool: memory pool (``torch.cuda.graph_pool_handle``) for what ``work`` allocates; a private one if None.
-        stream: stream on which to warm up and record; a new one each time if None.
-    """
-    side = stream or torch.cuda.Stream()
-    side.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(side):
-        for _ in range(WARM_UPS):
-            work()
-    torch.cuda.current_stream().wait_stream(side)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph, pool=pool, stream=stream):
-        work()
-    return graph.replay
-
-
-def cuda_graphs() -> Capture:
-    """:func:`cuda_graph` for many graphs of which one runs at a time, on the current CUDA device.
+def cuda_graphs(device: torch.device) -> Capture:
+    """Records work on ``device``, for graphs of which one runs at a time; a replay is one launch.
 
     They share one memory pool, so a replay overwrites what an earlier one left there: results must lie in buffers
     that were allocated before. They share one stream as well, because libraries keep one workspace per stream.
     """
-    return partial(cuda_graph, pool=torch.cuda.graph_pool_handle(), stream=torch.cuda.Stream())
+    with torch.cuda.device(device):  # streams, pools and graphs are the current device's
+        pool, side = torch.cuda.graph_pool_handle(), torch.cuda.Stream()
+
+    def capture(work: Work) -> Work:
+        with torch.cuda.device(device):
+            side.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(side):
+                for _ in range(WARM_UPS):
+                    work()
+            torch.cuda.current_stream().wait_stream(side)
+            graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(graph, pool=pool, stream=side):
+                work()
+        return graph.replay
+
+    return capture
 
 
 def graphs_for(device: torch.device) -> Capture | None:
     """Default capture for work on ``device``: CUDA graphs on a GPU, None elsewhere."""
-    return cuda_graphs() if device.type == "cuda" else None
+    return cuda_graphs(device) if device.type == "cuda" else None

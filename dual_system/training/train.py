@@ -28,6 +28,7 @@ from dual_system.data.episode import CAMERAS
 from dual_system.data.errors import DatasetError
 from dual_system.models.bfloat16 import warn_of_slow
 from dual_system.models.device import require_device
+from dual_system.models.gpu import settle
 from dual_system.models.pi05.pounce import PounceConfig, freeze
 from dual_system.models.pi05.prompt import Tokenizer, tokenizer_of_instructions
 from dual_system.models.ponder.checkpoint import load_ponder, save_ponder
@@ -272,7 +273,7 @@ def _prepare(model: JointModel, machine: MachineOptions, world: World) -> None:
         recompute_layers(model.ponder)
     if machine.device == "cuda" and machine.dtype == "float32":
         fuse_attention(model.ponder)
-    torch.backends.cuda.matmul.allow_tf32 = machine.tf32
+    settle(torch.device(machine.device), tf32=machine.tf32)
     if machine.weights == "sharded":
         shard(model, world)
 

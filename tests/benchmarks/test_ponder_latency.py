@@ -10,6 +10,7 @@ import torch
 from benchmarks.ponder_latency import (
     TEXT_TOKENS,
     LatencyOptions,
+    _dtypes,
     _labelled,
     _num_right,
     _own_text,
@@ -51,3 +52,9 @@ def test_graphs_are_told_of_where_there_are_some() -> None:
     gpu = LatencyOptions(device="cuda:0")
     assert _labelled({"p50_ms": 1.0}, OPTIONS) == {"weights": "float", "attention_threads": 1, "p50_ms": 1.0}
     assert [_labelled({}, gpu, graphs=graphs)["engine"] for graphs in (True, False)] == ["ours graphs", "ours eager"]
+
+
+def test_a_gpu_is_not_asked_for_two_large_networks_in_float32() -> None:
+    assert _dtypes(LatencyOptions(device="cuda:0")) == ("bfloat16",)
+    assert _dtypes(LatencyOptions(device="cuda:0", dtypes=("float32",))) == ("float32",)
+    assert _dtypes(OPTIONS) == ("float32", "bfloat16")

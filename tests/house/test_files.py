@@ -22,6 +22,10 @@ _SECRET = re.compile(
 )
 
 
+MAX_TREE_MIB = 48
+"""Limit of the tracked files: a borrowed GPU takes a tree of 64 MiB, with what a run carries besides."""
+
+
 @pytest.fixture(scope="module")
 def texts(root: Path, files: tuple[str, ...]) -> dict[str, str]:
     """Every text file of ours."""
@@ -31,6 +35,12 @@ def texts(root: Path, files: tuple[str, ...]) -> dict[str, str]:
         if b"\0" not in data[:8192]:
             found[name] = data.decode("utf-8")
     return found
+
+
+def test_the_tree_can_travel_to_a_gpu(root: Path, files: tuple[str, ...]) -> None:
+    sizes = {name: (root / name).stat().st_size for name in files}
+    largest = sorted(sizes, key=sizes.__getitem__)[-5:]
+    assert sum(sizes.values()) <= MAX_TREE_MIB << 20, f"largest: {[(name, sizes[name]) for name in largest]}"
 
 
 def test_every_module_says_in_a_docstring_what_it_is(root: Path, written: tuple[str, ...]) -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from dual_system.models import fp8
-from dual_system.models.fp8 import Fp8Linear, has_products, missing_for
+from dual_system.models.fp8 import LEAST_CAPABILITY, Fp8Linear, has_products, missing_for
 from dual_system.models.narrow_linear import quantise_where
 
 MODEL_TYPE = torch.bfloat16
@@ -110,8 +110,9 @@ def test_where_there_can_be_none_it_says_why(monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not has_products(torch.device("cuda" if torch.cuda.is_available() else "cpu")), reason="needs fp8")
 def test_a_gpu_s_products_are_those_of_the_widened_weights() -> None:
+    if not has_products(torch.device("cuda")):
+        pytest.skip(f"needs fp8 products, {LEAST_CAPABILITY} or newer; came {torch.cuda.get_device_capability()}")
     narrow = Fp8Linear(linear_of(64, 128).to("cuda"))
     x = torch.randn(17, 128, device="cuda", dtype=MODEL_TYPE)
     exact = x.float() @ (narrow.weight_OI.float() * narrow.scale_O[:, None]).T + narrow.bias

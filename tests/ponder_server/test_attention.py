@@ -1,9 +1,11 @@
 """The ways to attend are one: with a mask, in parts joined by log-sum-exp, in two windows; on any number of threads."""
 
 from collections.abc import Iterable
+from typing import Any
 
 import pytest
 import torch
+import torch.nn.functional as F
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -36,6 +38,21 @@ def test_past_and_present_apart_are_attention_with_a_mask(
     keys, values = torch.randn(2, key_heads, num_past + num_queries, 32, generator=generator)
     apart = attend_in_parts(queries, keys, values)
     torch.testing.assert_close(apart, attend_masked(queries, keys, values), rtol=0, atol=1e-5)
+
+
+def test_with_a_mask_no_call_has_grouped_heads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """torch's fused GPU kernels refuse the two together."""
+    calls, real = [], F.scaled_dot_product_attention
+
+    def watched(query: Tensor, key: Tensor, value: Tensor, **options: Any) -> Tensor:
+        calls.append((query.shape[1] == key.shape[1], options.get("enable_gqa", False)))
+        return real(query, key, value, **options)
+
+    queries, keys = torch.randn(6, 5, 32), torch.randn(2, 9, 32)
+    expected = real(queries[None], keys[None], keys[None], torch.ones(5, 9).tril(4).bool(), enable_gqa=True)[0]
+    monkeypatch.setattr(F, "scaled_dot_product_attention", watched)
+    torch.testing.assert_close(attend_masked(queries, keys, keys), expected, rtol=0, atol=1e-6)
+    assert calls == [(True, False)]
 
 
 def test_the_newest_position_does_not_reach_an_earlier_query() -> None:

@@ -4,8 +4,7 @@ Nothing here needs a GPU: the work that a CUDA graph would record is run itself.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import product
 from typing import Any
@@ -20,9 +19,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from dual_system.models import fp8
 from dual_system.models.graphs import Capture, Work, directly
 from dual_system.models.ponder.configs import tiny_cpu
-from dual_system.models.ponder.kernels import delta_rule_of_many
 from dual_system.models.ponder.network import Ponder
-from ponder_server import decoder
 from ponder_server.captured import CapturedDecoder, position_buckets
 from ponder_server.contract import WeightsName
 from ponder_server.decoder import Place, decode
@@ -225,30 +222,21 @@ def test_the_watch_sees_whatever_asks_for_a_number(ask: Callable[[torch.Tensor],
         ask(torch.ones(2))
 
 
-@contextmanager
-def delta_rule_of_gpus() -> Iterator[None]:
-    """transformers' own in place of ours, as on a GPU without fla."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(decoder, "gated_delta_rule", delta_rule_of_many)
-        yield
-
-
 @pytest.mark.parametrize("length", [1, 16, 70])
 @torch.inference_mode()
 def test_no_operation_depends_on_a_number_and_none_waits_for_one(ponder: Ponder, length: int) -> None:
     text_model = ponder.qwen.model.language_model
     forward = CapturedDecoder(text_model, memory_of(ponder), directly, num_read=16).forward(2, length, 200)
     seen = []
-    with delta_rule_of_gpus():
-        for seed, (slots, past, new) in enumerate([((0, 1), (0, 0), (1, length)), ((3, 1), (97, 9), (length, 1))]):
-            places = [
-                Place(slot=slot, num_past=before, num_new=more, num_wanted=more % 2)
-                for slot, before, more in zip(slots, past, new, strict=True)
-            ]
-            forward.load(places, embeds(ponder, 2 * length, seed).view(2, length, -1), torch.full((3, 2, length), seed))
-            with Watch() as watch:
-                forward.run()
-            seen.append(watch.operations)
+    for seed, (slots, past, new) in enumerate([((0, 1), (0, 0), (1, length)), ((3, 1), (97, 9), (length, 1))]):
+        places = [
+            Place(slot=slot, num_past=before, num_new=more, num_wanted=more % 2)
+            for slot, before, more in zip(slots, past, new, strict=True)
+        ]
+        forward.load(places, embeds(ponder, 2 * length, seed).view(2, length, -1), torch.full((3, 2, length), seed))
+        with Watch() as watch:
+            forward.run()
+        seen.append(watch.operations)
     assert len(seen[0]) > 100
     assert seen[0] == seen[1]
 
@@ -271,14 +259,6 @@ def test_it_runs_on_a_device_that_has_no_numbers(
         captured.forward(2, length, 200).run()
     hidden = captured(places, embeds_BTH, torch.zeros(3, 2, length, dtype=torch.long))
     assert [(row_NH.shape, row_NH.dtype) for row_NH in hidden] == [((1, ponder.hidden_size), dtype)] * 2
-
-
-@torch.inference_mode()
-def test_with_the_delta_rule_of_gpus_the_numbers_are_the_same_too(ponder: Ponder) -> None:
-    eager, captured = (sessions_of(ponder, capture) for capture in (None, directly))
-    with delta_rule_of_gpus():
-        for sizes in ((30, 9, 0), (12, 16, 1), (1, 1, 1)):
-            assert_alike(*(append(ponder, sessions, sizes, None, 1) for sessions in (captured, eager)))
 
 
 # -- capturing
@@ -319,7 +299,7 @@ def test_a_capture_that_fails_puts_the_memory_back_and_names_the_way_out(ponder:
     runner = sessions[0]._runner
     before = [states(runner.memory, slot) for slot in range(NUM_ROWS)]
     runner.capture(broken, num_read=4)
-    with pytest.raises(RuntimeError, match=r"3 rows of 16 tokens over 90 positions .* --no-graphs"):
+    with pytest.raises(RuntimeError, match=r"3 rows of 16 tokens over 128 positions .* --no-graphs"):
         runner.prepare(10, max_rows=8)
     for slot, was in enumerate(before):
         assert all(map(torch.equal, states(runner.memory, slot), was))
@@ -331,10 +311,11 @@ def test_attention_computes_at_most_twice_what_is_valid_but_for_short_contexts(
 ) -> None:
     buckets = position_buckets(max_tokens, least)
     assert list(buckets) == sorted(set(buckets))
-    assert buckets[-1] == max_tokens
+    assert max_tokens <= buckets[-1] < max_tokens + 64
+    assert buckets[-1] % 64 == 0
     longest = min(num_tokens, max_tokens)
     taken = next(bucket for bucket in buckets if bucket >= longest)
-    assert taken < 2 * longest or taken <= least
+    assert taken < 2 * longest + 64 or taken <= -(-least // 64) * 64, "but for the last bucket's multiple of 64"
 
 
 def test_the_paper_s_context_has_five_lengths() -> None:

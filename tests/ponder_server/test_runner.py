@@ -180,6 +180,13 @@ def test_an_append_keeps_every_address() -> None:
     assert [t.data_ptr() for slot in range(2) for t in runner.memory.states(slot)] == addresses
 
 
+def test_a_save_is_two_copies_however_many_layers_there_are() -> None:
+    memory = Runner(Ponder.random(tiny_cpu(), VOCABULARY, seed=1), num_slots=2, max_tokens=10).memory
+    assert len(memory.recurrent) > 2
+    assert all(tensor.is_contiguous() for tensor in memory.states(1))
+    assert len(memory.states(1)) == 2
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_memory_is_known_before_it_is_allocated(dtype: torch.dtype) -> None:
     ponder = Ponder.random(tiny_cpu(), VOCABULARY, seed=1, dtype=dtype)

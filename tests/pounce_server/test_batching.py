@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from dual_system.models.pounce.checkpoint import random_bundle
 from dual_system.models.pounce.configs import tiny_cpu, tiny_groot
@@ -77,3 +79,18 @@ def test_one_misfit_is_named_and_stops_the_batch(engine: EagerEngine, robots: li
 def test_an_empty_batch_is_refused(engine: EagerEngine) -> None:
     with pytest.raises(ValueError, match="at least one request"):
         engine.invoke_many([])
+
+
+def test_no_flow_step_writes_rows_by_a_list_of_indices(engine: EagerEngine, robots: list[Request]) -> None:
+    """On a GPU such a list is copied there, and the host waits, once a step."""
+    seen: list[str] = []
+
+    class Watch(TorchDispatchMode):
+        def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+            seen.append(str(func))
+            return func(*args, **(kwargs or {}))
+
+    with Watch():
+        engine.invoke_many(robots)
+    assert seen
+    assert not [name for name in seen if "index_put" in name]

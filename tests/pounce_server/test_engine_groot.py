@@ -6,10 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from dual_system.models.groot.prompt import prompt_text
 from dual_system.models.pounce.checkpoint import random_bundle, save_bundle
 from dual_system.models.pounce.configs import tiny_groot
+from dual_system.models.pounce.reading import groot_inputs
 from pounce_server.__main__ import build_engine
 from pounce_server.config import PounceOptions, RandomOptions
 from pounce_server.contract import PounceEngine, Request, example_request
@@ -99,6 +101,21 @@ def test_the_prompt_has_a_slot_per_patch_and_prints_the_instruction_as_a_list() 
 def test_a_long_instruction_is_refused_whatever_the_pictures_take(engine: EagerEngine, request_: Request) -> None:
     with pytest.raises(ValueError, match=r"prompt has \d+ tokens, expected at most 200 .* shorten"):
         engine.invoke(replace(request_, instruction="cube " * 500))
+
+
+def test_image_tokens_must_match_the_patches(engine: EagerEngine, request_: Request) -> None:
+    """Checked where the ids are made: in the network a GPU would have to wait for the answer."""
+    bundle = random_bundle(tiny_groot(num_carriers=2, cognition_size=24), seed=0)
+    config = bundle.model.config
+    other = replace(config.groot, eagle=replace(config.groot.eagle, image_token_id=7))  # type: ignore[union-attr]
+    with pytest.raises(ValueError, match=r"expected 128 image tokens \(id 7\).* came 0 and 2 frames"):
+        groot_inputs(
+            request_,
+            replace(config, groot=other),
+            bundle.tokenizer,
+            bundle.statistics,
+            torch.device("cpu"),  # type: ignore[arg-type]
+        )
 
 
 def test_bfloat16_rows_stay_near_float32(engine: EagerEngine, request_: Request) -> None:

@@ -17,7 +17,7 @@ from dual_system.models.pounce.configs import tiny_cpu, tiny_groot
 from dual_system.models.siglip import VisionConfig
 from pounce_server.contract import DTypeName, example_request
 from pounce_server.engine import EagerEngine
-from pounce_server.fused import BUCKET_TOKENS, FusedPounce, fused_for
+from pounce_server.fused import BUCKET_TOKENS, SLOT_MULTIPLE, FusedPounce, fused_for
 from pounce_server.fused_stream import KERNELS, TWINS, Operations
 from pounce_server.kernels.launch import missing_for
 from pounce_server.precision import cast_for_serving
@@ -25,6 +25,10 @@ from pounce_server.precision import cast_for_serving
 MAE = {"float32": 1e-5, "bfloat16": 4e-3}
 """Stated tolerance: mean absolute error of the normalised actions after the last step."""
 LACK = missing_for(torch.device("cpu"))
+NUM_BESIDE_TEXT = 2 * 64 + 2
+"""Two views, the age and one carrier of the tiny model stand before the text."""
+NUM_BUCKETS = 4
+"""Of prompts of 1 to 200 tokens after these: 192, 256, 320 and 384 tokens."""
 
 
 def model_of(config: PounceConfig, dtype: DTypeName = "float32", seed: int = 0) -> Pounce:
@@ -95,8 +99,14 @@ def small(num_kv_heads: int) -> PounceConfig:
     return replace(base, pi05=pi05, num_steps=2)
 
 
+@pytest.fixture
+def few_tokens(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shorter prefixes: the interpreter takes its time for every row."""
+    monkeypatch.setattr("pounce_server.fused.BUCKET_TOKENS", 8)
+
+
 @pytest.mark.skipif(bool(LACK), reason=LACK)
-@pytest.mark.usefixtures("rounding_interpreter")
+@pytest.mark.usefixtures("rounding_interpreter", "few_tokens")
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 @pytest.mark.parametrize("num_kv_heads", [1, 2])
 def test_kernels_in_the_interpreter_act_as_the_eager_model(num_kv_heads: int, dtype: DTypeName) -> None:
@@ -164,26 +174,35 @@ def with_tokens(config: PounceConfig, num_tokens: int) -> PounceInputs:
 def test_what_is_captured_once_is_replayed_over_new_inputs(config: PounceConfig) -> None:
     model = model_of(config)
     noise = noise_for(config, 1)
-    num_free = -(2 * 64 + 2) % BUCKET_TOKENS  # two views, the age and one carrier stand before the text
+    num_free = -NUM_BESIDE_TEXT % BUCKET_TOKENS
     requests = [with_tokens(config, count) for count in (num_free, 1, num_free)]
     expected = [eager_actions(model, inputs, noise) for inputs in requests]
     recorder = Recorder()
     fused = FusedPounce(model, TWINS, recorder)
     for inputs, actions in zip(requests, expected, strict=True):
         assert mean_error(fused_actions(fused, inputs, noise), actions) <= MAE["float32"]
-    assert recorder.events == "c" * 11 + "r" * 33, "prefill and ten steps, captured once for three prompts"
+    assert recorder.events == "c" * 11 * NUM_BUCKETS + "r" * 33, "prefill and ten steps, captured once"
 
 
-def test_another_shape_of_prefix_is_another_bucket_and_both_stay(config: PounceConfig) -> None:
+def test_no_prompt_waits_for_a_capture(config: PounceConfig) -> None:
+    """The prompt spells the state in digits: its length changes while a robot moves."""
     model = model_of(config)
     noise = noise_for(config, 1)
-    requests = [with_tokens(config, count) for count in (4, 4 + BUCKET_TOKENS, 4)]
+    requests = [with_tokens(config, count) for count in (4, 1, 4 + BUCKET_TOKENS, config.max_prompt_tokens, 4)]
     expected = [eager_actions(model, inputs, noise) for inputs in requests]
     recorder = Recorder()
     fused = FusedPounce(model, TWINS, recorder)
     for inputs, actions in zip(requests, expected, strict=True):
         assert mean_error(fused_actions(fused, inputs, noise), actions) <= MAE["float32"]
-    assert recorder.events == ("c" * 11 + "r" * 11) * 2 + "r" * 11
+    assert recorder.events == "c" * 11 * NUM_BUCKETS + "r" * 11 * len(requests)
+
+
+def test_the_keys_of_an_action_fill_whole_slots(config: PounceConfig) -> None:
+    fused = FusedPounce(model_of(config), TWINS)
+    fused_actions(fused, with_tokens(config, 3), noise_for(config, 1))
+    widths = [bucket._action_run.bias.shape[-1] for bucket in fused._buckets.values()]
+    assert len(widths) == NUM_BUCKETS
+    assert all(width % SLOT_MULTIPLE == 0 for width in widths)
 
 
 @pytest.mark.parametrize("capture", [directly, Recorder()], ids=["directly", "captured"])
@@ -216,7 +235,7 @@ def test_without_triton_the_fused_path_says_what_to_install(
 
 
 @pytest.mark.skipif(bool(LACK), reason=LACK)
-@pytest.mark.usefixtures("rounding_interpreter")
+@pytest.mark.usefixtures("rounding_interpreter", "few_tokens")
 def test_a_fused_engine_gives_the_eager_engine_s_rows() -> None:
     eager, fused = (
         EagerEngine(random_bundle(small(1), 0), path=path)

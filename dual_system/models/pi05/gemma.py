@@ -55,13 +55,25 @@ class Rotation:
 
 
 def attend(q_BhTD: Tensor, k_BgSD: Tensor, v_BgSD: Tensor, visible: Tensor | None) -> Tensor:
-    """Grouped-query attention -> (B, T, h*D). ``visible`` broadcasts to (B, 1, T, S); None means all.
+    """Grouped-query attention -> (B, T, h*D). ``visible``, bool or a bias, broadcasts to (B, 1, T, S); None means all.
 
     Hidden keys get weight exactly 0, where the public code adds -2.38e38 to their logits: the results are equal
     for every row that sees at least one key.
+
+    The query heads that share a key head become rows of one head: with a mask, torch's fused GPU kernels do not
+    support grouped heads, and its fallback computes in float32 and without tensor cores.
     """
-    mixed_BhTD = F.scaled_dot_product_attention(q_BhTD, k_BgSD, v_BgSD, attn_mask=visible, enable_gqa=True)
-    return mixed_BhTD.transpose(1, 2).flatten(2)
+    (batch_size, heads, num_queries, head_dim), key_heads = q_BhTD.shape, k_BgSD.shape[1]
+    if k_BgSD.requires_grad and not k_BgSD.is_cuda:
+        # A CPU's backward pass is as fast with groups, and sums the heads in the order of every earlier training.
+        mixed_BhTD = F.scaled_dot_product_attention(q_BhTD, k_BgSD, v_BgSD, attn_mask=visible, enable_gqa=True)
+        return mixed_BhTD.transpose(1, 2).flatten(2)
+    group = heads // key_heads
+    if visible is not None and visible.shape[2] > 1:
+        visible = visible.repeat(1, 1, group, 1)
+    rows_BgRD = q_BhTD.reshape(batch_size, key_heads, group * num_queries, head_dim)
+    mixed_BgRD = F.scaled_dot_product_attention(rows_BgRD, k_BgSD, v_BgSD, attn_mask=visible)
+    return mixed_BgRD.unflatten(2, (group, num_queries)).permute(0, 3, 1, 2, 4).flatten(2)
 
 
 class Attention(nn.Module):

@@ -8,10 +8,15 @@ training mixes whole rows (`gated_delta`), serving a few tokens against a cache 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from torch import Tensor
 from torch.nn import functional as F
+from transformers.models.qwen3_5.modeling_qwen3_5 import apply_rotary_pos_emb
+
+rotate: Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]] = apply_rotary_pos_emb
+"""(queries (B, heads, T, D), keys, cos, sin (B, T, rotary dim)) -> queries and keys with rotary positions."""
 
 
 class AttentionInputs(NamedTuple):

@@ -9,7 +9,6 @@ the same modules over a few tokens at a time (``ponder_server/decoder.py``).
 """
 
 from collections.abc import Sequence
-from importlib.util import find_spec
 from typing import Any, Self
 
 import numpy as np
@@ -22,6 +21,7 @@ from transformers.models.qwen3_5.modeling_qwen3_5 import (
     Qwen3_5VisionRotaryEmbedding,
 )
 
+from dual_system.models.gpu import generator_for
 from dual_system.models.ponder.configs import PonderConfig
 from dual_system.models.ponder.context import ContextFormat, Row
 from dual_system.models.ponder.gated_delta import GatedDelta
@@ -70,6 +70,8 @@ class Ponder(nn.Module):
         self.image_px = image_px
         self.is_random = True
         """True if the carriers were never trained: cognition is noise. Training sets it False; checkpoints store it."""
+        self.served_hash: str | None = None
+        """Hash of the weights when an engine took them over; computed once, because it reads all of them."""
         self.mtp: dict[str, Tensor] = {}
         """The checkpoint's multi-token prediction block, by name: a draft for serving, saved unchanged."""
         qwen: Any = skeleton(qwen_config).to(dtype=dtype)
@@ -93,7 +95,8 @@ class Ponder(nn.Module):
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float32,
     ) -> Self:
-        """A network whose weights depend on ``config`` and ``seed`` alone; global random state is untouched.
+        """A network whose weights depend on ``config`` and ``seed`` alone, and on whether ``device`` is a GPU; global
+        random state is untouched.
 
         Without a ``vocabulary`` it uses :meth:`Vocabulary.tiny`.
         """
@@ -215,11 +218,10 @@ def skeleton(qwen_config: Qwen3_5Config) -> nn.Module:
     build: Any = Qwen3_5ForConditionalGeneration._from_config
     with torch.device("meta"):
         model: Any = build(qwen_config, attn_implementation="sdpa")
-        if find_spec("fla") is None:  # with fla, transformers' own layer is fast already
-            text: Any = qwen_config.text_config
-            for index, layer in enumerate(model.model.language_model.layers):
-                if text.layer_types[index] == "linear_attention":
-                    layer.linear_attn = GatedDelta(text, index)
+        text: Any = qwen_config.text_config
+        for index, layer in enumerate(model.model.language_model.layers):
+            if text.layer_types[index] == "linear_attention":
+                layer.linear_attn = GatedDelta(text, index)
     return model
 
 
@@ -229,11 +231,15 @@ def fill_randomly(qwen: nn.Module, *, seed: int) -> None:
 
     Unlike with the usual std of 0.02, activations keep their scale through the layers, and the recurrent layers' decay
     times range from a few tokens to almost endless, so that hidden states depend on images and on the past, and tests
-    detect a wrong cache. Drawn on the CPU in float32, in order of name: the same weights on any device.
+    detect a wrong cache. Drawn in float32, in order of name, by `gpu.generator_for`; on the meta device nothing is.
     """
-    generator = torch.Generator().manual_seed(seed)
-    for name, parameter in sorted(qwen.named_parameters()):
-        value = torch.empty(parameter.shape)
+    parameters = sorted(qwen.named_parameters())
+    device = parameters[0][1].device
+    if device.type == "meta":
+        return
+    generator = generator_for(device, seed)
+    for name, parameter in parameters:
+        value = torch.empty(parameter.shape, device=generator.device)
         leaf = name.rsplit(".", 1)[-1]
         if leaf == "A_log":
             value.uniform_(-4.0, 0.5, generator=generator)

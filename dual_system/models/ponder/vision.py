@@ -9,14 +9,16 @@ transformers' (a test compares them).
 
 from __future__ import annotations
 
-import functools
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 _ROPE_BASE = 10_000.0
+_rotations: WeakKeyDictionary[Any, dict[tuple[Any, ...], tuple[Tensor, Tensor]]] = WeakKeyDictionary()
+"""Kept for each tower by grid and device: a tower that copied them to its GPU could not be captured."""
 
 
 def image_tokens(tower: Any, patches: Tensor, grid: tuple[int, int]) -> Tensor:
@@ -32,7 +34,10 @@ def image_tokens(tower: Any, patches: Tensor, grid: tuple[int, int]) -> Tensor:
     x_NPC = F.linear(patches, embedding.weight.flatten(1), embedding.bias).unflatten(0, (-1, rows * columns))
     x_NPC = x_NPC + _position_embeddings(tower, rows, columns, merge).to(x_NPC.dtype)
     head_dim = x_NPC.shape[-1] // heads
-    cos_PD, sin_PD = (t.to(x_NPC.device) for t in _rotation(rows, columns, merge, head_dim))
+    kept, key = _rotations.setdefault(tower, {}), (rows, columns, x_NPC.device)
+    if key not in kept:
+        kept[key] = _rotation(rows, columns, merge, head_dim, x_NPC.device)
+    cos_PD, sin_PD = kept[key]
     for block in tower.blocks:
         qkv = block.attn.qkv(block.norm1(x_NPC)).unflatten(-1, (3, heads, head_dim))
         q_NhPD, k_NhPD, v_NhPD = qkv.permute(2, 0, 3, 1, 4).unbind(0)
@@ -71,13 +76,13 @@ def _position_embeddings(tower: Any, rows: int, columns: int, merge: int) -> Ten
     return _in_blocks(table_SSC, merge)
 
 
-@functools.lru_cache(maxsize=16)
-@torch.inference_mode(False)  # the cached tensors may later be used with autograd
-def _rotation(rows: int, columns: int, merge: int, head_dim: int) -> tuple[Tensor, Tensor]:
+@torch.inference_mode(False)  # the kept tensors may later be used with autograd
+def _rotation(rows: int, columns: int, merge: int, head_dim: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Cosines and sines (P, D): the first half of the frequencies encodes the row, the second the column."""
     spatial = head_dim // 2
-    frequencies = 1.0 / _ROPE_BASE ** (torch.arange(0, spatial, 2, dtype=torch.float32) / spatial)
-    places = torch.stack(torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij"), dim=-1)
+    frequencies = 1.0 / _ROPE_BASE ** (torch.arange(0, spatial, 2, dtype=torch.float32, device=device) / spatial)
+    axes = (torch.arange(count, device=device) for count in (rows, columns))
+    places = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
     angles = (_in_blocks(places, merge)[..., None] * frequencies).flatten(1)
     angles = torch.cat([angles, angles], dim=-1)
     return angles.cos(), angles.sin()

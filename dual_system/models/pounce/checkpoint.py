@@ -137,13 +137,14 @@ def random_bundle(
     *,
     statistics: RobotStatistics = ROBOMME,
     tokenizer: AnyTokenizer | None = None,
+    device: torch.device | str = "cpu",
 ) -> PounceBundle:
-    """A bundle without files: seeded random weights, and a tiny tokenizer unless another is given."""
+    """A bundle without files: seeded random weights on ``device``, and a tiny tokenizer unless another is given."""
     if tokenizer is None:
         is_pi05 = isinstance(config, PounceConfig)
         tokenizer = tiny_tokenizer_for_random_weights() if is_pi05 else tiny_eagle_tokenizer_for_random_weights()
     return PounceBundle(
-        model=random_model(config, seed),
+        model=random_model(config, seed, device),
         tokenizer=tokenizer,
         statistics=statistics,
         is_random=True,

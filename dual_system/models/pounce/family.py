@@ -33,8 +33,10 @@ def blank_model(config: AnyPounceConfig) -> AnyPounce:
         return Pounce(config) if isinstance(config, PounceConfig) else GrootPounce(config)
 
 
-def random_model(config: AnyPounceConfig, seed: int) -> AnyPounce:
-    return random_pounce(config, seed) if isinstance(config, PounceConfig) else random_groot_pounce(config, seed)
+def random_model(config: AnyPounceConfig, seed: int, device: torch.device | str = "cpu") -> AnyPounce:
+    if isinstance(config, PounceConfig):
+        return random_pounce(config, seed, device)
+    return random_groot_pounce(config, seed, device)
 
 
 def action_loss(

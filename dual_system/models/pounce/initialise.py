@@ -3,6 +3,7 @@
 import torch
 from torch import nn
 
+from dual_system.models.gpu import generator_for
 from dual_system.models.groot.blocks import EmbodimentLinear
 from dual_system.models.groot.network import Groot
 from dual_system.models.groot.pounce import GrootPounce, GrootPounceConfig
@@ -14,15 +15,15 @@ from dual_system.models.pi05.pounce import Pounce, PounceConfig
 _FAINT = 0.1
 
 
-def random_pounce(config: PounceConfig, seed: int) -> Pounce:
-    """Returns a CPU float32 model with seeded random weights.
+def random_pounce(config: PounceConfig, seed: int, device: torch.device | str = "cpu") -> Pounce:
+    """Returns a float32 model with seeded random weights, drawn on ``device`` (`gpu.generator_for`).
 
     Built on the meta device first, because the constructors of torch.nn draw from the global generator.
     """
     with torch.device("meta"):
         model = Pounce(config)
-    model.to_empty(device="cpu")
-    generator = torch.Generator().manual_seed(seed)
+    model.to_empty(device=device)
+    generator = generator_for(torch.device(device), seed)
     initialise_pi05(model.pi05, generator)
     initialise_prefix(model, generator)
     if model.state_projector is not None:
@@ -43,12 +44,12 @@ def open_gates(model: Pounce | GrootPounce) -> None:
             gate.fill_(1.0)
 
 
-def random_groot_pounce(config: GrootPounceConfig, seed: int) -> GrootPounce:
+def random_groot_pounce(config: GrootPounceConfig, seed: int, device: torch.device | str = "cpu") -> GrootPounce:
     """`random_pounce` for GR00T."""
     with torch.device("meta"):
         model = GrootPounce(config)
-    model.to_empty(device="cpu")
-    generator = torch.Generator().manual_seed(seed)
+    model.to_empty(device=device)
+    generator = generator_for(torch.device(device), seed)
     initialise_groot(model.groot, generator)
     initialise_prefix(model, generator)
     return model

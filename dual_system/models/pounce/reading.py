@@ -84,13 +84,20 @@ def groot_inputs(
     """Inputs for GR00T. A missing camera is a black picture: GR00T identifies cameras by their order only.
 
     Raises:
-        ValueError: the prompt is too long.
+        ValueError: the prompt is too long, or its image tokens are not one per patch of the frames.
     """
     images, _ = camera_batch(moment.frames, config.image_px)
     num_patches = config.groot.eagle.vision.num_patches
     instruction = _instruction(moment, config.reads_subgoal)
     token_ids = tokenizer.encode(groot_prompt.prompt_text(instruction, config.num_cameras, num_patches))
-    num_text = len(token_ids) - config.num_cameras * num_patches
+    num_slots, image_id = config.num_cameras * num_patches, config.groot.eagle.image_token_id
+    if token_ids.count(image_id) != num_slots or images.shape[1] != config.num_cameras:
+        raise ValueError(
+            f"expected {num_slots} image tokens (id {image_id}), one per patch of {config.num_cameras} cameras, came "
+            f"{token_ids.count(image_id)} and {images.shape[1]} frames; the model was saved with another tokenizer.json"
+            " or other cameras"
+        )
+    num_text = len(token_ids) - num_slots
     _check_length(num_text, config.max_prompt_tokens, moment.instruction)
     state = torch.zeros(1, config.groot.state_dim)
     state[0, : config.robot_state_dim] = torch.from_numpy(statistics.normalise_states(moment.proprio))

@@ -1,0 +1,539 @@
+"""A borrowed GPU's day: what is right, then how fast, how many robots, how fast it trains; one JSON at the end of it.
+
+    python -m benchmarks.gpu_day --stage all --seconds 570          # on the GPU; the next call does what is left
+    python -m benchmarks.gpu_day --stage all --device cpu --size tiny
+
+A stage has a budget and starts only if that much time is left. Its file is written after every row, so a call that is
+killed leaves what it measured; a stage that ended is not run again without ``--again``. A row that fails says why and
+ends nothing. Predictions are in the file before the first stage runs. Nothing is needed but torch, transformers, numpy
+and, for the fused path, Triton: a GPU's image may lack the rest.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from benchmarks.roofline import measure_ceilings
+from dual_system.models.fp8 import has_products
+from dual_system.models.gpu import current, settle
+from dual_system.models.graphs import directly, graphs_for
+from dual_system.models.ponder import configs as ponder_configs
+from dual_system.models.ponder.configs import PonderConfig
+from dual_system.models.ponder.context import Row
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.pounce import configs as pounce_configs
+from dual_system.models.pounce.family import AnyPounceConfig, random_model
+from ponder_server.contract import Opening, WeightsName
+from ponder_server.draft import Draft, TrieDraft
+from ponder_server.engine import QwenEngine
+from ponder_server.engine_config import EngineConfig
+from pounce_server.compiled import compiled_sampler
+from pounce_server.contract import DTypeName
+from pounce_server.fused import FusedPounce, fused_for
+from pounce_server.fused_stream import TWINS
+from pounce_server.kernels.launch import missing_for
+from pounce_server.precision import cast_for_serving
+
+Result = TypeVar("Result")
+
+PREDICTED_MS = {
+    "fire at 800 tokens": 22.0,
+    "fire at 14000 tokens": 27.0,
+    "45 tokens, one by one": 615.0,
+    "45 tokens, a draft that knows them": 95.0,
+    "pi0.5 fused": 18.0,
+    "GR00T as graphs": 12.0,
+    "8 robots' fires together": 96.0,
+}
+"""Medians on an H100, by counting kernels, bytes and multiplications; none was measured."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Size:
+    """Networks and numbers of a day."""
+
+    ponder: PonderConfig
+    right_layers: int
+    """Layers of the network that is compared between precisions; it must fit twice."""
+    trained: PonderConfig
+    pi05: AnyPounceConfig
+    groot: AnyPounceConfig
+    contexts: tuple[int, ...]
+    fires: int
+    text_tokens: int
+    robots: tuple[int, ...]
+
+
+def sizes(name: str) -> Size:
+    """``full``: the paper's networks. ``tiny``: the same code in seconds on a CPU."""
+    if name == "full":
+        return Size(
+            ponder=ponder_configs.qwen35_9b(),
+            right_layers=8,
+            trained=ponder_configs.qwen35_0p8b(),
+            pi05=pounce_configs.pi05_base(num_carriers=8),
+            groot=pounce_configs.groot_n1_5(num_carriers=8),
+            contexts=(800, 4_000, 14_000),
+            fires=30,
+            text_tokens=45,
+            robots=(1, 2, 4, 8),
+        )
+    tiny = replace(ponder_configs.tiny_cpu(), num_layers=4, image_px=(64, 64))
+    return Size(
+        ponder=tiny,
+        right_layers=4,
+        trained=tiny,
+        pi05=pounce_configs.tiny_cpu(num_carriers=2),
+        groot=pounce_configs.tiny_groot(num_carriers=2),
+        contexts=(120,),
+        fires=2,
+        text_tokens=5,
+        robots=(1, 2),
+    )
+
+
+class Day:
+    """The rows of one stage, and how they are measured."""
+
+    def __init__(self, device: torch.device, size: str, path: Path) -> None:
+        self.device = device
+        self.size = sizes(size)
+        self.dtype: DTypeName = "bfloat16" if device.type == "cuda" else "float32"
+        self.rows: dict[str, Any] = {}
+        self._path = path
+        self._of = f"{size} on {device.type}"
+        self._predicted = PREDICTED_MS if size == "full" else {}
+
+    def row(self, name: str, work: Callable[[], Result]) -> Result | None:
+        """Runs ``work`` and keeps what it returns, or why it failed. Returns it, or None."""
+        result = None
+        try:
+            result = work()
+            self.rows[name] = result
+        except Exception as error:
+            self.fail(name, error)
+        if isinstance(self.rows[name], dict) and name in self._predicted:
+            self.rows[name]["predicted_p50_ms"] = self._predicted[name]
+        print(f"  {name}: {json.dumps(self.rows[name])}", flush=True)
+        self.write()
+        return result
+
+    def fail(self, name: str, error: Exception) -> None:
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        what = f"{type(error).__name__}: {error}"[:400]
+        self.rows[name] = {"FAILED": what, "at": f"{where.name}:{where.lineno}"}
+
+    def write(self, *, is_over: bool = False) -> None:
+        stage = {"of": self._of, "is_over": is_over, "rows": self.rows}
+        self._path.write_text(json.dumps(stage, indent=1) + "\n")
+
+    def ms(self, call: Callable[[], object], count: int | None = None, after: Callable[[], None] = lambda: None) -> Any:
+        """Durations of ``call``, to the end of the device's work; ``after`` each one runs uncounted."""
+        took = []
+        for index in range(2 + (count or self.size.fires)):
+            start_s = time.perf_counter()
+            call()
+            if self.device.type == "cuda":
+                torch.cuda.synchronize(self.device)
+            if index >= 2:
+                took.append(1e3 * (time.perf_counter() - start_s))
+            after()
+        p50, p95 = np.percentile(took, (50, 95), method="inverted_cdf")
+        return {"n": len(took), "min_ms": round(min(took), 3), "p50_ms": round(p50, 3), "p95_ms": round(p95, 3)}
+
+    def time(self, name: str, call: Callable[[], object], count: int | None = None, **after: Callable[[], None]) -> Any:
+        """A row of :meth:`ms`."""
+        return self.row(name, partial(self.ms, call, count, **after))
+
+    def to(self, inputs: Any) -> Any:
+        """A dataclass of tensors, on the device."""
+        values = {field.name: getattr(inputs, field.name) for field in fields(inputs)}
+        moved = {name: value.to(self.device) for name, value in values.items() if isinstance(value, Tensor)}
+        return replace(inputs, **moved)
+
+
+# -- stages
+
+
+def probe(day: Day) -> None:
+    """Versions, the machine's ceilings, and what the GPU path takes for granted."""
+    device, dtype = day.device, getattr(torch, day.dtype)
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"
+    day.row("machine", lambda: {"device": name, "torch": torch.__version__, "cuda": torch.version.cuda})
+    day.row("ceilings", lambda: asdict(measure_ceilings(device, dtype)))
+    capture = graphs_for(device) or directly
+    system = torch.eye(64, device=device).expand(128, 64, 64).contiguous()
+    solved = torch.empty_like(system)
+
+    def solve() -> None:
+        solved.copy_(torch.linalg.solve_triangular(system, system, upper=False, unitriangular=True))
+
+    def solves() -> Any:
+        replay = capture(solve)
+        solved.fill_(float("nan"))
+        replay()
+        return {"is_right": bool(torch.equal(solved, system)), **day.ms(replay)}
+
+    day.row("a triangular solve, captured", solves)
+    for what, queries, keys in (("flow step", 160, 880), ("prefill", 6784, 848)):
+        queries = queries if device.type == "cuda" else 16
+        q, k = (torch.randn(1, 1, count, 256, device=device, dtype=dtype) for count in (queries, keys))
+        bias = torch.zeros(1, 1, 1, keys, device=device, dtype=dtype)
+        bias[..., -8:] = float("-inf")
+
+        attend = partial(F.scaled_dot_product_attention, q, k, k, attn_mask=bias)
+        day.time(f"attention of a pi0.5 {what}, heads as rows", attend, 5)
+    if has_products(device):
+        x, weight = (torch.randn(160, 4096, device=device).to(torch.float8_e4m3fn) for _ in range(2))
+        one = torch.ones(160, 1, device=device)
+        for is_fast in (False, True):
+            scaled = partial(torch._scaled_mm, x, weight.t(), scale_a=one, scale_b=one.t(), out_dtype=torch.bfloat16)
+            day.time(f"an fp8 product, fast accumulation {is_fast}", partial(scaled, use_fast_accum=is_fast))
+
+
+def kernels(day: Day) -> None:
+    """The tests that need a GPU. They fail where there is none, so that a CPU runs none of them."""
+    if day.device.type != "cuda":
+        day.row("pytest -m gpu", lambda: "needs a GPU")
+        return
+    options = ["-q", "--noconftest", "--continue-on-collection-errors", "-m", "gpu", "-p", "no:cacheprovider"]
+    paths = ["tests/models/test_graphs.py", "tests/models/test_fp8.py", "tests/pounce_server/test_fused_gpu.py"]
+    paths += ["tests/ponder_server/test_captured_engine.py"]
+
+    def run() -> str:
+        done = subprocess.run(
+            [sys.executable, "-m", "pytest", *options, *paths], capture_output=True, text=True, check=False, timeout=120
+        )
+        if done.returncode:
+            raise RuntimeError(done.stdout[-350:])
+        return done.stdout.strip().splitlines()[-1]
+
+    day.row("pytest -m gpu", run)
+
+
+def ponder_right(day: Day) -> None:
+    """Cognition of one network by every way of computing it: relative L2 distances from eager float32."""
+    config = replace(day.size.ponder, num_layers=day.size.right_layers)
+
+    def cognition(dtype: torch.dtype, weights: WeightsName = "float", *, is_captured: bool = True) -> Tensor:
+        ponder = _random(day, config, dtype)
+        capture = (graphs_for(day.device) or directly) if is_captured else None
+        options = EngineConfig(max_context_tokens=1024, max_sessions=1, weights=weights, graphs=is_captured)
+        engine = QwenEngine(ponder, options, capture=capture)
+        if is_captured:
+            engine.warm_up()  # raises unless a replay is the same work run directly
+        return engine._example_cognition().cpu()
+
+    exact = cognition(torch.float32, is_captured=False)
+
+    def change(dtype: torch.dtype, weights: WeightsName) -> float:
+        return float((cognition(dtype, weights) - exact).norm() / exact.norm())
+
+    day.row("captured float32", partial(change, torch.float32, "float"))
+    day.row("captured bfloat16", partial(change, torch.bfloat16, "float"))
+    day.row("captured bfloat16, fp8 weights", partial(change, torch.bfloat16, "fp8"))
+
+
+def ponder_fire(day: Day) -> None:
+    """A fire, two frames to a cognition on the host, beside its parts and the baseline: the context encoded again."""
+    ponder = _ponder(day)
+    longest = max(day.size.contexts)
+    engine = _warm(day, ponder, longest)
+    frames = engine.example_frames()
+    for length in day.size.contexts:
+        context = _open(engine, "day", length)
+        restore = partial(context.restore, context.save())
+        day.time(f"fire at {length} tokens", partial(engine.fire, "day", frames), after=restore)
+        engine.close("day")
+    pictures = torch.from_numpy(np.stack(frames)).to(day.device)
+    day.time("vision tower, two frames", partial(ponder.image_features, pictures))
+    row, seen = _row(ponder, max(1, longest // sum(len(segment) for segment in ponder.format.query(2))))
+    day.time(f"baseline: {len(row.ids)} tokens encoded again", partial(ponder.encode_row, row, seen), 3)
+
+
+def ponder_text(day: Day) -> None:
+    """A fire with a text of forced length: token by token, and with a draft that knows it."""
+    ponder, count = _ponder(day), day.size.text_tokens
+    said: list[int] = []
+
+    def measure(draft: Draft | None = None) -> Any:
+        engine = _warm(day, ponder, day.size.contexts[0] + 2 * count, draft)
+        frames = engine.example_frames()
+        context = _open(engine, "day", day.size.contexts[0])
+        restore = partial(context.restore, context.save())
+
+        def fire() -> None:
+            said[:] = engine.fire("day", frames, force_text_tokens=count).texts[0].token_ids
+
+        took = day.ms(fire, 3, after=restore)
+        engine.close("day")
+        return took
+
+    day.row(f"{count} tokens, one by one", measure)
+    day.row(f"{count} tokens, a draft that knows them", lambda: measure(TrieDraft([list(said)])))
+
+
+def pounce(day: Day) -> None:
+    """pi0.5, tensors to actions: eager, compiled, fused, and the mean difference of the actions."""
+    model, inputs, noise = _pounce(day, day.size.pi05)
+    table = model.step_table()
+
+    def eager() -> Tensor:
+        *_, last = model.sample(inputs, noise, table)
+        return last.actions  # type: ignore[no-any-return]
+
+    day.time("pi0.5 eager", eager)
+    if day.device.type == "cuda":
+        run = compiled_sampler(model, "compile")
+        day.time("pi0.5 torch.compile", lambda: list(run(inputs, noise)), 10)
+    expected = eager().clone()
+    is_fused = not missing_for(day.device) and day.device.type == "cuda"
+    fused = fused_for(model, day.device) if is_fused else FusedPounce(model, TWINS)
+
+    def sampled() -> Tensor:
+        with current(day.device):
+            *_, last = fused.sample(inputs, noise)
+        return last.actions
+
+    day.time("pi0.5 fused", sampled)
+    day.row("pi0.5 fused against eager, mean", lambda: float((sampled() - expected).abs().mean()))
+
+
+def groot(day: Day) -> None:
+    """GR00T, tensors to actions: eager, and prefill and steps as graphs."""
+    model, inputs, noise = _pounce(day, day.size.groot)
+    table = model.step_table()
+    day.time("GR00T eager", lambda: list(model.sample(inputs, noise, table)))
+    capture = graphs_for(day.device) or directly
+    cache: list[Any] = []
+    x_BNA = noise.clone()
+
+    def prefill() -> None:
+        cache[:] = [model.prefill(inputs)]
+
+    def steps() -> None:
+        x_BNA.copy_(noise)
+        for style in table.styles:
+            x_BNA.add_(model.groot.velocity(x_BNA, style, cache[0]) / table.num_steps)
+
+    def as_graphs() -> Any:
+        replays = [capture(prefill), capture(steps)]
+        return day.ms(lambda: [replay() for replay in replays])
+
+    day.row("GR00T as graphs", as_graphs)
+
+
+def share(day: Day) -> None:
+    """Queries of several robots that arrive together, until the last is answered."""
+    ponder, most = _ponder(day), max(day.size.robots)
+    engine = _warm(day, ponder, day.size.contexts[-1], max_sessions=most)
+    frames = engine.example_frames()
+    contexts = {f"robot {index}": _open(engine, f"robot {index}", day.size.contexts[-1]) for index in range(most)}
+    opened = {name: context.save() for name, context in contexts.items()}
+
+    def fires(count: int) -> None:
+        for name in list(contexts)[:count]:
+            engine.begin(name, frames)
+        while count:
+            count -= len([outcome.unwrap() for outcome in engine.step()])
+
+    def restore() -> None:
+        for name, context in contexts.items():
+            context.restore(opened[name])
+
+    for count in day.size.robots:
+        name = "1 robot's fire" if count == 1 else f"{count} robots' fires together"
+        day.time(name, partial(fires, count), after=restore)
+
+
+def train(day: Day) -> None:
+    """Forward and backward pass of a small PONDER over one long row, and of pi0.5 over one observation."""
+    with torch.inference_mode(False), torch.enable_grad():
+        ponder = Ponder.random(day.size.trained, seed=0, device=day.device, dtype=getattr(torch, day.dtype))
+        row, seen = _row(ponder, 8)
+        took = day.time("PONDER, one row", lambda: ponder.encode_row(row, seen).square().mean().backward(), 3)
+        if took is not None:
+            day.row("PONDER, tokens a second", lambda: round(1e3 * len(row.ids) / took["p50_ms"]))
+        model, inputs, noise = _pounce(day, day.size.pi05)
+        model.requires_grad_(True)
+        loss = partial(model.loss, inputs, torch.zeros_like(noise), noise, torch.full((1,), 0.5, device=day.device))
+        day.time("pi0.5, one observation", lambda: loss().backward(), 3)
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """A part of the day."""
+
+    run: Callable[[Day], None]
+    budget_s: int
+
+
+STAGES = {
+    "probe": Stage(probe, 45),
+    "kernels": Stage(kernels, 75),
+    "ponder_right": Stage(ponder_right, 90),
+    "ponder_fire": Stage(ponder_fire, 150),
+    "ponder_text": Stage(ponder_text, 75),
+    "pounce": Stage(pounce, 150),
+    "groot": Stage(groot, 60),
+    "share": Stage(share, 150),  # most of it captures 130 graphs
+    "train": Stage(train, 75),
+}
+
+
+# -- what the stages share
+
+
+def _ponder(day: Day) -> Ponder:
+    return _random(day, day.size.ponder, getattr(torch, day.dtype))
+
+
+def _random(day: Day, config: PonderConfig, dtype: torch.dtype) -> Ponder:
+    """A random network, whose weights are not hashed: that would take a minute, and nobody will ask for them again."""
+    ponder = Ponder.random(config, seed=0, device=day.device, dtype=dtype)
+    ponder.served_hash = "unhashed"
+    return ponder
+
+
+def _row(ponder: Ponder, queries: int) -> tuple[Row, Tensor]:
+    """An episode's row of so many queries, and its pictures, which are black."""
+    form = ponder.format
+    row = form.row([*form.opening("go"), *(segment for _ in range(queries) for segment in form.query(2))])
+    return row, torch.zeros(row.num_images, *ponder.image_px, 3, dtype=torch.uint8, device=ponder.device)
+
+
+def _warm(day: Day, ponder: Ponder, tokens: int, draft: Draft | None = None, *, max_sessions: int = 1) -> QwenEngine:
+    """An engine with room for two queries after ``tokens``."""
+    config = EngineConfig(max_context_tokens=tokens + 600, max_sessions=max_sessions)
+    engine = QwenEngine(ponder, config, draft)
+    if day.device.type == "cuda":
+        engine.warm_up()
+    return engine
+
+
+def _open(engine: QwenEngine, session: str, tokens: int) -> Any:
+    """Opens a session and fills its context with meaningless tokens."""
+    engine.open(session, Opening(instruction="pick up the red cube"))
+    context = engine._episode(session).context
+    context.fill(max(tokens, context.num_tokens))
+    return context
+
+
+def _pounce(day: Day, config: AnyPounceConfig) -> tuple[Any, Any, Tensor]:
+    """A random network, one observation with a prompt of 60 tokens, and noise."""
+    model: Any = cast_for_serving(random_model(config, 0, day.device), day.dtype).eval().requires_grad_(False)
+    noise = torch.randn(1, config.horizon, config.padded_action_dim, device=day.device)
+    return model, day.to(config.example_inputs(1, num_tokens=60)), noise
+
+
+# -- the day
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DayOptions:
+    """One call. A command line without tyro, which a GPU's image lacks, so the help texts are ``main``'s."""
+
+    stage: str = "all"
+    device: str = "cuda"
+    size: str = "full"
+    seconds: float = 570.0
+    out: Path = Path("out/gpu_day")
+    again: bool = False
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="gpu-day", description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.set_defaults(**asdict(DayOptions()))
+    parser.add_argument("--stage", help=f"all, or some of {','.join(STAGES)}")
+    parser.add_argument("--device", help="cuda, cuda:N or cpu")
+    parser.add_argument("--size", choices=("full", "tiny"), help="networks; tiny is for a CPU")
+    parser.add_argument("--seconds", type=float, help="time of this call [s]")
+    parser.add_argument("--out", type=Path, help="folder of the stages' files and the JSON")
+    parser.add_argument("--again", action="store_true", help="run stages again that ended before")
+    options = DayOptions(**vars(parser.parse_args(argv)))
+    names = list(STAGES) if options.stage == "all" else options.stage.split(",")
+    if unknown := set(names) - set(STAGES):
+        parser.error(f"--stage {','.join(sorted(unknown))}: expected all, or some of {','.join(STAGES)}")
+    return run(options, names)
+
+
+def run(options: DayOptions, names: list[str]) -> int:
+    """Runs stages that have not ended; returns 1 if a row failed or a stage had no time, else 0."""
+    device, size, out = torch.device(options.device), options.size, options.out
+    settle(device)
+    out.mkdir(parents=True, exist_ok=True)
+    report = out / "gpu_day.json"
+    end_s = time.monotonic() + options.seconds
+    _gather(report, device, size)
+    for name in names:
+        path, left_s = out / f"{name}.json", end_s - time.monotonic()
+        if not options.again and _has_ended(path, device, size):
+            print(f"{name}: ended before; --again runs it again")
+            continue
+        if device.type == "cuda" and left_s < STAGES[name].budget_s:
+            print(f"{name}: {left_s:.0f} s are left of --seconds, it may take {STAGES[name].budget_s}; the next call")
+            continue
+        print(f"{name}: {(STAGES[name].run.__doc__ or '').splitlines()[0]}", flush=True)
+        day = Day(device, size, path)
+        with torch.inference_mode(), current(device):
+            try:
+                STAGES[name].run(day)
+            except Exception as error:  # what a stage builds for all of its rows
+                day.fail("stage", error)
+            finally:
+                day.write()
+                _gather(report, device, size)
+        day.write(is_over=True)
+        if device.type == "cuda":
+            gc.collect()
+            torch.cuda.empty_cache()
+        _gather(report, device, size)
+    stages = json.loads(report.read_text())["stages"]
+    failed = [
+        f"{stage}: {name}"
+        for stage, found in stages.items()
+        for name, row in found["rows"].items()
+        if isinstance(row, dict) and "FAILED" in row
+    ]
+    lacking = [name for name in names if not _has_ended(out / f"{name}.json", device, size)]
+    print(f"written: {report.name}. Failed: {failed or 'nothing'}. Without time: {lacking or 'none'}")
+    return int(bool(failed or lacking))
+
+
+def _has_ended(path: Path, device: torch.device, size: str) -> bool:
+    """Whether this stage ended, of this size and on this kind of device."""
+    stage = json.loads(path.read_text()) if path.exists() else {}
+    return bool(stage.get("is_over")) and stage["of"] == f"{size} on {device.type}"
+
+
+def _gather(report: Path, device: torch.device, size: str) -> None:
+    """Writes the day's one JSON from the stages' files."""
+    found = {name: path for name in STAGES if (path := report.parent / f"{name}.json").exists()}
+    day = {
+        "name": "gpu_day",
+        "device": str(device),
+        "size": size,
+        "predicted_p50_ms": PREDICTED_MS,
+        "stages": {name: json.loads(path.read_text()) for name, path in found.items()},
+    }
+    report.write_text(json.dumps(day, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,164 @@
+"""Work that a CUDA graph may record, on a GPU that need not be here: no host sync, no copy from or to the host.
+
+The tensors are torch's fakes on "cuda": every choice of device is a GPU's, and an operation that needs a number raises.
+Launches are torch's operations without views and allocations, each of which is at least one kernel. Their limits are
+what they are today: fewer is better, and more needs a reason.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from dual_system.models.graphs import directly
+from dual_system.models.groot.pounce import GrootPounce
+from dual_system.models.ponder.configs import tiny_cpu as tiny_ponder
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.pounce.configs import tiny_cpu, tiny_groot
+from dual_system.models.pounce.family import blank_model
+from ponder_server.captured import CapturedDecoder
+from ponder_server.slots import SlotMemory
+from pounce_server.fused import FusedPounce
+from pounce_server.fused_stream import TWINS
+from pounce_server.precision import cast_for_serving
+
+CUDA, META = 1, 14
+"""Places in torch's list of device types."""
+NO_KERNEL = (
+    *("prim.", "view", "reshape", "unsqueeze", "squeeze", "transpose", "permute", "expand", "slice", "select", "split"),
+    *("unbind", "detach", "alias", "as_strided", "t.", "empty", "new_empty", "unflatten", "chunk"),
+)
+
+
+@pytest.fixture(autouse=True)
+def a_guard_for_cuda() -> Iterator[None]:
+    """A build of torch without CUDA cannot index a fake tensor there: the meta device's guard, which does nothing,
+    stands in. (FakeTensorMode does the same in builds with CUDA.)"""
+    if torch.version.cuda is not None:
+        yield
+        return
+    library = ctypes.CDLL(str(Path(torch.__file__).parent / "lib" / "libc10.so"))
+    guards = (ctypes.c_void_p * 21).in_dll(library, "_ZN3c104impl26device_guard_impl_registryE")
+    guards[CUDA] = guards[META]
+    try:
+        yield
+    finally:
+        guards[CUDA] = None
+
+
+class Launches(TorchDispatchMode):
+    """Counts operations, and refuses tensors of the host and whatever makes the host wait."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.counts: Counter[str] = Counter()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        name = str(func).removeprefix("aten.")
+        for tensor in tree_leaves((args, kwargs, result)):
+            if isinstance(tensor, Tensor) and tensor.device.type != "cuda":
+                raise AssertionError(f"{name} has a tensor on {tensor.device}; expected all of them on the GPU")
+        if not name.startswith(NO_KERNEL) and result is not (args[0] if args else None):
+            self.counts[name] += 1
+        return result
+
+
+def on_gpu(module: nn.Module) -> None:
+    """Replaces parameters and buffers by fakes on "cuda"; a tensor with two names stays one."""
+    fakes: dict[int, nn.Parameter] = {}
+    for part in module.modules():
+        for tensors in (part._parameters, part._buffers):
+            for name, tensor in tensors.items():
+                if tensor is not None:
+                    blank = nn.Parameter(like(tensor), requires_grad=False)
+                    tensors[name] = fakes.setdefault(id(tensor), blank)
+
+
+def like(tensor: Tensor) -> Tensor:
+    return torch.empty(tensor.shape, dtype=tensor.dtype, device="cuda")
+
+
+def inputs_of(model: Any, num_tokens: int = 12) -> Any:
+    inputs = model.config.example_inputs(1, num_tokens=num_tokens)
+    values = {field.name: getattr(inputs, field.name) for field in fields(inputs)}
+    return replace(inputs, **{name: like(value) for name, value in values.items() if value is not None})
+
+
+def launched(work: Callable[[], object]) -> int:
+    with torch.inference_mode(), Launches() as launches:
+        work()
+    return launches.counts.total()
+
+
+@pytest.fixture
+def ponder() -> Ponder:
+    config = replace(tiny_ponder(), num_layers=4)
+    return Ponder.random(config, seed=0, device="meta", dtype=torch.bfloat16)
+
+
+@pytest.mark.parametrize(("length", "most"), [(1, 400), (70, 510)])
+def test_ponder_s_forward(ponder: Ponder, length: int, most: int) -> None:
+    with FakeTensorMode():
+        on_gpu(ponder)
+        text_model, config = ponder.qwen.model.language_model, ponder.qwen.config.text_config
+        memory = SlotMemory(config, num_slots=4, max_tokens=192, device=ponder.device, dtype=ponder.dtype)
+        with torch.inference_mode():
+            forward = CapturedDecoder(text_model, memory, directly, num_read=16).forward(2, length, 192)
+        assert launched(forward.run) <= most
+
+
+def test_ponder_s_vision_tower(ponder: Ponder) -> None:
+    with FakeTensorMode():
+        on_gpu(ponder)
+        frames = torch.zeros(2, *ponder.image_px, 3, dtype=torch.uint8, device="cuda")
+        assert launched(lambda: ponder.image_features(frames)) <= 80
+
+
+@pytest.mark.parametrize(
+    ("config", "most"),
+    [(tiny_cpu(num_carriers=2), (185, 160)), (tiny_groot(num_carriers=2), (215, 90))],
+    ids=["pi05", "groot"],
+)
+def test_an_eager_prefill_and_flow_step(config: Any, most: tuple[int, int]) -> None:
+    model: Any = cast_for_serving(blank_model(config).eval(), "bfloat16")
+    with FakeTensorMode():
+        on_gpu(model)
+        inputs = inputs_of(model)
+        kept: list[Any] = []
+        network = model.groot if isinstance(model, GrootPounce) else model.pi05
+        styles = model.step_table().styles
+        x_BNA = torch.zeros(1, config.horizon, config.padded_action_dim, device="cuda")
+        prefill = launched(lambda: kept.append(model.prefill(inputs)))
+        step = launched(lambda: network.velocity(x_BNA, styles[0], *kept))
+        assert prefill <= most[0]
+        assert step <= most[1]
+
+
+def test_a_fused_prefill_and_flow_step() -> None:
+    """With twins in place of the Triton kernels, whose launches torch does not see."""
+    model: Any = cast_for_serving(blank_model(tiny_cpu(num_carriers=2)).eval(), "bfloat16")
+    works: list[Callable[[], None]] = []
+
+    def capture(work: Callable[[], None]) -> Callable[[], None]:
+        works.append(work)
+        return lambda: None
+
+    with FakeTensorMode():
+        on_gpu(model)
+        with torch.inference_mode():
+            noise = torch.zeros(1, model.config.horizon, model.config.padded_action_dim, device="cuda")
+            list(FusedPounce(model, TWINS, capture).sample(inputs_of(model), noise))
+        assert launched(works[0]) <= 98
+        assert launched(works[1]) <= 140
