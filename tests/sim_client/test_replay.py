@@ -137,11 +137,11 @@ def test_a_cut_log_is_replayed_up_to_its_cut(record: Callable[..., Path], tmp_pa
 
 
 @pytest.mark.parametrize("content", [None, b"not a log"])
-def test_what_is_no_log_is_exit_1(content: bytes | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_no_log_is_exit_2(content: bytes | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "odd.mcap"
     if content is not None:
         path.write_bytes(content)
-    assert replay.main([str(path), "--save", str(tmp_path / "odd.rrd")]) == 1
+    assert replay.main([str(path), "--save", str(tmp_path / "odd.rrd")]) == 2
     assert "odd.mcap" in capsys.readouterr().err
     assert not (tmp_path / "odd.rrd").exists()
 
@@ -162,7 +162,7 @@ def test_a_viewer_that_finds_no_driver_is_told_as_that(
     stub.chmod(0o755)
     monkeypatch.setattr(replay, "_rerun", lambda: str(stub))
     png = tmp_path / "a.png"
-    assert replay.main([str(record(tmp_path / "a.mcap")), "--screenshot", str(png)]) == 1
+    assert replay.main([str(record(tmp_path / "a.mcap")), "--screenshot", str(png)]) == 2
     said = capsys.readouterr().err
     assert "is a Vulkan driver installed" in said
     assert "no adapter" in said
@@ -188,7 +188,7 @@ class TestScreenshot:
         is_colourful = (lanes.max(axis=-1) - lanes.min(axis=-1)) > 60
         assert is_colourful.mean() > 0.3  # bars
 
-    def test_a_picture_that_cannot_be_drawn_is_exit_1(
+    def test_a_picture_that_cannot_be_drawn_is_exit_2(
         self, record: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         def broken(seen: m.Observation) -> m.Observation:
@@ -196,5 +196,5 @@ class TestScreenshot:
             return replace(seen, images=tuple(replace(i, codec=m.ImageCodec.JPEG, data=data) for i in seen.images))
 
         log = record(tmp_path / "a.mcap", broken)
-        assert replay.main([str(log), "--screenshot", str(tmp_path / "a.png")]) == 1
-        assert "the viewer reports" in capsys.readouterr().err
+        assert replay.main([str(log), "--screenshot", str(tmp_path / "a.png")]) == 2
+        assert "a.mcap is no episode log: Image.data" in capsys.readouterr().err
