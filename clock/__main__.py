@@ -7,7 +7,7 @@ import sys
 
 from clock.config import ClockOptions
 from clock.service import ClockService
-from protocol.command_line import parse
+from protocol.command_line import command, parse
 from protocol.errors import TransportError
 from protocol.link import Link
 from protocol.process import IDLE_WAIT_NS, StopFlag, freeze_heap, set_up_logging
@@ -16,6 +16,7 @@ from protocol.zenoh_bus import open_bus
 log = logging.getLogger("clock-serve")
 
 
+@command("clock-serve")
 def main(argv: list[str] | None = None) -> int:
     options = parse(ClockOptions, argv, prog="clock-serve")
     set_up_logging()

@@ -11,7 +11,8 @@ from ponder_server.config import NUM_TORCH_THREADS, PonderOptions
 from ponder_server.contract import BatchingEngine
 from ponder_server.fleet import PonderFleet
 from ponder_server.serve import PonderServer
-from protocol.command_line import parse
+from protocol import files
+from protocol.command_line import command, parse
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
 
@@ -68,7 +69,7 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     )
     drafts: list[Draft] = []
     if speed.draft_texts is not None:
-        lines = speed.draft_texts.read_text(encoding="utf-8").splitlines()
+        lines = files.read_text(speed.draft_texts, "file of texts, one a line").splitlines()
         drafts.append(TrieDraft(ponder.format.vocabulary.encode(line) for line in lines if line.strip()))
     if speed.draft_tokens and ponder.mtp:
         drafts.append(MtpDraft(ponder, num_tokens=speed.draft_tokens))
@@ -77,6 +78,7 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     return QwenEngine(ponder, config, FirstOf(drafts))
 
 
+@command("ponder-serve")
 def main(argv: list[str] | None = None) -> int:
     options = parse(PonderOptions, argv, prog="ponder-serve")
     weights = str(options.checkpoint or f"random weights ({options.random.size})")

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from protocol.command_line import parse
+from protocol.command_line import command, parse
 from sim_client import doctor_probes as look
 from sim_client.doctor_probes import Finding, Level, Role
 
@@ -99,6 +99,7 @@ def table(findings: Sequence[Finding]) -> str:
     return "\n".join(lines) + "\n"
 
 
+@command("pp-doctor")
 def main(argv: list[str] | None = None) -> int:
     config = parse(DoctorConfig, argv, prog="pp-doctor")
     findings = list(examine(probes(config)))

@@ -14,8 +14,8 @@ import dual_system.tasks.headless  # noqa: F401 - before anything that imports m
 # isort: split
 
 from clock.service import ClockService, ServiceConfig
-from protocol.command_line import parse
-from protocol.errors import TransportError
+from protocol import files
+from protocol.command_line import command, parse
 from protocol.link import Link
 from protocol.process import StopFlag, set_up_logging
 from protocol.zenoh_bus import open_bus
@@ -28,18 +28,17 @@ from sim_client.launch import Daemons, local_link
 log = logging.getLogger("pp-gateway")
 
 
+@command("pp-gateway")
 def main(argv: list[str] | None = None) -> int:
     options = parse(GatewayOptions, argv, prog="pp-gateway")
     set_up_logging()
     should_stop = StopFlag()
-    try:
-        options.check()
-        with Daemons(options.out) as daemons, _machine(options, daemons) as machine, _serving(options, machine):
-            log.info("ready dialect=%s listen=%s mode=%s", options.dialect, options.listen, options.mode)
-            machine.run(should_stop)
-    except TransportError as error:
-        print(f"pp-gateway: {error}", file=sys.stderr)
-        return 2
+    options.check()
+    if options.local or options.log.record:
+        files.folder(options.out)
+    with Daemons(options.out) as daemons, _machine(options, daemons) as machine, _serving(options, machine):
+        log.info("ready dialect=%s listen=%s mode=%s", options.dialect, options.listen, options.mode)
+        machine.run(should_stop)
     return 0
 
 
