@@ -83,11 +83,13 @@ def donors_in(folder: Path, keys: Iterable[Key]) -> dict[Key, Path]:
         folder: of a recorded evaluation over the same scenes.
 
     Raises:
-        OSError, FileError: no such folder, or its results cannot be read.
-        DonorError: an episode is not in it or was not recorded, or there is no other one.
+        OSError, FileError: the folder's results cannot be read.
+        DonorError: there are none, an episode is not in it or was not recorded, or there is no other one.
     """
     path = folder / "results.json"
-    kind = "results file of pp-eval --record, whose --out --donors takes"
+    kind = "results file of pp-eval --record"
+    if not path.exists():
+        raise DonorError(f"{path} is not there; --donors takes the --out of pp-eval --record")
     found = files.read_json(path, kind)
     with files.reading(path, kind):
         recorded = {

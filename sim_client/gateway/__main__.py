@@ -34,6 +34,7 @@ def main(argv: list[str] | None = None) -> int:
     set_up_logging()
     should_stop = StopFlag()
     options.check()
+    options.api_key()  # a bad file before servers are started
     if options.local or options.log.record:
         files.folder(options.out)
     with Daemons(options.out) as daemons, _machine(options, daemons) as machine, _serving(options, machine):
