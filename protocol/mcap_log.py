@@ -50,7 +50,7 @@ LANES = {"ponder": "s2", "pounce": "s1"}  # topic prefix of a process; others us
 QUEUE_SIZE = 1024  # messages: at 20 Hz about 8 s, of which 160 observations hold 64 MB of raw 256 px pairs
 FLUSH_NS = 1_000_000_000
 FLUSHES_PER_FSYNC = 5
-MAX_KEPT_BYTES = 192 << 20  # of messages in memory, and 16 times the file: an hour at 20 Hz without pictures has 600 MB
+MAX_KEPT_BYTES = 64 << 20  # of messages in memory, and 16 times the file: 1300 ticks without pictures have 14 MB
 _MESSAGE_BYTES, _ENTRY_BYTES = 2_000, 200  # measured: a decoded message beside its bytes, and an entry of a mapping
 
 Pixels = Literal["jpeg", "exact"]

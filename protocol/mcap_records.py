@@ -22,7 +22,7 @@ from mcap.stream_reader import StreamReader
 
 MAX_RECORD_BYTES = 64 << 20  # a larger length is damaged: a chunk of ours has 1 MiB, or a second of raw frames
 MAX_UNPACKED_BYTES = 1 << 30  # of all chunks, and 16 times the file: an episode's raw frames at 8 MB/s have 520 MB
-MAX_MESSAGES = 500_000  # and one for 100 bytes of the file: an hour at 20 Hz with cameras has 600,000 in 700 MB
+MAX_MESSAGES = 300_000  # and one for 100 bytes of the file: an hour at 20 Hz with cameras has 600,000 in 700 MB
 
 _RECORD = struct.Struct("<BQ")  # opcode, length
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
