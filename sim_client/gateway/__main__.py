@@ -21,6 +21,7 @@ from protocol.process import StopFlag, set_up_logging
 from protocol.zenoh_bus import open_bus
 from sim_client.gateway.http_form import HttpSide
 from sim_client.gateway.machine import Machine
+from sim_client.gateway.memory import Memory
 from sim_client.gateway.options import GatewayOptions
 from sim_client.gateway.websocket import WebsocketSide
 from sim_client.launch import Daemons, local_link
@@ -71,13 +72,14 @@ def _serving(options: GatewayOptions, machine: Machine) -> Iterator[None]:
     """Listens in its own thread for as long as the block lasts. Raises TransportError if it cannot."""
     host, port = options.address
     max_bytes, terms, dialect = options.clients.max_message_mb << 20, options.terms(), options.dialect_class()
+    memory = Memory(options.clients.max_memory_mb << 20)
     if options.dialect == "challenge-http":
-        http = HttpSide((host, port), machine, terms, dialect, max_bytes, options.api_key())
+        http = HttpSide((host, port), machine, terms, dialect, max_bytes, options.api_key(), memory)
         with _in_thread(http.serve_forever, http.shutdown):
             yield
         http.server_close()
         return
-    side = WebsocketSide(machine, terms, dialect, max_bytes, options.api_key())
+    side = WebsocketSide(machine, terms, dialect, max_bytes, options.api_key(), memory)
     loop = asyncio.new_event_loop()
     server = loop.run_until_complete(side.start(host, port))
 

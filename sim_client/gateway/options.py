@@ -62,6 +62,8 @@ class ClientsOptions:
     """Time in seconds without a request after which a client loses the robot to the next one that asks."""
     max_message_mb: int = 1024
     """Size in MB above which messages are refused. Two raw 256 px views of a 48 s video are 380 MB."""
+    max_memory_mb: int = 2048
+    """Memory in MB for the requests of all clients together. Beyond it the one that holds most is disconnected."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
