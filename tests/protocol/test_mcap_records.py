@@ -73,10 +73,12 @@ def rewritten(path: Path, sources: list[Path], extra: Extra = (), **options: obj
                     channels[record.id] = writer.register_channel(record.topic, "protobuf", schemas[record.schema_id])
                 elif isinstance(record, Message):
                     writer.add_message(channels[record.channel_id], record.log_time, record.data, record.publish_time)
+        named: dict[str, int] = {}
         for cls, payload in extra:
             name = cls if isinstance(cls, str) else codec.type_name(cls)
-            channel = writer.register_channel(f"/{name}", "protobuf", writer.register_schema(name, "protobuf", b""))
-            writer.add_message(channel, 1, payload, 1)
+            if name not in named:
+                named[name] = writer.register_channel("/x", "protobuf", writer.register_schema(name, "protobuf", b""))
+            writer.add_message(named[name], 1, payload, 1)
         writer.finish()
     return path
 
