@@ -11,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
 from PIL import Image as Picture
 
 from protocol import codec, images, topics
@@ -134,6 +136,55 @@ def test_a_cut_log_is_replayed_up_to_its_cut(record: Callable[..., Path], tmp_pa
     cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 3])
     assert replay.main([str(cut), "--save", str(tmp_path / "b.rrd")]) == 0
     assert (tmp_path / "b.rrd").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    "container",
+    [
+        {"use_chunking": False},
+        {"use_statistics": False, "use_summary_offsets": False, "repeat_channels": False, "repeat_schemas": False},
+    ],
+    ids=["unchunked", "without a summary"],
+)
+def test_every_message_is_replayed_from_any_container(
+    container: dict[str, bool], record: Callable[..., Path], tmp_path: Path
+) -> None:
+    whole, other = record(tmp_path / "a.mcap"), tmp_path / "b.mcap"
+    with other.open("wb") as file:
+        writer = Writer(file, **container)  # type: ignore[arg-type]
+        writer.start()
+        channels: dict[str, int] = {}
+        with whole.open("rb") as source:
+            for schema, channel, message in make_reader(source).iter_messages():
+                if channel.topic not in channels:
+                    at = writer.register_schema(schema.name, schema.encoding, schema.data)  # type: ignore[union-attr]
+                    channels[channel.topic] = writer.register_channel(channel.topic, "protobuf", at)
+                writer.add_message(channels[channel.topic], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    for log in (whole, other):
+        assert replay.main([str(log), "--save", str(log.with_suffix(".rrd"))]) == 0
+    assert (tmp_path / "b.rrd").stat().st_size > 0.9 * (tmp_path / "a.rrd").stat().st_size
+
+
+def test_without_a_display_the_ways_out_are_named(
+    record: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert replay.main([str(record(tmp_path / "a.mcap"))]) == 2
+    said = capsys.readouterr().err
+    assert "no display" in said
+    assert "--screenshot" in said
+    assert "--save" in said
+
+
+@pytest.mark.parametrize("option", ["--save", "--screenshot"])
+def test_a_target_that_cannot_be_written_is_named_at_once(
+    option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    assert replay.main([str(tmp_path / "a.mcap"), option, str(tmp_path / "file" / "a")]) == 2
+    assert "file is a file; expected a folder" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("content", [None, b"not a log"])
