@@ -193,7 +193,7 @@ BOMBS = (
     Bomb("log: 200,000 ticks", _KEPT, _many_ticks, CHECK),
     Bomb("log: 20,000 events of 256 attributes", _KEPT, _large_mappings, CHECK),
     Bomb("log: an observation of 16,777,216 pictures", "8 pictures", _one_message, CHECK),
-    Bomb("log: 25,000 ticks and 25,000 stamps", "none, it is checked", _ticks_and_chunks, CHECK),
+    Bomb("log: 25,000 ticks and 25,000 stamps", _KEPT, _ticks_and_chunks, CHECK),
     Bomb("log: a JPEG of 65500 x 65500 px, shown", "4096 px", _jpeg_header, SHOW),
     Bomb("log: a PNG of 65000 x 65000 px, shown", "4096 px", _png_header, SHOW),
     Bomb("residual head: arrays of 4 GB", "16 MiB", _npz, HEAD),
@@ -238,7 +238,7 @@ def main() -> int:
             print(rows[-1], flush=True)
     report.add_table("Files", rows)
     report.notes.append(
-        "peak_MB is the command's largest resident memory, of which Python and its libraries are 60 to 160."
+        "peak_MB is an upper bound: what the benchmark itself had when it started the command counts as well."
     )
     print(report.write())
     return 0
