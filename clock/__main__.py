@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from clock.config import ClockOptions
 from clock.service import ClockService
 from clock.status import end_of
-from protocol.command_line import parse
+from protocol.command_line import command, parse
 from protocol.errors import TransportError
 from protocol.link import Link
 from protocol.logs import set_up_logging
@@ -23,6 +23,7 @@ from protocol.zenoh_bus import open_bus
 log = logging.getLogger("clock-serve")
 
 
+@command("clock-serve")
 def main(argv: list[str] | None = None) -> int:
     options = parse(ClockOptions, argv, prog="clock-serve")
     operations, robot = options.operations, options.link.robot

@@ -19,8 +19,9 @@ from clock.check_findings import Disagreement, compare
 from clock.check_ticks import check_deadlines, check_rows
 from clock.report import CLOCK_LOST_EVENT, statistics, stream_sha256
 from clock.residual import DEFAULT_LOADER, RESIDUAL_EVENT, ResidualHead, load_head
-from protocol.command_line import parse
-from protocol.errors import ProtocolError
+from protocol import files
+from protocol.command_line import command, parse, sentence
+from protocol.errors import FileError
 from protocol.mcap_log import EpisodeRecord, read_log, recover
 from protocol.messages import Mode
 
@@ -86,42 +87,46 @@ def check_result(record: EpisodeRecord) -> Iterator[Disagreement]:
         yield from compare("EpisodeResult", 0, stream_sha256=(stream_sha256(counted), result.stream_sha256))
 
 
+@command("pp-check")
 def main(argv: list[str] | None = None) -> int:
     config = parse(CheckConfig, argv, prog="pp-check")
     if not config.files or (config.recover is not None and len(config.files) != 1):
         sys.stderr.write("pp-check: name at least one log, and exactly one with --recover\n")
         return UNREADABLE
-    return max(_check(path, config) for path in config.files)
+    head = None if config.residual_head is None else load_head(config.residual_head, config.residual_loader)
+    return max(_check(path, config, head) for path in config.files)
 
 
-def _check(path: Path, config: CheckConfig) -> int:
+def _check(path: Path, config: CheckConfig, head: ResidualHead | None) -> int:
     try:
         if config.recover is not None:
             recover(path, config.recover)
             path = config.recover
         record = read_log(path)
-        head = None if config.residual_head is None else load_head(config.residual_head, config.residual_loader)
-    except (OSError, ValueError, ProtocolError) as error:
-        _tell(config, {"file": str(path), "error": str(error)}, f"{path}: unreadable: {error}")
+        with files.reading(path, "log of an episode"):  # an odd number may fail anywhere in the derivation
+            found = next(disagreements(record, head), None)
+            dropped = int(record.metadata.get("ponderpounce.result", {}).get("dropped_messages", "0"))
+            fields: dict[str, object] = {
+                "file": str(path),
+                "agrees": found is None,
+                "disagreement": None if found is None else _fields(found),
+                "unfinished": record.why if record.recovered else None,
+                "dropped_messages": dropped,
+                "stream_sha256": stream_sha256(record.ticks),
+                "statistics": statistics(record.ticks, record.stamps, record.invocations),
+            }
+    except (OSError, FileError) as error:
+        if isinstance(error, OSError) and config.recover is not None and error.filename != str(path):
+            raise  # it is about the file of --recover
+        _tell(config, {"file": str(path), "error": sentence(error)}, f"{path}: unreadable: {sentence(error)}")
         return UNREADABLE
-    found = next(disagreements(record, head), None)
-    dropped = int(record.metadata.get("ponderpounce.result", {}).get("dropped_messages", "0"))
-    fields: dict[str, object] = {
-        "file": str(path),
-        "agrees": found is None,
-        "disagreement": None if found is None else _fields(found),
-        "unfinished": record.why if record.recovered else None,
-        "dropped_messages": dropped,
-        "stream_sha256": stream_sha256(record.ticks),
-        "statistics": statistics(record.ticks, record.stamps, record.invocations),
-    }
-    sentence = f"{path}: " + ("agrees" if found is None else f"DISAGREES: {found}")
-    sentence += f" ({len(record.ticks)} ticks, {len(record.queries)} queries, {len(record.invocations)} invocations)"
+    text = f"{path}: " + ("agrees" if found is None else f"DISAGREES: {found}")
+    text += f" ({len(record.ticks)} ticks, {len(record.queries)} queries, {len(record.invocations)} invocations)"
     if record.recovered:
-        sentence += f"; {record.why}"
+        text += f"; {record.why}"
     if dropped:
-        sentence += f"; the recorder dropped {dropped} messages, which may be all that is missing"
-    _tell(config, fields, sentence)
+        text += f"; the recorder dropped {dropped} messages, which may be all that is missing"
+    _tell(config, fields, text)
     return AGREES if found is None else DISAGREES
 
 
@@ -129,8 +134,8 @@ def _fields(found: Disagreement) -> dict[str, object]:
     return {name: getattr(found, name) for name in ("message", "index", "field", "expected", "found")}
 
 
-def _tell(config: CheckConfig, fields: dict[str, object], sentence: str) -> None:
-    sys.stdout.write((json.dumps(fields) if config.json else sentence) + "\n")
+def _tell(config: CheckConfig, fields: dict[str, object], text: str) -> None:
+    sys.stdout.write((json.dumps(fields) if config.json else text) + "\n")
 
 
 if __name__ == "__main__":

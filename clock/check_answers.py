@@ -32,6 +32,8 @@ from protocol.messages import (
     StampKind,
 )
 
+_SKIPPED = {"Query": "query_skipped", "Invocation": "invocation_skipped"}  # events of a server that is away
+
 
 @dataclass(slots=True)
 class Answers:
@@ -91,7 +93,10 @@ def answers_of(record: EpisodeRecord) -> Answers:
 
 
 def check_queries(record: EpisodeRecord) -> Iterator[Disagreement]:
-    """Checks that queries are numbered without gaps, name existing observations, and come at most once per period."""
+    """Checks that queries are numbered without gaps, name existing observations, and come once per period.
+
+    In real time at most once: a query may wait for a busy server.
+    """
     schedule, queries = record.info.schedule, record.queries
     sources: dict[int, set[int]] = {}
     for observation in record.observations:
@@ -110,10 +115,35 @@ def check_queries(record: EpisodeRecord) -> Iterator[Disagreement]:
             start_ns, hz = record.ticks[0].deadline_ns, schedule.control_hz
             asked_ns = deadline_ns(start_ns, tick_at(start_ns, query.header.at_ns, hz), hz)
             previous, window = window, (asked_ns - queries[0].source_ns) // schedule.query_period_ns
+            due_ns = queries[0].source_ns + (previous + 1) * schedule.query_period_ns
+            yield from _left_out(record, "Query", index, due_ns, queries[index - 1].tick + 1, before_ns=asked_ns)
             if window <= previous:
                 period_ms = schedule.query_period_ns / 1e6
                 expected = f"the first of its {period_ms:.0f} ms, period {previous + 1} or later"
                 yield from compare("Query", index, period=(expected, f"period {window}"))
+
+    if queries and record.ticks:
+        due_ns = queries[0].source_ns + (window + 1) * schedule.query_period_ns
+        yield from _left_out(record, "Query", len(queries), due_ns, queries[-1].tick + 1)
+
+
+def _left_out(
+    record: EpisodeRecord, message: str, index: int, due_ns: int, due_tick: int = 0, *, before_ns: int | None = None
+) -> Iterator[Disagreement]:
+    """Checks, in lockstep, that no tick from ``due_ns`` and ``due_tick`` on was played before a request was made.
+
+    ``before_ns`` is the instant of that request; None if there is none up to the end.
+
+    In real time a request may wait for a busy server, and in both for one that is away, which the log then says.
+    """
+    is_lockstep = record.info.schedule.mode == Mode.LOCKSTEP
+    if not is_lockstep or any(event.name == _SKIPPED[message] for event in record.events):
+        return
+    start_ns, hz = record.ticks[0].deadline_ns, record.info.schedule.control_hz
+    first = max(due_tick, tick_at(start_ns, due_ns - 1, hz) + 1)
+    last = len(record.ticks) if before_ns is None else tick_at(start_ns, before_ns, hz)
+    if first < last:
+        yield from compare(message, index, sent=(f"at tick {first}", f"at tick {last}" if before_ns else "never"))
 
 
 def check_stamps(record: EpisodeRecord, answers: Answers) -> Iterator[Disagreement]:
@@ -179,6 +209,7 @@ def check_invocations(record: EpisodeRecord, answers: Answers) -> Iterator[Disag
     window, first_tick = -1, 0
     if record.ticks and record.invocations:  # the period counts from the first invocation
         first_tick = max(0, _tick_of(record, record.invocations[0]))
+    most_committed = max((each.committed_rows for each in record.invocations), default=0)
     for index, invocation in enumerate(record.invocations):
         yield from _check_given(record, answers, index, invocation)
         if record.ticks and (tick := _tick_of(record, invocation)) >= 0:
@@ -186,12 +217,23 @@ def check_invocations(record: EpisodeRecord, answers: Answers) -> Iterator[Disag
             yield from compare("Invocation", index, now_ns=(due_ns, invocation.now_ns))
             period = record.info.schedule.invoke_period_ticks
             previous, window = window, (tick - first_tick) // period
+            if index:
+                after = _tick_of(record, record.invocations[index - 1])
+                yield from _left_out(
+                    record, "Invocation", index, _invocation_due_ns(record, after), before_ns=invocation.now_ns
+                )
             if window <= previous:
                 expected = f"the first of its {period} ticks, period {previous + 1} or later"
                 yield from compare("Invocation", index, period=(expected, f"period {window}"))
             tail = _unplayed_rows(record, answers, tick, index)
             if tail is not None:
-                yield from compare("Invocation", index, previous_rows=(tail, invocation.previous_rows))
+                committed = min(most_committed, len(tail) // record.info.robot.action_dim)
+                yield from compare(
+                    "Invocation",
+                    index,
+                    previous_rows=(tail, invocation.previous_rows),
+                    committed_rows=(committed, invocation.committed_rows),
+                )
         chunk = answers.chunks.get(index)
         if chunk is not None and index in answers.chunk_ready_ns:
             yield from compare(
@@ -202,6 +244,9 @@ def check_invocations(record: EpisodeRecord, answers: Answers) -> Iterator[Disag
                 age_ns=(invocation.age_ns, chunk.age_ns),
                 seed=(invocation.seed, chunk.seed),
             )
+    if record.invocations and record.ticks:
+        due_ns = _invocation_due_ns(record, _tick_of(record, record.invocations[-1]))
+        yield from _left_out(record, "Invocation", len(record.invocations), due_ns)
 
 
 def _check_given(record: EpisodeRecord, answers: Answers, index: int, invocation: Invocation) -> Iterator[Disagreement]:
@@ -225,6 +270,13 @@ def _check_given(record: EpisodeRecord, answers: Answers, index: int, invocation
     elif reference.query in answers.cognitions:
         vector = answers.cognitions[reference.query].vector
         yield from compare("Invocation", index, cognition=(vector, invocation.cognition))
+
+
+def _invocation_due_ns(record: EpisodeRecord, after: int) -> int:
+    """When the next invocation is due after one at this tick; the opening's, before tick 0, counts as tick 0's."""
+    period = record.info.schedule.invoke_period_ticks
+    due = (max(after, 0) // period + 1) * period
+    return deadline_ns(record.ticks[0].deadline_ns, due, record.info.schedule.control_hz)
 
 
 def _tick_of(record: EpisodeRecord, invocation: Invocation) -> int:

@@ -6,8 +6,7 @@ import getpass
 import sys
 from dataclasses import dataclass, field
 
-from protocol.command_line import parse
-from protocol.errors import TransportError
+from protocol.command_line import command, parse
 from protocol.link import Link
 from protocol.messages import EngageRequest
 from protocol.options import LinkOptions
@@ -27,18 +26,15 @@ class EngageOptions:
     """Name of the person who engages the robot; it is logged."""
 
 
+@command("pp-engage")
 def main(argv: list[str] | None = None) -> int:
     options = parse(EngageOptions, argv, prog="pp-engage")
+    bus = open_bus(options.link)
     try:
-        bus = open_bus(options.link)
-        try:
-            link = Link(bus, robot=options.link.robot, proc="engage")
-            reply = link.call(ENGAGE, "clock", EngageRequest(operator=options.operator), timeout_ns=_CALL_NS)
-        finally:
-            bus.close()
-    except TransportError as error:
-        sys.stderr.write(f"pp-engage: {error}\n")
-        return 2
+        link = Link(bus, robot=options.link.robot, proc="engage")
+        reply = link.call(ENGAGE, "clock", EngageRequest(operator=options.operator), timeout_ns=_CALL_NS)
+    finally:
+        bus.close()
     sys.stdout.write(f"{reply.error or reply.level}\n")
     return 1 if reply.error else 0
 

@@ -9,7 +9,6 @@ thousand ticks takes a second, without gradients. Untrained, the last layer is z
 from __future__ import annotations
 
 import hashlib
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,12 +18,14 @@ import numpy as np
 
 from clock.residual import Due
 from clock.timebase import NS_PER_S
+from protocol import files
 from protocol.messages import Floats
 
 MAX_FILE_BYTES = 100 * 2**20  # unpacked
 _ARRAYS = ("inner", "outer", "limit_rad")
 _TICKS_PER_UNIT = 20.0
 RIDGE = 1e-3
+_MAX_BYTES = 16 << 20
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -101,14 +102,10 @@ def load(path: Path) -> ResidualMlp:
         ValueError: the file is no such head.
         OSError: it cannot be read.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            if (num_bytes := sum(each.file_size for each in archive.infolist())) > MAX_FILE_BYTES:
-                raise ValueError(f"unpacked it has {num_bytes} bytes, at most {MAX_FILE_BYTES} are read")
-        with np.load(path, allow_pickle=False) as arrays:
-            return ResidualMlp(**{name: arrays[name].astype(np.float32) for name in _ARRAYS})
-    except (KeyError, ValueError, zipfile.BadZipFile, EOFError) as error:
-        raise ValueError(f"{path} is no residual head (.npz with {', '.join(_ARRAYS)}): {error}") from error
+    kind = f"residual head (.npz with {', '.join(_ARRAYS)})"
+    arrays = files.read_npz(path, kind, most_bytes=_MAX_BYTES)
+    with files.reading(path, kind):
+        return ResidualMlp(**{name: arrays[name].astype(np.float32) for name in _ARRAYS})
 
 
 def _num_features(num_joints: int) -> int:

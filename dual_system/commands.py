@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-REFUSED = 2
+from protocol.command_line import REFUSED, command
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,21 +76,25 @@ COMMANDS = {
 }
 
 
+@command("pp-collect")
 def collect(argv: list[str] | None = None) -> int:
     """``pp-collect``."""
     return _run("pp-collect", sys.argv[1:] if argv is None else argv)
 
 
+@command("pp-export")
 def export(argv: list[str] | None = None) -> int:
     """``pp-export``."""
     return _run("pp-export", sys.argv[1:] if argv is None else argv)
 
 
+@command("pp-parity")
 def parity(argv: list[str] | None = None) -> int:
     """``pp-parity``."""
     return _run("pp-parity", sys.argv[1:] if argv is None else argv)
 
 
+@command("pp-diagnose")
 def diagnose(argv: list[str] | None = None) -> int:
     """``pp-diagnose``."""
     return _run("pp-diagnose", sys.argv[1:] if argv is None else argv)

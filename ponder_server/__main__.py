@@ -12,7 +12,8 @@ from ponder_server.config import NUM_TORCH_THREADS, PonderOptions
 from ponder_server.contract import BatchingEngine, PonderEngine
 from ponder_server.fleet import PonderFleet
 from ponder_server.serve import PonderServer
-from protocol.command_line import parse
+from protocol import files
+from protocol.command_line import command, parse
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
 
@@ -72,7 +73,7 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     )
     drafts: list[Draft] = []
     if speed.draft_texts is not None:
-        lines = speed.draft_texts.read_text(encoding="utf-8").splitlines()
+        lines = files.read_text(speed.draft_texts, "file of texts, one a line").splitlines()
         drafts.append(TrieDraft(ponder.format.vocabulary.encode(line) for line in lines if line.strip()))
     if speed.draft_tokens and ponder.mtp:
         drafts.append(MtpDraft(ponder, num_tokens=speed.draft_tokens))
@@ -96,6 +97,7 @@ def build_official(options: PonderOptions) -> PonderEngine:
     return OfficialPonder(options.checkpoint, options.device)
 
 
+@command("ponder-serve")
 def main(argv: list[str] | None = None) -> int:
     options = parse(PonderOptions, argv, prog="ponder-serve")
     weights = str(options.checkpoint or f"random weights ({options.random.size})")

@@ -9,7 +9,7 @@ from model_server.daemon import serve_model
 from pounce_server.config import NUM_TORCH_THREADS, PounceOptions
 from pounce_server.contract import PounceEngine
 from pounce_server.serve import PounceServer
-from protocol.command_line import parse
+from protocol.command_line import command, parse
 
 log = logging.getLogger(__name__)
 
@@ -75,6 +75,7 @@ def build_official(options: PounceOptions) -> PounceEngine:
     return OfficialPounce(options.checkpoint, options.device)
 
 
+@command("pounce-serve")
 def main(argv: list[str] | None = None) -> int:
     options = parse(PounceOptions, argv, prog="pounce-serve")
     weights = str(options.checkpoint or "random weights")

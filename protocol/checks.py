@@ -16,6 +16,7 @@ from protocol import messages as m
 from protocol.errors import MalformedMessage
 
 MAX_MESSAGE_BYTES = 64 << 20  # an OpenRequest with a 48 s demonstration of two raw 256 px views is 19 MB
+MAX_PLAIN_MESSAGE_BYTES = 4 << 20  # without pictures; two bytes of protobuf can become a hundred in memory
 MAX_IMAGES = 8
 MAX_IMAGE_SIDE_PX = 4096
 MAX_CARRIERS = 64

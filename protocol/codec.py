@@ -23,7 +23,7 @@ from google.protobuf.message import Message as Proto
 
 from protocol import messages as m
 from protocol import splice
-from protocol.checks import MAX_MESSAGE_BYTES, check
+from protocol.checks import MAX_IMAGES, MAX_MESSAGE_BYTES, MAX_PLAIN_MESSAGE_BYTES, check
 from protocol.errors import MalformedMessage, ProtocolError
 from protocol.ponderpounce.v1 import common_pb2, episode_pb2, stream_pb2
 
@@ -73,12 +73,13 @@ def decode(cls: type[T], payload: bytes) -> T:
     Raises:
         MalformedMessage: the bytes are no ``cls``, or the message breaks a rule of ``checks``.
     """
-    if len(payload) > MAX_MESSAGE_BYTES:
-        raise MalformedMessage(cls.__name__, "*", f"at most {MAX_MESSAGE_BYTES} bytes", f"{len(payload)}")
+    most = MAX_MESSAGE_BYTES if cls in _WITH_PICTURES else MAX_PLAIN_MESSAGE_BYTES
+    if len(payload) > most:
+        raise MalformedMessage(cls.__name__, "*", f"at most {most} bytes", f"{len(payload)}")
     images: list[tuple[bytes, memoryview]] = []
     try:
         if cls is m.Observation:
-            payload, images = splice.split(payload, _OBSERVATION_IMAGES, _IMAGE_DATA)
+            payload, images = splice.split(payload, _OBSERVATION_IMAGES, _IMAGE_DATA, most=MAX_IMAGES)
         fields = _from_fields(cls, proto_class(cls).FromString(payload))
         if images:  # those at the front; other encoders put none there
             fields["images"] = tuple(_image(meta, data) for meta, data in images) + fields["images"]
@@ -282,5 +283,6 @@ def _put_messages(value: Any) -> list[dict[str, Any]]:
 _NO_FLOATS = np.zeros(0, np.float32)
 _NO_FLOATS.flags.writeable = False
 _MAX_CACHED_BYTES = 512  # so that an untrusted peer cannot fill a cache with large keys
+_WITH_PICTURES = (m.Observation, m.OpenRequest, m.ActiveReply, m.JournalReply)
 _OBSERVATION_IMAGES = stream_pb2.Observation.DESCRIPTOR.fields_by_name["images"].number
 _IMAGE_DATA = common_pb2.Image.DESCRIPTOR.fields_by_name["data"].number

@@ -1,4 +1,4 @@
-"""Parses command lines into frozen dataclasses, with docstrings as ``--help`` and one flag per switch.
+"""Commands: options as frozen dataclasses, with docstrings as ``--help``; and one sentence for what a person can mend.
 
 A switch that is off by default has ``--x``; one that is on has only ``--no-x``, so its docstring says "Do not ...".
 """
@@ -6,15 +6,83 @@ A switch that is off by default has ``--x``; one that is on has only ``--no-x``,
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import functools
+import getpass
+import io
+import os
+import pwd
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import tyro
 
+from protocol import disk
+from protocol.errors import CommandError
 from protocol.options import LinkOptions
 
 Options = TypeVar("Options")
+Main = Callable[..., int]
+
+REFUSED, INTERRUPTED, READER_LEFT = 2, 130, 141  # the latter two as a shell counts SIGINT and SIGPIPE
+
+
+def command(prog: str) -> Callable[[Main], Main]:
+    """Decorates the ``main(argv)`` of a command; ``prog`` is its name, unless it is called with another.
+
+    Whatever a person can mend (CommandError, OSError, ValueError) becomes one sentence on stderr and exit code 2. Other
+    exceptions are defects of ours and keep their traceback. A reader that leaves (``| head``) ends a command silently.
+    """
+
+    def decorate(main: Main) -> Main:
+        @functools.wraps(main)
+        def run(argv: Sequence[str] | None = None, **options: Any) -> int:
+            name = options.get("prog", prog)
+            _settle_in()
+            try:
+                try:
+                    return main(argv, **options)
+                finally:
+                    sys.stdout.flush()
+            except BrokenPipeError:
+                os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Python flushes once more when it exits
+                return READER_LEFT
+            except KeyboardInterrupt:
+                sys.stderr.write(f"{name}: interrupted\n")
+                return INTERRUPTED
+            except (CommandError, OSError, ValueError) as error:
+                sys.stderr.write(f"{name}: {sentence(error)}\n")
+                return REFUSED
+
+        return run
+
+    return decorate
+
+
+def sentence(error: BaseException) -> str:
+    """An error for a person: an operating system's begins with the file's name and has no number."""
+    if not isinstance(error, OSError) or error.errno is None:
+        return str(error)
+    where = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
+    way_out = "; make room and start again" if error.errno in disk.FULL else ""
+    return f"{where}{error.strerror}{way_out}"
+
+
+def _settle_in() -> None:
+    """Makes up for what a container may lack: a name and a home for its user, and an encoding that has every letter."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    try:
+        getpass.getuser()
+    except (KeyError, OSError):
+        os.environ["USER"] = f"uid-{os.getuid()}"
+    try:
+        os.environ.setdefault("HOME", pwd.getpwuid(os.getuid()).pw_dir)
+    except KeyError:
+        os.environ["HOME"] = tempfile.gettempdir()
 
 
 def parse(kind: type[Options], argv: Sequence[str] | None, *, prog: str) -> Options:

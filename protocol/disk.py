@@ -1,7 +1,11 @@
-"""Syncs files to disk, so that they survive a power cut."""
+"""Syncs files to disk, so that they survive a power cut; and tells a full disk from other errors."""
 
+import errno
 import os
 from pathlib import Path
+
+FULL = (errno.ENOSPC, errno.EDQUOT)
+"""Numbers of an OSError of a disk without room: what ends a record, and not the episode."""
 
 
 def sync(path: Path) -> None:

@@ -1,12 +1,20 @@
-"""Errors of messages and links, which build their text from facts."""
+"""Errors of messages, files and links, which build their text from facts."""
 
 from __future__ import annotations
 
 from protocol.messages import Refusal
 
 
+class CommandError(RuntimeError):
+    """What a person can mend; the message says what was expected, what came, where, and the way out."""
+
+
 class ProtocolError(ValueError):
     """Bytes, shapes or identities that this process cannot accept."""
+
+
+class FileError(ProtocolError):
+    """A file that is not what it should be; the message names it."""
 
 
 class MalformedMessage(ProtocolError):
@@ -27,7 +35,7 @@ class EpisodeRefused(ProtocolError):
         self.try_again = try_again
 
 
-class TransportError(RuntimeError):
+class TransportError(CommandError):
     """A link that cannot be opened or does not answer."""
 
 

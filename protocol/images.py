@@ -7,6 +7,7 @@ models' input.
 
 from __future__ import annotations
 
+import struct
 import zlib
 from collections.abc import Mapping
 
@@ -14,10 +15,14 @@ import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
 
+from protocol.checks import MAX_IMAGE_SIDE_PX
 from protocol.errors import MalformedMessage
 from protocol.messages import Image, ImageCodec
 
 JPEG_QUALITY = 95
+_PNG = b"\x89PNG\r\n\x1a\n"
+_PNG_SIZE = struct.Struct(">16xII")  # width, height
+_SCAN, _MAX_SCANS = b"\xff\xda", 64  # a progressive JPEG of libjpeg has 10
 
 
 def wire_codec(is_local: bool) -> ImageCodec:
@@ -65,14 +70,33 @@ def unpack(image: Image) -> NDArray[np.uint8]:
     if image.codec != ImageCodec.JPEG:
         raise MalformedMessage("Image", "codec", "RAW or JPEG", image.codec.name)
     data = bytes(image.data)
+    height, width = claimed_size(data)
+    if (height, width) != (image.height, image.width):
+        raise MalformedMessage("Image", "data", f"{image.height} x {image.width} px", f"{height} x {width} px")
     try:
-        height, width, *_ = simplejpeg.decode_jpeg_header(data)
-        if (height, width) != (image.height, image.width):  # before decoding: a few bytes can claim 12 GB
-            came = f"{height} x {width} px"
-            raise MalformedMessage("Image", "data", f"{image.height} x {image.width} px", came)
         decoded: NDArray[np.uint8] = simplejpeg.decode_jpeg(data, colorspace="RGB")
-    except MalformedMessage:
-        raise
     except ValueError as error:
         raise MalformedMessage("Image", "data", "a JPEG picture", str(error)) from None
     return decoded
+
+
+def claimed_size(data: bytes) -> tuple[int, int]:
+    """(height, width) that a JPEG or PNG claims to have; nothing is decoded, since a few bytes can claim gigabytes.
+
+    Raises:
+        MalformedMessage: it is neither, is larger than any camera's picture, or has scans without end.
+    """
+    if data.startswith(_PNG):
+        if len(data) < _PNG_SIZE.size or data[12:16] != b"IHDR":
+            raise MalformedMessage("Image", "data", "a JPEG or PNG picture", "a PNG without a header")
+        width, height = _PNG_SIZE.unpack_from(data)
+    else:
+        try:
+            height, width, *_ = simplejpeg.decode_jpeg_header(data)
+        except ValueError as error:
+            raise MalformedMessage("Image", "data", "a JPEG or PNG picture", str(error)) from None
+        if (scans := data.count(_SCAN)) > _MAX_SCANS:  # each passes over all pixels
+            raise MalformedMessage("Image", "data", f"at most {_MAX_SCANS} scans", str(scans))
+    if not (0 < height <= MAX_IMAGE_SIDE_PX and 0 < width <= MAX_IMAGE_SIDE_PX):
+        raise MalformedMessage("Image", "data", f"sides of 1..{MAX_IMAGE_SIDE_PX} px", f"{height} x {width} px")
+    return height, width

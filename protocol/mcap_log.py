@@ -9,7 +9,7 @@ raw ones as JPEG, good for viewing but not for running a model again. ``pixels="
 
 Crash safety: all channels are in the first chunk, and a chunk ends at least every second of episode time and whenever
 the queue is empty for a second, so a killed process loses at most that (``recover`` repairs the file).
-Layout of the container: mcap.dev/spec. Only this file imports mcap.
+Layout of the container: mcap.dev/spec. Only this file and `protocol.mcap_records` import mcap.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import threading
 import zlib
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, NamedTuple, TypeVar
@@ -32,13 +32,13 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import Message as Proto
 from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
-from protocol import codec, disk, images, topics
+from protocol import codec, disk, files, images, topics
 from protocol import messages as m
 from protocol.checks import check
 from protocol.errors import ProtocolError
+from protocol.mcap_records import Records
 from protocol.topics import Topic
 from protocol.version import version
 
@@ -50,7 +50,8 @@ LANES = {"ponder": "s2", "pounce": "s1"}  # topic prefix of a process; others us
 QUEUE_SIZE = 1024  # messages: at 20 Hz about 8 s, of which 160 observations hold 64 MB of raw 256 px pairs
 FLUSH_NS = 1_000_000_000
 FLUSHES_PER_FSYNC = 5
-MAX_RECORD_BYTES = 256 << 20  # a larger length is damaged
+MAX_KEPT_BYTES = 64 << 20  # of messages in memory, and 16 times the file: 1300 ticks without pictures have 14 MB
+_MESSAGE_BYTES, _ENTRY_BYTES = 2_000, 200  # measured: a decoded message beside its bytes, and an entry of a mapping
 
 Pixels = Literal["jpeg", "exact"]
 WhenFull = Literal["drop", "wait"]
@@ -129,7 +130,14 @@ class EpisodeLog:
         check(info)
         path.parent.mkdir(parents=True, exist_ok=True)
         file = self.partial.open("xb")
-        self._writer = _Writer(file, info, pixels)
+        try:
+            with files.writing(self.partial):
+                self._writer = _Writer(file, info, pixels)
+        except BaseException:  # a full disk: leave it no file that holds nothing
+            with suppress(OSError):
+                file.close()
+            self.partial.unlink()
+            raise
         self._queue: queue.Queue[_Entry | _Last] = queue.Queue(queue_size)
         self._waits = when_full == "wait"
         self._overflowed: Counter[str] = Counter()
@@ -362,20 +370,26 @@ def read_log(path: Path) -> EpisodeRecord:
 
     Raises:
         OSError: the file cannot be opened.
-        ProtocolError: no EpisodeInfo before the end or the first damage, or an invalid message.
+        FileError: it is none of ours, holds more than one episode, or more than any episode needs.
     """
     lists: dict[str, list[Any]] = {name: [] for name in _LISTS.values()}
     metadata: dict[str, dict[str, str]] = {}
-    with path.open("rb") as file:
-        records = _Records(file)
+    with files.reading(path, "episode log"), files.open_file(path) as file:
+        records = Records(file)
+        room = MAX_KEPT_BYTES + 16 * records.num_bytes
         for record in records:
             if isinstance(record, Metadata):
                 metadata[record.name] = dict(record.metadata)
             elif isinstance(record, Message) and (cls := _CLASSES.get(records.schema_of(record))):
-                lists[_LISTS[cls]].append(codec.decode(cls, record.data))
-    infos, results = lists.pop("info"), lists.pop("result")
-    if not infos:
-        raise ProtocolError(f"{path}: no EpisodeInfo in it ({records.damage or 'not an episode log'})")
+                message: Any = codec.decode(cls, record.data)
+                lists[_LISTS[cls]].append(message)
+                room -= _num_bytes(message, record.data)
+                if room < 0:
+                    raise ValueError(f"its messages need more memory than an episode's, {MAX_KEPT_BYTES >> 20} MiB")
+        infos, results = lists.pop("info"), lists.pop("result")
+        if not infos:
+            raise ValueError(f"no EpisodeInfo in it ({records.damage or 'another kind of log'})")
+        _require_one_episode(infos, lists)
     return EpisodeRecord(
         info=infos[0],
         result=results[-1] if results else None,
@@ -384,6 +398,32 @@ def read_log(path: Path) -> EpisodeRecord:
         metadata=metadata,
         **lists,
     )
+
+
+def _num_bytes(message: Any, payload: bytes) -> int:
+    """About the memory that a decoded message takes."""
+    entries = sum(len(getattr(message, name)) for name in _MAPPINGS.get(type(message), ()))
+    return _MESSAGE_BYTES + len(payload) + _ENTRY_BYTES * entries
+
+
+_MAPPINGS: dict[type, tuple[str, ...]] = {
+    m.Event: ("attributes",),
+    m.Health: ("dropped",),
+    m.EpisodeInfo: ("versions",),
+    m.EpisodeResult: ("statistics",),
+}
+
+
+def _require_one_episode(infos: list[m.EpisodeInfo], lists: dict[str, list[Any]]) -> None:
+    """Raises ValueError if messages are of several episodes. Phases and healths are of processes, not of episodes."""
+    found = Counter(info.header.episode for info in infos)
+    for name in lists.keys() - {"phases", "healths"}:
+        found |= Counter({message.header.episode: 1 for message in lists[name]})
+    if found.total() > 1:
+        raise ValueError(
+            f"{found.total()} episodes in it ({', '.join(sorted(found.elements())[:4])}), as in merged logs; give one "
+            "log per episode"
+        )
 
 
 class Picture(NamedTuple):
@@ -400,17 +440,22 @@ def read_pictures(path: Path) -> Iterator[Picture]:
 
     Raises:
         OSError: the file cannot be opened.
+        FileError: it is none of ours, or a picture is no JPEG or PNG, or larger than any camera's.
     """
     t0_ns = 0
-    with path.open("rb") as file:
-        records = _Records(file)
+    with files.open_file(path) as file:
+        records = Records(file)
         for record in records:
-            if isinstance(record, Metadata) and record.name == "ponderpounce.episode":
-                t0_ns = int(record.metadata["t0_unix_ns"])
-            elif isinstance(record, Message) and records.schema_of(record) == CompressedImage.DESCRIPTOR.full_name:
+            with files.reading(path, "episode log"):
+                if isinstance(record, Metadata) and record.name == "ponderpounce.episode":
+                    t0_ns = int(record.metadata["t0_unix_ns"])
+                    continue
+                if not isinstance(record, Message) or records.schema_of(record) != CompressedImage.DESCRIPTOR.full_name:
+                    continue
                 picture = CompressedImage.FromString(record.data)
+                images.claimed_size(picture.data)
                 source_ns = picture.timestamp.ToNanoseconds() - t0_ns
-                yield Picture(picture.frame_id, source_ns, picture.format, picture.data)
+            yield Picture(picture.frame_id, source_ns, picture.format, picture.data)
 
 
 class Recovery(NamedTuple):
@@ -419,20 +464,22 @@ class Recovery(NamedTuple):
 
 
 def recover(src: Path, dst: Path) -> Recovery:
-    """Copies everything before the first damage into a finished file.
+    """Copies everything before the first damage into a finished file, in chunks and with all indexes.
 
     Raises:
         OSError: ``src`` cannot be read, or ``dst`` exists or cannot be written.
-        ProtocolError: no message could be read.
+        FileError: no message could be read, or ``src`` unpacks to more than any episode's log.
     """
     num_messages = 0
     schemas, channels = {0: 0}, dict[int, int]()
-    with src.open("rb") as file:
-        records = _Records(file)
+    if dst.exists():
+        raise FileExistsError(f"{dst} exists: a record is never overwritten. Name another file")
+    with files.reading(src, "episode log"), files.open_file(src) as file:
+        records = Records(file)
         head = next(iter(records), None)
         if not isinstance(head, Header):
-            raise ProtocolError(f"{src}: nothing to recover ({records.damage or 'no MCAP header'})")
-        with dst.open("xb") as out:
+            raise ValueError(f"nothing to recover ({records.damage or 'no MCAP header'})")
+        with _new_file(dst) as out:
             writer = Writer(out)
             writer.start(head.profile, f"{head.library}; recovered")
             for record in records:
@@ -459,39 +506,20 @@ def recover(src: Path, dst: Path) -> Recovery:
             writer.finish()
             out.flush()
             os.fsync(out.fileno())
-    if not num_messages:
-        dst.unlink()
-        raise ProtocolError(f"{src}: not one whole message in it ({records.damage})")
+            if not num_messages:
+                raise ValueError(f"not one whole message in it ({records.damage})")
     return Recovery(num_messages, records.damage)
 
 
-class _Records:
-    """The file's records up to its end or to the first damage, which ``damage`` names."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self.damage = ""
-        self._file = file
-        self._schemas: dict[int, str] = {}
-        self._channels: dict[int, str] = {}
-        self._records = iter(StreamReader(file, validate_crcs=True, record_size_limit=MAX_RECORD_BYTES).records)
-
-    def __iter__(self) -> Iterator[Any]:
-        while True:
-            try:
-                record = next(self._records)
-            except StopIteration:
-                return
-            except Exception as error:  # on damaged files the library raises many types, even OverflowError
-                self.damage = f"unfinished or damaged near byte {self._file.tell()}: {type(error).__name__} {error}"
-                return
-            if isinstance(record, Schema):
-                self._schemas[record.id] = record.name
-            elif isinstance(record, Channel):
-                self._channels[record.id] = self._schemas.get(record.schema_id, "")
-            yield record
-
-    def schema_of(self, message: Message) -> str:
-        return self._channels.get(message.channel_id, "")
+@contextmanager
+def _new_file(path: Path) -> Iterator[BinaryIO]:
+    """A file that is complete, or is not there."""
+    with files.writing(path), path.open("xb") as out:
+        try:
+            yield out
+        except BaseException:
+            path.unlink()
+            raise
 
 
 def _without_pixels(image: m.Image) -> m.Image:

@@ -81,7 +81,7 @@ def host_clock_id() -> str:
     The kernel's boot id, because two hosts may share a name, and containers of one kernel do not.
     """
     try:
-        kernel = _BOOT_ID.read_text().strip()[:8]
+        kernel = _BOOT_ID.read_text(encoding="utf-8").strip()[:8]
     except OSError:  # not Linux
         kernel = platform.node() or "host"
     return f"{kernel}/monotonic"

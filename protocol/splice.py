@@ -27,19 +27,21 @@ def join(small: bytes, field: int, blob_field: int, blobs: Iterable[Blob]) -> by
     return b"".join(parts)
 
 
-def split(payload: bytes, field: int, blob_field: int) -> tuple[bytes, list[tuple[bytes, memoryview]]]:
+def split(payload: bytes, field: int, blob_field: int, *, most: int) -> tuple[bytes, list[tuple[bytes, memoryview]]]:
     """The inverse of ``join``: the bytes after the blobs, and each leading sub-message with its blob separated.
 
     Another encoder may put these fields elsewhere. They remain in the bytes, for protobuf to parse.
 
     Raises:
-        ValueError: a leading blob is cut short.
+        ValueError: a leading blob is cut short, or there are more than ``most``.
     """
     view = memoryview(payload)
     tag, blob_tag = field << 3 | _LENGTH_DELIMITED, blob_field << 3 | _LENGTH_DELIMITED
-    blobs = []
+    blobs: list[tuple[bytes, memoryview]] = []
     at = 0
     while at < len(payload) and payload[at] == tag:
+        if len(blobs) == most:
+            raise ValueError(f"more than {most} blobs")
         body, at = _extent(payload, at + 1, len(payload))
         if body < at and payload[body] == blob_tag:
             blob, end = _extent(payload, body + 1, at)

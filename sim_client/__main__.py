@@ -11,9 +11,9 @@ import dual_system.tasks.headless  # noqa: F401 - before anything that imports m
 
 # isort: split
 
-from dual_system.tasks.task import TaskError, make_task, task_names
-from protocol.command_line import parse
-from protocol.errors import TransportError
+from dual_system.tasks.task import make_task, task_names
+from protocol import files
+from protocol.command_line import command, parse
 from protocol.logs import set_up_logging
 from sim_client.config import SimOptions
 from sim_client.harness import open_harness
@@ -21,6 +21,7 @@ from sim_client.launch import Daemons
 from sim_client.suite import Suite
 
 
+@command("sim-client")
 def main(argv: list[str] | None = None) -> int:
     options = parse(SimOptions, argv, prog="sim-client")
     set_up_logging("WARNING")
@@ -29,11 +30,8 @@ def main(argv: list[str] | None = None) -> int:
         return 0
     try:
         make_task(options.task)  # a mistyped name before anything is started
-        with Daemons(options.out) as daemons:
-            results = _run(options, daemons)
-    except (TaskError, TransportError) as error:
-        print(f"sim-client: {error}", file=sys.stderr)
-        return 2
+        with Daemons(files.folder(options.out)) as daemons:
+            results, unwritten = _run(options, daemons)
     except KeyboardInterrupt:
         print("sim-client: interrupted; finished episodes are in results.json", file=sys.stderr)
         return 130
@@ -43,10 +41,13 @@ def main(argv: list[str] | None = None) -> int:
             f"{episode['task']} seed={episode['seed']} {episode['status']} steps={episode['steps']} {episode['reason']}"
         )
     print(f"{sum(e['success'] for e in episodes)} of {len(episodes)} succeeded; {options.out / 'results.json'}")
+    if unwritten is not None:
+        raise unwritten
     return 1 if any(e["status"] == "ABORTED" for e in episodes) else 0
 
 
-def _run(options: SimOptions, daemons: Daemons) -> dict[str, Any]:
+def _run(options: SimOptions, daemons: Daemons) -> tuple[dict[str, Any], OSError | None]:
+    """Returns the results, and why they are not on the disk."""
     most_ticks = options.schedule.max_steps
     with tqdm(total=options.episodes * most_ticks, unit="tick", disable=not options.log.progress) as bar:
         bar.bar_format = "{desc}"  # until there are ticks, a rate means nothing
@@ -61,7 +62,8 @@ def _run(options: SimOptions, daemons: Daemons) -> dict[str, Any]:
             bar.update(episode * most_ticks + tick - bar.n)
 
         try:
-            return Suite(options, harness.link, harness.clock, daemons.dead).run(on_tick)
+            suite = Suite(options, harness.link, harness.clock, daemons.dead)
+            return suite.run(on_tick), suite.unwritten
         finally:
             harness.bus.close()
 

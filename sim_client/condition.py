@@ -12,12 +12,13 @@ from dual_system.data.seeds import TRAIN_SEED
 from dual_system.tasks.difficulty import Difficulty
 from dual_system.tasks.task import chosen_tasks
 from protocol.command_line import flat
+from protocol.errors import CommandError
 from sim_client import config
 from sim_client.config import ScheduleOptions, ServersOptions, SimOptions
 from sim_client.swapped_ponder import donors_in
 
 
-class EvaluationError(Exception):
+class EvaluationError(CommandError):
     """An evaluation that cannot run; the message says what was expected, what was given, and the way out."""
 
 

@@ -27,7 +27,8 @@ from dual_system.analysis.counterfactual import COUNTERFACTUAL, SCHEMA, follows_
 from dual_system.models.ponder.demo_sampling import DemoSampling
 from dual_system.tasks.pair_files import demo_sampling_of, read_pairs
 from dual_system.tasks.pairs import Pair, Telling
-from protocol.command_line import flat, parse
+from protocol import files
+from protocol.command_line import command, flat, parse
 from sim_client.ledger import write_json
 from sim_client.robot import CAMERAS
 
@@ -60,18 +61,15 @@ class CounterfactualOptions:
     """Do not show a progress bar."""
 
 
+@command("pp-diagnose counterfactual")
 def main(argv: list[str] | None = None, prog: str = "pp-diagnose counterfactual") -> int:
     options = parse(CounterfactualOptions, argv, prog=prog)
-    try:
-        pairs = read_pairs(options.pairs)
-        read, ponder = importlib.import_module("ponder_server.in_process").build_reader(options.ponder)
-        _require_as_in_training(options.pairs, ponder.demonstrations)
-        act, pounce = importlib.import_module("pounce_server.in_process").build_actor(options.pounce)
-        entries = scored(tqdm(pairs, unit="pair", disable=not options.progress), read, act, options)
-    except (OSError, ValueError) as error:
-        sys.stderr.write(f"{prog}: {error}\n")
-        return 2
-    options.out.mkdir(parents=True, exist_ok=True)
+    files.folder(options.out)
+    pairs = read_pairs(options.pairs)
+    read, ponder = importlib.import_module("ponder_server.in_process").build_reader(options.ponder)
+    _require_as_in_training(options.pairs, ponder.demonstrations)
+    act, pounce = importlib.import_module("pounce_server.in_process").build_actor(options.pounce)
+    entries = scored(tqdm(pairs, unit="pair", disable=not options.progress), read, act, options)
     models = {
         name: {"model_hash": spec.model_hash, "is_untrained": spec.is_fake}
         for name, spec in (("ponder", ponder), ("pounce", pounce))

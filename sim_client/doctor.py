@@ -12,7 +12,7 @@ from pathlib import Path
 
 import tyro
 
-from protocol.command_line import parse
+from protocol.command_line import command, parse
 from protocol.options import LinkOptions
 from protocol.sockets import endpoint
 from sim_client import certs, doctor_schedule
@@ -112,6 +112,7 @@ def table(findings: Sequence[Finding]) -> str:
     return "\n".join(lines) + "\n"
 
 
+@command("pp-doctor")
 def main(argv: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if argv is None else argv
     if arguments[:1] == ["certs"]:

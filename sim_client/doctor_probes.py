@@ -242,7 +242,7 @@ def _pass_a_frame() -> Passed:
 
 def _maps_zenoh_memory(size: int) -> bool:
     """Whether this process has mapped a shared segment of zenoh's that could hold ``size`` bytes (Linux)."""
-    for line in Path("/proc/self/maps").read_text(errors="replace").splitlines():
+    for line in Path("/proc/self/maps").read_text(encoding="utf-8", errors="replace").splitlines():
         if line.endswith((".zenoh", ".zenoh (deleted)")):
             first, last = (int(address, 16) for address in line.split()[0].split("-"))
             if last - first >= size:

@@ -22,22 +22,19 @@ import dual_system.tasks.headless  # noqa: F401 - before anything that imports m
 
 # isort: split
 
-from dual_system.data.errors import DatasetError
 from dual_system.data.workers import LocalWorkers, RayWorkers, Workers
 from dual_system.tasks.environment import Environment, make_environment
-from dual_system.tasks.task import TaskError
 from protocol.bus import Bus
-from protocol.command_line import parse
-from protocol.errors import TransportError
+from protocol.command_line import command, parse
 from protocol.link import Link
 from protocol.logs import set_up_logging
 from sim_client.condition import EvalOptions, EvaluationError, Job
 from sim_client.harness import BuildServer, ServerStep, open_harness
 from sim_client.launch import Daemons
-from sim_client.ledger import Ledger, LedgerError, write_json
+from sim_client.ledger import Ledger, write_json
 from sim_client.null_ponder import NullPonder, cognition_shape
 from sim_client.suite import Suite, versions
-from sim_client.swapped_ponder import DonorError, SwappedPonder
+from sim_client.swapped_ponder import SwappedPonder
 
 DONE, REFUSED, INTERRUPTED = 0, 2, 130
 Line = dict[str, Any]  # one episode's entry in results.json
@@ -46,14 +43,12 @@ _HOW_MANY = ("tasks", "episodes", "runs")  # a folder may be given more of them 
 _HOW = ("out", "patience_s", "progress")  # and these change no result
 
 
+@command("pp-eval")
 def main(argv: list[str] | None = None) -> int:
     set_up_logging("WARNING")
     try:
         options = parse(EvalOptions, argv, prog="pp-eval")
         episodes = evaluate(options, _workers(options))["episodes"]
-    except (EvaluationError, LedgerError, DonorError, DatasetError, TaskError, TransportError) as error:
-        sys.stderr.write(f"pp-eval: {error}\n")
-        return REFUSED
     except KeyboardInterrupt:
         sys.stderr.write("pp-eval: interrupted; finished episodes are kept, the same command resumes\n")
         return INTERRUPTED

@@ -13,10 +13,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from protocol import files
+from protocol.errors import CommandError
+
 SETTINGS, EPISODES = "settings.json", "episodes.jsonl"
+_SETTINGS_KIND = "settings file of pp-eval"
 
 
-class LedgerError(Exception):
+class LedgerError(CommandError):
     """The evaluation cannot continue in this folder; the message says what was expected, and the way out."""
 
 
@@ -34,8 +38,7 @@ class Ledger:
     """
 
     def __init__(self, out: Path, settings: dict[str, Any]) -> None:
-        out.mkdir(parents=True, exist_ok=True)
-        self._path = out / EPISODES
+        self._path = files.folder(out) / EPISODES
         self._file = self._path.open("a+b")
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -53,9 +56,10 @@ class Ledger:
         """Writes one line to disk; an existing key is kept."""
         if key in self.lines:
             return
-        self._file.write(json.dumps({"key": key, "episode": line}).encode() + b"\n")
-        self._file.flush()
-        os.fsync(self._file.fileno())
+        with files.writing(self._path):
+            self._file.write(json.dumps({"key": key, "episode": line}).encode() + b"\n")
+            self._file.flush()
+            os.fsync(self._file.fileno())
         self.lines[key] = line
 
     def _read(self) -> dict[str, dict[str, Any]]:
@@ -85,10 +89,11 @@ class Ledger:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Writes atomically, so that a reader never gets a partial file."""
+    """Writes atomically, so that a reader never gets a partial file. Raises OSError that names ``path``."""
     partial = path.with_suffix(".json.partial")
-    partial.write_text(json.dumps(value, indent=1) + "\n")
-    partial.replace(path)
+    with files.writing(path):
+        partial.write_text(json.dumps(value, indent=1) + "\n")
+        partial.replace(path)
 
 
 def _claim(path: Path, settings: dict[str, Any]) -> None:
@@ -96,8 +101,9 @@ def _claim(path: Path, settings: dict[str, Any]) -> None:
     if not path.exists():
         write_json(path, settings)
         return
-    there = json.loads(path.read_text())
-    differing = sorted(name for name in there.keys() | settings.keys() if there.get(name) != settings.get(name))
+    there = files.read_json(path, _SETTINGS_KIND)
+    with files.reading(path, _SETTINGS_KIND):
+        differing = sorted(name for name in there.keys() | settings.keys() if there.get(name) != settings.get(name))
     if differing:
         name = differing[0]
         raise LedgerError(

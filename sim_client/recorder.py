@@ -5,15 +5,19 @@ It is a passive subscriber, so the file has the messages as transmitted, byte fo
 
 from __future__ import annotations
 
+import logging
 import time
 from pathlib import Path
 from typing import Literal
 
 from clock.report import ADMITTED_EVENT
+from protocol import disk
 from protocol import messages as m
 from protocol.link import Link, Received, Stream
 from protocol.mcap_log import EpisodeLog
 from protocol.topics import EVENT, HEALTH, INFO, OBSERVATION, PHASE, RESULT, STREAMS, Topic
+
+log = logging.getLogger(__name__)
 
 KEEP = 512  # per topic, between two drains; drains come every tick
 
@@ -30,15 +34,27 @@ class Recorder:
             if topic is not INFO
         ]
         self._log: EpisodeLog | None = None
+        self._unrecorded = ""
         self.ticks: list[m.Tick] = []
         self.stamps: list[m.Stamp] = []
         self.invocations: list[m.Invocation] = []
 
     def begin(self, info: m.EpisodeInfo, path: Path | None) -> None:
-        """Starts an episode; without a path nothing is written."""
+        """Starts an episode; without a path nothing is written, and on a full disk neither.
+
+        Raises OSError if the log cannot be made for another reason.
+        """
         self.ticks, self.stamps, self.invocations = [], [], []
+        self._log, self._unrecorded = None, ""
         waits = info.schedule.mode == m.Mode.LOCKSTEP  # there the world has time, and a log with gaps is no proof
-        self._log = EpisodeLog(path, info, pixels=self._pixels, when_full="wait" if waits else "drop") if path else None
+        if path is not None:
+            try:
+                self._log = EpisodeLog(path, info, pixels=self._pixels, when_full="wait" if waits else "drop")
+            except OSError as error:
+                if error.errno not in disk.FULL:
+                    raise
+                self._unrecorded = f"log {path.name}: {error.strerror}: the episode is not recorded"
+                log.error("%s", self._unrecorded)
 
     def step(self) -> None:
         """Takes what has come since the last call."""
@@ -56,7 +72,7 @@ class Recorder:
 
     def end(self, result: m.EpisodeResult) -> list[str]:
         """Writes the result and closes the log; returns descriptions of what is missing from it."""
-        missing: list[str] = []
+        missing = [self._unrecorded] if self._unrecorded else []
         if self._log is not None:
             self._link.publish(RESULT, result, at_ns=max((t.decided_ns for t in self.ticks), default=0))
             self.step()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -25,9 +26,10 @@ import tyro
 from rerun.chunk import McapReader
 from rerun.experimental import ViewerClient
 
-from protocol.command_line import parse
-from protocol.errors import ProtocolError
-from protocol.mcap_log import read_log
+from protocol import files
+from protocol.command_line import command, parse
+from protocol.errors import CommandError
+from protocol.mcap_log import read_log, read_pictures, recover
 from sim_client.blueprint import TIMELINE, episode_blueprint
 
 APPLICATION_ID = "ponderpounce"
@@ -38,7 +40,7 @@ _END_S = 5.0  # for a viewer that closed its connection to exit
 _TAIL_CHARS = 500
 
 
-class ReplayError(RuntimeError):
+class ReplayError(CommandError):
     """rerun could not convert, open or draw the episode."""
 
 
@@ -56,46 +58,69 @@ class ReplayConfig:
     """Episode time of the screenshot in seconds."""
 
 
+@command("pp-replay")
 def main(argv: list[str] | None = None) -> int:
     config = parse(ReplayConfig, argv, prog="pp-replay")
-    try:
-        with tempfile.TemporaryDirectory(prefix="ponderpounce-replay-") as folder:
-            rrd = config.save or Path(folder) / "episode.rrd"
-            t0_unix_ns = convert(config.file, rrd)
-            if config.save is not None:
-                sys.stdout.write(f"{config.save}: {config.save.stat().st_size / 1e6:.1f} MB\n")
-            if config.screenshot is not None:
-                screenshot(rrd, config.screenshot, t0_unix_ns + round(config.at * 1e9))
-                sys.stdout.write(f"{config.screenshot}: {config.at:g} s into the episode\n")
-            elif config.save is None:
-                subprocess.run(
-                    [_rerun(), "--bind", "127.0.0.1", "--port", "auto", str(rrd)], env=_environ(), check=True
-                )
-    except (OSError, ProtocolError, ReplayError, subprocess.CalledProcessError) as error:
-        sys.stderr.write(f"pp-replay: {error}\n")
-        return 1
+    for target in filter(None, (config.save, config.screenshot)):
+        files.folder(target.parent)
+    with tempfile.TemporaryDirectory(prefix="ponderpounce-replay-") as folder:
+        rrd = Path(folder) / "episode.rrd"
+        t0_unix_ns = convert(config.file, rrd)
+        if config.save is not None:
+            _keep(rrd, config.save)
+            sys.stdout.write(f"{config.save}: {config.save.stat().st_size / 1e6:.1f} MB\n")
+        if config.screenshot is not None:
+            png = Path(folder) / "frame.png"
+            screenshot(rrd, png, t0_unix_ns + round(config.at * 1e9))
+            _keep(png, config.screenshot)
+            sys.stdout.write(f"{config.screenshot}: {config.at:g} s into the episode\n")
+        elif config.save is None:
+            _open_window(rrd)
     return 0
+
+
+def _keep(made: Path, target: Path) -> None:
+    """Copies a finished file: rerun has its own way with odd names and full disks."""
+    with files.writing(target):
+        shutil.copyfile(made, target)
+
+
+def _open_window(rrd: Path) -> None:
+    """Raises ReplayError if there is no display, or the viewer ends with an error."""
+    if sys.platform == "linux" and not any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
+        raise ReplayError("no display here; give --screenshot frame.png, or --save episode.rrd to open it elsewhere")
+    command = [_rerun(), "--bind", "127.0.0.1", "--port", "auto", str(rrd)]
+    code = subprocess.run(command, env=_environ(), check=False).returncode
+    if code:
+        raise ReplayError(f"the viewer ended with exit code {code}; --save and --screenshot need no window")
 
 
 def convert(log: Path, rrd: Path) -> int:
     """Writes the episode and its layout into ``rrd``; returns the unix time [ns] of episode time 0.
 
+    rerun reads a copy of the log: it needs chunks and a summary, which MCAP leaves to the writer, and would believe
+    what a picture or a chunk claims.
+
     Raises:
         OSError: a file cannot be read or written.
-        ProtocolError: ``log`` is not an episode's log.
+        FileError: ``log`` is not an episode's log.
         ReplayError: rerun refuses the conversion.
     """
     record = read_log(log)
+    for _ in read_pictures(log):
+        pass  # each is looked at
     with tempfile.TemporaryDirectory(prefix="ponderpounce-replay-") as folder:
-        episode, layout = Path(folder) / "episode.rrd", Path(folder) / "layout.rbl"
-        reader = McapReader(log, recover=record.recovered)
+        copy, episode, layout = (Path(folder) / name for name in ("episode.mcap", "episode.rrd", "layout.rbl"))
+        recover(log, copy)
         recording_id = record.info.header.episode or log.stem
-        reader.stream().write_rrd(episode, application_id=APPLICATION_ID, recording_id=recording_id)
+        with files.reading(log, "log that rerun can read"):
+            stream = McapReader(copy).stream()
+            stream.write_rrd(episode, application_id=APPLICATION_ID, recording_id=recording_id)
         episode_blueprint(record.info).save(APPLICATION_ID, layout)
         command = [_rerun(), "rrd", "merge", str(episode), str(layout), "-o", str(rrd)]
-        merged = subprocess.run(command, env=_environ(), capture_output=True, text=True, check=False)
+        merged = subprocess.run(command, env=_environ(), capture_output=True, check=False)
         if merged.returncode or not rrd.exists():
-            raise ReplayError(f"rerun rrd merge failed: {merged.stderr.strip()}")
+            raise ReplayError(f"rerun rrd merge failed: {merged.stderr.decode(errors='replace').strip()}")
     return record.info.t0_unix_ns
 
 
@@ -130,7 +155,7 @@ def _headless() -> Iterator[Any]:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     command = [_rerun(), "--headless", "--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen"]
-    with tempfile.TemporaryFile("w+") as output:
+    with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as output:
         # In its own process group: ``rerun`` is a script that starts the viewer, and both have to end.
         process = subprocess.Popen(command, env=_environ(), stdout=output, stderr=output, start_new_session=True)
         try:

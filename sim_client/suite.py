@@ -16,7 +16,7 @@ import numpy as np
 from clock.service import ClockService
 from dual_system.tasks.environment import Environment, Snapshot, make_environment
 from dual_system.tasks.physics import CONTROL_HZ
-from protocol import images
+from protocol import disk, files, images
 from protocol import messages as m
 from protocol.command_line import flat
 from protocol.errors import EpisodeRefused, TransportError
@@ -40,6 +40,9 @@ class Suite:
         link: the robot's end of the bus.
         clock: the clock service, if it is embedded here; it is stepped while this thread waits.
         dead_server: a sentence if a server that we started is dead, else "".
+
+    Attributes:
+        unwritten: why ``results.json`` lacks the last episodes; None if it has them.
     """
 
     def __init__(
@@ -52,11 +55,14 @@ class Suite:
         self._end = RobotEnd(link, clock, self._recorder, patience_ns=self._patience_ns, dead_server=dead_server)
         self._session = f"{options.task}-{secrets.token_hex(4)}"
         self._num_played = 0
+        self.unwritten: OSError | None = None
 
     def run(self, on_tick: OnTick = lambda episode, tick: None) -> dict[str, Any]:
-        """Runs all episodes and writes ``results.json`` after each, so that a crash loses at most one."""
-        out = self._options.out
-        out.mkdir(parents=True, exist_ok=True)
+        """Runs all episodes and writes ``results.json`` after each, so that a crash loses at most one.
+
+        A full disk does not end the run, see ``unwritten``. Raises OSError if ``out`` cannot be written otherwise.
+        """
+        out = files.folder(self._options.out)
         results: dict[str, Any] = {
             "config": flat(self._options),
             "versions": versions(),
@@ -68,7 +74,13 @@ class Suite:
             for index in range(self._options.episodes):
                 episode = self.play(environment, task, self._options.seed + index, on_tick=partial(on_tick, index))
                 results["episodes"].append(episode)
-                write_json(out / "results.json", results)
+                try:
+                    write_json(out / "results.json", results)
+                    self.unwritten = None
+                except OSError as error:
+                    if error.errno not in disk.FULL:
+                        raise
+                    self.unwritten = error
         return results
 
     def play(

@@ -7,11 +7,10 @@ schedule, and the age, counted from this episode's query. Beyond the donor's las
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
+from protocol import files
 from protocol import messages as m
 from protocol.errors import ProtocolError
 from protocol.link import Link
@@ -84,25 +83,30 @@ def donors_in(folder: Path, keys: Iterable[Key]) -> dict[Key, Path]:
         folder: of a recorded evaluation over the same scenes.
 
     Raises:
-        DonorError: no such folder, an episode is not in it or was not recorded, or there is no other one.
+        OSError, FileError: the folder's results cannot be read.
+        DonorError: there are none, an episode is not in it or was not recorded, or there is no other one.
     """
     path = folder / "results.json"
-    try:
-        lines: list[dict[str, Any]] = json.loads(path.read_text())["episodes"]
-    except (OSError, ValueError, KeyError) as error:
-        raise DonorError(f"{path} is no results file ({error}); --donors takes the --out of pp-eval --record") from None
-    known = {(line["task"], line.get("run", 0), line["seed"]): line for line in lines}
+    kind = "results file of pp-eval --record"
+    if not path.exists():
+        raise DonorError(f"{path} is not there; --donors takes the --out of pp-eval --record")
+    found = files.read_json(path, kind)
+    with files.reading(path, kind):
+        recorded = {
+            (line["task"], line.get("run", 0), line["seed"]): (line["difficulty"], str(line["mcap"] or ""))
+            for line in found["episodes"]
+        }
     chosen: dict[Key, Path] = {}
     for task, run, seed in keys:
-        own = known.get((task, run, seed))
-        if own is None:
+        if (task, run, seed) not in recorded:
             raise DonorError(f"{path} has no {task} seed {seed} run {run}: record the same scenes and runs there first")
-        alike = [(t, r, s) for t, r, s in known if (t, r) == (task, run) and s != seed]
-        alike = [key for key in alike if known[key]["difficulty"] == own["difficulty"]]
+        difficulty, _ = recorded[task, run, seed]
+        alike = [(t, r, s) for t, r, s in recorded if (t, r) == (task, run) and s != seed]
+        alike = [key for key in alike if recorded[key][0] == difficulty]
         if not alike:
-            raise DonorError(f"{path} has no other {own['difficulty']} episode of {task}, run {run}: --episodes more")
-        donor = known[min(alike, key=lambda key: (key[2] <= seed, key[2]))]
-        if not donor["mcap"]:
+            raise DonorError(f"{path} has no other {difficulty} episode of {task}, run {run}: --episodes more")
+        _, log = recorded[min(alike, key=lambda key: (key[2] <= seed, key[2]))]
+        if not log:
             raise DonorError(f"{path} was not recorded; --donors takes the --out of pp-eval --record")
-        chosen[task, run, seed] = folder / donor["mcap"]
+        chosen[task, run, seed] = folder / log
     return chosen

@@ -7,7 +7,6 @@ predicts the same twice, so it is right once and wrong once, or tied: it scores 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dual_system.analysis.results import ResultsError
+from protocol import files
 
 COUNTERFACTUAL = "counterfactual.json"
 SCHEMA = "ponderpounce-counterfactual/1"
@@ -35,10 +34,11 @@ class Counterfactual:
 
 
 def read_counterfactual(path: Path) -> Counterfactual:
-    """Reads a result file, or that of a folder. Raises ResultsError if it is not one or has no pairs."""
+    """Reads a result file, or that of a folder. Raises OSError or FileError if it is not one or has no pairs."""
     file = path / COUNTERFACTUAL if path.is_dir() else path
-    try:
-        found = json.loads(file.read_text())
+    kind = "file of pp-diagnose counterfactual"
+    found = files.read_json(file, kind)
+    with files.reading(file, kind):
         if found["schema"] != SCHEMA or not found["pairs"]:
             raise ValueError(
                 f"schema {found['schema']!r} with {len(found['pairs'])} pairs, expected some of {SCHEMA!r}"
@@ -47,10 +47,6 @@ def read_counterfactual(path: Path) -> Counterfactual:
         for pair in found["pairs"]:
             scores.setdefault(pair["task"], []).append(float(pair["score"]))
         is_untrained = any(model["is_untrained"] for model in found["models"].values())
-    except OSError as error:
-        raise ResultsError(f"{file} cannot be read ({error.strerror}); pp-diagnose counterfactual writes it") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ResultsError(f"{file} is no file of pp-diagnose counterfactual: {error!r}") from error
     label = str(path.parent if path.name == COUNTERFACTUAL else path)
     by_task = {task: np.array(of_task) for task, of_task in sorted(scores.items())}
     return Counterfactual(label=label, by_task=by_task, is_untrained=is_untrained)

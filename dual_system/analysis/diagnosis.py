@@ -6,7 +6,6 @@ are not independent, so episodes are resampled, within their task (the paper's t
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +14,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from dual_system.analysis.results import ResultsError
 from dual_system.analysis.statistics import LEVEL, NUM_RESAMPLES, Interval
+from protocol import files
 
 DIAGNOSIS = "diagnosis.json"
 SCHEMA = "ponderpounce-diagnosis/1"
@@ -63,20 +62,17 @@ def read_diagnosis(path: Path) -> Diagnosis:
     """Reads a diagnosis, or that of a folder.
 
     Raises:
-        ResultsError: the file does not exist or is no diagnosis.
+        OSError, FileError: the file cannot be read, or is no diagnosis.
     """
     file = path / DIAGNOSIS if path.is_dir() else path
-    try:
-        found = json.loads(file.read_text())
+    kind = "diagnosis of pp-diagnose"
+    found = files.read_json(file, kind)
+    with files.reading(file, kind):
         if found["schema"] != SCHEMA:
             raise ValueError(f"schema {found['schema']!r}, expected {SCHEMA!r}")
         names = {"staleness": tuple(map(str, found["stale_by"])), "all": CONDITIONS, "branch": CONDITIONS}
         parts: dict[Part, Losses] = {part: _losses(found["episodes"], part, names[part]) for part in names}  # type: ignore[misc]
         is_untrained = any(model["is_untrained"] for model in found["models"].values())
-    except OSError as error:
-        raise ResultsError(f"{file} cannot be read ({error.strerror}); give folders that pp-diagnose wrote") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ResultsError(f"{file} is no diagnosis of pp-diagnose: {error!r}") from error
     label = str(path.parent if path.name == DIAGNOSIS else path)
     return Diagnosis(label=label, parts=parts, is_untrained=is_untrained)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,12 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dual_system.analysis import paper
+from protocol import files
+from protocol.errors import CommandError
 
 Scene = tuple[int, str]  # seed and difficulty, which determine a task's scene
 RESULTS = "results.json"
 
 
-class ResultsError(Exception):
+class ResultsError(CommandError):
     """A results file that cannot be used; the message says what was expected, what was found, and the way out."""
 
 
@@ -58,19 +59,20 @@ def read_results(path: Path) -> Results:
     """Reads a results file, or that of a folder.
 
     Raises:
-        ResultsError: no such file, no episodes, a task that is not in the paper, a scene twice in one run, or runs
+        OSError, FileError: the file cannot be read, or is no results file.
+        ResultsError: no episodes, a task that is not in the paper, a scene twice in one run, or runs
             over different scenes, as in an unfinished evaluation.
     """
     file = path / RESULTS if path.is_dir() else path
-    try:
-        found = json.loads(file.read_text())
-        episodes, config = found["episodes"], found["config"]
+    kind = "results file of pp-eval or sim-client"
+    found = files.read_json(file, kind)
+    with files.reading(file, kind):
+        episodes, config = list(found["episodes"]), dict(found["config"])
         cells = Counter((e["task"], e.get("run", 0), (e["seed"], e["difficulty"])) for e in episodes)
-        successes = {(e["task"], e.get("run", 0), (e["seed"], e["difficulty"])): e["success"] for e in episodes}
-    except OSError as error:
-        raise ResultsError(f"{file} cannot be read ({error.strerror}); give folders that pp-eval wrote") from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise ResultsError(f"{file} is no results file of pp-eval or sim-client: {error!r}") from error
+        successes = {(e["task"], e.get("run", 0), (e["seed"], e["difficulty"])): bool(e["success"]) for e in episodes}
+        models = [(proc, dict(model)) for episode in episodes for proc, model in episode.get("models", {}).items()]
+        num_carriers = next((int(model["num_carriers"]) for proc, model in models if proc == "ponder"), None)
+        is_untrained = any(model["is_untrained"] for _, model in models)
     _require(bool(episodes), f"{file}: no episode is finished yet; let pp-eval go on")
     for (task, run, (seed, _)), count in cells.items():
         _require(task in paper.TASKS, f"{file}: {task!r} is none of the sixteen tasks of the paper's Table 7")
@@ -89,7 +91,6 @@ def read_results(path: Path) -> Results:
             f"{file}: {len(missing)} episodes are missing, the first is {task} seed {seed} of run {run}; start the "
             "same pp-eval again, it goes on where it was"
         )
-    models = [model for episode in episodes for model in episode.get("models", {}).items()]
     return Results(
         label=str(path.parent if path.name == RESULTS else path),
         config=config,
@@ -98,8 +99,8 @@ def read_results(path: Path) -> Results:
             for task, of_task in scenes.items()
         },
         scenes=scenes,
-        num_carriers=next((model["num_carriers"] for proc, model in models if proc == "ponder"), None),
-        is_untrained=any(model["is_untrained"] for _, model in models),
+        num_carriers=num_carriers,
+        is_untrained=is_untrained,
     )
 
 

@@ -21,7 +21,8 @@ from dual_system.analysis.diagnosis_tables import counterfactual_table, diagnosi
 from dual_system.analysis.markdown import markdown, percent
 from dual_system.analysis.results import Results, ResultsError, read_comparable
 from dual_system.analysis.statistics import bootstrap, paired, wilson
-from protocol.command_line import parse
+from protocol import files
+from protocol.command_line import command, parse
 
 TABLES = "tables.md"
 NOTE = f"""\
@@ -41,28 +42,25 @@ class TablesOptions:
     """Folder for tables.md, and for staleness.png of a diagnosis."""
 
 
+@command("pp-tables")
 def main(argv: list[str] | None = None) -> int:
     options = parse(TablesOptions, argv, prog="pp-tables")
     of_kind = {name: [p for p in options.results if _holds(p, name)] for name in (DIAGNOSIS, COUNTERFACTUAL)}
     evaluations = [p for p in options.results if not any(p in paths for paths in of_kind.values())]
     diagnoses, parts = [], []
-    try:
-        if evaluations:
-            parts.append(tables(read_comparable(evaluations)).rstrip("\n"))
-        if of_kind[DIAGNOSIS]:
-            diagnoses = [read_diagnosis(path) for path in of_kind[DIAGNOSIS]]
-            parts.append(diagnosis_tables(diagnoses))
-        if of_kind[COUNTERFACTUAL]:
-            parts.append(counterfactual_table([read_counterfactual(path) for path in of_kind[COUNTERFACTUAL]]))
-    except (ResultsError, ValueError) as error:
-        sys.stderr.write(f"pp-tables: {error}\n")
-        return 2
-    options.out.mkdir(parents=True, exist_ok=True)
-    if diagnoses:
-        from dual_system.analysis.staleness_plot import plot_staleness  # needs Pillow; tables alone do not
+    if evaluations:
+        parts.append(tables(read_comparable(evaluations)).rstrip("\n"))
+    if of_kind[DIAGNOSIS]:
+        diagnoses = [read_diagnosis(path) for path in of_kind[DIAGNOSIS]]
+        parts.append(diagnosis_tables(diagnoses))
+    if of_kind[COUNTERFACTUAL]:
+        parts.append(counterfactual_table([read_counterfactual(path) for path in of_kind[COUNTERFACTUAL]]))
+    with files.writing(files.folder(options.out)):
+        if diagnoses:
+            from dual_system.analysis.staleness_plot import plot_staleness  # needs Pillow; tables alone do not
 
-        plot_staleness(diagnoses, options.out / "staleness.png")
-    (options.out / TABLES).write_text("\n\n".join(parts) + "\n")
+            plot_staleness(diagnoses, options.out / "staleness.png")
+        (options.out / TABLES).write_text("\n\n".join(parts) + "\n", encoding="utf-8")
     sys.stdout.write(f"{options.out / TABLES}\n")
     return 0
 

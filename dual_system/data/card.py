@@ -14,16 +14,15 @@ import tyro
 from PIL import Image, ImageDraw
 
 from dual_system.data.dataset import Dataset, Entry
-from dual_system.data.errors import DatasetError
-from dual_system.data.lerobot_folder import reading
 from dual_system.data.lerobot_v3 import COLLECTION_PATH
 from dual_system.data.video import FPS
-from protocol.command_line import parse
-from protocol.files import read_object
+from protocol import files
+from protocol.command_line import command, parse
 
 CARD, SHEET = "README.md", "contact_sheet.jpg"
 PICTURES_PER_TASK, PICTURE_PX, LABEL_PX = 8, 128, 14
-DONE, REFUSED = 0, 2
+DONE = 0
+_KIND = "summary of pp-collect"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,13 +33,10 @@ class CardOptions:
     """Folder of a dataset of pp-collect or pp-export."""
 
 
+@command("pp-collect card")
 def main(argv: list[str] | None = None, prog: str = "pp-collect card") -> int:
     options = parse(CardOptions, argv, prog=prog)
-    try:
-        write_card(options.folder)
-    except (DatasetError, OSError) as error:
-        sys.stderr.write(f"{prog}: {error}\n")
-        return REFUSED
+    write_card(options.folder)
     sys.stdout.write(f"{options.folder / CARD}, {options.folder / SHEET}\n")
     return DONE
 
@@ -48,8 +44,9 @@ def main(argv: list[str] | None = None, prog: str = "pp-collect card") -> int:
 def write_card(folder: Path) -> None:
     """Writes both files. Raises DatasetError if there is no dataset of ours."""
     dataset = Dataset(folder)
-    contact_sheet(dataset).save(folder / SHEET, quality=90)
-    (folder / CARD).write_text(card(dataset))
+    with files.writing(folder):
+        contact_sheet(dataset).save(folder / SHEET, quality=90)
+        (folder / CARD).write_text(card(dataset), encoding="utf-8")
 
 
 def card(dataset: Dataset) -> str:
@@ -127,27 +124,31 @@ def _origin(dataset: Dataset) -> list[str]:
     lines = ["Origin: " + ", ".join(f"{count} episodes by {origin}" for origin, count in sorted(origins.items())) + "."]
     path = dataset.root / COLLECTION_PATH
     if path.exists():
-        with reading(path):
-            settings = read_object(path).get("settings", {})
-        if missing := {"look", "first_seed", "versions"} - settings.keys():
-            raise DatasetError(f"{path}: settings lack {', '.join(sorted(missing))}; pp-collect writes them")
-        look = settings["look"]
+        collection = files.read_json(path, _KIND)
+        with files.reading(path, _KIND):
+            lines += _settings(collection["settings"], dataset.episodes)
+    return lines
+
+
+def _settings(settings: dict[str, Any], entries: Sequence[Entry]) -> list[str]:
+    """Returns sentences on the settings of pp-collect."""
+    look = settings["look"]
+    lines = [
+        f"Pictures were rendered {look['demonstration_hz']} times a second in demonstrations, once more at "
+        f"their end, and {look['execution_hz']} times afterwards; other rows repeat the last one (`is_rendered` is "
+        f"false). Seeds begin at {settings['first_seed']}. Made with "
+        + ", ".join(f"{name} {version}" for name, version in settings["versions"].items())
+        + "."
+    ]
+    if (noise := settings.get("noise")) is not None:
+        lines.append(_noise(noise, entries))
+    if (shoves := settings.get("shoves")) is not None:
         lines.append(
-            f"Pictures were rendered {look['demonstration_hz']} times a second in demonstrations, once more at "
-            f"their end, and {look['execution_hz']} times afterwards; other rows repeat the last one (`is_rendered` is "
-            f"false). Seeds begin at {settings['first_seed']}. Made with "
-            + ", ".join(f"{name} {version}" for name, version in settings["versions"].items())
-            + "."
+            f"In {round(100 * shoves['share'])} % of the episodes objects may be pushed aside by "
+            f"{shoves['least_m'] * 100:g} to {shoves['most_m'] * 100:g} cm while the hand approaches."
         )
-        if (noise := settings.get("noise")) is not None:
-            lines.append(_noise(noise, dataset.episodes))
-        if (shoves := settings.get("shoves")) is not None:
-            lines.append(
-                f"In {round(100 * shoves['share'])} % of the episodes objects may be pushed aside by "
-                f"{shoves['least_m'] * 100:g} to {shoves['most_m'] * 100:g} cm while the hand approaches."
-            )
-        if settings.get("texts") == "follow":
-            lines.append("Coordinates in subgoals follow pushed objects.")
+    if settings.get("texts") == "follow":
+        lines.append("Coordinates in subgoals follow pushed objects.")
     return lines
 
 

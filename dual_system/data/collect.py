@@ -24,7 +24,6 @@ from dual_system.data.dart import DART, NoiseKind
 from dual_system.data.episode import Package, Rejection, unpack
 from dual_system.data.errors import DatasetError
 from dual_system.data.jobs import DIFFICULTY_CYCLE, RECOVERY_SHARE, Job, Look, jobs_of
-from dual_system.data.lerobot_folder import reading
 from dual_system.data.lerobot_v3 import COLLECTION_PATH, INFO_PATH, DatasetWriter
 from dual_system.data.rollout import UNSOLVED, work_out
 from dual_system.data.seeds import TRAIN_SEED
@@ -32,13 +31,14 @@ from dual_system.data.shove import SHOVES
 from dual_system.data.store import Store
 from dual_system.data.workers import LocalWorkers, RayWorkers, Workers
 from dual_system.tasks.difficulty import Difficulty
-from dual_system.tasks.task import TaskError, chosen_tasks
-from protocol.command_line import parse
-from protocol.files import read_object
+from dual_system.tasks.task import chosen_tasks
+from protocol import files
+from protocol.command_line import command, parse
 from protocol.version import DISTRIBUTION
 
 SCALES = {"1x": 1, "9x": 9}
 COLLECTING, JOINED = ".collecting", "joined"
+_SETTINGS_KIND = "settings file of pp-collect"
 DONE, INCOMPLETE, REFUSED, INTERRUPTED = 0, 1, 2, 130
 ROWS_PER_EPISODE, BYTES_PER_ROW = 500, 4200  # before anything is measured: both cameras at 256 px and 20 Hz, all tasks
 MEASURED_EPISODES = 5  # from this number on, the estimate is measured
@@ -183,13 +183,11 @@ class Report:
     num_rejected_noisy: int = 0  # of those rejected, how many failed under noise
 
 
+@command("pp-collect")
 def main(argv: list[str] | None = None) -> int:
     try:
         options = parse(CollectOptions, argv, prog="pp-collect")
         report = collect(options, _workers(options), say=print_line)
-    except (DatasetError, TaskError, OSError) as error:
-        sys.stderr.write(f"pp-collect: {error}\n")
-        return REFUSED
     except KeyboardInterrupt:
         sys.stderr.write("pp-collect: interrupted; finished episodes are kept, the same command goes on\n")
         return INTERRUPTED
@@ -220,6 +218,7 @@ def collect(
         if not options.machine.keep_episodes:
             shutil.rmtree(out / COLLECTING, ignore_errors=True)
         return found
+    files.folder(out)
     with Store(out / COLLECTING) as store:
         _claim(out / COLLECTING / "settings.json", options.settings())
         sizes = {job.key: store.num_bytes(job.key) for job in _present(store, jobs)}
@@ -234,7 +233,8 @@ def collect(
                 bar.set_postfix_str(f"{sum(sizes.values()) / 1e6:.0f} MB", refresh=False)
                 bar.update()
                 _require_disk(options, jobs, sizes)
-        report = _join(out, store, jobs, wanted)
+        with files.writing(out):
+            report = _join(out, store, jobs, wanted)
     if not options.machine.keep_episodes:
         shutil.rmtree(out / COLLECTING)
     return report
@@ -284,19 +284,22 @@ def _present(store: Store, jobs: Sequence[Job]) -> list[Job]:
 def _claim(path: Path, settings: dict[str, Any]) -> None:
     """Records the settings that a folder was begun with. Raises DatasetError if they differ now."""
     if path.exists():
-        with reading(path):
-            _require_equal(read_object(path), settings, path.parent.parent)
+        _require_equal(files.read_json(path, _SETTINGS_KIND), settings, path)
         return
     partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(settings, indent=1) + "\n")
-    partial.rename(path)
+    with files.writing(path):
+        partial.write_text(json.dumps(settings, indent=1) + "\n")
+        partial.rename(path)
 
 
-def _require_equal(there: dict[str, Any], wanted: dict[str, Any], out: Path) -> None:
-    differing = [name for name in {**wanted, **there} if there.get(name) != wanted.get(name)]
+def _require_equal(there: Any, wanted: dict[str, Any], path: Path) -> None:
+    with files.reading(path, _SETTINGS_KIND):
+        differing = [name for name in {**wanted, **there} if there.get(name) != wanted.get(name)]
     if differing:
         changes = "; ".join(f"{name} was {there.get(name)} and is {wanted.get(name)}" for name in differing)
-        raise DatasetError(f"{out} was begun with other settings: {changes}. Use the same, or another --out")
+        raise DatasetError(
+            f"{path.parent.parent} was begun with other settings: {changes}. Use the same, or another --out"
+        )
 
 
 def _finished(out: Path, wanted: dict[str, Any]) -> Report | None:
@@ -308,18 +311,17 @@ def _finished(out: Path, wanted: dict[str, Any]) -> Report | None:
         return None
     if not (out / COLLECTION_PATH).exists():
         raise DatasetError(f"{out} holds a dataset that pp-collect did not make; use another --out")
-    with reading(out / COLLECTION_PATH):
-        there = read_object(out / COLLECTION_PATH)
-    if missing := {"settings", "tasks", "episodes", "unsolved", "num_rejected"} - there.keys():
-        raise DatasetError(f"{out / COLLECTION_PATH} lacks {', '.join(sorted(missing))}; use another --out")
-    _require_equal(there["settings"], wanted["settings"], out)
-    if there["episodes"] == wanted["episodes"] and tuple(there["tasks"]) == wanted["tasks"]:
-        return Report(
-            num_episodes=there["episodes"] - len(there["unsolved"]),
-            num_rejected=there["num_rejected"],
-            unsolved=tuple(there["unsolved"]),
-            num_rejected_noisy=there.get("num_rejected_noisy", 0),
-        )
+    path = out / COLLECTION_PATH
+    there = files.read_json(path, _SETTINGS_KIND)
+    with files.reading(path, _SETTINGS_KIND):
+        _require_equal(there["settings"], wanted["settings"], path)
+        if there["episodes"] == wanted["episodes"] and tuple(there["tasks"]) == wanted["tasks"]:
+            return Report(
+                num_episodes=there["episodes"] - len(there["unsolved"]),
+                num_rejected=there["num_rejected"],
+                unsolved=tuple(there["unsolved"]),
+                num_rejected_noisy=there.get("num_rejected_noisy", 0),
+            )
     if not (out / COLLECTING).exists():
         raise DatasetError(
             f"{out} is a finished dataset of {there['episodes']} episodes, and its single episodes were not kept "

@@ -35,9 +35,8 @@ from dual_system.tasks.engine import Status
 from dual_system.tasks.environment import Environment, Snapshot
 from dual_system.tasks.kinematics import UnreachableError
 from dual_system.tasks.oracle import Motions
-from dual_system.tasks.task import TaskError
-from protocol.command_line import parse
-from protocol.errors import ProtocolError
+from protocol import files
+from protocol.command_line import command, parse
 from protocol.mcap_log import EpisodeRecord, read_log
 
 DONE, REFUSED = 0, 2
@@ -93,13 +92,10 @@ class Outcome:
     """The reason if there is no package."""
 
 
+@command("pp-collect correct")
 def main(argv: list[str] | None = None, prog: str = "pp-collect correct") -> int:
-    try:
-        options = parse(CorrectOptions, argv, prog=prog)
-        reasons = correct(options, LocalWorkers(options.workers, work_out))
-    except (DatasetError, ProtocolError, TaskError, OSError, ValueError) as error:
-        sys.stderr.write(f"{prog}: {error}\n")
-        return REFUSED
+    options = parse(CorrectOptions, argv, prog=prog)
+    reasons = correct(options, LocalWorkers(options.workers, work_out))
     num_jobs = len(options.files) * options.per_episode
     sys.stdout.write(f"{num_jobs - len(reasons)} episodes of {len(options.files)} logs in {options.out}\n")
     for reason in sorted(set(reasons)):
@@ -119,20 +115,21 @@ def correct(options: CorrectOptions, workers: Workers[Job, Outcome]) -> list[str
         raise DatasetError(f"{options.out} holds a dataset already; use another --out")
     jobs = [Job(path=path, part=part, options=options) for path in options.files for part in range(options.per_episode)]
     bar = tqdm(total=len(jobs), unit="episode", disable=not options.progress)
-    writer = DatasetWriter(options.out)
+    writer = DatasetWriter(files.folder(options.out))
     reasons = []
     num_written = 0
-    for outcome in _in_order(jobs, workers):
-        bar.update()
-        if outcome.package is None:
-            reasons.append(outcome.reason)
-        else:
-            writer.add(unpack(outcome.package))
-            num_written += 1
-    bar.close()
-    if not num_written:
-        raise DatasetError(f"no episode was left to write: {'; '.join(sorted(set(reasons)))}")
-    writer.finish()
+    with files.writing(options.out):
+        for outcome in _in_order(jobs, workers):
+            bar.update()
+            if outcome.package is None:
+                reasons.append(outcome.reason)
+            else:
+                writer.add(unpack(outcome.package))
+                num_written += 1
+        bar.close()
+        if not num_written:
+            raise DatasetError(f"no episode was left to write: {'; '.join(sorted(set(reasons)))}")
+        writer.finish()
     return reasons
 
 

@@ -23,11 +23,9 @@ from dual_system.data.lerobot_v3 import INFO_PATH, DatasetWriter
 from dual_system.data.rollout import Narrator
 from dual_system.data.video import FPS, Frame
 from dual_system.tasks.environment import Environment, Snapshot, make_environment
-from dual_system.tasks.task import TaskError
-from protocol import images
+from protocol import files, images
 from protocol import messages as m
-from protocol.command_line import parse
-from protocol.errors import ProtocolError
+from protocol.command_line import command, parse
 from protocol.mcap_log import EpisodeRecord, Picture, read_log, read_pictures
 
 DONE, REFUSED = 0, 2
@@ -53,13 +51,10 @@ class ExportOptions:
     """Do not show a progress bar."""
 
 
+@command("pp-export")
 def main(argv: list[str] | None = None) -> int:
     options = parse(ExportOptions, argv, prog="pp-export")
-    try:
-        num_episodes = export(options)
-    except (DatasetError, ProtocolError, TaskError, OSError) as error:
-        sys.stderr.write(f"pp-export: {error}\n")
-        return REFUSED
+    num_episodes = export(options)
     sys.stdout.write(f"{num_episodes} of {len(options.files)} episodes in {options.out}\n")
     return DONE
 
@@ -74,18 +69,20 @@ def export(options: ExportOptions) -> int:
     """
     if (options.out / INFO_PATH).exists():
         raise DatasetError(f"{options.out} holds a dataset already; use another --out")
-    writer = DatasetWriter(options.out)
+    writer = DatasetWriter(files.folder(options.out))
     num_episodes = 0
     for path in tqdm(options.files, unit="episode", disable=not options.progress):
         record = read_log(path)
         if options.only_success and not (record.result and record.result.is_success):
             continue
         episode = read_episode(path, record, texts=options.texts, demonstration_hz=options.demonstration_hz)
-        writer.add(episode)
+        with files.writing(options.out):
+            writer.add(episode)
         num_episodes += 1
     if not num_episodes:
         raise DatasetError("none of the logs is of an episode that succeeded; leave out --only-success")
-    writer.finish()
+    with files.writing(options.out):
+        writer.finish()
     return num_episodes
 
 
@@ -232,7 +229,8 @@ def _pictures(path: Path, observations: Sequence[m.Observation]) -> Iterator[dic
         found: dict[str, Frame] = {}
         for picture in logged:
             if picture.source_ns == observation.source_ns and picture.camera in CAMERAS:
-                found[picture.camera] = _pixels(picture, observation)
+                with files.reading(path, f"log with a picture of tick {observation.tick}"):
+                    found[picture.camera] = _pixels(picture, observation)
             if len(found) == len(CAMERAS):
                 break
         else:

@@ -23,7 +23,7 @@ from dual_system.models.golden import Golden, GoldenError, read_golden
 from dual_system.models.groot import flow as groot_flow
 from dual_system.models.groot.pounce import GrootInputs, GrootPounce
 from dual_system.models.pi05.pounce import Pounce, PounceInputs
-from protocol.command_line import parse
+from protocol.command_line import command, parse
 
 AGREES, DISAGREES, UNREADABLE = 0, 1, 2
 TOLERANCE = 1e-4
@@ -170,6 +170,7 @@ def report(golden: Golden, tolerance: float) -> dict[str, object]:
     }
 
 
+@command("pp-parity")
 def main(argv: list[str] | None = None) -> int:
     config = parse(ParityConfig, argv, prog="pp-parity")
     if not config.folders:

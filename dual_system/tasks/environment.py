@@ -105,7 +105,9 @@ class Environment:
         spec = table_scene(task.robot)
         task.furnish(spec)
         self.physics = Physics(spec)
-        self._cameras = Cameras(self.physics, image_px) if render else None
+        self._image_px = image_px if render else None
+        self._cameras: Cameras | None = None
+        self._open_cameras()
         self._max_steps = max_steps
         self._layout: Any = None
         self._memory: Any = None
@@ -267,8 +269,12 @@ class Environment:
         self._reorder()
         return self._snapshot(look=look)
 
+    def _open_cameras(self) -> None:
+        if self._image_px is not None and self._cameras is None:
+            self._cameras = Cameras(self.physics, self._image_px)
+
     def close(self) -> None:
-        """Frees the renderer. May be called twice."""
+        """Frees the renderer. May be called twice; ``reset`` and ``restore`` open it again."""
         if self._cameras is not None:
             self._cameras.close()
             self._cameras = None
@@ -282,6 +288,7 @@ class Environment:
         self.close()
 
     def _begin(self, difficulty: str, layout: Any) -> None:
+        self._open_cameras()
         self.difficulty, self._layout = difficulty, layout
         self._subtasks = self.task.subtasks(layout)
         self._step, self._memory, self._caption, self._progress = 0, None, None, Progress()

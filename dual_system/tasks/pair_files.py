@@ -33,10 +33,12 @@ from tqdm import tqdm
 from dual_system.tasks.environment import IMAGE_PX, make_environment
 from dual_system.tasks.pairs import Pair, Telling, find_pair
 from dual_system.tasks.task import make_task, task_names
-from protocol.command_line import parse
+from protocol import files
+from protocol.command_line import command, parse
 
 INDEX = "pairs.json"
 SCHEMA = "ponderpounce-pairs/1"
+_KIND = "index of pp-collect pairs"
 
 _BRANCHES = ("own", "twin")
 _ARRAYS = {"frames", "state"}
@@ -82,7 +84,8 @@ def write_pair(pair: Pair, folder: Path) -> dict[str, Any]:
         arrays[f"{branch}/state"], arrays[f"{branch}/step"] = telling.states, telling.steps
         arrays[f"{branch}/is_demonstration"], arrays[f"{branch}/oracle"] = telling.is_demonstration, telling.oracle
         entry[branch] = {"subgoal": telling.subgoal, "reasoning": telling.reasoning}
-    np.savez_compressed(folder / file, **arrays)  # type: ignore[arg-type]  # numpy's stubs take allow_pickle for one
+    with files.writing(folder / file):
+        np.savez_compressed(folder / file, **arrays)  # type: ignore[arg-type]  # its stubs take allow_pickle for one
     return entry
 
 
@@ -92,14 +95,15 @@ def write_index(
     """Replaces the index in one go."""
     partial = folder / f"{INDEX}.partial"
     index = {"schema": SCHEMA, "demo_hz": demo_hz, "demo_to_its_end": demo_to_its_end, "pairs": entries}
-    partial.write_text(json.dumps(index, indent=1) + "\n")
-    partial.replace(folder / INDEX)
+    with files.writing(folder / INDEX):
+        partial.write_text(json.dumps(index, indent=1) + "\n")
+        partial.replace(folder / INDEX)
 
 
 def read_pairs(folder: Path) -> Iterator[Pair]:
     """Yields the pairs of a folder in the index's order, reading lazily.
 
-    Raises FileNotFoundError without an index, and ValueError for another schema.
+    Raises OSError without an index, and FileError for one or a pair that is not what it should be.
     """
     return (_read_pair(entry, folder) for entry in _index(folder)["pairs"])
 
@@ -111,18 +115,24 @@ def demo_sampling_of(folder: Path) -> tuple[int, bool]:
 
 
 def _index(folder: Path) -> dict[str, Any]:
-    index: dict[str, Any] = json.loads((folder / INDEX).read_text())
-    if index.get("schema") != SCHEMA:
-        raise ValueError(f"{folder / INDEX} has schema {index.get('schema')!r}; expected {SCHEMA!r}")
-    return index
+    index = files.read_json(folder / INDEX, _KIND)
+    with files.reading(folder / INDEX, _KIND):
+        if index["schema"] != SCHEMA:
+            raise ValueError(f"schema {index['schema']!r}, expected {SCHEMA!r}")
+        return {"demo_hz": int(index["demo_hz"]), "demo_to_its_end": bool(index["demo_to_its_end"])} | {
+            "pairs": [dict(entry) for entry in index["pairs"]]
+        }
 
 
 def _read_pair(entry: dict[str, Any], folder: Path) -> Pair:
-    with np.load(folder / entry["file"]) as file:
-        arrays = {name: file[name] for name in file.files}
-    branches: dict[str, Any] = {branch: _telling(branch, entry[branch], arrays) for branch in _BRANCHES}
-    plain = {name: value for name, value in entry.items() if name not in {"file", *_BRANCHES}}
-    return Pair(**plain, frames=_pictures("now", arrays), state=arrays["now/state"], **branches)
+    with files.reading(folder / INDEX, _KIND):
+        path = folder / entry["file"]
+        texts = {branch: entry[branch] for branch in _BRANCHES}
+    arrays = files.read_npz(path, "pair of pp-collect pairs")
+    with files.reading(path, f"pair as {INDEX} describes it"):
+        branches: dict[str, Any] = {branch: _telling(branch, texts[branch], arrays) for branch in _BRANCHES}
+        plain = {name: value for name, value in entry.items() if name not in {"file", *_BRANCHES}}
+        return Pair(**plain, frames=_pictures("now", arrays), state=arrays["now/state"], **branches)
 
 
 def _telling(branch: str, texts: dict[str, str], arrays: dict[str, NDArray[Any]]) -> Telling:
@@ -157,6 +167,7 @@ def _pairs_of(task: str, options: PairsOptions) -> Generator[Pair]:
                 return
 
 
+@command("pp-collect pairs")
 def main(argv: list[str] | None = None, prog: str = "pp-collect pairs") -> int:
     options = parse(PairsOptions, argv, prog=prog)
     if (options.out / INDEX).exists():
@@ -172,7 +183,7 @@ def main(argv: list[str] | None = None, prog: str = "pp-collect pairs") -> int:
     if not tasks:
         sys.stderr.write(f"{prog}: no task of the {options.family} family can be forked; see docs/tasks.md\n")
         return 2
-    options.out.mkdir(parents=True, exist_ok=True)
+    files.folder(options.out)
     entries: list[dict[str, Any]] = []
     sources = {task: _pairs_of(task, options) for task in tasks}
     with tqdm(total=options.pairs, unit="pair", disable=None) as bar:

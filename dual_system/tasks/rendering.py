@@ -2,18 +2,33 @@
 
 from __future__ import annotations
 
+import os
+import sys
+import traceback
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from dual_system.tasks import headless
 from dual_system.tasks.physics import Physics
 from dual_system.tasks.scene import CAMERAS
+from protocol.errors import CommandError
 
 _UNSEEN_GROUPS = (0, 3, 4, 5)  # 0 holds the arm's collision shapes
 
 
+_SETTINGS = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "MUJOCO_EGL_DEVICE_ID")
+
+
+class RenderingError(CommandError):
+    """This computer has no GL context as the environment's variables want it."""
+
+
 class Cameras:
     """Renders one physics at one size. Needs a GL context (MUJOCO_GL=egl without a display); close it after use.
+
+    Raises RenderingError if there is none.
 
     Reflections, shadows and the sky are off: together with antialiasing (off in the scene) they are most of the
     cost of a software-rendered frame.
@@ -21,7 +36,7 @@ class Cameras:
 
     def __init__(self, physics: Physics, image_px: int) -> None:
         self._physics = physics
-        self._renderer = mujoco.Renderer(physics.model, height=image_px, width=image_px, max_geom=1000)
+        self._renderer = _renderer(physics.model, image_px)
         self._options = mujoco.MjvOption()
         for group in _UNSEEN_GROUPS:
             self._options.geomgroup[group] = 0
@@ -51,3 +66,18 @@ class Cameras:
     def _render(self, camera: str) -> NDArray[np.uint8]:
         self._renderer.update_scene(self._physics.data, camera=camera, scene_option=self._options)
         return self._renderer.render().copy()
+
+
+def _renderer(model: mujoco.MjModel, image_px: int) -> mujoco.Renderer:
+    try:
+        return mujoco.Renderer(model, height=image_px, width=image_px, max_geom=1000)
+    except Exception as error:  # every backend fails in its own way
+        why, frames = headless.GL_PROBLEM or f"{error}", error.__traceback__
+    hook, sys.unraisablehook = sys.unraisablehook, lambda unraisable: None
+    traceback.clear_frames(frames)  # a half-made GL context complains once more when it is freed
+    sys.unraisablehook = hook
+    found = " ".join(f"{name}={os.environ[name]}" for name in _SETTINGS if name in os.environ)
+    raise RenderingError(
+        f"no pictures with {found}: {why}. Unset these variables, or try MUJOCO_GL=egl or osmesa; pp-doctor says what "
+        "this computer has"
+    )

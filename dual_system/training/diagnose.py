@@ -28,7 +28,6 @@ from tqdm import tqdm
 
 from clock.sampling import EVALUATION
 from dual_system.analysis.diagnosis import DIAGNOSIS, SCHEMA
-from dual_system.data.errors import DatasetError
 from dual_system.models.device import require_device
 from dual_system.models.pi05.pounce import Pounce
 from dual_system.models.ponder.checkpoint import load_ponder, weights_hash
@@ -39,7 +38,8 @@ from dual_system.training.collate import collate_ponder, collate_pounce
 from dual_system.training.data import PictureSizes, TrainingSet
 from dual_system.training.example import Example, ExampleConfig, make_example
 from dual_system.training.joint import NO_QUERY, PounceBatch, encode_rows, gather_cognition
-from protocol.command_line import flat, parse
+from protocol import files
+from protocol.command_line import command, flat, parse
 
 STALE_BY = (0, 1, 2, 4)
 """k of C_{t-k}, in queries; at 1 Hz also in seconds."""
@@ -81,15 +81,13 @@ class Given:
     is_null_I: Tensor
 
 
+@command("pp-diagnose")
 def main(argv: list[str] | None = None) -> int:
     options = parse(DiagnoseOptions, argv, prog="pp-diagnose")
-    try:
-        found = diagnose(options)
-    except (DatasetError, OSError, ValueError) as error:
-        sys.stderr.write(f"pp-diagnose: {error}\n")
-        return 2
-    options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / DIAGNOSIS).write_text(json.dumps(found, indent=1) + "\n")
+    files.folder(options.out)
+    found = diagnose(options)
+    with files.writing(options.out / DIAGNOSIS):
+        (options.out / DIAGNOSIS).write_text(json.dumps(found, indent=1) + "\n")
     sys.stdout.write(f"{options.out / DIAGNOSIS}; tables: pp-tables {options.out} --out {options.out}\n")
     return 0
 

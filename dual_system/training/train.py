@@ -25,7 +25,6 @@ import tyro
 from tqdm import tqdm
 
 from dual_system.data.episode import CAMERAS
-from dual_system.data.errors import DatasetError
 from dual_system.models.bfloat16 import warn_of_slow
 from dual_system.models.device import require_device
 from dual_system.models.gpu import settle
@@ -47,9 +46,10 @@ from dual_system.training.parallel import World, gather, joined, require_alike, 
 from dual_system.training.prefetch import Prefetcher
 from dual_system.training.recipe import Recipe
 from dual_system.training.recipes import recipe
-from dual_system.training.trainer import CheckpointError, SaveError, Trainer
+from dual_system.training.trainer import CheckpointError, Trainer
 from dual_system.training.watch import Watch
-from protocol.command_line import parse
+from protocol import files
+from protocol.command_line import command, parse
 
 DONE, REFUSED, INTERRUPTED = 0, 2, 130
 _SYSTEMS = ("ponder", "pounce")
@@ -171,13 +171,14 @@ class Batches:
         return sorted(numbers, key=lambda number: -self._data.num_rows(number))
 
 
+@command("pp-train")
 def main(argv: list[str] | None = None) -> int:
     options = parse(TrainOptions, argv, prog="pp-train")
     if warning := warn_of_slow(options.machine.dtype, options.machine.device):
         sys.stderr.write(f"pp-train: {warning}\n")
     try:
         train(options)
-    except (DatasetError, CheckpointError, SaveError, OSError, ValueError, FloatingPointError) as error:
+    except FloatingPointError as error:
         sys.stderr.write(f"pp-train: {error}\n")
         return REFUSED
     except torch.OutOfMemoryError as error:
@@ -220,8 +221,9 @@ def train(options: TrainOptions) -> None:
             store=machine.picture_store,
             demo_hz=run.demo_hz,
         )
-        _update(run, model, Batches(data, run, model, bundle, world), data.hash, options, world)
-        _write(run, model, bundle, data, options, world)
+        with files.writing(options.out):
+            _update(run, model, Batches(data, run, model, bundle, world), data.hash, options, world)
+            _write(run, model, bundle, data, options, world)
 
 
 def _update(
@@ -237,7 +239,7 @@ def _update(
         # The number of steps is left out: a run may go on for longer.
         made_with = {name: value for name, value in asdict(run).items() if name != "num_steps"}
         trainer = Trainer(model, prefetcher or batches, run.train, data_hash=data_hash, recipe=made_with, world=world)
-        options.out.mkdir(parents=True, exist_ok=True)
+        files.folder(options.out)
         trainer.resume(checkpoint)
         shows = log.progress and world.is_first
         bar = stack.enter_context(tqdm(total=run.num_steps, initial=trainer.step, unit="step", disable=not shows))

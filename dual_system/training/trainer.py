@@ -24,8 +24,8 @@ from dual_system.training.joint import Draws, JointModel, PonderBatch, PounceBat
 from dual_system.training.optim import OptimConfig, Optimiser
 from dual_system.training.parallel import World, average_gradients, local
 from dual_system.training.shards import RowReader, write_rows
-from protocol import disk
-from protocol.files import read_object
+from protocol import disk, files
+from protocol.errors import CommandError
 
 Batches = Callable[[int], tuple[PonderBatch, PounceBatch]]
 """This process's share of the batch of a step (``World.share``); a pure function of the step's number."""
@@ -38,7 +38,7 @@ class CheckpointError(ValueError):
     """A run cannot continue from this checkpoint."""
 
 
-class SaveError(RuntimeError):
+class SaveError(CommandError):
     """A checkpoint could not be written; the previous one is intact."""
 
 
@@ -211,8 +211,10 @@ class Trainer:
         self._world.wait()
         if not folder.exists():
             return False
-        facts = read_object(folder / _FACTS)
-        if differs := list(_differences(facts.get("made_with", {}), self._made_with)):
+        facts = files.read_json(folder / _FACTS, "file of a checkpoint's facts")
+        with files.reading(folder / _FACTS, "file of a checkpoint's facts"):
+            step, made_with = int(facts["step"]), dict(facts.get("made_with", {}))
+        if differs := list(_differences(made_with, self._made_with)):
             raise CheckpointError(
                 f"{folder}: made with {'; '.join(differs[:5])}. Use another folder, or the same data and recipe."
             )
@@ -227,7 +229,7 @@ class Trainer:
                 local(tensor).copy_(stored.read(name, tensor))
         with RowReader(folder, _OPTIMISER, self._world) as stored:
             self._optimiser.load(stored)
-        self.step = facts["step"]
+        self.step = step
         return True
 
 

@@ -16,8 +16,10 @@ from torch import Tensor
 from dual_system.models.ponder.context import IGNORE, Row
 from dual_system.models.ponder.vocabulary import Vocabulary
 from dual_system.training.trainer import StepReport, Trainer
+from protocol import files
 
 LOG_FILE, SAMPLES_FILE, BOARD_FOLDER = "log.jsonl", "samples.jsonl", "tensorboard"
+_KIND = "log of pp-train"
 _TAGS = {
     "loss/total": "total",
     "loss/flow_matching": "flow_matching",
@@ -105,9 +107,12 @@ def samples_of(row: Row, predicted_N: Tensor, vocabulary: Vocabulary) -> list[Sa
 def _cut(path: Path, step: int) -> TextIO:
     """Opens the file for appending, with only the lines of earlier steps kept."""
     if path.exists():
-        lines: Sequence[str] = path.read_text().splitlines(keepends=True)
-        path.write_text("".join(line for line in lines if line.endswith("\n") and json.loads(line)["step"] < step))
-    return path.open("a")
+        lines: Sequence[str] = files.read_text(path, _KIND).splitlines(keepends=True)
+        with files.reading(path, _KIND):
+            kept = "".join(line for line in lines if line.endswith("\n") and json.loads(line)["step"] < step)
+        with files.writing(path):
+            path.write_text(kept, encoding="utf-8")
+    return path.open("a", encoding="utf-8")
 
 
 def _board(folder: Path, first_step: int) -> Any:

@@ -15,8 +15,8 @@ import dual_system.tasks.headless  # noqa: F401 - before anything that imports m
 
 from clock.service import ClockService, ServiceConfig
 from clock.status import end_of
-from protocol.command_line import parse
-from protocol.errors import TransportError
+from protocol import files
+from protocol.command_line import command, parse
 from protocol.link import Link
 from protocol.logs import set_up_logging
 from protocol.messages import Health, ServingState
@@ -27,6 +27,7 @@ from protocol.version import version
 from protocol.zenoh_bus import open_bus
 from sim_client.gateway.http_form import HttpSide
 from sim_client.gateway.machine import Machine
+from sim_client.gateway.memory import Memory
 from sim_client.gateway.options import GatewayOptions
 from sim_client.gateway.websocket import WebsocketSide
 from sim_client.launch import Daemons, local_link
@@ -34,25 +35,25 @@ from sim_client.launch import Daemons, local_link
 log = logging.getLogger("pp-gateway")
 
 
+@command("pp-gateway")
 def main(argv: list[str] | None = None) -> int:
     options = parse(GatewayOptions, argv, prog="pp-gateway")
     should_stop, metrics = StopFlag(), Metrics()
-    try:
-        set_up_logging(options=options.operations)
-        options.check()
-        with (
-            status_of(metrics, options.operations),
-            Daemons(options.out) as daemons,
-            _machine(options, daemons, metrics) as machine,
-        ):
-            if options.local:
-                machine.await_servers(should_stop)  # a client that finds the door open expects to be served
-            with _serving(options, machine):
-                log.info("ready dialect=%s listen=%s mode=%s", options.dialect, options.listen, options.mode)
-                machine.run(should_stop)
-    except TransportError as error:
-        print(f"pp-gateway: {error}", file=sys.stderr)
-        return 2
+    set_up_logging(options=options.operations)
+    options.check()
+    options.api_key()  # a bad file before servers are started
+    if options.local or options.log.record:
+        files.folder(options.out)
+    with (
+        status_of(metrics, options.operations),
+        Daemons(options.out) as daemons,
+        _machine(options, daemons, metrics) as machine,
+    ):
+        if options.local:
+            machine.await_servers(should_stop)  # a client that finds the door open expects to be served
+        with _serving(options, machine):
+            log.info("ready dialect=%s listen=%s mode=%s", options.dialect, options.listen, options.mode)
+            machine.run(should_stop)
     return 0
 
 
@@ -89,13 +90,14 @@ def _serving(options: GatewayOptions, machine: Machine) -> Iterator[None]:
     """Listens in its own thread for as long as the block lasts. Raises TransportError if it cannot."""
     host, port = options.address
     max_bytes, terms, dialect = options.clients.max_message_mb << 20, options.terms(), options.dialect_class()
+    memory = Memory(options.clients.max_memory_mb << 20)
     if options.dialect == "challenge-http":
-        http = HttpSide((host, port), machine, terms, dialect, max_bytes, options.api_key())
+        http = HttpSide((host, port), machine, terms, dialect, max_bytes, options.api_key(), memory)
         with _in_thread(http.serve_forever, http.shutdown):
             yield
         http.server_close()
         return
-    side = WebsocketSide(machine, terms, dialect, max_bytes, options.api_key())
+    side = WebsocketSide(machine, terms, dialect, max_bytes, options.api_key(), memory)
     loop = asyncio.new_event_loop()
     server = loop.run_until_complete(side.start(host, port))
 

@@ -47,8 +47,24 @@ def unpack(data: bytes) -> Any:
     Raises:
         Refused: not msgpack, an array whose shape, type and bytes disagree, or a structure beyond any real message's.
     """
+    left = _MAX_ITEMS
+
+    def counted(item: Any) -> Any:
+        nonlocal left
+        left -= 1 + len(item)
+        if left < 0:  # each limit below is of one list: nested ones would multiply
+            raise Refused(f"{len(data)} bytes that hold more than {_MAX_ITEMS} values: send arrays, not lists")
+        return item
+
     try:
-        return msgpack.unpackb(data, object_hook=_unspell, max_map_len=10_000, max_array_len=_MAX_ITEMS, max_ext_len=0)
+        return msgpack.unpackb(
+            data,
+            object_hook=lambda item: _unspell(counted(item)),
+            list_hook=counted,
+            max_map_len=10_000,
+            max_array_len=_MAX_ITEMS,
+            max_ext_len=0,
+        )
     except (ValueError, TypeError, OverflowError, msgpack.UnpackException) as error:
         raise Refused(f"{len(data)} bytes that are not a msgpack message: {error or type(error).__name__}") from None
 

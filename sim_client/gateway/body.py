@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 
 from dual_system.tasks.panda import PANDA_WRISTCAM
-from protocol import checks
-from protocol.errors import MalformedMessage, TransportError
+from protocol import checks, files
 from protocol.messages import Floats, Robot
 from sim_client.robot import simulated_robot
 
 _OPTIONAL = {"initial_command"}
 _LIMITS = ("command_low", "command_high", "max_step", "max_lead", "state_low", "state_high")
 _MEASURED = {"image_height", "image_width"}
+_KIND = "robot for --robot-file"
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,22 +44,21 @@ def read_body(path: Path) -> Body:
     Without ``initial_command`` the robot holds, until its first command, the first numbers of its state.
 
     Raises:
-        TransportError: the file cannot be read, or does not describe a robot.
+        OSError, FileError: the file cannot be read, or does not describe a robot.
     """
-    try:
-        given = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise TransportError(f"--robot-file {path}: {error}") from None
+    text = files.read_text(path, _KIND)
+    with files.reading(path, _KIND):
+        return _body(tomllib.loads(text))
+
+
+def _body(given: dict[str, Any]) -> Body:
     expected = {each.name for each in fields(Robot)} - _MEASURED
     if given.keys() - expected or expected - _OPTIONAL - given.keys():
-        raise TransportError(
-            f"--robot-file {path}: expected {', '.join(sorted(expected))}; came {', '.join(sorted(given))}"
-        )
-    try:
-        num_proprio = int(given["num_proprio"])
-        checks.check_robot(_robot(given, np.zeros(num_proprio, np.float32), (1, 1)))
-    except (MalformedMessage, TypeError, ValueError) as error:
-        raise TransportError(f"--robot-file {path}: {error}") from None
+        raise ValueError(f"expected {', '.join(sorted(expected))}; came {', '.join(sorted(given))}")
+    num_proprio = int(given["num_proprio"])
+    if not 0 < num_proprio <= checks.MAX_DIM:
+        raise ValueError(f"num_proprio {num_proprio}: expected 1 to {checks.MAX_DIM}")
+    checks.check_robot(_robot(given, np.zeros(num_proprio, np.float32), (1, 1)))
     return Body(num_proprio, lambda state, image_px: _robot(given, state, image_px))
 
 

@@ -16,6 +16,7 @@ from sim_client.gateway.arrays import pack
 from sim_client.gateway.challenge import RESET_FINISHED
 from sim_client.gateway.exchange import Busy, Dialect, Finish, Packet, Refused, Terms
 from sim_client.gateway.machine import Machine
+from sim_client.gateway.memory import Memory
 from sim_client.gateway.openpi import metadata
 from sim_client.gateway.websocket import KEY_WANTED, is_allowed
 
@@ -42,9 +43,10 @@ class HttpSide(ThreadingHTTPServer):
         new_dialect: Callable[[Terms], Dialect],
         max_bytes: int,
         api_key: str = "",
+        memory: Memory | None = None,
     ) -> None:
         self.machine, self.terms, self.new_dialect = machine, terms, new_dialect
-        self.max_bytes, self.api_key = max_bytes, api_key
+        self.max_bytes, self.api_key, self.memory = max_bytes, api_key, memory or Memory()
         try:
             super().__init__(address, _Handler)
         except OSError as error:
@@ -79,6 +81,8 @@ class _Handler(BaseHTTPRequestHandler):
             except Refused as error:
                 log.warning("client=%s refused: %s", self._client, error)
                 self._say(HTTPStatus.BAD_REQUEST, f"{error}\n")
+            finally:
+                self.server.memory.give(self)
 
     def _done(self, body: bytes) -> Packet:
         """Raises Refused."""
@@ -102,7 +106,16 @@ class _Handler(BaseHTTPRequestHandler):
                 HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"expected at most {limit}, came {length}: see --max-message-mb\n"
             )
             return None
-        return self.rfile.read(int(length))
+        memory = self.server.memory
+        if memory.take(self, int(length)) is not None:  # a request has no holder to close: the one that comes loses
+            memory.give(self)
+            self._leave_body(HTTPStatus.SERVICE_UNAVAILABLE, f"{memory.sentence}\n")
+            return None
+        try:
+            return self.rfile.read(int(length))
+        except BaseException:
+            memory.give(self)
+            raise
 
     def _leave_body(self, status: HTTPStatus, text: str) -> None:
         """Refuses without reading on: what follows on this connection could be anything, so it is closed."""

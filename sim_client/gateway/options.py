@@ -12,6 +12,7 @@ import tyro
 
 from clock import schedules
 from clock.timebase import NS_PER_MS
+from protocol import files
 from protocol.errors import TransportError
 from protocol.messages import Delay, DelayKind, Schedule, WaitKind
 from protocol.options import LinkOptions, OperationsOptions
@@ -66,6 +67,8 @@ class ClientsOptions:
     """Time in seconds without a request after which a client loses the robot to the next one that asks."""
     max_message_mb: int = 1024
     """Size in MB above which messages are refused. Two raw 256 px views of a 48 s video are 380 MB."""
+    max_memory_mb: int = 2048
+    """Memory in MB for the requests of all clients together. Beyond it the one that holds most is disconnected."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -170,17 +173,15 @@ class GatewayOptions:
         return place == "daemon" or (place == "auto" and self.mode == "realtime")
 
     def api_key(self) -> str:
-        """The word that clients must know; "" if none. Raises TransportError if the file has none."""
-        file = self.clients.api_key_file
+        """The word that clients must know; "" if none. Raises OSError or FileError unless the file has one."""
+        file, kind = self.clients.api_key_file, "word for --api-key-file"
         if file is None:
             return ""
-        try:
-            word = file.read_text(encoding="utf-8").strip()
-        except (OSError, UnicodeDecodeError) as error:
-            raise TransportError(f"--api-key-file {file}: {error}") from None
-        if not word:
-            raise TransportError(f"--api-key-file {file} is empty: expected one word")
-        return word
+        lines = files.read_text(file, kind).strip().splitlines()
+        with files.reading(file, kind):
+            if len(lines) != 1:
+                raise ValueError(f"expected one word, came {len(lines)} lines")
+        return lines[0]
 
     def dialect_class(self) -> type[Dialect]:
         return _SPOKEN[self.dialect][0]
@@ -219,7 +220,7 @@ class GatewayOptions:
         )
 
     def body(self) -> body.Body:
-        """The robot that clients drive. Raises TransportError if its file does not describe one."""
+        """The robot that clients drive. Raises OSError or FileError if its file does not describe one."""
         return body.read_body(self.robot_file) if self.robot_file else body.PANDA
 
     def plan(self) -> Plan:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from protocol.checks import MAX_IMAGE_SIDE_PX
+from protocol.images import claimed_size
 from sim_client.gateway.exchange import Frames, Refused
 
 
@@ -34,6 +35,7 @@ class EncodedPicture:
         if not (0 < height <= MAX_IMAGE_SIDE_PX and 0 < width <= MAX_IMAGE_SIDE_PX):
             raise Refused(f"a picture of shape {self.shape}: expected sides of 1 to {MAX_IMAGE_SIDE_PX} px")
         try:
+            claimed_size(self.data)  # and a JPEG may have scans without end
             with Image.open(io.BytesIO(self.data), formats=("PNG", "JPEG")) as picture:
                 if picture.size != (width, height):  # before memory is taken: a few bytes can claim gigabytes
                     came = f"{picture.size[1]} x {picture.size[0]}"

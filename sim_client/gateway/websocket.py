@@ -10,7 +10,7 @@ import json
 import logging
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
@@ -20,6 +20,7 @@ from protocol.errors import TransportError
 from protocol.messages import Mode
 from sim_client.gateway.exchange import Answer, ClientRequest, Dialect, Finish, Packet, Refused, Terms
 from sim_client.gateway.machine import Machine
+from sim_client.gateway.memory import Memory, counted
 from sim_client.gateway.openpi import metadata
 
 log = logging.getLogger("pp-gateway")
@@ -36,6 +37,7 @@ class WebsocketSide:
     new_dialect: Callable[[Terms], Dialect]
     max_bytes: int
     api_key: str = ""
+    memory: Memory = field(default_factory=Memory)
 
     async def start(self, host: str, port: int) -> Server:
         """Listens until the server is closed.
@@ -51,6 +53,7 @@ class WebsocketSide:
                 process_request=self._answer_http,
                 compression=None,  # pixels: deflate costs more than it saves
                 max_size=self.max_bytes,
+                create_connection=counted(self.memory),
                 ping_interval=_PING_S,
                 ping_timeout=None,  # a client that resets its simulator answers no ping for minutes
             )

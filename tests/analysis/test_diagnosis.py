@@ -15,7 +15,7 @@ from PIL import Image
 from dual_system.analysis import diagnosis, tables
 from dual_system.analysis.counterfactual import SCHEMA as COUNTERFACTUAL_SCHEMA
 from dual_system.analysis.diagnosis import CONDITIONS, Losses, absolute, ratio, read_diagnosis
-from dual_system.analysis.results import ResultsError
+from protocol.errors import FileError
 
 MODELS = {"ponder": {"is_untrained": False}, "pounce": {"is_untrained": False}}
 
@@ -93,7 +93,7 @@ def test_untrained_weights_are_named(tmp_path: Path) -> None:
     [({"schema": "other/1"}, "other/1"), ({"episodes": [{}]}, "task|staleness"), ({"models": 3}, "int")],
 )
 def test_what_is_no_diagnosis_is_refused(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
-    with pytest.raises(ResultsError, match=words):
+    with pytest.raises(FileError, match=rf"diagnosis\.json is no diagnosis .*{words}"):
         read_diagnosis(write(tmp_path, **changes))
 
 

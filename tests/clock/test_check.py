@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clock.check import check_result, disagreements, main
+from clock.check_answers import answers_of, check_invocations, check_queries
 from clock.report import stream_sha256
 from protocol import messages as m
 from protocol.mcap_log import EpisodeRecord, read_log
@@ -352,3 +353,21 @@ class TestCommandLine:
         assert main([str(cut), "--recover", str(whole)]) == 0
         assert "unfinished or damaged" in capsys.readouterr().out
         assert 0 < len(read_log(whole).ticks) < 40
+
+
+def test_a_request_that_was_due_and_left_out_is_noticed(good: EpisodeRecord) -> None:
+    fewer = replace(good, queries=good.queries[:-1])
+    (found,) = [each for each in check_queries(fewer) if each.field == "sent"]
+    assert (found.message, found.index, found.found) == ("Query", len(good.queries) - 1, "never")
+    fewer = replace(good, invocations=good.invocations[:-1])
+    (found,) = [each for each in check_invocations(fewer, answers_of(fewer)) if each.field == "sent"]
+    assert (found.message, found.index, found.found) == ("Invocation", len(good.invocations) - 1, "never")
+    away = m.Event(severity=m.Severity.WARNING, name="query_skipped", text="PONDER is away")
+    assert not [each for each in check_queries(replace(good, queries=[], events=[away])) if each.field == "sent"]
+
+
+def test_committed_rows_are_those_that_were_left(good: EpisodeRecord) -> None:
+    last = good.invocations[-1]
+    changed = [*good.invocations[:-1], replace(last, committed_rows=last.committed_rows + 1000)]
+    found = list(check_invocations(replace(good, invocations=changed), answers_of(good)))
+    assert "committed_rows" in {each.field for each in found}

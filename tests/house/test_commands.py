@@ -6,6 +6,7 @@ import ast
 import importlib.util
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -52,6 +53,23 @@ def parameters_of_main(module: str) -> list[str]:
         if isinstance(node, ast.FunctionDef) and node.name == "main":
             return [argument.arg for argument in node.args.args]
     raise AssertionError(f"{module} has no main")
+
+
+def test_every_installed_command_tells_what_a_person_can_mend(root: Path) -> None:
+    """All are decorated with `protocol.command_line.command`, the verbs' mains as well."""
+    scripts = tomllib.loads((root / "pyproject.toml").read_text())["project"]["scripts"]
+    entries = {name: tuple(target.split(":")) for name, target in scripts.items()}
+    entries |= {f"{name} {verb}": (COMMANDS[name].verbs[verb].module, "main") for name, verb in VERBS}
+    entries |= {f"{name} itself": (command.default, "main") for name, command in COMMANDS.items()}
+    bare = [name for name, (module, function) in entries.items() if not is_command(root, module, function)]
+    assert not bare
+
+
+def is_command(root: Path, module: str, function: str) -> bool:
+    path = root / f"{module.replace('.', '/')}.py"
+    nodes = ast.parse(path.read_text(encoding="utf-8")).body
+    (found,) = (node for node in nodes if isinstance(node, ast.FunctionDef) and node.name == function)
+    return any(isinstance(each, ast.Call) and ast.unparse(each.func) == "command" for each in found.decorator_list)
 
 
 def test_each_command_has_an_entry() -> None:

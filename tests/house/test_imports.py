@@ -13,7 +13,7 @@ import pytest
 ROOMS = ("protocol", "clock", "model_server", "dual_system", "ponder_server", "pounce_server", "sim_client")
 HOMES: dict[str, tuple[str, ...]] = {
     "zenoh": ("protocol/zenoh_bus.py",),
-    "mcap": ("protocol/mcap_log.py",),
+    "mcap": ("protocol/mcap_log.py", "protocol/mcap_records.py"),
     "foxglove_schemas_protobuf": ("protocol/mcap_log.py",),
     "google": ("protocol/codec.py", "protocol/mcap_log.py"),
     "simplejpeg": ("protocol/images.py",),

@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as hnp
 
 from protocol import codec
 from protocol import messages as m
-from protocol.checks import MAX_INDEX, MAX_INSTANT_NS, MAX_MESSAGE_BYTES
+from protocol.checks import MAX_INDEX, MAX_INSTANT_NS, MAX_MESSAGE_BYTES, MAX_PLAIN_MESSAGE_BYTES
 from protocol.errors import MalformedMessage, ProtocolError
 from protocol.ponderpounce.v1 import common_pb2, episode_pb2, stream_pb2
 
@@ -428,7 +428,7 @@ def test_decoded_arrays_are_read_only() -> None:
 
 
 def test_an_oversized_message_is_refused_unread() -> None:
-    with pytest.raises(MalformedMessage, match=rf"Phase\.\*: expected at most {MAX_MESSAGE_BYTES} bytes"):
+    with pytest.raises(MalformedMessage, match=rf"Phase\.\*: expected at most {MAX_PLAIN_MESSAGE_BYTES} bytes"):
         codec.decode(m.Phase, bytes(MAX_MESSAGE_BYTES + 1))
 
 

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
 from PIL import Image as Picture
 
 from protocol import codec, images, topics
@@ -136,12 +138,61 @@ def test_a_cut_log_is_replayed_up_to_its_cut(record: Callable[..., Path], tmp_pa
     assert (tmp_path / "b.rrd").stat().st_size > 10_000
 
 
+@pytest.mark.parametrize(
+    "container",
+    [
+        {"use_chunking": False},
+        {"use_statistics": False, "use_summary_offsets": False, "repeat_channels": False, "repeat_schemas": False},
+    ],
+    ids=["unchunked", "without a summary"],
+)
+def test_every_message_is_replayed_from_any_container(
+    container: dict[str, bool], record: Callable[..., Path], tmp_path: Path
+) -> None:
+    whole, other = record(tmp_path / "a.mcap"), tmp_path / "b.mcap"
+    with other.open("wb") as file:
+        writer = Writer(file, **container)  # type: ignore[arg-type]
+        writer.start()
+        channels: dict[str, int] = {}
+        with whole.open("rb") as source:
+            for schema, channel, message in make_reader(source).iter_messages():
+                if channel.topic not in channels:
+                    at = writer.register_schema(schema.name, schema.encoding, schema.data)  # type: ignore[union-attr]
+                    channels[channel.topic] = writer.register_channel(channel.topic, "protobuf", at)
+                writer.add_message(channels[channel.topic], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    for log in (whole, other):
+        assert replay.main([str(log), "--save", str(log.with_suffix(".rrd"))]) == 0
+    assert (tmp_path / "b.rrd").stat().st_size > 0.9 * (tmp_path / "a.rrd").stat().st_size
+
+
+def test_without_a_display_the_ways_out_are_named(
+    record: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert replay.main([str(record(tmp_path / "a.mcap"))]) == 2
+    said = capsys.readouterr().err
+    assert "no display" in said
+    assert "--screenshot" in said
+    assert "--save" in said
+
+
+@pytest.mark.parametrize("option", ["--save", "--screenshot"])
+def test_a_target_that_cannot_be_written_is_named_at_once(
+    option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    assert replay.main([str(tmp_path / "a.mcap"), option, str(tmp_path / "file" / "a")]) == 2
+    assert "file is a file; expected a folder" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("content", [None, b"not a log"])
-def test_what_is_no_log_is_exit_1(content: bytes | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_no_log_is_exit_2(content: bytes | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "odd.mcap"
     if content is not None:
         path.write_bytes(content)
-    assert replay.main([str(path), "--save", str(tmp_path / "odd.rrd")]) == 1
+    assert replay.main([str(path), "--save", str(tmp_path / "odd.rrd")]) == 2
     assert "odd.mcap" in capsys.readouterr().err
     assert not (tmp_path / "odd.rrd").exists()
 
@@ -162,7 +213,7 @@ def test_a_viewer_that_finds_no_driver_is_told_as_that(
     stub.chmod(0o755)
     monkeypatch.setattr(replay, "_rerun", lambda: str(stub))
     png = tmp_path / "a.png"
-    assert replay.main([str(record(tmp_path / "a.mcap")), "--screenshot", str(png)]) == 1
+    assert replay.main([str(record(tmp_path / "a.mcap")), "--screenshot", str(png)]) == 2
     said = capsys.readouterr().err
     assert "is a Vulkan driver installed" in said
     assert "no adapter" in said
@@ -188,7 +239,7 @@ class TestScreenshot:
         is_colourful = (lanes.max(axis=-1) - lanes.min(axis=-1)) > 60
         assert is_colourful.mean() > 0.3  # bars
 
-    def test_a_picture_that_cannot_be_drawn_is_exit_1(
+    def test_a_picture_that_cannot_be_drawn_is_exit_2(
         self, record: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         def broken(seen: m.Observation) -> m.Observation:
@@ -196,5 +247,5 @@ class TestScreenshot:
             return replace(seen, images=tuple(replace(i, codec=m.ImageCodec.JPEG, data=data) for i in seen.images))
 
         log = record(tmp_path / "a.mcap", broken)
-        assert replay.main([str(log), "--screenshot", str(tmp_path / "a.png")]) == 1
-        assert "the viewer reports" in capsys.readouterr().err
+        assert replay.main([str(log), "--screenshot", str(tmp_path / "a.png")]) == 2
+        assert "a.mcap is no episode log: Image.data" in capsys.readouterr().err

@@ -29,6 +29,16 @@ def blind() -> Iterator[gymnasium.Env]:
     env.close()
 
 
+@pytest.mark.sim
+def test_what_was_closed_opens_its_cameras_again_at_reset() -> None:
+    env = gymnasium.make(environment_id("PickHighlight"), image_px=64).unwrapped
+    env.close()
+    env.close()
+    observation, _ = env.reset(seed=SEED)
+    env.close()
+    assert env.observation_space.contains(observation)
+
+
 def test_every_task_is_registered() -> None:
     ours = {id_ for id_ in gymnasium.registry if id_.startswith("ponderpounce/")}
     assert ours == {environment_id(name) for name in task_names()}

@@ -68,7 +68,7 @@ def test_a_written_pair_is_read_back(tmp_path: Path) -> None:
 
 def test_another_schema_is_refused(tmp_path: Path) -> None:
     (tmp_path / INDEX).write_text('{"schema": "pairs/0", "pairs": []}')
-    with pytest.raises(ValueError, match="schema 'pairs/0'; expected 'ponderpounce-pairs/1'"):
+    with pytest.raises(ValueError, match="schema 'pairs/0', expected 'ponderpounce-pairs/1'"):
         read_pairs(tmp_path)
 
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -105,3 +109,31 @@ def test_a_picture_of_another_size_is_another_size() -> None:
         text = snapshot.grounded_subgoal
     with make_environment("PickHighlight", image_px=64, render=False) as env:
         assert env.reset(12600, "medium").grounded_subgoal == text
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"MUJOCO_GL": ""}, ""),
+        ({"MUJOCO_GL": "cuda"}, "no pictures with MUJOCO_GL=cuda: invalid value"),
+        ({"MUJOCO_GL": "egl", "PYOPENGL_PLATFORM": "glx"}, "PYOPENGL_PLATFORM=glx: Cannot use EGL"),
+        ({"MUJOCO_GL": "egl", "MUJOCO_EGL_DEVICE_ID": "77"}, "MUJOCO_EGL_DEVICE_ID=77: The MUJOCO_EGL_DEVICE_ID"),
+    ],
+    ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
+)
+def test_gl_settings_that_this_computer_does_not_have_are_named(settings: dict[str, str], said: str) -> None:
+    code = (
+        "from protocol.command_line import command\n"
+        "import dual_system.tasks.headless\n"
+        "from dual_system.tasks.environment import make_environment\n"
+        "@command('draw')\n"
+        "def main(argv):\n"
+        "    make_environment('PickHighlight', image_px=16).close()\n"
+        "    return 0\n"
+        "raise SystemExit(main([]))"
+    )
+    others = {name: value for name, value in os.environ.items() if not name.startswith(("MUJOCO", "PYOPENGL"))}
+    done = subprocess.run([sys.executable, "-c", code], env=others | settings, capture_output=True, text=True)
+    assert "Traceback" not in done.stderr
+    assert (done.returncode, said in done.stderr) == (2 if said else 0, True)

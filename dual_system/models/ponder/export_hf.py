@@ -36,7 +36,8 @@ from dual_system.models.pounce.checkpoint import (
 )
 from dual_system.models.public_layout import COGNITION, write_tensors
 from dual_system.models.stored_tensors import StoredTensors
-from protocol.command_line import parse
+from protocol import files
+from protocol.command_line import command, parse
 
 PREFIX_FILE = "pounce_prefix.safetensors"
 Layout = Literal["openpi", "lerobot"]
@@ -57,13 +58,10 @@ class ExportOptions:
     """Names of pi0.5's tensors: lerobot's have a leading `model.`."""
 
 
+@command("pp-export hf")
 def main(argv: list[str] | None = None, prog: str = "pp-export hf") -> int:
     options = parse(ExportOptions, argv, prog=prog)
-    try:
-        export_folder(options)
-    except (OSError, ValueError) as error:
-        sys.stderr.write(f"{prog}: {error}\n")
-        return 2
+    export_folder(options)
     sys.stdout.write(f"{options.out}: read back, equal to the last bit\n")
     return 0
 
@@ -81,10 +79,11 @@ def export_folder(options: ExportOptions) -> None:
     if options.out.exists():
         raise FileExistsError(f"{options.out} is there already; export to a new folder")
     try:
-        if options.ponder is not None:
-            _export_ponder(options.ponder, options.out)
-        elif options.pounce is not None:
-            _export_pounce(load_bundle(options.pounce), options.out, options.layout)
+        with files.writing(options.out):
+            if options.ponder is not None:
+                _export_ponder(options.ponder, options.out)
+            elif options.pounce is not None:
+                _export_pounce(load_bundle(options.pounce), options.out, options.layout)
     except BaseException:
         shutil.rmtree(options.out, ignore_errors=True)
         raise

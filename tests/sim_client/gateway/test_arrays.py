@@ -136,3 +136,19 @@ def test_pictures_are_resized_only_if_they_must() -> None:
     assert resized({"front": frame}, 4)["front"].tobytes() == np.full((4, 4, 3), 77, np.uint8).tobytes()
     square = np.zeros((4, 4, 3), np.uint8)
     assert resized({"front": square}, 4)["front"] is square
+
+
+def test_lists_in_lists_are_counted_together() -> None:
+    thousand = b"\xdc" + (1000).to_bytes(2, "big")
+    with pytest.raises(Refused, match="more than 1000000 values: send arrays, not lists"):
+        unpack(thousand + 1000 * (thousand + 1000 * b"\x90"))
+    assert len(unpack(thousand + 1000 * (thousand[:1] + b"\x00\x02" + 2 * b"\x90"))) == 1000
+
+
+def test_a_jpeg_of_countless_scans_is_not_decoded() -> None:
+    with io.BytesIO() as file:
+        Image.new("RGB", (16, 16)).save(file, "JPEG")
+        data = file.getvalue()
+    assert EncodedPicture("jpeg", data, (16, 16, 3)).decode().shape == (16, 16, 3)
+    with pytest.raises(Refused, match="at most 64 scans, came 1001"):
+        EncodedPicture("jpeg", data[:-2] + 1000 * b"\xff\xda" + data[-2:], (16, 16, 3)).decode()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dual_system.tasks.panda import HOME_QPOS
-from protocol.errors import TransportError
+from protocol.errors import FileError, TransportError
 from protocol.messages import DelayKind, Mode
 from sim_client.gateway.body import PANDA, read_body
 from sim_client.gateway.options import ClientsOptions, GatewayOptions, ScheduleOptions
@@ -94,11 +94,12 @@ def test_in_real_time_delays_are_measured() -> None:
 def test_a_key_file_must_hold_a_word(tmp_path: Path) -> None:
     file = tmp_path / "key"
     options = GatewayOptions(dialect="openpi", clients=ClientsOptions(api_key_file=file))
-    with pytest.raises(TransportError, match="No such file"):
+    with pytest.raises(OSError, match="No such file"):
         options.api_key()
-    file.write_text("\n")
-    with pytest.raises(TransportError, match="expected one word"):
-        options.api_key()
+    for text in ("\n", "version 1\nsize 2\n"):
+        file.write_text(text)
+        with pytest.raises(FileError, match=r"key is no word .*expected one word"):
+            options.api_key()
     file.write_text("open sesame\n")
     assert options.api_key() == "open sesame"
 
@@ -124,17 +125,17 @@ def test_a_robot_can_be_told_by_a_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("name = ", "robot.toml"),
+        ("name = ", "Invalid value"),
         (ROBOT.replace("max_step", "max_stop"), "expected .*max_step"),
         (ROBOT.replace("[0.1, 0.0]", "[0.1]"), "max_step"),
         (ROBOT.replace("[1.0, 0.5]", "[-2.0, 0.5]"), "command_low"),
         (ROBOT.replace("max_lead = [0.3, 0.0]", ""), "expected .*max_lead"),
         (ROBOT.replace("[0.3, 0.0]", "[]").replace("= true", "= false"), "max_lead: expected 2"),
-        (ROBOT.replace("num_proprio = 3", 'num_proprio = "three"'), "robot.toml"),
+        (ROBOT.replace("num_proprio = 3", 'num_proprio = "three"'), "three"),
     ],
 )
 def test_a_file_that_describes_no_robot_is_refused(tmp_path: Path, text: str, sentence: str) -> None:
     file = tmp_path / "robot.toml"
     file.write_text(text)
-    with pytest.raises(TransportError, match=sentence):
+    with pytest.raises(FileError, match=rf"robot\.toml is no robot .*{sentence}"):
         read_body(file)

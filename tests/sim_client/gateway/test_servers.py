@@ -16,6 +16,7 @@ from sim_client.gateway import challenge, openpi
 from sim_client.gateway.arrays import pack, unpack
 from sim_client.gateway.exchange import Terms
 from sim_client.gateway.http_form import HttpSide
+from sim_client.gateway.memory import Memory
 from sim_client.gateway.websocket import WebsocketSide
 
 PictureOf = Callable[[int], np.ndarray]
@@ -66,6 +67,26 @@ def test_a_conversation_goes_on_after_what_could_not_be_read(openpi_port: int, p
             assert isinstance(sentence, str)
             assert "expected" in sentence or "not a msgpack" in sentence
         assert ticks_of(client, good, 2) == [2, 3]
+
+
+def test_the_client_that_holds_most_of_the_memory_is_disconnected_and_no_other(
+    bench: Any,
+    terms_with: Callable[..., Terms],
+    working: Callable[..., Any],
+    listening: Callable[..., Any],
+    picture_of: PictureOf,
+) -> None:
+    terms = terms_with(cameras=openpi.CAMERAS, state_key=openpi.STATE_KEY)
+    side = WebsocketSide(bench.machine, terms, openpi.OpenpiDialect, 10 << 20, memory=Memory(2 << 20))
+    with working(bench.machine), listening(side) as port, client_at(port) as good, client_at(port) as hoarder:
+        good.recv(20)
+        hoarder.recv(20)
+        assert ticks_of(good, openpi_message(picture_of), 1) == [0]
+        hoarder.send(b"0" * (3 << 20))
+        with pytest.raises(ConnectionClosedError, match="more than 2 MB: see --max-memory-mb"):
+            hoarder.recv(20)
+        assert ticks_of(good, openpi_message(picture_of), 3) == [1, 2, 3]
+        assert side.memory.take(good, 0) is None
 
 
 def test_a_message_beyond_the_limit_closes_that_connection_only(openpi_port: int, picture_of: PictureOf) -> None:
