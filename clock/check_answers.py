@@ -206,9 +206,7 @@ def _check_kind(
 
 def check_invocations(record: EpisodeRecord, answers: Answers) -> Iterator[Disagreement]:
     """Checks the paper's rule: reference and age of every invocation, the vector it contains, and its chunk's copy."""
-    window, first_tick = -1, 0
-    if record.ticks and record.invocations:  # the period counts from the first invocation
-        first_tick = max(0, _tick_of(record, record.invocations[0]))
+    window, first_tick = -1, _first_tick(record)
     most_committed = max((each.committed_rows for each in record.invocations), default=0)
     for index, invocation in enumerate(record.invocations):
         yield from _check_given(record, answers, index, invocation)
@@ -272,10 +270,15 @@ def _check_given(record: EpisodeRecord, answers: Answers, index: int, invocation
         yield from compare("Invocation", index, cognition=(vector, invocation.cognition))
 
 
+def _first_tick(record: EpisodeRecord) -> int:
+    """The tick of the first invocation, from which the period counts."""
+    return max(0, _tick_of(record, record.invocations[0])) if record.ticks and record.invocations else 0
+
+
 def _invocation_due_ns(record: EpisodeRecord, after: int) -> int:
     """When the next invocation is due after one at this tick; the opening's, before tick 0, counts as tick 0's."""
-    period = record.info.schedule.invoke_period_ticks
-    due = (max(after, 0) // period + 1) * period
+    period, first = record.info.schedule.invoke_period_ticks, _first_tick(record)
+    due = first + ((max(after, first) - first) // period + 1) * period
     return deadline_ns(record.ticks[0].deadline_ns, due, record.info.schedule.control_hz)
 
 

@@ -21,11 +21,10 @@ from clock.timebase import NS_PER_S
 from protocol import files
 from protocol.messages import Floats
 
-MAX_FILE_BYTES = 100 * 2**20  # unpacked
 _ARRAYS = ("inner", "outer", "limit_rad")
 _TICKS_PER_UNIT = 20.0
 RIDGE = 1e-3
-_MAX_BYTES = 16 << 20
+MAX_FILE_BYTES = 16 << 20
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -103,7 +102,7 @@ def load(path: Path) -> ResidualMlp:
         OSError: it cannot be read.
     """
     kind = f"residual head (.npz with {', '.join(_ARRAYS)})"
-    arrays = files.read_npz(path, kind, most_bytes=_MAX_BYTES)
+    arrays = files.read_npz(path, kind, most_bytes=MAX_FILE_BYTES)
     with files.reading(path, kind):
         return ResidualMlp(**{name: arrays[name].astype(np.float32) for name in _ARRAYS})
 

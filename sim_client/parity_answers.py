@@ -20,9 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clock.timebase import NS_PER_S
-from protocol.command_line import parse
+from protocol import files
+from protocol.command_line import command, parse
 
-AGREES, DISAGREES, UNREADABLE = 0, 1, 2
+AGREES, DISAGREES = 0, 1
 AGES_NS = {"rows": 3 * NS_PER_S // 10, "rows_old": 23 * NS_PER_S // 10, "rows_null": 0}
 """Asked of POUNCE at every observation, by name of the answer; age 0 goes with the null."""
 SESSION = "parity"
@@ -169,20 +170,17 @@ def effects(answers: Arrays) -> dict[str, float]:
     }
 
 
+@command("pp-parity answers")
 def main(argv: list[str] | None = None, prog: str = "pp-parity answers") -> int:
     options = parse(AnswersOptions, argv, prog=prog)
-    try:
-        if not options.episode.exists():
-            np.savez_compressed(options.episode, **stored_episode(options.task, options.seed, options.seconds))
-        episode, reference = _read(options.episode), None if options.against is None else _read(options.against)
-        answers = ponder_answers(_engine("ponder", options.ponder, options), episode)
-        cognition = answers["cognition"] if reference is None else reference["cognition"]
-        answers |= pounce_answers(_engine("pounce", options.pounce, options), episode, cognition)
-        np.savez_compressed(options.out, **answers)
-        found = [] if reference is None else list(differences(reference, answers, options))
-    except (OSError, ValueError, KeyError) as error:
-        sys.stderr.write(f"{prog}: {error}\n")
-        return UNREADABLE
+    if not options.episode.exists():
+        np.savez_compressed(options.episode, **stored_episode(options.task, options.seed, options.seconds))
+    episode, reference = _read(options.episode), None if options.against is None else _read(options.against)
+    answers = ponder_answers(_engine("ponder", options.ponder, options), episode)
+    cognition = answers["cognition"] if reference is None else reference["cognition"]
+    answers |= pounce_answers(_engine("pounce", options.pounce, options), episode, cognition)
+    np.savez_compressed(options.out, **answers)
+    found = [] if reference is None else list(differences(reference, answers, options))
     changes = ", ".join(f"{name} {change:.2e}" for name, change in effects(answers).items())
     sys.stdout.write(f"written  {options.out}: {len(answers['texts'])} observations\nchanges  of rows by {changes}\n")
     if reference is not None:
@@ -201,5 +199,4 @@ def _engine(proc: str, checkpoint: Path, options: AnswersOptions) -> Any:
 
 
 def _read(path: Path) -> Arrays:
-    with np.load(path, allow_pickle=False) as file:
-        return {name: file[name] for name in file.files}
+    return files.read_npz(path, "stored episode or its answers (.npz)")

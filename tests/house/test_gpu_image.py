@@ -8,7 +8,10 @@ import sys
 import pytest
 
 LACKING = ("tyro", "zenoh", "simplejpeg", "mcap", "av", "mujoco")
-NEED_THEM = ("__main__", "config", "fleet", "in_process", "node", "serve", "parity", "export_hf")
+NEED_THEM = (
+    "__main__", "config", "fleet", "in_process", "node", "serve", "parity", "export_hf", "import_folder",
+    "inspect_folder",
+)  # fmt: skip
 """Command lines and daemons: the last part of their modules' names."""
 SCRIPT = f"""
 import importlib, importlib.util, pkgutil, sys

@@ -55,10 +55,8 @@ from dual_system.models.ponder.vocabulary import Vocabulary
 from dual_system.models.pounce.checkpoint import TOKENIZER_FILE, StoredConfig
 from dual_system.models.pounce.configs import pi05_base
 from dual_system.models.public_layout import COGNITION
-from dual_system.models.stored_tensors import CheckpointError
-from protocol.command_line import parse
+from protocol.command_line import command, parse
 
-DONE, REFUSED = 0, 2
 IMPORT_FILE = "import.json"
 
 
@@ -217,21 +215,18 @@ def _facts(plan: Plan, config: dict[str, Any], statistics: ReadStatistics) -> di
     }
 
 
+@command("pp-parity import-official")
 def main(argv: list[str] | None = None, prog: str = "pp-parity import-official") -> int:
     options = parse(ImportOptions, argv, prog=prog)
-    try:
-        pounce = None if options.pounce_like is None else sizes_like(options.pounce_like)
-        facts = import_official(
-            options.folder,
-            options.out,
-            qwen=options.qwen,
-            paligemma=options.paligemma,
-            pounce=pounce,
-            roles=options.roles,
-        )
-    except (FolderError, CheckpointError, OSError, ValueError) as error:
-        sys.stderr.write(f"{prog}: {error}\n")
-        return REFUSED
+    pounce = None if options.pounce_like is None else sizes_like(options.pounce_like)
+    facts = import_official(
+        options.folder,
+        options.out,
+        qwen=options.qwen,
+        paligemma=options.paligemma,
+        pounce=pounce,
+        roles=options.roles,
+    )
     for note in facts["notes"]:
         sys.stdout.write(f"note      {note}\n")
     for what, how in facts["assumptions"].items():
@@ -242,4 +237,4 @@ def main(argv: list[str] | None = None, prog: str = "pp-parity import-official")
         f"          pounce-serve --checkpoint {options.out}/pounce\n"
         "before    a robot moves: compare with the official code, `pp-parity answers`; see docs/official.md\n"
     )
-    return DONE
+    return 0

@@ -21,7 +21,6 @@ from dual_system.models.official.header import (
     CONFIG_FILE,
     STATISTICS_FILE,
     WEIGHTS_FILE,
-    FolderError,
     Header,
     read_header,
 )
@@ -36,9 +35,9 @@ from dual_system.models.official.plan import (
 from dual_system.models.official.statistics import read_statistics
 from dual_system.models.ponder.configs import qwen35_9b
 from dual_system.models.pounce.configs import pi05_base
-from protocol.command_line import parse
+from protocol.command_line import command, parse
 
-EXPLAINED, UNEXPLAINED, UNREADABLE = 0, 1, 2
+EXPLAINED, UNEXPLAINED = 0, 1
 COMPARED_BYTES = 2**20
 
 
@@ -116,14 +115,11 @@ def _or_error(make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         return {"error": str(error)}
 
 
+@command("pp-parity official")
 def main(argv: list[str] | None = None, prog: str = "pp-parity official") -> int:
     options = parse(InspectOptions, argv, prog=prog)
-    try:
-        facts = inspect(options)
-        options.out.write_text(json.dumps(facts, indent=1) + "\n")
-    except (FolderError, OSError, ValueError) as error:
-        sys.stderr.write(f"{prog}: {error}\n")
-        return UNREADABLE
+    facts = inspect(options)
+    options.out.write_text(json.dumps(facts, indent=1) + "\n")
     tensors, faults = facts["U3 tensors"], list(facts["faults"])
     faults += [facts[key]["error"] for key in ("U1 config", "U2 statistics") if "error" in facts[key]]
     lines = [
