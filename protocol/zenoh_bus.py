@@ -142,6 +142,10 @@ class ZenohBus:
         try:
             self._session = zenoh.open(zenoh_config(endpoints))
         except zenoh.ZError as error:
+            if "shm" in str(error):
+                raise TransportError(
+                    f"zenoh cannot make shared memory: {error}. Give /dev/shm room, or use --link.no-shared-memory"
+                ) from None
             where = ", ".join(endpoints.listen) or "no listen endpoint"
             raise TransportError(f"zenoh does not open ({where}): {error}. Is another one there?") from None
         self.is_local = endpoints.are_local

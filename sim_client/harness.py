@@ -77,7 +77,7 @@ def _bus(
     if options.local:
         link = local_link(
             daemons,
-            robot=link.robot,
+            link,
             with_clock=options.runs_clock_daemon,
             allow_starved=options.schedule.allow_starved,
             ponder_checkpoint=options.ponder_checkpoint,

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import IO
@@ -100,6 +101,7 @@ def start_local(
     robot: str,
     with_clock: bool,
     allow_starved: bool = False,
+    shared_memory: bool = True,
     ponder: Sequence[str],
     pounce: Sequence[str],
 ) -> tuple[str, ...]:
@@ -109,7 +111,7 @@ def start_local(
     the links among the others alone.
     """
     at_clock, at_ponder, at_pounce = (endpoint(proc, daemons.sockets()) for proc in ("clock", "ponder", "pounce"))
-    common = ["--link.robot", robot]
+    common = ["--link.robot", robot, *([] if shared_memory else ["--link.no-shared-memory"])]
     daemons.start("ponder", "ponder_server", [*common, "--link.listen", at_ponder, *ponder])
     daemons.start("pounce", "pounce_server", [*common, "--link.listen", at_pounce, *pounce])
     if not with_clock:
@@ -121,23 +123,24 @@ def start_local(
 
 def local_link(
     daemons: Daemons,
+    link: LinkOptions,
     *,
-    robot: str,
     with_clock: bool,
     allow_starved: bool,
     ponder_checkpoint: Path | None,
     pounce_checkpoint: Path | None,
 ) -> LinkOptions:
-    """Starts the servers of ``--local``; returns how to reach them."""
+    """Starts the servers of ``--local`` for the robot of ``link``; returns how to reach them."""
     endpoints = start_local(
         daemons,
-        robot=robot,
+        robot=link.robot,
         with_clock=with_clock,
         allow_starved=allow_starved,
+        shared_memory=link.shared_memory,
         ponder=_checkpoint(ponder_checkpoint),
         pounce=_checkpoint(pounce_checkpoint),
     )
-    return LinkOptions(robot=robot, connect=endpoints)
+    return replace(link, connect=endpoints)
 
 
 def _checkpoint(folder: Path | None) -> list[str]:

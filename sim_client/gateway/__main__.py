@@ -63,7 +63,7 @@ def _machine(options: GatewayOptions, daemons: Daemons, metrics: Metrics) -> Ite
     if options.local:
         link = local_link(
             daemons,
-            robot=link.robot,
+            link,
             with_clock=options.runs_clock_daemon,
             allow_starved=options.timing.allow_starved,
             ponder_checkpoint=options.ponder_checkpoint,

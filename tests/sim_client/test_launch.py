@@ -1,0 +1,43 @@
+"""The servers of ``--local`` get what their user asked of links, and lie where nobody else can reach them."""
+
+from __future__ import annotations
+
+import stat
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from protocol.options import LinkOptions
+from protocol.sockets import socket_path
+from sim_client.launch import Daemons, local_link
+
+
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
+    """The arguments of every daemon, in the place of processes."""
+    found: dict[str, list[str]] = {}
+
+    def pretend(self: Daemons, name: str, module: str, arguments: Sequence[str]) -> Any:
+        found[name] = list(arguments)
+
+    monkeypatch.setattr(Daemons, "start", pretend)
+    return found
+
+
+@pytest.mark.parametrize("shared_memory", [True, False])
+def test_local_servers_obey_the_options_of_the_link(
+    started: dict[str, list[str]], tmp_path: Path, shared_memory: bool
+) -> None:
+    asked = LinkOptions(robot="r7", shared_memory=shared_memory)
+    with Daemons(tmp_path) as daemons:
+        link = local_link(
+            daemons, asked, with_clock=True, allow_starved=False, ponder_checkpoint=None, pounce_checkpoint=None
+        )
+        assert (link.robot, link.shared_memory, len(link.connect)) == ("r7", shared_memory, 3)
+        (folder,) = {path.parent for path in map(socket_path, link.connect) if path}
+        assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    assert not folder.exists()
+    assert {"--link.no-shared-memory" in arguments for arguments in started.values()} == {not shared_memory}
+    assert all(arguments[:2] == ["--link.robot", "r7"] for arguments in started.values())
