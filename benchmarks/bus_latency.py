@@ -38,6 +38,7 @@ from benchmarks.noop_policy import (
     SIDE_PX,
     Wire,
     answer,
+    endpoint_at,
 )
 from benchmarks.report import Report, Row, show, spread
 from clock.schedules import realtime
@@ -80,6 +81,8 @@ class Way:
     wire: Wire
     messages: int
     shared_memory: bool = False
+    unix: bool = False
+    """A Unix socket, our default on one host, in the place of TCP on loopback."""
     codec: m.ImageCodec = m.ImageCodec.RAW
     keeps_memory: bool = False
     """Gives openpi's client our allocator setting (protocol/memory.py); our clients always have it."""
@@ -89,11 +92,21 @@ WAYS = (
     Way(name="openpi-client 0.1.2: websocket, msgpack-numpy", wire="openpi", messages=2),
     Way(name="openpi-client, our allocator setting lent to it", wire="openpi", messages=2, keeps_memory=True),
     Way(name="zenoh TCP, observation -> chunk", wire="observation", messages=2),
+    Way(name="zenoh Unix socket, observation -> chunk", wire="observation", messages=2, unix=True),
     Way(name="zenoh shared memory, observation -> chunk", wire="observation", messages=2, shared_memory=True),
+    Way(
+        name="zenoh Unix socket and shared memory, observation -> chunk",
+        wire="observation",
+        messages=2,
+        shared_memory=True,
+        unix=True,
+    ),
     Way(name="zenoh shared memory, bare bytes (floor of the row above)", wire="bytes", messages=2, shared_memory=True),
     Way(name="zenoh TCP, JPEG, observation -> chunk", wire="observation", messages=2, codec=m.ImageCodec.JPEG),
     Way(name="zenoh TCP, pounce-serve", wire="pounce", messages=3),
+    Way(name="zenoh Unix socket, pounce-serve", wire="pounce", messages=3, unix=True),
     Way(name="zenoh shared memory, pounce-serve", wire="pounce", messages=3, shared_memory=True),
+    Way(name="zenoh, as by default, pounce-serve", wire="pounce", messages=3, shared_memory=True, unix=True),
 )
 
 
@@ -142,8 +155,9 @@ class OverLink:
         self._codec = codec
         self._invokes = invokes
         self._tick = 0
-        self._link = Link(bus, robot=ROBOT, proc="sim")
-        self._link.enter_episode("bench", EPISODE, 1)
+        self._link, self._clock = (Link(bus, robot=ROBOT, proc=proc) for proc in ("sim", "clock"))
+        for link in (self._link, self._clock):
+            link.enter_episode("bench", EPISODE, 1)
         self._chunks = self._link.subscribe(topics.CHUNK)
         if invokes:
             self._open()
@@ -158,7 +172,7 @@ class OverLink:
             invocation = m.Invocation(
                 invocation=tick, tick=tick, now_ns=now_ns, ref_query=None, age_ns=0, cognition=_NO_COGNITION
             )
-            self._link.publish(topics.INVOCATION, invocation, at_ns=now_ns)
+            self._clock.publish(topics.INVOCATION, invocation, at_ns=now_ns)
         deadline_s = time.monotonic() + _PATIENCE_S
         while time.monotonic() < deadline_s:
             for chunk in self._chunks.drain():
@@ -168,8 +182,9 @@ class OverLink:
         raise TimeoutError(f"no chunk for tick {tick} within {_PATIENCE_S:.0f} s")
 
     def _open(self) -> None:
-        request = m.OpenRequest(info=episode_info(self._link.header("info", 0)))
-        reply = self._link.call(topics.OPEN, "pounce", request, timeout_ns=5_000_000_000)
+        members = tuple(m.Member(proc=link.proc, boot_id=link.boot_id) for link in (self._link, self._clock))
+        request = m.OpenRequest(info=episode_info(self._link.header("info", 0)), members=members)
+        reply = self._clock.call(topics.OPEN, "pounce", request, timeout_ns=5_000_000_000)
         if reply.error:
             raise CallFailed("open", 5_000, reply.error)
 
@@ -304,6 +319,7 @@ def contest() -> Iterator[list[Contestant]]:
 def _serving(way: Way, port: int) -> Iterator[subprocess.Popen[str]]:
     command = [sys.executable, "-m", "benchmarks.noop_policy", way.wire, "--port", str(port)]
     command += ["--shared-memory"] if way.shared_memory else []
+    command += ["--unix"] if way.unix else []
     server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         if server.stdout is None or server.stdout.readline().strip() != "READY":
@@ -336,7 +352,7 @@ def _connected(way: Way, port: int) -> Iterator[Call]:
             keep_freed_memory()
         yield OverWebsocket(port)
         return
-    bus = ZenohBus(Endpoints(connect=(f"tcp/127.0.0.1:{port}",), shared_memory=way.shared_memory))
+    bus = ZenohBus(Endpoints(connect=(endpoint_at(port, unix=way.unix),), shared_memory=way.shared_memory))
     try:
         time.sleep(1.0)  # until links and subscriptions are established
         yield OverBus(bus) if way.wire == "bytes" else OverLink(bus, way.codec, invokes=way.wire == "pounce")

@@ -30,6 +30,7 @@ from protocol.heartbeat import Heartbeat
 from protocol.link import Link
 from protocol.logs import set_up_logging
 from protocol.process import host_clock_id, run
+from protocol.sockets import endpoint
 from protocol.topics import Priority
 from protocol.zenoh_bus import Endpoints, ZenohBus
 
@@ -41,6 +42,11 @@ _CACHE_LINE_BYTES = 64
 REQUEST_KEY, ANSWER_KEY = "bench/request", "bench/answer"  # keys of the wire "bytes"
 
 Wire = Literal["openpi", "observation", "bytes", "pounce"]
+
+
+def endpoint_at(port: int, *, unix: bool) -> str:
+    """Where a server of zenoh listens: a port, or the socket that has its number."""
+    return endpoint(f"bench-{port}") if unix else f"tcp/127.0.0.1:{port}"
 
 
 def answer(front: NDArray[np.uint8], wrist: NDArray[np.uint8], state: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -187,6 +193,7 @@ class NoopOptions:
     wire: tyro.conf.Positional[Wire]
     port: int
     shared_memory: bool = False
+    unix: bool = False
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -196,7 +203,8 @@ def main(argv: list[str] | None = None) -> int:
     if options.wire == "openpi":
         serve_openpi(options.port)
         return 0
-    bus = ZenohBus(Endpoints(listen=(f"tcp/127.0.0.1:{options.port}",), shared_memory=options.shared_memory))
+    at = endpoint_at(options.port, unix=options.unix)
+    bus = ZenohBus(Endpoints(listen=(at,), shared_memory=options.shared_memory))
     if options.wire == "bytes":
         serve_bytes(bus)
     elif options.wire == "observation":
