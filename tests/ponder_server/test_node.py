@@ -175,7 +175,7 @@ def test_bytes_that_are_no_picture_cost_their_query_only(node: PonderNode) -> No
     node.on_observation(look(1))
     node.on_query(ask(0, 0))
     node.on_query(ask(1, 1))
-    with pytest.raises(MalformedMessage, match=r"Image\.data: expected a JPEG picture"):
+    with pytest.raises(MalformedMessage, match=r"Image\.data: expected a JPEG or PNG picture"):
         node.next_work()
     assert worked(node) == [1]
 
