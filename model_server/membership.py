@@ -55,6 +55,7 @@ class Membership:
         self._ask_again_ns = 0
         self._clocks = link.bus.watch_alive(alive_key(link.robot, "clock"))
         self._is_clock_there = False
+        self._clock_lost_ns = 0
         self._refused = ""
         self._is_lockstep = False
         self._is_draining = False
@@ -70,6 +71,8 @@ class Membership:
         """Answers waiting calls; returns whether there were any."""
         for sample in self._clocks.drain():
             self._is_clock_there = bool(sample.payload)
+            if not self._is_clock_there:
+                self._clock_lost_ns = time.monotonic_ns()
         answered = self._opening.answer(self._on_open) + self._closing.answer(self._on_close)
         return answered + self._asking.answer(self._on_contract) + self._timing.answer(_on_time) > 0
 
@@ -155,6 +158,7 @@ class Membership:
         try:
             self._link.enter_episode(header.session, header.episode, header.epoch, request.members)
             contract = replace(self._open_episode(request), boot_id=self._link.boot_id)
+            self._clock_lost_ns = 0
             self._is_lockstep = request.info.schedule.mode == m.Mode.LOCKSTEP
         except ValueError as error:
             self._leave()
@@ -187,7 +191,9 @@ class Membership:
         return boot_id == self._link.members.get("clock") or self._is_clock_gone()
 
     def _is_clock_gone(self) -> bool:
-        return not self._is_clock_there and self._link.silent_ns("clock") > _CLOCK_SILENCE_NS
+        """Whether this episode's clock lost its token and was not heard since: a successor's token says nothing."""
+        silent_ns = self._link.silent_ns("clock")
+        return silent_ns > _CLOCK_SILENCE_NS and time.monotonic_ns() - silent_ns < self._clock_lost_ns
 
     def _leave(self) -> None:
         self._close_episode()

@@ -124,10 +124,22 @@ def test_servers_whose_clock_is_gone_are_free(
     monkeypatch.setattr(membership, "_CLOCK_SILENCE_NS", 0)
     rig.enter(episode_info(paper))
     rig.bus.end_alive(topics.alive_key("r0", "clock"))
-    second = ClockService(Link(rig.bus, robot="r0", proc="clock"), ServiceConfig(watches=False))
-    rig.bus.end_alive(topics.alive_key("r0", "clock"))
+    rig.bus.run_participants()
+    second = ClockService(Link(rig.bus, robot="r0", proc="clock"), ServiceConfig(watches=False))  # under its token
     reply = second.open(m.OpenRequest(info=episode_info(paper, session="s2", epoch=2)))
     assert reply.error == ""
+
+
+def test_the_loss_of_an_earlier_clock_frees_no_server_of_the_next(
+    rig: Any, episode_info: Info, paper: m.Schedule, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(membership, "_CLOCK_SILENCE_NS", 0)
+    rig.bus.end_alive(topics.alive_key("r0", "clock"))
+    rig.bus.run_participants()
+    rig.enter(episode_info(paper))
+    second = ClockService(Link(rig.bus, robot="r0", proc="clock"), ServiceConfig(watches=False))
+    reply = second.open(m.OpenRequest(info=episode_info(paper, session="s2", epoch=2)))
+    assert reply.refusal == m.Refusal.BUSY
 
 
 def test_a_second_pounce_is_let_in_when_the_first_one_is_lost_and_not_before(
