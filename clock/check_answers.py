@@ -141,7 +141,8 @@ def _left_out(
         return
     start_ns, hz = record.ticks[0].deadline_ns, record.info.schedule.control_hz
     first = max(due_tick, tick_at(start_ns, due_ns - 1, hz) + 1)
-    last = len(record.ticks) if before_ns is None else tick_at(start_ns, before_ns, hz)
+    # A request of the last second may have been on its way to the log when the episode ended.
+    last = len(record.ticks) - hz if before_ns is None else tick_at(start_ns, before_ns, hz)
     if first < last:
         yield from compare(message, index, sent=(f"at tick {first}", f"at tick {last}" if before_ns else "never"))
 
