@@ -15,7 +15,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -382,20 +382,17 @@ def _rss_mb(pid: int | str) -> float:
     return next(int(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("VmRSS"))
 
 
-def _rows(outcomes: Iterator[tuple[str, Outcome]]) -> list[Row]:
-    return [
-        {
-            "stage": name,
-            "sent": each.sent,
-            "episodes": each.episodes,
-            "failures": each.failures,
-            "unsound_commands": each.unsound,
-            "logs_disputed": each.disagree,
-            "growth_mb": each.growth_mb,
-            "dropped": ", ".join(f"{reason} {count}" for reason, count in sorted(each.dropped.items())),
-        }
-        for name, each in outcomes
-    ]
+def _row(stage: str, each: Outcome) -> Row:
+    return {
+        "stage": stage,
+        "sent": each.sent,
+        "episodes": each.episodes,
+        "failures": each.failures,
+        "unsound_commands": each.unsound,
+        "logs_disputed": each.disagree,
+        "growth_mb": each.growth_mb,
+        "dropped": ", ".join(f"{reason} {count}" for reason, count in sorted(each.dropped.items())),
+    }
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -408,7 +405,10 @@ def main(argv: list[str] | None = None) -> int:
         warm_up="none; memory is compared with that after the first episode of a stage",
     )
     stages = (("members, lockstep", members), ("strangers, lockstep", strangers), ("strangers, real time", realtime))
-    rows = _rows((name, stage(options)) for name, stage in stages)
+    rows = []
+    for name, stage in stages:
+        rows.append(_row(name, stage(options)))
+        print(rows[-1], flush=True)
     report.add_table("Mutated messages", rows)
     if options.report:
         report.write()
