@@ -24,8 +24,6 @@ from protocol.errors import CommandError, FileError
 
 MAX_TEXT_BYTES = 64 << 20  # the largest text that we write, 100,000 episodes of results, has about half of that
 MAX_NPZ_BYTES = 256 << 20  # a pair with 48 s of two 256 px views at 5 Hz has 200 MB
-
-MAX_JSON_BYTES = 16 << 20  # a folder's description
 MAX_TOKENIZER_BYTES = 100 << 20
 """Largest tokenizer that is parsed; Qwen3.5's and Gemma's have 12 and 34 MB."""
 
@@ -106,7 +104,7 @@ def read_text(path: Path, kind: str) -> str:
         data = file.read(MAX_TEXT_BYTES + 1)
         if len(data) > MAX_TEXT_BYTES:
             raise ValueError(f"more than {MAX_TEXT_BYTES >> 20} MiB")
-        return data.decode("utf-8")
+        return data.decode("utf-8-sig")
 
 
 def read_json(path: Path, kind: str) -> Any:
@@ -138,42 +136,35 @@ def read_npz(path: Path, kind: str, *, most_bytes: int = MAX_NPZ_BYTES) -> dict[
             return {name: arrays[name] for name in arrays.files}
 
 
-def require_file(path: Path, max_bytes: int | None = None) -> None:
-    """Checks that ``path`` is a readable file with content.
-
-    Raises:
-        OSError: it is not there, or may not be read; the message names it.
-        ValueError: it is no file, is empty, is larger than ``max_bytes``, or is a Git LFS pointer to the real file.
-    """
-    if path.is_symlink() and not path.exists():
-        raise FileNotFoundError(f"{path} links to {os.readlink(path)}, which is not there; download the folder again")
-    status = path.stat()
-    if not stat.S_ISREG(status.st_mode):  # a pipe or a device would never end
-        raise ValueError(f"{path} is not a regular file")
-    if status.st_size == 0:
-        raise ValueError(f"{path} is empty; download it again")
-    if max_bytes is not None and status.st_size > max_bytes:
-        raise ValueError(f"{path} has {status.st_size} bytes; at most {max_bytes} are read")
-    with path.open("rb") as file:
-        if file.read(len(_LFS_POINTER)) == _LFS_POINTER:
-            raise ValueError(f"{path} is a Git LFS pointer, not the file itself; run `git lfs pull` in its folder")
-
-
-def read_object(path: Path) -> dict[str, Any]:
-    """Reads a JSON object.
+def read_object(path: Path, kind: str = "JSON object") -> dict[str, Any]:
+    """A JSON object, its values of any type.
 
     Raises:
         OSError: as `require_file`.
-        ValueError: as `require_file`, or the file holds no JSON object; the message names it.
+        FileError: as `require_file`, or it holds something else.
     """
-    require_file(path, MAX_JSON_BYTES)
-    try:
-        values = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is no JSON, or was cut short: {error}") from None
+    require_file(path, MAX_TEXT_BYTES)
+    values = read_json(path, kind)
     if not isinstance(values, dict):
-        raise ValueError(f"{path}: expected a JSON object, came {type(values).__name__}")
+        raise FileError(f"{path} is no {kind}: it holds a {type(values).__name__}")
     return values
+
+
+def require_file(path: Path, max_bytes: int | None = None) -> None:
+    """Checks that ``path`` is a file with content, before a library is given its name.
+
+    Raises:
+        OSError: it is not there, or may not be read; the message names it.
+        FileError: it is no file, is empty, is larger than ``max_bytes``, or is a Git LFS pointer to the real file.
+    """
+    if path.is_symlink() and not path.exists():
+        raise FileNotFoundError(f"{path} links to {os.readlink(path)}, which is not there; download the folder again")
+    with open_file(path) as file:
+        num_bytes = os.fstat(file.fileno()).st_size
+    if max_bytes is not None and num_bytes > max_bytes:
+        raise FileError(f"{path} has {num_bytes} bytes; at most {max_bytes} are read")
+    if instead := _instead(path):
+        raise FileError(f"{path} is {instead}")
 
 
 def _instead(path: Path) -> str:
@@ -182,7 +173,7 @@ def _instead(path: Path) -> str:
         start = file.read(len(_LFS_POINTER))
     if start == _LFS_POINTER:
         return "a Git LFS pointer; fetch the file itself with: git lfs pull"
-    return "" if start else "an empty file"
+    return "" if start else "an empty file; fetch it again"
 
 
 def _reason(error: Exception) -> str:

@@ -5,7 +5,6 @@ expected.safetensors. Sizes are read from config.json. Choices that this package
 norms, where time enters) are compared, and a golden that differs in one is refused.
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,7 @@ from dual_system.models.pi05.gemma import RMS_NORM_EPS, ROPE_BASE, GemmaConfig
 from dual_system.models.pi05.network import TIME_MAX_PERIOD, TIME_MIN_PERIOD, Pi05Config
 from dual_system.models.pi05.pounce import Pounce, PounceConfig
 from dual_system.models.siglip import LAYER_NORM_EPS, VisionConfig
+from protocol.files import read_object
 
 NO_COGNITION = CognitionConfig(num_carriers=0)
 _VISION_FACTS = {
@@ -91,10 +91,10 @@ def read_golden(folder: Path) -> Golden:
     """Reads a folder and loads its weights through the package's own loader.
 
     Raises:
-        GoldenError: a file or a size is missing, or the architecture differs from this package's.
+        ValueError: a file or a size is missing or broken, or the architecture differs from this package's.
         WeightsError: the weights do not fit the configuration.
     """
-    sizes = _Sizes(_read_json(folder / "config.json"), str(folder / "config.json"))
+    sizes = _Sizes(read_object(folder / "config.json"), str(folder / "config.json"))
     given, expected = (_read_tensors(folder / f"{name}.safetensors") for name in ("inputs", "expected"))
     weights = folder / "weights.safetensors"
     model: Pounce | GrootPounce
@@ -246,16 +246,6 @@ def _block(sizes: _Sizes, stack: str) -> BlockConfig:
 def _require(tensors: dict[str, Tensor], names: set[str], path: Path) -> None:
     if lacking := sorted(names - tensors.keys()):
         raise GoldenError(f"{path}: no {', '.join(lacking)}")
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        values = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise GoldenError(f"{path}: {error}") from error
-    if not isinstance(values, dict):
-        raise GoldenError(f"{path}: expected an object, came {type(values).__name__}")
-    return values
 
 
 def _read_tensors(path: Path) -> dict[str, Tensor]:

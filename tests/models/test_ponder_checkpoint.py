@@ -181,7 +181,7 @@ def test_a_declaration_that_cannot_be_is_refused(
 @pytest.mark.parametrize("values", [[], 7, "ponder"])
 def test_a_declaration_that_is_no_object_is_refused(folder: Path, values: object) -> None:
     declare(folder, values)
-    with pytest.raises(ValueError, match=r"ponder\.json: expected a JSON object"):
+    with pytest.raises(ValueError, match=r"ponder\.json is no JSON object"):
         load_ponder(folder)
 
 

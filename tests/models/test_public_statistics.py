@@ -61,7 +61,7 @@ def test_padding_is_cut_off(tmp_path: Path) -> None:
         (tables(actions={"q01": [2] * 8, "q99": [1] * 8}), "exceeds q99"),
         (tables(actions=None), r"actions\.q01: expected"),
         ({"norm_stats": 3}, "expected norm_stats to be an object"),
-        ([], "expected a JSON object"),
+        ([], "is no JSON object"),
         (tables() | {"delta_mask": [True] * 8}, r"delta_mask is .*, expected .*False\]: joint deltas and a gripper"),
     ],
 )

@@ -123,15 +123,15 @@ def test_a_byte_order_mark_is_no_part_of_the_json(tmp_path: Path) -> None:
     ("make", "said"),
     [
         (lambda path: path.write_text("version https://git-lfs.github.com/spec/v1\noid x\n"), "Git LFS .*git lfs pull"),
-        (lambda path: path.write_text('{"a": '), "is no JSON, or was cut short"),
-        (lambda path: path.write_text("[]"), "expected a JSON object, came list"),
-        (lambda path: path.write_text("[" * 100_000), "is no JSON.*recursion"),
-        (lambda path: path.write_text('{"a": ' + "9" * 10_000 + "}"), "is no JSON.*digits"),
-        (lambda path: path.write_bytes(b"\xff\xfe{}"), "is no JSON.*decode"),
-        (lambda path: path.write_text(""), "is empty"),
-        (lambda path: path.mkdir(), "not a regular file"),
-        (os.mkfifo, "not a regular file"),
-        (lambda path: path.symlink_to("/dev/zero"), "not a regular file"),
+        (lambda path: path.write_text('{"a": '), "is no JSON object: Expecting value"),
+        (lambda path: path.write_text("[]"), "is no JSON object: it holds a list"),
+        (lambda path: path.write_text("[" * 100_000), "is no JSON object: nested too deeply"),
+        (lambda path: path.write_text('{"a": ' + "9" * 10_000 + "}"), "is no JSON object: .*digits"),
+        (lambda path: path.write_bytes(b"\xff\xfe{}"), "is no JSON object: .*decode"),
+        (lambda path: path.write_text(""), "is an empty file"),
+        (lambda path: path.mkdir(), "is a folder; expected a file"),
+        (os.mkfifo, "is a pipe or a device; expected a file"),
+        (lambda path: path.symlink_to("/dev/zero"), "is a pipe or a device; expected a file"),
         (lambda path: path.symlink_to("blob"), "links to blob, which is not there"),
         (lambda path: path.symlink_to(path.name), r"links to a\.json"),
         (lambda path: None, "No such file"),
@@ -144,7 +144,7 @@ def test_what_is_no_json_object_is_refused_by_name(
     path = tmp_path / "a.json"
     make(path)
     if "at most" in said:
-        monkeypatch.setattr(files, "MAX_JSON_BYTES", 100)
+        monkeypatch.setattr(files, "MAX_TEXT_BYTES", 100)
     with pytest.raises((OSError, ValueError), match=said) as error:
         read_object(path)
     assert str(path) in str(error.value)
