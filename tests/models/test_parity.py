@@ -343,7 +343,7 @@ def _set(folder: Path, name: str, value: object) -> None:
 BROKEN: dict[str, tuple[Callable[[Path], None], str]] = {
     "no weights": (lambda folder: (folder / "weights.safetensors").unlink(), "has no weights.safetensors"),
     "no config": (lambda folder: (folder / "config.json").unlink(), "config.json"),
-    "config is no object": (lambda folder: (folder / "config.json").write_text("[]") and None, "is no JSON object: it holds a list"),
+    "config is no object": (lambda folder: (folder / "config.json").write_text("[]") and None, "holds a list"),
     "no size": (lambda folder: _set(folder, "llm.mlp", None), "no llm.mlp"),
     "another family": (lambda folder: _set(folder, "family", "gr00t_n1_7"), "family is 'gr00t_n1_7', expected 'pi05'"),
     "another gelu": (lambda folder: _set(folder, "vision.activation", "gelu"), "vision.activation is 'gelu', built"),
