@@ -16,7 +16,7 @@ from clock.check_findings import Disagreement, compare
 from clock.conductor import invocation_seed
 from clock.delays import in_order, modelled_ns
 from clock.playback import Chunk, covering, deadline_ns, tick_at
-from clock.reference import Ready, latest_ready, refer
+from clock.reference import Ready, latest_ready, refer, text_age_ns
 from protocol.mcap_log import EpisodeRecord
 from protocol.messages import (
     EPISODE_CLOCK,
@@ -265,10 +265,18 @@ def _check_given(record: EpisodeRecord, answers: Answers, index: int, invocation
     if latest_ready(admitted, invocation.now_ns) is None:
         yield from compare("Invocation", index, now_ns=("after the first cognition", invocation.now_ns))
     if reference.query is None:
-        yield from compare("Invocation", index, cognition=((0, 0), invocation.cognition.shape))
+        none = ((0, 0), None, 0)
+        came = (invocation.cognition.shape, invocation.text, invocation.text_age_ns)
+        yield from compare("Invocation", index, cognition=(none, came))
     elif reference.query in answers.cognitions:
-        vector = answers.cognitions[reference.query].vector
-        yield from compare("Invocation", index, cognition=(vector, invocation.cognition))
+        given = answers.cognitions[reference.query]
+        yield from compare(
+            "Invocation",
+            index,
+            cognition=(given.vector, invocation.cognition),
+            text=(given.text, invocation.text),
+            text_age_ns=(text_age_ns(given, invocation.now_ns), invocation.text_age_ns),
+        )
 
 
 def _first_tick(record: EpisodeRecord) -> int:

@@ -22,7 +22,7 @@ from clock.delays import in_order, modelled_ns
 from clock.ladder import Ladder
 from clock.limits import Hit, out_of_range
 from clock.playback import Chunk, Join, covering, deadline_ns, row_of, seam_policy, tick_at
-from clock.reference import Ready, Reference, latest_ready, refer
+from clock.reference import Ready, latest_ready, refer, text_age_ns
 from clock.residual import Due, ResidualHead, corrected
 from clock.timebase import NS_PER_S
 from protocol.messages import (
@@ -107,7 +107,7 @@ class Conductor:
     _queries: list[_Pending] = field(default_factory=list)
     _invocations: list[_Pending] = field(default_factory=list)
     _ready: list[Ready] = field(default_factory=list)
-    _vectors: dict[int, Floats] = field(default_factory=dict)
+    _cognitions: dict[int, Cognition] = field(default_factory=dict)
     _chunks: list[Chunk] = field(default_factory=list)
     _last_ready_ns: dict[StampKind, int] = field(default_factory=dict)
     _query_due_ns: int = 0
@@ -376,6 +376,7 @@ class Conductor:
         asked = _Pending(self.num_invocations, tau_ns, delay, (row0_tick, reference.query, reference.age_ns))
         self._invocations.append(asked)
         tail = self._unplayed_rows(tick)
+        given = None if reference.query is None else self._cognitions[reference.query]
         effects.append(
             Invocation(
                 invocation=asked.index,
@@ -383,16 +384,15 @@ class Conductor:
                 now_ns=tau_ns,
                 ref_query=reference.query,
                 age_ns=reference.age_ns,
-                cognition=self._vector_of(reference),
+                cognition=_NO_CARRIERS if given is None else given.vector,
                 seed=invocation_seed(self.info.schedule.seed, asked.index),
                 previous_rows=tail.ravel(),
                 committed_rows=min(self.committed_ticks, len(tail)),
+                text=None if given is None else given.text,
+                text_age_ns=0 if given is None else text_age_ns(given, tau_ns),
             )
         )
         self.num_invocations += 1
-
-    def _vector_of(self, reference: Reference) -> Floats:
-        return _NO_CARRIERS if reference.query is None else self._vectors[reference.query]
 
     def _unplayed_rows(self, tick: int) -> Floats:
         chunks = covering(self._chunks, tick)
@@ -413,8 +413,8 @@ class Conductor:
                     is_transition=answer.is_transition,
                 )
             )
-            self._vectors[stamp.index] = answer.vector
-            self._forget_vectors()
+            self._cognitions[stamp.index] = answer
+            self._forget_cognitions()
             effects.append(stamp)
         for asked, stamp in self._ripe(self._invocations, StampKind.CHUNK, now_ns):
             answer = asked.answer
@@ -434,16 +434,16 @@ class Conductor:
     def _ripe(self, asked: list[_Pending], kind: StampKind, now_ns: int) -> list[tuple[_Pending, Stamp]]:
         return _ripe(asked, kind, self._last_ready_ns, now_ns, self._is_lockstep)
 
-    def _forget_vectors(self) -> None:
-        """Keeps only vectors that a delivery can still refer to: the newest, the first, and the last two transitions'.
+    def _forget_cognitions(self) -> None:
+        """Keeps only cognitions that a delivery may refer to: the newest, the first, and the last two transitions'.
 
         Two, because the last one may have come after the tick's deadline and before this late poll.
         """
         transitions = [r.query for r in self._ready if r.is_transition]
         first = min(r.query for r in self._ready)  # an overdue answer may follow a later one
         keep = {first, *transitions[-2:], *(r.query for r in self._ready[-8:])}
-        for query in self._vectors.keys() - keep:
-            del self._vectors[query]
+        for query in self._cognitions.keys() - keep:
+            del self._cognitions[query]
 
     def _play(self, now_ns: int, effects: list[Effect]) -> None:
         self._chunks = [c if c.first_tick is not None else replace(c, first_tick=self.tick) for c in self._chunks]

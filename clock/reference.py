@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from protocol.messages import Delivery, DeliveryKind
+from protocol.messages import Cognition, Delivery, DeliveryKind
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,6 +42,11 @@ def latest_ready(stamps: Iterable[Ready], now_ns: int) -> Ready | None:
 def age_ns(ref: Ready | None, now_ns: int) -> int:
     """Age since the observation, not since the answer was ready; the null cognition has age 0."""
     return 0 if ref is None else now_ns - ref.source_ns
+
+
+def text_age_ns(cognition: Cognition, now_ns: int) -> int:
+    """Age of a cognition's text since the observation it was written about; without a text 0."""
+    return now_ns - cognition.text_source_ns if cognition.text else 0
 
 
 def held_at_transition(stamps: Iterable[Ready], now_ns: int) -> Ready | None:

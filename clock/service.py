@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from clock.channels import misfit
 from clock.conductor import Conductor, Stage
 from clock.feasibility import check_feasible
 from clock.offset import Offset, from_exchange, narrowest
@@ -200,7 +201,7 @@ class ClockService:
         contract = episode.contracts.get("ponder")
         if contract is None or not self._is_agreed(episode, "ponder", cognition):
             return False
-        expected = (contract.num_carriers, contract.hidden_size)
+        expected = (contract.num_carriers, contract.hidden_size) if contract.num_carriers else (0, 0)
         if cognition.vector.shape != expected:
             detail = f"expected a cognition of {expected}, came {cognition.vector.shape}"
             self._link.drop(source_of(cognition.header), DropReason.WRONG_SHAPE, detail)
@@ -470,16 +471,8 @@ class ClockService:
             EpisodeRefused: the parts do not fit, the schedule is infeasible, or untrained weights would move a robot.
         """
         ponder, pounce = contracts
-        fits = (
-            ("carriers K", ponder.num_carriers, pounce.num_carriers),
-            ("hidden size H", ponder.hidden_size, pounce.hidden_size),
-        )
-        for what, left, right in fits:
-            if pounce.num_carriers and left != right:
-                raise EpisodeRefused(
-                    m.Refusal.MODELS,
-                    f"{what}: PONDER gives {left}, POUNCE expects {right}. Load checkpoints trained together.",
-                )
+        if why_not := misfit(ponder, pounce):
+            raise EpisodeRefused(m.Refusal.MODELS, why_not)
         if (pounce.horizon, pounce.action_dim) != (info.schedule.horizon, info.robot.action_dim):
             raise EpisodeRefused(
                 m.Refusal.ROBOT,

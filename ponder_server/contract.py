@@ -74,6 +74,8 @@ class EngineSpec:
     """Sampling of demonstrations."""
     session_bytes: int = 0
     """Memory of one session at full length; it is allocated for all sessions at start."""
+    gives_text: bool = True
+    """False if it never writes a subgoal, so that POUNCE's prompt cannot come from it."""
     weights: WeightsName = "float"
     cognition_error: float = 0.0
     """Relative L2 change of C by narrow ``weights``, measured in the warm-up's short context."""

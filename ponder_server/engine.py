@@ -115,6 +115,7 @@ class QwenEngine:
             is_random=ponder.is_random,
             dtype=str(ponder.dtype).removeprefix("torch."),
             session_bytes=session_bytes,
+            gives_text=self._format.speaks,
         )
         draft = draft or NoDraft()
         self._parts = [*(layer.mlp for layer in ponder.layers), *draft.parts]

@@ -171,6 +171,8 @@ class RobotServer(PonderServer):
             fire = outcome.unwrap()
             if self._is_owed(work):
                 self._answer(work, fire, start_ns)
+            else:
+                self._node.keep(work.query, fire)
         return True
 
     def _fail(self, work: Work, error: Exception) -> None:

@@ -36,6 +36,7 @@ class PonderNode:
         self._rendezvous: Rendezvous[m.Query] = Rendezvous(keep_requests=KEEP_QUERIES)
         self.next_query = 0
         self._next_asked = 0
+        self._subgoal, self._subgoal_source_ns = "", 0
 
     @property
     def num_superseded(self) -> int:
@@ -45,6 +46,7 @@ class PonderNode:
         """Starts an episode; after a rebuild, queries before ``next_query`` are in the context already."""
         self._rendezvous.clear()
         self.next_query = self._next_asked = next_query
+        self._subgoal, self._subgoal_source_ns = "", 0
 
     def on_observation(self, observation: m.Observation) -> None:
         """Keeps an observation for queries; without pictures it is ignored, as no query names it (`will_look`).
@@ -87,10 +89,17 @@ class PonderNode:
         """Queries whose observation was lost in transit."""
         return list(self._rendezvous.give_up())
 
+    def keep(self, query: m.Query, fire: Fire) -> None:
+        """Takes the subgoal that a fire wrote: it is in force until the next one, and goes with every answer."""
+        for text in fire.texts:
+            if text.kind == "subgoal":
+                self._subgoal, self._subgoal_source_ns = text.text, query.source_ns if text.text else 0
+
     def answer(self, work: Work, fire: Fire, *, ready_ns: int, infer_ns: int) -> tuple[m.Cognition, list[m.Subgoal]]:
         """Messages to publish: the cognition, and PONDER's generated texts."""
         query = work.query
         self.next_query = query.query + 1
+        self.keep(query, fire)
         vector = np.ascontiguousarray(fire.cognition, np.float32)
         cognition = m.Cognition(
             query=query.query,
@@ -104,6 +113,8 @@ class PonderNode:
             norm=float(np.linalg.norm(vector)),
             model_hash=self._spec.model_hash,
             is_fake=self._spec.is_random,
+            text=self._subgoal if self._spec.gives_text else None,
+            text_source_ns=self._subgoal_source_ns,
         )
         texts = [
             m.Subgoal(

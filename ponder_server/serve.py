@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from model_server.shell import ModelShell
-from ponder_server.contract import ContextFull, Fire, Opening, PonderEngine, SessionError
+from ponder_server.contract import ContextFull, EngineSpec, Fire, Opening, PonderEngine, SessionError
 from ponder_server.node import PonderNode, Work, check_robot
 from protocol import codec, images, topics
 from protocol import messages as m
@@ -85,7 +85,7 @@ class PonderServer(ModelShell):
                 if work.query.query == rejoined.owed_query:
                     self._fire(work)  # the clock still waits for this one (lockstep)
                 else:
-                    self._think(work)
+                    self._node.keep(work.query, self._think(work))
         except (CallFailed, ProtocolError, ContextFull) as error:
             self._give_up(error)
             return False
@@ -168,6 +168,7 @@ class PonderServer(ModelShell):
             version=self._version,
             max_context_tokens=spec.max_context_tokens,
             demonstrations=m.DemoSampling(hz=spec.demonstrations.hz, to_its_end=spec.demonstrations.to_its_end),
+            channels=_channels(spec),
         )
 
     def _open(self, request: m.OpenRequest) -> m.Contract:
@@ -186,3 +187,9 @@ class PonderServer(ModelShell):
             self._engine.close(self._link.episode)
         self._node.open()
         self._last = None
+
+
+def _channels(spec: EngineSpec) -> tuple[m.ChannelSpec, ...]:
+    vectors = [m.PayloadKind.VECTORS] if spec.num_carriers else []
+    texts = [m.PayloadKind.TEXT] if spec.gives_text else []
+    return tuple(m.ChannelSpec(payload=payload) for payload in (*vectors, *texts))

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 
+from clock.channels import PREFIX, PROMPT
 from clock.feasibility import delay_ticks
 from model_server.shell import ModelShell
 from pounce_server.contract import PounceEngine, check_robot
 from pounce_server.node import PounceNode, Work
-from pounce_server.subgoal_text import Source, SubgoalText
+from pounce_server.subgoal_text import OracleText, Source
 from protocol import codec, images, topics
 from protocol import messages as m
 from protocol.drops import DropReason
@@ -24,14 +25,15 @@ class PounceServer(ModelShell):
     def __init__(
         self, link: Link, engine: PounceEngine, heartbeat: Heartbeat, version: str, subgoals: Source | None = None
     ) -> None:
-        """``subgoals``: source of the texts for an engine that reads them; see `subgoal_text`."""
+        """``subgoals``: source of the texts for an engine that must read them. None, "ponder": the invocation's."""
         super().__init__(link, engine, heartbeat, version)
         self._engine = engine
         self._has_subgoals = subgoals is not None
-        self._node = PounceNode(engine.spec, None if subgoals is None else SubgoalText(subgoals))
+        oracle = OracleText() if subgoals == "oracle" else None
+        self._node = PounceNode(engine.spec, oracle)
         self._invocations = link.subscribe(topics.INVOCATION)
         self._last: m.ActionChunk | None = None
-        self._subgoals = link.subscribe(topics.SUBGOAL) if self._has_subgoals else None
+        self._subgoals = None if oracle is None else link.subscribe(topics.SUBGOAL)
 
     @property
     def num_superseded(self) -> int:
@@ -125,17 +127,17 @@ class PounceServer(ModelShell):
             model_hash=spec.model_hash,
             is_fake=spec.is_fake,
             version=self._version,
+            channels=self._channels(),
         )
+
+    def _channels(self) -> tuple[m.ChannelSpec, ...]:
+        spec = self._engine.spec
+        reads_ponder_s = spec.reads_subgoal and self._subgoals is None
+        return (*([PREFIX] if spec.num_carriers else []), *([PROMPT] if reads_ponder_s else []))
 
     def _open(self, request: m.OpenRequest) -> m.Contract:
         spec = self._engine.spec
         check_robot(request.info.robot, spec)
-        if spec.reads_subgoal and not self._has_subgoals:
-            raise EpisodeRefused(
-                m.Refusal.MODELS,
-                "this checkpoint reads PONDER's subgoals in place of cognition, and no message of the protocol brings "
-                "them to POUNCE; serve one that reads cognition, or evaluate with pp-eval --subgoal-text",
-            )
         if self._has_subgoals and not spec.reads_subgoal:
             raise EpisodeRefused(
                 m.Refusal.MODELS,

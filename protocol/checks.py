@@ -29,6 +29,7 @@ MAX_INSTANT_NS = 10**18  # 31 years: more is a unit mistake
 MAX_INDEX = 2**53
 MAX_DEMO_FRAMES = 600
 MAX_MEMBERS = 16
+MAX_CHANNELS = 8
 DEMO_VIDEO_HZ = 20
 MAX_DECAY = 10  # per chunk: exp(-10) is negligible
 MAX_JOURNAL_ENTRIES = 64
@@ -104,6 +105,13 @@ def _text(message: Any, *names: str, limit: int = MAX_TEXT) -> None:
             raise _broken(message, name, f"at most {limit} characters", len(value))
 
 
+def _spoken(message: Any, instant: str) -> None:
+    """A subgoal in force, and when it was written: 0 without one."""
+    if message.text is not None:
+        _text(message, "text")
+    _require(bool(message.text) or not getattr(message, instant), message, instant, "0 without a text", "a number")
+
+
 def _members(message: Any, members: tuple[m.Member, ...]) -> None:
     _require(len(members) <= MAX_MEMBERS, message, "members", f"at most {MAX_MEMBERS}", len(members))
     for member in members:
@@ -171,8 +179,11 @@ def check_cognition(c: m.Cognition) -> None:
     _index(c, "context_tokens")
     _instant(c, "source_ns", "ready_ns")
     _duration(c, "infer_ns")
-    _carriers(c, "vector", may_be_empty=False)
+    _carriers(c, "vector", may_be_empty=c.text is not None)
     _text(c, "model_hash", limit=MAX_ID)
+    _spoken(c, "text_source_ns")
+    written_ns = c.text_source_ns if c.text else c.source_ns
+    _require(0 <= c.source_ns - written_ns <= MAX_INSTANT_NS, c, "text_source_ns", f"<= {c.source_ns}", written_ns)
 
 
 def check_stamp(s: m.Stamp) -> None:
@@ -188,7 +199,7 @@ def check_invocation(i: m.Invocation) -> None:
     _instant(i, "now_ns")
     _duration(i, "age_ns")
     _carriers(i, "cognition", may_be_empty=True)
-    is_null = i.ref_query is None
+    is_null, is_text = i.ref_query is None, i.text is not None
     _require(
         not is_null or (i.age_ns == 0 and i.cognition.size == 0),
         i,
@@ -196,7 +207,10 @@ def check_invocation(i: m.Invocation) -> None:
         "0 for null cognition",
         i.age_ns,
     )
-    _require(is_null or i.cognition.size > 0, i, "cognition", "the vector of ref_query", "nothing")
+    _require(not (is_null and is_text), i, "text", "nothing for null cognition", "a text")
+    _require(is_null or is_text or i.cognition.size > 0, i, "cognition", "the vector of ref_query", "nothing")
+    _spoken(i, "text_age_ns")
+    _duration(i, "text_age_ns")
     _vector(i, "previous_rows", high=MAX_HORIZON * MAX_DIM)
 
 
@@ -337,6 +351,7 @@ def check_open_request(r: m.OpenRequest) -> None:
 def check_contract(c: m.Contract) -> None:
     _text(c, "proc", "model_hash", "version", limit=MAX_ID)
     _duration(c, "infer_p50_ns", "infer_p99_ns")
+    _require(len(c.channels) <= MAX_CHANNELS, c, "channels", f"at most {MAX_CHANNELS}", len(c.channels))
     if c.demonstrations is not None:
         hz = c.demonstrations.hz
         _require(hz > 0 and DEMO_VIDEO_HZ % hz == 0, c, "demonstrations.hz", f"a divisor of {DEMO_VIDEO_HZ}", hz)

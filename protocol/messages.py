@@ -136,6 +136,24 @@ class SeamKind(IntEnum):
     ENSEMBLE = 3
 
 
+class PayloadKind(IntEnum):
+    UNSPECIFIED = 0
+    VECTORS = 1
+    TEXT = 2
+
+
+class ConsumerKind(IntEnum):
+    UNSPECIFIED = 0
+    PREFIX = 1
+    PROMPT = 2
+
+
+class NullKind(IntEnum):
+    UNSPECIFIED = 0
+    LEARNED = 1
+    ABSENT = 2
+
+
 class Refusal(IntEnum):
     """Why an episode was not opened, for programs."""
 
@@ -211,6 +229,8 @@ class Cognition:
     norm: float = 0.0
     model_hash: str = ""
     is_fake: bool = False
+    text: str | None = None
+    text_source_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -237,6 +257,8 @@ class Invocation:
     previous_rows: Floats = field(default_factory=_no_floats)
     committed_rows: int = 0
     num_samples: int = 0
+    text: str | None = None
+    text_age_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -457,6 +479,14 @@ class DemoSampling:
     to_its_end: bool = False
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChannelSpec:
+    payload: PayloadKind
+    consumer: ConsumerKind = ConsumerKind.UNSPECIFIED
+    reads_age: bool = False
+    null: NullKind = NullKind.UNSPECIFIED
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Contract:
     proc: str
@@ -474,6 +504,7 @@ class Contract:
     max_context_tokens: int = 0
     demonstrations: DemoSampling | None = None
     boot_id: int = 0
+    channels: tuple[ChannelSpec, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

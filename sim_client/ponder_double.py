@@ -23,6 +23,10 @@ class Answer:
     """(K, H)."""
     is_transition: bool
     norm: float
+    text: str = ""
+    """The subgoal in force."""
+    text_age_ns: int = 0
+    """Age of that subgoal at the query's observation."""
 
 
 class PonderDouble(ABC):
@@ -79,6 +83,8 @@ class PonderDouble(ABC):
             norm=answer.norm,
             model_hash=self.model_hash,
             is_fake=self.is_fake,
+            text=answer.text,
+            text_source_ns=query.source_ns - answer.text_age_ns if answer.text else 0,
         )
         self.link.publish(topics.COGNITION, cognition, at_ns=now_ns, clock_id=host_clock_id())
 
@@ -94,4 +100,5 @@ class PonderDouble(ABC):
             model_hash=self.model_hash,
             is_fake=self.is_fake,
             version=version(),
+            channels=tuple(m.ChannelSpec(payload=kind) for kind in (m.PayloadKind.VECTORS, m.PayloadKind.TEXT)),
         )

@@ -56,6 +56,8 @@ class SwappedPonder(PonderDouble):
             vector=given.vector,
             is_transition=given.is_transition and not has_ended,
             norm=given.norm,
+            text=given.text or "",
+            text_age_ns=given.source_ns - given.text_source_ns if given.text else 0,
         )
 
     def end(self) -> None:

@@ -138,6 +138,8 @@ def think(query: m.Query, rng: np.random.Generator) -> m.Cognition:
         is_transition=bool(rng.random() < 0.15),
         infer_ns=int(rng.integers(20 * MS, 400 * MS)),
         norm=float(np.linalg.norm(vector)),
+        text=f"subgoal {query.query // 3}",
+        text_source_ns=query.source_ns - query.query % 3 * 500 * MS,
     )
 
 

@@ -99,6 +99,15 @@ def test_real_time_agrees_however_late_everybody_is(
     assert list(disagreements(record)) == []
 
 
+def test_a_subgoal_of_another_query_or_age_is_found(good: EpisodeRecord) -> None:
+    index = next(i for i, each in enumerate(good.invocations) if each.text_age_ns)
+    for field, value in (("text", "another"), ("text", None), ("text_age_ns", 1)):
+        forged = list(good.invocations)
+        forged[index] = replace(forged[index], **{field: value})
+        found = next(check_invocations(replace(good, invocations=forged), answers_of(good)))
+        assert (found.message, found.index, found.field) == ("Invocation", index, field)
+
+
 def test_lockstep_is_the_same_in_whatever_order_answers_come(timing: Any, lockstep: Any, record_of: Any) -> None:
     hashes = set()
     for order in range(4):

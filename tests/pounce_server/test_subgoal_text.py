@@ -1,22 +1,22 @@
-"""A POUNCE that reads text gets the subgoal of the moment: PONDER's of the query referred to, or the task's."""
+"""A POUNCE that reads text gets the subgoal of the moment: PONDER's, inside the invocation, or the task's own."""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
+from ponder_server.contract import Text
 from pounce_server.serve import PounceServer
-from pounce_server.subgoal_text import Source, SubgoalText
+from pounce_server.subgoal_text import OracleText, Source
 from protocol import messages as m
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
-from protocol.topics import SUBGOAL
+from protocol.topics import COGNITION, INVOCATION, SUBGOAL
 
 
 def invocation(tick: int, ref_query: int | None) -> m.Invocation:
@@ -29,18 +29,8 @@ def subgoal(kind: m.SubgoalKind, text: str, *, tick: int = 0, query: int | None 
     return m.Subgoal(kind=kind, text=text, tick=tick, query=query)
 
 
-@given(st.sets(st.integers(0, 20), min_size=1), st.none() | st.integers(0, 25))
-def test_the_text_is_the_newest_that_the_invocation_may_know(written_at: set[int], ref_query: int | None) -> None:
-    texts = SubgoalText("ponder")
-    for query in sorted(written_at):
-        texts.on_subgoal(subgoal(m.SubgoalKind.SUBGOAL, f"text {query}", query=query))
-        texts.on_subgoal(subgoal(m.SubgoalKind.TASK_GROUNDED, "the oracle's", tick=query))
-    known = [query for query in written_at if ref_query is not None and query <= ref_query]
-    assert texts.at(invocation(0, ref_query)) == (f"text {max(known)}" if known else "")
-
-
 def test_the_oracle_s_text_is_the_task_s_at_this_tick_as_ponder_would_write_it() -> None:
-    texts = SubgoalText("oracle")
+    texts = OracleText()
     texts.on_subgoal(subgoal(m.SubgoalKind.TASK_GROUNDED, "press at <128, 64>"))
     texts.on_subgoal(subgoal(m.SubgoalKind.TASK_SIMPLE, "pick", tick=30))
     texts.on_subgoal(subgoal(m.SubgoalKind.TASK_GROUNDED, "pick at <10, 20>", tick=30))
@@ -53,11 +43,11 @@ def test_the_oracle_s_text_is_the_task_s_at_this_tick_as_ponder_would_write_it()
 
 
 @pytest.fixture
-def text_rig(new_rig: Callable[..., Any], fake_pounce: Any) -> Callable[[Source], Any]:
+def text_rig(new_rig: Callable[..., Any], fake_pounce: Any) -> Callable[..., Any]:
     """A rig whose POUNCE reads text."""
     fake_pounce.spec = dataclasses.replace(fake_pounce.spec, num_carriers=0, reads_subgoal=True)
 
-    def build(source: Source) -> Any:
+    def build(source: Source | None, **engines: Any) -> Any:
         class Rig(new_rig):  # type: ignore[misc, valid-type]
             def start_pounce(self, link: Link, engine: Any) -> PounceServer:
                 server = PounceServer(link, engine, Heartbeat(link, "test", "host/monotonic"), "test", source)
@@ -65,7 +55,7 @@ def text_rig(new_rig: Callable[..., Any], fake_pounce: Any) -> Callable[[Source]
                 server.ready()
                 return server
 
-        return Rig(pounce_engine=fake_pounce)
+        return Rig(pounce_engine=fake_pounce, **engines)
 
     return build
 
@@ -87,6 +77,43 @@ def test_the_texts_of_an_episode_reach_the_engine(
     rig.meanwhile = speak
     rig.run(info, 70)
     assert [request.subgoal for request in rig.pounce_engine.requests] == ["", "", "place", "place"]
+
+
+@pytest.mark.parametrize("source", [None, "ponder"])
+def test_ponder_s_newest_ready_subgoal_comes_with_the_invocation(
+    source: Source | None, text_rig: Callable[..., Any], episode_info: Callable[..., m.EpisodeInfo], paper: m.Schedule
+) -> None:
+    rig = text_rig(source)
+    num_fires = itertools.count()
+
+    def speak() -> None:
+        """The first and the third fire write a subgoal; it holds until the next."""
+        said = {0: "pick", 2: "place"}.get(next(num_fires))
+        rig.ponder_engine.texts = (Text(kind="subgoal", text=said, token_ids=(), truncated=False),) if said else ()
+
+    rig.ponder_engine.on_fire = speak
+    take = rig.listen(COGNITION, INVOCATION)
+    rig.run(episode_info(paper), 90)
+    take()
+    assert [request.subgoal for request in rig.pounce_engine.requests] == ["pick", "pick", "place", "place", "place"]
+    written_ns = {c.query: c.text_source_ns for c in rig.said[m.Cognition]}
+    source_ns = {c.query: c.source_ns for c in rig.said[m.Cognition]}
+    assert [written_ns[query] for query in range(4)] == [source_ns[query] for query in (0, 0, 2, 2)]
+    for invocation in rig.said[m.Invocation]:
+        assert invocation.text_age_ns == invocation.now_ns - written_ns[invocation.ref_query]
+
+    null = dataclasses.replace(paper, delivery=m.Delivery(kind=m.DeliveryKind.NULL))
+    rig.run(episode_info(null, epoch=2), 30)
+    assert rig.pounce_engine.requests[-1].subgoal == ""  # the task alone
+
+
+def test_a_ponder_that_writes_nothing_is_refused(
+    text_rig: Any, fake_ponder: Any, episode_info: Any, paper: m.Schedule
+) -> None:
+    fake_ponder.spec = dataclasses.replace(fake_ponder.spec, gives_text=False)
+    reply = text_rig(None, ponder_engine=fake_ponder).open(episode_info(paper))
+    assert "POUNCE reads text (prompt), PONDER gives vectors" in reply.error
+    assert reply.refusal == m.Refusal.MODELS
 
 
 def test_a_pounce_that_reads_cognition_gets_no_text(

@@ -55,6 +55,7 @@ HEADER = st.builds(
     at_ns=INSTANT,
 )  # fmt: skip
 CARRIERS = hnp.arrays(np.float32, st.tuples(st.integers(1, 3), st.integers(1, 6)), elements=NUMBER)
+VECTORS = CARRIERS | st.just(np.zeros((0, 0), np.float32))
 
 
 @st.composite
@@ -69,8 +70,31 @@ def pictures(draw: st.DrawFn) -> m.Image:
 
 
 @st.composite
+def cognitions(draw: st.DrawFn) -> m.Cognition:
+    text_source_ns, source_ns = sorted(draw(st.tuples(DURATION, DURATION)))
+    text = draw(st.none() | TEXT)
+    return m.Cognition(
+        header=draw(HEADER),
+        query=draw(INDEX),
+        tick=draw(INDEX),
+        source_ns=source_ns,
+        ready_ns=draw(INSTANT),
+        vector=draw(CARRIERS if text is None else VECTORS),
+        is_transition=draw(st.booleans()),
+        context_tokens=draw(U32),
+        infer_ns=draw(DURATION),
+        norm=draw(NUMBER),
+        model_hash=draw(TEXT),
+        is_fake=draw(st.booleans()),
+        text=text,
+        text_source_ns=text_source_ns if text else 0,
+    )
+
+
+@st.composite
 def invocations(draw: st.DrawFn) -> m.Invocation:
     is_null = draw(st.booleans())
+    text = None if is_null else draw(st.none() | TEXT)
     return m.Invocation(
         header=draw(HEADER),
         invocation=draw(INDEX),
@@ -78,11 +102,13 @@ def invocations(draw: st.DrawFn) -> m.Invocation:
         now_ns=draw(INSTANT),
         ref_query=None if is_null else draw(INDEX),
         age_ns=0 if is_null else draw(DURATION),
-        cognition=np.zeros((0, 0), np.float32) if is_null else draw(CARRIERS),
+        cognition=np.zeros((0, 0), np.float32) if is_null else draw(VECTORS if text is not None else CARRIERS),
         seed=draw(U64),
         previous_rows=draw(floats()),
         committed_rows=draw(U32),
         num_samples=draw(U32),
+        text=text,
+        text_age_ns=draw(DURATION) if text else 0,
     )
 
 
@@ -175,11 +201,15 @@ DEMO_FRAME = st.builds(m.DemoFrame, images=tuples_of(pictures()))
 MEMBER = st.builds(m.Member, proc=TEXT, boot_id=U64)
 OPEN_REQUEST = st.builds(m.OpenRequest, info=INFO, demo=tuples_of(DEMO_FRAME, 2), members=tuples_of(MEMBER, 4))
 DEMO_SAMPLING = st.builds(m.DemoSampling, hz=st.sampled_from([1, 2, 4, 5, 10, 20]), to_its_end=st.booleans())
+CHANNEL = st.builds(
+    m.ChannelSpec, payload=st.sampled_from(m.PayloadKind), consumer=st.sampled_from(m.ConsumerKind),
+    reads_age=st.booleans(), null=st.sampled_from(m.NullKind),
+)  # fmt: skip
 CONTRACT = st.builds(
     m.Contract, proc=TEXT, num_carriers=U32, hidden_size=U32, horizon=U32, action_dim=U32,
     preferred_codec=chosen(m.ImageCodec), infer_p50_ns=DURATION, infer_p99_ns=DURATION, model_hash=TEXT,
     is_fake=st.booleans(), version=TEXT, context_tokens=U32, max_context_tokens=U32,
-    demonstrations=st.none() | DEMO_SAMPLING,
+    demonstrations=st.none() | DEMO_SAMPLING, channels=tuples_of(CHANNEL),
 )  # fmt: skip
 JOURNAL_ENTRY = st.builds(
     m.JournalEntry, query=INDEX, tick=INDEX, source_ns=INSTANT, observation=st.binary(max_size=40)
@@ -194,11 +224,7 @@ MESSAGES: dict[type, st.SearchStrategy[Any]] = {
         status=chosen(m.TaskStatus), reason=TEXT,
     ),
     m.Query: st.builds(m.Query, header=HEADER, query=INDEX, tick=INDEX, source_ns=INSTANT),
-    m.Cognition: st.builds(
-        m.Cognition, header=HEADER, query=INDEX, tick=INDEX, source_ns=INSTANT, ready_ns=INSTANT, vector=CARRIERS,
-        is_transition=st.booleans(), context_tokens=U32, infer_ns=DURATION, norm=NUMBER, model_hash=TEXT,
-        is_fake=st.booleans(),
-    ),
+    m.Cognition: cognitions(),
     m.Stamp: stamps(),
     m.Invocation: invocations(),
     m.ActionChunk: chunks(),
@@ -235,6 +261,7 @@ MESSAGES: dict[type, st.SearchStrategy[Any]] = {
     m.OpenRequest: OPEN_REQUEST,
     m.Member: MEMBER,
     m.DemoSampling: DEMO_SAMPLING,
+    m.ChannelSpec: CHANNEL,
     m.Contract: CONTRACT,
     m.ContractRequest: st.builds(m.ContractRequest, header=HEADER),
     m.ContractReply: st.builds(m.ContractReply, error=TEXT, contract=st.none() | CONTRACT),

@@ -41,6 +41,24 @@ class SeamKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     SEAM_KIND_OFFSET_FADE: _ClassVar[SeamKind]
     SEAM_KIND_ENSEMBLE: _ClassVar[SeamKind]
 
+class PayloadKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    PAYLOAD_KIND_UNSPECIFIED: _ClassVar[PayloadKind]
+    PAYLOAD_KIND_VECTORS: _ClassVar[PayloadKind]
+    PAYLOAD_KIND_TEXT: _ClassVar[PayloadKind]
+
+class ConsumerKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    CONSUMER_KIND_UNSPECIFIED: _ClassVar[ConsumerKind]
+    CONSUMER_KIND_PREFIX: _ClassVar[ConsumerKind]
+    CONSUMER_KIND_PROMPT: _ClassVar[ConsumerKind]
+
+class NullKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    NULL_KIND_UNSPECIFIED: _ClassVar[NullKind]
+    NULL_KIND_LEARNED: _ClassVar[NullKind]
+    NULL_KIND_ABSENT: _ClassVar[NullKind]
+
 class Refusal(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     REFUSAL_UNSPECIFIED: _ClassVar[Refusal]
@@ -69,6 +87,15 @@ SEAM_KIND_UNSPECIFIED: SeamKind
 SEAM_KIND_SWITCH: SeamKind
 SEAM_KIND_OFFSET_FADE: SeamKind
 SEAM_KIND_ENSEMBLE: SeamKind
+PAYLOAD_KIND_UNSPECIFIED: PayloadKind
+PAYLOAD_KIND_VECTORS: PayloadKind
+PAYLOAD_KIND_TEXT: PayloadKind
+CONSUMER_KIND_UNSPECIFIED: ConsumerKind
+CONSUMER_KIND_PREFIX: ConsumerKind
+CONSUMER_KIND_PROMPT: ConsumerKind
+NULL_KIND_UNSPECIFIED: NullKind
+NULL_KIND_LEARNED: NullKind
+NULL_KIND_ABSENT: NullKind
 REFUSAL_UNSPECIFIED: Refusal
 REFUSAL_NOT_READY: Refusal
 REFUSAL_BUSY: Refusal
@@ -264,8 +291,20 @@ class DemoSampling(_message.Message):
     to_its_end: bool
     def __init__(self, hz: _Optional[int] = ..., to_its_end: _Optional[bool] = ...) -> None: ...
 
+class ChannelSpec(_message.Message):
+    __slots__ = ("payload", "consumer", "reads_age", "null")
+    PAYLOAD_FIELD_NUMBER: _ClassVar[int]
+    CONSUMER_FIELD_NUMBER: _ClassVar[int]
+    READS_AGE_FIELD_NUMBER: _ClassVar[int]
+    NULL_FIELD_NUMBER: _ClassVar[int]
+    payload: PayloadKind
+    consumer: ConsumerKind
+    reads_age: bool
+    null: NullKind
+    def __init__(self, payload: _Optional[_Union[PayloadKind, str]] = ..., consumer: _Optional[_Union[ConsumerKind, str]] = ..., reads_age: _Optional[bool] = ..., null: _Optional[_Union[NullKind, str]] = ...) -> None: ...
+
 class Contract(_message.Message):
-    __slots__ = ("proc", "num_carriers", "hidden_size", "horizon", "action_dim", "preferred_codec", "infer_p50_ns", "infer_p99_ns", "model_hash", "is_fake", "version", "context_tokens", "max_context_tokens", "demonstrations", "boot_id")
+    __slots__ = ("proc", "num_carriers", "hidden_size", "horizon", "action_dim", "preferred_codec", "infer_p50_ns", "infer_p99_ns", "model_hash", "is_fake", "version", "context_tokens", "max_context_tokens", "demonstrations", "boot_id", "channels")
     PROC_FIELD_NUMBER: _ClassVar[int]
     NUM_CARRIERS_FIELD_NUMBER: _ClassVar[int]
     HIDDEN_SIZE_FIELD_NUMBER: _ClassVar[int]
@@ -281,6 +320,7 @@ class Contract(_message.Message):
     MAX_CONTEXT_TOKENS_FIELD_NUMBER: _ClassVar[int]
     DEMONSTRATIONS_FIELD_NUMBER: _ClassVar[int]
     BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    CHANNELS_FIELD_NUMBER: _ClassVar[int]
     proc: str
     num_carriers: int
     hidden_size: int
@@ -296,7 +336,8 @@ class Contract(_message.Message):
     max_context_tokens: int
     demonstrations: DemoSampling
     boot_id: int
-    def __init__(self, proc: _Optional[str] = ..., num_carriers: _Optional[int] = ..., hidden_size: _Optional[int] = ..., horizon: _Optional[int] = ..., action_dim: _Optional[int] = ..., preferred_codec: _Optional[_Union[_common_pb2.ImageCodec, str]] = ..., infer_p50_ns: _Optional[int] = ..., infer_p99_ns: _Optional[int] = ..., model_hash: _Optional[str] = ..., is_fake: _Optional[bool] = ..., version: _Optional[str] = ..., context_tokens: _Optional[int] = ..., max_context_tokens: _Optional[int] = ..., demonstrations: _Optional[_Union[DemoSampling, _Mapping]] = ..., boot_id: _Optional[int] = ...) -> None: ...
+    channels: _containers.RepeatedCompositeFieldContainer[ChannelSpec]
+    def __init__(self, proc: _Optional[str] = ..., num_carriers: _Optional[int] = ..., hidden_size: _Optional[int] = ..., horizon: _Optional[int] = ..., action_dim: _Optional[int] = ..., preferred_codec: _Optional[_Union[_common_pb2.ImageCodec, str]] = ..., infer_p50_ns: _Optional[int] = ..., infer_p99_ns: _Optional[int] = ..., model_hash: _Optional[str] = ..., is_fake: _Optional[bool] = ..., version: _Optional[str] = ..., context_tokens: _Optional[int] = ..., max_context_tokens: _Optional[int] = ..., demonstrations: _Optional[_Union[DemoSampling, _Mapping]] = ..., boot_id: _Optional[int] = ..., channels: _Optional[_Iterable[_Union[ChannelSpec, _Mapping]]] = ...) -> None: ...
 
 class ContractRequest(_message.Message):
     __slots__ = ("header",)

@@ -132,7 +132,7 @@ class Query(_message.Message):
     def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ..., query: _Optional[int] = ..., tick: _Optional[int] = ..., source_ns: _Optional[int] = ...) -> None: ...
 
 class Cognition(_message.Message):
-    __slots__ = ("header", "query", "tick", "source_ns", "ready_ns", "vector", "is_transition", "context_tokens", "infer_ns", "norm", "model_hash", "is_fake")
+    __slots__ = ("header", "query", "tick", "source_ns", "ready_ns", "vector", "is_transition", "context_tokens", "infer_ns", "norm", "model_hash", "is_fake", "text", "text_source_ns")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     QUERY_FIELD_NUMBER: _ClassVar[int]
     TICK_FIELD_NUMBER: _ClassVar[int]
@@ -145,6 +145,8 @@ class Cognition(_message.Message):
     NORM_FIELD_NUMBER: _ClassVar[int]
     MODEL_HASH_FIELD_NUMBER: _ClassVar[int]
     IS_FAKE_FIELD_NUMBER: _ClassVar[int]
+    TEXT_FIELD_NUMBER: _ClassVar[int]
+    TEXT_SOURCE_NS_FIELD_NUMBER: _ClassVar[int]
     header: _common_pb2.Header
     query: int
     tick: int
@@ -157,7 +159,9 @@ class Cognition(_message.Message):
     norm: float
     model_hash: str
     is_fake: bool
-    def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ..., query: _Optional[int] = ..., tick: _Optional[int] = ..., source_ns: _Optional[int] = ..., ready_ns: _Optional[int] = ..., vector: _Optional[_Union[_common_pb2.Tensor, _Mapping]] = ..., is_transition: _Optional[bool] = ..., context_tokens: _Optional[int] = ..., infer_ns: _Optional[int] = ..., norm: _Optional[float] = ..., model_hash: _Optional[str] = ..., is_fake: _Optional[bool] = ...) -> None: ...
+    text: str
+    text_source_ns: int
+    def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ..., query: _Optional[int] = ..., tick: _Optional[int] = ..., source_ns: _Optional[int] = ..., ready_ns: _Optional[int] = ..., vector: _Optional[_Union[_common_pb2.Tensor, _Mapping]] = ..., is_transition: _Optional[bool] = ..., context_tokens: _Optional[int] = ..., infer_ns: _Optional[int] = ..., norm: _Optional[float] = ..., model_hash: _Optional[str] = ..., is_fake: _Optional[bool] = ..., text: _Optional[str] = ..., text_source_ns: _Optional[int] = ...) -> None: ...
 
 class Stamp(_message.Message):
     __slots__ = ("header", "kind", "index", "source_ns", "ready_ns", "arrived_ns", "is_transition")
@@ -178,7 +182,7 @@ class Stamp(_message.Message):
     def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ..., kind: _Optional[_Union[StampKind, str]] = ..., index: _Optional[int] = ..., source_ns: _Optional[int] = ..., ready_ns: _Optional[int] = ..., arrived_ns: _Optional[int] = ..., is_transition: _Optional[bool] = ...) -> None: ...
 
 class Invocation(_message.Message):
-    __slots__ = ("header", "invocation", "tick", "now_ns", "ref_query", "age_ns", "cognition", "seed", "previous_rows", "committed_rows", "num_samples")
+    __slots__ = ("header", "invocation", "tick", "now_ns", "ref_query", "age_ns", "cognition", "seed", "previous_rows", "committed_rows", "num_samples", "text", "text_age_ns")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     INVOCATION_FIELD_NUMBER: _ClassVar[int]
     TICK_FIELD_NUMBER: _ClassVar[int]
@@ -190,6 +194,8 @@ class Invocation(_message.Message):
     PREVIOUS_ROWS_FIELD_NUMBER: _ClassVar[int]
     COMMITTED_ROWS_FIELD_NUMBER: _ClassVar[int]
     NUM_SAMPLES_FIELD_NUMBER: _ClassVar[int]
+    TEXT_FIELD_NUMBER: _ClassVar[int]
+    TEXT_AGE_NS_FIELD_NUMBER: _ClassVar[int]
     header: _common_pb2.Header
     invocation: int
     tick: int
@@ -201,7 +207,9 @@ class Invocation(_message.Message):
     previous_rows: _containers.RepeatedScalarFieldContainer[float]
     committed_rows: int
     num_samples: int
-    def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ..., invocation: _Optional[int] = ..., tick: _Optional[int] = ..., now_ns: _Optional[int] = ..., ref_query: _Optional[int] = ..., age_ns: _Optional[int] = ..., cognition: _Optional[_Union[_common_pb2.Tensor, _Mapping]] = ..., seed: _Optional[int] = ..., previous_rows: _Optional[_Iterable[float]] = ..., committed_rows: _Optional[int] = ..., num_samples: _Optional[int] = ...) -> None: ...
+    text: str
+    text_age_ns: int
+    def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ..., invocation: _Optional[int] = ..., tick: _Optional[int] = ..., now_ns: _Optional[int] = ..., ref_query: _Optional[int] = ..., age_ns: _Optional[int] = ..., cognition: _Optional[_Union[_common_pb2.Tensor, _Mapping]] = ..., seed: _Optional[int] = ..., previous_rows: _Optional[_Iterable[float]] = ..., committed_rows: _Optional[int] = ..., num_samples: _Optional[int] = ..., text: _Optional[str] = ..., text_age_ns: _Optional[int] = ...) -> None: ...
 
 class ActionChunk(_message.Message):
     __slots__ = ("header", "invocation", "t_row0", "horizon", "action_dim", "dt_ns", "rows", "source_ns", "ref_query", "age_ns", "infer_ns", "action_space", "reference_state", "seed", "model_hash", "is_fake", "previous_rows", "committed_rows", "features")

@@ -1,0 +1,40 @@
+"""What PONDER feeds and what POUNCE reads: the channels of both contracts, and whether they fit.
+
+A channel is told by its payload; how POUNCE reads it is POUNCE's affair. When a payload may be used is the schedule's
+(`reference`), the same for all of them.
+"""
+
+from __future__ import annotations
+
+from protocol.messages import ChannelSpec, ConsumerKind, Contract, NullKind, PayloadKind
+
+PREFIX = ChannelSpec(
+    payload=PayloadKind.VECTORS, consumer=ConsumerKind.PREFIX, reads_age=True, null=NullKind.LEARNED
+)  # fmt: skip
+"""The paper's channel: the carriers and their age before the observation, a learned null in their place."""
+PROMPT = ChannelSpec(payload=PayloadKind.TEXT, consumer=ConsumerKind.PROMPT, null=NullKind.ABSENT)
+"""The newest subgoal in the instruction; before the first one, the task alone."""
+
+
+def channels_of(contract: Contract) -> tuple[ChannelSpec, ...]:
+    """The channels of a contract; one without them is an earlier release's, whose only channel was the prefix."""
+    return contract.channels or ((PREFIX,) if contract.num_carriers else ())
+
+
+def misfit(ponder: Contract, pounce: Contract) -> str:
+    """Why POUNCE cannot read what PONDER gives; "" if it can."""
+    gives = {channel.payload for channel in channels_of(ponder)}
+    for channel in channels_of(pounce):
+        if channel.payload not in gives:
+            given = " and ".join(sorted(payload.name.lower() for payload in gives)) or "nothing"
+            return (
+                f"POUNCE reads {channel.payload.name.lower()} ({channel.consumer.name.lower()}), PONDER gives {given}. "
+                "Serve a PONDER that gives them, or none (--ponder none)."
+            )
+    for what, left, right in (
+        ("carriers K", ponder.num_carriers, pounce.num_carriers),
+        ("hidden size H", ponder.hidden_size, pounce.hidden_size),
+    ):
+        if pounce.num_carriers and left != right:
+            return f"{what}: PONDER gives {left}, POUNCE expects {right}. Load checkpoints trained together."
+    return ""
