@@ -162,8 +162,9 @@ class Membership:
             self._is_lockstep = request.info.schedule.mode == m.Mode.LOCKSTEP
         except ValueError as error:
             self._leave()
-            refusal = error.refusal if isinstance(error, EpisodeRefused) else m.Refusal.REQUEST
-            return m.OpenReply(error=str(error), refusal=refusal)
+            if isinstance(error, EpisodeRefused):
+                return m.OpenReply(error=str(error), refusal=error.refusal, try_again=error.try_again)
+            return m.OpenReply(error=str(error), refusal=m.Refusal.REQUEST)
         except Exception:  # a bug: the episode is not half open afterwards
             self._leave()
             raise

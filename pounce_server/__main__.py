@@ -75,11 +75,24 @@ def build_official(options: PounceOptions) -> PounceEngine:
     return OfficialPounce(options.checkpoint, options.device)
 
 
+def build_remote(options: PounceOptions) -> PounceEngine:
+    """Waits for a policy server and compares its first answer with the mapping file.
+
+    Raises:
+        OSError, ValueError: no mapping file, no server, or another answer than the file says.
+    """
+    from pounce_server.remote.build import build
+
+    if options.checkpoint is not None:
+        raise ValueError(f"--backend {options.backend}: its server has the weights; leave --checkpoint out")
+    return build(options.backend, options.remote)
+
+
 @command("pounce-serve")
 def main(argv: list[str] | None = None) -> int:
     options = parse(PounceOptions, argv, prog="pounce-serve")
-    weights = str(options.checkpoint or "random weights")
-    build = build_official if options.backend == "official" else build_engine
+    weights = str(options.remote.url or options.checkpoint or "random weights")
+    build = {"own": build_engine, "official": build_official}.get(options.backend, build_remote)
     return serve_model("pounce", options.link, weights, lambda: build(options), PounceServer, options.operations)
 
 

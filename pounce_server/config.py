@@ -55,6 +55,25 @@ class ContinuityOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RemoteOptions:
+    """Another project's policy server in place of the network, for --backend openpi, vla-eval, groot and groot-n1.5."""
+
+    url: str | None = None
+    """Address of the policy server: ws://HOST:PORT or wss://..., with a path if it has one (openpi, vla-eval);
+    tcp://HOST:PORT (GR00T)."""
+    mapping: Path | None = None
+    """TOML file with the policy's names, units and rate for the robot's cameras, state and commands, see
+    docs/policies.md."""
+    key_file: Path | None = None
+    """File with the word that the policy server wants: openpi's Api-Key, GR00T's api_token."""
+    answer_s: float = 5.0
+    """Longest time for an answer in seconds. After it the connection is made anew; the robot plays the rows it has,
+    then holds."""
+    start_s: float = 600.0
+    """Longest wait in seconds for the server and its first answer: a policy may compile for minutes."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PounceOptions:
     """POUNCE (System 1): turns an observation, a cognition and its age into a chunk of 20 rows."""
 
@@ -63,9 +82,10 @@ class PounceOptions:
     N1.5. None: random weights, which are no policy."""
     tokenizer: Path | None = None
     """tokenizer.model (pi0.5) or tokenizer.json (GR00T), if the checkpoint folder has none."""
-    backend: Literal["own", "official"] = "own"
+    backend: Literal["own", "official", "openpi", "vla-eval", "groot", "groot-n1.5"] = "own"
     """Code that runs the network. official: the official PonderPounce package, in whose environment this then runs;
-    --checkpoint is its folder, and of the other options --device and --link apply."""
+    --checkpoint is its folder, and of the other options --device and --link apply. The others ask a policy server at
+    --url by --mapping: openpi (also SGLang's and vLLM-Omni's), vla-eval 0.8's, GR00T N1.6's and N1.7's, or N1.5's."""
     device: str = "cpu"
     """Device of the network: cpu, cuda or cuda:N."""
     dtype: Literal["float32", "bfloat16"] = "float32"
@@ -73,5 +93,6 @@ class PounceOptions:
     link: LinkOptions = field(default_factory=lambda: LinkOptions(listen=(endpoint("pounce"),)))
     operations: tyro.conf.OmitArgPrefixes[DaemonOptions] = field(default_factory=DaemonOptions)
     speed: tyro.conf.OmitArgPrefixes[SpeedOptions] = field(default_factory=SpeedOptions)
+    remote: tyro.conf.OmitArgPrefixes[RemoteOptions] = field(default_factory=RemoteOptions)
     chunks: tyro.conf.OmitArgPrefixes[ContinuityOptions] = field(default_factory=ContinuityOptions)
     random: tyro.conf.OmitArgPrefixes[RandomOptions] = field(default_factory=RandomOptions)

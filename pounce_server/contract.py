@@ -7,7 +7,7 @@ The node and the shell need only this file, so a fake engine can test them in mi
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol, TypeAlias
+from typing import Literal, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dual_system.models.action_space import ActionSpace
 from dual_system.models.arm import JOINT_HIGH_RAD, JOINT_LOW_RAD, NUM_ARM_JOINTS
 from protocol.errors import EpisodeRefused
-from protocol.messages import Refusal, Robot
+from protocol.messages import EpisodeInfo, Refusal, Robot
 
 DTypeName: TypeAlias = Literal["float32", "bfloat16"]
 WeightsName: TypeAlias = Literal["float", "int8"]
@@ -112,6 +112,15 @@ class PounceEngine(Protocol):
 
     def warm_up(self) -> list[int]:
         """Runs invocations; returns the durations in ns of at least 20, without the first ones."""
+        ...
+
+
+@runtime_checkable
+class Episodic(Protocol):
+    """An engine that is told when an episode opens."""
+
+    def begin(self, info: EpisodeInfo) -> None:
+        """Raises EpisodeRefused if it cannot play this one."""
         ...
 
 

@@ -75,6 +75,10 @@ class PounceNode:
             self._next_asked = invocation.invocation + 1
             self._rendezvous.on_request(invocation)
 
+    def on_refusal(self, invocation: m.Invocation) -> None:
+        """The engine gave no rows: where the clock waits for them, it may ask for the same ones again."""
+        self._next_asked = min(self._next_asked, invocation.invocation)
+
     def missed(self) -> list[m.Invocation]:
         """Invocations whose observation was lost in transit."""
         return list(self._rendezvous.give_up())

@@ -7,7 +7,7 @@ import time
 from clock.channels import PREFIX, PROMPT
 from clock.feasibility import delay_ticks
 from model_server.shell import ModelShell
-from pounce_server.contract import PounceEngine, check_robot
+from pounce_server.contract import Episodic, PounceEngine, check_robot
 from pounce_server.node import PounceNode, Work
 from pounce_server.subgoal_text import OracleText, Source
 from protocol import codec, images, topics
@@ -101,7 +101,8 @@ class PounceServer(ModelShell):
             try:
                 rows_NA = self._engine.invoke(work.request, self._heartbeat.beat)
             except ValueError as error:
-                # Without a chunk the clock plays the rows it has, then holds.
+                # Without a chunk the clock plays the rows it has, then holds; in lockstep it is asked for again.
+                self._node.on_refusal(work.invocation)
                 text = f"invocation {work.invocation.invocation}: {error}"
                 self._tell(m.Severity.ERROR, "invocation_refused", text)
                 return
@@ -145,6 +146,8 @@ class PounceServer(ModelShell):
                 "--subgoal-text out",
             )
         self._check_committed(request.info.schedule)
+        if isinstance(self._engine, Episodic):
+            self._engine.begin(request.info)
         self._node.open(request.info)
         return self._contract()
 

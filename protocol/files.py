@@ -107,6 +107,15 @@ def read_text(path: Path, kind: str) -> str:
         return data.decode("utf-8-sig")
 
 
+def read_word(path: Path, kind: str) -> str:
+    """The only line of a text file, as secrets are kept. Raises OSError, FileError as `read_text`."""
+    lines = read_text(path, kind).strip().splitlines()
+    with reading(path, kind):
+        if len(lines) != 1:
+            raise ValueError(f"expected one word, came {len(lines)} lines")
+    return lines[0]
+
+
 def read_json(path: Path, kind: str) -> Any:
     """A JSON file's contents. Parse them within `reading`, since any value may have any type.
 

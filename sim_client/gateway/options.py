@@ -174,14 +174,8 @@ class GatewayOptions:
 
     def api_key(self) -> str:
         """The word that clients must know; "" if none. Raises OSError or FileError unless the file has one."""
-        file, kind = self.clients.api_key_file, "word for --api-key-file"
-        if file is None:
-            return ""
-        lines = files.read_text(file, kind).strip().splitlines()
-        with files.reading(file, kind):
-            if len(lines) != 1:
-                raise ValueError(f"expected one word, came {len(lines)} lines")
-        return lines[0]
+        file = self.clients.api_key_file
+        return files.read_word(file, "word for --api-key-file") if file else ""
 
     def dialect_class(self) -> type[Dialect]:
         return _SPOKEN[self.dialect][0]

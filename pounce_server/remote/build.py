@@ -1,0 +1,36 @@
+"""From options to the engine of a policy server."""
+
+from __future__ import annotations
+
+from pounce_server.config import RemoteOptions
+from pounce_server.remote.engine import RemoteEngine
+from pounce_server.remote.peer import Peer
+from protocol import files
+from protocol.peers.mapping import PolicyMapping, read_mapping
+
+
+def build(backend: str, options: RemoteOptions) -> RemoteEngine:
+    """Waits for the policy server. Raises OSError, ValueError: see `RemoteEngine`, or an option is missing."""
+    if options.url is None or options.mapping is None:
+        raise ValueError(f"--backend {backend} needs the policy server's --url and a --mapping file")
+    mapping = read_mapping(options.mapping)
+    key = files.read_word(options.key_file, "word for --key-file") if options.key_file else ""
+    peer = _peer(backend, options.url, mapping, key)
+    return RemoteEngine(peer, mapping, options.url, answer_s=options.answer_s, start_s=options.start_s)
+
+
+def _peer(backend: str, url: str, mapping: PolicyMapping, key: str) -> Peer:
+    """The wire, imported here: each has a package that the others do without."""
+    if backend == "openpi":
+        from pounce_server.remote.openpi import OpenpiPeer
+
+        return OpenpiPeer(url, mapping, key)
+    if backend == "vla-eval":
+        from pounce_server.remote.vla_eval import VlaEvalPeer
+
+        if key:
+            raise ValueError("--key-file: vla-eval's servers ask for none; leave it out")
+        return VlaEvalPeer(url, mapping)
+    from pounce_server.remote.groot import GrootPeer
+
+    return GrootPeer(url, mapping, is_flat=backend == "groot-n1.5", api_token=key)
