@@ -53,6 +53,7 @@ class Membership:
         self._closing = link.serve(CLOSE)
         self._timing = link.serve(TIME)
         self._ask_again_ns = 0
+        self._asked: Callable[[], m.ActiveReply | None] | None = None
         self._clocks = link.bus.watch_alive(alive_key(link.robot, "clock"))
         self._is_clock_there = False
         self._clock_lost_ns = 0
@@ -81,21 +82,21 @@ class Membership:
         """Whether an episode may run without this server: it is in none, and there is a clock service."""
         return self._is_clock_there and not self._link.episode
 
+    @property
+    def is_asking(self) -> bool:
+        """Whether the clock service's word on the running episode is still to come."""
+        return self._asked is not None
+
     def rejoin(self) -> m.ActiveReply | None:
         """Asks the clock service for the running episode, at most once a second, and opens it here.
 
-        Returns the clock service's reply, or None if no episode runs or this server is in it already.
+        Returns the clock service's reply once it is there; None before, and if no episode runs or this server is in it.
         """
-        now_ns = time.monotonic_ns()
-        if now_ns < self._ask_again_ns:
-            return None
-        self._ask_again_ns = now_ns + _ASK_AGAIN_NS
         if self._link.episode and not self._is_clock_gone():
             return None  # what another clock says of its episode is no reason to leave this one
-        try:
-            reply = self._link.call(ACTIVE, "clock", m.ActiveRequest(), timeout_ns=_CALL_NS)
-        except CallFailed:
-            return None  # no clock service, hence no episode
+        reply = self._active()
+        if reply is None:
+            return None
         if reply.error != self._refused:
             self._refused = reply.error
             log.log(logging.ERROR if reply.error else logging.INFO, "rejoin %s", reply.error or "is possible again")
@@ -106,24 +107,40 @@ class Membership:
             log.error("rejoin refused=%s", opened.error)
             return None
         log.info("rejoin episode=%s queries=%d", self._link.episode, reply.num_queries)
-        return reply  # type: ignore[no-any-return]
+        return reply
 
     def owed(self) -> m.ActiveReply | None:
-        """What the clock service waits for from this server; None if it does not, or cannot be asked now.
+        """What the clock service waits for from this server; None if it does not, or has not said so yet.
 
         Only in lockstep does the world wait for an answer that a broken link swallowed; in real time it asks anew.
         """
-        now_ns = time.monotonic_ns()
-        is_silent = self._link.silent_ns("clock") > _LOST_REQUEST_NS and now_ns >= self._ask_again_ns
+        is_silent = self._link.silent_ns("clock") > _LOST_REQUEST_NS
         if not (self._link.episode and self._is_lockstep and self._is_clock_there and is_silent):
+            self._asked = None if self._link.episode else self._asked  # what was owed then may be answered by now
             return None
-        self._ask_again_ns = now_ns + _ASK_AGAIN_NS
+        reply = self._active()
+        is_ours = reply is not None and reply.open is not None and reply.open.info.header.episode == self._link.episode
+        return reply if is_ours else None
+
+    def _active(self) -> m.ActiveReply | None:
+        """The clock service's word on the running episode, asked at most once a second; None while there is none.
+
+        Nobody waits for it here: a clock that is busy with an opening would hold up the other robots of this server.
+        """
+        now_ns = time.monotonic_ns()
+        if self._asked is None:
+            if now_ns < self._ask_again_ns:
+                return None
+            self._ask_again_ns = now_ns + _ASK_AGAIN_NS
+            self._asked = self._link.ask(ACTIVE, "clock", m.ActiveRequest(), timeout_ns=_CALL_NS)
         try:
-            reply = self._link.call(ACTIVE, "clock", m.ActiveRequest(), timeout_ns=_CALL_NS)
-        except CallFailed:
+            reply = self._asked()
+        except CallFailed:  # no clock service, hence no episode
+            self._asked = None
             return None
-        is_ours = reply.open is not None and reply.open.info.header.episode == self._link.episode
-        return reply if is_ours else None  # type: ignore[no-any-return]
+        if reply is not None:
+            self._asked = None
+        return reply  # type: ignore[no-any-return]
 
     def journal(self, num_queries: int, first: int = 0) -> Iterator[m.JournalEntry]:
         """The episode's queries from ``first`` up to ``num_queries``, with their observations, oldest first.
@@ -155,6 +172,7 @@ class Membership:
         if self._is_draining:
             error = "it is draining: it leaves after its last episode, and another process takes its place"
             return m.OpenReply(error=error, refusal=m.Refusal.NOT_READY, try_again=True)
+        self._asked = None  # what the clock says of the time before comes too late
         try:
             self._link.enter_episode(header.session, header.episode, header.epoch, request.members)
             contract = replace(self._open_episode(request), boot_id=self._link.boot_id)
@@ -197,6 +215,7 @@ class Membership:
         return silent_ns > _CLOCK_SILENCE_NS and time.monotonic_ns() - silent_ns < self._clock_lost_ns
 
     def _leave(self) -> None:
+        self._asked = None
         self._close_episode()
         self._link.leave_episode()
         self._heartbeat.set(open_episode="")

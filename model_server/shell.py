@@ -16,7 +16,7 @@ from protocol.drops import DropReason
 from protocol.errors import MalformedMessage
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link, source_of
-from protocol.process import host_clock_id
+from protocol.process import IDLE_WAIT_NS, host_clock_id
 
 log = logging.getLogger(__name__)
 
@@ -98,7 +98,10 @@ class ModelShell(ABC):
     def warm_up(self) -> None:
         """Measures the engine before it serves, without the first answers of the process, which are slower."""
         self._heartbeat.set(state=m.ServingState.WARMING)
-        durations_ns = self._warmed_engine.warm_up()
+        self.warmed(self._warmed_engine.warm_up())
+
+    def warmed(self, durations_ns: list[int]) -> None:
+        """Announces the engine and how long its answers took in the warm-up."""
         spec = self._warmed_engine.spec
         self._heartbeat.set(
             infer_p50_ns=percentile_ns(durations_ns, 50),
@@ -113,7 +116,9 @@ class ModelShell(ABC):
 
     def ready(self) -> None:
         """Joins a running episode, if there is one, and only then reports readiness."""
-        self.rejoin()
+        while not self.rejoin() and self._membership.is_asking:
+            self._heartbeat.beat()
+            self._link.bus.wait(IDLE_WAIT_NS)
         self._heartbeat.set(state=m.ServingState.READY)
         log.info("ready infer_p50_ms=%.1f", self._heartbeat.health.infer_p50_ns / 1e6)
 

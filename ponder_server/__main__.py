@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import partial
 
 from model_server.daemon import serve_model
+from model_server.ends import check_robots
 from ponder_server.config import NUM_TORCH_THREADS, PonderOptions
 from ponder_server.contract import BatchingEngine, PonderEngine
 from ponder_server.fleet import PonderFleet
@@ -41,9 +42,8 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     from ponder_server.threads import num_usable_cores
 
     context, speed, robots = options.context, options.speed, options.robots
-    num_robots = 1 + len(robots.other_robots)
-    if robots.max_sessions < num_robots:
-        raise ValueError(f"{num_robots} robots need as many sessions: --max-sessions is {robots.max_sessions}.")
+    max_sessions = robots.num_sessions
+    check_robots((options.link.robot, *options.robots.other_robots))
     torch.set_num_threads(NUM_TORCH_THREADS)
     num_cores = num_usable_cores()
     if speed.attention_threads > num_cores:
@@ -64,7 +64,7 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
     config = EngineConfig(
         max_context_tokens=context.max_context_tokens,
         when_full=context.when_full,
-        max_sessions=robots.max_sessions,
+        max_sessions=max_sessions,
         max_text_tokens=context.max_text_tokens,
         max_batch_rows=robots.max_batch_rows,
         attention_threads=min(speed.attention_threads, num_cores),
@@ -108,14 +108,7 @@ def main(argv: list[str] | None = None) -> int:
     def make(link: Link, engine: BatchingEngine, heartbeat: Heartbeat, version: str) -> PonderServer | PonderFleet:
         if not options.robots.other_robots:
             return PonderServer(link, engine, heartbeat, version)
-        return PonderFleet(
-            link,
-            engine,
-            heartbeat,
-            version,
-            other_robots=options.robots.other_robots,
-            latency_budget_ns=options.robots.latency_budget_ms * 1_000_000,
-        )
+        return PonderFleet(link, engine, heartbeat, version, other_robots=options.robots.other_robots)
 
     return serve_model("ponder", options.link, weights, lambda: build_engine(options), make, options.operations)
 

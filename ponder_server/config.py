@@ -69,14 +69,21 @@ class RobotsOptions:
     """Serving several robots with one network."""
 
     other_robots: tuple[str, ...] = ()
-    """Further robots to serve; they share the weights with --link.robot and are batched together."""
-    max_sessions: int = 2
-    """Largest number of open contexts; their memory is allocated at start."""
+    """Further robots to serve; they share the weights with --link.robot and are batched together. An episode with which
+    a robot's cognition could grow older than its --max-age-ms is refused."""
+    max_sessions: int | None = None
+    """Largest number of open contexts; their memory is allocated at start. None: two, or one for each robot if they are
+    more."""
     max_batch_rows: int = 8
     """Largest number of robots in one forward. With 1, no robot's answer depends on the others in its last bits."""
-    latency_budget_ms: int = 1000
-    """With other robots: limit of the time from a query to its cognition when all query at once with full contexts.
-    An episode that would exceed it is refused."""
+
+    @property
+    def num_sessions(self) -> int:
+        """Contexts to allocate. Raises ValueError if there are more robots."""
+        num_robots = 1 + len(self.other_robots)
+        if self.max_sessions is not None and self.max_sessions < num_robots:
+            raise ValueError(f"{num_robots} robots need as many sessions: --max-sessions is {self.max_sessions}.")
+        return max(2, num_robots) if self.max_sessions is None else self.max_sessions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

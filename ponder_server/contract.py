@@ -171,6 +171,15 @@ class PonderEngine(Protocol):
 class BatchingEngine(PonderEngine, Protocol):
     """Runs queries of several sessions at once; ``fire`` requires that none is in progress."""
 
+    def open(
+        self,
+        session: str,
+        opening: Opening,
+        progress: Progress = no_progress,
+        between: Callable[[], None] = no_progress,
+    ) -> int:
+        """As ``PonderEngine.open``; ``between`` is called between two forwards, and may ``step`` other sessions."""
+
     def begin(self, session: str, frames: tuple[Frame, ...], *, proprio: Proprio | None = None) -> None:
         """Accepts one query of a session that has none. Raises as ``fire`` does, and then changes nothing."""
 

@@ -11,7 +11,7 @@ The engine is deterministic: on one machine equal calls give equal bits, also af
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import accumulate
 
@@ -58,6 +58,8 @@ NUM_UNMEASURED_FIRES = 5
 NUM_MEASURED_FIRES = 30
 NUM_FULL_FIRES = 10
 WARM_UP_PROPRIO = np.zeros(ROBOT_DIM, np.float32)
+
+_ENCODED = object()
 
 
 class QwenEngine:
@@ -140,8 +142,14 @@ class QwenEngine:
         return self._spec
 
     @torch.inference_mode()
-    def open(self, session: str, opening: Opening, progress: Progress = no_progress) -> int:
-        """Encodes instruction and demonstration; see ``PonderEngine.open``."""
+    def open(
+        self,
+        session: str,
+        opening: Opening,
+        progress: Progress = no_progress,
+        between: Callable[[], None] = no_progress,
+    ) -> int:
+        """Encodes instruction and demonstration; see ``BatchingEngine.open``."""
         if session in self._episodes:
             raise SessionError(f"session {session!r} is already open; close it first.")
         if len(self._episodes) >= self._config.max_sessions:
@@ -163,9 +171,14 @@ class QwenEngine:
         demo = [self._see(cameras, f"demo instant {n}") for n, cameras in enumerate(opening.demo_frames)]
         context = self._runner.open(session)
         try:
-            with heartbeats(self._parts, progress):
-                pictures = [picture for instant in demo for picture in instant]
-                self._opener.encode(context, opening, segments, pictures, progress)
+            pictures = [picture for instant in demo for picture in instant]
+            encoding = self._opener.encode(context, opening, segments, pictures)
+            while True:
+                with heartbeats(self._parts, progress):
+                    if next(encoding, _ENCODED) is _ENCODED:
+                        break
+                progress()
+                between()
         except BaseException as error:
             self._runner.close(context)
             if isinstance(error, torch.OutOfMemoryError):

@@ -1,15 +1,16 @@
 """Several robots, one network: a server per robot, with queries batched in common forwards.
 
 Every robot has its own link, heartbeat and node, exactly as if it were alone; they share the engine, hence its weights
-and its queue. A robot is admitted to an episode if the latency budget then still holds for every robot.
+and its queue. A robot is admitted to an episode if no robot's cognition then grows older than that robot allows.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
+from model_server.ends import Ends
 from model_server.shell import percentile_ns
 from ponder_server.admission import Admission
 from ponder_server.contract import (
@@ -30,14 +31,19 @@ from protocol import messages as m
 from protocol.errors import CallFailed, ProtocolError
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
-from protocol.process import host_clock_id
 
 
 class SharedEngine:
-    """One engine, and its answers that were not fetched yet."""
+    """One engine, and its answers that were not fetched yet.
 
-    def __init__(self, engine: BatchingEngine) -> None:
+    Args:
+        between: what else is done between two forwards of an opening, for the robots that play meanwhile.
+        beat: every robot's heartbeat.
+    """
+
+    def __init__(self, engine: BatchingEngine, beat: Progress, between: Callable[[], None]) -> None:
         self.engine = engine
+        self.beat, self.between = beat, between
         self.outcomes: dict[str, Outcome[Fire]] = {}
 
     def step(self, progress: Progress) -> None:
@@ -58,7 +64,7 @@ class RobotEngine:
         return self._shared.engine.spec
 
     def open(self, session: str, opening: Opening, progress: Progress = no_progress) -> int:
-        return self._shared.engine.open(self._name(session), opening, progress)
+        return self._shared.engine.open(self._name(session), opening, self._shared.beat, self._shared.between)
 
     def begin(self, session: str, frames: tuple[Frame, ...], *, proprio: Proprio | None = None) -> None:
         self._shared.engine.begin(self._name(session), frames, proprio=proprio)
@@ -85,6 +91,9 @@ class RobotEngine:
         self._shared.outcomes.pop(self._name(session), None)
         self._shared.engine.close(self._name(session))
 
+    def beat(self) -> None:
+        self._shared.beat()
+
     def warm_up(self) -> list[int]:
         """Returns the durations of the engine's common warm-up."""
         return self._durations_ns
@@ -109,6 +118,7 @@ class RobotServer(PonderServer):
         self._waiting: deque[Work] = deque()
         self._thinking: tuple[Work, int] | None = None
         self._rebuild: _Rebuild | None = None
+        self._is_opening = False
 
     @property
     def is_busy(self) -> bool:
@@ -116,10 +126,17 @@ class RobotServer(PonderServer):
 
     def step(self) -> bool:
         """Reads messages and publishes answers; the fleet runs the engine in between."""
+        worked = self._take_calls()
+        return self.work() or worked or (not self.is_busy and self._resume())
+
+    def work(self) -> bool:
+        """As ``step``, without calls: what a robot needs while another one's episode is being opened."""
+        if self._is_opening:
+            return False
         worked = self._listen()
         while len(self._waiting) < KEEP_QUERIES and (work := self._next_work()) is not None:
             self._waiting.append(work)  # taken early: the node keeps observations for ticks, not for seconds
-        return self._finish() or self._begin() or worked or (not self.is_busy and self._resume())
+        return self._finish() or self._begin() or worked
 
     def rejoin(self) -> bool:
         """Asks for the running episode, and begins to rebuild its context."""
@@ -186,8 +203,15 @@ class RobotServer(PonderServer):
         return self._rebuild is None or work.query.query == self._rebuild.owed_query
 
     def _open(self, request: m.OpenRequest) -> m.Contract:
-        self._admission.admit(self._link.robot, request.info.schedule.query_period_ns)
-        return super()._open(request)
+        self._admission.admit(self._link.robot, request.info.schedule)
+        self._is_opening = True
+        try:
+            return super()._open(request)
+        finally:
+            self._is_opening = False
+
+    def _beat(self) -> None:
+        self._robot_engine.beat()
 
     def _close(self) -> None:
         self._rebuild = None
@@ -220,16 +244,11 @@ class PonderFleet:
         version: str,
         *,
         other_robots: Sequence[str],
-        latency_budget_ns: int,
     ) -> None:
-        """``link`` and ``heartbeat`` are the first robot's; the others are created here."""
-        self._shared = SharedEngine(engine)
+        """``link`` and ``heartbeat`` are the first robot's."""
+        self._ends = Ends(link, heartbeat, version, other_robots)
+        self._shared = SharedEngine(engine, self._ends.beat, self._between)
         self._version = version
-        self._latency_budget_ns = latency_budget_ns
-        self._ends = [(link, heartbeat)]
-        for robot in other_robots:
-            other = Link(link.bus, robot=robot, proc=link.proc)
-            self._ends.append((other, Heartbeat(other, version, host_clock_id())))
         self._servers: list[RobotServer] = []
 
     @property
@@ -237,15 +256,10 @@ class PonderFleet:
         return tuple(self._servers)
 
     def warm_up(self) -> None:
-        for _, heartbeat in self._ends:
-            heartbeat.set(state=m.ServingState.WARMING)
+        self._ends.warming()
         durations_ns = self._shared.engine.warm_up()
         full_ns = self._shared.engine.warm_up_full()
-        admission = Admission(
-            fire_p50_ns=percentile_ns(full_ns, 50),
-            fire_p99_ns=percentile_ns(full_ns, 99),
-            latency_budget_ns=self._latency_budget_ns,
-        )
+        admission = Admission(fire_p50_ns=percentile_ns(full_ns, 50), fire_p99_ns=percentile_ns(full_ns, 99))
         for link, heartbeat in self._ends:
             engine = RobotEngine(self._shared, link.robot, durations_ns)
             self._servers.append(RobotServer(link, engine, heartbeat, self._version, admission))
@@ -259,9 +273,11 @@ class PonderFleet:
     def step(self) -> bool:
         """Reads every robot's messages, then runs one forward for those with queries."""
         worked = [server.step() for server in self._servers]
-        self._shared.step(self._beat)
+        self._shared.step(self._shared.beat)
         return any(worked) or any(server.is_busy for server in self._servers)
 
-    def _beat(self) -> None:
-        for _, heartbeat in self._ends:
-            heartbeat.beat()
+    def _between(self) -> None:
+        """A turn for the robots that play, between two forwards of another one's opening."""
+        for server in self._servers:
+            server.work()
+        self._shared.step(self._shared.beat)

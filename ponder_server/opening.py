@@ -3,13 +3,13 @@
 # T tokens, H hidden
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 from torch import Tensor
 
 from dual_system.models.ponder.context import Segment, in_groups
 from dual_system.models.ponder.observation import Pictures
-from ponder_server.contract import Opening, Progress
+from ponder_server.contract import Opening
 from ponder_server.prefixes import Prefixes
 from ponder_server.runner import Session
 
@@ -35,9 +35,11 @@ class Opener:
         opening: Opening,
         segments: Sequence[Segment],
         pictures: Sequence[Pictures],
-        progress: Progress,
-    ) -> None:
-        """Appends ``segments`` with their ``pictures``. If a forward raises, the caller must close the context."""
+    ) -> Iterator[None]:
+        """Appends ``segments`` with their ``pictures``, one forward an item: other sessions may have one in between.
+
+        If a forward raises, the caller must close the context.
+        """
         if opening.has_demo and (found := self._prefixes.find(opening)) is not None:
             context.start_from(found)
             return
@@ -47,6 +49,6 @@ class Opener:
             num_images = sum(segment.num_images for segment in chunk)
             context.append(ids, self._embed(ids, pictures[first : first + num_images]), num_wanted=0)
             first += num_images
-            progress()
+            yield
         if opening.has_demo:
             self._prefixes.keep(opening, context)

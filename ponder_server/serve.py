@@ -43,16 +43,17 @@ class PonderServer(ModelShell):
         return f"{spec.weights} weights: relative L2 change of cognition {spec.cognition_error:.1e} at start"
 
     def step(self) -> bool:
-        worked = self._listen()
+        worked = self._take_calls()
+        worked |= self._listen()
         work = self._next_work()
         if work is not None:
             self._fire(work)
         return worked or work is not None or self._resume()
 
     def _listen(self) -> bool:
-        """Reads all pending messages; returns whether there was a call among them."""
+        """Reads all pending messages; returns whether one led to an episode."""
         self._heartbeat.beat()
-        worked = self._take_calls()
+        worked = False
         self._take_observations()
         for query in self._queries.drain():
             if query.header.episode != self._link.episode:
@@ -139,6 +140,10 @@ class PonderServer(ModelShell):
             else:
                 self._answer(work, fire, start_ns)
 
+    def _beat(self) -> None:
+        """The heartbeat of whoever waits while this server works."""
+        self._heartbeat.beat()
+
     def _think(self, work: Work) -> Fire:
         return self._engine.fire(self._link.episode, work.frames, self._heartbeat.beat, proprio=work.proprio)
 
@@ -173,8 +178,11 @@ class PonderServer(ModelShell):
 
     def _open(self, request: m.OpenRequest) -> m.Contract:
         check_robot(request.info.robot, self._engine.spec)
-        demo = tuple(tuple(images.unpack(image) for image in frame.images) for frame in request.demo)
-        opening = Opening(instruction=request.info.instruction, demo_frames=demo)
+        demo = []
+        for frame in request.demo:
+            demo.append(tuple(images.unpack(image) for image in frame.images))
+            self._beat()  # six hundred pictures take seconds
+        opening = Opening(instruction=request.info.instruction, demo_frames=tuple(demo))
         try:
             context_tokens = self._engine.open(self._link.episode, opening, self._heartbeat.beat)
         except SessionError as error:

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import logging
 import sys
+from functools import partial
 
 from model_server.daemon import serve_model
+from model_server.ends import check_robots
 from pounce_server.config import NUM_TORCH_THREADS, PounceOptions
-from pounce_server.contract import PounceEngine
+from pounce_server.contract import BatchingEngine, PounceEngine
+from pounce_server.fleet import PounceFleet
 from pounce_server.serve import PounceServer
 from protocol.command_line import command, parse
+from protocol.heartbeat import Heartbeat
+from protocol.link import Link
 
 log = logging.getLogger(__name__)
 
 
-def build_engine(options: PounceOptions) -> PounceEngine:
+def build_engine(options: PounceOptions) -> BatchingEngine:
     """Loads or randomly initialises the model.
 
     Raises:
@@ -31,6 +36,9 @@ def build_engine(options: PounceOptions) -> PounceEngine:
     from dual_system.models.pounce.family import family_of_config
     from pounce_server.engine import EagerEngine
 
+    check_robots((options.link.robot, *options.robots.other_robots))
+    if options.robots.max_batch_rows < 1:
+        raise ValueError(f"--max-batch-rows {options.robots.max_batch_rows}: expected at least 1")
     torch.set_num_threads(NUM_TORCH_THREADS)
     require_device(options.device)
     if warning := warn_of_slow(options.dtype, options.device):
@@ -72,6 +80,8 @@ def build_official(options: PounceOptions) -> PounceEngine:
 
     if options.checkpoint is None:
         raise ValueError("--backend official needs the official folder; give it with --checkpoint")
+    if options.robots.other_robots:
+        raise ValueError("--backend official serves one robot; leave --other-robots out")
     return OfficialPounce(options.checkpoint, options.device)
 
 
@@ -85,6 +95,8 @@ def build_remote(options: PounceOptions) -> PounceEngine:
 
     if options.checkpoint is not None:
         raise ValueError(f"--backend {options.backend}: its server has the weights; leave --checkpoint out")
+    if options.robots.other_robots:
+        raise ValueError(f"--backend {options.backend} serves one robot; leave --other-robots out")
     return build(options.backend, options.remote)
 
 
@@ -92,8 +104,17 @@ def build_remote(options: PounceOptions) -> PounceEngine:
 def main(argv: list[str] | None = None) -> int:
     options = parse(PounceOptions, argv, prog="pounce-serve")
     weights = str(options.remote.url or options.checkpoint or "random weights")
-    build = {"own": build_engine, "official": build_official}.get(options.backend, build_remote)
-    return serve_model("pounce", options.link, weights, lambda: build(options), PounceServer, options.operations)
+    if options.backend != "own":
+        build = partial(build_official if options.backend == "official" else build_remote, options)
+        return serve_model("pounce", options.link, weights, build, PounceServer, options.operations)
+
+    def make(link: Link, engine: BatchingEngine, heartbeat: Heartbeat, version: str) -> PounceServer | PounceFleet:
+        others, max_rows = options.robots.other_robots, options.robots.max_batch_rows
+        if not others:
+            return PounceServer(link, engine, heartbeat, version)
+        return PounceFleet(link, engine, heartbeat, version, other_robots=others, max_batch_rows=max_rows)
+
+    return serve_model("pounce", options.link, weights, lambda: build_engine(options), make, options.operations)
 
 
 if __name__ == "__main__":

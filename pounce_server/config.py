@@ -74,6 +74,17 @@ class RemoteOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RobotsOptions:
+    """Serving several robots with one network."""
+
+    other_robots: tuple[str, ...] = ()
+    """Further robots to serve; they share the weights with --link.robot. An episode with which a robot's rows could
+    come too late for its schedule is refused."""
+    max_batch_rows: int = 8
+    """Largest number of robots in one batch. With 1, no robot's rows depend on the others in their last bits."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PounceOptions:
     """POUNCE (System 1): turns an observation, a cognition and its age into a chunk of 20 rows."""
 
@@ -95,4 +106,5 @@ class PounceOptions:
     speed: tyro.conf.OmitArgPrefixes[SpeedOptions] = field(default_factory=SpeedOptions)
     remote: tyro.conf.OmitArgPrefixes[RemoteOptions] = field(default_factory=RemoteOptions)
     chunks: tyro.conf.OmitArgPrefixes[ContinuityOptions] = field(default_factory=ContinuityOptions)
+    robots: tyro.conf.OmitArgPrefixes[RobotsOptions] = field(default_factory=RobotsOptions)
     random: tyro.conf.OmitArgPrefixes[RandomOptions] = field(default_factory=RandomOptions)

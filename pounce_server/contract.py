@@ -5,7 +5,7 @@ The node and the shell need only this file, so a fake engine can test them in mi
 
 # N horizon, K carriers, H carrier size
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol, TypeAlias, runtime_checkable
 
@@ -121,6 +121,17 @@ class Episodic(Protocol):
 
     def begin(self, info: EpisodeInfo) -> None:
         """Raises EpisodeRefused if it cannot play this one."""
+        ...
+
+
+class BatchingEngine(PounceEngine, Protocol):
+    """Answers several robots at once."""
+
+    def invoke_many(self, requests: Sequence[Request], progress: Progress = no_progress) -> list[NDArray[np.float32]]:
+        """Returns rows for each request, in order: those of ``invoke`` up to float32 rounding, alone bit for bit.
+
+        Raises ValueError if a request does not fit ``spec``; then there are rows for none.
+        """
         ...
 
 

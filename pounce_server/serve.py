@@ -46,6 +46,13 @@ class PounceServer(ModelShell):
         return f"{spec.weights} weights: mean error of the normalised actions {spec.action_error:.1e}"
 
     def step(self) -> bool:
+        worked, work = self._listen()
+        if work is not None:
+            self._invoke(work)
+        return worked or work is not None or self.resume()
+
+    def _listen(self) -> tuple[bool, Work | None]:
+        """Reads all pending messages; returns whether there was a call or a bad request, and the work."""
         self._heartbeat.beat()
         worked = self._take_calls()
         self._take_observations()
@@ -61,13 +68,10 @@ class PounceServer(ModelShell):
             text = f"invocation {invocation.invocation}: tick {invocation.tick} never came"
             self._tell(m.Severity.ERROR, "observation_missed", text)
         try:
-            work = self._node.next_work()
+            return worked, self._node.next_work()
         except MalformedMessage as error:
             self._link.drop("invocation", DropReason.WRONG_REQUEST, str(error))
-            return True
-        if work is not None:
-            self._invoke(work)
-        return worked or work is not None or self._resume()
+            return True, None
 
     def _on_observation(self, observation: m.Observation) -> None:
         self._node.on_observation(observation)
@@ -83,7 +87,7 @@ class PounceServer(ModelShell):
         self._membership.announce()
         return True
 
-    def _resume(self) -> bool:
+    def resume(self) -> bool:
         """Takes the invocation that the clock waits for although it did not arrive, or sends its chunk again."""
         owed = self._membership.owed()
         if owed is None or not owed.owed_invocation:
@@ -101,11 +105,19 @@ class PounceServer(ModelShell):
             try:
                 rows_NA = self._engine.invoke(work.request, self._heartbeat.beat)
             except ValueError as error:
-                # Without a chunk the clock plays the rows it has, then holds; in lockstep it is asked for again.
-                self._node.on_refusal(work.invocation)
-                text = f"invocation {work.invocation.invocation}: {error}"
-                self._tell(m.Severity.ERROR, "invocation_refused", text)
+                self._refuse(work, error)
                 return
+        self._answer(work, rows_NA, start_ns)
+
+    def _refuse(self, work: Work, error: ValueError) -> None:
+        """Reports an invocation that the engine refused; in lockstep it is asked for again.
+
+        Without a chunk the clock plays the rows it has, then holds.
+        """
+        self._node.on_refusal(work.invocation)
+        self._tell(m.Severity.ERROR, "invocation_refused", f"invocation {work.invocation.invocation}: {error}")
+
+    def _answer(self, work: Work, rows_NA: m.Floats, start_ns: int) -> None:
         ready_ns = time.monotonic_ns()
         chunk = self._node.answer(work, rows_NA, infer_ns=ready_ns - start_ns)
         try:
@@ -124,7 +136,7 @@ class PounceServer(ModelShell):
             action_dim=spec.action_dim,
             preferred_codec=images.wire_codec(self._link.bus.is_local),
             infer_p50_ns=self._heartbeat.health.infer_p50_ns,
-            infer_p99_ns=self._heartbeat.health.infer_p99_ns,
+            infer_p99_ns=self._infer_p99_ns(),
             model_hash=spec.model_hash,
             is_fake=spec.is_fake,
             version=self._version,
@@ -135,6 +147,9 @@ class PounceServer(ModelShell):
         spec = self._engine.spec
         reads_ponder_s = spec.reads_subgoal and self._subgoals is None
         return (*([PREFIX] if spec.num_carriers else []), *([PROMPT] if reads_ponder_s else []))
+
+    def _infer_p99_ns(self) -> int:
+        return self._heartbeat.health.infer_p99_ns
 
     def _open(self, request: m.OpenRequest) -> m.Contract:
         spec = self._engine.spec
@@ -156,7 +171,7 @@ class PounceServer(ModelShell):
         spec = self._engine.spec
         if spec.continuity != "trained":
             return
-        ticks = delay_ticks(schedule, self._heartbeat.health.infer_p99_ns)
+        ticks = delay_ticks(schedule, self._infer_p99_ns())
         if ticks > spec.max_committed_rows:
             raise EpisodeRefused(
                 m.Refusal.SCHEDULE,

@@ -10,6 +10,7 @@ import contextlib
 import threading
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import NamedTuple, Protocol
 
 from protocol.errors import CallFailed
@@ -96,6 +97,10 @@ class Bus(Protocol):
         """Sends a request and returns the reply. Raises CallFailed if no reply comes in time."""
         ...
 
+    def ask(self, key: str, payload: bytes, *, timeout_ns: int) -> Future[bytes]:
+        """As ``call``, without waiting; the bell rings when it is done."""
+        ...
+
     def declare_alive(self, key: str) -> None: ...
     def watch_alive(self, expression: str) -> Subscription: ...
     def wait(self, timeout_ns: int) -> None:
@@ -151,6 +156,14 @@ class LocalBus:
             if not self.run_participants() and not answers:  # it may have answered inside of another one's call
                 raise CallFailed(key, timeout_ns / 1e6, "its server has nothing to do and did not answer")
         return answers[0]
+
+    def ask(self, key: str, payload: bytes, *, timeout_ns: int) -> Future[bytes]:
+        future: Future[bytes] = Future()
+        try:
+            future.set_result(self.call(key, payload, timeout_ns=timeout_ns))
+        except CallFailed as error:
+            future.set_exception(error)
+        return future
 
     def run_participants(self) -> bool:
         """Lets every participant do one piece of work; returns False if none had any."""

@@ -204,13 +204,28 @@ class Link:
         Raises:
             CallFailed: no reply, or one that is not a ``call.reply``.
         """
-        key = topics.call_key(call, self.robot, proc)
+        payload = self.bus.call(*self._request(call, proc, request), timeout_ns=timeout_ns)
+        return self._reply(call, proc, payload, timeout_ns)
+
+    def ask(self, call: Call, proc: str, request: Any, *, timeout_ns: int) -> Callable[[], Any]:
+        """As ``call``, without waiting. The function returned gives the reply, or None while there is none.
+
+        Raises:
+            CallFailed: (the function) no reply, or one that is not a ``call.reply``.
+        """
+        future = self.bus.ask(*self._request(call, proc, request), timeout_ns=timeout_ns)
+        return lambda: self._reply(call, proc, future.result(), timeout_ns) if future.done() else None
+
+    def _request(self, call: Call, proc: str, request: Any) -> tuple[str, bytes]:
         if hasattr(request, "header"):
             request = dataclasses.replace(request, header=self.header(call.name, 0))
-        payload = self.bus.call(key, codec.encode(request), timeout_ns=timeout_ns)
+        return topics.call_key(call, self.robot, proc), codec.encode(request)
+
+    def _reply(self, call: Call, proc: str, payload: bytes, timeout_ns: int) -> Any:
         try:
             return codec.decode(call.reply, payload)
         except ProtocolError as error:
+            key = topics.call_key(call, self.robot, proc)
             raise CallFailed(key, timeout_ns / 1e6, f"unreadable answer: {error}") from None
 
     def drop(self, source: str, reason: DropReason, detail: str) -> None:

@@ -11,8 +11,10 @@ from __future__ import annotations
 import ipaddress
 import json
 import os
+import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any
 
@@ -199,6 +201,20 @@ class ZenohBus:
         if time.monotonic_ns() - start_ns >= timeout_ns:  # for an absent server zenoh gives no reply, and at once
             why = "it is served, and the reply did not come in time"
         raise CallFailed(key, timeout_ms, why)
+
+    def ask(self, key: str, payload: bytes, *, timeout_ns: int) -> Future[bytes]:
+        future: Future[bytes] = Future()
+
+        def wait() -> None:
+            try:
+                future.set_result(self.call(key, payload, timeout_ns=timeout_ns))
+            except Exception as error:  # besides CallFailed: the session was closed meanwhile
+                why = str(error) or type(error).__name__
+                future.set_exception(error if isinstance(error, CallFailed) else CallFailed(key, timeout_ns / 1e6, why))
+            self._bell.ring()
+
+        threading.Thread(target=wait, name="zenoh-ask", daemon=True).start()
+        return future
 
     def declare_alive(self, key: str) -> None:
         self._declared.append(self._session.liveliness().declare_token(key))

@@ -494,7 +494,8 @@ def test_example_texts_are_read_into_a_draft(tmp_path: Path) -> None:
 
 def test_every_robot_needs_a_session() -> None:
     with pytest.raises(ValueError, match="3 robots need as many sessions: --max-sessions is 2"):
-        build_engine(PonderOptions(robots=RobotsOptions(other_robots=("r1", "r2"))))
+        build_engine(PonderOptions(robots=RobotsOptions(other_robots=("r1", "r2"), max_sessions=2)))
+    assert RobotsOptions(other_robots=("r1", "r2")).num_sessions == 3
 
 
 @pytest.mark.parametrize(

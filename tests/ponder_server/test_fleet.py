@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from clock import schedules
 from dual_system.models.ponder.configs import tiny_cpu
 from dual_system.models.ponder.network import Ponder
 from ponder_server import contract
@@ -41,6 +42,9 @@ class InTurns:
     def warm_up_full(self) -> list[int]:
         return [self._full_ms * MS] * 10
 
+    def open(self, session: str, opening: contract.Opening, progress: Any, between: Any) -> int:
+        return self._engine.open(session, opening, progress)  # type: ignore[no-any-return]
+
     def begin(
         self, session: str, frames: tuple[contract.Frame, ...], *, proprio: contract.Proprio | None = None
     ) -> None:
@@ -64,7 +68,6 @@ class Hall:
     engine: Any
     px: int = 4
     bus: LocalBus = dataclasses.field(default_factory=LocalBus)
-    latency_budget_ms: int = 1000
 
     def __post_init__(self) -> None:
         self.clocks = {robot: Link(self.bus, robot=robot, proc="clock") for robot in ROBOTS}
@@ -75,14 +78,8 @@ class Hall:
             for topic in (topics.COGNITION, topics.EVENT)
         }
         link = Link(self.bus, robot=ROBOTS[0], proc="ponder")
-        self.fleet = PonderFleet(
-            link,
-            self.engine,
-            Heartbeat(link, "test", "host/monotonic"),
-            "test",
-            other_robots=ROBOTS[1:],
-            latency_budget_ns=self.latency_budget_ms * MS,
-        )
+        heartbeat = Heartbeat(link, "test", "host/monotonic")
+        self.fleet = PonderFleet(link, self.engine, heartbeat, "test", other_robots=ROBOTS[1:])
         self.fleet.warm_up()
         self.fleet.ready()
         self.bus.add_participant(self.fleet.step)
@@ -180,18 +177,50 @@ def test_a_robot_that_asks_more_is_not_answered_more(hall: Hall, episode_info: I
 @pytest.mark.parametrize(
     ("full_ms", "is_refused"), [(53, [False] * 3), (78, [False, False, True]), (81, [False, True, True])]
 )
-def test_an_episode_that_would_break_the_budget_with_full_contexts_is_refused(
-    fake_ponder: Any, episode_info: Info, paper: m.Schedule, full_ms: int, is_refused: list[bool]
+def test_an_episode_with_which_a_cognition_would_grow_too_old_is_refused(
+    fake_ponder: Any, episode_info: Info, full_ms: int, is_refused: list[bool]
 ) -> None:
-    hall = Hall(InTurns(fake_ponder, full_ms=full_ms), latency_budget_ms=160)
-    replies = {robot: hall.open(robot, episode_info(paper)) for robot in ROBOTS}
+    hall = Hall(InTurns(fake_ponder, full_ms=full_ms))
+    schedule = dataclasses.replace(schedules.realtime(), max_age_ns=1160 * MS)
+    replies = {robot: hall.open(robot, episode_info(schedule)) for robot in ROBOTS}
     assert [bool(reply.error) for reply in replies.values()] == is_refused
     for robot, reply in replies.items():
         if reply.error:
-            assert "latency budget is 160 ms" in reply.error
+            assert "older than its --max-age-ms 1160" in reply.error
             hall.clocks["r0"].call(topics.CLOSE, "ponder", m.CloseRequest(), timeout_ns=1)
-            assert hall.open(robot, episode_info(paper)).error == ""
+            assert hall.open(robot, episode_info(schedule)).error == ""
             break
+
+
+def test_in_lockstep_the_world_waits_and_nobody_is_refused(
+    fake_ponder: Any, episode_info: Info, paper: m.Schedule
+) -> None:
+    hall = Hall(InTurns(fake_ponder, full_ms=5000))
+    assert [hall.open(robot, episode_info(paper)).error for robot in ROBOTS] == [""] * 3
+
+
+def test_a_long_opening_stops_nobody(hall: Hall, episode_info: Info, paper: m.Schedule) -> None:
+    """Between its forwards the others are answered, and every heartbeat goes on within them."""
+    hall.open("r1", episode_info(paper))
+    heard = {robot: Link(hall.bus, robot=robot, proc="ear").subscribe(topics.HEALTH, keep=100) for robot in ROBOTS}
+    answered: list[int] = []
+    plain_open = hall.engine.open
+
+    def opens_in_forwards(session: str, opening: Any, progress: Any, between: Any) -> int:
+        for query in range(3):
+            hall.ask("r1", query)
+            for server in hall.fleet.shells:
+                server.heartbeat._next_ns = 0
+            progress()
+            for _ in range(2):  # one begins a query, one answers it
+                between()
+            answered.append(len(hall.said("r1", m.Cognition)))
+        return plain_open(session, opening, progress, between)  # type: ignore[no-any-return]
+
+    hall.engine.open = opens_in_forwards
+    assert hall.open("r0", episode_info(paper)).error == ""
+    assert answered == [1, 1, 1]
+    assert all(len(stream.drain()) >= 3 for stream in heard.values())
 
 
 def test_a_refused_query_is_told_to_its_robot_alone(hall: Hall, episode_info: Info, paper: m.Schedule) -> None:

@@ -72,7 +72,8 @@ def opener(*, max_prefixes: int = 2, chunk_tokens: int = 4096) -> Opener:
 def encoded(opener: Opener, opening: Opening, progress: Any = no_progress) -> FakeContext:
     context = FakeContext()
     pictures = [picture for views in opening.demo_frames for picture in views]
-    opener.encode(context, opening, segments_of(opening), pictures, progress)  # type: ignore[arg-type]
+    for _ in opener.encode(context, opening, segments_of(opening), pictures):  # type: ignore[arg-type]
+        progress()
     return context
 
 
