@@ -21,6 +21,12 @@ def channels_of(contract: Contract) -> tuple[ChannelSpec, ...]:
     return contract.channels or ((PREFIX,) if contract.num_carriers else ())
 
 
+def null_of(pounce: Contract) -> str:
+    """What POUNCE reads if it is given nothing, in words."""
+    has_learned = any(channel.null == NullKind.LEARNED for channel in channels_of(pounce))
+    return "its learned null" if has_learned else "the task alone"
+
+
 def misfit(ponder: Contract, pounce: Contract) -> str:
     """Why POUNCE cannot read what PONDER gives; "" if it can."""
     gives = {channel.payload for channel in channels_of(ponder)}

@@ -1,7 +1,7 @@
 """``pp-check``: derives every decision of an episode's log again, and names the first that differs.
 
 Causes are checked before consequences: queries, stamps, invocations, chunks, deadlines, rows, result. An "oracle"
-episode has no servers, so only deadlines and result are checked.
+episode has no servers, so only deadlines and result are checked; one of POUNCE alone has no queries.
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ from clock.check_findings import Disagreement, compare
 from clock.conductor import invocation_seed
 from clock.delays import in_order, modelled_ns
 from clock.playback import Chunk, covering, deadline_ns, tick_at
+from clock.policies import has_ponder
 from clock.reference import Ready, latest_ready, refer, text_age_ns
 from protocol.mcap_log import EpisodeRecord
 from protocol.messages import (
@@ -98,6 +99,8 @@ def check_queries(record: EpisodeRecord) -> Iterator[Disagreement]:
     In real time at most once: a query may wait for a busy server.
     """
     schedule, queries = record.info.schedule, record.queries
+    if queries and not has_ponder(record.info.policy):
+        yield from compare("Query", 0, sent=("never: POUNCE plays alone", "once"))
     sources: dict[int, set[int]] = {}
     for observation in record.observations:
         if observation.header.clock_id == EPISODE_CLOCK:  # not comparable on another clock
@@ -262,7 +265,7 @@ def _check_given(record: EpisodeRecord, answers: Answers, index: int, invocation
         age_ns=(reference.age_ns, invocation.age_ns),
         seed=(invocation_seed(schedule.seed, index), invocation.seed),
     )
-    if latest_ready(admitted, invocation.now_ns) is None:
+    if latest_ready(admitted, invocation.now_ns) is None and has_ponder(record.info.policy):
         yield from compare("Invocation", index, now_ns=("after the first cognition", invocation.now_ns))
     if reference.query is None:
         none = ((0, 0), None, 0)

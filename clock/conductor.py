@@ -7,7 +7,7 @@ lockstep are the same code: in lockstep the shell checks ``is_waiting`` and stop
     WAIT_OBSERVATION -> WAIT_COGNITION -> WAIT_CHUNK -> RUNNING -> ENDED
 
 As in the paper, control starts only after the first cognition; with WaitKind.HOLD, ticks run from the first observation
-and hold the initial command until then.
+and hold the initial command until then. Without a PONDER (`policies`) nothing is awaited but the first chunk.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from clock.delays import in_order, modelled_ns
 from clock.ladder import Ladder
 from clock.limits import Hit, out_of_range
 from clock.playback import Chunk, Join, covering, deadline_ns, row_of, seam_policy, tick_at
+from clock.policies import has_ponder
 from clock.reference import Ready, latest_ready, refer, text_age_ns
 from clock.residual import Due, ResidualHead, corrected
 from clock.timebase import NS_PER_S
@@ -117,12 +118,14 @@ class Conductor:
     _invoked_in: int = -1
     _told_state: RobotState = RobotState.UNSPECIFIED
     _emitted: set[str] = field(default_factory=set)
+    _has_ponder: bool = field(init=False)
     _join: Join = field(init=False)
     _commander: Commander = field(init=False)
     _query_rng: np.random.Generator = field(init=False)
     _invoke_rng: np.random.Generator = field(init=False)
 
     def __post_init__(self) -> None:
+        self._has_ponder = has_ponder(self.info.policy)
         self._commander = Commander(self.info)
         self._join = seam_policy(self.info.schedule.seam)
         streams = np.random.SeedSequence(self.info.schedule.seed).spawn(2)
@@ -198,12 +201,14 @@ class Conductor:
             self.stage = Stage.ENDED
         self._settle(now_ns, effects)
         if self.stage == Stage.WAIT_OBSERVATION and self._newest is not None:
-            self._ask_ponder(self._newest, effects)
+            if self._has_ponder:
+                self._ask_ponder(self._newest, effects)
             self._query_due_ns = self._newest.source_ns + self.info.schedule.query_period_ns
             self.stage = Stage.WAIT_COGNITION
             if self.info.schedule.wait == WaitKind.HOLD:
                 self._start(now_ns)
-        if self.stage == Stage.WAIT_COGNITION and self._ready and "pounce" not in self._absent:
+        has_cognition = bool(self._ready) or not self._has_ponder
+        if self.stage == Stage.WAIT_COGNITION and has_cognition and "pounce" not in self._absent:
             self._ask_pounce(0, now_ns, effects)
             self._invoke_due_tick = self.info.schedule.invoke_period_ticks
             self.stage = Stage.WAIT_CHUNK
@@ -233,7 +238,7 @@ class Conductor:
         """
         if not self._is_lockstep or self.stage != Stage.RUNNING:
             return True
-        return tick >= self._invoke_due_tick or self.deadline_ns(tick) >= self._query_due_ns
+        return tick >= self._invoke_due_tick or (self._has_ponder and self.deadline_ns(tick) >= self._query_due_ns)
 
     def is_waiting(self, now_ns: int) -> bool:
         """In lockstep: whether time must stop at ``now_ns`` because an answer or an observation is due."""
@@ -336,6 +341,8 @@ class Conductor:
 
     def _ask_ponder_if_due(self, effects: list[Effect]) -> None:
         tau_ns, newest = self.deadline_ns(self.tick), self._newest
+        if not self._has_ponder:
+            return
         if newest is not None and tau_ns >= self._query_due_ns and newest.tick > self._queried_tick:
             if "ponder" in self._absent:
                 self._tell(effects, Severity.WARNING, "query_skipped", "PONDER is away: no queries until it is back")
@@ -346,7 +353,8 @@ class Conductor:
 
     def _ask_pounce_if_due(self, effects: list[Effect]) -> None:
         tau_ns = self.deadline_ns(self.tick)
-        if self.tick >= self._invoke_due_tick and latest_ready(self._ready, tau_ns) is not None:
+        has_cognition = latest_ready(self._ready, tau_ns) is not None or not self._has_ponder
+        if self.tick >= self._invoke_due_tick and has_cognition:
             if "pounce" in self._absent:
                 self._tell(
                     effects,

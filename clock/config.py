@@ -7,6 +7,7 @@ from pathlib import Path
 
 import tyro
 
+from clock.policies import PonderChoice, policy_of, servers_of
 from clock.residual import DEFAULT_LOADER, load_head
 from clock.service import ServiceConfig
 from protocol.options import DaemonOptions, LinkOptions
@@ -22,6 +23,8 @@ class ClockOptions:
             listen=(endpoint("clock"),), connect=(endpoint("ponder"), endpoint("pounce"))
         )
     )
+    ponder: PonderChoice = "serve"
+    """Whether this clock is ready (/readyz) only with a PONDER. An episode says itself whether it has one."""
     allow_starved: bool = False
     """Start although the schedule leaves ticks without a row (see docs/clock.md)."""
     max_clock_bound_ms: float = 5.0
@@ -38,6 +41,7 @@ class ClockOptions:
         head = None if self.residual_head is None else load_head(self.residual_head, self.residual_loader)
         return ServiceConfig(
             allow_starved=self.allow_starved,
+            servers=servers_of(policy_of(self.ponder)),
             max_clock_bound_ns=round(self.max_clock_bound_ms * 1_000_000),
             residual=head,
         )

@@ -12,10 +12,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from clock.channels import misfit
+from clock.channels import misfit, null_of
 from clock.conductor import Conductor, Stage
 from clock.feasibility import check_feasible
 from clock.offset import Offset, from_exchange, narrowest
+from clock.policies import SERVERS, has_ponder, servers_of
 from clock.report import ADMITTED_EVENT
 from clock.residual import RESIDUAL_EVENT, ResidualHead, check_head
 from clock.timebase import NS_PER_S, MonotonicClock, VirtualClock
@@ -51,7 +52,6 @@ from protocol.topics import (
 
 log = logging.getLogger(__name__)
 
-SERVERS = ("ponder", "pounce")
 ROBOT = "sim"
 NUM_TIME_EXCHANGES = 8
 ROBOT_SILENCE_NS = 1_000_000_000
@@ -76,6 +76,8 @@ class ServiceConfig:
     """Residual head that corrects every row at 20 Hz."""
     journal_limit_bytes: int = 2 << 30
     """Limit of the observations kept for a restarted PONDER; beyond it a rejoin is refused and the ladder acts."""
+    servers: tuple[str, ...] = SERVERS
+    """Servers without which this clock does not call itself ready; an episode names its own."""
     watches: bool = True
     """False if all participants share one thread, so that none can die alone."""
 
@@ -99,6 +101,10 @@ class _Episode:
     @property
     def now_ns(self) -> int:
         return self.clock.now_ns() if self.clock is not None else 0
+
+    @property
+    def servers(self) -> tuple[str, ...]:
+        return servers_of(self.request.info.policy)
 
     @property
     def is_lockstep(self) -> bool:
@@ -281,8 +287,7 @@ class ClockService:
         episode = self._episode
         if episode is None or not self._config.watches:
             return
-        procs = SERVERS if episode.request.info.policy == "servers" else ()
-        for change in self._watch.poll(procs, self._link.episode, self._host.now_ns()):
+        for change in self._watch.poll(episode.servers, self._link.episode, self._host.now_ns()):
             if change.is_lost:
                 episode.conductor.on_lost(change.proc)
                 self._event(m.Severity.ERROR, f"{change.proc}_lost", f"{change.proc} is lost: {change.why}")
@@ -365,18 +370,19 @@ class ClockService:
         if self._is_draining:
             error = "the clock service is draining: it leaves now, and another process takes its place"
             return m.OpenReply(error=error, refusal=m.Refusal.NOT_READY, try_again=True)
-        if info.policy != "servers":
+        procs = servers_of(info.policy)
+        if not procs:
             return self._begin(request, contracts=(), warnings=(), committed_ticks=0)
-        not_ready = self.not_ready() if self._config.watches else ""
+        not_ready = self.not_ready(procs) if self._config.watches else ""
         if not_ready:
             return m.OpenReply(error=not_ready, refusal=m.Refusal.NOT_READY, try_again=True)
         try:
             self._enter(header)
-            self._measure_offsets(SERVERS if info.robot.is_simulated else (*SERVERS, ROBOT))
-            contracts = tuple(self._open_at(proc, request) for proc in SERVERS)
+            self._measure_offsets(procs if info.robot.is_simulated else (*procs, ROBOT))
+            contracts = tuple(self._open_at(proc, request) for proc in procs)
             warnings, committed_ticks = self._agree(info, contracts)
         except (CallFailed, ProtocolError) as error:
-            self._close_servers(None)
+            self._close_servers(procs, None)
             self._link.leave_episode()
             if isinstance(error, EpisodeRefused):
                 return m.OpenReply(error=str(error), refusal=error.refusal, try_again=error.try_again)
@@ -394,16 +400,19 @@ class ClockService:
             self._enter(header)
         self._last_epoch[header.session] = header.epoch
         self.models = "+".join(contract.model_hash for contract in contracts)
-        head = self._config.residual if request.info.policy == "servers" else None
+        procs = servers_of(request.info.policy)
+        head = self._config.residual if procs else None
         conductor = Conductor(request.info, committed_ticks=committed_ticks, residual=head)
-        self._episode = _Episode(request, conductor, contracts=dict(zip(SERVERS, contracts, strict=False)))
+        self._episode = _Episode(request, conductor, contracts=dict(zip(procs, contracts, strict=True)))
         self._robot_heard_ns = self._host.now_ns()
-        members = {proc: self._link.members[proc] for proc in SERVERS if contracts}
+        members = {proc: self._link.members[proc] for proc in procs}
         self._watch.enter(members, self._robot_heard_ns)
         self._link.publish(INFO, request.info, at_ns=0)
         if head is not None:
             text = f"every row is corrected by {head.digest}"
             self._event(m.Severity.INFO, RESIDUAL_EVENT, text, digest=head.digest)
+        if procs and not has_ponder(request.info.policy):
+            self._event(m.Severity.INFO, "no_ponder", f"POUNCE plays alone: it reads {null_of(contracts[0])}")
         for warning in warnings:
             self._event(m.Severity.WARNING, "warning", warning)
         for proc, offset in self._offsets.items():
@@ -418,9 +427,9 @@ class ClockService:
     def _members(self) -> tuple[m.Member, ...]:
         return tuple(m.Member(proc=proc, boot_id=boot_id) for proc, boot_id in self._link.members.items())
 
-    def not_ready(self) -> str:
-        """Why no episode can be opened, unless one runs already; "" if one can."""
-        for proc in SERVERS:
+    def not_ready(self, procs: Sequence[str] | None = None) -> str:
+        """Why no episode of these servers can be opened, unless one runs already; "" if one can."""
+        for proc in self._config.servers if procs is None else procs:
             health = self._watch.health_of(proc)
             if health is None:
                 return f"{proc} is not there: start {proc}-serve, or check its endpoint"
@@ -470,8 +479,8 @@ class ClockService:
         Raises:
             EpisodeRefused: the parts do not fit, the schedule is infeasible, or untrained weights would move a robot.
         """
-        ponder, pounce = contracts
-        if why_not := misfit(ponder, pounce):
+        *ponder, pounce = contracts
+        if ponder and (why_not := misfit(ponder[0], pounce)):
             raise EpisodeRefused(m.Refusal.MODELS, why_not)
         if (pounce.horizon, pounce.action_dim) != (info.schedule.horizon, info.robot.action_dim):
             raise EpisodeRefused(
@@ -508,13 +517,13 @@ class ClockService:
 
     def _finish(self, result: m.EpisodeResult | None) -> None:
         episode, self._episode = self._episode, None  # first, so that a server with a late query cannot rejoin it
-        if episode is not None and episode.request.info.policy == "servers":
-            self._close_servers(result)
+        if episode is not None:
+            self._close_servers(episode.servers, result)
         self._watch.enter({}, self._host.now_ns())  # a server that restarts between episodes is not lost
         self._link.leave_episode()
 
-    def _close_servers(self, result: m.EpisodeResult | None) -> None:
-        for proc in SERVERS:
+    def _close_servers(self, procs: Sequence[str], result: m.EpisodeResult | None) -> None:
+        for proc in procs:
             if self._config.watches and (self._watch.is_lost(proc) or self._watch.is_gone(proc)):
                 continue
             try:
@@ -523,7 +532,7 @@ class ClockService:
                 log.warning("close proc=%s %s", proc, error)
 
     def _on_active(self, request: m.ActiveRequest) -> m.ActiveReply:
-        if self._episode is None or self._episode.request.info.policy != "servers":
+        if self._episode is None or self._plays_without(request.header.proc):
             return m.ActiveReply()
         if self._episode.journal_bytes > self._config.journal_limit_bytes:
             return m.ActiveReply(error="the journal of this episode outgrew its limit: its context cannot be rebuilt")
@@ -538,6 +547,10 @@ class ClockService:
             owed_invocation=codec.encode(invoked) if is_owed else b"",
             observation=self._episode.newest_payload,
         )
+
+    def _plays_without(self, proc: str) -> bool:
+        """Whether this server has no part in the running episode."""
+        return self._episode is not None and proc in set(SERVERS) - set(self._episode.servers)
 
     def _admit(self, asking: m.Header) -> str:
         """Lets a restarted server take the place of the one that is lost; returns why not, or ""."""

@@ -12,7 +12,7 @@ from protocol.version import version
 
 
 def end_of(service: ClockService, link: Link, silent_ns: Callable[[], int]) -> End:
-    """The clock service's end of the bus: it is ready if both model servers are. It may be busy in an opening."""
+    """The clock service's end of the bus: it is ready if the model servers are. It may be busy in an opening."""
     build = version()  # reads a file
 
     def health() -> Health:

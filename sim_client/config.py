@@ -9,8 +9,10 @@ from typing import Literal
 import tyro
 
 from clock import schedules
+from clock.policies import PonderChoice, policy_of
 from clock.timebase import NS_PER_MS
 from dual_system.tasks.difficulty import Difficulty
+from protocol.errors import TransportError
 from protocol.messages import Delay, DelayKind, Delivery, DeliveryKind, Schedule, Seam, SeamKind, WaitKind
 from protocol.options import LinkOptions
 from protocol.sockets import endpoint
@@ -115,6 +117,8 @@ class SimOptions:
     """Clock. lockstep: simulated time waits for results, delays are modelled, bit-reproducible. realtime: no wait."""
     policy: Literal["servers", "oracle"] = "servers"
     """Source of actions: the servers, or the task's own script (oracle)."""
+    ponder: PonderChoice = "serve"
+    """Whether there is a PONDER. none: POUNCE plays alone, on its learned null or the task alone."""
     local: bool = False
     """Start ponder-serve, pounce-serve (and in real time clock-serve) on this machine, and stop them at the end."""
     in_process: bool = False
@@ -133,6 +137,18 @@ class SimOptions:
     link: LinkOptions = field(
         default_factory=lambda: LinkOptions(connect=tuple(map(endpoint, ("clock", "ponder", "pounce"))))
     )
+
+    @property
+    def played_by(self) -> str:
+        """``EpisodeInfo.policy``."""
+        return policy_of(self.ponder) if self.policy == "servers" else self.policy
+
+    def check(self) -> None:
+        """Raises TransportError for what cannot work together."""
+        if self.ponder == "none" and self.policy == "oracle":
+            raise TransportError("--policy oracle plays without servers: leave --ponder none out")
+        if self.ponder == "none" and self.ponder_checkpoint is not None:
+            raise TransportError("--ponder none starts no PONDER: leave --ponder-checkpoint out")
 
     @property
     def runs_clock_daemon(self) -> bool:

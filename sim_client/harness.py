@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from clock.policies import has_ponder
 from clock.service import ClockService, ServiceConfig
 from protocol.bus import Bus, LocalBus
 from protocol.errors import TransportError
@@ -44,6 +45,7 @@ def open_harness(
     Raises:
         TransportError: a bus that cannot be opened, or options that contradict each other.
     """
+    options.check()
     bus, add_participant = _bus(options, daemons, ponder, subgoals)
     try:
         clock = None
@@ -68,9 +70,9 @@ def _bus(
         if options.mode != "lockstep":
             raise TransportError("--in-process shares one thread: use --mode lockstep, or --local")
         bus = LocalBus()
-        bus.add_participant(
-            (ponder or _builder("ponder_server.in_process"))(bus, link.robot, options.ponder_checkpoint)
-        )
+        if has_ponder(options.played_by):
+            build_ponder = ponder or _builder("ponder_server.in_process")
+            bus.add_participant(build_ponder(bus, link.robot, options.ponder_checkpoint))
         pounce = partial(_builder("pounce_server.in_process"), **({} if subgoals is None else {"subgoals": subgoals}))
         bus.add_participant(pounce(bus, link.robot, options.pounce_checkpoint))
         return bus, bus.add_participant
@@ -80,6 +82,7 @@ def _bus(
             link,
             with_clock=options.runs_clock_daemon,
             allow_starved=options.schedule.allow_starved,
+            with_ponder=has_ponder(options.played_by),
             ponder_checkpoint=options.ponder_checkpoint,
             pounce_checkpoint=options.pounce_checkpoint,
         )

@@ -102,23 +102,26 @@ def start_local(
     with_clock: bool,
     allow_starved: bool = False,
     shared_memory: bool = True,
-    ponder: Sequence[str],
+    ponder: Sequence[str] | None,
     pounce: Sequence[str],
 ) -> tuple[str, ...]:
-    """Starts the servers on sockets of their own; returns the endpoints to connect to.
+    """Starts the servers on sockets of their own, PONDER unless None; returns the endpoints to connect to.
 
     Every process listens on its own socket and connects to the servers it talks to, so that the death of one leaves
     the links among the others alone.
     """
-    at_clock, at_ponder, at_pounce = (endpoint(proc, daemons.sockets()) for proc in ("clock", "ponder", "pounce"))
+    models = {"pounce": pounce} if ponder is None else {"ponder": ponder, "pounce": pounce}
+    at_models = [endpoint(proc, daemons.sockets()) for proc in models]
     common = ["--link.robot", robot, *([] if shared_memory else ["--link.no-shared-memory"])]
-    daemons.start("ponder", "ponder_server", [*common, "--link.listen", at_ponder, *ponder])
-    daemons.start("pounce", "pounce_server", [*common, "--link.listen", at_pounce, *pounce])
+    for (proc, arguments), at_model in zip(models.items(), at_models, strict=True):
+        daemons.start(proc, f"{proc}_server", [*common, "--link.listen", at_model, *arguments])
     if not with_clock:
-        return at_ponder, at_pounce
-    arguments = [*common, "--link.listen", at_clock, "--link.connect", at_ponder, at_pounce]
-    daemons.start("clock", "clock", [*arguments, *(["--allow-starved"] if allow_starved else [])])
-    return at_clock, at_ponder, at_pounce
+        return tuple(at_models)
+    at_clock = endpoint("clock", daemons.sockets())
+    at_clock_arguments = [*common, "--link.listen", at_clock, "--link.connect", *at_models]
+    alone = ["--ponder", "none"] if ponder is None else []
+    daemons.start("clock", "clock", [*at_clock_arguments, *alone, *(["--allow-starved"] if allow_starved else [])])
+    return at_clock, *at_models
 
 
 def local_link(
@@ -127,6 +130,7 @@ def local_link(
     *,
     with_clock: bool,
     allow_starved: bool,
+    with_ponder: bool,
     ponder_checkpoint: Path | None,
     pounce_checkpoint: Path | None,
 ) -> LinkOptions:
@@ -137,7 +141,7 @@ def local_link(
         with_clock=with_clock,
         allow_starved=allow_starved,
         shared_memory=link.shared_memory,
-        ponder=_checkpoint(ponder_checkpoint),
+        ponder=_checkpoint(ponder_checkpoint) if with_ponder else None,
         pounce=_checkpoint(pounce_checkpoint),
     )
     return replace(link, connect=endpoints)

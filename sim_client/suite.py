@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from clock.policies import has_ponder
 from clock.service import ClockService
 from dual_system.tasks.environment import Environment, Snapshot, make_environment
 from dual_system.tasks.physics import CONTROL_HZ
@@ -117,7 +118,7 @@ class Suite:
             except (TransportError, EpisodeRefused) as error:
                 outcome = Outcome(status=m.TaskStatus.ABORTED, reason=str(error), num_ticks=0)
         result, missing = self._end.end(
-            outcome.status, outcome.reason, outcome.num_ticks, with_servers=info.policy == "servers"
+            outcome.status, outcome.reason, outcome.num_ticks, with_servers=info.policy != "oracle"
         )
         return {
             "task": info.task,
@@ -147,15 +148,19 @@ class Suite:
             robot=simulated_robot(environment.physics.robot, first.state),
             t0_unix_ns=time.time_ns(),
             versions=versions(),
-            policy=self._options.policy,
-            has_demo=environment.has_demonstration and self._options.policy == "servers",
+            policy=self._options.played_by,
+            has_demo=self._shows_demonstration(environment),
         )
 
     def _demonstration(self, environment: Environment) -> tuple[m.DemoFrame, ...]:
         """The demonstration's frames. Raises TransportError or EpisodeRefused if PONDER's contract is not available."""
-        if not environment.has_demonstration:
+        if not self._shows_demonstration(environment):
             return ()
         return demonstration(environment, images.wire_codec(self._link.bus.is_local), self._end.demo_sampling())
+
+    def _shows_demonstration(self, environment: Environment) -> bool:
+        """Whether there is one, and a PONDER to see it."""
+        return environment.has_demonstration and has_ponder(self._options.played_by)
 
     def _looks(self, tick: int) -> bool:
         """Whether a tick's pictures are needed, by the log or, according to the schedule, by the models."""

@@ -13,6 +13,7 @@ import dual_system.tasks.headless  # noqa: F401 - before anything that imports m
 
 # isort: split
 
+from clock.policies import policy_of, servers_of
 from clock.service import ClockService, ServiceConfig
 from clock.status import end_of
 from protocol import files
@@ -66,6 +67,7 @@ def _machine(options: GatewayOptions, daemons: Daemons, metrics: Metrics) -> Ite
             link,
             with_clock=options.runs_clock_daemon,
             allow_starved=options.timing.allow_starved,
+            with_ponder=options.ponder == "serve",
             ponder_checkpoint=options.ponder_checkpoint,
             pounce_checkpoint=options.pounce_checkpoint,
         )
@@ -76,7 +78,8 @@ def _machine(options: GatewayOptions, daemons: Daemons, metrics: Metrics) -> Ite
         metrics.watch(End(link=robot, health=lambda: health, silent_ns=lambda: 0))  # a request may wait for minutes
         clock = None
         if not options.runs_clock_daemon:
-            config = ServiceConfig(allow_starved=options.timing.allow_starved)
+            servers = servers_of(policy_of(options.ponder))
+            config = ServiceConfig(allow_starved=options.timing.allow_starved, servers=servers)
             at_clock = Link(bus, robot=link.robot, proc="clock")
             clock = ClockService(at_clock, config)
             metrics.watch(end_of(clock, at_clock, lambda: 0))

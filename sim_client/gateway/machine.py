@@ -22,7 +22,8 @@ from typing import Literal, TypeVar
 import numpy as np
 
 from clock.limits import out_of_range
-from clock.service import SERVERS, ClockService
+from clock.policies import has_ponder, servers_of
+from clock.service import ClockService
 from clock.timebase import MonotonicClock
 from protocol import images
 from protocol import messages as m
@@ -59,6 +60,7 @@ class Plan:
     num_rows: int
     body: Body
     suite: str
+    policy: str = "servers"  # of EpisodeInfo
     task: str = "gateway"
     image_px: int | None = None  # side of the squares that pictures are resized to; None: as they come
     seed: int = 0
@@ -146,14 +148,15 @@ class Machine:
     # -- the working thread
 
     def await_servers(self, should_stop: Callable[[], bool]) -> None:
-        """Waits until both model servers are ready, and tells how far they are.
+        """Waits until the model servers are ready, and tells how far they are.
 
         Raises:
             TransportError: a server that we started is dead, or they are not ready within the patience.
         """
         states: dict[str, str] = {}
         deadline_ns = time.monotonic_ns() + self._plan.patience_ns
-        while set(states.values()) != {"ready"} or len(states) < len(SERVERS):
+        procs = servers_of(self._plan.policy)
+        while any(states.get(proc) != "ready" for proc in procs):
             for health in self._healths.drain():
                 state = (
                     f"{health.state.name.lower()} ({health.progress:.0%})"
@@ -166,7 +169,7 @@ class Machine:
             if (why := self._dead_server()) or should_stop():
                 raise TransportError(why or _STOPPED)
             if time.monotonic_ns() > deadline_ns:
-                missing = ", ".join(f"{proc} is {states.get(proc, 'not there')}" for proc in SERVERS)
+                missing = ", ".join(f"{proc} is {states.get(proc, 'not there')}" for proc in procs)
                 raise TransportError(f"not ready within {self._plan.patience_ns / 1e9:.0f} s (--patience-s): {missing}")
             self._turn(_IDLE_NS)
 
@@ -348,14 +351,15 @@ class Machine:
             robot=robot,
             t0_unix_ns=time.time_ns(),
             versions=versions(),
-            has_demo=bool(step.demo),
+            policy=self._plan.policy,
+            has_demo=bool(step.demo) and has_ponder(self._plan.policy),
         )
         path = self._log_path(info)
         self._recorder.begin(info, path)
         episode = _Episode(client, info, self._node(info), MonotonicClock())
         self._episode = episode
         try:
-            demo = self._demonstration(step.demo, info.schedule.control_hz)
+            demo = self._demonstration(step.demo if info.has_demo else (), info.schedule.control_hz)
             opened = self._robot_end.open(m.OpenRequest(info=info, demo=demo))
         except (TransportError, ProtocolError) as error:
             self._end(m.TaskStatus.ABORTED, str(error))

@@ -11,6 +11,7 @@ from typing import Literal
 import tyro
 
 from clock import schedules
+from clock.policies import PonderChoice, policy_of
 from clock.timebase import NS_PER_MS
 from protocol import files
 from protocol.errors import TransportError
@@ -117,6 +118,8 @@ class GatewayOptions:
     """Key of the measured joints. None: the dialect's usual key."""
     image_px: int | None = None
     """Side in pixels of the squares that pictures are resized to. None: no resizing; PONDER refuses a wrong size."""
+    ponder: PonderChoice = "serve"
+    """Whether there is a PONDER. none: POUNCE plays alone, on its learned null or the task alone."""
     local: bool = False
     """Start ponder-serve, pounce-serve (and in real time clock-serve) on this machine, and stop them at the end."""
     ponder_checkpoint: Path | None = None
@@ -136,6 +139,8 @@ class GatewayOptions:
 
     def check(self) -> None:
         """Raises TransportError for what cannot work together."""
+        if self.ponder == "none" and self.ponder_checkpoint is not None:
+            raise TransportError("--ponder none starts no PONDER: leave --ponder-checkpoint out")
         host, _ = self.address
         rows, horizon = self.terms().rows, schedules.HORIZON
         if not 1 <= rows <= horizon:
@@ -224,6 +229,7 @@ class GatewayOptions:
             num_rows=self.terms().rows,
             body=self.body(),
             suite=self.dialect,
+            policy=policy_of(self.ponder),
             task=self.log.task,
             image_px=self.image_px,
             seed=self.log.seed,

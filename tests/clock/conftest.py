@@ -101,8 +101,9 @@ def schedule(**changes: Any) -> m.Schedule:
     return m.Schedule(**(values | changes))
 
 
-def episode_info(timing: m.Schedule) -> m.EpisodeInfo:
+def episode_info(timing: m.Schedule, policy: str = "servers") -> m.EpisodeInfo:
     return m.EpisodeInfo(
+        policy=policy,
         header=m.Header(robot="arm", session="s1", episode="pick-11", epoch=1, proc="clock"),
         task="PickHighlight",
         suite="tests",
@@ -191,11 +192,17 @@ def _conductor(episode: Episode, residual: ResidualHead | None) -> Conductor:
 
 
 def run_lockstep(
-    timing: m.Schedule, num_ticks: int, seed: int, *, has_images: bool = False, residual: ResidualHead | None = None
+    timing: m.Schedule,
+    num_ticks: int,
+    seed: int,
+    *,
+    has_images: bool = False,
+    residual: ResidualHead | None = None,
+    policy: str = "servers",
 ) -> Episode:
     """Virtual time; answers are handed over in any order and as late as ``is_waiting`` allows."""
     rng = np.random.default_rng(seed)
-    episode = Episode(episode_info(timing))
+    episode = Episode(episode_info(timing, policy))
     conductor = _conductor(episode, residual)
     inbox: list[Any] = [look(0, 0, num_ticks, has_images=has_images)]
     now_ns = 0
@@ -229,6 +236,7 @@ def run_realtime(
     stalls: float = 0.02,
     silence: range = range(0),
     residual: ResidualHead | None = None,
+    policy: str = "servers",
 ) -> Episode:
     """Real time, simulated: everything takes as long as it takes, and the clock service itself is late or stalls.
 
@@ -238,7 +246,7 @@ def run_realtime(
         residual: corrects every row.
     """
     rng = np.random.default_rng(seed)
-    episode = Episode(episode_info(dataclasses.replace(timing, mode=m.Mode.REALTIME)))
+    episode = Episode(episode_info(dataclasses.replace(timing, mode=m.Mode.REALTIME), policy))
     conductor = _conductor(episode, residual)
     coming: list[tuple[int, int, Any]] = []
 

@@ -99,6 +99,20 @@ def test_real_time_agrees_however_late_everybody_is(
     assert list(disagreements(record)) == []
 
 
+@settings(max_examples=15, deadline=None)
+@given(changes=SCHEDULES, seed=st.integers(0, 2**32), is_live=st.booleans())
+def test_pounce_alone_agrees_and_reads_null_from_the_first_observation_on(
+    changes: Any, seed: int, is_live: bool, timing: Any, lockstep: Any, realtime: Any, record_of: Any
+) -> None:
+    record = record_of((realtime if is_live else lockstep)(timing(**changes), 40, seed, policy="pounce"))
+    assert list(disagreements(record)) == []
+    assert record.queries == []
+    assert {(each.ref_query, each.age_ns, each.text) for each in record.invocations} == {(None, 0, None)}
+    assert m.Level.STALE not in {tick.level for tick in record.ticks}
+    asked = replace(record, queries=[m.Query(query=0, tick=0, source_ns=0)])
+    assert "never: POUNCE plays alone" in str(next(disagreements(asked)))
+
+
 def test_a_subgoal_of_another_query_or_age_is_found(good: EpisodeRecord) -> None:
     index = next(i for i, each in enumerate(good.invocations) if each.text_age_ns)
     for field, value in (("text", "another"), ("text", None), ("text_age_ns", 1)):

@@ -149,6 +149,39 @@ def test_trained_weights_move_a_real_robot(
     assert rig.open(episode_info(paper, robot=robot_with(is_simulated=False))).error == ""
 
 
+class TestPounceAlone:
+    def test_moves_a_real_robot_and_the_log_says_what_it_reads(
+        self, rig: Any, episode_info: Info, robot_with: Callable[..., m.Robot], paper: m.Schedule
+    ) -> None:
+        serve_time(rig)
+        take = rig.listen(topics.EVENT)
+        reply = rig.open(episode_info(paper, robot=robot_with(is_simulated=False), policy="pounce"))
+        assert (reply.error, [contract.proc for contract in reply.contracts]) == ("", ["pounce"])
+        take()
+        assert "POUNCE plays alone: it reads its learned null" in {event.text for event in rig.said[m.Event]}
+
+    def test_plays_although_no_ponder_runs(self, rig: Any, episode_info: Info, paper: m.Schedule) -> None:
+        rig.ponder = SimpleNamespace(step=lambda: False)
+        rig.run(episode_info(paper, policy="pounce"), 45)
+        requests = rig.pounce_engine.requests
+        assert [(request.cognition, request.age_ns, request.subgoal) for request in requests] == [(None, 0, "")] * 3
+
+    def test_untrained_is_refused_a_real_robot_as_ever(
+        self, fitted: Callable[..., Any], episode_info: Info, robot_with: Callable[..., m.Robot], paper: m.Schedule
+    ) -> None:
+        rig = fitted({}, {"is_random": True})
+        serve_time(rig)
+        info = episode_info(paper, robot=robot_with(is_simulated=False), policy="pounce")
+        assert rig.open(info).error == "pounce run untrained weights, which never move a real robot."
+
+    def test_a_ponder_that_runs_beside_it_is_told_of_no_episode(
+        self, rig: Any, episode_info: Info, paper: m.Schedule
+    ) -> None:
+        rig.enter(episode_info(paper, policy="pounce"))
+        assert not rig.ponder.rejoin()
+        assert rig.links["ponder"].episode == ""
+
+
 def test_a_schedule_that_cannot_be_kept_is_refused_with_the_way_out(rig: Any, episode_info: Info) -> None:
     reply = rig.open(episode_info(REALTIME_PAPER))
     assert reply.error.startswith("the schedule cannot be kept: d <= s <= H - d with d=1 s=20 H=20: fails, 1 starved")

@@ -33,7 +33,13 @@ def test_local_servers_obey_the_options_of_the_link(
     asked = LinkOptions(robot="r7", shared_memory=shared_memory)
     with Daemons(tmp_path) as daemons:
         link = local_link(
-            daemons, asked, with_clock=True, allow_starved=False, ponder_checkpoint=None, pounce_checkpoint=None
+            daemons,
+            asked,
+            with_clock=True,
+            allow_starved=False,
+            with_ponder=True,
+            ponder_checkpoint=None,
+            pounce_checkpoint=None,
         )
         assert (link.robot, link.shared_memory, len(link.connect)) == ("r7", shared_memory, 3)
         (folder,) = {path.parent for path in map(socket_path, link.connect) if path}
@@ -41,3 +47,19 @@ def test_local_servers_obey_the_options_of_the_link(
     assert not folder.exists()
     assert {"--link.no-shared-memory" in arguments for arguments in started.values()} == {not shared_memory}
     assert all(arguments[:2] == ["--link.robot", "r7"] for arguments in started.values())
+
+
+def test_pounce_alone_needs_no_ponder(started: dict[str, list[str]], tmp_path: Path) -> None:
+    with Daemons(tmp_path) as daemons:
+        link = local_link(
+            daemons,
+            LinkOptions(),
+            with_clock=True,
+            allow_starved=False,
+            with_ponder=False,
+            ponder_checkpoint=None,
+            pounce_checkpoint=None,
+        )
+    assert (set(started), len(link.connect)) == ({"pounce", "clock"}, 2)
+    alone = started["clock"].index("--ponder")
+    assert started["clock"][alone + 1] == "none"

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from clock.check import disagreements
 from dual_system.models.ponder.configs import tiny_cpu
 from dual_system.models.ponder.demo_sampling import DemoSampling
 from dual_system.tasks.environment import make_environment
@@ -19,6 +21,7 @@ from protocol.bus import Bus, LocalBus
 from protocol.errors import EpisodeRefused, TransportError
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
+from protocol.mcap_log import read_log
 from sim_client.config import LogOptions, ScheduleOptions, SimOptions
 from sim_client.harness import open_harness
 from sim_client.launch import Daemons
@@ -115,6 +118,35 @@ def test_an_episode_shows_ponder_what_its_contract_asks_for(tmp_path: Path) -> N
     assert len(ponders[0].shown) == len(wanted) > 2
     for ours, theirs in zip(ponders[0].shown, wanted, strict=True):
         np.testing.assert_array_equal(images.unpack(ours.images[0]), images.unpack(theirs.images[0]))
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_an_episode_without_a_ponder_asks_for_no_demonstration(tmp_path: Path) -> None:
+    options = SimOptions(
+        task="VideoUnmask",
+        seed=3,
+        in_process=True,
+        ponder="none",
+        out=tmp_path,
+        schedule=ScheduleOptions(max_steps=5),
+    )
+    with Daemons(tmp_path) as daemons:
+        harness = open_harness(options, daemons)
+        episode = Suite(options, harness.link, harness.clock, lambda: "").run()["episodes"][0]
+    assert (set(episode["models"]), episode["steps"]) == ({"pounce"}, 5)
+    record = read_log(tmp_path / episode["mcap"])
+    assert (record.info.policy, record.info.has_demo) == ("pounce", False)
+    assert next(disagreements(record), None) is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [({"policy": "oracle"}, "leave --ponder none out"), ({"ponder_checkpoint": Path("x")}, "--ponder-checkpoint out")],
+)
+def test_no_ponder_beside_what_contradicts_it_is_refused(changes: Any, sentence: str, tmp_path: Path) -> None:
+    with Daemons(tmp_path) as daemons, pytest.raises(TransportError, match=sentence):
+        open_harness(SimOptions(ponder="none", in_process=True, **changes), daemons)
 
 
 @pytest.mark.sim

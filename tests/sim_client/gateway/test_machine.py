@@ -113,6 +113,21 @@ def _every(num_ticks: int) -> m.Schedule:
     return replace(schedules.paper(), invoke_period_ticks=num_ticks)
 
 
+@pytest.mark.parametrize("schedule", [schedules.paper(), schedules.realtime()], ids=["lockstep", "live"])
+def test_without_a_ponder_pounce_plays_alone(
+    bench_with: Callable[..., Any], step_of: StepOf, tmp_path: Path, schedule: m.Schedule
+) -> None:
+    bench = bench_with(schedule, policy="pounce", out=tmp_path)
+    video = tuple(step_of().frames for _ in range(30))
+    answers = play(bench, step_of, 5, demo=video)
+    assert {answer.levels[0] for answer in answers} == {m.Level.PLAY}
+    bench.tell(Finish())
+    (path,) = tmp_path.rglob("*.mcap")
+    record = read_log(path)
+    assert (record.info.policy, record.info.has_demo, record.queries) == ("pounce", False, [])
+    assert next(disagreements(record), None) is None
+
+
 def test_the_video_reaches_ponder_once_a_second(bench: Any, step_of: StepOf) -> None:
     opened: list[Any] = []
     open_engine = bench.rig.ponder_engine.open
