@@ -1,4 +1,4 @@
-"""Who plays an episode: what ``EpisodeInfo.policy`` means."""
+"""The players of an episode by the name in ``EpisodeInfo.policy``."""
 
 from __future__ import annotations
 
