@@ -56,10 +56,10 @@ demo: setup
 ## make test    the tests that need no GPU, but those of make accept; make unit: without processes and long runs
 # Files share the cores; a test that keeps real time has them all.
 test: setup
-	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile -m "not gpu and not acceptance and not realtime" --durations=10
-	$(BIN)/python -m pytest -q -m "realtime and not gpu and not acceptance" --durations=10
+	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile -m "not gpu and not acceptance and not peers and not realtime" --durations=10
+	$(BIN)/python -m pytest -q -m "realtime and not gpu and not acceptance and not peers" --durations=10
 unit: setup
-	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile -m "not gpu and not acceptance and not e2e and not slow"
+	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile -m "not gpu and not acceptance and not peers and not e2e and not slow"
 
 ## make oldest  the models' tests under the oldest transformers that pyproject.toml allows
 OLDEST := $(VENV)/oldest

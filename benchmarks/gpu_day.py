@@ -39,6 +39,7 @@ from dual_system.models.ponder.context import Row
 from dual_system.models.ponder.network import Ponder
 from dual_system.models.pounce import configs as pounce_configs
 from dual_system.models.pounce.family import AnyPounceConfig, random_model
+from dual_system.models.pounce.precision import cast_streams
 from ponder_server.contract import Opening, WeightsName
 from ponder_server.draft import Draft, TrieDraft
 from ponder_server.engine import QwenEngine
@@ -48,7 +49,6 @@ from pounce_server.contract import DTypeName
 from pounce_server.fused import FusedPounce, fused_for
 from pounce_server.fused_stream import TWINS
 from pounce_server.kernels.launch import missing_for
-from pounce_server.precision import cast_for_serving
 
 Result = TypeVar("Result")
 
@@ -437,7 +437,7 @@ def _open(engine: QwenEngine, session: str, tokens: int) -> Any:
 
 def _pounce(day: Day, config: AnyPounceConfig) -> tuple[Any, Any, Tensor]:
     """A random network, one observation with a prompt of 60 tokens, and noise."""
-    model: Any = cast_for_serving(random_model(config, 0, day.device), day.dtype).eval().requires_grad_(False)
+    model: Any = cast_streams(random_model(config, 0, day.device), day.dtype).eval().requires_grad_(False)
     noise = torch.randn(1, config.horizon, config.padded_action_dim, device=day.device)
     return model, day.to(config.example_inputs(1, num_tokens=60)), noise
 

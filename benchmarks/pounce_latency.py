@@ -28,11 +28,11 @@ from dual_system.models.pi05.pounce import Pounce
 from dual_system.models.pounce.checkpoint import random_bundle
 from dual_system.models.pounce.configs import groot_n1_5, pi05_base, tiny_cpu, tiny_groot
 from dual_system.models.pounce.family import AnyPounce, AnyPounceConfig, Family, random_model
+from dual_system.models.pounce.precision import cast_streams
 from pounce_server.contract import DTypeName, example_request
 from pounce_server.engine import EagerEngine
 from pounce_server.fused import FusedPounce, fused_for
 from pounce_server.int8 import quantise
-from pounce_server.precision import cast_for_serving
 from protocol.command_line import parse
 
 CompileMode = Literal["default", "reduce-overhead", "max-autotune"]
@@ -201,14 +201,14 @@ def _measure(
     bundle = random_bundle(shape.config(family, options.size), 0, device=device)
     model = bundle.model.to(device).eval()
     exact = {batch: Ways(model, batch, device).eager() for batch in options.batches}
-    cast_for_serving(model, options.dtype)
+    cast_streams(model, options.dtype)
     without = random_model(shape.config(family, options.size, has_cognition=False), 0, device).eval()
-    cast_for_serving(without, options.dtype)
+    cast_streams(without, options.dtype)
     engine = EagerEngine(bundle, device=options.device, dtype=options.dtype)
     narrow = random_model(shape.config(family, options.size), 0, device).eval() if device.type == "cpu" else None
     if narrow is not None:
         quantise(narrow)
-        cast_for_serving(narrow, options.dtype)
+        cast_streams(narrow, options.dtype)
     invocations: list[Row] = []
     parts: list[Row] = []
     ratios: list[Row] = []

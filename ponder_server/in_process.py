@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +22,11 @@ from protocol.version import version
 _OFFLINE = "offline"
 
 
-def build(bus: Bus, robot: str, checkpoint: Path | None) -> Callable[[], bool]:
-    """Returns the step function of a warm server."""
+def build(bus: Bus, robot: str, checkpoint: Path | None, **options: Any) -> Callable[[], bool]:
+    """Returns the step function of a warm server. ``options``: further ones of `PonderOptions`, by name."""
     link = Link(bus, robot=robot, proc="ponder")
     heartbeat = Heartbeat(link, version(), host_clock_id())
-    server = PonderServer(link, build_engine(PonderOptions(checkpoint=checkpoint)), heartbeat, version())
+    server = PonderServer(link, build_engine(PonderOptions(checkpoint=checkpoint, **options)), heartbeat, version())
     server.warm_up()
     server.ready()
     return server.step
@@ -36,13 +37,13 @@ Views = Sequence[Frame]
 Read = Callable[[str, Sequence[Views], Sequence[Views], NDArray[np.float32]], NDArray[np.float32]]
 
 
-def build_reader(checkpoint: Path | None) -> tuple[Read, EngineSpec]:
-    """Builds a PONDER outside of any episode, for offline measurements.
+def build_reader(checkpoint: Path | None, **options: Any) -> tuple[Read, EngineSpec]:
+    """Builds a PONDER outside of any episode, for offline measurements. ``options``: as in `build`.
 
     Returns the engine's spec, and a function from an instruction, the demonstration's instants and the T observations
     since with the robot's states (T, 8), to the last one's cognition (K, H) as in serving, with PONDER's own texts.
     """
-    engine = build_engine(PonderOptions(checkpoint=checkpoint))
+    engine = build_engine(PonderOptions(checkpoint=checkpoint, **options))
 
     def read(
         instruction: str, demo: Sequence[Views], seen: Sequence[Views], state_T8: NDArray[np.float32]

@@ -11,6 +11,8 @@ import tyro
 from protocol.options import DaemonOptions, LinkOptions
 from protocol.sockets import endpoint
 
+PathName = Literal["eager", "compile", "max-autotune", "fused"]
+
 NUM_TORCH_THREADS = 1  # on a CPU one thread per process beats two: contention for the second core costs more
 
 
@@ -32,7 +34,7 @@ class RandomOptions:
 class SpeedOptions:
     """How an invocation is computed."""
 
-    path: Literal["eager", "compile", "max-autotune", "fused"] = "eager"
+    path: PathName = "eager"
     """compile, max-autotune: torch.compile, for either family; takes a minute at start. fused: Triton kernels, static
     buffers and CUDA graphs for pi0.5; needs a GPU and Triton."""
     autotune: bool = False

@@ -26,6 +26,7 @@ from dual_system.models.pi05.prompt import Tokenizer
 from dual_system.models.pounce.batching import joined_groot, joined_pi05, of_equal_length
 from dual_system.models.pounce.checkpoint import PounceBundle
 from dual_system.models.pounce.family import AnyPounce, max_committed_rows
+from dual_system.models.pounce.precision import cast_streams
 from dual_system.models.pounce.reading import groot_inputs, pi05_inputs
 from pounce_server.compiled import compiled_sampler
 from pounce_server.contract import (
@@ -42,7 +43,6 @@ from pounce_server.contract import (
 from pounce_server.fused import fused_for
 from pounce_server.guidance import given, guide, with_committed
 from pounce_server.int8 import quantise
-from pounce_server.precision import cast_for_serving
 from pounce_server.roll_forward import placed, rolled
 
 Sampler: TypeAlias = Callable[[Sequence[Request], Tensor], Iterator[tuple[list[int], EulerStep]]]
@@ -111,7 +111,7 @@ class EagerEngine:
             max_committed_rows=max_committed_rows(config),
             reads_subgoal=config.reads_subgoal,
         )
-        model = cast_for_serving(bundle.model, dtype).to(self._device).eval().requires_grad_(False)
+        model = cast_streams(bundle.model, dtype).to(self._device).eval().requires_grad_(False)
         make_sampler = _sampler
         if path == "fused":
             make_sampler = partial(_fused_sampler, autotune=autotune)

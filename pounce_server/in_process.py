@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pounce_server.__main__ import build_engine
-from pounce_server.config import PounceOptions
+from pounce_server.config import PathName, PounceOptions, SpeedOptions
 from pounce_server.contract import EngineSpec, Request
 from pounce_server.serve import PounceServer
 from pounce_server.subgoal_text import Source
@@ -20,11 +21,22 @@ from protocol.process import host_clock_id
 from protocol.version import version
 
 
-def build(bus: Bus, robot: str, checkpoint: Path | None, subgoals: Source | None = None) -> Callable[[], bool]:
-    """Returns the step function of a warm server. ``subgoals``: see `subgoal_text`."""
+def build(
+    bus: Bus,
+    robot: str,
+    checkpoint: Path | None,
+    subgoals: Source | None = None,
+    *,
+    path: PathName = "eager",
+    **options: Any,
+) -> Callable[[], bool]:
+    """Returns the step function of a warm server.
+
+    ``subgoals``: see `subgoal_text`; ``path``: see `SpeedOptions`; ``options``: further ones of `PounceOptions`.
+    """
     link = Link(bus, robot=robot, proc="pounce")
     heartbeat = Heartbeat(link, version(), host_clock_id())
-    engine = build_engine(PounceOptions(checkpoint=checkpoint))
+    engine = build_engine(PounceOptions(checkpoint=checkpoint, speed=SpeedOptions(path=path), **options))
     server = PounceServer(link, engine, heartbeat, version(), subgoals)
     server.warm_up()
     server.ready()
@@ -36,9 +48,12 @@ Act = Callable[[str, Sequence[NDArray[np.uint8]], Floats, Floats | None, int, in
 """(instruction, frames, proprioception, cognition (None: null), its age [ns], noise seed) -> chunk."""
 
 
-def build_actor(checkpoint: Path | None) -> tuple[Act, EngineSpec]:
-    """Builds a POUNCE outside of any episode, for offline measurements: a function, and the engine's spec."""
-    engine = build_engine(PounceOptions(checkpoint=checkpoint))
+def build_actor(checkpoint: Path | None, *, path: PathName = "eager", **options: Any) -> tuple[Act, EngineSpec]:
+    """Builds a POUNCE outside of any episode, for offline measurements: a function, and the engine's spec.
+
+    ``path``, ``options``: as in `build`.
+    """
+    engine = build_engine(PounceOptions(checkpoint=checkpoint, speed=SpeedOptions(path=path), **options))
 
     def act(
         instruction: str,

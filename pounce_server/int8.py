@@ -3,7 +3,7 @@
 from dual_system.models.int8 import Int8Linear
 from dual_system.models.narrow_linear import quantise_where
 from dual_system.models.pounce.family import AnyPounce
-from pounce_server.precision import is_of_a_stream
+from dual_system.models.pounce.precision import is_of_a_stream
 
 _KEPT = "groot.dit.proj_out_2.weight"  # GR00T's action stream takes its dtype from it
 

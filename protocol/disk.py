@@ -2,10 +2,25 @@
 
 import errno
 import os
+import shutil
 from pathlib import Path
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 """Numbers of an OSError of a disk without room: what ends a record, and not the episode."""
+
+
+def exchange(fresh: Path, folder: Path) -> None:
+    """Renames a finished folder to ``folder``, in place of one that is there and then removed.
+
+    A kill between both renames leaves neither, and the one that was there as ``folder.old``.
+    """
+    old = folder.with_name(folder.name + ".old")
+    if folder.exists():
+        shutil.rmtree(old, ignore_errors=True)
+        folder.rename(old)
+    fresh.rename(folder)
+    sync(folder.parent)
+    shutil.rmtree(old, ignore_errors=True)
 
 
 def sync(path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,8 +13,9 @@ from dual_system.tasks.difficulty import Difficulty
 from dual_system.tasks.task import chosen_tasks
 from protocol.command_line import flat
 from protocol.errors import CommandError
+from protocol.options import LinkOptions
 from sim_client import config
-from sim_client.config import ScheduleOptions, ServersOptions, SimOptions
+from sim_client.config import ModelsOptions, ScheduleOptions, ServersOptions, SimOptions
 from sim_client.swapped_ponder import donors_in
 
 
@@ -51,12 +52,13 @@ class WorkersOptions:
 
     workers: int = 1
     """Number of worker processes on this computer; each loads the checkpoints."""
-    servers: Literal["in-process", "local"] = "in-process"
-    """Place of each worker's servers: its own thread, or two processes that it starts."""
+    servers: Literal["in-process", "local", "running"] = "in-process"
+    """Place of each worker's servers: its own thread, two processes that it starts, or servers that run already, at
+    --link.connect, for one worker."""
     ray: str | None = None
     """Address of a Ray cluster to work on instead, or `auto`, or `local`. Logs then need an --out that nodes share."""
     gpus_per_worker: float = 0.0
-    """GPUs that a worker requests with --ray; 0.5 puts two workers on each GPU."""
+    """GPUs of a worker with --device cuda: 0.5 puts two workers on each GPU. 0: all workers share the first one."""
     patience_s: float = 600.0
     """Longest wait in seconds for servers to be ready, or for any answer."""
 
@@ -97,11 +99,13 @@ class EvalOptions:
     """Source of actions: the servers, or the tasks' own scripts (oracle), to test the machine."""
     condition: tyro.conf.OmitArgPrefixes[ConditionOptions] = field(default_factory=ConditionOptions)
     workers: tyro.conf.OmitArgPrefixes[WorkersOptions] = field(default_factory=WorkersOptions)
+    models: tyro.conf.OmitArgPrefixes[ModelsOptions] = field(default_factory=ModelsOptions)
+    link: LinkOptions = field(default_factory=lambda: SimOptions().link)
     log: tyro.conf.OmitArgPrefixes[LogOptions] = field(default_factory=LogOptions)
 
     def __post_init__(self) -> None:
-        condition, servers = self.condition, self.workers.servers
-        if min(self.episodes, self.runs, self.workers.workers) < 1 or self.seed < 0:
+        condition, workers, servers = self.condition, self.workers, self.workers.servers
+        if min(self.episodes, self.runs, workers.workers) < 1 or self.seed < 0:
             raise EvaluationError("--episodes, --runs and --workers must be at least 1, and --seed at least 0")
         if self.seed + self.episodes > TRAIN_SEED:
             raise EvaluationError(
@@ -119,6 +123,21 @@ class EvalOptions:
         if condition.subgoal_text is not None and (servers, condition.cognition) != ("in-process", "real"):
             raise EvaluationError(
                 "--subgoal-text is for --servers in-process, and POUNCE then reads no cognition: leave --cognition out"
+            )
+        on_gpu = self.models.device == "cuda"
+        if workers.gpus_per_worker and not on_gpu:
+            raise EvaluationError("--gpus-per-worker divides the GPUs among workers: use it with --device cuda")
+        if workers.ray is not None and on_gpu and not workers.gpus_per_worker:
+            raise EvaluationError("--ray hides GPUs from workers that request none: add --gpus-per-worker")
+        if servers == "running" and (
+            workers.workers > 1
+            or workers.ray is not None
+            or self.models != ModelsOptions()
+            or (self.ponder_checkpoint, self.pounce_checkpoint) != (None, None)
+        ):
+            raise EvaluationError(
+                "--servers running asks servers that have their own checkpoints, devices and paths, with one worker: "
+                "leave --workers, --ray, the checkpoints, --device, --dtype and --path out"
             )
 
     def task_names(self) -> tuple[str, ...]:
@@ -145,9 +164,11 @@ class EvalOptions:
             for task, run, seed in keys
         ]
 
-    def sim(self) -> SimOptions:
-        """Returns the episodes' options, as of `sim-client`."""
-        condition = self.condition
+    def sim(self, worker: int = 0) -> SimOptions:
+        """Returns the episodes' options, as of `sim-client`, in the ``worker``-th process of this computer."""
+        condition, models = self.condition, self.models
+        if models.device == "cuda" and self.workers.ray is None:  # Ray shows a worker its own GPUs alone
+            models = replace(models, device=f"cuda:{int(worker * self.workers.gpus_per_worker)}")
         return SimOptions(
             task="evaluation",
             episodes=self.episodes,
@@ -167,6 +188,8 @@ class EvalOptions:
                 max_steps=condition.max_steps,
             ),
             servers=ServersOptions(patience_s=self.workers.patience_s),
+            models=models,
+            link=self.link,
             log=config.LogOptions(record=self.log.record, record_hz=self.log.record_hz, progress=False),
         )
 

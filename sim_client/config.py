@@ -88,6 +88,30 @@ class ServersOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ModelsOptions:
+    """How the models are run, where their servers are started here."""
+
+    device: str = "cpu"
+    """Device of both models: cpu, cuda or cuda:N."""
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """Number format of both models' weights and activations."""
+    path: Literal["eager", "compile", "max-autotune", "fused"] = "eager"
+    """How POUNCE computes an invocation; see pounce-serve --help."""
+
+    def of_ponder(self) -> dict[str, str]:
+        """Options of ponder-serve that differ from its defaults, by name."""
+        return self._changed("device", "dtype")
+
+    def of_pounce(self) -> dict[str, str]:
+        """Options of pounce-serve that differ from its defaults, by name."""
+        return self._changed("device", "dtype", "path")
+
+    def _changed(self, *names: str) -> dict[str, str]:
+        defaults = ModelsOptions()
+        return {name: getattr(self, name) for name in names if getattr(self, name) != getattr(defaults, name)}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LogOptions:
     """Logs and progress."""
 
@@ -133,6 +157,7 @@ class SimOptions:
     """Print the names of the tasks and exit."""
     schedule: tyro.conf.OmitArgPrefixes[ScheduleOptions] = field(default_factory=ScheduleOptions)
     servers: tyro.conf.OmitArgPrefixes[ServersOptions] = field(default_factory=ServersOptions)
+    models: tyro.conf.OmitArgPrefixes[ModelsOptions] = field(default_factory=ModelsOptions)
     log: tyro.conf.OmitArgPrefixes[LogOptions] = field(default_factory=LogOptions)
     link: LinkOptions = field(
         default_factory=lambda: LinkOptions(connect=tuple(map(endpoint, ("clock", "ponder", "pounce"))))

@@ -10,11 +10,12 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tyro
 from numpy.typing import NDArray
 from tqdm import tqdm
 
@@ -29,6 +30,7 @@ from dual_system.tasks.pair_files import demo_sampling_of, read_pairs
 from dual_system.tasks.pairs import Pair, Telling
 from protocol import files
 from protocol.command_line import command, flat, parse
+from sim_client.config import ModelsOptions
 from sim_client.ledger import write_json
 from sim_client.robot import CAMERAS
 
@@ -57,6 +59,7 @@ class CounterfactualOptions:
     """Number of draws of flow noise per pair; each is used in both branches."""
     age_ms: int = 300
     """Age of the present's cognition in ms, given to POUNCE; in an episode it is PONDER's delay (paper: 300)."""
+    models: tyro.conf.OmitArgPrefixes[ModelsOptions] = field(default_factory=ModelsOptions)
     progress: bool = True
     """Do not show a progress bar."""
 
@@ -66,9 +69,13 @@ def main(argv: list[str] | None = None, prog: str = "pp-diagnose counterfactual"
     options = parse(CounterfactualOptions, argv, prog=prog)
     files.folder(options.out)
     pairs = read_pairs(options.pairs)
-    read, ponder = importlib.import_module("ponder_server.in_process").build_reader(options.ponder)
+    read, ponder = importlib.import_module("ponder_server.in_process").build_reader(
+        options.ponder, **options.models.of_ponder()
+    )
     _require_as_in_training(options.pairs, ponder.demonstrations)
-    act, pounce = importlib.import_module("pounce_server.in_process").build_actor(options.pounce)
+    act, pounce = importlib.import_module("pounce_server.in_process").build_actor(
+        options.pounce, **options.models.of_pounce()
+    )
     entries = scored(tqdm(pairs, unit="pair", disable=not options.progress), read, act, options)
     models = {
         name: {"model_hash": spec.model_hash, "is_untrained": spec.is_fake}

@@ -22,7 +22,7 @@ import dual_system.tasks.headless  # noqa: F401 - before anything that imports m
 
 # isort: split
 
-from dual_system.data.workers import LocalWorkers, RayWorkers, Workers
+from dual_system.data.workers import LocalWorkers, RayWorkers, Workers, worker_index
 from dual_system.tasks.environment import Environment, make_environment
 from protocol.bus import Bus
 from protocol.command_line import command, parse
@@ -116,7 +116,7 @@ class EvaluationHarness:
     """One worker's servers, and the scene of its current task."""
 
     def __init__(self, options: EvalOptions) -> None:
-        sim = options.sim()
+        sim = options.sim(worker_index())
         self._options = options
         self._donor: SwappedPonder | None = None
         self._open = contextlib.ExitStack()

@@ -70,10 +70,12 @@ def _bus(
         if options.mode != "lockstep":
             raise TransportError("--in-process shares one thread: use --mode lockstep, or --local")
         bus = LocalBus()
+        models = options.models
         if has_ponder(options.played_by):
-            build_ponder = ponder or _builder("ponder_server.in_process")
+            build_ponder = ponder or partial(_builder("ponder_server.in_process"), **models.of_ponder())
             bus.add_participant(build_ponder(bus, link.robot, options.ponder_checkpoint))
-        pounce = partial(_builder("pounce_server.in_process"), **({} if subgoals is None else {"subgoals": subgoals}))
+        reads = {} if subgoals is None else {"subgoals": subgoals}
+        pounce = partial(_builder("pounce_server.in_process"), **models.of_pounce(), **reads)
         bus.add_participant(pounce(bus, link.robot, options.pounce_checkpoint))
         return bus, bus.add_participant
     if options.local:
@@ -85,11 +87,12 @@ def _bus(
             with_ponder=has_ponder(options.played_by),
             ponder_checkpoint=options.ponder_checkpoint,
             pounce_checkpoint=options.pounce_checkpoint,
+            models=options.models,
         )
     return open_bus(link), lambda step: None
 
 
-def _builder(module: str) -> BuildServer:
+def _builder(module: str) -> Callable[..., ServerStep]:
     """Imports a server by name: this package never imports torch, so a robot's computer can do without it."""
-    build: BuildServer = importlib.import_module(module).build
+    build: Callable[..., ServerStep] = importlib.import_module(module).build
     return build

@@ -11,7 +11,7 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -20,6 +20,7 @@ from typing import IO
 from protocol.options import LinkOptions
 from protocol.process import PARENT_VARIABLE
 from protocol.sockets import endpoint
+from sim_client.config import ModelsOptions
 
 _GRACE_S = 5.0
 
@@ -133,19 +134,22 @@ def local_link(
     with_ponder: bool,
     ponder_checkpoint: Path | None,
     pounce_checkpoint: Path | None,
+    models: ModelsOptions | None = None,
 ) -> LinkOptions:
     """Starts the servers of ``--local`` for the robot of ``link``; returns how to reach them."""
+    models = models or ModelsOptions()
     endpoints = start_local(
         daemons,
         robot=link.robot,
         with_clock=with_clock,
         allow_starved=allow_starved,
         shared_memory=link.shared_memory,
-        ponder=_checkpoint(ponder_checkpoint) if with_ponder else None,
-        pounce=_checkpoint(pounce_checkpoint),
+        ponder=_arguments(ponder_checkpoint, models.of_ponder()) if with_ponder else None,
+        pounce=_arguments(pounce_checkpoint, models.of_pounce()),
     )
     return replace(link, connect=endpoints)
 
 
-def _checkpoint(folder: Path | None) -> list[str]:
-    return [] if folder is None else ["--checkpoint", str(folder)]
+def _arguments(checkpoint: Path | None, options: Mapping[str, str]) -> list[str]:
+    named = {} if checkpoint is None else {"checkpoint": str(checkpoint)}
+    return [part for name, value in (named | {**options}).items() for part in (f"--{name}", value)]

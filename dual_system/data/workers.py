@@ -16,6 +16,7 @@ from dual_system.data.errors import DatasetError
 
 QUEUED_PER_WORKER = 2  # enough to keep it busy; a waiting result takes some megabytes
 MAX_DEATHS = 3
+_index = 0
 
 
 class HasKey(Protocol):
@@ -53,7 +54,8 @@ class LocalWorkers(Generic[JobT, ResultT]):
             under_way: dict[Future[ResultT], JobT] = {}
             # Spawned: a forked child would share its parent's GL context.
             context = multiprocessing.get_context("spawn")
-            with ProcessPoolExecutor(self._num_workers, mp_context=context, initializer=_leave_with_parent) as pool:
+            started = context.Value("i", 0)
+            with ProcessPoolExecutor(self._num_workers, context, initializer=_begin, initargs=(started,)) as pool:
                 try:
                     while waiting or under_way:
                         while waiting and len(under_way) < QUEUED_PER_WORKER * self._num_workers:
@@ -75,6 +77,19 @@ class LocalWorkers(Generic[JobT, ResultT]):
                 except BaseException:
                     pool.shutdown(wait=False, cancel_futures=True)
                     raise
+
+
+def worker_index() -> int:
+    """Number of this worker among those of `LocalWorkers`, from 0 on; 0 in any other process."""
+    return _index
+
+
+def _begin(started: Any) -> None:
+    global _index
+    with started.get_lock():
+        _index = started.value
+        started.value += 1
+    _leave_with_parent()
 
 
 def _leave_with_parent() -> None:

@@ -106,6 +106,7 @@ class TrainingSet:
             DatasetError: a folder holds no dataset of ours.
             ValueError: a folder has no episode of these tasks, or the folders' pictures differ in size.
         """
+        self.roots = roots
         self._sizes, self._demo_hz = sizes or PictureSizes(), demo_hz
         self._store = None if store is None else PictureStore(store, self._sizes.key)
         self._sources = [source for root in roots for source in _sources(Dataset(root), tasks)]

@@ -34,6 +34,8 @@ from dual_system.models.ponder.checkpoint import load_ponder, weights_hash
 from dual_system.models.ponder.network import Ponder
 from dual_system.models.pounce.checkpoint import PounceBundle, load_bundle
 from dual_system.models.pounce.family import AnyPounce, sample_times
+from dual_system.models.pounce.precision import cast_streams
+from dual_system.training.build import DTYPES, DTypeName
 from dual_system.training.collate import collate_ponder, collate_pounce
 from dual_system.training.data import PictureSizes, TrainingSet
 from dual_system.training.example import Example, ExampleConfig, make_example
@@ -68,6 +70,8 @@ class DiagnoseOptions:
     """Seed of the flow draws."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Device of both networks."""
+    dtype: DTypeName = "float32"
+    """Number format of both networks' matrices."""
     progress: bool = True
     """Do not show a progress bar."""
 
@@ -99,9 +103,9 @@ def diagnose(options: DiagnoseOptions) -> dict[str, Any]:
         DatasetError, FileNotFoundError, ValueError: the inputs do not fit together; the message says why.
     """
     require_device(options.device)
-    ponder = load_ponder(options.ponder, device=options.device)
+    ponder = load_ponder(options.ponder, device=options.device, dtype=DTYPES[options.dtype])
     bundle = load_bundle(options.pounce)
-    pounce = bundle.model.to(options.device).eval()
+    pounce = cast_streams(bundle.model.to(options.device), options.dtype).eval()
     wanted = (pounce.config.cognition.num_carriers, pounce.config.cognition.cognition_size)
     if wanted != (ponder.format.num_carriers, ponder.hidden_size):
         given = (ponder.format.num_carriers, ponder.hidden_size)

@@ -55,6 +55,10 @@ class PonderBatch:
         if len(self.rows) != len(self.frames):
             raise ValueError(f"{len(self.rows)} rows, frames for {len(self.frames)}")
 
+    def part(self, begin: int, end: int) -> PonderBatch:
+        """Episodes ``begin`` to ``end`` - 1."""
+        return PonderBatch(rows=self.rows[begin:end], frames=self.frames[begin:end])
+
     def to(self, device: torch.device | str) -> PonderBatch:
         frames = iter(_moved([each for each in self.frames if each is not None], device))
         return replace(self, frames=tuple(None if each is None else next(frames) for each in self.frames))
@@ -85,16 +89,29 @@ class PounceBatch:
         """Number of episodes up to the last one with an invocation."""
         return 1 + int(self.episode_I.max())
 
+    def part(self, begin: int, end: int) -> PounceBatch:
+        """Invocations of the episodes ``begin`` to ``end`` - 1, which are numbered from 0 then. Padding stays.
+
+        Raises ValueError if these episodes have no invocation.
+        """
+        is_here_I = (self.episode_I >= begin) & (self.episode_I < end)
+        if not is_here_I.any():
+            raise ValueError(f"episodes {begin} to {end - 1} of a batch have no invocation to learn from")
+        found = self._each(lambda tensor: tensor[is_here_I])
+        return replace(found, episode_I=found.episode_I - begin)
+
     def to(self, device: torch.device | str) -> PounceBatch:
-        moved: dict[str, Any] = {}
-        for each in fields(self.inputs):
-            value = getattr(self.inputs, each.name)
-            moved[each.name] = None if value is None else value.to(device)
+        return self._each(lambda tensor: tensor.to(device))
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> PounceBatch:
+        """The batch with every tensor changed."""
+        inputs = {each.name: getattr(self.inputs, each.name) for each in fields(self.inputs)}
+        changed: dict[str, Any] = {name: None if tensor is None else change(tensor) for name, tensor in inputs.items()}
         return PounceBatch(
-            inputs=type(self.inputs)(**moved),
-            actions_INA=self.actions_INA.to(device),
-            episode_I=self.episode_I.to(device),
-            query_I=self.query_I.to(device),
+            inputs=type(self.inputs)(**changed),
+            actions_INA=change(self.actions_INA),
+            episode_I=change(self.episode_I),
+            query_I=change(self.query_I),
         )
 
 
@@ -160,14 +177,17 @@ class JointLoss(NamedTuple):
     grounding: Tensor
     predicted_N: Tensor
     """int64: PONDER's most likely token at every supervised position, row after row."""
-    num_null: int
-    """Number of invocations with null cognition."""
+
+
+class Counts(NamedTuple):
+    """What a loss is the mean over."""
+
     num_rows: int
     """Number of chunk rows over which flow matching is the mean: those that are not committed."""
-
-    @property
-    def num_supervised(self) -> int:
-        return len(self.predicted_N)
+    num_supervised: int
+    """Number of supervised tokens, over which grounding is the mean."""
+    num_null: int
+    """Number of invocations with null cognition."""
 
 
 class JointModel(nn.Module):
@@ -207,9 +227,18 @@ class JointModel(nn.Module):
         """Whether a step runs PONDER: to train it, or for POUNCE's cognition."""
         return runs_ponder(self.trains, self.pounce.config.cognition.num_carriers)
 
+    def counts(self, episodes: PonderBatch, invocations: PounceBatch, draws: Draws) -> Counts:
+        """What `forward`'s losses will be means over."""
+        is_grounded, acts = self.trains != "pounce" and self.w2 != 0, self.trains != "ponder"
+        return Counts(
+            num_rows=draws.num_counted_rows if acts else 0,
+            num_supervised=sum(len(row.supervised_index) for row in episodes.rows) if is_grounded else 0,
+            num_null=int(_is_null(invocations, draws).sum()) if acts else 0,
+        )
+
     def forward(self, episodes: PonderBatch, invocations: PounceBatch, draws: Draws) -> JointLoss:
         zero = torch.zeros((), device=invocations.actions_INA.device)
-        matching, grounding, num_null, num_rows = zero, zero, 0, 0
+        matching, grounding = zero, zero
         predicted_N = torch.zeros(0, dtype=torch.int64)
         cognition_QKH, first_query = None, None
         if self.runs_ponder:
@@ -219,23 +248,14 @@ class JointModel(nn.Module):
             if self.trains != "pounce":
                 grounding, predicted_N = self._grounding(episodes, hidden)
         if self.trains != "ponder":
-            is_null_I = (invocations.query_I == NO_QUERY) | draws.is_dropped_I
-            num_null, num_rows = int(is_null_I.sum()), draws.num_counted_rows
             inputs = invocations.inputs
             if cognition_QKH is not None and first_query is not None:
                 index_I = first_query[invocations.episode_I] + invocations.query_I.clamp(min=0)
-                inputs = replace(inputs, cognition=cognition_QKH[index_I], is_null=is_null_I)
+                inputs = replace(inputs, cognition=cognition_QKH[index_I], is_null=_is_null(invocations, draws))
             matching = action_loss(
                 self.pounce, inputs, invocations.actions_INA, draws.noise_SNA, draws.time_S, draws.num_committed_S
             )
-        return JointLoss(
-            self.weigh(matching, grounding),
-            matching,
-            grounding,
-            predicted_N=predicted_N,
-            num_null=num_null,
-            num_rows=num_rows,
-        )
+        return JointLoss(self.weigh(matching, grounding), matching, grounding, predicted_N=predicted_N)
 
     def weigh(self, matching: Tensor, grounding: Tensor) -> Tensor:
         """Returns L, the weighted sum of its parts."""
@@ -251,6 +271,11 @@ class JointModel(nn.Module):
         logits_NV = self.ponder.logits(_taken(hidden, index))
         predicted_N = logits_NV.detach().argmax(dim=-1)
         return F.cross_entropy(logits_NV.float(), targets_N) if len(targets_N) else logits_NV.sum(), predicted_N
+
+
+def _is_null(invocations: PounceBatch, draws: Draws) -> Tensor:
+    """(I,) bool: invocations that get the learned null."""
+    return (invocations.query_I == NO_QUERY) | draws.is_dropped_I
 
 
 def runs_ponder(trains: Trains, num_carriers: int) -> bool:

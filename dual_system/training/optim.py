@@ -63,15 +63,20 @@ class Optimiser:
         )
         self.average = {name: p.detach().clone() for name, p in self._masters.items()} if config.ema_decay else {}
 
+    def collect(self) -> None:
+        """Adds the gradients of rounded weights to their masters', so that those of several parts add up in float32."""
+        for parameter, master in self._mastered().values():
+            if parameter.grad is not None:
+                gradient, parameter.grad = parameter.grad.float(), None
+                master.grad = gradient if master.grad is None else master.grad + gradient
+
     def update(self, step: int) -> float:
         """Applies the gradients and clears them; returns their norm before clipping.
 
         Raises:
             FloatingPointError: the gradients are not finite; nothing was changed.
         """
-        for parameter, master in self._mastered().values():
-            if parameter.grad is not None:
-                master.grad, parameter.grad = parameter.grad.float(), None
+        self.collect()
         norm = self._clip()
         if not torch.isfinite(torch.tensor(norm)):
             gradients = {name: p.grad for name, p in self._masters.items() if p.grad is not None}

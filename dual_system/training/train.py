@@ -15,7 +15,6 @@ from __future__ import annotations
 import sys
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -24,35 +23,29 @@ import torch
 import tyro
 from tqdm import tqdm
 
-from dual_system.data.episode import CAMERAS
 from dual_system.models.bfloat16 import warn_of_slow
 from dual_system.models.device import require_device
 from dual_system.models.gpu import settle
-from dual_system.models.pi05.pounce import PounceConfig, freeze
-from dual_system.models.pi05.prompt import Tokenizer, tokenizer_of_instructions
-from dual_system.models.ponder.checkpoint import load_ponder, save_ponder
+from dual_system.models.pi05.pounce import PounceConfig
 from dual_system.models.ponder.fused_attention import fuse_attention
-from dual_system.models.ponder.network import Ponder
-from dual_system.models.ponder.observation import check_cameras
 from dual_system.models.ponder.recompute import recompute_layers
-from dual_system.models.ponder.vocabulary import Vocabulary
-from dual_system.models.pounce.checkpoint import PounceBundle, declares_config, load_bundle, random_bundle, save_bundle
-from dual_system.models.pounce.initialise import open_gates
+from dual_system.models.pounce.checkpoint import PounceBundle
+from dual_system.training.build import Start, build, export
 from dual_system.training.collate import collate_ponder, collate_pounce
 from dual_system.training.data import PictureSizes, TrainingSet
 from dual_system.training.example import make_example
-from dual_system.training.joint import JointModel, PonderBatch, PounceBatch, Trains
+from dual_system.training.joint import JointModel, PonderBatch, PounceBatch
 from dual_system.training.parallel import World, gather, joined, require_alike, shard
 from dual_system.training.prefetch import Prefetcher
 from dual_system.training.recipe import Recipe
 from dual_system.training.recipes import recipe
-from dual_system.training.trainer import CheckpointError, Trainer
+from dual_system.training.trainer import CheckpointError, Trainer, num_steps_in
 from dual_system.training.watch import Watch
 from protocol import files
 from protocol.command_line import command, parse
 
 DONE, REFUSED, INTERRUPTED = 0, 2, 130
-_SYSTEMS = ("ponder", "pounce")
+_SYSTEMS, CHECKPOINT = ("ponder", "pounce"), "checkpoint"
 _EPISODE_STREAM = 7  # random stream of a step for episodes and schedules
 
 
@@ -79,7 +72,9 @@ class MachineOptions:
     device: Literal["cpu", "cuda"] = "cpu"
     """Device of both systems."""
     dtype: Literal["float32", "bfloat16"] = "float32"
-    """Number format of PONDER's weights and of POUNCE's stream; the optimiser keeps float32 masters."""
+    """Number format of both networks' matrices; norms stay float32, and the optimiser keeps float32 masters."""
+    accumulate: int = 1
+    """Parts of a batch that are computed one after the other: less memory, the same step up to rounding."""
     tf32: bool = False
     """Multiply float32 matrices in TF32 on a GPU that has it, which rounds to 1 in 2000."""
     weights: Literal["sharded", "whole"] = "sharded"
@@ -126,11 +121,24 @@ class TrainOptions:
     """Pretrained Qwen3.5 folder; needed unless the recipe is from scratch."""
     pounce: Path | None = None
     """Pretrained pi0.5 or GR00T N1.5 folder; needed unless the recipe is from scratch."""
+    tokenizer: Path | None = None
+    """tokenizer.model (pi0.5) or tokenizer.json (GR00T), if the --pounce folder has none."""
     tasks: tuple[str, ...] = ()
     """Names of the tasks to train on. Empty: all of the data."""
     instead: tyro.conf.OmitArgPrefixes[InsteadOptions] = field(default_factory=InsteadOptions)
     machine: tyro.conf.OmitArgPrefixes[MachineOptions] = field(default_factory=MachineOptions)
     log: tyro.conf.OmitArgPrefixes[LogOptions] = field(default_factory=LogOptions)
+
+    @property
+    def start(self) -> Start:
+        machine = self.machine
+        return Start(
+            ponder=self.ponder,
+            pounce=self.pounce,
+            tokenizer=self.tokenizer,
+            device=machine.device,
+            dtype=machine.dtype,
+        )
 
 
 class Batches:
@@ -199,19 +207,19 @@ def train(options: TrainOptions) -> None:
         SaveError: a checkpoint could not be written; the previous one is kept.
     """
     machine, run = options.machine, _adjusted(recipe(options.recipe), options.instead)
-    if _is_finished(options.out):
-        raise CheckpointError(f"{options.out} holds a finished run; use another --out")
+    _require_unfinished(options.out, run)
     require_device(machine.device)
     if machine.tf32 and machine.device == "cpu":
         raise ValueError("--tf32 is for GPUs; on a CPU leave it out")
     data = TrainingSet(*options.data, tasks=options.tasks, demo_hz=run.demo_hz)
     with joined(machine.device) as world:
-        if not 0 < machine.length_groups <= max(1, run.batch_episodes // world.size):  # every process has this many
+        share = run.batch_episodes // world.size  # every process has this many
+        if min(machine.accumulate, machine.length_groups) < 1 or machine.accumulate * machine.length_groups > share:
             raise ValueError(
-                f"--length-groups {machine.length_groups}: expected 1 to {run.batch_episodes // world.size}, the rows "
-                "that every process has of a batch"
+                f"--accumulate {machine.accumulate} parts of --length-groups {machine.length_groups}: expected at "
+                f"least 1 of each, and together at most {share}, the episodes that every process has of a batch"
             )
-        model, bundle = build(run, data, options)
+        model, bundle = build(run, data, options.start)
         _prepare(model, machine, world)
         data = TrainingSet(
             *options.data,
@@ -230,7 +238,7 @@ def _update(
     run: Recipe, model: JointModel, batches: Batches, data_hash: str, options: TrainOptions, world: World
 ) -> None:
     """Runs all updates, from the checkpoint on if there is one; leaves the averaged weights in ``model``."""
-    log, checkpoint = options.log, options.out / "checkpoint"
+    log, checkpoint = options.log, options.out / CHECKPOINT
     with ExitStack() as stack:
         prefetcher = None
         if options.machine.loaders:
@@ -238,7 +246,15 @@ def _update(
             stack.callback(prefetcher.close)
         # The number of steps is left out: a run may go on for longer.
         made_with = {name: value for name, value in asdict(run).items() if name != "num_steps"}
-        trainer = Trainer(model, prefetcher or batches, run.train, data_hash=data_hash, recipe=made_with, world=world)
+        trainer = Trainer(
+            model,
+            prefetcher or batches,
+            run.train,
+            data_hash=data_hash,
+            recipe=made_with,
+            world=world,
+            num_parts=options.machine.accumulate,
+        )
         files.folder(options.out)
         trainer.resume(checkpoint)
         shows = log.progress and world.is_first
@@ -262,8 +278,18 @@ def _update(
         trainer.take_average()
 
 
-def _is_finished(out: Path) -> bool:
-    return any((out / system).exists() for system in _SYSTEMS)
+def _require_unfinished(out: Path, run: Recipe) -> None:
+    """Raises CheckpointError if ``out`` holds a finished run, unless its checkpoint has fewer steps than this one."""
+    if not any((out / system).exists() for system in _SYSTEMS):
+        return
+    done = num_steps_in(out / CHECKPOINT)
+    if done is None:
+        raise CheckpointError(f"{out} holds a finished run without a {CHECKPOINT} to go on from; use another --out")
+    if done >= run.num_steps:
+        raise CheckpointError(
+            f"{out} holds a finished run of {done} steps; --steps with a larger number goes on with it, or use "
+            "another --out"
+        )
 
 
 def _prepare(model: JointModel, machine: MachineOptions, world: World) -> None:
@@ -287,73 +313,10 @@ def _write(
     if world.size == 1:
         export(model, bundle, options.out, trained=run.trains)
     else:
-        on_cpu = replace(options, machine=replace(options.machine, device="cpu"))
-        whole = build(run, data, on_cpu) if world.is_first else None
+        whole = build(run, data, replace(options.start, device="cpu")) if world.is_first else None
         gather(model, None if whole is None else whole[0])
         if whole is not None:
             export(*whole, options.out, trained=run.trains)
-
-
-def build(run: Recipe, data: TrainingSet, options: TrainOptions) -> tuple[JointModel, PounceBundle]:
-    """Both systems, initialised or loaded, frozen as the recipe says, with the data's own statistics.
-
-    Raises:
-        ValueError: pretrained weights are missing, or PONDER cannot read the pictures' size.
-        FileNotFoundError: a given folder holds no checkpoint.
-    """
-    device, seed = options.machine.device, run.train.seed
-    dtype = {"float32": torch.float32, "bfloat16": torch.bfloat16}[options.machine.dtype]
-    if not run.from_scratch and (options.ponder is None or options.pounce is None):
-        raise ValueError(
-            f"recipe {run.name} starts from pretrained weights; give their folders with --ponder, --pounce"
-        )
-    if options.ponder is not None:
-        ponder = load_ponder(options.ponder, device=device, dtype=dtype)
-    else:
-        own = Vocabulary.trained_on(data.texts(), run.ponder.first_carrier_id) if run.has_own_tokenizers else None
-        ponder = Ponder.random(run.ponder, own, seed=seed, device=device, dtype=dtype)
-    try:
-        check_cameras([(data.image_px, data.image_px)] * len(CAMERAS), ponder.format.reader, ponder.image_px)
-    except ValueError as error:
-        wanted_px = ponder.format.reader.readable_sizes(ponder.image_px)[0][0]
-        raise ValueError(f"{', '.join(map(str, options.data))}: {error}; collect with --image-px {wanted_px}") from None
-    if run.trains != "pounce":
-        declared = ponder.format.demonstrations
-        demonstrations = replace(data.demo_sampling() or declared, num_views=declared.num_views)
-        ponder.format = replace(ponder.format, speaks=run.w2 > 0, demonstrations=demonstrations)
-    measured = partial(data.statistics, run.pounce.horizon, run.space, by_row=run.statistics_by_row)
-    if options.pounce is None:
-        bundle = random_bundle(run.pounce, seed, statistics=measured(), tokenizer=_own_tokenizer(run, data))
-        open_gates(bundle.model)
-    else:
-        if declares_config(options.pounce):
-            bundle = load_bundle(options.pounce)
-        else:  # a public folder has no cognition prefix and declares no inputs, and its statistics are of other data
-            bundle = load_bundle(options.pounce, config=run.pounce, statistics=measured())
-    pounce = bundle.model.to(device)
-    if type(pounce.config) is not type(run.pounce):
-        raise ValueError(f"recipe {run.name} is of another action model than {options.pounce} holds")
-    if isinstance(pounce.config, PounceConfig) and isinstance(run.pounce, PounceConfig):
-        pounce.config = replace(pounce.config, max_committed_rows=run.pounce.max_committed_rows)
-    freeze(pounce, run.freeze)
-    return JointModel(ponder, pounce, w1=run.w1, w2=run.w2, trains=run.trains), bundle
-
-
-def _own_tokenizer(run: Recipe, data: TrainingSet) -> Tokenizer | None:
-    """A tokenizer for POUNCE, trained on all prompts in the data; None for the family's."""
-    if not run.has_own_tokenizers or not isinstance(run.pounce, PounceConfig):
-        return None
-    prompts = data.instructions_with_subgoals() if run.pounce.reads_subgoal else data.instructions()
-    return tokenizer_of_instructions(prompts)
-
-
-def export(model: JointModel, bundle: PounceBundle, out: Path, *, trained: Trains = "both") -> None:
-    """Writes checkpoint folders of the trained systems for the servers."""
-    if trained != "pounce":
-        model.ponder.is_random = False
-        save_ponder(model.ponder, out / "ponder")
-    if trained != "ponder":
-        save_bundle(replace(bundle, is_random=False, has_fresh_prefix=False), out / "pounce")
 
 
 def _adjusted(run: Recipe, instead: InsteadOptions) -> Recipe:
@@ -384,9 +347,10 @@ def _out_of_memory(options: TrainOptions, error: BaseException) -> str:
     run = _adjusted(recipe(options.recipe), options.instead)
     tried = f"{run.batch_episodes} x {run.example.max_invocations}"
     return (
-        f"out of memory at {tried} (episodes a step x invocations each; {error}). Lower --max-invocations first, then "
-        "--batch-episodes; --recompute keeps less of PONDER's rows; --dtype bfloat16 halves PONDER; or start more "
-        "processes with torchrun. The last checkpoint is kept: the same command with the lower number goes on."
+        f"out of memory at {tried} (episodes a step x invocations each; {error}). Raise --accumulate first; "
+        "--recompute keeps less of PONDER's rows; --dtype bfloat16 halves the weights; or start more processes with "
+        "torchrun. The last checkpoint is kept, and the same command with these goes on. --max-invocations and "
+        "--batch-episodes make it another run, with another --out."
     )
 
 

@@ -79,8 +79,11 @@ class Trainer:
         data_hash: str = "",
         recipe: Mapping[str, Any] | None = None,
         world: World | None = None,
+        num_parts: int = 1,
     ) -> None:
-        """A checkpoint made with another ``config``, ``data_hash`` or ``recipe`` (what else fixes the run) is refused.
+        """``num_parts``: the parts of a batch that are computed one after the other; their gradients add up.
+
+        A checkpoint made with another ``config``, ``data_hash`` or ``recipe`` (what else fixes the run) is refused.
 
         With several processes, ``model`` must be sharded already, or equal on all of them.
         """
@@ -90,7 +93,7 @@ class Trainer:
         self._batches = batches
         made_with = {"train": asdict(config), "data": data_hash, **(recipe or {})}
         self._made_with: dict[str, Any] = json.loads(json.dumps(made_with))  # as a checkpoint's facts come back
-        self._world = world or World()
+        self._world, self._num_parts = world or World(), num_parts
         self._optimiser = Optimiser(model, config.optim)
         self._latest: tuple[PonderBatch, Tensor] | None = None
 
@@ -106,33 +109,38 @@ class Trainer:
     def _update(self) -> StepReport:
         world, model = self._world, self.model
         episodes, invocations = self._batches(self.step)
-        loss = model(episodes, invocations, self._draws(invocations))
-        # The losses are means over the whole batch: each process's mean is weighted by its share of the count.
-        counts = (loss.num_rows, loss.num_supervised, loss.num_null)
-        num_rows, num_supervised, num_null = (int(number) for number in world.sums(counts))
-        matching = loss.flow_matching * (loss.num_rows / max(1, num_rows))
-        grounding = loss.grounding * (loss.num_supervised / max(1, num_supervised))
-        part = model.weigh(matching, grounding)
-        total, flow_matching, text = world.sums([each.detach() for each in (part, matching, grounding)])
-        if not np.isfinite(total):
-            raise FloatingPointError(
-                f"step {self.step}: the loss is {total} (flow matching {flow_matching}, grounding {text}). Look at "
-                "that batch's data, or lower learning_rate; the last checkpoint is untouched."
-            )
-        (part * world.size).backward()  # averaging gradients over processes divides by their number
-        average_gradients(model, world)
+        parts = list(self._parts(episodes, invocations))
+        # The losses are means over the whole batch: each part's mean is weighted by its share of the count.
+        counts = [model.counts(*part) for part in parts]
+        num_rows, num_supervised, num_null = (int(number) for number in world.sums(np.sum(counts, axis=0)))
+        sums, predicted = np.zeros(3), []
+        for part, (rows_here, supervised_here, _) in zip(parts, counts, strict=True):
+            loss = model(*part)
+            matching = loss.flow_matching * (rows_here / max(1, num_rows))
+            grounding = loss.grounding * (supervised_here / max(1, num_supervised))
+            total = model.weigh(matching, grounding)
+            sums += world.sums([each.detach() for each in (total, matching, grounding)])
+            if not np.isfinite(sums[0]):
+                raise FloatingPointError(
+                    f"step {self.step}: the loss is {sums[0]} (flow matching {sums[1]}, grounding {sums[2]}). Look at "
+                    "that batch's data, or lower learning_rate; the last checkpoint is untouched."
+                )
+            (total * world.size).backward()  # averaging gradients over processes divides by their number
+            average_gradients(model, world)
+            self._optimiser.collect()
+            predicted.append(loss.predicted_N)
         norm = self._optimiser.update(self.step)
         report = StepReport(
             step=self.step,
-            total=total,
-            flow_matching=flow_matching,
-            grounding=text,
+            total=float(sums[0]),
+            flow_matching=float(sums[1]),
+            grounding=float(sums[2]),
             gradient_norm=norm,
             num_supervised=num_supervised,
             num_null=num_null,
         )
         self.step += 1
-        self._latest = episodes, loss.predicted_N
+        self._latest = episodes, torch.cat(predicted)
         return report
 
     @property
@@ -146,10 +154,23 @@ class Trainer:
             raise RuntimeError("no step was done yet; latest is of the last one")
         return self._latest
 
-    def _draws(self, invocations: PounceBatch) -> Draws:
-        """The random draws of this step, per episode: independent of the process that has the episode."""
+    def _parts(
+        self, episodes: PonderBatch, invocations: PounceBatch
+    ) -> Iterator[tuple[PonderBatch, PounceBatch, Draws]]:
+        """Yields the parts of a batch that are computed one after the other, with their draws."""
+        if self._num_parts == 1:
+            yield episodes, invocations, self._draws(invocations)
+            return
+        num_episodes = max(len(episodes.rows), invocations.num_episodes)
+        for numbers in np.array_split(np.arange(num_episodes), self._num_parts):
+            begin, end = int(numbers[0]), int(numbers[-1]) + 1
+            part = invocations.part(begin, end)
+            yield episodes.part(begin, end), part, self._draws(part, begin)
+
+    def _draws(self, invocations: PounceBatch, first: int = 0) -> Draws:
+        """The random draws of this step, per episode: independent of the process and the part that has the episode."""
         generators = []
-        for index in range(invocations.num_episodes):
+        for index in range(first, first + invocations.num_episodes):
             place = self._world.rank + index * self._world.size
             sequence = np.random.SeedSequence([self.config.seed, _DRAW_STREAM, self.step, place])
             generators.append(torch.Generator().manual_seed(int(sequence.generate_state(1, np.uint64)[0] >> 1)))
@@ -174,7 +195,7 @@ class Trainer:
         Raises:
             SaveError: a process could not write (a full disk); the old checkpoint is kept, the partial one removed.
         """
-        fresh, old = (folder.with_name(folder.name + suffix) for suffix in (".tmp", ".old"))
+        fresh = folder.with_name(folder.name + ".tmp")
         world = self._world
         if world.is_first:
             shutil.rmtree(fresh, ignore_errors=True)
@@ -196,7 +217,7 @@ class Trainer:
         if num_failed:
             raise SaveError(_why_not_saved(folder, self.step, failure)) from failure
         if world.is_first:
-            _replace(folder, fresh, old)
+            disk.exchange(fresh, folder)
         world.wait()
 
     def resume(self, folder: Path) -> bool:
@@ -211,9 +232,10 @@ class Trainer:
         self._world.wait()
         if not folder.exists():
             return False
-        facts = files.read_json(folder / _FACTS, "file of a checkpoint's facts")
-        with files.reading(folder / _FACTS, "file of a checkpoint's facts"):
-            step, made_with = int(facts["step"]), dict(facts.get("made_with", {}))
+        step, made_with = _facts_in(folder)
+        then, now = (each.get("name") for each in (made_with, self._made_with))
+        if then != now:
+            raise CheckpointError(f"{folder}: made with recipe {then}, this run is of recipe {now}. Use another --out.")
         if differs := list(_differences(made_with, self._made_with)):
             raise CheckpointError(
                 f"{folder}: made with {'; '.join(differs[:5])}. Use another folder, or the same data and recipe."
@@ -233,6 +255,17 @@ class Trainer:
         return True
 
 
+def num_steps_in(folder: Path) -> int | None:
+    """Number of steps of a checkpoint; None if there is none. Raises FileError if it is broken."""
+    return _facts_in(folder)[0] if folder.exists() else None
+
+
+def _facts_in(folder: Path) -> tuple[int, dict[str, Any]]:
+    facts = files.read_json(folder / _FACTS, "file of a checkpoint's facts")
+    with files.reading(folder / _FACTS, "file of a checkpoint's facts"):
+        return int(facts["step"]), dict(facts.get("made_with", {}))
+
+
 def _weights(model: JointModel) -> dict[str, Tensor]:
     """Every parameter once, tied ones under their first name."""
     return {name: parameter.detach() for name, parameter in model.named_parameters()}
@@ -245,15 +278,6 @@ def _differences(then: Any, now: Any, name: str = "") -> Iterator[str]:
             yield from _differences(then.get(key), now.get(key), f"{name}.{key}".lstrip("."))
     elif then != now:
         yield f"{name} {then}, this run has {now}"
-
-
-def _replace(folder: Path, fresh: Path, old: Path) -> None:
-    if folder.exists():
-        shutil.rmtree(old, ignore_errors=True)
-        folder.rename(old)
-    fresh.rename(folder)
-    disk.sync(folder.parent)
-    shutil.rmtree(old, ignore_errors=True)
 
 
 def _why_not_saved(folder: Path, step: int, failure: Exception | None) -> str:

@@ -27,11 +27,11 @@ from dual_system.models.ponder.configs import tiny_cpu as tiny_ponder
 from dual_system.models.ponder.network import Ponder
 from dual_system.models.pounce.configs import tiny_cpu, tiny_groot
 from dual_system.models.pounce.family import blank_model
+from dual_system.models.pounce.precision import cast_streams
 from ponder_server.captured import CapturedDecoder
 from ponder_server.slots import SlotMemory
 from pounce_server.fused import FusedPounce
 from pounce_server.fused_stream import TWINS
-from pounce_server.precision import cast_for_serving
 
 CUDA, META = 1, 14
 """Places in torch's list of device types."""
@@ -132,7 +132,7 @@ def test_ponder_s_vision_tower(ponder: Ponder) -> None:
     ids=["pi05", "groot"],
 )
 def test_an_eager_prefill_and_flow_step(config: Any, most: tuple[int, int]) -> None:
-    model: Any = cast_for_serving(blank_model(config).eval(), "bfloat16")
+    model: Any = cast_streams(blank_model(config).eval(), "bfloat16")
     with FakeTensorMode():
         on_gpu(model)
         inputs = inputs_of(model)
@@ -148,7 +148,7 @@ def test_an_eager_prefill_and_flow_step(config: Any, most: tuple[int, int]) -> N
 
 def test_a_fused_prefill_and_flow_step() -> None:
     """With twins in place of the Triton kernels, whose launches torch does not see."""
-    model: Any = cast_for_serving(blank_model(tiny_cpu(num_carriers=2)).eval(), "bfloat16")
+    model: Any = cast_streams(blank_model(tiny_cpu(num_carriers=2)).eval(), "bfloat16")
     works: list[Callable[[], None]] = []
 
     def capture(work: Callable[[], None]) -> Callable[[], None]:

@@ -13,10 +13,11 @@ from safetensors.torch import load_file, save_file
 
 from dual_system.models.interface import CognitionConfig
 from dual_system.models.normalisation import ROBOMME, Quantiles, RobotStatistics
+from dual_system.models.pi05.pounce import PounceConfig
 from dual_system.models.pounce.checkpoint import PounceBundle, load_bundle, random_bundle, save_bundle
-from dual_system.models.pounce.configs import in_space, tiny_cpu, tiny_groot
+from dual_system.models.pounce.configs import in_space, pi05_base, tiny_cpu, tiny_groot
 from dual_system.models.pounce.family import AnyPounceConfig
-from dual_system.models.stored_tensors import CheckpointError, WeightsError
+from dual_system.models.stored_tensors import CheckpointError
 
 
 @pytest.fixture(scope="module")
@@ -81,9 +82,26 @@ def test_public_folder_without_carriers_has_no_prefix_to_flag(bundle: PounceBund
     assert load_bundle(folder, config=config).has_fresh_prefix is False
 
 
-def test_public_folder_is_taken_for_full_size_by_default(folder: Path) -> None:
+def test_sizes_of_a_public_folder_are_read_off_its_tensors(
+    bundle: PounceBundle, folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     _make_public(folder)
-    with pytest.raises(WeightsError, match=r"misshapen: .*expected"):
+    found, own = load_bundle(folder).model.config, bundle.model.config
+    assert isinstance(found, PounceConfig)
+    assert isinstance(own, PounceConfig)
+    heads = pi05_base().pi05.vision.num_heads
+    sizes = replace(own.pi05, vision=replace(own.pi05.vision, num_heads=heads), horizon=found.horizon)
+    assert found == replace(pi05_base(), pi05=sizes)
+    assert "language.depth 3 (18)" in caplog.text
+    assert f"SigLIP's {heads} heads, which no file says, are assumed" in caplog.text
+
+
+def test_a_public_folder_without_a_stream_is_told(folder: Path) -> None:
+    _make_public(folder)
+    tensors = load_file(folder / "model.safetensors")
+    kept = {name: tensor for name, tensor in tensors.items() if "gemma_expert" not in name}
+    save_file(kept, folder / "model.safetensors")
+    with pytest.raises(ValueError, match=r"no tensor .*gemma_expert.*sizes are read from it"):
         load_bundle(folder)
 
 

@@ -14,13 +14,13 @@ from dual_system.models.pi05.gemma import GemmaConfig
 from dual_system.models.pi05.pounce import Pounce, PounceConfig, PounceInputs
 from dual_system.models.pounce.checkpoint import random_bundle
 from dual_system.models.pounce.configs import tiny_cpu, tiny_groot
+from dual_system.models.pounce.precision import cast_streams
 from dual_system.models.siglip import VisionConfig
 from pounce_server.contract import DTypeName, example_request
 from pounce_server.engine import EagerEngine
 from pounce_server.fused import BUCKET_TOKENS, SLOT_MULTIPLE, FusedPounce, fused_for
 from pounce_server.fused_stream import KERNELS, TWINS, Operations
 from pounce_server.kernels.launch import missing_for
-from pounce_server.precision import cast_for_serving
 
 MAE = {"float32": 1e-5, "bfloat16": 4e-3}
 """Stated tolerance: mean absolute error of the normalised actions after the last step."""
@@ -34,7 +34,7 @@ NUM_BUCKETS = 4
 def model_of(config: PounceConfig, dtype: DTypeName = "float32", seed: int = 0) -> Pounce:
     model = random_bundle(config, seed).model
     assert isinstance(model, Pounce)
-    return cast_for_serving(model, dtype).eval()  # type: ignore[return-value]
+    return cast_streams(model, dtype).eval()  # type: ignore[return-value]
 
 
 def ragged(config: PounceConfig, seed: int = 0) -> PounceInputs:

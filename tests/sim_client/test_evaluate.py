@@ -29,6 +29,7 @@ from protocol import messages as m
 from protocol.mcap_log import read_log
 from sim_client import evaluate as module
 from sim_client.condition import ConditionOptions, EvalOptions, EvaluationError, Job, LogOptions, WorkersOptions
+from sim_client.config import ModelsOptions
 from sim_client.evaluate import EvaluationHarness, Line, evaluate, play
 from sim_client.ledger import LedgerError
 from sim_client.null_ponder import cognition_shape
@@ -76,7 +77,10 @@ def options(out: Path, **changes: Any) -> EvalOptions:
     }  # fmt: skip
     values |= changes
     groups = {}
-    for name, kind in {"condition": ConditionOptions, "log": LogOptions, "workers": WorkersOptions}.items():
+    kinds = {
+        "condition": ConditionOptions, "log": LogOptions, "workers": WorkersOptions, "models": ModelsOptions,
+    }  # fmt: skip
+    for name, kind in kinds.items():
         own = {field.name for field in dataclasses.fields(kind)} & values.keys()
         groups[name] = kind(**{each: values.pop(each) for each in own})
     return EvalOptions(**values, **groups)
@@ -140,6 +144,12 @@ def test_one_folder_holds_one_condition(tmp_path: Path) -> None:
         ({"cognition": "other-episode", "donors": Path("x"), "servers": "local"}, "in-process"),
         ({"subgoal_text": "oracle", "servers": "local"}, "in-process"),
         ({"subgoal_text": "oracle", "cognition": "null"}, "reads no cognition"),
+        ({"gpus_per_worker": 0.5}, "use it with --device cuda"),
+        ({"gpus_per_worker": 0.5, "device": "cuda:1"}, "use it with --device cuda"),
+        ({"ray": "local", "device": "cuda"}, "add --gpus-per-worker"),
+        ({"servers": "running", "workers": 2}, "with one worker"),
+        ({"servers": "running", "dtype": "bfloat16"}, "their own checkpoints, devices and paths"),
+        ({"servers": "running", "pounce_checkpoint": Path("x")}, "their own checkpoints, devices and paths"),
     ],
 )
 def test_options_that_contradict_each_other_are_refused(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
@@ -158,6 +168,30 @@ def test_the_defaults_are_the_paper_s_protocol(tmp_path: Path) -> None:
     assert (schedule.query_period_ns, schedule.invoke_period_ticks) == (10**9, 20)
     assert (schedule.query_delay.kind, schedule.query_delay.mean_ns) == (m.DelayKind.FIXED, 300_000_000)
     assert len(paper.jobs()) == 16 * 50 * 3
+
+
+@pytest.mark.parametrize(
+    ("changes", "devices"),
+    [
+        ({"gpus_per_worker": 1}, ["cuda:0", "cuda:1", "cuda:2", "cuda:3"]),
+        ({"gpus_per_worker": 0.5}, ["cuda:0", "cuda:0", "cuda:1", "cuda:1"]),
+        ({"gpus_per_worker": 2}, ["cuda:0", "cuda:2", "cuda:4", "cuda:6"]),
+        ({}, ["cuda:0"] * 4),
+        ({"gpus_per_worker": 1, "ray": "local"}, ["cuda"] * 4),  # Ray shows each worker its own alone
+        ({"device": "cuda:3"}, ["cuda:3"] * 4),
+        ({"device": "cpu"}, ["cpu"] * 4),
+    ],
+)
+def test_workers_divide_the_gpus(tmp_path: Path, changes: dict[str, Any], devices: list[str]) -> None:
+    chosen = options(tmp_path, **{"device": "cuda", **changes})
+    assert [chosen.sim(worker).models.device for worker in range(4)] == devices
+
+
+def test_models_options_reach_the_servers_that_are_started(tmp_path: Path) -> None:
+    models = options(tmp_path, device="cuda:1", dtype="bfloat16", path="fused").sim().models
+    assert models.of_ponder() == {"device": "cuda:1", "dtype": "bfloat16"}
+    assert models.of_pounce() == {"device": "cuda:1", "dtype": "bfloat16", "path": "fused"}
+    assert ModelsOptions().of_pounce() == {}
 
 
 @pytest.mark.parametrize(

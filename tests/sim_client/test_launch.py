@@ -11,6 +11,7 @@ import pytest
 
 from protocol.options import LinkOptions
 from protocol.sockets import socket_path
+from sim_client.config import ModelsOptions
 from sim_client.launch import Daemons, local_link
 
 
@@ -63,3 +64,15 @@ def test_pounce_alone_needs_no_ponder(started: dict[str, list[str]], tmp_path: P
     assert (set(started), len(link.connect)) == ({"pounce", "clock"}, 2)
     alone = started["clock"].index("--ponder")
     assert started["clock"][alone + 1] == "none"
+
+
+def test_local_servers_get_device_precision_and_path(started: dict[str, list[str]], tmp_path: Path) -> None:
+    with Daemons(tmp_path) as daemons:
+        local_link(
+            daemons, LinkOptions(), with_clock=False, allow_starved=False, with_ponder=True,
+            ponder_checkpoint=Path("p"), pounce_checkpoint=None,
+            models=ModelsOptions(device="cuda", dtype="bfloat16", path="compile"),
+        )  # fmt: skip
+    both = ["--device", "cuda", "--dtype", "bfloat16"]
+    assert started["ponder"][-6:] == ["--checkpoint", "p", *both]
+    assert started["pounce"][-6:] == [*both, "--path", "compile"]

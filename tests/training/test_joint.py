@@ -98,8 +98,9 @@ def test_learning_to_continue_rows_leaves_the_other_draws_and_its_loss_counts_th
     assert torch.equal(drawn.time_S, plain.time_S)
     both = episodes(model.ponder, 1)
     losses = [model(both, batch, draws) for draws in (plain, drawn)]
-    assert [loss.num_rows for loss in losses] == [16, 16 - int(drawn.num_committed_S.sum())]
-    assert losses[0].num_rows != losses[1].num_rows
+    num_rows = [model.counts(both, batch, draws).num_rows for draws in (plain, drawn)]
+    assert num_rows == [16, 16 - int(drawn.num_committed_S.sum())]
+    assert num_rows[0] != num_rows[1]
     noise = drawn.noise_SNA.clone()
     for place, count in enumerate(drawn.num_committed_S.tolist()):
         noise[place, :count] = 9.0
@@ -147,7 +148,7 @@ def test_dropout_replaces_cognition_by_null(model: JointModel) -> None:
     both, batch = episodes(model.ponder, 2), invocations(model.pounce, (0, 0), (0, 1))
     dropped = model(both, batch, draws_of(batch, dropout=1.0))
     null = model(both, replace(batch, query_I=torch.full((2,), NO_QUERY)), draws_of(batch))
-    assert dropped.num_null == 2
+    assert model.counts(both, batch, draws_of(batch, dropout=1.0)).num_null == 2
     torch.testing.assert_close(dropped.flow_matching, null.flow_matching, rtol=0, atol=0)
 
 
@@ -170,7 +171,8 @@ def test_the_lm_head_reads_supervised_positions_only(model: JointModel, monkeypa
     both, batch = episodes(model.ponder, 2, 1), invocations(model.pounce, (0, 0))
     loss = model(both, batch, draws_of(batch))
     text = len(model.ponder.format.vocabulary.encode("pick the cube")) + 1
-    assert read == [loss.num_supervised] == [2 * text + 3]  # T_yes and text twice, T_no at each of three queries
+    assert read == [len(loss.predicted_N)] == [2 * text + 3]  # T_yes and text twice, T_no at each of three queries
+    assert model.counts(both, batch, draws_of(batch)).num_supervised == 2 * text + 3
 
 
 def test_without_annotations_the_lm_head_is_not_run(model: JointModel, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -178,7 +180,8 @@ def test_without_annotations_the_lm_head_is_not_run(model: JointModel, monkeypat
     model.w2 = 0.0
     both, batch = episodes(model.ponder, 2), invocations(model.pounce, (0, 0))
     loss = model(both, batch, draws_of(batch))
-    assert (float(loss.grounding), loss.num_supervised) == (0.0, 0)
+    assert (float(loss.grounding), len(loss.predicted_N)) == (0.0, 0)
+    assert model.counts(both, batch, draws_of(batch)).num_supervised == 0
 
 
 def test_total_is_the_weighted_sum(model: JointModel) -> None:
@@ -210,7 +213,12 @@ def test_both_systems_alone_lose_what_they_lose_together(model: JointModel) -> N
     alone = {name: JointModel(model.ponder, model.pounce, trains=name)(both, batch, draws) for name in SYSTEMS}
     assert torch.equal(alone["pounce"].flow_matching, together.flow_matching)
     assert torch.equal(alone["ponder"].grounding, together.grounding)
-    assert (alone["pounce"].num_null, alone["pounce"].num_rows) == (together.num_null, together.num_rows)
+    counts = {
+        name: JointModel(model.ponder, model.pounce, trains=name).counts(both, batch, draws)
+        for name in ("both", *SYSTEMS)
+    }
+    assert counts["both"] == counts["pounce"]._replace(num_supervised=counts["ponder"].num_supervised)
+    assert (counts["ponder"].num_rows, counts["ponder"].num_null, counts["pounce"].num_supervised) == (0, 0, 0)
     assert torch.equal(alone["ponder"].predicted_N, together.predicted_N)
     for name, part in (("pounce", "grounding"), ("ponder", "flow_matching")):
         assert float(getattr(alone[name], part)) == 0.0
@@ -234,7 +242,7 @@ def test_several_flow_samples_are_the_mean_of_single_ones(model: JointModel) -> 
     ]
     apart = torch.stack([model(both, batch, one).flow_matching for one in singles])
     torch.testing.assert_close(loss.flow_matching, apart.mean())
-    assert loss.num_rows == 2 * 2 * batch.actions_INA.shape[1]
+    assert model.counts(both, batch, drawn).num_rows == 2 * 2 * batch.actions_INA.shape[1]
 
 
 def test_frames_without_rows_are_refused() -> None:

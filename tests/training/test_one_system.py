@@ -34,7 +34,7 @@ def options(folder: Path, out: Path) -> TrainOptions:
 
 
 def trainer_of(run: Recipe, folder: Path) -> Trainer:
-    model, bundle = train.build(run, TrainingSet(folder), options(folder, folder / "unused"))
+    model, bundle = train.build(run, TrainingSet(folder), options(folder, folder / "unused").start)
     data = TrainingSet(folder, sizes=train._picture_sizes(run, model))
     return Trainer(model, train.Batches(data, run, model, bundle, World()), run.train)
 

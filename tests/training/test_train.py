@@ -55,7 +55,7 @@ def options(folder: Path, out: Path, recipe: str = "tiny", **changes: Any) -> Tr
 
 def trainer_of(folder: Path, tmp_path: Path) -> Trainer:
     run, data = recipes.recipe("tiny"), TrainingSet(folder)
-    model, bundle = train.build(run, data, options(folder, tmp_path))
+    model, bundle = train.build(run, data, options(folder, tmp_path).start)
     data = TrainingSet(folder, sizes=train._picture_sizes(run, model))
     return Trainer(model, train.Batches(data, run, model, bundle, World()), run.train)
 
@@ -110,8 +110,9 @@ def test_a_run_that_was_killed_ends_as_one_that_was_not(
         ({"recipe": "tinny"}, "Did you mean 'tiny'?"),
         ({"recipe": "robomme"}, "--ponder, --pounce"),
         ({"machine": MachineOptions(tf32=True)}, "is for GPUs"),
-        ({"machine": MachineOptions(length_groups=0)}, "expected 1 to 2"),
-        ({"machine": MachineOptions(length_groups=3)}, "expected 1 to 2"),
+        ({"machine": MachineOptions(length_groups=0)}, "at least 1 of each, and together at most 2"),
+        ({"machine": MachineOptions(length_groups=3)}, "together at most 2"),
+        ({"machine": MachineOptions(accumulate=2, length_groups=2)}, "together at most 2"),
         ({"machine": MachineOptions(loaders=-1)}, "at least one process"),
         ({"tasks": ("StopCube",)}, "has no successful episode of StopCube; it has PickHighlight"),
     ],
@@ -153,8 +154,19 @@ def test_options_are_flat_on_the_command_line() -> None:
 
 def test_a_finished_run_is_not_overwritten(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "run" / "pounce").mkdir(parents=True)
-    with pytest.raises(train.CheckpointError, match="finished run"):
+    with pytest.raises(train.CheckpointError, match="finished run without a checkpoint"):
         train.train(options(folder, tmp_path / "run"))
+
+
+def test_a_finished_run_is_prolonged_to_what_a_longer_one_would_have_been(folder: Path, tmp_path: Path) -> None:
+    longer = InsteadOptions(steps=3)
+    train.train(options(folder, tmp_path / "run"))
+    with pytest.raises(train.CheckpointError, match="finished run of 2 steps; --steps with a larger number"):
+        train.train(options(folder, tmp_path / "run"))
+    train.train(options(folder, tmp_path / "run", instead=longer))
+    train.train(options(folder, tmp_path / "whole", instead=longer))
+    for name in ("log.jsonl", "ponder/model.safetensors", "pounce/model.safetensors"):
+        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
 
 def test_a_step_draws_the_same_batch_whenever_it_is_asked(folder: Path, tmp_path: Path) -> None:
@@ -178,7 +190,7 @@ def test_the_processes_share_one_batch_and_rows_of_like_length(folder: Path, tmp
             return self.rows[number]
 
     run, lengths = replace(recipes.recipe("tiny"), batch_episodes=8), Lengths()
-    model, bundle = train.build(run, TrainingSet(folder), options(folder, tmp_path))
+    model, bundle = train.build(run, TrainingSet(folder), options(folder, tmp_path).start)
     shares = [train.Batches(lengths, run, model, bundle, World(rank=rank, size=2)) for rank in (0, 1)]  # type: ignore[arg-type]
     seen = set()
     for seed in range(30):
@@ -206,7 +218,7 @@ def test_both_tokenizers_can_be_trained_on_the_data(
     monkeypatch.setitem(recipes.RECIPES, "own", lambda: own)
     lengths = {}
     for name in ("tiny", "own"):
-        model, bundle = train.build(recipes.recipe(name), TrainingSet(folder), options(folder, tmp_path))
+        model, bundle = train.build(recipes.recipe(name), TrainingSet(folder), options(folder, tmp_path).start)
         text = "pick what was shown"
         lengths[name] = len(model.ponder.format.vocabulary.encode(text)), len(bundle.tokenizer.encode(text))
     assert all(mine < tinys for mine, tinys in zip(lengths["own"], lengths["tiny"], strict=True))
@@ -223,7 +235,7 @@ def test_out_of_memory_says_what_to_lower(
     assert train.main(arguments) == 2
     said = capsys.readouterr().err
     assert "out of memory at 1 x 2 (episodes a step x invocations each; CUDA" in said
-    assert "--max-invocations" in said
+    assert "Raise --accumulate first" in said
 
 
 def test_a_pounce_that_learned_to_continue_rows_is_served_so(folder: Path, tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
@@ -171,3 +171,58 @@ def test_a_disk_that_is_full_keeps_the_checkpoint_before(tmp_path: Path, monkeyp
     again = Trainer(joint(), batch, TRAIN)
     assert again.resume(tmp_path / "checkpoint")
     assert again.step == 1
+
+
+def joined(*steps: int) -> tuple[PonderBatch, PounceBatch]:
+    """The episodes of several steps' batches as one batch."""
+    parts = [batch(step) for step in steps]
+    inputs = [invocations.inputs for _, invocations in parts]
+    values = {
+        each.name: torch.cat([getattr(one, each.name) for one in inputs])
+        for each in fields(inputs[0])
+        if getattr(inputs[0], each.name) is not None
+    }
+    episodes = PonderBatch(
+        rows=tuple(row for each, _ in parts for row in each.rows),
+        frames=tuple(frames for each, _ in parts for frames in each.frames),
+    )
+    return episodes, PounceBatch(
+        inputs=replace(inputs[0], **values),
+        actions_INA=torch.cat([each.actions_INA for _, each in parts]),
+        episode_I=torch.arange(len(steps)).repeat_interleave(3),
+        query_I=torch.cat([each.query_I for _, each in parts]),
+    )
+
+
+@pytest.mark.parametrize(("num_parts", "dtype"), [(4, torch.float32), (3, torch.float32), (4, torch.bfloat16)], ids=str)
+def test_a_batch_in_parts_makes_the_step_of_the_whole(num_parts: int, dtype: torch.dtype) -> None:
+    """4 x 2, and an uneven division, are 1 x 8."""
+    found, config = {}, replace(TRAIN, optim=replace(TRAIN.optim, learning_rate=1e-4))
+    for parts in (1, num_parts):
+        model = joint()
+        model.ponder.to(dtype)
+        one = Trainer(model, lambda step: joined(*range(step, step + 8)), config, num_parts=parts)
+        found[parts] = list(one.run(2)), one._optimiser._masters, one.latest[1]
+    (whole, weights_of_whole, said), (parted, weights_of_parts, said_in_parts) = found.values()
+    for one, other in zip(whole, parted, strict=True):
+        assert (one.num_supervised, one.num_null) == (other.num_supervised, other.num_null)
+        for name in ("total", "flow_matching", "grounding", "gradient_norm"):
+            assert getattr(one, name) == pytest.approx(getattr(other, name), abs=1e-5 if dtype.itemsize == 4 else 2e-2)
+    assert len(said) == len(said_in_parts)
+    for name, weight in weights_of_whole.items():
+        close = 1e-5 if dtype.itemsize == 4 else 2e-4  # AdamW moves a weight by its rate where the gradient is rounding
+        torch.testing.assert_close(weights_of_parts[name], weight, rtol=0, atol=close)
+
+
+def test_a_part_without_an_invocation_is_told() -> None:
+    episodes, invocations = joined(0, 1)
+    invocations = replace(invocations, episode_I=torch.zeros(6, dtype=torch.int64))
+    with pytest.raises(ValueError, match="episodes 1 to 1 of a batch have no invocation"):
+        next(Trainer(joint(), lambda step: (episodes, invocations), TRAIN, num_parts=2).run(1))
+
+
+def test_a_run_of_another_recipe_is_refused_by_name(tmp_path: Path) -> None:
+    Trainer(joint(), batch, TRAIN, recipe={"name": "robomme", "a": 1}).save(tmp_path / "checkpoint")
+    other = Trainer(joint(), batch, TRAIN, recipe={"name": "robomme_0p8b", "a": 2})
+    with pytest.raises(CheckpointError, match="made with recipe robomme, this run is of recipe robomme_0p8b"):
+        other.resume(tmp_path / "checkpoint")

@@ -114,6 +114,20 @@ class Ponder(nn.Module):
         fill_randomly(ponder.qwen, seed=seed)
         return ponder
 
+    @torch.no_grad()
+    def draw_carriers(self, seed: int) -> None:
+        """Draws the carriers' input embeddings anew, with the rms of the tokenizer's (paper, 3.2: at random).
+
+        A public folder has padding rows in their place, which may all be equal.
+        """
+        table: Tensor = self.qwen.model.language_model.embed_tokens.weight
+        tokens = table[: self.format.vocabulary.num_tokens]
+        rms = float(torch.linalg.vector_norm(tokens, dtype=torch.float32)) / tokens.numel() ** 0.5
+        generator = generator_for(table.device, seed)
+        for row in self.format.carrier_ids:
+            drawn = torch.empty(table.shape[1], device=generator.device).normal_(0.0, rms, generator=generator)
+            table[row].copy_(drawn)
+
     @property
     def hidden_size(self) -> int:
         return int(self.qwen.config.text_config.hidden_size)

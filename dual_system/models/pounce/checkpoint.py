@@ -17,6 +17,7 @@ from dual_system.models.groot.folder import groot_config_of
 from dual_system.models.groot.pounce import GrootPounceConfig
 from dual_system.models.groot.prompt import EagleTokenizer, tiny_eagle_tokenizer_for_random_weights
 from dual_system.models.normalisation import ROBOMME, Quantiles, RobotStatistics
+from dual_system.models.pi05.folder import with_sizes_of
 from dual_system.models.pi05.openpi_jax import METADATA_FILE, load_jax_weights
 from dual_system.models.pi05.pounce import Pounce, PounceConfig
 from dual_system.models.pi05.prompt import Tokenizer, tiny_tokenizer_for_random_weights
@@ -179,7 +180,7 @@ def load_bundle(
     not, and lerobot's ``groot``.
 
     Args:
-        config: for a public folder; default `pi05_base()`, or for GR00T the folder's own.
+        config: for a public folder; default that of `public_config`.
         statistics: for a public folder, in place of its own; ``config`` must be in their action space.
         tokenizer: tokenizer file; default the folder's tokenizer.model (pi0.5) or tokenizer.json (GR00T).
         prefix_seed: seed of the cognition prefix if the folder has none.
@@ -203,7 +204,7 @@ def load_bundle(
     else:
         statistics = _public_statistics(folder, statistics)
     if config is None:
-        config = pi05_base() if tensors is None else _public_config(tensors, values, folder)
+        config = _public_config(tensors, values, folder)
     try:
         model = blank_model(config)
     except (ArithmeticError, RuntimeError) as error:
@@ -229,9 +230,21 @@ def _load_jax(model: AnyPounce, folder: Path) -> bool:
     return False
 
 
-def _public_config(tensors: StoredTensors, values: dict[str, Any] | None, folder: Path) -> AnyPounceConfig:
-    if family_of(tensors.shapes, str(folder / WEIGHTS_FILE)) == "pi05":
+def public_config(folder: Path) -> AnyPounceConfig:
+    """The published configuration of a public folder's family, with the sizes of the folder's own network.
+
+    Raises: as `load_bundle`.
+    """
+    is_jax = (folder / JAX_FOLDER / METADATA_FILE).is_file()
+    values, _ = _read_config(folder / CONFIG_FILE)
+    return _public_config(None if is_jax else StoredTensors.of(folder / WEIGHTS_FILE), values, folder)
+
+
+def _public_config(tensors: StoredTensors | None, values: dict[str, Any] | None, folder: Path) -> AnyPounceConfig:
+    if tensors is None:  # openpi's JAX folder
         return pi05_base()
+    if family_of(tensors.shapes, str(folder / WEIGHTS_FILE)) == "pi05":
+        return with_sizes_of(tensors.shapes, pi05_base(), str(folder))
     groot, num_steps = groot_config_of(tensors.shapes, values, str(folder))
     return replace(groot_n1_5(), groot=groot, num_steps=num_steps)
 

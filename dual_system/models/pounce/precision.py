@@ -1,9 +1,10 @@
-"""Selects the parameters that are bfloat16 in serving and those that stay float32 (openpi's choice)."""
+"""Selects the parameters of POUNCE that are bfloat16 and those that stay float32 (openpi's choice)."""
+
+from typing import Literal
 
 import torch
 
 from dual_system.models.pounce.family import AnyPounce
-from pounce_server.contract import DTypeName
 
 _STREAMS = (
     *("pi05.vision.", "pi05.projector.", "pi05.language.", "pi05.expert."),
@@ -17,7 +18,7 @@ def is_of_a_stream(name: str) -> bool:
     return name.startswith(_STREAMS) and not any(part in name for part in _FLOAT32_PARTS)
 
 
-def cast_for_serving(model: AnyPounce, dtype: DTypeName) -> AnyPounce:
+def cast_streams(model: AnyPounce, dtype: Literal["float32", "bfloat16"]) -> AnyPounce:
     """Casts ``model`` in place and returns it.
 
     In bfloat16 the streams' matrices are cast (two in pi0.5; Eagle, mixer and transformer in GR00T); norms

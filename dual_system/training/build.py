@@ -1,0 +1,150 @@
+"""Both systems of a run: initialised or loaded, in the run's number format; and the folders that they leave."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+from dual_system.data.episode import CAMERAS
+from dual_system.models.groot.pounce import GrootPounceConfig
+from dual_system.models.pi05.pounce import PounceConfig, freeze
+from dual_system.models.pi05.prompt import Tokenizer, tokenizer_of_instructions
+from dual_system.models.ponder.checkpoint import load_ponder, save_ponder
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.observation import check_cameras
+from dual_system.models.ponder.vocabulary import Vocabulary
+from dual_system.models.pounce.checkpoint import (
+    PounceBundle,
+    declares_config,
+    load_bundle,
+    public_config,
+    random_bundle,
+    save_bundle,
+)
+from dual_system.models.pounce.family import AnyPounceConfig
+from dual_system.models.pounce.initialise import open_gates
+from dual_system.models.pounce.precision import cast_streams
+from dual_system.training.data import TrainingSet
+from dual_system.training.joint import JointModel, Trains
+from dual_system.training.recipe import Recipe
+from protocol import disk
+
+DTypeName = Literal["float32", "bfloat16"]
+DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Start:
+    """What a run starts from, and where it is built."""
+
+    ponder: Path | None = None
+    pounce: Path | None = None
+    tokenizer: Path | None = None
+    """POUNCE's tokenizer file, if its folder has none."""
+    device: str = "cpu"
+    dtype: DTypeName = "float32"
+    """Number format of PONDER's weights and of the matrices of POUNCE's streams (`cast_streams`)."""
+
+
+def build(run: Recipe, data: TrainingSet, start: Start) -> tuple[JointModel, PounceBundle]:
+    """Both systems, initialised or loaded, frozen as the recipe says, with the data's own statistics.
+
+    Raises:
+        ValueError: pretrained weights are missing, or PONDER cannot read the pictures' size.
+        FileNotFoundError: a given folder holds no checkpoint.
+    """
+    if not run.from_scratch and (start.ponder is None or start.pounce is None):
+        raise ValueError(
+            f"recipe {run.name} starts from pretrained weights; give their folders with --ponder, --pounce"
+        )
+    ponder = _ponder(run, data, start)
+    bundle = _pounce(run, data, start, ponder)
+    pounce = cast_streams(bundle.model.to(start.device), start.dtype)
+    if type(pounce.config) is not type(run.pounce):
+        raise ValueError(f"recipe {run.name} is of another action model than {start.pounce} holds")
+    if isinstance(pounce.config, PounceConfig) and isinstance(run.pounce, PounceConfig):
+        pounce.config = replace(pounce.config, max_committed_rows=run.pounce.max_committed_rows)
+    freeze(pounce, run.freeze)
+    return JointModel(ponder, pounce, w1=run.w1, w2=run.w2, trains=run.trains), bundle
+
+
+def _ponder(run: Recipe, data: TrainingSet, start: Start) -> Ponder:
+    seed, dtype = run.train.seed, DTYPES[start.dtype]
+    if start.ponder is not None:
+        ponder = load_ponder(start.ponder, device=start.device, dtype=dtype)
+        if ponder.is_random and run.trains != "pounce":
+            ponder.draw_carriers(seed)
+    else:
+        own = Vocabulary.trained_on(data.texts(), run.ponder.first_carrier_id) if run.has_own_tokenizers else None
+        ponder = Ponder.random(run.ponder, own, seed=seed, device=start.device, dtype=dtype)
+    try:
+        check_cameras([(data.image_px, data.image_px)] * len(CAMERAS), ponder.format.reader, ponder.image_px)
+    except ValueError as error:
+        wanted_px = ponder.format.reader.readable_sizes(ponder.image_px)[0][0]
+        folders = ", ".join(map(str, data.roots))
+        raise ValueError(f"{folders}: {error}; collect with --image-px {wanted_px}") from None
+    if run.trains != "pounce":
+        declared = ponder.format.demonstrations
+        demonstrations = replace(data.demo_sampling() or declared, num_views=declared.num_views)
+        ponder.format = replace(ponder.format, speaks=run.w2 > 0, demonstrations=demonstrations)
+    return ponder
+
+
+def _pounce(run: Recipe, data: TrainingSet, start: Start, ponder: Ponder) -> PounceBundle:
+    measured = partial(data.statistics, run.pounce.horizon, run.space, by_row=run.statistics_by_row)
+    if start.pounce is None:
+        own = _own_tokenizer(run, data)
+        bundle = random_bundle(run.pounce, run.train.seed, statistics=measured(), tokenizer=own)
+        open_gates(bundle.model)
+        return bundle
+    if declares_config(start.pounce):
+        return load_bundle(start.pounce, tokenizer=start.tokenizer)
+    # A public folder has no cognition prefix and declares no inputs, and its statistics are of other data.
+    config = _for_this_pair(run, public_config(start.pounce), ponder)
+    return load_bundle(
+        start.pounce, config=config, statistics=measured(), tokenizer=start.tokenizer, prefix_seed=run.train.seed
+    )
+
+
+def _for_this_pair(run: Recipe, found: AnyPounceConfig, ponder: Ponder) -> AnyPounceConfig:
+    """The recipe's configuration with the network sizes of a public folder, and the prefix that this PONDER needs."""
+    cognition = run.pounce.cognition
+    if cognition.num_carriers:
+        cognition = replace(cognition, num_carriers=ponder.format.num_carriers, cognition_size=ponder.hidden_size)
+    if isinstance(found, PounceConfig) and isinstance(run.pounce, PounceConfig):
+        network = replace(found.pi05, horizon=run.pounce.horizon)
+        return replace(run.pounce, pi05=network, cognition=cognition)
+    if isinstance(found, GrootPounceConfig) and isinstance(run.pounce, GrootPounceConfig):
+        groot = replace(found.groot, horizon=run.pounce.horizon)
+        return replace(run.pounce, groot=groot, num_steps=found.num_steps, cognition=cognition)
+    return run.pounce  # of the other family: refused when both are there
+
+
+def _own_tokenizer(run: Recipe, data: TrainingSet) -> Tokenizer | None:
+    """A tokenizer for POUNCE, trained on all prompts in the data; None for the family's."""
+    if not run.has_own_tokenizers or not isinstance(run.pounce, PounceConfig):
+        return None
+    prompts = data.instructions_with_subgoals() if run.pounce.reads_subgoal else data.instructions()
+    return tokenizer_of_instructions(prompts)
+
+
+def export(model: JointModel, bundle: PounceBundle, out: Path, *, trained: Trains = "both") -> None:
+    """Writes checkpoint folders of the trained systems for the servers, in place of those of a shorter run."""
+    if trained != "pounce":
+        model.ponder.is_random = False
+        _write(out / "ponder", partial(save_ponder, model.ponder))
+    if trained != "ponder":
+        _write(out / "pounce", partial(save_bundle, replace(bundle, is_random=False, has_fresh_prefix=False)))
+
+
+def _write(folder: Path, save: Callable[[Path], None]) -> None:
+    fresh = folder.with_name(folder.name + ".tmp")
+    shutil.rmtree(fresh, ignore_errors=True)
+    save(fresh)
+    disk.exchange(fresh, folder)
