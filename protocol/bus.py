@@ -107,6 +107,10 @@ class Bus(Protocol):
         """Returns when something may have arrived, or after ``timeout_ns``."""
         ...
 
+    def ring(self) -> None:
+        """Ends another thread's ``wait``: there is something to do that does not come over the bus."""
+        ...
+
     def close(self) -> None: ...
 
 
@@ -202,6 +206,9 @@ class LocalBus:
 
     def wait(self, timeout_ns: int) -> None:
         self.run_participants()
+
+    def ring(self) -> None:
+        """Nobody waits here."""
 
     def close(self) -> None:
         self._subscriptions.clear()

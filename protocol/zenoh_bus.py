@@ -234,6 +234,9 @@ class ZenohBus:
     def wait(self, timeout_ns: int) -> None:
         self._bell.wait(timeout_ns)
 
+    def ring(self) -> None:
+        self._bell.ring()
+
     def close(self) -> None:
         self._session.close()  # type: ignore[no-untyped-call, unused-ignore]
 

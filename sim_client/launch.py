@@ -101,6 +101,7 @@ def start_local(
     *,
     robot: str,
     with_clock: bool,
+    other_robots: Sequence[str] = (),
     allow_starved: bool = False,
     shared_memory: bool = True,
     ponder: Sequence[str] | None,
@@ -109,20 +110,24 @@ def start_local(
     """Starts the servers on sockets of their own, PONDER unless None; returns the endpoints to connect to.
 
     Every process listens on its own socket and connects to the servers it talks to, so that the death of one leaves
-    the links among the others alone.
+    the links among the others alone. The model servers are shared by all robots; each robot has a clock of its own.
     """
     models = {"pounce": pounce} if ponder is None else {"ponder": ponder, "pounce": pounce}
     at_models = [endpoint(proc, daemons.sockets()) for proc in models]
-    common = ["--link.robot", robot, *([] if shared_memory else ["--link.no-shared-memory"])]
+    memory = [] if shared_memory else ["--link.no-shared-memory"]
+    robots = ["--link.robot", robot, *(["--other-robots", *other_robots] if other_robots else [])]
     for (proc, arguments), at_model in zip(models.items(), at_models, strict=True):
-        daemons.start(proc, f"{proc}_server", [*common, "--link.listen", at_model, *arguments])
+        daemons.start(proc, f"{proc}_server", [*robots, *memory, "--link.listen", at_model, *arguments])
     if not with_clock:
         return tuple(at_models)
-    at_clock = endpoint("clock", daemons.sockets())
-    at_clock_arguments = [*common, "--link.listen", at_clock, "--link.connect", *at_models]
-    alone = ["--ponder", "none"] if ponder is None else []
-    daemons.start("clock", "clock", [*at_clock_arguments, *alone, *(["--allow-starved"] if allow_starved else [])])
-    return at_clock, *at_models
+    at_clocks = []
+    options = [*memory, *(["--ponder", "none"] if ponder is None else []), *(["--allow-starved"] * allow_starved)]
+    for index, each in enumerate((robot, *other_robots)):
+        name = f"clock-{index}" if index else "clock"
+        at_clocks.append(endpoint(name, daemons.sockets()))
+        own = ["--link.robot", each, "--link.listen", at_clocks[-1], "--link.connect", *at_models]
+        daemons.start(name, "clock", [*own, *options])
+    return *at_clocks, *at_models
 
 
 def local_link(
@@ -132,6 +137,7 @@ def local_link(
     with_clock: bool,
     allow_starved: bool,
     with_ponder: bool,
+    other_robots: Sequence[str] = (),
     ponder_checkpoint: Path | None,
     pounce_checkpoint: Path | None,
     models: ModelsOptions | None = None,
@@ -141,6 +147,7 @@ def local_link(
     endpoints = start_local(
         daemons,
         robot=link.robot,
+        other_robots=other_robots,
         with_clock=with_clock,
         allow_starved=allow_starved,
         shared_memory=link.shared_memory,

@@ -7,7 +7,8 @@ import logging
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 
 import dual_system.tasks.headless  # noqa: F401 - before anything that imports mujoco
 
@@ -22,6 +23,7 @@ from protocol.link import Link
 from protocol.logs import set_up_logging
 from protocol.messages import Health, ServingState
 from protocol.metrics import End, Metrics
+from protocol.options import LinkOptions
 from protocol.process import StopFlag
 from protocol.status import status_of
 from protocol.version import version
@@ -30,6 +32,7 @@ from sim_client.gateway.http_form import HttpSide
 from sim_client.gateway.machine import Machine
 from sim_client.gateway.memory import Memory
 from sim_client.gateway.options import GatewayOptions
+from sim_client.gateway.seats import Seats, seat_names
 from sim_client.gateway.websocket import WebsocketSide
 from sim_client.launch import Daemons, local_link
 
@@ -48,59 +51,65 @@ def main(argv: list[str] | None = None) -> int:
     with (
         status_of(metrics, options.operations),
         Daemons(options.out) as daemons,
-        _machine(options, daemons, metrics) as machine,
+        _seats(options, daemons, metrics) as seats,
     ):
         if options.local:
-            machine.await_servers(should_stop)  # a client that finds the door open expects to be served
-        with _serving(options, machine):
+            seats.await_servers(should_stop)  # a client that finds the door open expects to be served
+        with _serving(options, seats):
             log.info("ready dialect=%s listen=%s mode=%s", options.dialect, options.listen, options.mode)
-            machine.run(should_stop)
+            seats.run(should_stop)
     return 0
 
 
 @contextmanager
-def _machine(options: GatewayOptions, daemons: Daemons, metrics: Metrics) -> Iterator[Machine]:
-    plan, link = options.plan(), options.link
+def _seats(options: GatewayOptions, daemons: Daemons, metrics: Metrics) -> Iterator[Seats]:
+    link, robots = options.link, seat_names(options.link.robot, options.seats)
     if options.local:
         link = local_link(
             daemons,
             link,
+            other_robots=robots[1:],
             with_clock=options.runs_clock_daemon,
             allow_starved=options.timing.allow_starved,
             with_ponder=options.ponder == "serve",
             ponder_checkpoint=options.ponder_checkpoint,
             pounce_checkpoint=options.pounce_checkpoint,
         )
+    with ExitStack() as opened:
+        yield Seats([_machine(options, replace(link, robot=robot), daemons, metrics, opened) for robot in robots])
+
+
+def _machine(
+    options: GatewayOptions, link: LinkOptions, daemons: Daemons, metrics: Metrics, opened: ExitStack
+) -> Machine:
     bus = open_bus(link)
-    try:
-        robot = Link(bus, robot=link.robot, proc="sim")
-        health = Health(state=ServingState.READY, version=version())
-        metrics.watch(End(link=robot, health=lambda: health, silent_ns=lambda: 0))  # a request may wait for minutes
-        clock = None
-        if not options.runs_clock_daemon:
-            servers = servers_of(policy_of(options.ponder))
-            config = ServiceConfig(allow_starved=options.timing.allow_starved, servers=servers)
-            at_clock = Link(bus, robot=link.robot, proc="clock")
-            clock = ClockService(at_clock, config)
-            metrics.watch(end_of(clock, at_clock, lambda: 0))
-        yield Machine(plan, robot, clock, daemons.dead)
-    finally:
-        bus.close()
+    opened.callback(bus.close)
+    robot = Link(bus, robot=link.robot, proc="sim")
+    health = Health(state=ServingState.READY, version=version())
+    metrics.watch(End(link=robot, health=lambda: health, silent_ns=lambda: 0))  # a request may wait for minutes
+    clock = None
+    if not options.runs_clock_daemon:
+        servers = servers_of(policy_of(options.ponder))
+        config = ServiceConfig(allow_starved=options.timing.allow_starved, servers=servers)
+        at_clock = Link(bus, robot=link.robot, proc="clock")
+        clock = ClockService(at_clock, config)
+        metrics.watch(end_of(clock, at_clock, lambda: 0))
+    return Machine(options.plan(), robot, clock, daemons.dead)
 
 
 @contextmanager
-def _serving(options: GatewayOptions, machine: Machine) -> Iterator[None]:
+def _serving(options: GatewayOptions, seats: Seats) -> Iterator[None]:
     """Listens in its own thread for as long as the block lasts. Raises TransportError if it cannot."""
     host, port = options.address
     max_bytes, terms, dialect = options.clients.max_message_mb << 20, options.terms(), options.dialect_class()
     memory = Memory(options.clients.max_memory_mb << 20)
     if options.dialect == "challenge-http":
-        http = HttpSide((host, port), machine, terms, dialect, max_bytes, options.api_key(), memory)
+        http = HttpSide((host, port), seats, terms, dialect, max_bytes, options.api_key(), memory)
         with _in_thread(http.serve_forever, http.shutdown):
             yield
         http.server_close()
         return
-    side = WebsocketSide(machine, terms, dialect, max_bytes, options.api_key(), memory)
+    side = WebsocketSide(seats, terms, dialect, max_bytes, options.api_key(), memory)
     loop = asyncio.new_event_loop()
     server = loop.run_until_complete(side.start(host, port))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -90,6 +91,19 @@ class Terms:
     state_key: str
     num_proprio: int
     version: str
+
+
+class Door(Protocol):
+    """Where network threads hand in what clients ask: one robot, or several seats."""
+
+    def submit(self, client: str, request: Step | Finish) -> Future[Answer | None]:
+        """The future holds the answer (None of a Finish), or raises Refused.
+
+        Raises:
+            Busy: other clients have all there is.
+            Refused: the gateway was stopped.
+        """
+        ...
 
 
 class Dialect(Protocol):

@@ -1,12 +1,13 @@
 """The challenge over HTTP: ``GET /healthz`` and ``/metadata``, ``POST /reset`` and ``/infer``, bodies in msgpack.
 
 The standard library's server: a handful of requests a second, a thread each, no dependency more. HTTP has no
-connection to tell clients apart by, so a client is a host with its key.
+connection to tell clients apart by, so a client is a host, or one of its sessions if it names them.
 """
 
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -14,14 +15,15 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from protocol.errors import TransportError
 from sim_client.gateway.arrays import pack
 from sim_client.gateway.challenge import RESET_FINISHED
-from sim_client.gateway.exchange import Busy, Dialect, Finish, Packet, Refused, Terms
-from sim_client.gateway.machine import Machine
+from sim_client.gateway.exchange import Busy, Dialect, Door, Finish, Packet, Refused, Terms
 from sim_client.gateway.memory import Memory
 from sim_client.gateway.openpi import metadata
 from sim_client.gateway.websocket import KEY_WANTED, is_allowed
 
 log = logging.getLogger("pp-gateway")
 
+SESSION_HEADER = "X-Session-Id"
+_NO_ID = re.compile(r"[^A-Za-z0-9_.-]+")
 _SILENT_S = 60.0  # a body that stops arriving does not hold its thread
 
 
@@ -38,14 +40,14 @@ class HttpSide(ThreadingHTTPServer):
     def __init__(
         self,
         address: tuple[str, int],
-        machine: Machine,
+        door: Door,
         terms: Terms,
         new_dialect: Callable[[Terms], Dialect],
         max_bytes: int,
         api_key: str = "",
         memory: Memory | None = None,
     ) -> None:
-        self.machine, self.terms, self.new_dialect = machine, terms, new_dialect
+        self.door, self.terms, self.new_dialect = door, terms, new_dialect
         self.max_bytes, self.api_key, self.memory = max_bytes, api_key, memory or Memory()
         try:
             super().__init__(address, _Handler)
@@ -86,12 +88,12 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _done(self, body: bytes) -> Packet:
         """Raises Refused."""
-        machine, dialect = self.server.machine, self.server.new_dialect(self.server.terms)
+        door, dialect = self.server.door, self.server.new_dialect(self.server.terms)
         if self.path == "/reset":
-            machine.submit(self._client, Finish()).result()
+            door.submit(self._client, Finish()).result()
             return pack(RESET_FINISHED, "openpi")
         asked = dialect.read(body)
-        answer = machine.submit(self._client, asked.request).result() if asked.request is not None else None
+        answer = door.submit(self._client, asked.request).result() if asked.request is not None else None
         return dialect.answer(asked, answer) if answer is not None else asked.reply or b""
 
     def _body(self) -> bytes | None:
@@ -134,7 +136,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     @property
     def _client(self) -> str:
-        return f"{self.client_address[0]} over HTTP"
+        session = _NO_ID.sub("", self.headers.get(SESSION_HEADER, ""))[:60]
+        return f"{self.client_address[0]} over HTTP{session and f', session {session}'}"
 
     def _is_allowed(self) -> bool:
         return is_allowed(self.headers.get("Authorization"), self.server.api_key)

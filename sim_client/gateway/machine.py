@@ -45,7 +45,6 @@ from sim_client.suite import versions
 log = logging.getLogger("pp-gateway")
 
 _IDLE_NS = 20_000_000
-_LIVE_TURN_NS = 2_000_000  # a request cannot ring the bus's bell
 _STOPPED = "the gateway was stopped"
 T = TypeVar("T")
 
@@ -126,7 +125,21 @@ class Machine:
         self._lock = threading.Lock()  # of the lease and the next line: network threads read them
         self._is_closed = False
 
+    @property
+    def robot(self) -> str:
+        return self._link.robot
+
     # -- called by network threads
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether it takes no more requests: it was stopped, or has failed."""
+        return self._is_closed
+
+    @property
+    def holder(self) -> str:
+        """The client that has the robot; "" if it is free."""
+        return self._lease.holder
 
     def submit(self, client: str, request: Step | Finish) -> Future[Answer | None]:
         """Hands in a request; the future holds its answer (None of a Finish), or raises Refused.
@@ -143,6 +156,7 @@ class Machine:
             if isinstance(request, Step):
                 self._lease.acquire(client, time.monotonic_ns())
             self._jobs.put(job)
+        self._link.bus.ring()
         return job.future
 
     # -- the working thread
@@ -164,7 +178,7 @@ class Machine:
                     else "ready"
                 )
                 if states.get(health.header.proc) != state:
-                    log.info("server=%s state=%s %s", health.header.proc, state, health.detail)
+                    log.info("robot=%s server=%s state=%s %s", self.robot, health.header.proc, state, health.detail)
                 states[health.header.proc] = state
             if (why := self._dead_server()) or should_stop():
                 raise TransportError(why or _STOPPED)
@@ -191,7 +205,7 @@ class Machine:
         is_live = self._episode is not None and isinstance(self._episode.node, LiveNode)
         with contextlib.suppress(queue.Empty):
             self._work(self._jobs.get(block=not is_live, timeout=_IDLE_NS / 1e9))
-        self._turn(_LIVE_TURN_NS if is_live else 0)
+        self._turn(_IDLE_NS if is_live else 0)
         if is_live:
             self._look_after_live()
 

@@ -23,6 +23,9 @@ from sim_client.gateway import body, challenge, mme_vla, openpi, vla_eval
 from sim_client.gateway.exchange import Dialect, Terms
 from sim_client.gateway.machine import Plan
 
+MAX_SEATS = 64
+"""Each is a thread, a bus and, in real time, a clock of its own: more robots want another gateway on another host."""
+
 DialectName = Literal["openpi", "challenge", "challenge-http", "mme-vla", "vla-eval"]
 _SPOKEN: dict[DialectName, tuple[type[Dialect], Mapping[str, str], str, int]] = {
     # by name: who speaks it, where it has the cameras and the state, and how many rows an answer usually has
@@ -93,7 +96,7 @@ class LogOptions:
     task: str = "gateway"
     """Name of the task in logs if the client does not give one."""
     seed: int = 0
-    """Seed of the first episode; each further one uses the next."""
+    """Seed of a seat's first episode; each further one uses the next."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,6 +129,8 @@ class GatewayOptions:
     """PONDER's checkpoint, with --local. None: random weights."""
     pounce_checkpoint: Path | None = None
     """POUNCE's checkpoint, with --local. None: random weights."""
+    seats: int = 1
+    """Number of robots, hence of clients at a time. Their names are --link.robot, and that with -1, -2 and so on."""
     out: Path = Path("out")
     """Folder for one MCAP per episode."""
     clients: tyro.conf.OmitArgPrefixes[ClientsOptions] = field(default_factory=ClientsOptions)
@@ -143,6 +148,8 @@ class GatewayOptions:
             raise TransportError("--ponder none starts no PONDER: leave --ponder-checkpoint out")
         host, _ = self.address
         rows, horizon = self.terms().rows, schedules.HORIZON
+        if not 1 <= self.seats <= MAX_SEATS:
+            raise TransportError(f"--seats {self.seats}: expected 1 to {MAX_SEATS}")
         if not 1 <= rows <= horizon:
             raise TransportError(f"--rows {rows}: POUNCE's chunks have {horizon} rows, expected 1 to {horizon}")
         if self.dialect == "vla-eval" and rows != 1:

@@ -18,8 +18,7 @@ from websockets.http11 import Request, Response
 
 from protocol.errors import TransportError
 from protocol.messages import Mode
-from sim_client.gateway.exchange import Answer, ClientRequest, Dialect, Finish, Packet, Refused, Terms
-from sim_client.gateway.machine import Machine
+from sim_client.gateway.exchange import Answer, ClientRequest, Dialect, Door, Finish, Packet, Refused, Terms
 from sim_client.gateway.memory import Memory, counted
 from sim_client.gateway.openpi import metadata
 
@@ -32,7 +31,7 @@ _PING_S = 20.0
 class WebsocketSide:
     """Serves one dialect. ``api_key``: the key that clients must send; "" admits all."""
 
-    machine: Machine
+    door: Door
     terms: Terms
     new_dialect: Callable[[Terms], Dialect]
     max_bytes: int
@@ -82,7 +81,7 @@ class WebsocketSide:
             async for packet in connection:
                 try:
                     asked = await asyncio.to_thread(dialect.read, packet)
-                    future = self.machine.submit(client, asked.request) if asked.request is not None else None
+                    future = self.door.submit(client, asked.request) if asked.request is not None else None
                 except Refused as error:
                     log.warning("client=%s refused: %s", client, error)
                     await connection.send(dialect.refuse(str(error)))
@@ -98,7 +97,7 @@ class WebsocketSide:
             for task in under_way:
                 task.cancel()
             with contextlib.suppress(Refused):  # the gateway is being stopped, and ends the episode itself
-                self.machine.submit(client, Finish(reason="the client left"))
+                self.door.submit(client, Finish(reason="the client left"))
             log.info("client=%s left", client)
 
     async def _reply(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -110,3 +111,52 @@ def test_the_log_follows_from_itself_and_holds_what_the_client_played(episode: A
     assert sent.tobytes() == played[: len(sent)].tobytes()
     assert record.result is not None
     assert record.result.status == m.TaskStatus.ABORTED  # the gateway was stopped while the client was connected
+
+
+def test_clients_on_one_port_play_side_by_side_on_one_pair_of_servers(tmp_path: Path) -> None:
+    """Whoever sits beside them, equal requests get equal rows: batches change the last bits only."""
+    client_module = pytest.importorskip("openpi_client.websocket_client_policy")
+    gateway = Gateway(tmp_path, "--dialect", "openpi", "--seats", "2", "--rows", str(NUM_ROWS))
+    clients = [client_module.WebsocketClientPolicy("127.0.0.1", gateway.port) for _ in range(3)]
+
+    def ask(client: Any, shade: int) -> Any:
+        picture = np.full((256, 256, 3), shade, np.uint8)
+        return client.infer(
+            {
+                "observation/image": picture,
+                "observation/wrist_image": picture,
+                "observation/state": np.array([0, 0, 0, -1.5, 0, 1.8, 0, 0.04], np.float32),
+                "prompt": "pick the cube",
+            }
+        )["actions"]
+
+    try:
+        rows: list[list[np.ndarray]] = [[], []]
+        for shade in range(3):
+            threads = [
+                threading.Thread(target=lambda one=one, shade=shade: rows[one].append(ask(clients[one], shade)))
+                for one in range(2)
+            ]
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join(PATIENCE_S)
+        with pytest.raises(RuntimeError, match="all 2 seats are taken"):
+            ask(clients[2], 0)
+        np.testing.assert_allclose(np.concatenate(rows[0]), np.concatenate(rows[1]), rtol=0, atol=1e-4)
+        clients[0]._ws.close()
+        deadline_s = time.monotonic() + PATIENCE_S
+        while "client left" not in gateway.log.read_text():
+            assert time.monotonic() < deadline_s
+            time.sleep(0.05)
+        assert ask(clients[2], 0).shape == (NUM_ROWS, 8)
+        assert gateway.stop() == 0
+        logs = list(tmp_path.rglob("*.mcap"))
+        assert len(logs) == 3
+        assert {read_log(path).info.header.robot for path in logs} == {"r0", "r0-1"}
+        assert [next(disagreements(read_log(path)), None) for path in logs] == [None] * 3
+    finally:
+        for client in clients:
+            client._ws.close()
+        gateway.process.kill()
+        gateway.process.wait()

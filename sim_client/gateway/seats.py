@@ -1,0 +1,87 @@
+"""Several robots behind one door: every client has a seat of its own, or hears that none is free.
+
+A seat is a `Machine` with a robot's name, a bus and a thread of its own; seats share nothing but the model servers.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+
+from protocol.errors import TransportError
+from sim_client.gateway.exchange import Answer, Busy, Finish, Step
+from sim_client.gateway.machine import Machine
+
+log = logging.getLogger("pp-gateway")
+
+
+def seat_names(robot: str, count: int) -> tuple[str, ...]:
+    """The robots' names of so many seats: ``robot``, ``robot-1``, ``robot-2`` and so on."""
+    return (robot, *(f"{robot}-{index}" for index in range(1, count)))
+
+
+class Seats:
+    """Hands each client's requests to its seat. ``submit`` is for network threads, as a machine's."""
+
+    def __init__(self, machines: Sequence[Machine]) -> None:
+        self._machines = machines
+        self._lock = threading.Lock()  # of finding a seat and taking it
+
+    def submit(self, client: str, request: Step | Finish) -> Future[Answer | None]:
+        """Hands in a request; the future holds its answer (None of a Finish), or raises Refused.
+
+        Raises:
+            Busy: every seat is taken.
+            Refused: the gateway was stopped.
+        """
+        with self._lock:
+            theirs = [each for each in self._machines if each.holder == client]
+            if theirs or isinstance(request, Finish):
+                return (theirs or self._machines)[0].submit(client, request)
+            working = [each for each in self._machines if not each.is_closed] or self._machines
+            for machine in sorted(working, key=lambda each: each.holder != ""):  # then who fell silent loses
+                try:
+                    return machine.submit(client, request)
+                except Busy as error:
+                    why = error
+        if len(working) == 1:
+            raise why
+        raise Busy(
+            f"all {len(working)} seats are taken, one of them by {working[-1].holder}. Wait until a client has "
+            "finished or left, or start pp-gateway with more --seats, and its servers with as many robots."
+        )
+
+    def await_servers(self, should_stop: Callable[[], bool]) -> None:
+        """Waits until both model servers are ready for every seat. Raises TransportError as a machine does."""
+        for machine in self._machines:
+            machine.await_servers(should_stop)
+
+    def run(self, should_stop: Callable[[], bool]) -> None:
+        """Works until ``should_stop()``, each seat in a thread. One that fails leaves the others.
+
+        Raises:
+            TransportError: all have failed.
+        """
+        if len(self._machines) == 1:
+            self._machines[0].run(should_stop)
+            return
+        threads = [
+            threading.Thread(target=_run, args=(machine, should_stop), name=machine.robot, daemon=True)
+            for machine in self._machines
+        ]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            while thread.is_alive():
+                thread.join(0.2)  # in slices, so that a signal is handled
+        if not should_stop():
+            raise TransportError("every seat has failed; the log says why")
+
+
+def _run(machine: Machine, should_stop: Callable[[], bool]) -> None:
+    try:
+        machine.run(should_stop)
+    except Exception:  # a bug: the others' robots are not to stop for it
+        log.exception("seat=%s failed, and is closed", machine.robot)
