@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pounce_server.contract import EngineSpec, Progress, Request, check_request, no_progress
-from pounce_server.remote.peer import Patience, Peer, PeerError
+from pounce_server.remote.peer import Lost, Patience, Peer, PeerError
 from protocol.errors import EpisodeRefused
 from protocol.messages import EpisodeInfo, Refusal
 from protocol.peers.mapping import PolicyMapping
@@ -118,12 +118,14 @@ class RemoteEngine:
             try:
                 facts = self._peer.facts(patience)
                 break
-            except (PeerError, OSError) as error:
+            except (Lost, OSError) as error:
                 self._peer.close()
                 if patience.is_over:
                     raise PeerError(f"{self._sentence(error)}: start it, or wait longer with --start-s") from error
                 log.info("waiting for %s: %s", url, error)
                 time.sleep(min(_START_AGAIN_S, start_s))
+            except PeerError as error:
+                raise PeerError(self._sentence(error)) from error
         try:
             self._answer(self._example(), patience)
         except WrongAnswer as error:

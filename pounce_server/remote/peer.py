@@ -19,7 +19,7 @@ class PeerError(ValueError):
 
 
 class Lost(PeerError):
-    """A connection that ended; there may be another one."""
+    """A connection that ended, or could not be made: the server may come yet."""
 
 
 @dataclass(slots=True)

@@ -32,7 +32,7 @@ class Socket:
         return self._connection is not None
 
     def open(self) -> None:
-        """Raises PeerError, OSError."""
+        """Raises Lost, OSError."""
         where = urlsplit(self._url)
         port = where.port or (443 if where.scheme == "wss" else 80)
         link = socket.create_connection((where.hostname or "", port), _OPEN_S)
@@ -52,7 +52,7 @@ class Socket:
             self._connection = opening.__enter__()  # left by close_socket: __exit__ would wait for the other side
         except (WebSocketException, TimeoutError, ValueError) as error:
             link.close()
-            raise PeerError(f"no websocket there: {str(error) or type(error).__name__}") from error
+            raise Lost(f"no websocket there: {str(error) or type(error).__name__}") from error
 
     def send(self, data: bytes) -> None:
         """Raises Lost: the connection is closed, or the server reads nothing."""
