@@ -38,7 +38,11 @@ class RemoteEngine:
         """
         self._peer, self._mapping, self._answer_s = peer, mapping, answer_s
         self._cameras = tuple(camera.camera for camera in mapping.cameras)
-        facts = self._first_answer(url, start_s)
+        try:
+            facts = self._first_answer(url, start_s)
+        except ValueError:
+            peer.close()
+            raise
         log.info("policy url=%s mapping=%s says %s", url, mapping.name, facts)
         identity = hashlib.sha256(f"{url} {mapping.digest} {facts}".encode()).hexdigest()[:12]
         self._facts, self._url = facts, url

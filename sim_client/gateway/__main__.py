@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from functools import partial
 
 import dual_system.tasks.headless  # noqa: F401 - before anything that imports mujoco
 
@@ -28,6 +29,7 @@ from protocol.process import StopFlag
 from protocol.status import status_of
 from protocol.version import version
 from protocol.zenoh_bus import open_bus
+from sim_client.gateway.groot import GrootDialect
 from sim_client.gateway.http_form import HttpSide
 from sim_client.gateway.machine import Machine
 from sim_client.gateway.memory import Memory
@@ -108,6 +110,13 @@ def _serving(options: GatewayOptions, seats: Seats) -> Iterator[None]:
         with _in_thread(http.serve_forever, http.shutdown):
             yield
         http.server_close()
+        return
+    if issubclass(dialect, GrootDialect):
+        from sim_client.gateway.zmq_side import ZmqSide  # pyzmq is needed here alone
+
+        zmq = ZmqSide((host, port), seats, terms, partial(dialect, api_token=options.api_key()), max_bytes)
+        with _in_thread(zmq.serve_forever, zmq.shutdown):
+            yield
         return
     side = WebsocketSide(seats, terms, dialect, max_bytes, options.api_key(), memory)
     loop = asyncio.new_event_loop()

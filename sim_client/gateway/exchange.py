@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.messages import Floats, Level, Mode, TaskStatus
+from protocol.peers.mapping import PolicyMapping
 
 Frames = Mapping[str, NDArray[np.uint8]]
 """Camera name -> (height, width, 3) RGB."""
@@ -82,6 +83,7 @@ class Terms:
     """Facts that a client may know before its first request, and the keys that its dialect reads.
 
     ``cameras`` are our names with the client's keys; an empty key: the client's pictures in their own order.
+    ``mapping``: names and units of a policy's client, for GR00T's dialects.
     """
 
     mode: Mode
@@ -91,6 +93,7 @@ class Terms:
     state_key: str
     num_proprio: int
     version: str
+    mapping: PolicyMapping | None = None
 
 
 class Door(Protocol):

@@ -57,7 +57,9 @@ class GrootDialect:
     def answer(self, asked: ClientRequest, answer: Answer) -> bytes:
         num_commands = answer.rows_NA.shape[1]
         if num_commands != self._mapping.num_commands:
-            raise Refused(f"{self._mapping.name} maps {self._mapping.num_commands} commands, the robot has {num_commands}")
+            raise Refused(
+                f"{self._mapping.name} maps {self._mapping.num_commands} commands, the robot has {num_commands}"
+            )
         arrays = answer_of(self._mapping, answer.rows_NA)
         if self.is_flat:
             return self._packed({f"action.{named(key)}": array for key, array in arrays.items()})
@@ -105,7 +107,9 @@ class GrootDialect:
 
     def _text(self, observation: Mapping[Any, Any]) -> str:
         key = named(self._mapping.prompt.key)
-        value = reading.field(observation if self.is_flat else self._within(observation, "language"), key, "the instruction")
+        value = reading.field(
+            observation if self.is_flat else self._within(observation, "language"), key, "the instruction"
+        )
         while isinstance(value, list) and len(value) == 1:
             value = value[0]
         if isinstance(value, list) and value:

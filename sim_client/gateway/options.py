@@ -17,16 +17,18 @@ from protocol import files
 from protocol.errors import TransportError
 from protocol.messages import Delay, DelayKind, Schedule, WaitKind
 from protocol.options import LinkOptions, OperationsOptions
+from protocol.peers.mapping import PolicyMapping, read_mapping
 from protocol.sockets import endpoint
 from protocol.version import version
-from sim_client.gateway import body, challenge, mme_vla, openpi, vla_eval
+from sim_client.gateway import body, challenge, groot, mme_vla, openpi, vla_eval
 from sim_client.gateway.exchange import Dialect, Terms
 from sim_client.gateway.machine import Plan
 
 MAX_SEATS = 64
 """Each is a thread, a bus and, in real time, a clock of its own: more robots want another gateway on another host."""
 
-DialectName = Literal["openpi", "challenge", "challenge-http", "mme-vla", "vla-eval"]
+DialectName = Literal["openpi", "challenge", "challenge-http", "mme-vla", "vla-eval", "groot", "groot-n1.5"]
+GROOT: tuple[DialectName, ...] = ("groot", "groot-n1.5")
 _SPOKEN: dict[DialectName, tuple[type[Dialect], Mapping[str, str], str, int]] = {
     # by name: who speaks it, where it has the cameras and the state, and how many rows an answer usually has
     "openpi": (openpi.OpenpiDialect, openpi.CAMERAS, openpi.STATE_KEY, 1),
@@ -34,6 +36,8 @@ _SPOKEN: dict[DialectName, tuple[type[Dialect], Mapping[str, str], str, int]] = 
     "challenge-http": (challenge.ChallengeDialect, challenge.CAMERAS, challenge.JOINTS_KEY, schedules.HORIZON),
     "mme-vla": (mme_vla.MmeVlaDialect, openpi.CAMERAS, openpi.STATE_KEY, mme_vla.ROWS),
     "vla-eval": (vla_eval.VlaEvalDialect, vla_eval.CAMERAS, "states", 1),
+    "groot": (groot.GrootDialect, {}, "", 0),  # these two have all of it in a mapping file
+    "groot-n1.5": (groot.GrootN15Dialect, {}, "", 0),
 }
 
 
@@ -64,7 +68,8 @@ class ClientsOptions:
     """Access of clients, and limits of their requests."""
 
     api_key_file: Path | None = None
-    """File with a word that clients must send as "Authorization: Api-Key WORD", as openpi-client's api_key does."""
+    """File with a word that clients must send: as "Authorization: Api-Key WORD", which openpi-client's api_key does, or
+    as GR00T's api_token."""
     open_to_anyone: bool = False
     """Listen beyond loopback without a key: any host that reaches the port drives the robot."""
     idle_s: float = 300.0
@@ -101,7 +106,7 @@ class LogOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GatewayOptions:
-    """Lets clients of other protocols drive PONDER and POUNCE: openpi's, RoboMME's two evaluators', vla-eval's."""
+    """Lets clients of other protocols drive PONDER and POUNCE: openpi, RoboMME's two evaluators, vla-eval, GR00T."""
 
     dialect: DialectName
     """Protocol of the clients."""
@@ -111,12 +116,16 @@ class GatewayOptions:
     """Clock. lockstep: a request is --rows ticks of virtual time, and models may take their time. realtime: the
     schedule runs by itself, and a request is answered immediately with the action commanded at that moment."""
     rows: int | None = None
-    """Number of rows in an answer, played by the client before its next request. None: 1, and 20 for the challenge."""
+    """Number of rows in an answer, played by the client before its next request. None: 1, 20 for the challenge, and the
+    mapping file's horizon for GR00T."""
     robot_file: Path | None = None
     """TOML description of the robot, see docs/gateway.md. None: the Panda of our tasks and of RoboMME."""
     cameras: tuple[str, ...] = ()
     """Pairs NAME=KEY, one per camera of ours, e.g. front=observation/image wrist=observation/wrist_image. Empty: the
     dialect's usual keys; in vla-eval the first picture is the front camera's and the second the wrist's."""
+    mapping: Path | None = None
+    """TOML file with the client's names and units for cameras, state and actions, for the dialects of GR00T; see
+    docs/policies.md."""
     state_key: str | None = None
     """Key of the measured joints. None: the dialect's usual key."""
     image_px: int | None = None
@@ -147,9 +156,13 @@ class GatewayOptions:
         if self.ponder == "none" and self.ponder_checkpoint is not None:
             raise TransportError("--ponder none starts no PONDER: leave --ponder-checkpoint out")
         host, _ = self.address
+        if self.dialect in GROOT and self.mapping is None:
+            raise TransportError(f"--dialect {self.dialect} needs a --mapping file: its clients name every number")
         rows, horizon = self.terms().rows, schedules.HORIZON
         if not 1 <= self.seats <= MAX_SEATS:
             raise TransportError(f"--seats {self.seats}: expected 1 to {MAX_SEATS}")
+        if (mapping := self.policy_mapping()) is not None:
+            self._check_mapping(mapping)
         if not 1 <= rows <= horizon:
             raise TransportError(f"--rows {rows}: POUNCE's chunks have {horizon} rows, expected 1 to {horizon}")
         if self.dialect == "vla-eval" and rows != 1:
@@ -170,6 +183,19 @@ class GatewayOptions:
             )
         if self.clients.api_key_file and self.dialect == "vla-eval":
             raise TransportError("--api-key-file: vla-eval sends no key; use --open-to-anyone, or a tunnel")
+
+    def _check_mapping(self, mapping: PolicyMapping) -> None:
+        """Raises TransportError or FileError for a client that this robot could not be."""
+        assert self.mapping is not None, "it was read"
+        if self.dialect not in GROOT:
+            raise TransportError(f"--mapping: --dialect {self.dialect} has names of its own; see --cameras")
+        with files.reading(self.mapping, "mapping file for this robot"):
+            groot.check_mapping(mapping)
+            num_proprio = self.body().num_proprio
+            if mapping.num_proprio != num_proprio:
+                raise ValueError(f"num_proprio is {mapping.num_proprio}, the robot's {num_proprio}; see --robot-file")
+            if mapping.play_hz != schedules.CONTROL_HZ:
+                raise ValueError(f"play_hz is {mapping.play_hz}, the robot's {schedules.CONTROL_HZ}")
 
     @property
     def address(self) -> tuple[str, int]:
@@ -195,23 +221,33 @@ class GatewayOptions:
     def terms(self) -> Terms:
         """The terms for the dialect. Raises TransportError for a camera that is not NAME=KEY."""
         _, cameras, state_key, rows = _SPOKEN[self.dialect]
+        mapping = self.policy_mapping()
         pairs = [each.partition("=") for each in self.cameras]
         if any(not name or not key for name, _, key in pairs):
             raise TransportError(f"--cameras {' '.join(self.cameras)}: expected NAME=KEY, e.g. front=observation/image")
         return Terms(
             mode=self.schedule(0).mode,
-            rows=self.rows if self.rows is not None else rows,
+            rows=self.rows if self.rows is not None else rows or self._mapped_rows(),
             control_hz=schedules.CONTROL_HZ,
             cameras={name: key for name, _, key in pairs} or cameras,
             state_key=self.state_key or state_key,
             num_proprio=self.body().num_proprio,
             version=version(),
+            mapping=mapping,
         )
+
+    def policy_mapping(self) -> PolicyMapping | None:
+        """The client's names and units. Raises OSError, FileError unless the file has them."""
+        return read_mapping(self.mapping) if self.mapping is not None else None
+
+    def _mapped_rows(self) -> int:
+        mapping = self.policy_mapping()
+        return mapping.num_rows if mapping is not None else 1
 
     def schedule(self, seed: int) -> Schedule:
         """The schedule of the episode with this seed."""
         base = schedules.realtime() if self.mode == "realtime" else schedules.paper()
-        rows = self.rows or _SPOKEN[self.dialect][3]
+        rows = self.rows or _SPOKEN[self.dialect][3] or self._mapped_rows()
         every_ticks = rows if self.mode == "lockstep" and rows > 1 else base.invoke_period_ticks
         fixed = Delay(kind=DelayKind.FIXED, mean_ns=self.timing.delay_ms * NS_PER_MS)
         return replace(

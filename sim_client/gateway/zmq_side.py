@@ -15,8 +15,7 @@ from concurrent.futures import Future
 import zmq
 
 from protocol.errors import TransportError
-from sim_client.gateway.exchange import Answer, ClientRequest, Dialect, Packet, Refused, Terms
-from sim_client.gateway.machine import Machine
+from sim_client.gateway.exchange import Answer, ClientRequest, Dialect, Door, Packet, Refused, Terms
 
 log = logging.getLogger("pp-gateway")
 
@@ -35,16 +34,16 @@ class ZmqSide:
     def __init__(
         self,
         address: tuple[str, int],
-        machine: Machine,
+        door: Door,
         terms: Terms,
         new_dialect: Callable[[Terms], Dialect],
         max_bytes: int,
     ) -> None:
-        self._machine, self._terms, self._new_dialect = machine, terms, new_dialect
+        self._door, self._terms, self._new_dialect = door, terms, new_dialect
         self._dialects: OrderedDict[str, Dialect] = OrderedDict()
         self._pending: list[tuple[bytes, Dialect, ClientRequest, Future[Answer | None]]] = []
         self._should_stop = threading.Event()
-        self._socket = zmq.Context.instance().socket(zmq.ROUTER)
+        self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.ROUTER)
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.MAXMSGSIZE, max_bytes)
         self._socket.setsockopt(zmq.RCVHWM, _MAX_WAITING)
@@ -83,7 +82,7 @@ class ZmqSide:
             if asked.request is None:
                 self._send(identity, asked.reply)
                 return
-            self._pending.append((identity, dialect, asked, self._machine.submit(client, asked.request)))
+            self._pending.append((identity, dialect, asked, self._door.submit(client, asked.request)))
         except Refused as error:
             log.warning("client=%s refused: %s", client, error)
             self._send(identity, dialect.refuse(str(error)))
