@@ -16,6 +16,7 @@ import tyro
 
 from clock.check_answers import answers_of, check_invocations, check_queries, check_stamps
 from clock.check_findings import Disagreement, compare
+from clock.check_shadow import check_shadows
 from clock.check_ticks import check_deadlines, check_rows
 from clock.report import CLOCK_LOST_EVENT, statistics, stream_sha256
 from clock.residual import DEFAULT_LOADER, RESIDUAL_EVENT, ResidualHead, load_head
@@ -59,6 +60,7 @@ def disagreements(record: EpisodeRecord, residual: ResidualHead | None = None) -
         yield from check_rows(record, answers, residual)
     else:
         yield from check_deadlines(record)
+    yield from check_shadows(record)
     yield from check_result(record)
 
 
@@ -122,6 +124,8 @@ def _check(path: Path, config: CheckConfig, head: ResidualHead | None) -> int:
         return UNREADABLE
     text = f"{path}: " + ("agrees" if found is None else f"DISAGREES: {found}")
     text += f" ({len(record.ticks)} ticks, {len(record.queries)} queries, {len(record.invocations)} invocations)"
+    if shadows := len(record.shadow_cognitions) + len(record.shadow_chunks):
+        text += f"; {shadows} answers of shadows, never used"
     if record.recovered:
         text += f"; {record.why}"
     if dropped:

@@ -43,6 +43,7 @@ from protocol.topics import (
     OPEN,
     PHASE,
     QUERY,
+    SHADOW_OF,
     STAMP,
     TICK,
     TIME,
@@ -57,6 +58,7 @@ NUM_TIME_EXCHANGES = 8
 ROBOT_SILENCE_NS = 1_000_000_000
 _CALL_NS = 2_000_000_000
 OPEN_NS = 120_000_000_000  # a long demonstration is encoded inside this call
+MAX_SHADOW_QUERIES = 4  # for later ones it would fetch a journal from this thread, while rows are played
 _TOPIC_OF: dict[type, Topic[object]] = {
     t.cls: t  # type: ignore[misc]
     for t in (QUERY, STAMP, INVOCATION, ACTION, TICK, EVENT)
@@ -538,10 +540,12 @@ class ClockService:
             return m.ActiveReply(error="the journal of this episode outgrew its limit: its context cannot be rebuilt")
         if why_not := self._admit(request.header):
             return m.ActiveReply(error=why_not)
-        conductor, invoked = self._episode.conductor, self._episode.invoked
+        conductor, invoked, opened = self._episode.conductor, self._episode.invoked, self._episode.request
+        if request.header.proc == "pounce-shadow":
+            opened = replace(opened, demo=())  # megabytes that a POUNCE does not read, while rows are played
         is_owed = invoked is not None and invoked.invocation == conductor.owed_invocation
         return m.ActiveReply(
-            open=replace(self._episode.request, members=self._members()),
+            open=replace(opened, members=self._members()),
             num_queries=len(self._episode.journal),
             owed_query=conductor.owed_query,
             owed_invocation=codec.encode(invoked) if is_owed else b"",
@@ -555,6 +559,8 @@ class ClockService:
     def _admit(self, asking: m.Header) -> str:
         """Lets a restarted server take the place of the one that is lost; returns why not, or ""."""
         proc = asking.proc
+        if proc in SHADOW_OF:
+            return self._admit_shadow(asking)
         if proc not in SERVERS:
             return f"{proc} has no part in an episode; expected {' or '.join(SERVERS)}"
         if self._link.members[proc] == asking.boot_id:
@@ -565,6 +571,22 @@ class ClockService:
         self._watch.members[proc] = asking.boot_id
         text = f"{source_of(asking)} takes the place of the {proc} that is lost"
         self._event(m.Severity.INFO, ADMITTED_EVENT, text, proc=proc, boot_id=str(asking.boot_id))
+        return ""
+
+    def _admit_shadow(self, asking: m.Header) -> str:
+        """Lets a process be heard by the log, and by nothing here. It costs this thread one reply, near the beginning."""
+        proc, episode = asking.proc, self._episode
+        assert episode is not None
+        if self._watch.has_rival(proc, self._host.now_ns()):
+            return f"two processes answer to the name of {proc}: stop one of them"
+        if SHADOW_OF[proc] not in episode.servers:
+            return f"there is no {SHADOW_OF[proc]} in this episode"
+        if SHADOW_OF[proc] == "ponder" and len(episode.journal) > MAX_SHADOW_QUERIES:
+            return f"query {len(episode.journal)}: a PONDER stands behind another from the beginning; the next episode"
+        if self._link.members.get(proc) != asking.boot_id:
+            self._link.admit(m.Member(proc=proc, boot_id=asking.boot_id))
+            text = f"{source_of(asking)} is asked like {SHADOW_OF[proc]}, and its answers are never used"
+            self._event(m.Severity.INFO, ADMITTED_EVENT, text, proc=proc, boot_id=str(asking.boot_id))
         return ""
 
     def _on_journal(self, request: m.JournalRequest) -> m.JournalReply:

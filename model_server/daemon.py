@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from typing import Protocol, TypeVar
 
 from model_server.shell import ModelShell
@@ -16,6 +17,7 @@ from protocol.messages import ServingState
 from protocol.metrics import End, Metrics
 from protocol.options import DaemonOptions, LinkOptions
 from protocol.process import StopFlag, host_clock_id, run
+from protocol.sockets import endpoint
 from protocol.status import status_of
 from protocol.version import version
 from protocol.watchdog import watchdog
@@ -44,6 +46,8 @@ def serve_model(
     load: Callable[[], EngineT],
     make: Callable[[Link, EngineT, Heartbeat, str], ModelServer],
     operations: DaemonOptions | None = None,
+    *,
+    is_shadow: bool = False,
 ) -> int:
     """Runs a model server until SIGTERM or SIGINT; returns the exit status, 2 if it could not start.
 
@@ -55,7 +59,10 @@ def serve_model(
         load: builds the engine; raises OSError or ValueError with a message for the user.
         make: builds the server around the engine.
         operations: what it tells its operators, and how it leaves; None: logs on standard error.
+        is_shadow: answer for the log only, beside the server that is used.
     """
+    if is_shadow:
+        link_options = behind(link_options, proc)
     operations = operations or DaemonOptions()
     should_stop = StopFlag(drains=True, sigterm_drains=operations.drain)
     metrics = Metrics()
@@ -69,7 +76,7 @@ def serve_model(
             return 2
         opened.callback(bus.close)
         opened.enter_context(watchdog(metrics))
-        link = Link(bus, robot=link_options.robot, proc=proc)
+        link = Link(bus, robot=link_options.robot, proc=f"{proc}-shadow" if is_shadow else proc)
         heartbeat = Heartbeat(link, version(), host_clock_id())
         metrics.watch(_end(link, heartbeat))
         heartbeat.set(state=ServingState.LOADING, detail=weights)
@@ -91,6 +98,12 @@ def serve_model(
         run(bus, server.step, lambda: should_stop() or (should_stop.is_draining and _is_drained(server)))
         heartbeat.set(state=ServingState.CLOSING)
     return 0
+
+
+def behind(link: LinkOptions, proc: str) -> LinkOptions:
+    """The link of ``proc``'s shadow: by default a socket of its own, and the clock service's."""
+    listens = link.listen if link.listen != (endpoint(proc),) else (endpoint(f"{proc}-shadow"),)
+    return replace(link, listen=listens, connect=link.connect or (endpoint("clock"),))
 
 
 def _end(link: Link, heartbeat: Heartbeat, num_superseded: Callable[[], int] = lambda: 0) -> End:

@@ -87,6 +87,12 @@ class Membership:
         """Whether the clock service's word on the running episode is still to come."""
         return self._asked is not None
 
+    def leave(self) -> None:
+        """Ends the running episode here, and lets the clock service be asked for the next one at once: for shadows."""
+        if self._link.episode:
+            self._leave()
+        self._ask_again_ns = 0
+
     def rejoin(self) -> m.ActiveReply | None:
         """Asks the clock service for the running episode, at most once a second, and opens it here.
 

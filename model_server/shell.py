@@ -54,6 +54,8 @@ class ModelShell(ABC):
         self._warmed_engine = engine
         self._membership = Membership(link, heartbeat, self._contract, self._open, self._close)
         self._observations = link.subscribe(topics.OBSERVATION, keep=KEEP_OBSERVATIONS)
+        self._is_shadow = link.proc in topics.SHADOW_OF
+        self._infos = link.subscribe(topics.INFO) if self._is_shadow else None
 
     @property
     def shells(self) -> tuple[ModelShell, ...]:
@@ -65,8 +67,8 @@ class ModelShell(ABC):
         """Number of requests that a newer one replaced before the model read them."""
 
     def drain(self) -> bool:
-        """Opens no more episodes from now on; returns whether none runs."""
-        return self._membership.drain()
+        """Opens no more episodes from now on; returns whether none runs. Nobody misses a shadow."""
+        return self._membership.drain() or self._is_shadow
 
     @abstractmethod
     def step(self) -> bool: ...
@@ -125,6 +127,9 @@ class ModelShell(ABC):
     def _take_calls(self) -> bool:
         """Answers the clock service, and asks it in case an episode began or goes on without this server."""
         worked = self._membership.step()
+        for info in self._infos.drain() if self._infos is not None else ():  # nobody opens a shadow's episode
+            if info.header.proc == "clock" and info.header.episode != self._link.episode:
+                self._membership.leave()
         if self._membership.may_have_missed_one and self._heartbeat.health.state == m.ServingState.READY:
             worked |= self.rejoin()
         return worked

@@ -103,14 +103,24 @@ def main(argv: list[str] | None = None) -> int:
     weights = str(options.checkpoint or f"random weights ({options.random.size})")
     if options.backend == "official":
         build = partial(build_official, options)
-        return serve_model("ponder", options.link, weights, build, PonderServer, options.operations)
+        return serve_model(
+            "ponder", options.link, weights, build, PonderServer, options.operations, is_shadow=options.shadow
+        )
 
     def make(link: Link, engine: BatchingEngine, heartbeat: Heartbeat, version: str) -> PonderServer | PonderFleet:
         if not options.robots.other_robots:
             return PonderServer(link, engine, heartbeat, version)
         return PonderFleet(link, engine, heartbeat, version, other_robots=options.robots.other_robots)
 
-    return serve_model("ponder", options.link, weights, lambda: build_engine(options), make, options.operations)
+    return serve_model(
+        "ponder",
+        options.link,
+        weights,
+        lambda: build_engine(options),
+        make,
+        options.operations,
+        is_shadow=options.shadow,
+    )
 
 
 if __name__ == "__main__":

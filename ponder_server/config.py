@@ -99,6 +99,8 @@ class PonderOptions:
     """Device of the network: cpu, cuda or cuda:N."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Number format of weights and activations."""
+    shadow: bool = False
+    """Answer what the running PONDER is asked, for the log only: nothing of it is used. See docs/operations.md."""
     link: LinkOptions = field(default_factory=lambda: LinkOptions(listen=(endpoint("ponder"),)))
     operations: tyro.conf.OmitArgPrefixes[DaemonOptions] = field(default_factory=DaemonOptions)
     context: tyro.conf.OmitArgPrefixes[ContextOptions] = field(default_factory=ContextOptions)

@@ -200,7 +200,7 @@ class RobotServer(PonderServer):
 
     def _is_owed(self, work: Work) -> bool:
         """Whether the clock waits for the answer; otherwise only the context needs the query."""
-        return self._rebuild is None or work.query.query == self._rebuild.owed_query
+        return self._is_shadow or self._rebuild is None or work.query.query == self._rebuild.owed_query
 
     def _open(self, request: m.OpenRequest) -> m.Contract:
         self._admission.admit(self._link.robot, request.info.schedule)

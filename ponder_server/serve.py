@@ -31,6 +31,7 @@ class PonderServer(ModelShell):
         self._node = PonderNode(engine.spec)
         self._queries = link.subscribe(topics.QUERY)
         self._last: m.Cognition | None = None
+        self._num_left_out = 0
 
     @property
     def num_superseded(self) -> int:
@@ -60,8 +61,13 @@ class PonderServer(ModelShell):
                 worked |= self.rejoin()  # unknown episode: this process restarted, or another one opened it
             if self._link.is_from(query.header, "clock"):
                 self._link.survive("query", self._node.on_query, query)
-        for query in self._node.missed():
+        missed = self._node.missed()
+        for query in missed:
             self._tell(m.Severity.ERROR, "observation_missed", f"query {query.query}: tick {query.tick} never came")
+        if self._is_shadow and (missed or self._node.num_superseded > self._num_left_out):
+            self._tell(m.Severity.WARNING, "shadow_left", "it did not keep up: its context would have a hole")
+            self._membership.leave()
+        self._num_left_out = self._node.num_superseded
         return worked
 
     def _next_work(self) -> Work | None:
@@ -83,8 +89,8 @@ class PonderServer(ModelShell):
         self._take_newest(rejoined)
         try:
             for work in self._missed_work(rejoined.num_queries):
-                if work.query.query == rejoined.owed_query:
-                    self._fire(work)  # the clock still waits for this one (lockstep)
+                if self._is_shadow or work.query.query == rejoined.owed_query:
+                    self._fire(work)  # the log waits for each, or the clock still waits for this one (lockstep)
                 else:
                     self._node.keep(work.query, self._think(work))
         except (CallFailed, ProtocolError, ContextFull) as error:
@@ -95,7 +101,7 @@ class PonderServer(ModelShell):
 
     def _resume(self) -> bool:
         """Takes the query that the clock waits for although it did not arrive, or sends its answer again."""
-        owed = self._membership.owed()
+        owed = None if self._is_shadow else self._membership.owed()
         if owed is None or owed.owed_query is None:
             return False
         if self._last is not None and self._last.query == owed.owed_query:
@@ -123,7 +129,10 @@ class PonderServer(ModelShell):
     def _rebuilt(self, num_queries: int) -> None:
         self._heartbeat.set(next_index=num_queries)
         self._membership.announce()
-        self._tell(m.Severity.INFO, "context_rebuilt", f"PONDER rebuilt its context from {num_queries} observations")
+        if not self._is_shadow:  # it has just come, and had no other context
+            self._tell(
+                m.Severity.INFO, "context_rebuilt", f"PONDER rebuilt its context from {num_queries} observations"
+            )
 
     def _give_up(self, error: Exception) -> None:
         """Leaves an episode whose context cannot be rebuilt."""
@@ -154,8 +163,9 @@ class PonderServer(ModelShell):
     def _answer(self, work: Work, fire: Fire, start_ns: int) -> None:
         ready_ns = time.monotonic_ns()
         cognition, subgoals = self._node.answer(work, fire, ready_ns=ready_ns, infer_ns=ready_ns - start_ns)
-        self._last = self._link.publish(topics.COGNITION, cognition, at_ns=ready_ns, clock_id=host_clock_id())
-        for subgoal in subgoals:
+        topic = topics.SHADOW_COGNITION if self._is_shadow else topics.COGNITION
+        self._last = self._link.publish(topic, cognition, at_ns=ready_ns, clock_id=host_clock_id())
+        for subgoal in () if self._is_shadow else subgoals:  # readers of texts take those of the PONDER that is used
             self._link.publish(topics.SUBGOAL, subgoal, at_ns=ready_ns, clock_id=host_clock_id())
         self._answered(self._node.next_query)
 

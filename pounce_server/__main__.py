@@ -106,7 +106,9 @@ def main(argv: list[str] | None = None) -> int:
     weights = str(options.remote.url or options.checkpoint or "random weights")
     if options.backend != "own":
         build = partial(build_official if options.backend == "official" else build_remote, options)
-        return serve_model("pounce", options.link, weights, build, PounceServer, options.operations)
+        return serve_model(
+            "pounce", options.link, weights, build, PounceServer, options.operations, is_shadow=options.shadow
+        )
 
     def make(link: Link, engine: BatchingEngine, heartbeat: Heartbeat, version: str) -> PounceServer | PounceFleet:
         others, max_rows = options.robots.other_robots, options.robots.max_batch_rows
@@ -114,7 +116,15 @@ def main(argv: list[str] | None = None) -> int:
             return PounceServer(link, engine, heartbeat, version)
         return PounceFleet(link, engine, heartbeat, version, other_robots=others, max_batch_rows=max_rows)
 
-    return serve_model("pounce", options.link, weights, lambda: build_engine(options), make, options.operations)
+    return serve_model(
+        "pounce",
+        options.link,
+        weights,
+        lambda: build_engine(options),
+        make,
+        options.operations,
+        is_shadow=options.shadow,
+    )
 
 
 if __name__ == "__main__":

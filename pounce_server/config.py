@@ -103,6 +103,8 @@ class PounceOptions:
     """Device of the network: cpu, cuda or cuda:N."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Number format of weights and activations."""
+    shadow: bool = False
+    """Answer what the running POUNCE is asked, for the log only: nothing of it is used. See docs/operations.md."""
     link: LinkOptions = field(default_factory=lambda: LinkOptions(listen=(endpoint("pounce"),)))
     operations: tyro.conf.OmitArgPrefixes[DaemonOptions] = field(default_factory=DaemonOptions)
     speed: tyro.conf.OmitArgPrefixes[SpeedOptions] = field(default_factory=SpeedOptions)

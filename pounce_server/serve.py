@@ -89,7 +89,7 @@ class PounceServer(ModelShell):
 
     def resume(self) -> bool:
         """Takes the invocation that the clock waits for although it did not arrive, or sends its chunk again."""
-        owed = self._membership.owed()
+        owed = None if self._is_shadow else self._membership.owed()
         if owed is None or not owed.owed_invocation:
             return False
         invocation = codec.decode(m.Invocation, owed.owed_invocation)
@@ -121,7 +121,8 @@ class PounceServer(ModelShell):
         ready_ns = time.monotonic_ns()
         chunk = self._node.answer(work, rows_NA, infer_ns=ready_ns - start_ns)
         try:
-            self._last = self._link.publish(topics.CHUNK, chunk, at_ns=ready_ns, clock_id=host_clock_id())
+            topic = topics.SHADOW_CHUNK if self._is_shadow else topics.CHUNK
+            self._last = self._link.publish(topic, chunk, at_ns=ready_ns, clock_id=host_clock_id())
         except MalformedMessage as error:
             self._tell(m.Severity.ERROR, "chunk_refused", f"invocation {work.invocation.invocation}: {error}")
         self._answered(work.invocation.invocation + 1)

@@ -18,7 +18,9 @@ _EVERYTHING = (
 )  # fmt: skip
 _HEARING = ("declare_subscriber", "declare_liveliness_subscriber", "liveliness_query")
 
-PROC_OF = {"clock": "clock", "ponder": "ponder", "pounce": "pounce", "robot": "sim"}
+PROC_OF = {"clock": "clock", "ponder": "ponder", "pounce": "pounce", "robot": "sim"} | {
+    shadow: shadow for shadow in topics.SHADOW_OF
+}
 """Name in the certificate -> name of the process on the bus. A ``viewer`` besides hears everything and says nothing."""
 VIEWER = "viewer"
 ROLES = (*PROC_OF, VIEWER)
@@ -31,6 +33,8 @@ _SAYS: dict[str, tuple[Topic[Any], ...]] = {
     ),
     "ponder": (topics.COGNITION, topics.SUBGOAL, topics.EVENT, topics.PHASE, topics.HEALTH),
     "pounce": (topics.CHUNK, topics.EVENT, topics.PHASE, topics.HEALTH),
+    "ponder-shadow": (topics.SHADOW_COGNITION, topics.EVENT, topics.PHASE, topics.HEALTH),
+    "pounce-shadow": (topics.SHADOW_CHUNK, topics.EVENT, topics.PHASE, topics.HEALTH),
     "robot": (topics.OBSERVATION, topics.SUBGOAL, topics.EVENT, topics.PHASE, topics.RESULT),
 }  # fmt: skip
 _CALLS: dict[str, tuple[tuple[str, Call], ...]] = {
@@ -40,6 +44,8 @@ _CALLS: dict[str, tuple[tuple[str, Call], ...]] = {
     ),
     "ponder": (("clock", topics.ACTIVE), ("clock", topics.JOURNAL)),
     "pounce": (("clock", topics.ACTIVE), ("clock", topics.JOURNAL)),
+    "ponder-shadow": (("clock", topics.ACTIVE), ("clock", topics.JOURNAL)),
+    "pounce-shadow": (("clock", topics.ACTIVE),),
     "robot": (
         *(("clock", call) for call in (topics.OPEN, topics.CLOSE, topics.TIME, topics.ENGAGE)),
         ("ponder", topics.CONTRACT),
@@ -48,7 +54,7 @@ _CALLS: dict[str, tuple[tuple[str, Call], ...]] = {
 
 
 def access_control() -> dict[str, Any]:
-    """Zenoh's ``access_control`` for the five roles; what it does not name is denied."""
+    """Zenoh's ``access_control`` for every role; what it does not name is denied."""
     everything = [f"{topics.ROOT}/**", *(f"{topics.ROOT}/{_ANY}/@rpc/{proc}/*" for proc in PROC_OF.values())]
     rules: list[dict[str, Any]] = []
     policies = []

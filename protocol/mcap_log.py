@@ -71,6 +71,8 @@ _TOPICS = {
     "info": "/episode/info",
     "result": "/episode/result",
     "health": "/health",
+    "shadow_cognition": "/shadow/cognition",
+    "shadow_chunk": "/shadow/chunk",
 }
 _LEVELS = {m.Severity.INFO: Log.INFO, m.Severity.WARNING: Log.WARNING, m.Severity.ERROR: Log.ERROR}
 _KNOWN_PROCS = ("clock", "ponder", "pounce", "sim")
@@ -344,6 +346,10 @@ class EpisodeRecord:
     events: list[m.Event] = field(default_factory=list)
     phases: list[m.Phase] = field(default_factory=list)
     healths: list[m.Health] = field(default_factory=list)
+    shadow_cognitions: list[m.Cognition] = field(default_factory=list)
+    """Of a PONDER that is asked like the other and never used."""
+    shadow_chunks: list[m.ActionChunk] = field(default_factory=list)
+    """Of a POUNCE that is asked like the other and never played."""
 
 
 _LISTS: dict[type, str] = {
@@ -362,6 +368,7 @@ _LISTS: dict[type, str] = {
     m.EpisodeInfo: "info",
     m.EpisodeResult: "result",
 }
+_SHADOW_LISTS: dict[type, str] = {m.Cognition: "shadow_cognitions", m.ActionChunk: "shadow_chunks"}
 _CLASSES = {codec.type_name(cls): cls for cls in _LISTS}
 
 
@@ -372,7 +379,7 @@ def read_log(path: Path) -> EpisodeRecord:
         OSError: the file cannot be opened.
         FileError: it is none of ours, holds more than one episode, or more than any episode needs.
     """
-    lists: dict[str, list[Any]] = {name: [] for name in _LISTS.values()}
+    lists: dict[str, list[Any]] = {name: [] for name in (*_LISTS.values(), *_SHADOW_LISTS.values())}
     metadata: dict[str, dict[str, str]] = {}
     with files.reading(path, "episode log"), files.open_file(path) as file:
         records = Records(file)
@@ -382,7 +389,8 @@ def read_log(path: Path) -> EpisodeRecord:
                 metadata[record.name] = dict(record.metadata)
             elif isinstance(record, Message) and (cls := _CLASSES.get(records.schema_of(record))):
                 message: Any = codec.decode(cls, record.data)
-                lists[_LISTS[cls]].append(message)
+                is_shadow = message.header.proc in topics.SHADOW_OF
+                lists[_SHADOW_LISTS.get(cls, _LISTS[cls]) if is_shadow else _LISTS[cls]].append(message)
                 room -= _num_bytes(message, record.data)
                 if room < 0:
                     raise ValueError(f"its messages need more memory than an episode's, {MAX_KEPT_BYTES >> 20} MiB")

@@ -60,9 +60,15 @@ PHASE = Topic("phase", m.Phase, Priority.BACKGROUND, keep=64)
 INFO = Topic("info", m.EpisodeInfo, Priority.DATA, keep=4)
 RESULT = Topic("result", m.EpisodeResult, Priority.DATA, keep=4)
 HEALTH = Topic("health", m.Health, Priority.BACKGROUND, keep=64)
+SHADOW_COGNITION = Topic("shadow_cognition", m.Cognition, Priority.BACKGROUND, keep=8)
+SHADOW_CHUNK = Topic("shadow_chunk", m.ActionChunk, Priority.BACKGROUND, keep=8)
+
+SHADOW_OF = {"ponder-shadow": "ponder", "pounce-shadow": "pounce"}
+"""Processes that answer what the servers are asked, on topics that only the log reads, and whom they stand behind."""
 
 STREAMS: tuple[Topic[object], ...] = (  # type: ignore[assignment]
     OBSERVATION, QUERY, COGNITION, STAMP, INVOCATION, CHUNK, ACTION, TICK, SUBGOAL, EVENT, PHASE, INFO, RESULT, HEALTH,
+    SHADOW_COGNITION, SHADOW_CHUNK,
 )  # fmt: skip
 
 

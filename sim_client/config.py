@@ -9,13 +9,14 @@ from typing import Literal
 import tyro
 
 from clock import schedules
-from clock.policies import PonderChoice, policy_of
+from clock.policies import SERVERS, PonderChoice, policy_of
 from clock.timebase import NS_PER_MS
 from dual_system.tasks.difficulty import Difficulty
 from protocol.errors import TransportError
 from protocol.messages import Delay, DelayKind, Delivery, DeliveryKind, Schedule, Seam, SeamKind, WaitKind
 from protocol.options import LinkOptions
 from protocol.sockets import endpoint
+from protocol.topics import SHADOW_OF
 
 ModeName = Literal["lockstep", "realtime"]
 
@@ -160,7 +161,7 @@ class SimOptions:
     models: tyro.conf.OmitArgPrefixes[ModelsOptions] = field(default_factory=ModelsOptions)
     log: tyro.conf.OmitArgPrefixes[LogOptions] = field(default_factory=LogOptions)
     link: LinkOptions = field(
-        default_factory=lambda: LinkOptions(connect=tuple(map(endpoint, ("clock", "ponder", "pounce"))))
+        default_factory=lambda: LinkOptions(connect=tuple(map(endpoint, ("clock", *SERVERS, *SHADOW_OF))))
     )
 
     @property

@@ -30,7 +30,7 @@ from protocol import messages as m
 from protocol.drops import DropReason
 from protocol.errors import EpisodeRefused, ProtocolError, TransportError
 from protocol.link import Link, Stream
-from protocol.topics import ACTION, CHUNK, HEALTH, OBSERVATION, TICK
+from protocol.topics import ACTION, CHUNK, HEALTH, OBSERVATION, SHADOW_OF, TICK
 from sim_client.episode import CLOCK_SILENCE_NS
 from sim_client.gateway.body import Body
 from sim_client.gateway.exchange import Answer, Finish, Frames, Refused, Step
@@ -310,7 +310,8 @@ class Machine:
         if self._link.second_sender:
             return self._link.second_sender
         for health in self._healths.drain():
-            if self._link.members.get(health.header.proc) != health.header.boot_id:
+            is_member = self._link.members.get(health.header.proc) == health.header.boot_id
+            if not is_member or health.header.proc in SHADOW_OF:
                 continue
             if health.dropped.get(DropReason.WRONG_SHAPE, 0) > self._misshapen.get(health.header.proc, 0):
                 proc = health.header.proc

@@ -11,7 +11,7 @@ from typing import Literal
 import tyro
 
 from clock import schedules
-from clock.policies import PonderChoice, policy_of
+from clock.policies import SERVERS, PonderChoice, policy_of
 from clock.timebase import NS_PER_MS
 from protocol import files
 from protocol.errors import TransportError
@@ -19,6 +19,7 @@ from protocol.messages import Delay, DelayKind, Schedule, WaitKind
 from protocol.options import LinkOptions, OperationsOptions
 from protocol.peers.mapping import PolicyMapping, read_mapping
 from protocol.sockets import endpoint
+from protocol.topics import SHADOW_OF
 from protocol.version import version
 from sim_client.gateway import body, challenge, groot, mme_vla, openpi, vla_eval
 from sim_client.gateway.exchange import Dialect, Terms
@@ -148,7 +149,7 @@ class GatewayOptions:
     log: tyro.conf.OmitArgPrefixes[LogOptions] = field(default_factory=LogOptions)
     operations: tyro.conf.OmitArgPrefixes[OperationsOptions] = field(default_factory=OperationsOptions)
     link: LinkOptions = field(
-        default_factory=lambda: LinkOptions(connect=tuple(map(endpoint, ("clock", "ponder", "pounce"))))
+        default_factory=lambda: LinkOptions(connect=tuple(map(endpoint, ("clock", *SERVERS, *SHADOW_OF))))
     )
 
     def check(self) -> None:

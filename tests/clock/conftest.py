@@ -28,7 +28,7 @@ NUM_CARRIERS, HIDDEN = 2, 8
 FIXED_300 = m.Delay(kind=m.DelayKind.FIXED, mean_ns=300 * MS)
 MEASURED = m.Delay(kind=m.DelayKind.MEASURED)
 
-_TOPIC_OF: dict[type, Topic[Any]] = {topic.cls: topic for topic in topics.STREAMS}
+_TOPIC_OF: dict[type, Topic[Any]] = {topic.cls: topic for topic in reversed(topics.STREAMS)}
 _PROC_OF = {m.Observation: "sim", m.Cognition: "ponder", m.ActionChunk: "pounce"}
 
 

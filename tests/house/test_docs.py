@@ -92,11 +92,11 @@ def _rows(page: str, width: int) -> list[list[str]]:
 
 
 def test_the_table_of_streams_is_the_code_s() -> None:
-    documented = {row[0].strip("`"): (row[1].strip("`"), row[4], row[5]) for row in _rows("docs/protocol.md", 6)[1:]}
+    documented = {row[1].strip("`"): (row[0].strip("`"), row[4], row[5]) for row in _rows("docs/protocol.md", 6)[1:]}
     actual = {}
     for topic in topics.STREAMS:
         key = topics.stream_key(topic, "r0", "{episode}", "{proc}").removeprefix(f"{topics.ROOT}/r0/")
-        actual[topic.cls.__name__] = (key, topic.priority.name, str(topic.keep))
+        actual[key] = (topic.cls.__name__, topic.priority.name, str(topic.keep))
     assert documented == actual
 
 

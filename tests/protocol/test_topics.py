@@ -38,7 +38,7 @@ def test_a_topic_has_its_key(topic: Topic[object], key: str) -> None:
 
 
 def test_the_table_above_is_complete() -> None:
-    assert len(topics.STREAMS) == len({topic.name for topic in topics.STREAMS}) == 14
+    assert len(topics.STREAMS) == len({topic.name for topic in topics.STREAMS}) == 16
 
 
 def test_a_call_and_a_token_have_their_keys() -> None:
