@@ -15,8 +15,17 @@ def build(backend: str, options: RemoteOptions) -> RemoteEngine:
         raise ValueError(f"--backend {backend} needs the policy server's --url and a --mapping file")
     mapping = read_mapping(options.mapping)
     key = files.read_word(options.key_file, "word for --key-file") if options.key_file else ""
-    peer = _peer(backend, options.url, mapping, key)
+    try:
+        peer = _peer(backend, options.url, mapping, key)
+    except ModuleNotFoundError as error:
+        raise ValueError(
+            f"--backend {backend} needs {error.name}: pip install 'ponderpounce-server[{_extra(backend)}]'"
+        ) from error
     return RemoteEngine(peer, mapping, options.url, answer_s=options.answer_s, start_s=options.start_s)
+
+
+def _extra(backend: str) -> str:
+    return "groot" if backend.startswith("groot") else "policies"
 
 
 def _peer(backend: str, url: str, mapping: PolicyMapping, key: str) -> Peer:

@@ -36,16 +36,15 @@ class RemoteEngine:
         Raises:
             ValueError: no server within ``start_s``, or its answer is not what the mapping file says.
         """
-        self._peer, self._mapping, self._answer_s = peer, mapping, answer_s
+        self._peer, self._mapping, self._url, self._answer_s = peer, mapping, url, answer_s
         self._cameras = tuple(camera.camera for camera in mapping.cameras)
         try:
-            facts = self._first_answer(url, start_s)
+            facts = self._first_answer(start_s)
         except ValueError:
             peer.close()
             raise
         log.info("policy url=%s mapping=%s says %s", url, mapping.name, facts)
         identity = hashlib.sha256(f"{url} {mapping.digest} {facts}".encode()).hexdigest()[:12]
-        self._facts, self._url = facts, url
         self.spec = EngineSpec(
             horizon=mapping.num_rows,
             action_dim=mapping.num_commands,
@@ -114,27 +113,31 @@ class RemoteEngine:
         except (PeerError, OSError) as error:
             raise PeerError(self._sentence(error)) from error
 
-    def _first_answer(self, url: str, start_s: float) -> str:
+    def _first_answer(self, start_s: float) -> str:
         """What the server says of itself, once it is there and has answered as the mapping file says."""
-        self._url = url
         patience = Patience(start_s)
-        while True:
-            try:
-                facts = self._peer.facts(patience)
-                break
-            except (Lost, OSError) as error:
-                self._peer.close()
-                if patience.is_over:
-                    raise PeerError(f"{self._sentence(error)}: start it, or wait longer with --start-s") from error
-                log.info("waiting for %s: %s", url, error)
-                time.sleep(min(_START_AGAIN_S, start_s))
-            except PeerError as error:
-                raise PeerError(self._sentence(error)) from error
+        facts = self._awaited(patience)
         try:
             self._answer(self._example(), patience)
         except WrongAnswer as error:
             raise WrongAnswer(f"{error}. Nothing has moved: mend the mapping file, or serve the other policy") from None
         return facts
+
+    def _awaited(self, patience: Patience) -> str:
+        """What the server says of itself, as soon as it is there."""
+        absence: Exception | None = None
+        while True:
+            try:
+                return self._peer.facts(patience)
+            except (PeerError, OSError) as error:
+                if isinstance(error, PeerError) and not isinstance(error, Lost) and not patience.is_over:
+                    raise PeerError(self._sentence(error)) from error  # it is there, and another one
+                if patience.is_over:
+                    sentence = self._sentence(absence or error)
+                    raise PeerError(f"{sentence}: start it, or wait longer with --start-s") from error
+                absence = error
+                log.info("waiting: %s", self._sentence(error))
+                time.sleep(min(_START_AGAIN_S, patience.limit_s))
 
     def _example(self) -> Request:
         return Request(

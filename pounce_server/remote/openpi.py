@@ -56,7 +56,7 @@ class OpenpiPeer:
         """Raises PeerError: no server, or another one than at first."""
         if self._socket.is_open:
             return
-        self._socket.open()
+        self._socket.open(patience)
         metadata = self._received(patience)
         if not isinstance(metadata, dict) or metadata.get("type") == "error":
             self.close()

@@ -60,7 +60,7 @@ class VlaEvalPeer:
         """Connects, compares versions and begins an episode. Raises PeerError."""
         if self._socket.is_open:
             return
-        self._socket.open()
+        self._socket.open(patience)
         self._send("hello", {"harness_version": "0.8.0", "protocol_version": PROTOCOL_VERSION})
         hello = self._received("hello", patience)
         if (version := hello.get("protocol_version")) != PROTOCOL_VERSION:

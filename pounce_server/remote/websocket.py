@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import struct
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from urllib.parse import urlsplit
 
 from websockets.exceptions import ConnectionClosed, WebSocketException
@@ -12,7 +13,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from pounce_server.remote.peer import Lost, Patience, PeerError
 
-_OPEN_S = 1.0  # without a heartbeat
+_OPEN_S = 5.0
 _STUCK_US = 400_000  # a frozen server reads nothing: a send must not wait for it
 _MAX_BYTES = 64 << 20
 
@@ -31,8 +32,20 @@ class Socket:
     def is_open(self) -> bool:
         return self._connection is not None
 
-    def open(self) -> None:
-        """Raises Lost, OSError."""
+    def open(self, patience: Patience) -> None:
+        """Raises PeerError: no websocket in time. Raises Lost, OSError: there is none."""
+        pool = ThreadPoolExecutor(1)  # names are looked up, and TLS is agreed on, without a heartbeat of ours
+        opening = pool.submit(self._opened)
+        pool.shutdown(wait=False)
+        try:
+            while not opening.done():
+                wait([opening], patience.look_s())
+        except PeerError:
+            opening.add_done_callback(_leave)
+            raise
+        self._connection = opening.result()
+
+    def _opened(self) -> ClientConnection:
         where = urlsplit(self._url)
         port = where.port or (443 if where.scheme == "wss" else 80)
         link = socket.create_connection((where.hostname or "", port), _OPEN_S)
@@ -49,7 +62,7 @@ class Socket:
                 close_timeout=0,
                 max_size=_MAX_BYTES,
             )
-            self._connection = opening.__enter__()  # left by close_socket: __exit__ would wait for the other side
+            return opening.__enter__()  # left by close_socket: __exit__ would wait for the other side
         except (WebSocketException, TimeoutError, ValueError) as error:
             link.close()
             raise Lost(f"no websocket there: {str(error) or type(error).__name__}") from error
@@ -80,5 +93,15 @@ class Socket:
     def close(self) -> None:
         connection, self._connection = self._connection, None
         if connection is not None:
-            with contextlib.suppress(Exception):  # it is of no use any more, whatever its end looks like
-                connection.close_socket()
+            _close(connection)
+
+
+def _leave(opening: Future[ClientConnection]) -> None:
+    """Closes a connection that came too late."""
+    if opening.exception() is None:
+        _close(opening.result())
+
+
+def _close(connection: ClientConnection) -> None:
+    with contextlib.suppress(Exception):  # it is of no use any more, whatever its end looks like
+        connection.close_socket()

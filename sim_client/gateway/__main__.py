@@ -20,6 +20,7 @@ from clock.service import ClockService, ServiceConfig
 from clock.status import end_of
 from protocol import files
 from protocol.command_line import command, parse
+from protocol.errors import TransportError
 from protocol.link import Link
 from protocol.logs import set_up_logging
 from protocol.messages import Health, ServingState
@@ -112,8 +113,12 @@ def _serving(options: GatewayOptions, seats: Seats) -> Iterator[None]:
         http.server_close()
         return
     if issubclass(dialect, GrootDialect):
-        from sim_client.gateway.zmq_side import ZmqSide  # pyzmq is needed here alone
-
+        try:
+            from sim_client.gateway.zmq_side import ZmqSide
+        except ModuleNotFoundError as error:
+            raise TransportError(
+                f"--dialect {options.dialect} needs {error.name}: pip install 'ponderpounce-server[groot]'"
+            ) from error
         zmq = ZmqSide((host, port), seats, terms, partial(dialect, api_token=options.api_key()), max_bytes)
         with _in_thread(zmq.serve_forever, zmq.shutdown):
             yield

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -81,10 +81,11 @@ class Player:
 class Machine:
     """PONDER, POUNCE and the clock service as processes; any of them can be struck and comes back."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, ponder: Sequence[str] | None = (), pounce: Sequence[str] = ()) -> None:
         self._daemons = Daemons(folder)
-        endpoints = start_local(self._daemons, robot="r0", with_clock=True, ponder=[], pounce=[])
-        self.endpoints = dict(zip(("clock", "ponder", "pounce"), endpoints, strict=True))
+        endpoints = start_local(self._daemons, robot="r0", with_clock=True, ponder=ponder, pounce=pounce)
+        names = ("clock", "pounce") if ponder is None else ("clock", "ponder", "pounce")
+        self.endpoints = dict(zip(names, endpoints, strict=True))
         self.at_ear = f"tcp/127.0.0.1:{free_ports(1)[0]}"
         self._bus = ZenohBus(Endpoints(listen=(self.at_ear,), connect=endpoints))
         link = Link(self._bus, robot="r0", proc="ear")
@@ -145,6 +146,12 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
     machine = Machine(tmp_path_factory.mktemp("daemons"))
     yield machine
     machine.end()
+
+
+@pytest.fixture(scope="session")
+def machine_with() -> type[Machine]:
+    """Another one: PONDER's options, None without one, and POUNCE's."""
+    return Machine
 
 
 @pytest.fixture(scope="session")

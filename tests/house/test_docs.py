@@ -68,7 +68,7 @@ def _options() -> set[str]:
 
 @every_page
 def test_options_that_are_named_exist(page: str) -> None:
-    strangers = re.compile(r"^.*\b(?:pip|docker|apt-get|git) .*$", re.MULTILINE)
+    strangers = re.compile(r"^.*\b(?:pip|docker|apt-get|git|uv run|python gr00t\S*) .*$", re.MULTILINE)
     named = set(re.findall(r"(?<![\w-])--[a-z][\w.-]*\w", code(strangers.sub("", PAGES[page]))))
     assert named - _options() - {"--serve", "--nproc-per-node"} == set()  # an example's own; torchrun's
 

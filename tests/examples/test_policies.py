@@ -1,0 +1,39 @@
+"""Every mapping file that we give away is one, and fits the wire that its name says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from protocol.peers.mapping import read_mapping
+from protocol.peers.translation import request_of, rows_of
+from sim_client.gateway.groot import check_mapping
+
+FOLDER = Path(__file__).parents[2] / "examples" / "policies"
+FILES = sorted(FOLDER.glob("*.toml"))
+
+
+@pytest.mark.parametrize("path", FILES, ids=[path.stem for path in FILES])
+def test_a_mapping_file_fits_our_panda(path: Path) -> None:
+    mapping = read_mapping(path)
+    assert (mapping.play_hz, mapping.num_proprio, mapping.num_commands) == (20, 8, 8)
+    assert sorted(camera.camera for camera in mapping.cameras) == ["front", "wrist"]
+    if path.stem.startswith("groot"):
+        check_mapping(mapping)
+
+
+def test_droid_s_numbers_become_ours() -> None:
+    """An open hand is 0 there and 0.04 m here; a full velocity is a step of 0.2 rad, as in DROID's controller."""
+    mapping = read_mapping(FOLDER / "openpi_droid.toml")
+    state = np.array([0.1] * 7 + [0.04], np.float32)
+    asked = request_of(mapping, dict.fromkeys(("front", "wrist"), np.zeros((256, 256, 3), np.uint8)), state, "go")
+    assert asked["observation/gripper_position",] == pytest.approx(0.0, abs=1e-6)
+    assert asked["observation/wrist_image_left",].shape == (224, 224, 3)
+    actions = np.tile([1.0] * 7 + [1.0], (10, 1))
+    rows = rows_of(mapping, {("actions",): actions}, state)
+    assert rows.shape == (13, 8)
+    assert rows[0, 0] == pytest.approx(0.3)
+    assert np.diff(rows[:, 0]) == pytest.approx(0.2 * 15 / 20)
+    assert (rows[:, 7] == -1).all()
