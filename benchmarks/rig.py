@@ -15,10 +15,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
 
+from benchmarks.proxy import Proxy
 from protocol import messages as m
 from protocol.link import Link
-from protocol.topics import EVENT, TICK
+from protocol.topics import EVENT, TICK, alive_key
 from protocol.zenoh_bus import Endpoints, ZenohBus
+from sim_client.config import ModeName
 from sim_client.launch import Daemons, free_ports, start_local
 
 ROBOT = "r0"
@@ -34,45 +36,64 @@ class Heard(NamedTuple):
 
 
 class Rig:
-    """PONDER, POUNCE and, if it is not embedded in the robot's process, the clock service. A context manager."""
+    """PONDER, POUNCE and, if it is not embedded in the robot's process, the clock service. A context manager.
 
-    def __init__(self, folder: Path, *, with_clock: bool = True) -> None:
+    Args:
+        folder: for what the daemons print.
+        with_clock: whether the clock service is a daemon.
+        proxied: whether the daemons listen on TCP and are reached through ``proxies``, by name.
+    """
+
+    def __init__(self, folder: Path, *, with_clock: bool = True, proxied: bool = False) -> None:
         self.heard: list[Heard] = []
         self._episodes: set[str] = set()
         self._over: set[str] = set()
         self.daemons = Daemons(folder)
         self._players: list[subprocess.Popen[bytes]] = []
-        endpoints = start_local(self.daemons, robot=ROBOT, with_clock=with_clock, ponder=[], pounce=[])
+        self.proxies: dict[str, Proxy] = {}
         names = ("clock", "ponder", "pounce") if with_clock else ("ponder", "pounce")
-        self._endpoints = dict(zip(names, endpoints, strict=True))
+        if proxied:
+            ports = free_ports(len(names))
+            self.proxies = {name: Proxy(port) for name, port in zip(names, ports, strict=True)}
+            endpoints = tuple(f"tcp/127.0.0.1:{port}" for port in ports)
+        else:
+            endpoints = start_local(self.daemons, robot=ROBOT, with_clock=with_clock, ponder=[], pounce=[])
+        self._listens = dict(zip(names, endpoints, strict=True))
+        self._reached = self._listens | {name: proxy.endpoint for name, proxy in self.proxies.items()}
+        for name in self.proxies:
+            self.restart(name)
         self._at_ear = f"tcp/127.0.0.1:{free_ports(1)[0]}"
         self.bus = ZenohBus(Endpoints(listen=(self._at_ear,), connect=endpoints))
         link = Link(self.bus, robot=ROBOT, proc="ear")
+        self._robots = self.bus.watch_alive(alive_key(ROBOT, "sim"))
         self._streams = [link.subscribe(TICK, keep=_KEEP), link.subscribe(EVENT, keep=_KEEP)]
 
-    def play(self, arguments: Sequence[str], out: Path) -> subprocess.Popen[bytes]:
-        """Starts ``sim-client`` in real time against these daemons; clears the messages heard so far.
+    def play(
+        self, arguments: Sequence[str], out: Path, *, said: Path | None = None, mode: ModeName = "realtime"
+    ) -> subprocess.Popen[bytes]:
+        """Starts ``sim-client`` against these daemons; clears the messages heard so far.
 
         Args:
             out: folder for its results and logs.
+            said: file for what it prints; ``sim.log`` in ``out`` if not given.
         """
         self._over |= self._episodes  # a continued clock service still sends messages of its old episode
         self.heard.clear()
+        self._robots.drain()
         out.mkdir(parents=True, exist_ok=True)
-        command = [sys.executable, "-m", "sim_client", "--mode", "realtime", "--out", str(out), "--no-progress"]
-        command += ["--link.connect", *self._endpoints.values(), self._at_ear, *arguments]
+        command = [sys.executable, "-m", "sim_client", "--mode", mode, "--out", str(out), "--no-progress"]
+        command += ["--link.connect", *self._reached.values(), self._at_ear, *arguments]
         environment = os.environ | {"OMP_NUM_THREADS": "1", "MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl")}
-        player = subprocess.Popen(
-            command, env=environment, stdout=subprocess.DEVNULL, stderr=(out / "sim.log").open("ab")
-        )
+        with (said or out / "sim.log").open("ab") as log:
+            player = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=log)
         self._players.append(player)
         return player
 
     def restart(self, name: str) -> None:
-        """Restarts a killed daemon at its endpoint."""
-        arguments = ["--link.robot", ROBOT, "--link.listen", self._endpoints[name]]
+        """Starts a daemon, for instance a killed one, at its endpoint."""
+        arguments = ["--link.robot", ROBOT, "--link.listen", self._listens[name]]
         if name == "clock":
-            arguments += ["--link.connect", self._endpoints["ponder"], self._endpoints["pounce"]]
+            arguments += ["--link.connect", self._reached["ponder"], self._reached["pounce"]]
         self.daemons.start(name, _MODULES[name], arguments)
 
     def listen(self, is_enough: Callable[[], bool], patience_s: float) -> bool:
@@ -91,6 +112,10 @@ class Rig:
         self._episodes.add(message.header.episode)
         return message.header.episode not in self._over
 
+    def is_robot_there(self) -> bool:
+        """Whether a robot's process came since the last call, or since ``play``."""
+        return any(sample.payload for sample in self._robots.drain())
+
     def ticks(self) -> list[m.Tick]:
         return [h.message for h in self.heard if isinstance(h.message, m.Tick)]
 
@@ -108,4 +133,6 @@ class Rig:
             player.kill()
             player.wait()
         self.bus.close()
+        for proxy in self.proxies.values():
+            proxy.close()
         self.daemons.__exit__(kind, error, trace)

@@ -26,6 +26,7 @@ MAX_DIM = 256
 MAX_TEXT = 20_000
 MAX_ID = 128
 MAX_INSTANT_NS = 10**18  # 31 years: more is a unit mistake
+MAX_UNIX_NS = 2**62  # the year 2116
 MAX_INDEX = 2**53
 MAX_DEMO_FRAMES = 600
 MAX_MEMBERS = 16
@@ -60,6 +61,13 @@ def _ordinal(message: Any, *names: str) -> None:
         value = getattr(message, name)
         if not 0 <= value < MAX_INDEX:
             raise _broken(message, name, f"0..{MAX_INDEX - 1}", value)
+
+
+def _reference(message: Any, *names: str) -> None:
+    """Indices of another message, or none."""
+    for name in names:
+        if getattr(message, name) is not None:
+            _index(message, name)
 
 
 def _instant(message: Any, *names: str) -> None:
@@ -196,6 +204,7 @@ def check_stamp(s: m.Stamp) -> None:
 def check_invocation(i: m.Invocation) -> None:
     _ordinal(i, "invocation", "tick")
     _index(i, "committed_rows", "num_samples")
+    _reference(i, "ref_query")
     _instant(i, "now_ns")
     _duration(i, "age_ns")
     _carriers(i, "cognition", may_be_empty=True)
@@ -217,8 +226,9 @@ def check_invocation(i: m.Invocation) -> None:
 def check_action_chunk(c: m.ActionChunk) -> None:
     _ordinal(c, "invocation", "t_row0")
     _index(c, "committed_rows")
+    _reference(c, "ref_query")
     _instant(c, "source_ns")
-    _duration(c, "age_ns", "infer_ns")
+    _duration(c, "age_ns", "infer_ns", "dt_ns")
     if not 1 <= c.horizon <= MAX_HORIZON:
         raise _broken(c, "horizon", f"1..{MAX_HORIZON}", c.horizon)
     if not 1 <= c.action_dim <= MAX_DIM:
@@ -242,6 +252,7 @@ def check_action(a: m.Action) -> None:
 
 def check_tick(t: m.Tick) -> None:
     _index(t, "tick", "t_row0", "row", "observation_tick")
+    _reference(t, "invocation", "ref_query")
     _instant(t, "deadline_ns", "decided_ns", "late_ns", "age_ns")
     _chosen(t, "level")
     for name in ("state", "action"):
@@ -259,6 +270,7 @@ def check_tick(t: m.Tick) -> None:
 def check_subgoal(s: m.Subgoal) -> None:  # of any kind, because an unknown kind is only logged
     _text(s, "text")
     _index(s, "tick")
+    _reference(s, "query")
     _require(len(s.token_ids) <= MAX_TEXT, s, "token_ids", f"at most {MAX_TEXT}", len(s.token_ids))
 
 
@@ -288,6 +300,7 @@ def check_schedule(s: m.Schedule) -> None:
     _chosen(s, "mode", "wait")
     _require(1 <= s.control_hz <= 1000, s, "control_hz", "1..1000", s.control_hz)
     _require(1 <= s.horizon <= MAX_HORIZON, s, "horizon", f"1..{MAX_HORIZON}", s.horizon)
+    _duration(s, "query_period_ns")
     _require(s.query_period_ns > 0, s, "query_period_ns", "> 0", s.query_period_ns)
     _require(s.invoke_period_ticks >= 1, s, "invoke_period_ticks", ">= 1", s.invoke_period_ticks)
     for delay in (s.query_delay, s.invoke_delay):
@@ -329,6 +342,7 @@ def check_episode_info(e: m.EpisodeInfo) -> None:
     _text(e, "instruction")
     check_schedule(e.schedule)
     check_robot(e.robot)
+    _require(0 <= e.t0_unix_ns <= MAX_UNIX_NS, e, "t0_unix_ns", f"0..{MAX_UNIX_NS}", e.t0_unix_ns)
     _map(e, "versions")
 
 
@@ -379,6 +393,7 @@ def check_close_request(r: m.CloseRequest) -> None:
 def check_active_reply(r: m.ActiveReply) -> None:
     _text(r, "error")
     _index(r, "num_queries")
+    _reference(r, "owed_query")
     if r.open is not None:
         check_open_request(r.open)
 

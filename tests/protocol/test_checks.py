@@ -251,6 +251,19 @@ def test_a_broken_rule_is_refused_by_name(cls: type, change: dict[str, Any], sen
         check(dataclasses.replace(GOOD[cls], **change))
 
 
+OF_CHANCE = {"boot_id", "seed"}  # all 64 bits of them
+
+
+@pytest.mark.parametrize("cls", GOOD, ids=lambda c: c.__name__)
+def test_every_number_of_64_bits_is_bounded(cls: type) -> None:
+    """So that a sum, a float and a hash of it fit wherever they are made."""
+    for field in codec.proto_class(cls).DESCRIPTOR.fields:
+        wide = {field.CPPTYPE_UINT64: 2**64 - 1, field.CPPTYPE_INT64: 2**63 - 1}
+        if field.cpp_type in wide and not field.is_repeated and field.name not in OF_CHANCE:
+            with pytest.raises(MalformedMessage, match=field.name):
+                check(dataclasses.replace(GOOD[cls], **{field.name: wide[field.cpp_type]}))
+
+
 @pytest.mark.parametrize("cls", sorted(checks.CHECKS, key=lambda c: c.__name__), ids=lambda c: c.__name__)
 def test_every_checked_message_has_a_broken_example(cls: type) -> None:
     assert cls in {broken for broken, _, _ in BROKEN}

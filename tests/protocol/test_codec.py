@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as hnp
 
 from protocol import codec
 from protocol import messages as m
-from protocol.checks import MAX_INDEX, MAX_INSTANT_NS, MAX_MESSAGE_BYTES, MAX_PLAIN_MESSAGE_BYTES
+from protocol.checks import MAX_INDEX, MAX_INSTANT_NS, MAX_MESSAGE_BYTES, MAX_PLAIN_MESSAGE_BYTES, MAX_UNIX_NS
 from protocol.errors import MalformedMessage, ProtocolError
 from protocol.ponderpounce.v1 import common_pb2, episode_pb2, stream_pb2
 
@@ -191,7 +191,8 @@ SCHEDULE = st.builds(
 )  # fmt: skip
 INFO = st.builds(
     m.EpisodeInfo, header=HEADER, task=TEXT, suite=TEXT, seed=U64, difficulty=TEXT, instruction=TEXT,
-    schedule=SCHEDULE, robot=robots(), t0_unix_ns=INSTANT, versions=maps(TEXT), policy=TEXT, has_demo=st.booleans(),
+    schedule=SCHEDULE, robot=robots(),
+    t0_unix_ns=st.integers(0, MAX_UNIX_NS), versions=maps(TEXT), policy=TEXT, has_demo=st.booleans(),
 )  # fmt: skip
 RESULT = st.builds(
     m.EpisodeResult, header=HEADER, status=chosen(m.TaskStatus), is_success=st.booleans(), reason=TEXT,
