@@ -574,7 +574,7 @@ class ClockService:
         return ""
 
     def _admit_shadow(self, asking: m.Header) -> str:
-        """Lets a process be heard by the log, and by nothing here. It costs this thread one reply, near the beginning."""
+        """Lets a process be heard by the log, and by nothing here. It costs this thread one early reply."""
         proc, episode = asking.proc, self._episode
         assert episode is not None
         if self._watch.has_rival(proc, self._host.now_ns()):
