@@ -6,8 +6,9 @@ The caller runs the episode in between: a simulation (`suite`), or a client of a
 from __future__ import annotations
 
 import contextlib
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TypeVar
 
 from clock.report import statistics, stream_sha256
@@ -17,7 +18,8 @@ from protocol import messages as m
 from protocol.drops import DropReason
 from protocol.errors import CallFailed, EpisodeRefused, TransportError
 from protocol.link import Link, source_of
-from protocol.topics import CLOSE, CONTRACT, OPEN, alive_key
+from protocol.process import host_clock_id
+from protocol.topics import CLOSE, CONTRACT, OPEN, TIME, alive_key
 from sim_client.recorder import Recorder
 
 _CONTRACT_NS = 5_000_000_000
@@ -26,6 +28,7 @@ _CLOSE_NS = 5_000_000_000
 _ASK_AGAIN_NS = 200_000_000
 _LAST_TICKS_NS = 1_000_000_000
 _TURN_NS = 1_000_000
+_TIME_TURN_S = 0.0005  # what the clocks' offset becomes uncertain by
 
 MAX_SKIPPED_TICKS = 200
 """Ticks (ten seconds) that the clock service may have skipped between two commands."""
@@ -76,7 +79,12 @@ class RobotEnd:
         self._patience_ns = patience_ns
         self._dead_server = dead_server
         self._gives_up = gives_up
+        self._timing = link.serve(TIME)
         link.bus.declare_alive(alive_key(link.robot, link.proc))
+
+    def tell_time(self) -> bool:
+        """Answers those who ask for this host's clock; returns whether there were any."""
+        return self._timing.answer(_time) > 0
 
     def demo_sampling(self) -> DemoSampling:
         """Asks PONDER which frames of a demonstration it reads.
@@ -96,7 +104,8 @@ class RobotEnd:
             EpisodeRefused: a server does not take it.
             TransportError: not ready within the patience.
         """
-        reply = self._patiently(lambda: self._ask_clock(request))
+        with contextlib.nullcontext() if request.info.robot.is_simulated else self._telling_time():
+            reply = self._patiently(lambda: self._ask_clock(request))
         self._link.admit(*(member for member in reply.members if member.proc != self._link.proc))
         return reply
 
@@ -130,6 +139,23 @@ class RobotEnd:
             self._close(m.CloseRequest(header=self._link.header("close", 0), result=result))
         self._link.leave_episode()
         return result, missing
+
+    @contextlib.contextmanager
+    def _telling_time(self) -> Iterator[None]:
+        """The clock service compares clocks within the call that opens an episode, for which this thread waits."""
+        is_over = threading.Event()
+
+        def tell() -> None:
+            while not is_over.wait(_TIME_TURN_S):
+                self.tell_time()
+
+        thread = threading.Thread(target=tell, name="time", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            is_over.set()
+            thread.join()
 
     def _patiently(self, ask: Callable[[], tuple[Reply, bool]]) -> Reply:
         """Asks until there is an answer. ``ask`` returns a reply, and whether to ask again because of its error."""
@@ -177,3 +203,8 @@ class RobotEnd:
         while len(self._recorder.ticks) < num_ticks and time.monotonic_ns() < deadline_ns:
             self.take_turn(_TURN_NS)
             self._recorder.step()
+
+
+def _time(request: m.TimeRequest) -> m.TimeReply:
+    now_ns = time.monotonic_ns()
+    return m.TimeReply(clock_id=host_clock_id(), t1_ns=now_ns, t2_ns=now_ns)

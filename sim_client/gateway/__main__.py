@@ -45,22 +45,23 @@ log = logging.getLogger("pp-gateway")
 @command("pp-gateway")
 def main(argv: list[str] | None = None) -> int:
     options = parse(GatewayOptions, argv, prog="pp-gateway")
-    should_stop, metrics = StopFlag(), Metrics()
+    should_stop, metrics = StopFlag(drains=True, sigterm_drains=options.operations.drain), Metrics()
     set_up_logging(options=options.operations)
     options.check()
     options.api_key()  # a bad file before servers are started
     if options.local or options.log.record:
         files.folder(options.out)
     with (
-        status_of(metrics, options.operations),
+        status_of(metrics, options.operations, lambda: should_stop.is_draining),
         Daemons(options.out) as daemons,
         _seats(options, daemons, metrics) as seats,
     ):
         if options.local:
             seats.await_servers(should_stop)  # a client that finds the door open expects to be served
         with _serving(options, seats):
-            log.info("ready dialect=%s listen=%s mode=%s", options.dialect, options.listen, options.mode)
-            seats.run(should_stop)
+            mode = "realtime" if options.is_realtime else "lockstep"
+            log.info("ready dialect=%s listen=%s mode=%s", options.dialect, options.listen, mode)
+            seats.run(should_stop, lambda: should_stop.is_draining)
     return 0
 
 

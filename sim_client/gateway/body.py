@@ -29,6 +29,10 @@ class Body:
     num_proprio: int
     describe: Callable[[Floats, tuple[int, int]], Robot]
 
+    def example(self) -> Robot:
+        """The description for a state of zeros and pictures of one pixel."""
+        return self.describe(np.zeros(self.num_proprio, np.float32), (1, 1))
+
 
 def _panda(state: Floats, image_px: tuple[int, int]) -> Robot:
     return replace(simulated_robot(PANDA_WRISTCAM, state), image_height=image_px[0], image_width=image_px[1])

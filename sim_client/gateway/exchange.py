@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.messages import Floats, Level, Mode, TaskStatus
+from protocol.messages import Floats, Level, Mode, Robot, RobotState, TaskStatus
 from protocol.peers.mapping import PolicyMapping
 
 Frames = Mapping[str, NDArray[np.uint8]]
@@ -27,6 +27,17 @@ class Busy(Refused):
     """Another client has the robot."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trial:
+    """How a robot's own program runs an episode.
+
+    ``speed``: share of the robot's step limits, (0, 1]. ``is_dry``: it sends nothing to the robot.
+    """
+
+    speed: float = 1.0
+    is_dry: bool = False
+
+
 class Observed(NamedTuple):
     """Observation of the client's robot at one tick."""
 
@@ -41,6 +52,10 @@ class Step:
     ``begins``: start a new episode in any case. ``may_begin``: start one if none is open, for protocols without
     episodes. ``demo`` is the conditioning video at the control rate, used only at the start of an episode. ``since``:
     the observations between the last request and this one, for protocols that send them.
+
+    A robot's own program says more: ``taken_ns``, the instant of ``state`` (this host's monotonic clock; None: now);
+    what the robot says of itself; and, live, the newest tick that it was told of, to wait for a later one. ``trial``
+    are its terms if the request only opens an episode.
     """
 
     instruction: str
@@ -51,6 +66,11 @@ class Step:
     demo: Sequence[Frames] = ()
     since: Sequence[Observed] = ()
     task: str = ""
+    taken_ns: int | None = None
+    robot_state: RobotState = RobotState.UNSPECIFIED
+    robot_text: str = ""
+    after_tick: int = -1
+    trial: Trial | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,11 +83,15 @@ class Finish:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Answer:
-    """Commands for ``tick`` and the ticks after it, one row each, and the rung of the ladder that each came from."""
+    """Commands for ``tick`` and the ticks after it, one row each, and the rung of the ladder that each came from.
+
+    ``deadline_ns``: live, the deadline of ``tick`` on this host's monotonic clock.
+    """
 
     rows_NA: Floats
     tick: int
     levels: tuple[Level, ...]
+    deadline_ns: int = 0
 
 
 class ClientRequest(NamedTuple):
@@ -83,7 +107,8 @@ class Terms:
     """Facts that a client may know before its first request, and the keys that its dialect reads.
 
     ``cameras`` are our names with the client's keys; an empty key: the client's pictures in their own order.
-    ``mapping``: names and units of a policy's client, for GR00T's dialects.
+    ``robot`` is described for a state of zeros and pictures of one pixel. ``mapping``: names and units of a policy's
+    client, for GR00T's dialects.
     """
 
     mode: Mode
@@ -91,9 +116,13 @@ class Terms:
     control_hz: int
     cameras: Mapping[str, str]
     state_key: str
-    num_proprio: int
+    robot: Robot
     version: str
     mapping: PolicyMapping | None = None
+
+    @property
+    def num_proprio(self) -> int:
+        return self.robot.num_proprio
 
 
 class Door(Protocol):

@@ -30,10 +30,11 @@ from protocol import messages as m
 from protocol.drops import DropReason
 from protocol.errors import EpisodeRefused, ProtocolError, TransportError
 from protocol.link import Link, Stream
-from protocol.topics import ACTION, CHUNK, HEALTH, OBSERVATION, SHADOW_OF, TICK
+from protocol.process import host_clock_id
+from protocol.topics import ACTION, CHUNK, EVENT, HEALTH, OBSERVATION, SHADOW_OF, TICK
 from sim_client.episode import CLOCK_SILENCE_NS
 from sim_client.gateway.body import Body
-from sim_client.gateway.exchange import Answer, Finish, Frames, Refused, Step
+from sim_client.gateway.exchange import Answer, Finish, Frames, Refused, Step, Trial
 from sim_client.gateway.lease import Lease
 from sim_client.gateway.node import LiveNode, LockstepNode, Measurement, Node
 from sim_client.gateway.pictures import resized
@@ -67,6 +68,7 @@ class Plan:
     pixels: Literal["jpeg", "exact"] = "jpeg"
     patience_ns: int = 120_000_000_000
     idle_ns: int = 300_000_000_000
+    waits_for_person: bool = False  # a stopped episode goes on until somebody engages it
 
 
 @dataclass(slots=True)
@@ -81,7 +83,7 @@ class _Episode:
     client: str
     info: m.EpisodeInfo
     node: Node
-    clock: MonotonicClock  # of the host, from the first observation on
+    clock: MonotonicClock | None = None  # of the host, from the first observation on
     heard_ns: int = 0  # the newest command, on that clock
     over: str = ""  # why it ended although the client did not end it
 
@@ -119,11 +121,12 @@ class Machine:
         self._session = f"{_id_of(plan.suite)}-{secrets.token_hex(4)}"
         self._num_episodes = 0
         self._episode: _Episode | None = None
-        self._waiting: list[Future[Answer | None]] = []  # live: asked before the first command
+        self._waiting: list[tuple[Future[Answer | None], int]] = []  # live: for a command after a tick
         self._jobs: queue.SimpleQueue[_Job] = queue.SimpleQueue()
         self._lease = Lease(plan.idle_ns)
         self._lock = threading.Lock()  # of the lease and the next line: network threads read them
         self._is_closed = False
+        self._is_draining = False
 
     @property
     def robot(self) -> str:
@@ -142,7 +145,7 @@ class Machine:
         return self._lease.holder
 
     def submit(self, client: str, request: Step | Finish) -> Future[Answer | None]:
-        """Hands in a request; the future holds its answer (None of a Finish), or raises Refused.
+        """Hands in a request; the future holds its answer (None if it asks for no rows), or raises Refused.
 
         Raises:
             Busy: another client has the robot.
@@ -187,11 +190,22 @@ class Machine:
                 raise TransportError(f"not ready within {self._plan.patience_ns / 1e9:.0f} s (--patience-s): {missing}")
             self._turn(_IDLE_NS)
 
-    def run(self, should_stop: Callable[[], bool]) -> None:
-        """Works until ``should_stop()``, then ends an open episode."""
+    def tell_time(self) -> bool:
+        """Answers those who ask for this host's clock; returns whether there were any."""
+        return self._robot_end.tell_time()
+
+    def drain(self) -> bool:
+        """Begins no more episodes from now on; returns whether none runs."""
+        if not self._is_draining:
+            log.info("draining robot=%s episode=%s", self._link.robot, self._link.episode or "none")
+        self._is_draining = True
+        return self._episode is None or bool(self._episode.over)
+
+    def run(self, should_stop: Callable[[], bool], is_draining: Callable[[], bool] = lambda: False) -> None:
+        """Works until ``should_stop()``, or while ``is_draining()`` to the end of an open episode."""
         self._should_stop = should_stop
         try:
-            while not should_stop():
+            while not (should_stop() or (is_draining() and self.drain())):
                 self.step()
         finally:
             with self._lock:
@@ -246,16 +260,29 @@ class Machine:
             if frame.shape[:2] != (height, width):
                 came = f"{frame.shape[0]} x {frame.shape[1]}"
                 raise Refused(f"{name}: expected {height} x {width} px as at first, came {came}. See --image-px.")
-        now = Measurement(self._packed(frames), step.state)
+        if step.trial is not None:
+            job.future.set_result(None)
+            return
+        now = Measurement(self._packed(frames), step.state, step.robot_state, step.robot_text)
         if isinstance(episode.node, LockstepNode):
             px = self._plan.image_px
             since = [Measurement(self._packed(resized(seen.frames, px)), seen.state) for seen in step.since]
             self._show(episode.node.show(since, now))
             job.future.set_result(self._play(episode, episode.node))
             return
-        self._show(episode.node.show(now, episode.clock.now_ns()))
-        self._waiting.append(job.future)
+        self._show_live(episode, episode.node, now, step.taken_ns)
+        self._waiting.append((job.future, step.after_tick))
         self._look_after_live()
+
+    def _show_live(self, episode: _Episode, node: LiveNode, now: Measurement, taken_ns: int | None) -> None:
+        """A real robot's observations have this host's instants, which the clock service converts."""
+        if episode.clock is None:
+            episode.clock = MonotonicClock()
+        host_ns = time.monotonic_ns() if taken_ns is None else taken_ns
+        if episode.info.robot.is_simulated:
+            self._show(node.show(now, host_ns - episode.clock.zero_ns))
+        else:
+            self._show(node.show(now, host_ns), host_clock_id())
 
     def _play(self, episode: _Episode, node: LockstepNode) -> Answer:
         """Lockstep: all ticks that the client has played since its last request, and the one that it asks about."""
@@ -283,24 +310,24 @@ class Machine:
     def _look_after_live(self) -> None:
         """Takes commands as they come, answers those who waited for the first, and notices the end."""
         episode = self._episode
-        if episode is None or not isinstance(episode.node, LiveNode) or episode.over:
+        if episode is None or not isinstance(episode.node, LiveNode) or episode.over or episode.clock is None:
             return
-        self._take_background(episode.node)
+        node = episode.node
+        self._take_background(node)
         for action in self._commands(episode):
-            episode.node.on_action(action)
+            node.on_action(action, time.monotonic_ns())
             episode.heard_ns = episode.clock.now_ns()
-        answer = episode.node.answer()
         silent_ns = episode.clock.now_ns() - episode.heard_ns
-        limit_ns = self._plan.patience_ns if answer is None else CLOCK_SILENCE_NS
+        limit_ns = self._plan.patience_ns if node.commands.newest is None else CLOCK_SILENCE_NS
         why = episode.node.over() or self._objection()
         if not why and silent_ns > limit_ns:
             why = f"no command for {silent_ns / 1e6:.0f} ms"
-        waiting, self._waiting = (self._waiting, []) if answer is not None or why else ([], self._waiting)
-        for future in waiting:
-            if answer is not None:
+        waiting, self._waiting = self._waiting, []
+        for future, after_tick in waiting:
+            if (answer := node.answer(after_tick)) is not None:
                 future.set_result(answer)
             else:
-                future.set_exception(Refused(f"the episode is over: {why}"))
+                self._waiting.append((future, after_tick))
         if why:
             episode.over = why
             self._end(m.TaskStatus.ABORTED, why, keep=episode)
@@ -336,13 +363,20 @@ class Machine:
         self._recorder.step()
         self._robot_end.take_turn(longest_ns)
 
-    def _show(self, observation: m.Observation) -> None:
-        self._link.publish(OBSERVATION, observation, at_ns=observation.source_ns)
+    def _show(self, observation: m.Observation, clock_id: str = m.EPISODE_CLOCK) -> None:
+        self._link.publish(OBSERVATION, observation, at_ns=observation.source_ns, clock_id=clock_id)
+
+    def _tell(self, name: str, text: str) -> None:
+        event = m.Event(severity=m.Severity.WARNING, name=name, text=text)
+        self._link.publish(EVENT, event, at_ns=0)
 
     # -- one episode
 
     def _begin(self, client: str, step: Step, frames: Frames) -> _Episode:
         """Raises Refused, TransportError: the servers do not take this episode."""
+        if self._is_draining:
+            self._end(m.TaskStatus.ONGOING, "another episode was begun")
+            raise Refused("the gateway is draining: it leaves now, and another process takes its place")
         image_px = next(iter(frames.values())).shape[:2]
         robot = self._plan.body.describe(step.state, (image_px[0], image_px[1]))
         _check_state(step.state, robot)
@@ -350,7 +384,11 @@ class Machine:
         schedule = self._plan.schedule(seed)
         if schedule.mode == m.Mode.LOCKSTEP and self._plan.num_rows > 1:
             # A client may not say what it saw between its requests: the last state is repeated, and has no lead.
-            robot = replace(robot, max_lead=np.zeros(0, np.float32))
+            robot = _without_lead(robot)
+        trial = step.trial or Trial()
+        if trial.is_dry:  # nothing moves, so commands lead the arm
+            robot = _without_lead(robot)
+        robot = replace(robot, max_step=(robot.max_step * np.float32(trial.speed)).astype(np.float32))
         self._end(m.TaskStatus.ONGOING, "another episode was begun")
         self._num_episodes += 1
         task = _id_of(step.task) or self._plan.task
@@ -371,7 +409,7 @@ class Machine:
         )
         path = self._log_path(info)
         self._recorder.begin(info, path)
-        episode = _Episode(client, info, self._node(info), MonotonicClock())
+        episode = _Episode(client, info, self._node(info))
         self._episode = episode
         try:
             demo = self._demonstration(step.demo if info.has_demo else (), info.schedule.control_hz)
@@ -387,7 +425,8 @@ class Machine:
             stale.drain()
         for health in self._healths.drain():
             self._misshapen[health.header.proc] = health.dropped.get(DropReason.WRONG_SHAPE, 0)
-        episode.clock, episode.heard_ns = MonotonicClock(), 0
+        if trial.is_dry:
+            self._tell("dry_run", "a dry run: the robot is sent nothing")
         log.info("episode=%s client=%r demo=%d log=%s", info.header.episode, client, len(demo), path)
         for warning in opened.warnings:
             log.warning("episode=%s %s", info.header.episode, warning)
@@ -404,8 +443,9 @@ class Machine:
         return images.pack(frames, images.wire_codec(self._link.bus.is_local))
 
     def _node(self, info: m.EpisodeInfo) -> Node:
-        node = LiveNode if info.schedule.mode == m.Mode.REALTIME else LockstepNode
-        return node(info, self._plan.num_rows)
+        if info.schedule.mode == m.Mode.LOCKSTEP:
+            return LockstepNode(info, self._plan.num_rows)
+        return LiveNode(info, self._plan.num_rows, self._plan.waits_for_person)
 
     def _log_path(self, info: m.EpisodeInfo) -> Path | None:
         if self._plan.out is None:
@@ -420,7 +460,7 @@ class Machine:
             return
         name, num_ticks = self._link.episode, episode.node.tick
         _, missing = self._robot_end.end(status, reason, num_ticks)
-        for future in self._waiting:
+        for future, _ in self._waiting:
             future.set_exception(Refused(f"the episode is over: {reason}"))
         self._waiting = []
         outcome = " ".join([f"status={status.name} ticks={num_ticks} {reason}", *missing])
@@ -430,6 +470,10 @@ class Machine:
 def _refuse(future: Future[Answer | None], sentence: str) -> None:
     if not future.done():  # what failed may have come after the answer
         future.set_exception(Refused(sentence))
+
+
+def _without_lead(robot: m.Robot) -> m.Robot:
+    return replace(robot, max_lead=np.zeros(robot.action_dim, np.float32))
 
 
 def _check_state(state: m.Floats, robot: m.Robot) -> None:

@@ -11,7 +11,7 @@ client, and commands may differ from the forecast.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from clock.playback import deadline_ns
@@ -28,6 +28,8 @@ class Measurement(NamedTuple):
 
     pictures: tuple[m.Image, ...]
     state: m.Floats
+    robot_state: m.RobotState = m.RobotState.UNSPECIFIED
+    robot_text: str = ""
 
 
 @dataclass(slots=True)
@@ -115,12 +117,18 @@ class LockstepNode:
 
 @dataclass(slots=True)
 class LiveNode:
-    """Follows the clock's commands; ``answer`` is what holds at this moment."""
+    """Follows the clock's commands; ``answer`` is what holds at this moment.
+
+    ``waits_for_person``: an episode that the ladder stopped goes on until somebody engages it again.
+    """
 
     info: m.EpisodeInfo
     num_rows: int
+    waits_for_person: bool = False
     tick: int = 0
     """The next one to be commanded."""
+    zero_ns: int | None = None
+    """Episode time 0 on this host's monotonic clock, as far as the commands tell: the first one may come late."""
     commands: Commands = field(init=False)
     _stopped_ticks: int = 0
 
@@ -129,21 +137,30 @@ class LiveNode:
 
     def show(self, now: Measurement, now_ns: int) -> m.Observation:
         """The observation to publish for a request at ``now_ns``, episode time, at the first tick that it can serve."""
-        return m.Observation(tick=self.tick, source_ns=now_ns, proprio=now.state, images=now.pictures)
+        return m.Observation(
+            tick=self.tick, source_ns=now_ns, proprio=now.state, images=now.pictures,
+            robot_state=now.robot_state, robot_text=now.robot_text,
+        )  # fmt: skip
 
-    def on_action(self, action: m.Action) -> None:
+    def on_action(self, action: m.Action, host_ns: int) -> None:
+        """Takes a command that came at ``host_ns``, this host's monotonic clock."""
         if action.tick < self.tick:
             return
+        zero_ns = host_ns - action.header.at_ns
+        self.zero_ns = zero_ns if self.zero_ns is None else min(zero_ns, self.zero_ns)
         self.commands.newest, self.tick = action, action.tick + 1
         self._stopped_ticks = self._stopped_ticks + 1 if action.level == m.Level.STOPPED else 0
 
-    def answer(self) -> Answer | None:
-        """The current command and its forecast; None before the first command."""
-        return self.commands.answer(self.num_rows)
+    def answer(self, after_tick: int = -1) -> Answer | None:
+        """The current command and its forecast; None before the first command after ``after_tick``."""
+        newest = self.commands.newest
+        if newest is None or newest.tick <= after_tick or (answer := self.commands.answer(self.num_rows)) is None:
+            return None
+        return replace(answer, deadline_ns=newest.deadline_ns + (self.zero_ns or 0))
 
     def over(self) -> str:
         """Why the episode cannot go on; "" while it can."""
-        if self._stopped_ticks > STOPPED_TICKS:
+        if self._stopped_ticks > STOPPED_TICKS and not self.waits_for_person:
             return "stopped by the ladder, and nobody engaged it again"
         return ""
 

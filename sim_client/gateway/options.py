@@ -16,22 +16,26 @@ from clock.timebase import NS_PER_MS
 from protocol import files
 from protocol.errors import TransportError
 from protocol.messages import Delay, DelayKind, Schedule, WaitKind
-from protocol.options import LinkOptions, OperationsOptions
+from protocol.options import DaemonOptions, LinkOptions
 from protocol.peers.mapping import PolicyMapping, read_mapping
 from protocol.sockets import endpoint
 from protocol.topics import SHADOW_OF
 from protocol.version import version
-from sim_client.gateway import body, challenge, groot, mme_vla, openpi, vla_eval
+from sim_client.gateway import body, challenge, groot, mme_vla, openpi, ponderpounce, vla_eval
 from sim_client.gateway.exchange import Dialect, Terms
 from sim_client.gateway.machine import Plan
 
 MAX_SEATS = 64
 """Each is a thread, a bus and, in real time, a clock of its own: more robots want another gateway on another host."""
 
-DialectName = Literal["openpi", "challenge", "challenge-http", "mme-vla", "vla-eval", "groot", "groot-n1.5"]
+DialectName = Literal[
+    "ponderpounce", "openpi", "challenge", "challenge-http", "mme-vla", "vla-eval", "groot", "groot-n1.5"
+]
 GROOT: tuple[DialectName, ...] = ("groot", "groot-n1.5")
 _SPOKEN: dict[DialectName, tuple[type[Dialect], Mapping[str, str], str, int]] = {
-    # by name: who speaks it, where it has the cameras and the state, and how many rows an answer usually has
+    # by name: who speaks it, where it has the cameras (if empty: by their names) and the state, and how many rows an
+    # answer usually has
+    "ponderpounce": (ponderpounce.PonderpounceDialect, {}, ponderpounce.STATE_KEY, 1),
     "openpi": (openpi.OpenpiDialect, openpi.CAMERAS, openpi.STATE_KEY, 1),
     "challenge": (challenge.ChallengeDialect, challenge.CAMERAS, challenge.JOINTS_KEY, schedules.HORIZON),
     "challenge-http": (challenge.ChallengeDialect, challenge.CAMERAS, challenge.JOINTS_KEY, schedules.HORIZON),
@@ -107,15 +111,17 @@ class LogOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GatewayOptions:
-    """Lets clients of other protocols drive PONDER and POUNCE: openpi, RoboMME's two evaluators, vla-eval, GR00T."""
+    """Lets a robot's own program drive PONDER and POUNCE, and clients of other protocols: openpi, RoboMME's two
+    evaluators, vla-eval, GR00T."""
 
     dialect: DialectName
     """Protocol of the clients."""
     listen: str = "127.0.0.1:8000"
     """HOST:PORT for the clients. Beyond loopback it needs --api-key-file or --open-to-anyone."""
-    mode: Literal["lockstep", "realtime"] = "lockstep"
+    mode: Literal["lockstep", "realtime"] | None = None
     """Clock. lockstep: a request is --rows ticks of virtual time, and models may take their time. realtime: the
-    schedule runs by itself, and a request is answered immediately with the action commanded at that moment."""
+    schedule runs by itself, and a request is answered immediately with the action commanded at that moment. None:
+    realtime for the dialect ponderpounce, lockstep for the others."""
     rows: int | None = None
     """Number of rows in an answer, played by the client before its next request. None: 1, 20 for the challenge, and the
     mapping file's horizon for GR00T."""
@@ -147,7 +153,7 @@ class GatewayOptions:
     timing: tyro.conf.OmitArgPrefixes[ScheduleOptions] = field(default_factory=ScheduleOptions)
     servers: tyro.conf.OmitArgPrefixes[ServersOptions] = field(default_factory=ServersOptions)
     log: tyro.conf.OmitArgPrefixes[LogOptions] = field(default_factory=LogOptions)
-    operations: tyro.conf.OmitArgPrefixes[OperationsOptions] = field(default_factory=OperationsOptions)
+    operations: tyro.conf.OmitArgPrefixes[DaemonOptions] = field(default_factory=DaemonOptions)
     link: LinkOptions = field(
         default_factory=lambda: LinkOptions(connect=tuple(map(endpoint, ("clock", *SERVERS, *SHADOW_OF))))
     )
@@ -166,15 +172,20 @@ class GatewayOptions:
             self._check_mapping(mapping)
         if not 1 <= rows <= horizon:
             raise TransportError(f"--rows {rows}: POUNCE's chunks have {horizon} rows, expected 1 to {horizon}")
+        if self.dialect == "ponderpounce" and (rows != 1 or not self.is_realtime):
+            raise TransportError(
+                "--dialect ponderpounce: a robot's own program gets each tick's command in real time; "
+                "leave --rows and --mode out"
+            )
         if self.dialect == "vla-eval" and rows != 1:
             raise TransportError(f"--rows {rows}: vla-eval asks at every step and plays one row; leave --rows out")
         every_ticks = self.schedule(0).invoke_period_ticks
-        if self.mode == "lockstep" and every_ticks % rows:
+        if not self.is_realtime and every_ticks % rows:
             raise TransportError(
                 f"--invoke-every-ticks {every_ticks} is no multiple of --rows {rows}: a new chunk would break the "
                 "promise of rows that the client is still playing"
             )
-        if self.mode == "lockstep" and self.timing.wait == "hold" and rows != 1:
+        if not self.is_realtime and self.timing.wait == "hold" and rows != 1:
             raise TransportError(
                 f"--wait hold ends within --rows {rows}, whose last rows it would change; take --rows 1"
             )
@@ -199,6 +210,10 @@ class GatewayOptions:
                 raise ValueError(f"play_hz is {mapping.play_hz}, the robot's {schedules.CONTROL_HZ}")
 
     @property
+    def is_realtime(self) -> bool:
+        return (self.mode or ("realtime" if self.dialect == "ponderpounce" else "lockstep")) == "realtime"
+
+    @property
     def address(self) -> tuple[str, int]:
         """Host and port of ``listen``. Raises TransportError if it is not HOST:PORT."""
         host, _, port = self.listen.rpartition(":")
@@ -209,7 +224,7 @@ class GatewayOptions:
     @property
     def runs_clock_daemon(self) -> bool:
         place = self.servers.clock
-        return place == "daemon" or (place == "auto" and self.mode == "realtime")
+        return place == "daemon" or (place == "auto" and self.is_realtime)
 
     def api_key(self) -> str:
         """The word that clients must know; "" if none. Raises OSError or FileError unless the file has one."""
@@ -222,7 +237,7 @@ class GatewayOptions:
     def terms(self) -> Terms:
         """The terms for the dialect. Raises TransportError for a camera that is not NAME=KEY."""
         _, cameras, state_key, rows = _SPOKEN[self.dialect]
-        mapping = self.policy_mapping()
+        mapping, robot = self.policy_mapping(), self.body().example()
         pairs = [each.partition("=") for each in self.cameras]
         if any(not name or not key for name, _, key in pairs):
             raise TransportError(f"--cameras {' '.join(self.cameras)}: expected NAME=KEY, e.g. front=observation/image")
@@ -230,9 +245,9 @@ class GatewayOptions:
             mode=self.schedule(0).mode,
             rows=self.rows if self.rows is not None else rows or self._mapped_rows(),
             control_hz=schedules.CONTROL_HZ,
-            cameras={name: key for name, _, key in pairs} or cameras,
+            cameras={name: key for name, _, key in pairs} or cameras or {name: name for name in robot.cameras},
             state_key=self.state_key or state_key,
-            num_proprio=self.body().num_proprio,
+            robot=robot,
             version=version(),
             mapping=mapping,
         )
@@ -247,15 +262,15 @@ class GatewayOptions:
 
     def schedule(self, seed: int) -> Schedule:
         """The schedule of the episode with this seed."""
-        base = schedules.realtime() if self.mode == "realtime" else schedules.paper()
+        base = schedules.realtime() if self.is_realtime else schedules.paper()
         rows = self.rows or _SPOKEN[self.dialect][3] or self._mapped_rows()
-        every_ticks = rows if self.mode == "lockstep" and rows > 1 else base.invoke_period_ticks
+        every_ticks = rows if not self.is_realtime and rows > 1 else base.invoke_period_ticks
         fixed = Delay(kind=DelayKind.FIXED, mean_ns=self.timing.delay_ms * NS_PER_MS)
         return replace(
             base,
             query_period_ns=self.timing.query_period_ms * NS_PER_MS,
             invoke_period_ticks=self.timing.invoke_every_ticks or every_ticks,
-            query_delay=base.query_delay if self.mode == "realtime" else fixed,
+            query_delay=base.query_delay if self.is_realtime else fixed,
             wait=WaitKind.HOLD if self.timing.wait == "hold" else WaitKind.STAND_STILL,
             max_age_ns=self.timing.max_age_ms * NS_PER_MS,
             stale_limit_ns=self.timing.stale_limit_ms * NS_PER_MS,
@@ -281,6 +296,7 @@ class GatewayOptions:
             pixels=self.log.pixels,
             patience_ns=round(self.servers.patience_s * 1e9),
             idle_ns=round(self.clients.idle_s * 1e9),
+            waits_for_person=self.dialect == "ponderpounce",
         )
 
 

@@ -58,17 +58,17 @@ class Seats:
         for machine in self._machines:
             machine.await_servers(should_stop)
 
-    def run(self, should_stop: Callable[[], bool]) -> None:
-        """Works until ``should_stop()``, each seat in a thread. One that fails leaves the others.
+    def run(self, should_stop: Callable[[], bool], is_draining: Callable[[], bool] = lambda: False) -> None:
+        """Works as a machine does, each seat in a thread. One that fails leaves the others.
 
         Raises:
             TransportError: all have failed.
         """
         if len(self._machines) == 1:
-            self._machines[0].run(should_stop)
+            self._machines[0].run(should_stop, is_draining)
             return
         threads = [
-            threading.Thread(target=_run, args=(machine, should_stop), name=machine.robot, daemon=True)
+            threading.Thread(target=_run, args=(machine, should_stop, is_draining), name=machine.robot, daemon=True)
             for machine in self._machines
         ]
         for thread in threads:
@@ -76,12 +76,12 @@ class Seats:
         for thread in threads:
             while thread.is_alive():
                 thread.join(0.2)  # in slices, so that a signal is handled
-        if not should_stop():
+        if not (should_stop() or is_draining()):
             raise TransportError("every seat has failed; the log says why")
 
 
-def _run(machine: Machine, should_stop: Callable[[], bool]) -> None:
+def _run(machine: Machine, should_stop: Callable[[], bool], is_draining: Callable[[], bool]) -> None:
     try:
-        machine.run(should_stop)
+        machine.run(should_stop, is_draining)
     except Exception:  # a bug: the others' robots are not to stop for it
         log.exception("seat=%s failed, and is closed", machine.robot)

@@ -14,14 +14,15 @@ import pytest
 
 from clock import schedules
 from protocol import messages as m
-from sim_client.gateway.body import Body
+from sim_client.gateway.body import PANDA, Body
 from sim_client.gateway.exchange import Answer, Step, Terms
 from sim_client.gateway.machine import Machine, Plan
 from sim_client.gateway.websocket import WebsocketSide
 
 PX, DIM = 4, 3
 TERMS = Terms(
-    mode=m.Mode.LOCKSTEP, rows=1, control_hz=20, cameras={}, state_key="", num_proprio=DIM, version="0.0.0"
+    mode=m.Mode.LOCKSTEP, rows=1, control_hz=20, cameras={}, state_key="", version="0.0.0",
+    robot=replace(PANDA.example(), num_proprio=DIM),
 )  # fmt: skip
 
 

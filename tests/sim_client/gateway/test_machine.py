@@ -180,6 +180,23 @@ def test_each_beginning_is_an_episode_of_its_own(bench: Any, step_of: StepOf) ->
     assert bench.rig.clock.conductor is None
 
 
+def test_a_draining_gateway_plays_its_episode_to_the_end_and_begins_no_other(bench: Any, step_of: StepOf) -> None:
+    bench.ask(step_of(begins=True))
+    assert not bench.machine.drain()
+    assert bench.ask(step_of(1)).tick == 1
+    with pytest.raises(Refused, match="draining"):
+        bench.ask(step_of(begins=True))
+    assert bench.machine.drain()
+
+
+def test_a_gateway_that_drains_leaves_when_its_client_has_finished(bench: Any, step_of: StepOf) -> None:
+    bench.ask(step_of(begins=True))
+    bench.machine.submit("anna", Finish())
+    bench.machine.run(lambda: False, lambda: True)
+    with pytest.raises(Refused, match="stopped"):
+        bench.machine.submit("anna", step_of(begins=True))
+
+
 def test_pictures_that_change_their_size_are_refused_and_the_episode_goes_on(bench: Any, step_of: StepOf) -> None:
     bench.ask(step_of(begins=True))
     big = np.zeros((8, 8, 3), np.uint8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -120,7 +121,7 @@ def test_live_a_request_is_answered_with_the_newest_command(info: m.EpisodeInfo)
     assert node.answer() is None
     assert (node.show(SHOWN, 7).tick, node.show(SHOWN, 7).source_ns) == (0, 7)
     for tick in (0, 1, 4, 2):  # the fourth comes late
-        node.on_action(commanded(tick))
+        node.on_action(commanded(tick), 0)
     answer = node.answer()
     assert answer is not None
     assert (answer.tick, answer.levels) == (4, (m.Level.PLAY,))
@@ -131,7 +132,7 @@ def test_live_a_request_is_answered_with_the_newest_command(info: m.EpisodeInfo)
 def test_live_several_rows_are_the_command_and_what_its_chunk_has_ahead(info: m.EpisodeInfo) -> None:
     node = LiveNode(info, 4)
     node.commands.on_chunk(chunk_from(0, value=0.05))
-    node.on_action(commanded(18))
+    node.on_action(commanded(18), 0)
     node.commands.on_account(account_of(commanded(18), invocation=0))
     answer = node.answer()
     assert answer is not None
@@ -139,13 +140,25 @@ def test_live_several_rows_are_the_command_and_what_its_chunk_has_ahead(info: m.
     assert answer.rows_NA[:, 0].tolist() == pytest.approx([commanded(18).values[0], 0.05, 0.05, 0.05], abs=1e-6)
 
 
+def test_live_an_answer_comes_after_a_tick_and_with_its_deadline_on_the_host_s_clock(info: m.EpisodeInfo) -> None:
+    node = LiveNode(info, 1)
+    for tick, late_ns in ((3, 900), (4, 200), (5, 500)):  # what is least late shows where episode time began
+        action = replace(commanded(tick), deadline_ns=1000 * tick, header=m.Header(at_ns=1000 * tick))
+        node.on_action(action, 70_000 + 1000 * tick + late_ns)
+    assert node.answer(5) is None
+    answer = node.answer(4)
+    assert answer is not None
+    assert (answer.tick, answer.deadline_ns) == (5, 75_200)
+
+
 def test_live_an_arm_that_stays_stopped_ends_the_episode(info: m.EpisodeInfo) -> None:
     node = LiveNode(info, 1)
     for tick in range(STOPPED_TICKS):
-        node.on_action(commanded(tick, m.Level.STOPPED))
+        node.on_action(commanded(tick, m.Level.STOPPED), 0)
     assert node.over() == ""
-    node.on_action(commanded(STOPPED_TICKS, m.Level.STOPPED))
+    node.on_action(commanded(STOPPED_TICKS, m.Level.STOPPED), 0)
     assert "nobody engaged" in node.over()
+    assert replace(node, waits_for_person=True).over() == ""
 
 
 @pytest.mark.parametrize("level", [m.Level.HOLD, m.Level.DECELERATE, m.Level.STOPPED])

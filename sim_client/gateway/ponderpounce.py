@@ -1,0 +1,139 @@
+"""The dialect of ``ponderpounce-client``, for a robot's own program: it says what the robot measured and when, and gets
+each tick's command with its rung of the ladder and its deadline.
+
+Every message is a msgpack map with ``kind`` and ``seq``; its answer has the same ``seq``. All instants are this host's
+monotonic clock in ns; a client on another host measures the offset with ``time``. Live only: an observation is answered
+with the first command after the last one that this client was told of, so a loop without a timer of its own keeps
+the schedule's rate, and a late one gets the newest command.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import msgpack
+
+from clock.timebase import NS_PER_S
+from protocol.messages import RobotState, TaskStatus
+from sim_client.gateway import reading
+from sim_client.gateway.exchange import Answer, ClientRequest, Finish, Packet, Refused, Step, Terms, Trial
+
+VERSION = 1
+STATE_KEY = "state"
+EXPIRY_TICKS = 3
+"""Ticks after its deadline at which a command expires: the robot's own watchdog stops it unless another has come."""
+MAX_TEXT = 500
+_STATES = {state.name.lower(): state for state in RobotState if state}
+
+
+class PonderpounceDialect:
+    """The robot's program begins and ends episodes itself; a robot that was stopped waits for a person."""
+
+    def __init__(self, terms: Terms) -> None:
+        self._terms = terms
+        self._seq = 0
+        self._instruction = ""
+        self._told_tick = -1
+
+    def greeting(self) -> bytes:
+        terms, robot = self._terms, self._terms.robot
+        return _message(
+            "welcome",
+            0,
+            version=VERSION,
+            server=f"ponderpounce {terms.version}",
+            control_hz=terms.control_hz,
+            cameras=list(terms.cameras.values()),
+            robot={
+                "name": robot.name,
+                "num_proprio": robot.num_proprio,
+                "is_simulated": robot.is_simulated,
+                "command_low": robot.command_low.tolist(),
+                "command_high": robot.command_high.tolist(),
+                "max_step": robot.max_step.tolist(),
+            },
+        )
+
+    def read(self, packet: Packet) -> ClientRequest:
+        self._seq = 0
+        message = reading.message(packet)
+        kind, seq = message.get("kind"), message.get("seq")
+        if type(seq) is not int or not 0 <= seq < 1 << 63:
+            raise Refused(f"seq: expected the number of this message, came {str(seq)[:80]!r}")
+        self._seq = seq
+        if kind == "time":
+            return ClientRequest(None, seq, reply=_message("time", seq, now_ns=time.monotonic_ns()))
+        if kind == "begin":
+            self._instruction, self._told_tick = reading.text(message, "instruction"), -1
+            trial = Trial(speed=_speed(message), is_dry=message.get("dry_run") is True)
+            return ClientRequest(self._step(message, trial), seq, reply=_message("begun", seq))
+        if kind == "observe":
+            return ClientRequest(self._step(message, None), seq)
+        if kind == "end":
+            return ClientRequest(_outcome(message), seq, reply=_message("ended", seq))
+        raise Refused(f"kind: expected time, begin, observe or end, came {str(kind)[:80]!r}")
+
+    def answer(self, asked: ClientRequest, answer: Answer) -> bytes:
+        self._told_tick = answer.tick
+        return _message(
+            "command",
+            asked.seq,
+            tick=answer.tick,
+            values=answer.rows_NA[0].tolist(),
+            level=answer.levels[0].name,
+            deadline_ns=answer.deadline_ns,
+            expires_ns=answer.deadline_ns + EXPIRY_TICKS * NS_PER_S // self._terms.control_hz,
+        )
+
+    def refuse(self, sentence: str) -> bytes:
+        return _message("refused", self._seq, why=sentence)
+
+    def _step(self, message: Mapping[Any, Any], trial: Trial | None) -> Step:
+        key, said = self._terms.state_key, message.get("robot_state", "ok")
+        if not isinstance(said, str) or said not in _STATES:
+            raise Refused(f"robot_state: expected {', '.join(_STATES)}, came {str(said)[:80]!r}")
+        pictures = reading.field(message, "images", "pictures by camera")
+        if not isinstance(pictures, Mapping):
+            raise Refused(f"images: expected pictures by camera, came {type(pictures).__name__}")
+        task = message.get("task", "")
+        return Step(
+            instruction=self._instruction,
+            frames=reading.frames(pictures, self._terms.cameras),
+            state=reading.numbers(reading.field(message, key, "the measured joints"), key, self._terms.num_proprio),
+            begins=trial is not None,
+            task=task if isinstance(task, str) else "",
+            taken_ns=_instant(message, "state_ns"),
+            robot_state=_STATES[said],
+            robot_text=str(message.get("robot_text", ""))[:MAX_TEXT],
+            after_tick=self._told_tick,
+            trial=trial,
+        )
+
+
+def _instant(message: Mapping[Any, Any], key: str) -> int:
+    value = reading.field(message, key, "when the joints were measured, on this host's monotonic clock")
+    if type(value) is not int or abs(value) >= 1 << 62:
+        raise Refused(f"{key}: expected nanoseconds, came {str(value)[:80]!r}")
+    return value
+
+
+def _speed(message: Mapping[Any, Any]) -> float:
+    value = message.get("speed", 1.0)
+    if type(value) not in (int, float) or not 0.1 <= value <= 1:
+        raise Refused(f"speed: expected 0.1 to 1, the share of the robot's step limits, came {str(value)[:80]!r}")
+    return float(value)
+
+
+def _outcome(message: Mapping[Any, Any]) -> Finish:
+    success, reason = message.get("success"), str(message.get("reason", ""))[:MAX_TEXT]
+    if success is None:
+        return Finish(reason=reason or "the robot's program ended it")
+    return Finish(
+        status=TaskStatus.SUCCESS if success else TaskStatus.FAIL, reason=reason or "says the robot's program"
+    )
+
+
+def _message(kind: str, seq: int, **values: Any) -> bytes:
+    return bytes(msgpack.packb({"kind": kind, "seq": seq, **values}))
