@@ -118,16 +118,18 @@ class Arm:
         self.said = "ok"
         self.sent: list[np.ndarray] = []
         self.moved: list[float] = []
+        self.tick = -1
 
     def observe(self) -> Any:
         frame = np.full((4, 4, 3), len(self.sent) % 256, np.uint8)
         return client.Observation(self.joints.copy(), {"front": frame, "wrist": frame}, robot_state=self.said)
 
-    def obey(self, values: np.ndarray) -> None:
+    def obey(self, command: Any) -> None:
+        """Notes the movement per tick: a test that is late leaves ticks out."""
         assert self.said == "ok"
-        self.moved.append(float(np.abs(values - self.joints).max()))
-        self.sent.append(values)
-        self.joints = values.copy()
+        self.moved.append(float(np.abs(command.values - self.joints).max()) / (command.tick - self.tick))
+        self.sent.append(command.values)
+        self.joints, self.tick = command.values.copy(), command.tick
 
 
 @pytest.fixture
@@ -155,12 +157,12 @@ def gateway(
         yield bench.rig, f"ws://127.0.0.1:{port}", tmp_path
 
 
-def until(asked: Any, arm: Arm, level: str, *, obeys: bool = True, longest: int = 100) -> Any:
+def until(asked: Any, arm: Arm, level: str, longest: int = 100) -> Any:
     """Steps until the schedule is on this rung."""
     for _ in range(longest):
         command = asked.step(arm.observe())
-        if obeys and arm.said == "ok" and command.level not in ("STOPPED", "DECELERATE"):
-            arm.obey(command.values)
+        if arm.said == "ok" and command.level not in ("STOPPED", "DECELERATE"):
+            arm.obey(command)
         if command.level == level:
             return command
     pytest.fail(f"no {level} within {longest} ticks")
@@ -174,7 +176,7 @@ def test_every_tick_is_told_once_with_a_deadline_of_this_clock(gateway: Any) -> 
         asked.begin(arm.observe(), "lift")
         commands = [asked.step(arm.observe())]
         for _ in range(12):
-            arm.obey(commands[-1].values)
+            arm.obey(commands[-1])
             commands.append(asked.step(arm.observe()))
             assert commands[-1].deadline_ns <= time.monotonic_ns() <= commands[-1].expires_ns + 1_000_000_000
         asked.end(success=True)
@@ -210,8 +212,7 @@ def test_stop_displace_release_engage_and_no_step_is_above_the_limit(
         assert (arm.joints == left_at).all()
         engage(rig)
         until(asked, arm, "PLAY")
-        for _ in range(10):
-            asked.step(arm.observe())
+        for _ in range(15):
             until(asked, arm, "PLAY")
         asked.end()
     assert len(arm.moved) > 15
