@@ -42,9 +42,13 @@ class Rig:
         folder: for what the daemons print.
         with_clock: whether the clock service is a daemon.
         proxied: whether the daemons listen on TCP and are reached through ``proxies``, by name.
+        allow_starved: whether a busy machine may play a schedule that leaves ticks without a row.
     """
 
-    def __init__(self, folder: Path, *, with_clock: bool = True, proxied: bool = False) -> None:
+    def __init__(
+        self, folder: Path, *, with_clock: bool = True, proxied: bool = False, allow_starved: bool = False
+    ) -> None:
+        self._of_clock = ["--allow-starved"] if allow_starved else []
         self.heard: list[Heard] = []
         self._episodes: set[str] = set()
         self._over: set[str] = set()
@@ -57,7 +61,9 @@ class Rig:
             self.proxies = {name: Proxy(port) for name, port in zip(names, ports, strict=True)}
             endpoints = tuple(f"tcp/127.0.0.1:{port}" for port in ports)
         else:
-            endpoints = start_local(self.daemons, robot=ROBOT, with_clock=with_clock, ponder=[], pounce=[])
+            endpoints = start_local(
+                self.daemons, robot=ROBOT, with_clock=with_clock, allow_starved=allow_starved, ponder=[], pounce=[]
+            )
         self._listens = dict(zip(names, endpoints, strict=True))
         self._reached = self._listens | {name: proxy.endpoint for name, proxy in self.proxies.items()}
         for name in self.proxies:
@@ -93,7 +99,7 @@ class Rig:
         """Starts a daemon, for instance a killed one, at its endpoint."""
         arguments = ["--link.robot", ROBOT, "--link.listen", self._listens[name]]
         if name == "clock":
-            arguments += ["--link.connect", self._reached["ponder"], self._reached["pounce"]]
+            arguments += ["--link.connect", self._reached["ponder"], self._reached["pounce"], *self._of_clock]
         self.daemons.start(name, _MODULES[name], arguments)
 
     def listen(self, is_enough: Callable[[], bool], patience_s: float) -> bool:

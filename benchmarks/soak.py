@@ -118,7 +118,10 @@ def look(pid: int, at_s: float) -> Look:
 def soak(options: SoakOptions) -> Soak:
     """Plays for the given time."""
     seen = Soak()
-    with tempfile.TemporaryDirectory() as name, Rig(Path(name), with_clock=options.mode == "realtime") as rig:
+    with (
+        tempfile.TemporaryDirectory() as name,
+        Rig(Path(name), with_clock=options.mode == "realtime", allow_starved=options.mode == "realtime") as rig,
+    ):
         out = Path(name) / "out"
         words = ["--episodes", "1000000", "--max-steps", str(options.max_steps), "--task", options.task]
         player = rig.play(words, out, mode=options.mode)
