@@ -84,7 +84,7 @@ def draw(seed: int, index: int) -> Fault:
     """The fault of trial ``index``; kinds come in turn, everything else is drawn."""
     rng = np.random.default_rng([seed, index])
     kind = tuple(KINDS)[index % len(KINDS)]
-    victims = _VICTIMS[rng.integers(len(_VICTIMS))]
+    victims: tuple[str, ...] = _VICTIMS[rng.integers(len(_VICTIMS))]
     if kind in ("fds_limited", "memory_limited"):
         victims = _VICTIMS[rng.integers(4)]
     elif kind in ("tcp_stalled", "tcp_cut"):

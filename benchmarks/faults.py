@@ -173,7 +173,7 @@ def place_for(place: Place) -> Iterator[tuple[Rig, Path]]:
         disk = folder / "disk"
         disk.mkdir()
         subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64m", "faults", disk], check=True)
-        stack.callback(subprocess.run, ["umount", "--lazy", disk], check=True)
+        stack.callback(lambda: subprocess.run(["umount", "--lazy", disk], check=True))
         if place == "faketime":
             (folder / "time").write_text("+0\n")
             faked = {
