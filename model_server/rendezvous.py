@@ -28,7 +28,7 @@ class Rendezvous(Generic[R]):
     def __init__(self, *, keep_requests: int) -> None:
         self._observations: OrderedDict[int, Observation] = OrderedDict()
         self._requests: list[R] = []
-        self._keep_requests = keep_requests
+        self.keep_requests = keep_requests
         self.num_superseded = 0
 
     def on_observation(self, observation: Observation) -> None:
@@ -38,7 +38,7 @@ class Rendezvous(Generic[R]):
 
     def on_request(self, request: R) -> None:
         self._requests.append(request)
-        while len(self._requests) > self._keep_requests:
+        while len(self._requests) > self.keep_requests:
             self._requests.pop(0)
             self.num_superseded += 1
 

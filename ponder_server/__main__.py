@@ -97,12 +97,30 @@ def build_official(options: PonderOptions) -> PonderEngine:
     return OfficialPonder(options.checkpoint, options.device)
 
 
+def build_chat(options: PonderOptions) -> PonderEngine:
+    """Waits for the chat endpoint.
+
+    Raises:
+        OSError, ValueError: an option is missing or does not apply, or the endpoint does not answer; the message says
+            why.
+    """
+    from ponder_server.chat.build import build
+
+    if options.checkpoint is not None:
+        raise ValueError("--backend openai has no checkpoint: the endpoint loads --model; leave --checkpoint out")
+    if options.robots.other_robots:
+        raise ValueError("--backend openai serves one robot; leave --other-robots out")
+    return build(options.chat)
+
+
 @command("ponder-serve")
 def main(argv: list[str] | None = None) -> int:
     options = parse(PonderOptions, argv, prog="ponder-serve")
     weights = str(options.checkpoint or f"random weights ({options.random.size})")
-    if options.backend == "official":
-        build = partial(build_official, options)
+    if options.backend == "openai":
+        weights = f"{options.chat.model} at an endpoint"
+    if options.backend != "own":
+        build = partial(build_official if options.backend == "official" else build_chat, options)
         return serve_model(
             "ponder", options.link, weights, build, PonderServer, options.operations, is_shadow=options.shadow
         )

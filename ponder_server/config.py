@@ -87,14 +87,33 @@ class RobotsOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ChatOptions:
+    """A chat model in place of the network, for --backend openai."""
+
+    url: str | None = None
+    """Address of an endpoint with OpenAI's chat completions and pictures, up to the version: http://HOST:PORT/v1."""
+    model: str | None = None
+    """Name of the model at that endpoint."""
+    ask: Path | None = None
+    """TOML file with what the model is told, shown and allowed to answer, see docs/planners.md."""
+    key_variable: str | None = None
+    """Environment variable with the endpoint's key, e.g. OPENAI_API_KEY. None: no key is sent. It is never logged."""
+    answer_s: float = 4.0
+    """Longest time for a reply in seconds. A later one is no transition: the subgoal in force stays."""
+    start_s: float = 60.0
+    """Longest wait in seconds for the endpoint and its first answer: a model may still be loading."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PonderOptions:
     """PONDER (System 2): keeps the episode in Qwen3.5's causal context and answers queries with a cognition."""
 
     checkpoint: Path | None = None
     """Folder in the Hugging Face layout. None: random weights, which are no policy."""
-    backend: Literal["own", "official"] = "own"
+    backend: Literal["own", "official", "openai"] = "own"
     """Code that runs the network. official: the official PonderPounce package, in whose environment this then runs;
-    --checkpoint is its folder, and of the other options --device and --link apply."""
+    --checkpoint is its folder, and of the other options --device and --link apply. openai: a chat model at --url, asked
+    for the next subgoal as --ask says; POUNCE must then read text."""
     device: str = "cpu"
     """Device of the network: cpu, cuda or cuda:N."""
     dtype: Literal["float32", "bfloat16"] = "float32"
@@ -105,5 +124,6 @@ class PonderOptions:
     operations: tyro.conf.OmitArgPrefixes[DaemonOptions] = field(default_factory=DaemonOptions)
     context: tyro.conf.OmitArgPrefixes[ContextOptions] = field(default_factory=ContextOptions)
     speed: tyro.conf.OmitArgPrefixes[SpeedOptions] = field(default_factory=SpeedOptions)
+    chat: tyro.conf.OmitArgPrefixes[ChatOptions] = field(default_factory=ChatOptions)
     robots: tyro.conf.OmitArgPrefixes[RobotsOptions] = field(default_factory=RobotsOptions)
     random: tyro.conf.OmitArgPrefixes[RandomOptions] = field(default_factory=RandomOptions)

@@ -59,8 +59,8 @@ class EngineSpec:
     """H"""
     image_px: tuple[int, int]
     """(h, w) of every image that the network reads."""
-    num_cameras: int
-    """Frames per fire, always the same cameras in the same order."""
+    num_cameras: int | None
+    """Frames per fire, always the same cameras in the same order. None: as many as the robot has."""
     max_context_tokens: int
     model_hash: str
     """12 hex digits over the weights, with a suffix for narrow ones."""
@@ -74,6 +74,11 @@ class EngineSpec:
     """Sampling of demonstrations."""
     session_bytes: int = 0
     """Memory of one session at full length; it is allocated for all sessions at start."""
+    answers_newest: bool = False
+    """True if in real time a query that a newer one overtakes is left out, as it leaves no gap in any context; and if a
+    context that is lost begins anew."""
+    introduction: str = ""
+    """What an episode's log is to say of the model, besides its hash."""
     gives_text: bool = True
     """False if it never writes a subgoal, so that POUNCE's prompt cannot come from it."""
     weights: WeightsName = "float"
@@ -121,6 +126,8 @@ class Fire:
     texts: tuple[Text, ...]
     context_tokens: int
     """Tokens in the session after this fire."""
+    trouble: str = ""
+    """Why it says nothing new although it was asked, for the log; "" if nothing went wrong."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -42,9 +42,13 @@ class PonderNode:
     def num_superseded(self) -> int:
         return self._rendezvous.num_superseded
 
-    def open(self, next_query: int = 0) -> None:
-        """Starts an episode; after a rebuild, queries before ``next_query`` are in the context already."""
+    def open(self, next_query: int = 0, *, is_live: bool = False) -> None:
+        """Starts an episode; after a rebuild, queries before ``next_query`` are in the context already.
+
+        ``is_live``: in real time, where nobody waits for an overtaken query.
+        """
         self._rendezvous.clear()
+        self._rendezvous.keep_requests = 1 if is_live and self._spec.answers_newest else KEEP_QUERIES
         self.next_query = self._next_asked = next_query
         self._subgoal, self._subgoal_source_ns = "", 0
 
@@ -137,7 +141,7 @@ def _work(query: m.Query, observation: m.Observation) -> Work:
 
 def check_robot(robot: m.Robot, spec: EngineSpec) -> None:
     """Raises EpisodeRefused unless the engine can read this robot's cameras and state."""
-    if len(robot.cameras) != spec.num_cameras:
+    if spec.num_cameras is not None and len(robot.cameras) != spec.num_cameras:
         raise EpisodeRefused(
             m.Refusal.CAMERAS,
             f"robot {robot.name!r} has {len(robot.cameras)} cameras {list(robot.cameras)}; PONDER expects "
@@ -162,7 +166,7 @@ def check_robot(robot: m.Robot, spec: EngineSpec) -> None:
 
 def check_pictures(observation: m.Observation, spec: EngineSpec) -> None:
     """Raises MalformedMessage unless the images have the number and sizes that the engine can read."""
-    if len(observation.images) != spec.num_cameras:
+    if spec.num_cameras is not None and len(observation.images) != spec.num_cameras:
         raise MalformedMessage("Observation", "images", f"{spec.num_cameras} cameras", f"{len(observation.images)}")
     found = spec.reader.unreadable([(image.height, image.width) for image in observation.images], spec.image_px)
     if found is not None:

@@ -84,7 +84,7 @@ class OfficialPonder:
         progress()
         self._sessions[session] = _Session(opening.instruction)
         self._theirs.start(session)
-        black = [np.zeros((*IMAGE_PX, 3), np.uint8)] * self.spec.num_cameras  # makes the session; never encoded
+        black = [np.zeros((*IMAGE_PX, 3), np.uint8)] * self._theirs.num_cameras  # makes the session; never encoded
         demo = [views[0] for views in opening.demo_frames]
         try:
             self._observe(session, black, _NO_STATE, demo)
@@ -138,7 +138,7 @@ class OfficialPonder:
 
     def warm_up(self) -> list[int]:
         """See ``PonderEngine.warm_up``."""
-        frames = tuple(np.zeros((*IMAGE_PX, 3), np.uint8) for _ in range(self.spec.num_cameras))
+        frames = tuple(np.zeros((*IMAGE_PX, 3), np.uint8) for _ in range(self._theirs.num_cameras))
         durations_ns = []
         self.open(WARM_UP_SESSION, Opening(instruction="warm up"))
         try:

@@ -85,10 +85,10 @@ class PonderServer(ModelShell):
         rejoined = self._membership.rejoin()
         if rejoined is None:
             return False
-        self._node.open(next_query=rejoined.num_queries)
+        self._node.open(next_query=rejoined.num_queries, is_live=_is_live(rejoined.open))
         self._take_newest(rejoined)
         try:
-            for work in self._missed_work(rejoined.num_queries):
+            for work in self._missed_work(rejoined.num_queries, self._first_missed(rejoined)):
                 if self._is_shadow or work.query.query == rejoined.owed_query:
                     self._fire(work)  # the log waits for each, or the clock still waits for this one (lockstep)
                 else:
@@ -116,13 +116,20 @@ class PonderServer(ModelShell):
         self._node.on_query(m.Query(query=entry.query, tick=entry.tick, source_ns=entry.source_ns))
         return True
 
-    def _missed_work(self, num_queries: int) -> Iterator[Work]:
-        """The first queries of the running episode, from the clock service's journal.
+    def _first_missed(self, rejoined: m.ActiveReply) -> int:
+        """The first query that a rebuild takes: 0, or with ``answers_newest`` the one that the clock awaits."""
+        if not self._engine.spec.answers_newest:
+            return 0
+        is_awaited = rejoined.owed_query is not None and not _is_live(rejoined.open)
+        return rejoined.owed_query if is_awaited else rejoined.num_queries  # type: ignore[return-value]
+
+    def _missed_work(self, num_queries: int, first: int = 0) -> Iterator[Work]:
+        """Queries of the running episode up to ``num_queries``, from the clock service's journal.
 
         Raises:
             CallFailed, ProtocolError: the clock service does not answer, or not with the requested queries.
         """
-        for entry in self._membership.journal(num_queries):
+        for entry in self._membership.journal(num_queries, first):
             query = m.Query(query=entry.query, tick=entry.tick, source_ns=entry.source_ns)
             yield self._node.replay(query, codec.decode(m.Observation, entry.observation))
 
@@ -162,6 +169,10 @@ class PonderServer(ModelShell):
 
     def _answer(self, work: Work, fire: Fire, start_ns: int) -> None:
         ready_ns = time.monotonic_ns()
+        if self._last is None and self._engine.spec.introduction:
+            self._tell(m.Severity.INFO, "ponder_is", self._engine.spec.introduction)
+        if fire.trouble:
+            self._tell(m.Severity.WARNING, "no_reply", f"query {work.query.query}: {fire.trouble}")
         cognition, subgoals = self._node.answer(work, fire, ready_ns=ready_ns, infer_ns=ready_ns - start_ns)
         topic = topics.SHADOW_COGNITION if self._is_shadow else topics.COGNITION
         self._last = self._link.publish(topic, cognition, at_ns=ready_ns, clock_id=host_clock_id())
@@ -197,7 +208,7 @@ class PonderServer(ModelShell):
             context_tokens = self._engine.open(self._link.episode, opening, self._heartbeat.beat)
         except SessionError as error:
             raise EpisodeRefused(m.Refusal.BUSY, str(error)) from error
-        self._node.open()
+        self._node.open(is_live=_is_live(request))
         return replace(self._contract(), context_tokens=context_tokens)
 
     def _close(self) -> None:
@@ -205,6 +216,10 @@ class PonderServer(ModelShell):
             self._engine.close(self._link.episode)
         self._node.open()
         self._last = None
+
+
+def _is_live(opened: m.OpenRequest | None) -> bool:
+    return opened is not None and opened.info.schedule.mode == m.Mode.REALTIME
 
 
 def _channels(spec: EngineSpec) -> tuple[m.ChannelSpec, ...]:
