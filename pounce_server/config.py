@@ -58,11 +58,11 @@ class ContinuityOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RemoteOptions:
-    """Another project's policy server in place of the network, for --backend openpi, vla-eval, groot and groot-n1.5."""
+    """Another project's policy server in place of the network, for the other backends than own and official."""
 
     url: str | None = None
     """Address of the policy server: ws://HOST:PORT or wss://..., with a path if it has one (openpi, vla-eval);
-    tcp://HOST:PORT (GR00T)."""
+    tcp://HOST:PORT (GR00T); tcp/HOST:PORT#DEPLOYMENT (LeRobot)."""
     mapping: Path | None = None
     """TOML file with the policy's names, units and rate for the robot's cameras, state and commands, see
     docs/policies.md."""
@@ -95,10 +95,11 @@ class PounceOptions:
     N1.5. None: random weights, which are no policy."""
     tokenizer: Path | None = None
     """tokenizer.model (pi0.5) or tokenizer.json (GR00T), if the checkpoint folder has none."""
-    backend: Literal["own", "official", "openpi", "vla-eval", "groot", "groot-n1.5"] = "own"
+    backend: Literal["own", "official", "openpi", "vla-eval", "groot", "groot-n1.5", "lerobot"] = "own"
     """Code that runs the network. official: the official PonderPounce package, in whose environment this then runs;
     --checkpoint is its folder, and of the other options --device and --link apply. The others ask a policy server at
-    --url by --mapping: openpi (also SGLang's and vLLM-Omni's), vla-eval 0.8's, GR00T N1.6's and N1.7's, or N1.5's."""
+    --url by --mapping: openpi (also SGLang's and vLLM-Omni's), vla-eval 0.8's, GR00T N1.6's and N1.7's, or N1.5's,
+    LeRobot's."""
     device: str = "cpu"
     """Device of the network: cpu, cuda or cuda:N."""
     dtype: Literal["float32", "bfloat16"] = "float32"

@@ -40,6 +40,12 @@ def _peer(backend: str, url: str, mapping: PolicyMapping, key: str) -> Peer:
         if key:
             raise ValueError("--key-file: vla-eval's servers ask for none; leave it out")
         return VlaEvalPeer(url, mapping)
+    if backend == "lerobot":
+        from pounce_server.remote.lerobot import LerobotPeer
+
+        if key:
+            raise ValueError("--key-file: LeRobot's server asks for none; leave it out")
+        return LerobotPeer(url, mapping)
     from pounce_server.remote.groot import GrootPeer
 
     return GrootPeer(url, mapping, is_flat=backend == "groot-n1.5", api_token=key)

@@ -13,9 +13,16 @@ from sim_client.gateway.groot import check_mapping
 
 FOLDER = Path(__file__).parents[2] / "examples" / "policies"
 FILES = sorted(FOLDER.glob("*.toml"))
+PANDAS = [path for path in FILES if path.stem != "lerobot_so101"]
 
 
-@pytest.mark.parametrize("path", FILES, ids=[path.stem for path in FILES])
+def test_an_so101_s_degrees_become_ours() -> None:
+    mapping = read_mapping(FOLDER / "lerobot_so101.toml")
+    rows = rows_of(mapping, {("action",): np.tile([180.0, 0, 0, 0, 0, 50.0], (50, 1))}, np.zeros(6, np.float32))
+    assert rows[0] == pytest.approx([np.pi, 0, 0, 0, 0, 0.5])
+
+
+@pytest.mark.parametrize("path", PANDAS, ids=[path.stem for path in PANDAS])
 def test_a_mapping_file_fits_our_panda(path: Path) -> None:
     mapping = read_mapping(path)
     assert (mapping.play_hz, mapping.num_proprio, mapping.num_commands) == (20, 8, 8)

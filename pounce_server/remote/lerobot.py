@@ -1,0 +1,234 @@
+"""LeRobot's policy server (``lerobot-policy-server``, after 0.6.1): MessagePack over zenoh, one client per process.
+
+Written from the public source files of October 2026, none of which is a release: see docs/policies.md. Chunks are asked
+for without alignment, because our clock places them by the tick of their observation. An error closes the session, and
+the next invocation opens another one: our ladder holds the robot meanwhile.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Mapping
+from concurrent.futures import wait
+from typing import Any
+
+import numpy as np
+
+from clock.timebase import NS_PER_S
+from pounce_server.remote.peer import Lost, Patience, PeerError
+from protocol.bus import Bus
+from protocol.errors import CallFailed, TransportError
+from protocol.peers.arrays import NotAMessage, pack, unpack
+from protocol.peers.mapping import Key, PolicyMapping
+from protocol.peers.translation import Values, named
+from protocol.topics import Priority
+from protocol.zenoh_bus import Endpoints, ZenohBus
+
+VERSION = 1
+ACTION = ("action",)
+_ROOT = "lerobot/inference/v1/deployments"
+_CALL_S = 5.0
+_LEAVE_NS = 300_000_000
+_KEEP_ANSWERS = 4
+_MAX_ERROR = 500
+
+
+class LerobotPeer:
+    """``url``: zenoh's endpoint and the deployment, ``tcp/127.0.0.1:7447#DEPLOYMENT``."""
+
+    def __init__(self, url: str, mapping: PolicyMapping) -> None:
+        """Raises ValueError: no deployment, or an endpoint that other hosts can read."""
+        endpoint, _, self._deployment = url.partition("#")
+        if not self._deployment or "/" not in endpoint:
+            raise ValueError(f"--url {url}: expected tcp/HOST:PORT#DEPLOYMENT")
+        try:
+            self._endpoints = Endpoints(connect=(endpoint,), shared_memory=False)
+        except TransportError as error:
+            raise ValueError(f"--url {url}: {error} LeRobot's server has no TLS of its own: use a tunnel") from None
+        self._mapping = mapping
+        self._bus: Bus | None = None
+        self._descriptor: Mapping[str, Any] = {}
+        self._session = ""
+        self._answers: Any = None
+        self._generation = self._sequence = self._task_version = 0
+        self._task = ""
+
+    def facts(self, patience: Patience) -> str:
+        self._connect(patience)
+        found = self._descriptor
+        return f"deployment={self._deployment} artifact={found['artifact_identity']} semantics={found['semantics']}"
+
+    def begin(self, patience: Patience) -> None:
+        """An episode's edge: the server drops what is under way."""
+        self._connect(patience)
+        self._generation += 1
+        self._control("reset", patience)
+
+    def infer(self, values: Values, patience: Patience) -> dict[Key, Any]:
+        self._connect(patience)
+        task = str(values[self._mapping.prompt.key])
+        self._task_version += task != self._task
+        self._task = task
+        self._sequence += 1
+        request = secrets.token_hex(16)
+        body = {
+            "sequence": self._sequence,
+            "artifact_identity": self._descriptor["artifact_identity"],
+            "observation_id": f"{self._generation}-{self._sequence}",
+            "capture_time": time.monotonic_ns() / NS_PER_S,
+            "task": task,
+            "task_version": self._task_version,
+            "features": {named(key): value for key, value in values.items() if key != self._mapping.prompt.key},
+            "delay": 0,
+            "model_continuation": None,
+            "canonical_continuation": None,
+            "cursor": 0,
+        }
+        packet = self._enveloped("observation", request, body)
+        bus = self._opened()
+        bus.publish(f"{self._session}/obs", packet, encoding="", attachment=b"", priority=Priority.DATA)
+        answer = self._answered(request, patience)
+        return {ACTION: np.asarray(answer.get("canonical_actions"))}
+
+    def close(self) -> None:
+        bus, self._bus = self._bus, None
+        if bus is not None:
+            if self._session:  # without it the server keeps the seat until its grace is over
+                packet = self._enveloped("control", secrets.token_hex(16), {"operation": "close"})
+                wait([bus.ask(f"{self._session}/control", packet, timeout_ns=_LEAVE_NS)], _LEAVE_NS / NS_PER_S)
+            bus.close()
+
+    def _opened(self) -> Bus:
+        assert self._bus is not None, "connect first"
+        return self._bus
+
+    def _connect(self, patience: Patience) -> None:
+        """Describes, compares, takes the only seat, and begins generation 0. Raises PeerError, Lost."""
+        if self._bus is not None:
+            return
+        self._bus = ZenohBus(self._endpoints)
+        self._session, self._generation, self._sequence = "", 0, 0
+        try:
+            descriptor = self._call(f"{_ROOT}/{self._deployment}/describe", "describe", {}, "descriptor", patience)[1]
+            self._compare(descriptor)
+            if self._descriptor and descriptor["artifact_identity"] != self._descriptor["artifact_identity"]:
+                raise PeerError("it serves another artifact than at first; start pounce-serve again")
+            self._descriptor = descriptor
+            self._open(patience)
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self, patience: Patience) -> None:
+        found = self._descriptor
+        capabilities = found["capabilities"]
+        instance = f"{_ROOT}/{self._deployment}/instances/{found['instance_id']}"
+        body = {
+            "expected_artifact": found["artifact_identity"],
+            "features": capabilities["features"],
+            "action_feature": capabilities["action_feature"],
+            "semantics": found["semantics"],
+            "action_interval": capabilities["action_interval"],
+            "mode": "chunk",
+            "encoding": "raw",
+        }
+        envelope, _ = self._call(f"{instance}/open", "open", body, "accepted", patience)
+        self._session = f"{instance}/sessions/{envelope['session_id']}"
+        bus = self._opened()
+        self._answers = bus.subscribe(f"{self._session}/act", keep=_KEEP_ANSWERS)
+        bus.subscribe(f"{self._session}/language/result", keep=1)  # the server waits for it, also without language
+        bus.declare_alive(f"{self._session}/alive")
+        self._control("reset", patience)
+
+    def _compare(self, found: Mapping[str, Any]) -> None:
+        """Raises PeerError unless the deployment reads and answers what the mapping file says."""
+        mapping, capabilities = self._mapping, found.get("capabilities")
+        if not isinstance(capabilities, Mapping) or not isinstance(capabilities.get("features"), list):
+            raise PeerError(f"expected a descriptor with capabilities, came {str(found)[:_MAX_ERROR]}")
+        features = {str(each.get("name")): each for each in capabilities["features"] if isinstance(each, Mapping)}
+        ours = {named(camera.key): "rgb" for camera in mapping.cameras if camera.key is not None}
+        ours |= {named(key): "tensor" for key in mapping.state_keys()}
+        theirs = {name: each.get("kind") for name, each in features.items()}
+        if theirs != ours:
+            raise PeerError(f"its features are {theirs}; {mapping.name} has {ours}")
+        for key, width in mapping.state_keys().items():
+            if list(features[named(key)].get("shape", ())) != [width]:
+                raise PeerError(
+                    f"its {named(key)} is {features[named(key)].get('shape')}; {mapping.name} has ({width},)"
+                )
+        if "chunk" not in capabilities.get("modes", ()):
+            raise PeerError(f"its modes are {capabilities.get('modes')}, expected chunk among them")
+        rows, rate_hz = capabilities.get("execution_steps"), 1 / float(capabilities.get("action_interval") or np.inf)
+        if rows != mapping.horizon or abs(rate_hz - mapping.rate_hz) > 1e-3:
+            raise PeerError(
+                f"it answers {rows} rows at {rate_hz:.4g} Hz; {mapping.name} has horizon {mapping.horizon} at "
+                f"{mapping.rate_hz} Hz"
+            )
+        if not found.get("ready"):
+            raise Lost(f"it is not ready: {found.get('failure') or found.get('session_status')}")
+
+    def _control(self, operation: str, patience: Patience) -> None:
+        _, ack = self._call(f"{self._session}/control", "control", {"operation": operation}, "ack", patience)
+        if ack.get("applied_generation") != self._generation:
+            self.close()
+            raise PeerError(
+                f"{operation}: expected generation {self._generation}, came {ack.get('applied_generation')}"
+            )
+
+    def _call(
+        self, key: str, kind: str, body: Mapping[str, Any], expected: str, patience: Patience
+    ) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+        """The reply's envelope and body. Raises Lost: nobody serves it; PeerError: an error, or no answer in time."""
+        request = secrets.token_hex(16)
+        asked = self._opened().ask(key, self._enveloped(kind, request, body), timeout_ns=round(_CALL_S * NS_PER_S))
+        try:
+            while not asked.done():
+                wait([asked], patience.look_s())
+            return self._read(asked.result(), expected, request)
+        except CallFailed as error:
+            self.close()
+            raise Lost(str(error)) from error
+        except PeerError:
+            self.close()
+            raise
+
+    def _answered(self, request: str, patience: Patience) -> Mapping[str, Any]:
+        """The action for a request. Late ones, of requests that were given up, are dropped."""
+        try:
+            while True:
+                for sample in self._answers.drain():
+                    packet = sample.payload
+                    if request.encode() in packet:
+                        return self._read(packet, "action", request)[1]
+                self._opened().wait(round(patience.look_s() * NS_PER_S))
+        except PeerError:
+            self.close()
+            raise
+
+    def _enveloped(self, kind: str, request: str, body: Mapping[str, Any]) -> bytes:
+        envelope = {
+            "version": VERSION,
+            "message_type": kind,
+            "instance_id": self._descriptor.get("instance_id", "") if kind != "describe" else "",
+            "session_id": self._session.rpartition("/")[2],
+            "request_id": request,
+            "generation": self._generation,
+            "body": dict(body),
+        }
+        return pack(envelope, "lerobot")
+
+    def _read(self, packet: bytes, expected: str, request: str) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+        """Raises PeerError for an error, and for what is no reply to this request."""
+        try:
+            envelope = unpack(packet)
+        except NotAMessage as error:
+            raise PeerError(f"expected LeRobot's msgpack, came {error}") from None
+        body = envelope.get("body") if isinstance(envelope, Mapping) else None
+        if not isinstance(body, Mapping) or envelope.get("version") != VERSION:
+            raise PeerError(f"expected a message of version {VERSION} with a body, came {str(envelope)[:_MAX_ERROR]}")
+        if envelope.get("message_type") == "error":
+            raise PeerError(f"it says: {body.get('code')}: {str(body.get('message'))[:_MAX_ERROR]}")
+        if envelope.get("message_type") != expected or envelope.get("request_id") != request:
+            raise PeerError(f"expected {expected}, came {envelope.get('message_type')}")
+        return envelope, body
