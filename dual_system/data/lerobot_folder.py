@@ -7,6 +7,7 @@ each other are refused with both numbers: the alternative is an episode with ano
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
+from PIL import Image
 
 from dual_system.data.errors import DatasetError
 from dual_system.data.lerobot_v3 import DATA_PATH, INFO_PATH, VERSION, VIDEO_PATH
@@ -77,7 +79,10 @@ class LeRobotFolder:
                 raise DatasetError(
                     f"{root / INFO_PATH}: {name} is {found!r}, expected {expected!r} as LeRobot writes it"
                 )
-        self.cameras = tuple(name for name, feature in self.features.items() if feature.get("dtype") == "video")
+        self.cameras, self._stills = (
+            tuple(name for name, feature in self.features.items() if feature.get("dtype") == kind)
+            for kind in ("video", "image")
+        )
         self.listed = list(self._listed())
         if not self.listed:
             raise DatasetError(f"{root}: meta/episodes lists no episode")
@@ -108,7 +113,7 @@ class LeRobotFolder:
 
         Args:
             episode: its ``episode_index``.
-            camera: name of a feature in `cameras`.
+            camera: name of a feature of videos or of pictures, which lie among the rows.
             rows: numbers within the episode.
 
         Raises:
@@ -118,6 +123,10 @@ class LeRobotFolder:
         place = self._places[episode]
         if rows and not 0 <= rows[0] <= rows[-1] < place.length:
             raise IndexError(f"rows {rows[0]} to {rows[-1]} of an episode of {place.length} rows")
+        if camera in self._stills:
+            stored = self.rows(episode, [camera])[camera].take(list(rows))
+            with reading(place.data):
+                return np.stack([_decoded(each) for each in stored.to_pylist()])
         path, begin = place.videos[camera]
         with reading(path):
             return np.stack(list(read_frames(path, [begin + row for row in rows], fps=self.fps)))
@@ -241,6 +250,13 @@ def reading(path: Path) -> Iterator[None]:
     except (pa.ArrowException, OSError, ValueError, TypeError, IndexError, MemoryError) as error:
         told = (getattr(error, "strerror", None) or str(error)).partition("\n")[0]
         raise DatasetError(told if str(path) in told else f"{path} cannot be read: {told}") from None
+
+
+def _decoded(stored: Any) -> NDArray[np.uint8]:
+    """A picture of a row: LeRobot stores its file's bytes. Raises ValueError if it is none."""
+    if not isinstance(stored, dict) or not isinstance(stored.get("bytes"), bytes):
+        raise ValueError(f"expected a picture as bytes, came {str(stored)[:80]}")
+    return np.asarray(Image.open(io.BytesIO(stored["bytes"])).convert("RGB"))
 
 
 def _opened(path: Path) -> pq.ParquetFile:

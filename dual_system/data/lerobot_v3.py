@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from dual_system.data.episode import CAMERAS, EXECUTED, OPTIONAL, Episode, to_table
+from dual_system.data.language import EVENTS, FEATURE, PERSISTENT, language_columns
 from dual_system.data.statistics import PixelHistogram, Statistics, of_vectors
 from dual_system.data.video import CODEC, FPS, PIXEL_FORMAT, VideoJoiner
 
@@ -142,7 +143,7 @@ class DatasetWriter:
         columns["episode_index"] = pa.array(np.full(num_rows, len(self._episodes)))
         columns["index"] = pa.array(np.arange(num_rows) + self._num_rows)
         columns["task_index"] = pa.array(np.full(num_rows, task_index))
-        return pa.table(columns)
+        return pa.table(columns | language_columns(episode.rows))
 
     def _columns(self) -> dict[str, dict[str, Any]]:
         return _COLUMNS | {name: _OPTIONAL_COLUMNS[name] for name in self._optional or ()}
@@ -176,7 +177,12 @@ class DatasetWriter:
             "splits": {"train": f"0:{len(self._episodes)}"},
             "data_path": DATA_PATH,
             "video_path": VIDEO_PATH,
-            "features": {**self._columns(), **{video_key(camera): video for camera in CAMERAS}},
+            "features": {
+                **self._columns(),
+                PERSISTENT: FEATURE,
+                EVENTS: FEATURE,
+                **{video_key(camera): video for camera in CAMERAS},
+            },
         }
 
 
@@ -251,7 +257,8 @@ def _place(number: int) -> dict[str, int]:
 
 def _numbers(schema: pa.Schema) -> list[str]:
     """Returns the names of the columns that have statistics."""
-    return [column.name for column in schema if not pa.types.is_string(column.type)]
+    kinds = {column.name: column.type for column in schema}
+    return [name for name, kind in kinds.items() if not (pa.types.is_string(kind) or pa.types.is_list(kind))]
 
 
 def _of_columns(table: pa.Table, names: Sequence[str]) -> dict[str, Statistics]:

@@ -56,13 +56,16 @@ def build(run: Recipe, data: TrainingSet, start: Start) -> tuple[JointModel, Pou
     """Both systems, initialised or loaded, frozen as the recipe says, with the data's own statistics.
 
     Raises:
-        ValueError: pretrained weights are missing, or PONDER cannot read the pictures' size.
+        ValueError: pretrained weights are missing, PONDER cannot read the pictures' size, or texts that the recipe
+            learns are missing.
         FileNotFoundError: a given folder holds no checkpoint.
     """
     if not run.from_scratch and (start.ponder is None or start.pounce is None):
         raise ValueError(
             f"recipe {run.name} starts from pretrained weights; give their folders with --ponder, --pounce"
         )
+    if run.trains != "pounce" and run.example.is_grounded:
+        data.require_texts()
     ponder = _ponder(run, data, start)
     bundle = _pounce(run, data, start, ponder)
     pounce = cast_streams(bundle.model.to(start.device), start.dtype)

@@ -164,6 +164,17 @@ class TrainingSet:
         }
         return sorted(found)
 
+    def require_texts(self) -> None:
+        """Raises ValueError if an episode has no subgoals: PONDER would learn that nothing is ever to be said."""
+        silent = [source for source in self._sources if not any(source.rows().grounded_subgoal)]
+        if silent:
+            entry = silent[0].entry
+            raise ValueError(
+                f"{len(silent)} of {len(self)} episodes have no subgoals (first {entry.task} {entry.seed} of "
+                f"{silent[0].dataset.root}), and the recipe trains PONDER to generate them; leave these episodes out, "
+                "or take a recipe with w2 = 0 (robomme_without_grounding, robocasa_dc)"
+            )
+
     def texts(self) -> list[str]:
         """Distinct texts that PONDER reads or writes in these episodes, sorted."""
         found = set()
