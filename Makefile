@@ -11,7 +11,7 @@ export MUJOCO_GL ?= egl
 export OMP_NUM_THREADS ?= 1
 
 # `make help` lists the rest.
-.PHONY: help setup demo test unit oldest accept soak lint types proto bench clean
+.PHONY: help setup demo test unit oldest peers accept soak lint types proto bench clean
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
 
@@ -67,6 +67,20 @@ oldest: setup
 	test -d $(OLDEST)/transformers || $(BIN)/pip install --quiet --no-deps --target $(OLDEST) transformers==5.17.0
 	test -d $(OLDEST)/httpx || $(BIN)/pip install --quiet --target $(OLDEST) 'huggingface-hub<2' httpx
 	PYTHONPATH=$(OLDEST) $(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile -m "not gpu" tests/models tests/ponder_server
+
+## make peers   unit under Python 3.12 and 3.13, and LeRobot beside us; writes benchmarks/reports/peers.json (an hour)
+LEROBOT := $(VENV)/peers/lerobot
+$(LEROBOT)/.ready:
+	python3.12 -m venv $(LEROBOT)
+	$(LEROBOT)/bin/pip install --quiet "$(TORCH)" torchvision
+	$(LEROBOT)/bin/pip install --quiet --no-deps lerobot==0.6.1  # its own pin of torch would fetch CUDA
+	$(LEROBOT)/bin/pip install --quiet 'datasets<5' 'pandas<3' 'av<16' 'draccus<0.12' 'huggingface-hub<2' jsonlines einops \
+		gymnasium opencv-python-headless termcolor deepdiff requests 'setuptools<82'
+	touch $@
+peers: setup $(LEROBOT)/.ready
+	for version in 3.12 3.13; do $(MAKE) setup VENV=$(VENV)/peers/$$version PYTHON=python$$version || exit 1; done
+	$(BIN)/python -m benchmarks.peers --pythons $(BIN)/python $(VENV)/peers/3.12/bin/python $(VENV)/peers/3.13/bin/python \
+		--lerobot $(LEROBOT)/bin/python
 
 ## make accept  a hundred oracle episodes of every task (about ten minutes)
 accept: setup

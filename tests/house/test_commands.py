@@ -133,7 +133,10 @@ def test_a_mistyped_verb_is_refused_with_the_nearest(
 
 def test_a_word_like_no_verb_is_refused_with_all(called: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
     assert commands.collect(["zzz"]) == REFUSED
-    assert capsys.readouterr().err == "pp-collect: 'zzz' is neither a verb nor a file. Verbs: correct, card, pairs.\n"
+    assert (
+        capsys.readouterr().err
+        == "pp-collect: 'zzz' is neither a verb nor a file. Verbs: correct, import, card, pairs.\n"
+    )
     assert not called
 
 
