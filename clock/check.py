@@ -1,7 +1,8 @@
 """``pp-check``: derives every decision of an episode's log again, and names the first that differs.
 
-Causes are checked before consequences: queries, stamps, invocations, chunks, deadlines, rows, result. An "oracle"
-episode has no servers, so only deadlines and result are checked; one of POUNCE alone has no queries.
+Causes are checked before consequences: queries, stamps, invocations, chunks, deadlines, rows, the robot's laws,
+result. An "oracle" episode has no servers, so only deadlines and result are checked; one of POUNCE alone has
+no queries.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import tyro
 
 from clock.check_answers import answers_of, check_invocations, check_queries, check_stamps
 from clock.check_findings import Disagreement, compare
+from clock.check_robot import check_robot
 from clock.check_shadow import check_shadows
 from clock.check_ticks import check_deadlines, check_rows
 from clock.report import CLOCK_LOST_EVENT, statistics, stream_sha256
@@ -58,6 +60,7 @@ def disagreements(record: EpisodeRecord, residual: ResidualHead | None = None) -
         yield from check_deadlines(record)
         yield from check_residual(record, residual)
         yield from check_rows(record, answers, residual)
+        yield from check_robot(record)
     else:
         yield from check_deadlines(record)
     yield from check_shadows(record)

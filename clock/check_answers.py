@@ -15,6 +15,7 @@ import numpy as np
 from clock.check_findings import Disagreement, compare
 from clock.conductor import invocation_seed
 from clock.delays import in_order, modelled_ns
+from clock.dimensions import dimensions_of
 from clock.playback import Chunk, covering, deadline_ns, tick_at
 from clock.policies import has_ponder
 from clock.reference import Ready, latest_ready, refer, text_age_ns
@@ -29,6 +30,7 @@ from protocol.messages import (
     Level,
     Mode,
     Query,
+    Robot,
     Stamp,
     StampKind,
 )
@@ -40,6 +42,7 @@ _SKIPPED = {"Query": "query_skipped", "Invocation": "invocation_skipped"}  # eve
 class Answers:
     """The answers that the clock service took, by index, and the stamps that admitted them."""
 
+    robot: Robot
     cognitions: dict[int, Cognition] = field(default_factory=dict)
     chunks: dict[int, ActionChunk] = field(default_factory=dict)
     ready: list[Ready] = field(default_factory=list)
@@ -49,14 +52,7 @@ class Answers:
     def admitted(self, now_ns: int) -> list[Chunk]:
         """The chunks that were admitted by ``now_ns``."""
         return [
-            Chunk(
-                invocation=chunk.invocation,
-                t_row0=chunk.t_row0,
-                rows_NA=chunk.rows_NA,
-                ref_query=chunk.ref_query,
-                age_ns=chunk.age_ns,
-                first_tick=self.first_ticks.get(index),
-            )
+            Chunk.of(chunk, self.robot, self.first_ticks.get(index))
             for index, chunk in self.chunks.items()
             if index in self.chunk_ready_ns and self.chunk_ready_ns[index] <= now_ns
         ]
@@ -67,13 +63,15 @@ def answers_of(record: EpisodeRecord) -> Answers:
     asked_ns = {q.query: q.source_ns for q in record.queries}
     invoked_ns = {i.invocation: i.now_ns for i in record.invocations}
     form = (record.info.schedule.horizon, record.info.robot.action_dim, ActionSpace.JOINT_TARGET)
-    answers = Answers()
+    answers, anchors = Answers(record.info.robot), _anchors(record)
     for cognition in record.cognitions:
         if asked_ns.get(cognition.query) == cognition.source_ns:
             answers.cognitions.setdefault(cognition.query, cognition)
     for chunk in record.chunks:
         came = (chunk.horizon, chunk.action_dim, chunk.action_space)
-        if invoked_ns.get(chunk.invocation) == chunk.source_ns and came == form:
+        reference = chunk.reference_state.tobytes()
+        is_anchored = reference in anchors.get(chunk.t_row0, {reference})
+        if invoked_ns.get(chunk.invocation) == chunk.source_ns and came == form and is_anchored:
             answers.chunks.setdefault(chunk.invocation, chunk)
     for stamp in record.stamps:
         if stamp.kind == StampKind.CHUNK:
@@ -251,6 +249,15 @@ def check_invocations(record: EpisodeRecord, answers: Answers) -> Iterator[Disag
         yield from _left_out(record, "Invocation", len(record.invocations), due_ns)
 
 
+def _anchors(record: EpisodeRecord) -> dict[int, set[bytes]]:
+    """States by tick, to which increments may be added; empty for a robot without increments."""
+    found: dict[int, set[bytes]] = {}
+    if len(dimensions_of(record.info.robot).deltas):
+        for observation in record.observations:
+            found.setdefault(observation.tick, set()).add(observation.proprio.tobytes())
+    return found
+
+
 def _check_given(record: EpisodeRecord, answers: Answers, index: int, invocation: Invocation) -> Iterator[Disagreement]:
     """Checks reference, age, vector and noise seed against the stamps admitted when the invocation was made."""
     schedule = record.info.schedule
@@ -316,4 +323,4 @@ def _unplayed_rows(record: EpisodeRecord, answers: Answers, tick: int, invocatio
         return None
     admitted = answers.admitted(record.ticks[tick].decided_ns)
     chunks = covering([c for c in admitted if c.invocation < invocation], tick)
-    return chunks[-1].rows_NA[tick - chunks[-1].t_row0 :].ravel() if chunks else np.zeros(0, np.float32)
+    return chunks[-1].given_from(tick).ravel() if chunks else np.zeros(0, np.float32)

@@ -15,8 +15,10 @@ import numpy as np
 from clock.check_answers import Answers
 from clock.check_findings import Disagreement, compare
 from clock.commander import Commander
+from clock.dimensions import dimensions_of
 from clock.playback import Chunk, covering, deadline_ns, row_of, seam_policy, tick_at
 from clock.residual import Due, ResidualHead, corrected
+from clock.sight import unfit
 from clock.timebase import NS_PER_MS
 from protocol.mcap_log import EpisodeRecord
 from protocol.messages import EpisodeInfo, Floats, Level, Mode, Tick
@@ -55,6 +57,7 @@ def check_rows(record: EpisodeRecord, answers: Answers, residual: ResidualHead |
         if is_skipped or tick.level == Level.SKIPPED:  # no command, no change of state
             yield from compare("Tick", index, is_skipped=(is_skipped, tick.level == Level.SKIPPED))
             yield from compare("Tick", index, action=(_NO_FLOATS, tick.action), sent=(False, index in actions))
+            playing.commander.skip(1)
             continue
         while engaged and engaged[0] <= index:
             engaged.pop(0)
@@ -97,11 +100,13 @@ class _Playing:
         """(expected, found) of every field of ``tick``; ``usable``: chunks with a row for it, oldest first."""
         newest, raw = None, _NO_FLOATS
         if usable:
-            joined, newest = seam_policy(self.info.schedule.seam)(usable, tick.tick), usable[-1]
+            is_gripper_A = dimensions_of(self.info.robot).is_gripper_A
+            joined, newest = seam_policy(self.info.schedule.seam, is_gripper_A)(usable, tick.tick), usable[-1]
             due = Due(row_A=joined, state=tick.state, row=tick.tick - newest.t_row0, age_ns=newest.age_ns)
-            raw = corrected(self.residual, due)
+            raw = corrected(self.residual, due, is_gripper_A)
         state, state_ticks = tick.state if len(tick.state) else None, tick.tick - tick.observation_tick
-        decided = self.commander.step(raw, newest, state, tick.robot_state, state_ticks=state_ticks)
+        sight = unfit(self.info.robot, tick.picture_age_ns, tick.picture_still_ns)
+        decided = self.commander.step(raw, newest, state, tick.robot_state, state_ticks=state_ticks, sight=sight)
         chunk = decided.chunk
         age_ns = chunk.age_ns if chunk else 0
         return {

@@ -9,16 +9,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from clock.dimensions import coasting, dimensions_of
 from clock.ladder import Ladder
-from clock.limits import Hit, following, in_place, is_in_range, within_limits
+from clock.limits import Hit, following, in_place, is_in_range, stop_target, within_limits
 from clock.playback import Chunk
 from protocol.messages import EpisodeInfo, Floats, Level, RobotState
-
-BLOCKED_TICKS = 10
-"""Ticks (half a second at 20 Hz) at the lead over the measured joints after which a blocked arm is held."""
-
-MAX_STATE_TICKS = 2
-"""Largest age of a measured state, in ticks, from which the lead is taken."""
 
 NO_ROW: Floats = np.zeros(0, np.float32)
 
@@ -33,7 +28,7 @@ class Decision:
     chunk: Chunk | None
     """The chunk whose row is played, if one is."""
     seam_jump: float
-    """Largest joint difference between the last command and the first row of a new chunk; 0 between switches."""
+    """Largest difference, grippers aside, from the last command to a new chunk's first row; 0 between switches."""
 
 
 @dataclass(slots=True)
@@ -44,16 +39,18 @@ class Commander:
     ladder: Ladder = field(init=False)
     last_command: Floats = field(init=False)
     blocked_ticks: int = 0
+    _last_played: Floats = field(init=False)
+    _idle_ticks: int = 0  # since a row was played
     _is_engaging: bool = False
     _played_invocation: int | None = None
 
     def __post_init__(self) -> None:
         self.ladder = Ladder(self.info.schedule)
-        self.last_command = self.info.robot.initial_command
+        self.last_command = self._last_played = self.info.robot.initial_command
 
     @property
     def is_blocked(self) -> bool:
-        return self.blocked_ticks > BLOCKED_TICKS
+        return self.blocked_ticks > blocked_ticks(self.info.schedule.control_hz)
 
     def engage(self) -> None:
         """Allows motion again, from where the arm is at the next tick: somebody may have moved it."""
@@ -61,7 +58,14 @@ class Commander:
         self._is_engaging, self.blocked_ticks = True, 0
 
     def step(
-        self, raw: Floats, chunk: Chunk | None, state: Floats | None, robot_state: RobotState, *, state_ticks: int = 0
+        self,
+        raw: Floats,
+        chunk: Chunk | None,
+        state: Floats | None,
+        robot_state: RobotState,
+        *,
+        state_ticks: int = 0,
+        sight: Hit = Hit.NONE,
     ) -> Decision:
         """Decides one tick.
 
@@ -71,6 +75,7 @@ class Commander:
             state: (num_proprio,), the newest measured values; None before the first observation.
             robot_state: what the robot says of itself.
             state_ticks: age of ``state`` in ticks. An old one says nothing of an arm's lead: it has moved since.
+            sight: why the pictures are no ground to move on.
         """
         robot = self.info.robot
         measured = state if state is not None and is_in_range(state, robot) else None
@@ -80,24 +85,35 @@ class Commander:
             self.ladder.stop()
         row, hit = None, Hit.NONE
         if chunk is not None:
-            is_fresh = state_ticks <= MAX_STATE_TICKS
+            is_fresh = state_ticks <= max_state_ticks(self.info.schedule.control_hz)
             row, hit = within_limits(raw, self.last_command, robot, measured if is_fresh else None)
         self.blocked_ticks = self.blocked_ticks + 1 if Hit.LEAD in hit else 0
         if state is not None and measured is None:
             hit |= Hit.STATE
-        if Hit.STATE in hit or self.is_blocked:
+        hit |= sight
+        if hit & (Hit.STATE | Hit.SIGHT) or self.is_blocked:
             row = None
         command = self._on_ladder(row, chunk, measured)
         level = self.ladder.level
         played = chunk if level in (Level.PLAY, Level.STALE) else None
         jump = self._jump(played, raw)
+        if played is None:
+            self._idle_ticks += 1
+            command = coasting(command, self._last_played, robot, self._idle_ticks)
+        else:
+            self._last_played, self._idle_ticks = command, 0
         self.last_command = command
         return Decision(command=command, level=level, hit=hit, chunk=played, seam_jump=jump)
+
+    def skip(self, num_ticks: int) -> None:
+        """Ticks that passed without a command: the robot's side held, and its velocities went on to zero."""
+        self._idle_ticks += num_ticks
+        self.last_command = coasting(self.last_command, self._last_played, self.info.robot, self._idle_ticks)
 
     def _on_ladder(self, row: Floats | None, chunk: Chunk | None, measured: Floats | None) -> Floats:
         robot, last = self.info.robot, self.last_command
         is_stale = chunk is not None and chunk.age_ns > self.info.schedule.max_age_ns
-        target = last if measured is None else in_place(last, robot, measured)
+        target = last if measured is None else stop_target(last, robot, measured)
         command = self.ladder.step(row, is_stale, last, target)
         if not self.ladder.is_latched:
             return command
@@ -110,4 +126,15 @@ class Commander:
         if chunk is None or chunk.invocation == self._played_invocation or not np.isfinite(raw).all():
             return 0.0
         self._played_invocation = chunk.invocation
-        return float(np.abs(raw[:-1] - self.last_command[:-1]).max(initial=0.0))
+        moves = ~dimensions_of(self.info.robot).is_gripper_A
+        return float(np.abs(raw[moves] - self.last_command[moves]).max(initial=0.0))
+
+
+def blocked_ticks(control_hz: int) -> int:
+    """Half a second at the lead over the measured joints, after which a blocked arm is held."""
+    return control_hz // 2
+
+
+def max_state_ticks(control_hz: int) -> int:
+    """Largest age of a measured state, 100 ms or two ticks, from which the lead is taken."""
+    return max(2, control_hz // 10)

@@ -16,15 +16,18 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clock.commander import NO_ROW, Commander, Decision
 from clock.delays import in_order, modelled_ns
+from clock.dimensions import dimensions_of
 from clock.ladder import Ladder
 from clock.limits import Hit, out_of_range
 from clock.playback import Chunk, Join, covering, deadline_ns, row_of, seam_policy, tick_at
 from clock.policies import has_ponder
 from clock.reference import Ready, latest_ready, refer, text_age_ns
 from clock.residual import Due, ResidualHead, corrected
+from clock.sight import Sight, unfit, unfit_text
 from clock.timebase import NS_PER_S
 from protocol.messages import (
     Action,
@@ -72,6 +75,8 @@ class _Pending:
     delay_ns: int | None
     terms: tuple[int, int | None, int] = (0, None, 0)
     """Tick of row 0, ref(j) and Delta(j) of an invocation, which its chunk must repeat."""
+    state: Floats = field(default_factory=lambda: NO_ROW)
+    """That of an invocation's observation, to which increments are added; its chunk must repeat it as well."""
     answer: Cognition | ActionChunk | None = None
     arrived_ns: int = 0
 
@@ -117,8 +122,10 @@ class Conductor:
     _queried_in: int = -1  # tick
     _invoked_in: int = -1
     _told_state: RobotState = RobotState.UNSPECIFIED
+    _told_sight: Hit = Hit.NONE
     _emitted: set[str] = field(default_factory=set)
     _has_ponder: bool = field(init=False)
+    _sight: Sight = field(init=False)
     _join: Join = field(init=False)
     _commander: Commander = field(init=False)
     _query_rng: np.random.Generator = field(init=False)
@@ -127,7 +134,8 @@ class Conductor:
     def __post_init__(self) -> None:
         self._has_ponder = has_ponder(self.info.policy)
         self._commander = Commander(self.info)
-        self._join = seam_policy(self.info.schedule.seam)
+        self._sight = Sight(self.info.robot)
+        self._join = seam_policy(self.info.schedule.seam, self._is_gripper_A)
         streams = np.random.SeedSequence(self.info.schedule.seed).spawn(2)
         self._query_rng, self._invoke_rng = (np.random.default_rng(s) for s in streams)
 
@@ -138,6 +146,7 @@ class Conductor:
         if self._newest is not None and observation.tick < self._newest.tick:
             return False
         self._newest = observation
+        self._sight.on_observation(observation)
         return True
 
     def on_cognition(self, cognition: Cognition, now_ns: int) -> bool:
@@ -151,7 +160,10 @@ class Conductor:
         if chunk.action_space != ActionSpace.JOINT_TARGET:
             return False
         terms = (chunk.t_row0, chunk.ref_query, chunk.age_ns)
-        if not any(a.index == chunk.invocation and a.terms == terms for a in self._invocations):
+        asked = next((a for a in self._invocations if a.index == chunk.invocation and a.terms == terms), None)
+        if asked is None:
+            return False
+        if len(dimensions_of(self.info.robot).deltas) and asked.state.tobytes() != chunk.reference_state.tobytes():
             return False
         return _take(self._invocations, chunk.invocation, chunk, chunk.infer_ns, now_ns, self._is_lockstep)
 
@@ -254,6 +266,10 @@ class Conductor:
     # -- internals
 
     @property
+    def _is_gripper_A(self) -> NDArray[np.bool_]:
+        return dimensions_of(self.info.robot).is_gripper_A
+
+    @property
     def _is_lockstep(self) -> bool:
         return self.info.schedule.mode == Mode.LOCKSTEP
 
@@ -337,6 +353,8 @@ class Conductor:
             self._tell(effects, Severity.ERROR, "ticks_skipped", text, always=True)
         for tick in range(self.tick, newest):
             effects.append(self._account(tick, now_ns, _SKIPPED, NO_ROW))
+        if newest > self.tick:
+            self._commander.skip(newest - self.tick)
         self.tick = max(self.tick, newest)
 
     def _ask_ponder_if_due(self, effects: list[Effect]) -> None:
@@ -381,7 +399,8 @@ class Conductor:
         reference = refer(self._ready, tau_ns, self.info.schedule.delivery)
         delay = modelled_ns(self.info.schedule.invoke_delay, self._invoke_rng)
         row0_tick = self._newest.tick if self._newest is not None else tick
-        asked = _Pending(self.num_invocations, tau_ns, delay, (row0_tick, reference.query, reference.age_ns))
+        state = NO_ROW if self._newest is None else self._newest.proprio
+        asked = _Pending(self.num_invocations, tau_ns, delay, (row0_tick, reference.query, reference.age_ns), state)
         self._invocations.append(asked)
         tail = self._unplayed_rows(tick)
         given = None if reference.query is None else self._cognitions[reference.query]
@@ -406,7 +425,7 @@ class Conductor:
         chunks = covering(self._chunks, tick)
         if not chunks:
             return np.zeros((0, self.info.robot.action_dim), np.float32)
-        return chunks[-1].rows_NA[tick - chunks[-1].t_row0 :]
+        return chunks[-1].given_from(tick)
 
     def _stamp_answers(self, now_ns: int, effects: list[Effect]) -> None:
         """Admits every ready answer; the log's stamp is authoritative."""
@@ -427,15 +446,7 @@ class Conductor:
         for asked, stamp in self._ripe(self._invocations, StampKind.CHUNK, now_ns):
             answer = asked.answer
             assert isinstance(answer, ActionChunk)
-            self._chunks.append(
-                Chunk(
-                    invocation=answer.invocation,
-                    t_row0=answer.t_row0,
-                    rows_NA=answer.rows_NA,
-                    ref_query=answer.ref_query,
-                    age_ns=answer.age_ns,
-                )
-            )
+            self._chunks.append(Chunk.of(answer, self.info.robot))
             effects.append(stamp)
         self._chunks = [c for c in self._chunks if c.t_row0 + len(c.rows_NA) > self.tick]
 
@@ -463,10 +474,11 @@ class Conductor:
             chunk, row_A = usable[-1], self._join(usable, self.tick)
             known = self.last_command if state is None else state
             due = Due(row_A=row_A, state=known, row=self.tick - chunk.t_row0, age_ns=chunk.age_ns)
-            raw = corrected(self.residual, due)
+            raw = corrected(self.residual, due, self._is_gripper_A)
         before, was_playing, was_blocked = self.ladder.level, self.ladder.has_played, self._commander.is_blocked
         state_ticks = self.tick - self.newest_tick
-        decided = self._commander.step(raw, chunk, state, robot_state, state_ticks=state_ticks)
+        sight = self._look(effects)
+        decided = self._commander.step(raw, chunk, state, robot_state, state_ticks=state_ticks, sight=sight)
         self._tell_limits(effects, decided.hit, chunk, was_blocked)
         self._tell_robot(effects, robot_state)
         if decided.level != before and (was_playing or decided.level != Level.PLAY):
@@ -475,11 +487,24 @@ class Conductor:
         effects.append(Action(tick=self.tick, deadline_ns=due_ns, level=decided.level, values=decided.command))
         effects.append(self._account(self.tick, now_ns, decided, raw))
 
+    def _look(self, effects: list[Effect]) -> Hit:
+        """Whether the pictures are a ground to move on at this tick; tells when that changes."""
+        due_ns, robot = self.deadline_ns(self.tick), self.info.robot
+        age_ns, still_ns = self._sight.age_ns(due_ns), self._sight.still_ns(due_ns)
+        hit = unfit(robot, age_ns, still_ns)
+        if hit and hit != self._told_sight:
+            text = f"{unfit_text(robot, hit, age_ns, still_ns)}. Held."
+            self._tell(effects, Severity.ERROR, "pictures_unfit", text, always=True)
+        elif self._told_sight and not hit:
+            self._tell(effects, Severity.INFO, "pictures_fit", "the pictures are fresh again", always=True)
+        self._told_sight = hit
+        return hit
+
     def _tell_limits(self, effects: list[Effect], hit: Hit, chunk: Chunk | None, was_blocked: bool) -> None:
         robot, newest = self.info.robot, self._newest
         if Hit.NON_FINITE in hit and chunk is not None:
             self._tell(effects, Severity.ERROR, "non_finite_row", f"chunk {chunk.invocation} has a NaN row: held")
-        elif clipped := hit & ~Hit.STATE:
+        elif clipped := hit & ~(Hit.STATE | Hit.SIGHT):
             text = f"first row clipped to the robot's limits: {clipped.name}"
             self._tell(effects, Severity.WARNING, "limit_hit", text)
         if Hit.STATE in hit and newest is not None:
@@ -499,6 +524,7 @@ class Conductor:
     def _account(self, tick: int, now_ns: int, decided: Decision, raw: Floats) -> Tick:
         due_ns, chunk = self.deadline_ns(tick), decided.chunk
         row = row_of(chunk, tick) if chunk is not None else None
+        age_ns = self._sight.age_ns(due_ns)
         return Tick(
             tick=tick,
             deadline_ns=due_ns,
@@ -519,6 +545,8 @@ class Conductor:
             age_ms=chunk.age_ns / 1e6 if chunk is not None else 0.0,
             late_ms=(now_ns - due_ns) / 1e6,
             robot_state=self._newest.robot_state if self._newest is not None else RobotState.UNSPECIFIED,
+            picture_age_ns=age_ns,
+            picture_still_ns=self._sight.still_ns(due_ns),
         )
 
     def _tell_level(self, effects: list[Effect], before: Level, level: Level) -> None:

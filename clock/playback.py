@@ -11,14 +11,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from clock.dimensions import absolute
 from clock.timebase import NS_PER_S
-from protocol.messages import Floats, Seam, SeamKind
+from protocol.messages import ActionChunk, Floats, Robot, Seam, SeamKind
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Chunk:
-    """A POUNCE answer, as far as playback needs it. ``rows_NA``: (horizon, action_dim) float32, robot units."""
+    """A POUNCE answer, as far as playback needs it. ``rows_NA``: (horizon, action_dim) float32, as they are played."""
 
     invocation: int
     t_row0: int
@@ -26,6 +28,25 @@ class Chunk:
     ref_query: int | None
     age_ns: int
     first_tick: int | None = None  # first tick decided after its arrival; earlier rows were past
+    given_NA: Floats | None = None  # as POUNCE gave them, if that is something else
+
+    @classmethod
+    def of(cls, answer: ActionChunk, robot: Robot, first_tick: int | None = None) -> Chunk:
+        """The chunk of an answer: increments are summed up from the state of its observation."""
+        rows_NA = absolute(answer.rows_NA, answer.reference_state, robot)
+        return cls(
+            invocation=answer.invocation,
+            t_row0=answer.t_row0,
+            rows_NA=rows_NA,
+            ref_query=answer.ref_query,
+            age_ns=answer.age_ns,
+            first_tick=first_tick,
+            given_NA=None if rows_NA is answer.rows_NA else answer.rows_NA,
+        )
+
+    def given_from(self, tick: int) -> Floats:
+        """(n, action_dim), POUNCE's own rows from ``tick`` on."""
+        return (self.rows_NA if self.given_NA is None else self.given_NA)[tick - self.t_row0 :]
 
 
 def deadline_ns(start_ns: int, tick: int, rate_hz: int) -> int:
@@ -58,7 +79,7 @@ def switch(chunks: Sequence[Chunk], tick: int) -> Floats:
     return _row(chunks[-1], tick)
 
 
-def offset_fade(fade_ticks: int) -> Join:
+def offset_fade(fade_ticks: int, is_gripper_A: NDArray[np.bool_]) -> Join:
     """Cancels the jump at the switch and fades the correction out linearly over ``fade_ticks``.
 
     The jump is the previous chunk's row minus the new chunk's at the first tick that the new one can play: a pure
@@ -76,30 +97,30 @@ def offset_fade(fade_ticks: int) -> Join:
         if weight == 0.0 or row_of(old, switched) is None:
             return row
         jump = _row(old, switched) - _row(new, switched)
-        jump[-1] = 0.0  # the gripper is binary: do not blend it
+        jump[is_gripper_A] = 0.0  # a gripper is binary: do not blend it
         return (row + np.float32(weight) * jump).astype(np.float32)
 
     return join
 
 
-def ensemble(decay: float) -> Join:
+def ensemble(decay: float, is_gripper_A: NDArray[np.bool_]) -> Join:
     """Exponential average over all chunks that cover the tick; the oldest weighs most for decay > 0 (ACT)."""
 
     def join(chunks: Sequence[Chunk], tick: int) -> Floats:
         weights = [math.exp(-decay * rank) for rank in range(len(chunks))]
         rows = np.stack([_row(c, tick) for c in chunks]).astype(np.float64)
         mean = np.average(rows, axis=0, weights=weights).astype(np.float32)
-        mean[-1] = _row(chunks[-1], tick)[-1]  # an averaged gripper would be half open
+        mean[is_gripper_A] = _row(chunks[-1], tick)[is_gripper_A]  # an averaged gripper would be half open
         return mean
 
     return join
 
 
-def seam_policy(seam: Seam) -> Join:
+def seam_policy(seam: Seam, is_gripper_A: NDArray[np.bool_]) -> Join:
     if seam.kind == SeamKind.OFFSET_FADE:
-        return offset_fade(seam.fade_ticks)
+        return offset_fade(seam.fade_ticks, is_gripper_A)
     if seam.kind == SeamKind.ENSEMBLE:
-        return ensemble(seam.ensemble_decay)
+        return ensemble(seam.ensemble_decay, is_gripper_A)
     return switch
 
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Protocol, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from protocol.messages import Floats, Robot
 
@@ -48,16 +49,16 @@ class ResidualHead(Protocol):
         ...
 
     def correction(self, due: Due) -> Floats:
-        """Returns (A,) float32, to be added to the row; the gripper's is ignored."""
+        """Returns (A,) float32, to be added to the row; a gripper's is ignored."""
         ...
 
 
-def corrected(head: ResidualHead | None, due: Due) -> Floats:
+def corrected(head: ResidualHead | None, due: Due, is_gripper_A: NDArray[np.bool_]) -> Floats:
     """The row as it is played: ``due.row_A`` itself without a head."""
     if head is None:
         return due.row_A
     step_A = head.correction(due).astype(np.float32)
-    step_A[-1] = 0.0  # the gripper is binary: do not correct it
+    step_A[is_gripper_A] = 0.0  # a gripper is binary: do not correct it
     return (due.row_A + step_A).astype(np.float32)
 
 

@@ -8,8 +8,9 @@ from clock.timebase import NS_PER_MS, NS_PER_S
 from protocol.messages import Delay, DelayKind, Mode, Schedule, WaitKind
 
 CONTROL_HZ = 20
+"""Rate of the paper's robot and of our tasks'."""
 HORIZON = 20
-MAX_TICKS = 1300  # RoboMME's limit as the paper uses it (B.1)
+MAX_S = 65  # RoboMME's limit of 1300 steps, as the paper uses it (B.1)
 
 MEASURED = Delay(kind=DelayKind.MEASURED)
 NONE = Delay(kind=DelayKind.FIXED, mean_ns=0)
@@ -17,25 +18,34 @@ FIXED_300_MS = Delay(kind=DelayKind.FIXED, mean_ns=300 * NS_PER_MS)
 TRAINING_DELAY = Delay(kind=DelayKind.LOG_NORMAL, mean_ns=300 * NS_PER_MS, sigma=0.3)  # A.1
 
 
-def paper() -> Schedule:
-    """The paper's evaluation (B.1): both models at 1 Hz, 300 ms of modelled delay, 20 rows of 20 played, lockstep."""
+def paper(control_hz: int = CONTROL_HZ, horizon: int = HORIZON) -> Schedule:
+    """The paper's evaluation (B.1): both models at 1 Hz, 300 ms of modelled delay, 20 rows of 20 played, lockstep.
+
+    At another rate or with other chunks: all rows of a chunk are played, and what was a time stays that time.
+    """
     return Schedule(
         mode=Mode.LOCKSTEP,
-        control_hz=CONTROL_HZ,
-        horizon=HORIZON,
+        control_hz=control_hz,
+        horizon=horizon,
         query_period_ns=NS_PER_S,
-        invoke_period_ticks=20,
+        invoke_period_ticks=horizon,
         query_delay=FIXED_300_MS,
         invoke_delay=NONE,
         wait=WaitKind.STAND_STILL,
         max_age_ns=2 * NS_PER_S,  # a fire with text takes 0.87 s p95: an age of 1.9 s is normal at 1 Hz
         stale_limit_ns=10 * NS_PER_S,
-        hold_limit_ticks=10,
-        decelerate_ticks=10,
-        max_ticks=MAX_TICKS,
+        hold_limit_ticks=control_hz // 2,
+        decelerate_ticks=control_hz // 2,
+        max_ticks=MAX_S * control_hz,
     )
 
 
-def realtime() -> Schedule:
-    """Feasible in real time: POUNCE every 10 ticks, so an invocation may take up to H - s = 10 ticks."""
-    return replace(paper(), mode=Mode.REALTIME, invoke_period_ticks=10, query_delay=MEASURED, invoke_delay=MEASURED)
+def realtime(control_hz: int = CONTROL_HZ, horizon: int = HORIZON) -> Schedule:
+    """Feasible in real time: POUNCE every H / 2 ticks, so an invocation may take as long."""
+    return replace(
+        paper(control_hz, horizon),
+        mode=Mode.REALTIME,
+        invoke_period_ticks=max(1, horizon // 2),
+        query_delay=MEASURED,
+        invoke_delay=MEASURED,
+    )

@@ -251,7 +251,9 @@ class ClockService:
                 self._link.drop(observation.header.proc, DropReason.UNKNOWN_CLOCK, observation.header.clock_id)
                 return False
             zero_ns = episode.clock.zero_ns if isinstance(episode.clock, MonotonicClock) else self._host.now_ns()
-            observation = replace(observation, source_ns=offset.to_ours(observation.source_ns) - zero_ns)
+            captured_ns = tuple(offset.to_ours(at_ns) - zero_ns for at_ns in observation.captured_ns)
+            source_ns = offset.to_ours(observation.source_ns) - zero_ns
+            observation = replace(observation, source_ns=source_ns, captured_ns=captured_ns)
         if why_not := self._out_of_time(episode, observation):
             self._link.drop(source_of(observation.header), DropReason.WRONG_INSTANT, why_not)
             return False
@@ -272,7 +274,7 @@ class ClockService:
         early = schedule.control_hz if may_count else 0
         if observation.tick > conductor.tick + early:
             return f"tick {observation.tick} before tick {conductor.tick} was commanded"
-        ahead_ns = observation.source_ns - episode.now_ns
+        ahead_ns = max((observation.source_ns, *observation.captured_ns)) - episode.now_ns
         if ahead_ns > 2 * NS_PER_S // schedule.control_hz:
             return f"tick {observation.tick} is dated {ahead_ns / 1e6:.0f} ms ahead of the episode's clock"
         oldest_ns = conductor.newest_source_ns if conductor.newest_source_ns is not None else -NS_PER_S
@@ -490,6 +492,14 @@ class ClockService:
                 f"POUNCE gives chunks of ({pounce.horizon}, {pounce.action_dim}), the episode was opened for "
                 f"({info.schedule.horizon}, {info.robot.action_dim}). Load another checkpoint.",
             )
+        rate_hz = info.schedule.control_hz
+        if pounce.control_hz not in (0, rate_hz):
+            raise EpisodeRefused(
+                m.Refusal.SCHEDULE,
+                f"POUNCE's rows are for {pounce.control_hz} Hz, {info.robot.name} takes {rate_hz} commands a second. "
+                "Rows are not resampled: load a checkpoint of the robot's rate, or say the other control_hz in the "
+                "robot's file if the robot can keep it.",
+            )
         if self._config.residual is not None:
             try:
                 check_head(self._config.residual, info.robot)
@@ -501,6 +511,8 @@ class ClockService:
                 m.Refusal.MODELS, f"{' and '.join(fake)} run untrained weights, which never move a real robot."
             )
         warnings = [f"{proc} runs untrained weights: expect motion, not skill" for proc in fake]
+        if not pounce.control_hz and not info.robot.is_simulated:
+            warnings.append(f"POUNCE does not say for which rate its rows are: they are played at {rate_hz} Hz")
         feasibility = check_feasible(info.schedule, pounce.infer_p99_ns)
         if not feasibility.is_feasible:
             if info.schedule.mode == m.Mode.REALTIME and not self._config.allow_starved:

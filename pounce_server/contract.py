@@ -34,7 +34,7 @@ class EngineSpec:
     """An engine's inputs, outputs and limits: a process announces them, and requests are checked against them."""
 
     horizon: int
-    """Rows per chunk, played at 20 Hz."""
+    """Rows per chunk."""
     action_dim: int
     """Dims of a row in robot units: 7 joint targets (rad) and the gripper, -1 closed to 1 open."""
     proprio_dim: int
@@ -62,6 +62,8 @@ class EngineSpec:
     weights: WeightsName = "float"
     action_error: float = 0.0
     """Mean absolute error of the normalised actions due to narrow ``weights``, on example requests."""
+    control_hz: int = 0
+    """Rows a second; 0: not known."""
     reads_subgoal: bool = False
     """True if the engine reads PONDER's newest subgoal in place of cognition (then K = 0)."""
 

@@ -95,6 +95,7 @@ class EagerEngine:
         settle(self._device)
         self.spec = EngineSpec(
             horizon=config.horizon,
+            control_hz=0 if bundle.is_random else config.control_hz,
             action_dim=ROBOT_DIM,
             proprio_dim=ROBOT_DIM,
             space=bundle.statistics.space,

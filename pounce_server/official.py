@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from clock.schedules import CONTROL_HZ
 from clock.timebase import NS_PER_MS
 from dual_system.models.action_space import ROBOT_DIM
 from dual_system.models.official.their_server import OfficialError, TheirServer, weights_hash
@@ -76,6 +77,7 @@ class OfficialPounce:
             raise OfficialError(f"expected actions of {ROBOT_DIM} numbers or more, came {self._system1.action_dim}")
         self.spec = EngineSpec(
             horizon=int(self._system1.action_chunk_size),
+            control_hz=CONTROL_HZ,
             action_dim=ROBOT_DIM,
             proprio_dim=ROBOT_DIM,
             num_carriers=self._theirs.num_carriers,

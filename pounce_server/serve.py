@@ -142,6 +142,7 @@ class PounceServer(ModelShell):
             is_fake=spec.is_fake,
             version=self._version,
             channels=self._channels(),
+            control_hz=spec.control_hz,
         )
 
     def _channels(self) -> tuple[m.ChannelSpec, ...]:

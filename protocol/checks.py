@@ -14,6 +14,7 @@ import numpy as np
 
 from protocol import messages as m
 from protocol.errors import MalformedMessage
+from protocol.robot_checks import MAX_CONTROL_HZ, faults
 
 MAX_MESSAGE_BYTES = 64 << 20  # an OpenRequest with a 48 s demonstration of two raw 256 px views is 19 MB
 MAX_PLAIN_MESSAGE_BYTES = 4 << 20  # without pictures; two bytes of protobuf can become a hundred in memory
@@ -175,6 +176,9 @@ def check_observation(o: m.Observation) -> None:
     _chosen(o, "status")
     _text(o, "reason", "robot_text")
     _images(o, o.images)
+    if o.captured_ns:
+        _require(len(o.captured_ns) == len(o.images), o, "captured_ns", f"{len(o.images)} instants", len(o.captured_ns))
+        _require(max(map(abs, o.captured_ns)) <= MAX_INSTANT_NS, o, "captured_ns", "within 31 years", o.captured_ns)
 
 
 def check_query(q: m.Query) -> None:
@@ -265,6 +269,8 @@ def check_tick(t: m.Tick) -> None:
         f"0..{MAX_DIM} numbers",
         t.raw_row.shape,
     )
+    for name in ("picture_age_ns", "picture_still_ns"):
+        _require(len(getattr(t, name)) <= MAX_IMAGES, t, name, f"at most {MAX_IMAGES}", len(getattr(t, name)))
 
 
 def check_subgoal(s: m.Subgoal) -> None:  # of any kind, because an unknown kind is only logged
@@ -333,7 +339,9 @@ def check_robot(r: m.Robot) -> None:
     is_range = len(r.state_low) == len(r.state_high) and bool((r.state_low <= r.state_high).all())
     _require(is_range, r, "state_low", "<= state_high", "the opposite")
     _require(len(r.cameras) <= MAX_IMAGES, r, "cameras", f"at most {MAX_IMAGES}", len(r.cameras))
-    _index(r, "image_height", "image_width", "num_proprio")
+    _index(r, "image_height", "image_width", "num_proprio", "stop_ticks")
+    for field, expected, came in faults(r):
+        raise _broken(r, field, expected, came)
 
 
 def check_episode_info(e: m.EpisodeInfo) -> None:
@@ -343,6 +351,8 @@ def check_episode_info(e: m.EpisodeInfo) -> None:
     check_schedule(e.schedule)
     check_robot(e.robot)
     _require(0 <= e.t0_unix_ns <= MAX_UNIX_NS, e, "t0_unix_ns", f"0..{MAX_UNIX_NS}", e.t0_unix_ns)
+    rate_hz, robot_hz = e.schedule.control_hz, e.robot.control_hz
+    _require(robot_hz in (0, rate_hz), e, "schedule.control_hz", f"{robot_hz}, the robot's control_hz", rate_hz)
     _map(e, "versions")
 
 
@@ -366,6 +376,7 @@ def check_contract(c: m.Contract) -> None:
     _text(c, "proc", "model_hash", "version", limit=MAX_ID)
     _duration(c, "infer_p50_ns", "infer_p99_ns")
     _require(len(c.channels) <= MAX_CHANNELS, c, "channels", f"at most {MAX_CHANNELS}", len(c.channels))
+    _require(0 <= c.control_hz <= MAX_CONTROL_HZ, c, "control_hz", f"0..{MAX_CONTROL_HZ}", c.control_hz)
     if c.demonstrations is not None:
         hz = c.demonstrations.hz
         _require(hz > 0 and DEMO_VIDEO_HZ % hz == 0, c, "demonstrations.hz", f"a divisor of {DEMO_VIDEO_HZ}", hz)

@@ -154,6 +154,29 @@ class NullKind(IntEnum):
     ABSENT = 2
 
 
+class DimensionKind(IntEnum):
+    UNSPECIFIED = 0
+    POSITION = 1
+    VELOCITY = 2
+    DELTA = 3
+    GRIPPER = 4
+
+
+class AtStop(IntEnum):
+    UNSPECIFIED = 0
+    HOLD = 1
+    MEASURED = 2
+    ZERO = 3
+    KEEP = 4
+
+
+class AtExit(IntEnum):
+    UNSPECIFIED = 0
+    HOLD = 1
+    PARK = 2
+    RELEASE = 3
+
+
 class Refusal(IntEnum):
     """Why an episode was not opened, for programs."""
 
@@ -205,6 +228,7 @@ class Observation:
     reason: str = ""
     robot_state: RobotState = RobotState.UNSPECIFIED
     robot_text: str = ""
+    captured_ns: tuple[int, ...] = ()  # of each image
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -320,6 +344,8 @@ class Tick:
     age_ms: float = 0.0
     late_ms: float = 0.0
     robot_state: RobotState = RobotState.UNSPECIFIED
+    picture_age_ns: tuple[int, ...] = ()
+    picture_still_ns: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -407,6 +433,15 @@ class Schedule:
     seed: int = 0
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Dimension:
+    name: str
+    kind: DimensionKind
+    unit: str = ""
+    state_index: int | None = None
+    at_stop: AtStop
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Robot:
     name: str
@@ -422,6 +457,14 @@ class Robot:
     max_lead: Floats = field(default_factory=_no_floats)
     state_low: Floats = field(default_factory=_no_floats)
     state_high: Floats = field(default_factory=_no_floats)
+    dimensions: tuple[Dimension, ...] = ()
+    control_hz: int = 0
+    stop_ticks: int = 0
+    max_picture_age_ns: int = 0
+    max_picture_skew_ns: int = 0
+    max_picture_still_ns: int = 0
+    at_exit: AtExit = AtExit.UNSPECIFIED
+    home: Floats = field(default_factory=_no_floats)
 
     @property
     def action_dim(self) -> int:
@@ -505,6 +548,7 @@ class Contract:
     demonstrations: DemoSampling | None = None
     boot_id: int = 0
     channels: tuple[ChannelSpec, ...] = ()
+    control_hz: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -28,7 +28,8 @@ class ScheduleOptions:
     query_period_ms: int = 1000
     """Period of PONDER's queries in ms (paper: 1 Hz)."""
     invoke_every_ticks: int | None = None
-    """Period of POUNCE's invocations in 50 ms ticks. None: 20 in lockstep (the paper's 1 Hz), 10 in real time."""
+    """Period of POUNCE's invocations in 50 ms ticks. None: as many as its chunks have rows in lockstep (20 rows: the
+    paper's 1 Hz), half of that in real time."""
     delay: Literal["default", "measured", "fixed", "log-normal"] = "default"
     """PONDER's delay. default: fixed in lockstep, measured in real time."""
     delay_ms: int = 300
@@ -50,9 +51,10 @@ class ScheduleOptions:
     max_steps: int = 1300
     """Limit of control steps per episode (paper: 1300)."""
 
-    def of_episode(self, mode: ModeName, seed: int) -> Schedule:
-        """Returns the schedule of the episode with this seed."""
-        base = schedules.realtime() if mode == "realtime" else schedules.paper()
+    def of_episode(self, mode: ModeName, seed: int, horizon: int = schedules.HORIZON) -> Schedule:
+        """Returns the schedule of the episode with this seed, for chunks of ``horizon`` rows."""
+        named = schedules.realtime if mode == "realtime" else schedules.paper
+        base = named(horizon=horizon)
         return replace(
             base,
             query_period_ns=self.query_period_ms * NS_PER_MS,

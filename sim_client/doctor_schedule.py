@@ -33,7 +33,7 @@ class ScheduleProbeOptions:
     """Which models are asked, and for which schedule."""
 
     invoke_every_ticks: int | None = None
-    """With --schedule: ticks between invocations. None: 10, or half a shorter horizon."""
+    """With --schedule: ticks between invocations. None: half the horizon, as in real time."""
     control_hz: int = schedules.CONTROL_HZ
     """With --schedule: ticks per second."""
     query_period_ms: int = 1000
@@ -133,8 +133,9 @@ def _openpi_verdict(found: dict[str, Any], options: ScheduleProbeOptions) -> Fin
 
 
 def _verdict(name: str, text: str, p99_ns: int, horizon: int, options: ScheduleProbeOptions) -> Finding:
-    ticks = options.invoke_every_ticks or max(1, min(schedules.realtime().invoke_period_ticks, horizon // 2))
-    schedule = replace(schedules.realtime(), control_hz=options.control_hz, horizon=horizon, invoke_period_ticks=ticks)
+    schedule = schedules.realtime(options.control_hz, horizon)
+    if options.invoke_every_ticks:
+        schedule = replace(schedule, invoke_period_ticks=options.invoke_every_ticks)
     found = check_feasible(schedule, p99_ns)
     rule = replace(found, ways_out=()).sentence()
     return Finding(name, Level.OK if found.is_feasible else Level.FAILED, f"{text} {rule}", " ".join(found.ways_out))

@@ -10,8 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
-import numpy as np
-
+from clock.obeyed import Obeyed
 from clock.playback import deadline_ns
 from clock.report import CLOCK_LOST_EVENT
 from clock.timebase import NS_PER_MS
@@ -30,10 +29,10 @@ CLOCK_SILENCE_NS = 500 * NS_PER_MS
 """Real time: commands that stay away this long mean that the clock service is gone. The servos hold meanwhile."""
 STALL_NS = 200 * NS_PER_MS
 """Real time: a turn of 20 ms that takes this long means that this process stood still, and heard nobody meanwhile."""
-HOLD_TICKS = 10
-"""Ticks (half a second) for which the robot then holds before it ends the episode."""
-STOPPED_TICKS = 60
-"""Ticks (three seconds) after which an episode that the ladder stopped ends unless it is engaged again."""
+HOLD_S = 0.5
+"""Time for which the robot then holds before it ends the episode."""
+STOPPED_S = 3
+"""Time after which an episode that the ladder stopped ends unless it is engaged again."""
 
 Others = Callable[[int], None]
 """Lets the other participants run: returns when a message may have come, or after the given nanoseconds."""
@@ -65,7 +64,8 @@ class RobotSide:
     looks: Callable[[int], bool] = always
     _tick: int = 0
     _start_ns: int = 0
-    _command: m.Floats = field(default_factory=lambda: np.zeros(0, np.float32))
+    _control_hz: int = 1
+    _obeyed: Obeyed = field(init=False)
     _texts: tuple[str, str] = ("", "")
     _subgoal_index: int = -1
     _stopped_ticks: int = 0
@@ -74,7 +74,7 @@ class RobotSide:
         """Plays until the task ends, or the servers do."""
         actions = self.link.subscribe(ACTION)
         snapshot = first
-        self._command = info.robot.initial_command
+        self._begin(info)
         self._show(snapshot, 0)
         self.link.publish(PHASE, m.Phase(state="running"), at_ns=0)
         heard_ns = time.monotonic_ns()
@@ -83,14 +83,14 @@ class RobotSide:
             for action in actions.drain():
                 if not self.link.is_from(action.header, "clock") or action.tick < self._tick:
                     continue
-                if not is_sound(self.link, action, info.robot, self._tick):
+                if not is_sound(self.link, action, self._obeyed, snapshot.state):
                     continue
                 heard_ns = time.monotonic_ns()
                 snapshot = self._obey(info, action)
                 on_tick(self._tick)
                 if snapshot.status is not Status.ONGOING:
                     return Outcome(status=status_of(snapshot), reason=snapshot.reason, num_ticks=self._tick)
-                if self._stopped_ticks > STOPPED_TICKS:
+                if self._stopped_ticks > STOPPED_S * self._control_hz:
                     return self._abort("stopped by the ladder, and nobody engaged it again")
             if self.link.second_sender:  # nobody can say which of the two is meant
                 self._tell(
@@ -107,6 +107,10 @@ class RobotSide:
                 self._hold()
                 return self._abort("clock lost")
             heard_ns += self._rest(info)
+
+    def _begin(self, info: m.EpisodeInfo) -> None:
+        self._control_hz = info.schedule.control_hz
+        self._obeyed = Obeyed(info.robot, self._control_hz)
 
     def _rest(self, info: m.EpisodeInfo) -> int:
         """Lets the others run; returns for how long this process stood still, which is nobody's silence but its own."""
@@ -129,12 +133,12 @@ class RobotSide:
         if self._tick == 0 and action.tick == 0:
             self._start_ns = action.deadline_ns
         for tick in range(self._tick, action.tick):
-            snapshot = self.environment.step(self._command)
+            snapshot = self.environment.step(self._obeyed.idle(tick - self._tick + 1))
             if snapshot.status is not Status.ONGOING:  # it ended before the tick that is commanded
                 self._tick = tick + 1
                 self._show(snapshot, deadline_ns(self._start_ns, self._tick, info.schedule.control_hz))
                 return snapshot
-        self._command = action.values
+        self._obeyed.obey(action)
         self._stopped_ticks = self._stopped_ticks + 1 if action.level == m.Level.STOPPED else 0
         self._tick = action.tick + 1
         snapshot = self.environment.step(action.values, look=self.looks(self._tick))
@@ -154,8 +158,8 @@ class RobotSide:
         self._texts, self._subgoal_index = texts, snapshot.subgoal_index
 
     def _hold(self) -> None:
-        for _ in range(HOLD_TICKS):
-            if self.environment.step(self._command).status is not Status.ONGOING:
+        for ticks in range(round(HOLD_S * self._control_hz)):
+            if self.environment.step(self._obeyed.idle(ticks + 1)).status is not Status.ONGOING:
                 return
 
     def _abort(self, reason: str) -> Outcome:
@@ -163,7 +167,7 @@ class RobotSide:
 
     def _tell(self, severity: m.Severity, name: str, text: str) -> None:
         event = m.Event(severity=severity, name=name, text=text, tick=self._tick)
-        self.link.publish(EVENT, event, at_ns=self._start_ns + self._tick * 50 * NS_PER_MS)
+        self.link.publish(EVENT, event, at_ns=deadline_ns(self._start_ns, self._tick, self._control_hz))
 
 
 def play_oracle(
@@ -172,6 +176,7 @@ def play_oracle(
     """The task's own script in place of the servers: the same log, without queries, invocations or chunks."""
     ticks: list[m.Tick] = []
     snapshot, script = first, _script(side.environment)
+    side._begin(info)
     side._show(first, 0)
     while snapshot.status is Status.ONGOING:
         values = next(script, None)

@@ -47,6 +47,7 @@ def simulated_robot(robot: panda.Robot, initial_state: np.ndarray) -> Robot:
         max_lead=np.array([_MAX_LEAD_RAD] * 7 + [_GRIPPER_UNLIMITED], np.float32),
         state_low=(robot.state_low - _STATE_MARGIN).astype(np.float32),
         state_high=(robot.state_high + _STATE_MARGIN).astype(np.float32),
+        control_hz=CONTROL_HZ,
     )
 
 

@@ -11,7 +11,9 @@ import time
 from collections.abc import Callable, Iterator
 from typing import TypeVar
 
+from clock.obeyed import Obeyed
 from clock.report import statistics, stream_sha256
+from clock.schedules import HORIZON
 from clock.service import ClockService
 from dual_system.models.ponder.demo_sampling import PAPER_SAMPLING, DemoSampling
 from protocol import messages as m
@@ -30,25 +32,17 @@ _LAST_TICKS_NS = 1_000_000_000
 _TURN_NS = 1_000_000
 _TIME_TURN_S = 0.0005  # what the clocks' offset becomes uncertain by
 
-MAX_SKIPPED_TICKS = 200
-"""Ticks (ten seconds) that the clock service may have skipped between two commands."""
-
 Reply = TypeVar("Reply", m.ContractReply, m.OpenReply)
 
 
-def is_sound(link: Link, action: m.Action, robot: m.Robot, next_tick: int) -> bool:
-    """Whether this robot may be given a command: it has the last word on its own limits. If not, it is counted."""
-    values = action.values
-    if values.shape != robot.command_low.shape:
-        why_not = f"expected {robot.action_dim} values, came {len(values)}"
-    elif not ((robot.command_low <= values) & (values <= robot.command_high)).all():
-        why_not = f"expected values within the joint limits, came {values.tolist()}"
-    elif action.tick - next_tick > MAX_SKIPPED_TICKS:
-        why_not = f"expected tick {next_tick} or a few later, came {action.tick}"
-    else:
-        return True
-    link.drop(source_of(action.header), DropReason.OUT_OF_LIMITS, why_not)
-    return False
+def is_sound(link: Link, action: m.Action, obeyed: Obeyed, state: m.Floats | None) -> bool:
+    """Whether this robot may be given a command: it has the last word on its own limits. If not, it is counted.
+
+    ``state``: (num_proprio,), the newest that was measured; None: not known.
+    """
+    if why_not := obeyed.why_not(action, state):
+        link.drop(source_of(action.header), DropReason.OUT_OF_LIMITS, why_not)
+    return not why_not
 
 
 class RobotEnd:
@@ -93,9 +87,19 @@ class RobotEnd:
             EpisodeRefused: PONDER refuses the call.
             TransportError: it is not ready within the patience.
         """
-        reply = self._patiently(self._ask_ponder)
+        reply = self._patiently(lambda: self._ask_contract("ponder"))
         wanted = reply.contract.demonstrations if reply.contract is not None else None
         return PAPER_SAMPLING if wanted is None else DemoSampling(hz=wanted.hz, to_its_end=wanted.to_its_end)
+
+    def horizon(self) -> int:
+        """Asks POUNCE how many rows its chunks have.
+
+        Raises:
+            EpisodeRefused: POUNCE refuses the call.
+            TransportError: it is not ready within the patience.
+        """
+        contract = self._patiently(lambda: self._ask_contract("pounce")).contract
+        return contract.horizon if contract is not None and contract.horizon else HORIZON
 
     def open(self, request: m.OpenRequest) -> m.OpenReply:
         """Opens the episode with every server, as soon as all are ready.
@@ -173,9 +177,9 @@ class RobotEnd:
             self._recorder.step()
             self.take_turn(_ASK_AGAIN_NS)
 
-    def _ask_ponder(self) -> tuple[m.ContractReply, bool]:
+    def _ask_contract(self, proc: str) -> tuple[m.ContractReply, bool]:
         try:
-            return self._link.call(CONTRACT, "ponder", m.ContractRequest(), timeout_ns=_CONTRACT_NS), False
+            return self._link.call(CONTRACT, proc, m.ContractRequest(), timeout_ns=_CONTRACT_NS), False
         except CallFailed as error:
             return m.ContractReply(error=str(error)), True
 

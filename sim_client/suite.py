@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from clock.policies import has_ponder
+from clock.schedules import HORIZON
 from clock.service import ClockService
 from dual_system.tasks.environment import Environment, Snapshot, make_environment
 from dual_system.tasks.physics import CONTROL_HZ
@@ -104,13 +105,16 @@ class Suite:
         first = environment.reset(seed, self._options.difficulty)
         self._num_played += 1
         self._link.enter_episode(self._session, f"{task}-{seed}-{secrets.token_hex(3)}", self._num_played)
-        info = self._info(environment, first, task, seed, run)
+        horizon, why_not = self._horizon()
+        info = self._info(environment, first, task, seed, run, horizon)
         path = self._log_path(info) if self._options.log.record else None
         side = RobotSide(self._link, environment, self._recorder, self._end.take_turn, self._patience_ns, self._looks)
         opened = m.OpenReply()
         self._recorder.begin(info, path)
         if info.policy == "oracle":
             outcome, _ = play_oracle(info, side, first, on_tick)
+        elif why_not:
+            outcome = Outcome(status=m.TaskStatus.ABORTED, reason=why_not, num_ticks=0)
         else:
             try:
                 opened = self._end.open(m.OpenRequest(info=info, demo=self._demonstration(environment)))
@@ -136,7 +140,18 @@ class Suite:
             "schedule": result.statistics,
         }
 
-    def _info(self, environment: Environment, first: Snapshot, task: str, seed: int, run: int) -> m.EpisodeInfo:
+    def _horizon(self) -> tuple[int, str]:
+        """Rows of POUNCE's chunks, and why there is nobody to ask, or ""."""
+        if self._options.policy == "servers":
+            try:
+                return self._end.horizon(), ""
+            except (TransportError, EpisodeRefused) as error:
+                return HORIZON, str(error)
+        return HORIZON, ""
+
+    def _info(
+        self, environment: Environment, first: Snapshot, task: str, seed: int, run: int, horizon: int
+    ) -> m.EpisodeInfo:
         return m.EpisodeInfo(
             header=self._link.header("info", 0),
             task=task,
@@ -144,7 +159,7 @@ class Suite:
             seed=seed,
             difficulty=environment.difficulty,
             instruction=environment.instruction,
-            schedule=self._options.schedule.of_episode(self._options.mode, run_seed(seed, run)),
+            schedule=self._options.schedule.of_episode(self._options.mode, run_seed(seed, run), horizon),
             robot=simulated_robot(environment.physics.robot, first.state),
             t0_unix_ns=time.time_ns(),
             versions=versions(),

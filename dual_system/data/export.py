@@ -104,6 +104,8 @@ def read_episode(
         TaskError: its task does not exist here.
     """
     info = record.info
+    if info.schedule.control_hz != FPS:
+        raise DatasetError(f"{path}: {info.schedule.control_hz} commands a second; datasets here have {FPS} rows")
     observations, actions = _joined(path, record)
     height_px, width_px = info.robot.image_height, info.robot.image_width
     if height_px != width_px:

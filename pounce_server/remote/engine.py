@@ -47,6 +47,7 @@ class RemoteEngine:
         identity = hashlib.sha256(f"{url} {mapping.digest} {facts}".encode()).hexdigest()[:12]
         self.spec = EngineSpec(
             horizon=mapping.num_rows,
+            control_hz=mapping.play_hz,
             action_dim=mapping.num_commands,
             proprio_dim=mapping.num_proprio,
             num_carriers=0,

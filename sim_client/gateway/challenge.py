@@ -20,6 +20,8 @@ from sim_client.gateway.openpi import actions_of, metadata
 
 CAMERAS = {"front": "front_rgb_list", "wrist": "wrist_rgb_list"}
 JOINTS_KEY, GRIPPER_KEY = "joint_state_list", "gripper_state_list"
+ROWS = 20
+"""Rows of each answer that the challenge's runner usually plays."""
 RESET_FINISHED = {"reset_finished": True}
 
 

@@ -13,7 +13,7 @@ import re
 import secrets
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,7 +21,7 @@ from typing import Literal, TypeVar
 
 import numpy as np
 
-from clock.limits import out_of_range
+from clock.limits import out_of_range, slowed
 from clock.policies import has_ponder, servers_of
 from clock.service import ClockService
 from clock.timebase import MonotonicClock
@@ -56,7 +56,7 @@ _NO_ID = re.compile(r"[^A-Za-z0-9_.-]+")
 class Plan:
     """The settings that all episodes of this gateway share."""
 
-    schedule: Callable[[int], m.Schedule]  # from the episode's seed
+    schedule: Callable[[int, int], m.Schedule]  # from the episode's seed and the rows of POUNCE's chunks
     num_rows: int
     body: Body
     suite: str
@@ -120,6 +120,7 @@ class Machine:
         self._misshapen: dict[str, int] = {}  # by server: observations it had dropped for their shape at the start
         self._session = f"{_id_of(plan.suite)}-{secrets.token_hex(4)}"
         self._num_episodes = 0
+        self._state: m.Floats | None = None  # the newest
         self._episode: _Episode | None = None
         self._waiting: list[tuple[Future[Answer | None], int]] = []  # live: for a command after a tick
         self._jobs: queue.SimpleQueue[_Job] = queue.SimpleQueue()
@@ -324,7 +325,7 @@ class Machine:
             why = f"no command for {silent_ns / 1e6:.0f} ms"
         waiting, self._waiting = self._waiting, []
         for future, after_tick in waiting:
-            if (answer := node.answer(after_tick)) is not None:
+            if (answer := node.answer(time.monotonic_ns(), after_tick)) is not None:
                 future.set_result(answer)
             else:
                 self._waiting.append((future, after_tick))
@@ -352,9 +353,11 @@ class Machine:
         for chunk in self._from("pounce", self._chunks):
             node.commands.on_chunk(chunk)
 
-    def _commands(self, episode: _Episode) -> list[m.Action]:
-        robot, tick = episode.info.robot, episode.node.tick
-        return [each for each in self._from("clock", self._actions) if is_sound(self._link, each, robot, tick)]
+    def _commands(self, episode: _Episode) -> Iterator[m.Action]:
+        """The commands to carry out, one at a time: whether one is sound depends on those before it."""
+        for action in self._from("clock", self._actions):
+            if is_sound(self._link, action, episode.node.commands.obeyed, self._state):
+                yield action
 
     def _from(self, proc: str, stream: Stream[T]) -> list[T]:
         return [each for each in stream.drain() if self._link.is_from(each.header, proc)]  # type: ignore[attr-defined]
@@ -364,6 +367,7 @@ class Machine:
         self._robot_end.take_turn(longest_ns)
 
     def _show(self, observation: m.Observation, clock_id: str = m.EPISODE_CLOCK) -> None:
+        self._state = observation.proprio
         self._link.publish(OBSERVATION, observation, at_ns=observation.source_ns, clock_id=clock_id)
 
     def _tell(self, name: str, text: str) -> None:
@@ -380,16 +384,16 @@ class Machine:
         image_px = next(iter(frames.values())).shape[:2]
         robot = self._plan.body.describe(step.state, (image_px[0], image_px[1]))
         _check_state(step.state, robot)
-        seed = self._plan.seed + self._num_episodes
-        schedule = self._plan.schedule(seed)
+        self._end(m.TaskStatus.ONGOING, "another episode was begun")
+        seed, horizon = self._plan.seed + self._num_episodes, self._horizon(client)
+        schedule = self._plan.schedule(seed, horizon)
         if schedule.mode == m.Mode.LOCKSTEP and self._plan.num_rows > 1:
             # A client may not say what it saw between its requests: the last state is repeated, and has no lead.
             robot = _without_lead(robot)
         trial = step.trial or Trial()
         if trial.is_dry:  # nothing moves, so commands lead the arm
             robot = _without_lead(robot)
-        robot = replace(robot, max_step=(robot.max_step * np.float32(trial.speed)).astype(np.float32))
-        self._end(m.TaskStatus.ONGOING, "another episode was begun")
+        robot = slowed(robot, trial.speed)
         self._num_episodes += 1
         task = _id_of(step.task) or self._plan.task
         self._link.enter_episode(self._session, f"{task}-{seed}-{secrets.token_hex(3)}", self._num_episodes)
@@ -431,6 +435,18 @@ class Machine:
         for warning in opened.warnings:
             log.warning("episode=%s %s", info.header.episode, warning)
         return episode
+
+    def _horizon(self, client: str) -> int:
+        """Rows of POUNCE's chunks. Raises Refused, TransportError, EpisodeRefused: they cannot be served."""
+        try:
+            horizon, rows = self._robot_end.horizon(), self._plan.num_rows
+            if rows > horizon:
+                raise Refused(f"--rows {rows}: POUNCE's chunks have {horizon} rows, expected 1 to {horizon}")
+        except (Refused, TransportError, ProtocolError):
+            with self._lock:
+                self._lease.release(client)
+            raise
+        return horizon
 
     def _demonstration(self, video: Sequence[Frames], control_hz: int) -> tuple[m.DemoFrame, ...]:
         """PONDER's frames of a video. Raises TransportError or EpisodeRefused if PONDER's contract is not available."""

@@ -14,13 +14,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
+import numpy as np
+
+from clock.dimensions import dimensions_of
+from clock.obeyed import Obeyed
 from clock.playback import deadline_ns
+from clock.timebase import NS_PER_S
 from protocol import messages as m
-from sim_client.episode import STOPPED_TICKS
+from sim_client.episode import STOPPED_S
 from sim_client.gateway.exchange import Answer
 from sim_client.gateway.rule import ahead
 
 _KEEP_CHUNKS = 8
+_LATE_TICKS = 2  # a command may be on its way for one
 
 
 class Measurement(NamedTuple):
@@ -37,9 +43,18 @@ class Commands:
     """The newest command, the clock's account of it, and the chunks that it may have come from."""
 
     robot: m.Robot
+    control_hz: int
+    obeyed: Obeyed = field(init=False)
     newest: m.Action | None = None
     _account: m.Tick | None = None
     _chunks: dict[int, m.ActionChunk] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.obeyed = Obeyed(self.robot, self.control_hz)
+
+    def on_action(self, action: m.Action) -> None:
+        self.newest = action
+        self.obeyed.obey(action)
 
     def on_account(self, account: m.Tick) -> None:
         self._account = account
@@ -79,7 +94,7 @@ class LockstepNode:
     _asked_tick: int = 0  # of the request under way
 
     def __post_init__(self) -> None:
-        self.commands = Commands(self.info.robot)
+        self.commands = Commands(self.info.robot, self.info.schedule.control_hz)
 
     def show(self, since: Sequence[Measurement], now: Measurement) -> m.Observation:
         """Takes a request's observations since the last request and now; returns the observation to publish.
@@ -101,7 +116,7 @@ class LockstepNode:
             return None
         if self.tick == 0:
             self._start_ns = action.deadline_ns
-        self.commands.newest = action
+        self.commands.on_action(action)
         self.tick += 1
         return self._next() if self._coming else None
 
@@ -133,7 +148,7 @@ class LiveNode:
     _stopped_ticks: int = 0
 
     def __post_init__(self) -> None:
-        self.commands = Commands(self.info.robot)
+        self.commands = Commands(self.info.robot, self.info.schedule.control_hz)
 
     def show(self, now: Measurement, now_ns: int) -> m.Observation:
         """The observation to publish for a request at ``now_ns``, episode time, at the first tick that it can serve."""
@@ -148,19 +163,29 @@ class LiveNode:
             return
         zero_ns = host_ns - action.header.at_ns
         self.zero_ns = zero_ns if self.zero_ns is None else min(zero_ns, self.zero_ns)
-        self.commands.newest, self.tick = action, action.tick + 1
+        self.commands.on_action(action)
+        self.tick = action.tick + 1
         self._stopped_ticks = self._stopped_ticks + 1 if action.level == m.Level.STOPPED else 0
 
-    def answer(self, after_tick: int = -1) -> Answer | None:
-        """The current command and its forecast; None before the first command after ``after_tick``."""
+    def answer(self, host_ns: int, after_tick: int = -1) -> Answer | None:
+        """The current command and its forecast; None before the first command after ``after_tick``.
+
+        If no command has come for some ticks at ``host_ns``, this host's monotonic clock, velocities go on to zero.
+        """
         newest = self.commands.newest
         if newest is None or newest.tick <= after_tick or (answer := self.commands.answer(self.num_rows)) is None:
             return None
-        return replace(answer, deadline_ns=newest.deadline_ns + (self.zero_ns or 0))
+        due_ns, robot = newest.deadline_ns + (self.zero_ns or 0), self.info.robot
+        late_ticks = (host_ns - due_ns) * self.info.schedule.control_hz // NS_PER_S
+        if late_ticks >= min(_LATE_TICKS, max(1, robot.stop_ticks)) and len(dimensions_of(robot).velocities):
+            rows = [self.commands.obeyed.idle(late_ticks + ahead) for ahead in range(self.num_rows)]
+            answer = replace(answer, rows_NA=np.stack(rows), levels=(m.Level.HOLD,) * self.num_rows)
+        return replace(answer, deadline_ns=due_ns)
 
     def over(self) -> str:
         """Why the episode cannot go on; "" while it can."""
-        if self._stopped_ticks > STOPPED_TICKS and not self.waits_for_person:
+        stopped_ticks = STOPPED_S * self.info.schedule.control_hz
+        if self._stopped_ticks > stopped_ticks and not self.waits_for_person:
             return "stopped by the ladder, and nobody engaged it again"
         return ""
 

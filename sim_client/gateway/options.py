@@ -5,6 +5,7 @@ from __future__ import annotations
 import ipaddress
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -14,8 +15,9 @@ from clock import schedules
 from clock.policies import SERVERS, PonderChoice, policy_of
 from clock.timebase import NS_PER_MS
 from protocol import files
+from protocol.checks import MAX_HORIZON
 from protocol.errors import TransportError
-from protocol.messages import Delay, DelayKind, Schedule, WaitKind
+from protocol.messages import Delay, DelayKind, Mode, Schedule, WaitKind
 from protocol.options import DaemonOptions, LinkOptions
 from protocol.peers.mapping import PolicyMapping, read_mapping
 from protocol.sockets import endpoint
@@ -37,8 +39,8 @@ _SPOKEN: dict[DialectName, tuple[type[Dialect], Mapping[str, str], str, int]] = 
     # answer usually has
     "ponderpounce": (ponderpounce.PonderpounceDialect, {}, ponderpounce.STATE_KEY, 1),
     "openpi": (openpi.OpenpiDialect, openpi.CAMERAS, openpi.STATE_KEY, 1),
-    "challenge": (challenge.ChallengeDialect, challenge.CAMERAS, challenge.JOINTS_KEY, schedules.HORIZON),
-    "challenge-http": (challenge.ChallengeDialect, challenge.CAMERAS, challenge.JOINTS_KEY, schedules.HORIZON),
+    "challenge": (challenge.ChallengeDialect, challenge.CAMERAS, challenge.JOINTS_KEY, challenge.ROWS),
+    "challenge-http": (challenge.ChallengeDialect, challenge.CAMERAS, challenge.JOINTS_KEY, challenge.ROWS),
     "mme-vla": (mme_vla.MmeVlaDialect, openpi.CAMERAS, openpi.STATE_KEY, mme_vla.ROWS),
     "vla-eval": (vla_eval.VlaEvalDialect, vla_eval.CAMERAS, "states", 1),
     "groot": (groot.GrootDialect, {}, "", 0),  # these two have all of it in a mapping file
@@ -53,8 +55,8 @@ class ScheduleOptions:
     query_period_ms: int = 1000
     """Period of PONDER's queries in ms (paper: 1 Hz)."""
     invoke_every_ticks: int | None = None
-    """Period of POUNCE's invocations in 50 ms ticks. None: --rows in lockstep if several; else 20 in lockstep, 10 in
-    real time."""
+    """Period of POUNCE's invocations in ticks of the robot. None: --rows in lockstep if several; else as many as its
+    chunks have rows in lockstep, half of that in real time."""
     delay_ms: int = 300
     """PONDER's modelled delay in ms, in lockstep (paper: 300)."""
     wait: Literal["stand-still", "hold"] = "stand-still"
@@ -126,7 +128,7 @@ class GatewayOptions:
     """Number of rows in an answer, played by the client before its next request. None: 1, 20 for the challenge, and the
     mapping file's horizon for GR00T."""
     robot_file: Path | None = None
-    """TOML description of the robot, see docs/gateway.md. None: the Panda of our tasks and of RoboMME."""
+    """TOML description of the robot, see docs/robots.md. None: the Panda of our tasks and of RoboMME."""
     cameras: tuple[str, ...] = ()
     """Pairs NAME=KEY, one per camera of ours, e.g. front=observation/image wrist=observation/wrist_image. Empty: the
     dialect's usual keys; in vla-eval the first picture is the front camera's and the second the wrist's."""
@@ -165,13 +167,13 @@ class GatewayOptions:
         host, _ = self.address
         if self.dialect in GROOT and self.mapping is None:
             raise TransportError(f"--dialect {self.dialect} needs a --mapping file: its clients name every number")
-        rows, horizon = self.terms().rows, schedules.HORIZON
+        rows = self.terms().rows
         if not 1 <= self.seats <= MAX_SEATS:
             raise TransportError(f"--seats {self.seats}: expected 1 to {MAX_SEATS}")
         if (mapping := self.policy_mapping()) is not None:
             self._check_mapping(mapping)
-        if not 1 <= rows <= horizon:
-            raise TransportError(f"--rows {rows}: POUNCE's chunks have {horizon} rows, expected 1 to {horizon}")
+        if not 1 <= rows <= MAX_HORIZON:
+            raise TransportError(f"--rows {rows}: expected 1 to as many as POUNCE's chunks have")
         if self.dialect == "ponderpounce" and (rows != 1 or not self.is_realtime):
             raise TransportError(
                 "--dialect ponderpounce: a robot's own program gets each tick's command in real time; "
@@ -179,8 +181,8 @@ class GatewayOptions:
             )
         if self.dialect == "vla-eval" and rows != 1:
             raise TransportError(f"--rows {rows}: vla-eval asks at every step and plays one row; leave --rows out")
-        every_ticks = self.schedule(0).invoke_period_ticks
-        if not self.is_realtime and every_ticks % rows:
+        every_ticks = self.timing.invoke_every_ticks
+        if not self.is_realtime and every_ticks is not None and every_ticks % rows:
             raise TransportError(
                 f"--invoke-every-ticks {every_ticks} is no multiple of --rows {rows}: a new chunk would break the "
                 "promise of rows that the client is still playing"
@@ -203,11 +205,11 @@ class GatewayOptions:
             raise TransportError(f"--mapping: --dialect {self.dialect} has names of its own; see --cameras")
         with files.reading(self.mapping, "mapping file for this robot"):
             groot.check_mapping(mapping)
-            num_proprio = self.body().num_proprio
+            num_proprio, control_hz = self.body().num_proprio, self.body().control_hz
             if mapping.num_proprio != num_proprio:
                 raise ValueError(f"num_proprio is {mapping.num_proprio}, the robot's {num_proprio}; see --robot-file")
-            if mapping.play_hz != schedules.CONTROL_HZ:
-                raise ValueError(f"play_hz is {mapping.play_hz}, the robot's {schedules.CONTROL_HZ}")
+            if mapping.play_hz != control_hz:
+                raise ValueError(f"play_hz is {mapping.play_hz}, the robot's {control_hz}; see --robot-file")
 
     @property
     def is_realtime(self) -> bool:
@@ -237,17 +239,18 @@ class GatewayOptions:
     def terms(self) -> Terms:
         """The terms for the dialect. Raises TransportError for a camera that is not NAME=KEY."""
         _, cameras, state_key, rows = _SPOKEN[self.dialect]
-        mapping, robot = self.policy_mapping(), self.body().example()
+        mapping, robot = self.policy_mapping(), self.body()
+        described = robot.example()
         pairs = [each.partition("=") for each in self.cameras]
         if any(not name or not key for name, _, key in pairs):
             raise TransportError(f"--cameras {' '.join(self.cameras)}: expected NAME=KEY, e.g. front=observation/image")
         return Terms(
-            mode=self.schedule(0).mode,
+            mode=Mode.REALTIME if self.is_realtime else Mode.LOCKSTEP,
             rows=self.rows if self.rows is not None else rows or self._mapped_rows(),
-            control_hz=schedules.CONTROL_HZ,
-            cameras={name: key for name, _, key in pairs} or cameras or {name: name for name in robot.cameras},
+            control_hz=robot.control_hz,
+            cameras={name: key for name, _, key in pairs} or cameras or {name: name for name in described.cameras},
             state_key=self.state_key or state_key,
-            robot=robot,
+            robot=described,
             version=version(),
             mapping=mapping,
         )
@@ -260,9 +263,12 @@ class GatewayOptions:
         mapping = self.policy_mapping()
         return mapping.num_rows if mapping is not None else 1
 
-    def schedule(self, seed: int) -> Schedule:
-        """The schedule of the episode with this seed."""
-        base = schedules.realtime() if self.is_realtime else schedules.paper()
+    def schedule(
+        self, seed: int, horizon: int = schedules.HORIZON, *, control_hz: int = schedules.CONTROL_HZ
+    ) -> Schedule:
+        """The schedule of the episode with this seed, for chunks of ``horizon`` rows and a robot of this rate."""
+        named = schedules.realtime if self.is_realtime else schedules.paper
+        base = named(control_hz, horizon)
         rows = self.rows or _SPOKEN[self.dialect][3] or self._mapped_rows()
         every_ticks = rows if not self.is_realtime and rows > 1 else base.invoke_period_ticks
         fixed = Delay(kind=DelayKind.FIXED, mean_ns=self.timing.delay_ms * NS_PER_MS)
@@ -283,10 +289,11 @@ class GatewayOptions:
 
     def plan(self) -> Plan:
         """The common plan of all episodes. Raises TransportError as ``body``."""
+        robot = self.body()  # read once: a file that changes later changes no episode
         return Plan(
-            schedule=self.schedule,
+            schedule=partial(self.schedule, control_hz=robot.control_hz),
             num_rows=self.terms().rows,
-            body=self.body(),
+            body=robot,
             suite=self.dialect,
             policy=policy_of(self.ponder),
             task=self.log.task,

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from clock.commander import BLOCKED_TICKS, NO_ROW, Commander, Decision
+from clock.commander import NO_ROW, Commander, Decision, blocked_ticks
 from clock.limits import Hit
 from clock.playback import Chunk
 from protocol.messages import EpisodeInfo, Floats, Level, Robot, RobotState, Schedule
@@ -95,7 +95,7 @@ def test_a_blocked_arm_is_held_and_then_stopped_where_it_is(info: EpisodeInfo) -
     levels = list(dict.fromkeys(decided.level for decided in decisions))
     assert levels == [Level.PLAY, Level.HOLD, Level.DECELERATE, Level.STOPPED]
     at_lead = [decided for decided in decisions if decided.level == Level.PLAY and Hit.LEAD in decided.hit]
-    assert len(at_lead) == BLOCKED_TICKS
+    assert len(at_lead) == blocked_ticks(info.schedule.control_hz)
     np.testing.assert_allclose(decisions[-1].command, at(0, 0, 0, 1), atol=1e-6)
 
 

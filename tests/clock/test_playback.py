@@ -26,6 +26,7 @@ RATES = st.integers(1, 1000)
 STARTS = st.integers(-(10**12), 10**12)
 TICKS = st.integers(0, 10**7)
 H, DIM = 8, 3
+LAST = np.array([False, False, True])  # the gripper
 
 
 def chunk(invocation: int, t_row0: int, rows_NA: Floats | None = None, first_tick: int | None = None) -> Chunk:
@@ -108,7 +109,7 @@ def test_switch_plays_the_newest_row_as_it_is(chunks_tick: tuple[list[Chunk], in
 
 @given(old=ROWS, new=ROWS, at=st.integers(0, H - 1), fade=st.integers(1, 20))
 def test_a_fade_is_continuous_at_the_switch(old: Floats, new: Floats, at: int, fade: int) -> None:
-    joined = offset_fade(fade)([chunk(0, 0, old), chunk(1, at, new)], at)
+    joined = offset_fade(fade, LAST)([chunk(0, 0, old), chunk(1, at, new)], at)
     assert joined[:-1] == pytest.approx(old[at, :-1], abs=1e-5)
 
 
@@ -117,7 +118,7 @@ def test_a_fade_is_continuous_where_a_late_chunk_is_first_played(
     old: Floats, new: Floats, at: int, late: int, fade: int
 ) -> None:
     first = min(at + late, H - 1)
-    joined = offset_fade(fade)([chunk(0, 0, old), chunk(1, at, new, first_tick=first)], first)
+    joined = offset_fade(fade, LAST)([chunk(0, 0, old), chunk(1, at, new, first_tick=first)], first)
     assert joined[:-1] == pytest.approx(old[first, :-1], abs=1e-5)
 
 
@@ -126,13 +127,13 @@ def test_a_fade_is_over_after_its_ticks(old: Floats, new: Floats, at: int, fade:
     tick = at + fade
     chunks = [c for c in (chunk(0, 0, old), chunk(1, at, new)) if row_of(c, tick) is not None]
     if chunks and chunks[-1].invocation == 1:
-        assert (offset_fade(fade)(chunks, tick) == new[fade]).all()
+        assert (offset_fade(fade, LAST)(chunks, tick) == new[fade]).all()
 
 
 @given(old=ROWS, new=ROWS, fade=st.integers(2, 6), since=st.integers(0, 4))
 def test_a_fade_shrinks_the_jump_linearly(old: Floats, new: Floats, fade: int, since: int) -> None:
     at = 2
-    joined = offset_fade(fade)([chunk(0, 0, old), chunk(1, at, new)], at + since)
+    joined = offset_fade(fade, LAST)([chunk(0, 0, old), chunk(1, at, new)], at + since)
     jump = (old[at] - new[0])[:-1]
     expected = new[since, :-1] + max(0.0, 1 - since / fade) * jump
     assert joined[:-1] == pytest.approx(expected, abs=1e-4)
@@ -141,14 +142,14 @@ def test_a_fade_shrinks_the_jump_linearly(old: Floats, new: Floats, fade: int, s
 @pytest.mark.parametrize("fade", [0, 5])
 def test_a_lone_chunk_has_nothing_to_fade_from(fade: int) -> None:
     lone = chunk(0, 3)
-    assert (offset_fade(fade)([lone], 4) == lone.rows_NA[1]).all()
+    assert (offset_fade(fade, LAST)([lone], 4) == lone.rows_NA[1]).all()
 
 
 @given(chunks_tick=overlapping(), decay=st.floats(-2, 2))
 def test_an_ensemble_lies_between_its_rows(chunks_tick: tuple[list[Chunk], int], decay: float) -> None:
     chunks, tick = chunks_tick
     rows = np.stack([c.rows_NA[tick - c.t_row0] for c in chunks])
-    mean = ensemble(decay)(chunks, tick)
+    mean = ensemble(decay, LAST)(chunks, tick)
     assert (mean >= rows.min(axis=0) - 1e-5).all()
     assert (mean <= rows.max(axis=0) + 1e-5).all()
 
@@ -157,12 +158,12 @@ def test_an_ensemble_lies_between_its_rows(chunks_tick: tuple[list[Chunk], int],
 def test_an_ensemble_of_agreeing_chunks_is_what_they_say(row: Floats, decay: float) -> None:
     same = np.tile(row, (H, 1))
     chunks = [chunk(j, j, same) for j in range(3)]
-    assert ensemble(decay)(chunks, 4) == pytest.approx(row, abs=1e-5)
+    assert ensemble(decay, LAST)(chunks, 4) == pytest.approx(row, abs=1e-5)
 
 
 def test_a_positive_decay_lets_the_oldest_weigh_most() -> None:
     chunks = [chunk(0, 0), chunk(1, 1)]  # second coordinate: the invocation
-    assert ensemble(1.0)(chunks, 3)[1] == pytest.approx(np.exp(-1) / (1 + np.exp(-1)))
+    assert ensemble(1.0, LAST)(chunks, 3)[1] == pytest.approx(np.exp(-1) / (1 + np.exp(-1)))
 
 
 @given(chunks_tick=overlapping())
@@ -178,7 +179,7 @@ def test_a_positive_decay_lets_the_oldest_weigh_most() -> None:
 def test_the_gripper_is_a_switch_at_every_seam(seam: Seam, chunks_tick: tuple[list[Chunk], int]) -> None:
     chunks, tick = chunks_tick
     newest = chunks[-1]
-    assert seam_policy(seam)(chunks, tick)[-1] == newest.rows_NA[tick - newest.t_row0, -1]
+    assert seam_policy(seam, LAST)(chunks, tick)[-1] == newest.rows_NA[tick - newest.t_row0, -1]
 
 
 @given(chunks_tick=overlapping())
@@ -186,7 +187,7 @@ def test_the_gripper_is_a_switch_at_every_seam(seam: Seam, chunks_tick: tuple[li
 def test_joining_changes_no_chunk(kind: SeamKind, chunks_tick: tuple[list[Chunk], int]) -> None:
     chunks, tick = chunks_tick
     before = [c.rows_NA.tobytes() for c in chunks]
-    seam_policy(Seam(kind=kind, fade_ticks=4, ensemble_decay=0.1))(chunks, tick)[:] = 9
+    seam_policy(Seam(kind=kind, fade_ticks=4, ensemble_decay=0.1), LAST)(chunks, tick)[:] = 9
     assert [c.rows_NA.tobytes() for c in chunks] == before
 
 

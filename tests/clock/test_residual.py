@@ -24,6 +24,7 @@ from protocol.mcap_log import read_log
 from protocol.topics import EVENT, TICK
 
 LIMIT = np.full(7, 0.05, np.float32)
+LAST = np.arange(8) == 7  # the gripper
 SMALL = LIMIT[:3]  # of the arm whose episodes are played here
 
 
@@ -45,13 +46,13 @@ def due_at(rng: np.random.Generator, *, num_joints: int = 7) -> Due:
 
 def test_without_a_head_it_is_the_very_row() -> None:
     due = due_at(np.random.default_rng(0))
-    assert corrected(None, due) is due.row_A
+    assert corrected(None, due, LAST) is due.row_A
 
 
 def test_the_gripper_is_not_corrected_nor_the_row_touched() -> None:
     due = due_at(np.random.default_rng(0))
     before = due.row_A.copy()
-    row = corrected(Nudge(0.25), due)
+    row = corrected(Nudge(0.25), due, LAST)
     np.testing.assert_array_equal(row[:-1], before[:-1] + np.float32(0.25))
     assert row[-1] == before[-1]
     np.testing.assert_array_equal(due.row_A, before)
@@ -71,7 +72,7 @@ def test_no_correction_exceeds_its_limit(seed: int, scale: float) -> None:
 
 def test_an_untrained_head_changes_no_bit() -> None:
     due = due_at(np.random.default_rng(0))
-    np.testing.assert_array_equal(corrected(ResidualMlp.untrained(limit_rad=LIMIT), due), due.row_A)
+    np.testing.assert_array_equal(corrected(ResidualMlp.untrained(limit_rad=LIMIT), due, LAST), due.row_A)
 
 
 def test_a_fitted_head_learns_what_follows_from_its_inputs() -> None:

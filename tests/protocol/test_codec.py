@@ -142,6 +142,7 @@ def chunks(draw: st.DrawFn) -> m.ActionChunk:
 def robots(draw: st.DrawFn) -> m.Robot:
     dim, num_proprio = draw(st.integers(1, 8)), draw(st.integers(0, 8))
     bounds = np.sort(np.stack([draw(floats(dim, dim)), draw(floats(dim, dim))]), axis=0)
+    described = draw(st.just(()) | st.tuples(*(dimensions(index) for index in range(dim))))
     states = np.sort(np.stack([draw(floats(num_proprio, num_proprio)) for _ in range(2)]), axis=0)
     return m.Robot(
         name=draw(TEXT),
@@ -154,9 +155,25 @@ def robots(draw: st.DrawFn) -> m.Robot:
         image_width=draw(U32),
         num_proprio=num_proprio,
         is_simulated=draw(st.booleans()),
-        max_lead=np.abs(draw(floats(dim, dim))),
+        max_lead=np.abs(draw(floats(dim, dim))) if not described else np.zeros(dim, np.float32),
         state_low=states[0],
         state_high=states[1],
+        dimensions=described,
+        control_hz=draw(st.just(0) | st.integers(5, 100)),
+        stop_ticks=draw(U32),
+        max_picture_age_ns=draw(DURATION),
+        max_picture_skew_ns=draw(DURATION),
+        max_picture_still_ns=draw(DURATION),
+        at_exit=draw(st.sampled_from(m.AtExit)),
+        home=bounds[draw(st.integers(0, 1))],
+    )
+
+
+def dimensions(index: int) -> st.SearchStrategy[m.Dimension]:
+    """One that is not measured and may have any limits; what fits together is for ``test_robot_checks``."""
+    joint, gripper = (m.DimensionKind.POSITION, m.AtStop.HOLD), (m.DimensionKind.GRIPPER, m.AtStop.KEEP)
+    return st.tuples(st.sampled_from([joint, gripper]), TEXT).map(
+        lambda drawn: m.Dimension(name=f"dim {index}", kind=drawn[0][0], unit=drawn[1], at_stop=drawn[0][1])
     )
 
 
@@ -210,7 +227,7 @@ CONTRACT = st.builds(
     m.Contract, proc=TEXT, num_carriers=U32, hidden_size=U32, horizon=U32, action_dim=U32,
     preferred_codec=chosen(m.ImageCodec), infer_p50_ns=DURATION, infer_p99_ns=DURATION, model_hash=TEXT,
     is_fake=st.booleans(), version=TEXT, context_tokens=U32, max_context_tokens=U32,
-    demonstrations=st.none() | DEMO_SAMPLING, channels=tuples_of(CHANNEL),
+    demonstrations=st.none() | DEMO_SAMPLING, control_hz=st.integers(0, 100), channels=tuples_of(CHANNEL),
 )  # fmt: skip
 JOURNAL_ENTRY = st.builds(
     m.JournalEntry, query=INDEX, tick=INDEX, source_ns=INSTANT, observation=st.binary(max_size=40)
@@ -236,7 +253,7 @@ MESSAGES: dict[type, st.SearchStrategy[Any]] = {
         m.Tick, header=HEADER, tick=INDEX, deadline_ns=INSTANT, decided_ns=INSTANT, late_ns=INSTANT,
         level=chosen(m.Level), invocation=st.none() | INDEX, t_row0=INDEX, row=U32, ref_query=st.none() | INDEX,
         age_ns=INSTANT, observation_tick=INDEX, state=floats(), action=floats(), raw_row=any_row, limits_hit=U32,
-        seam_jump=NUMBER, age_ms=DOUBLE, late_ms=DOUBLE,
+        seam_jump=NUMBER, age_ms=DOUBLE, late_ms=DOUBLE, picture_age_ns=tuples_of(INSTANT),
     ),
     m.Subgoal: st.builds(
         m.Subgoal, header=HEADER, kind=chosen(m.SubgoalKind), text=TEXT, tick=INDEX, query=st.none() | INDEX,
@@ -256,6 +273,7 @@ MESSAGES: dict[type, st.SearchStrategy[Any]] = {
     m.Seam: SEAM,
     m.Schedule: SCHEDULE,
     m.Robot: robots(),
+    m.Dimension: dimensions(0),
     m.EpisodeInfo: INFO,
     m.EpisodeResult: RESULT,
     m.DemoFrame: DEMO_FRAME,

@@ -63,6 +63,8 @@ class GrootPounceConfig:
     """front, wrist"""
     num_steps: int = 4
     """Euler steps per chunk."""
+    control_hz: int = 20
+    """Rows a second; 0: not known, as of a public folder."""
     max_prompt_tokens: int = 200
     """Limit of the text's tokens, without the image tokens."""
     reads_subgoal: bool = False

@@ -53,6 +53,8 @@ class PounceConfig:
     """front, wrist. 0: it acts on state and cognition alone, whatever cameras the robot has."""
     num_steps: int = 10
     """Euler steps per chunk."""
+    control_hz: int = 20
+    """Rows a second; 0: not known, as of a public folder."""
     max_prompt_tokens: int = 200
     state_input: StateInput = "prompt"
     """prompt: 256 bins written as digits, as pi0.5 does. token: one linearly projected token, as pi0 has in its action

@@ -33,9 +33,9 @@ class DemoSampling:
             raise ValueError(f"num_views must be at least 1, or None for all; came {self.num_views}")
 
     def indices(self, num_frames: int, video_hz: int = FASTEST_HZ) -> list[int]:
-        """Indices of the sampled frames of a video of ``num_frames``; ``hz`` divides ``video_hz``."""
-        every, last = video_hz // self.hz, num_frames - 1
-        sampled = [*range(0, num_frames, every)]
+        """Indices of the sampled frames of a video of ``num_frames``, each the first that is not before its instant."""
+        last = num_frames - 1
+        sampled = list(dict.fromkeys(-(-at * video_hz // self.hz) for at in range(last * self.hz // video_hz + 1)))
         return [*sampled, last] if self.to_its_end and sampled and sampled[-1] != last else sampled
 
 

@@ -242,11 +242,11 @@ def public_config(folder: Path) -> AnyPounceConfig:
 
 def _public_config(tensors: StoredTensors | None, values: dict[str, Any] | None, folder: Path) -> AnyPounceConfig:
     if tensors is None:  # openpi's JAX folder
-        return pi05_base()
+        return replace(pi05_base(), control_hz=0)
     if family_of(tensors.shapes, str(folder / WEIGHTS_FILE)) == "pi05":
-        return with_sizes_of(tensors.shapes, pi05_base(), str(folder))
+        return with_sizes_of(tensors.shapes, replace(pi05_base(), control_hz=0), str(folder))
     groot, num_steps = groot_config_of(tensors.shapes, values, str(folder))
-    return replace(groot_n1_5(), groot=groot, num_steps=num_steps)
+    return replace(groot_n1_5(), groot=groot, num_steps=num_steps, control_hz=0)
 
 
 def _public_statistics(folder: Path, given: RobotStatistics | None) -> RobotStatistics:

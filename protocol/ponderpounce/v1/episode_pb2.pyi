@@ -41,6 +41,29 @@ class SeamKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     SEAM_KIND_OFFSET_FADE: _ClassVar[SeamKind]
     SEAM_KIND_ENSEMBLE: _ClassVar[SeamKind]
 
+class DimensionKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    DIMENSION_KIND_UNSPECIFIED: _ClassVar[DimensionKind]
+    DIMENSION_KIND_POSITION: _ClassVar[DimensionKind]
+    DIMENSION_KIND_VELOCITY: _ClassVar[DimensionKind]
+    DIMENSION_KIND_DELTA: _ClassVar[DimensionKind]
+    DIMENSION_KIND_GRIPPER: _ClassVar[DimensionKind]
+
+class AtStop(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    AT_STOP_UNSPECIFIED: _ClassVar[AtStop]
+    AT_STOP_HOLD: _ClassVar[AtStop]
+    AT_STOP_MEASURED: _ClassVar[AtStop]
+    AT_STOP_ZERO: _ClassVar[AtStop]
+    AT_STOP_KEEP: _ClassVar[AtStop]
+
+class AtExit(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    AT_EXIT_UNSPECIFIED: _ClassVar[AtExit]
+    AT_EXIT_HOLD: _ClassVar[AtExit]
+    AT_EXIT_PARK: _ClassVar[AtExit]
+    AT_EXIT_RELEASE: _ClassVar[AtExit]
+
 class PayloadKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     PAYLOAD_KIND_UNSPECIFIED: _ClassVar[PayloadKind]
@@ -87,6 +110,20 @@ SEAM_KIND_UNSPECIFIED: SeamKind
 SEAM_KIND_SWITCH: SeamKind
 SEAM_KIND_OFFSET_FADE: SeamKind
 SEAM_KIND_ENSEMBLE: SeamKind
+DIMENSION_KIND_UNSPECIFIED: DimensionKind
+DIMENSION_KIND_POSITION: DimensionKind
+DIMENSION_KIND_VELOCITY: DimensionKind
+DIMENSION_KIND_DELTA: DimensionKind
+DIMENSION_KIND_GRIPPER: DimensionKind
+AT_STOP_UNSPECIFIED: AtStop
+AT_STOP_HOLD: AtStop
+AT_STOP_MEASURED: AtStop
+AT_STOP_ZERO: AtStop
+AT_STOP_KEEP: AtStop
+AT_EXIT_UNSPECIFIED: AtExit
+AT_EXIT_HOLD: AtExit
+AT_EXIT_PARK: AtExit
+AT_EXIT_RELEASE: AtExit
 PAYLOAD_KIND_UNSPECIFIED: PayloadKind
 PAYLOAD_KIND_VECTORS: PayloadKind
 PAYLOAD_KIND_TEXT: PayloadKind
@@ -169,8 +206,22 @@ class Schedule(_message.Message):
     seed: int
     def __init__(self, mode: _Optional[_Union[Mode, str]] = ..., control_hz: _Optional[int] = ..., horizon: _Optional[int] = ..., query_period_ns: _Optional[int] = ..., invoke_period_ticks: _Optional[int] = ..., query_delay: _Optional[_Union[Delay, _Mapping]] = ..., invoke_delay: _Optional[_Union[Delay, _Mapping]] = ..., delivery: _Optional[_Union[Delivery, _Mapping]] = ..., wait: _Optional[_Union[WaitKind, str]] = ..., seam: _Optional[_Union[Seam, _Mapping]] = ..., max_age_ns: _Optional[int] = ..., stale_limit_ns: _Optional[int] = ..., hold_limit_ticks: _Optional[int] = ..., decelerate_ticks: _Optional[int] = ..., max_ticks: _Optional[int] = ..., seed: _Optional[int] = ...) -> None: ...
 
+class Dimension(_message.Message):
+    __slots__ = ("name", "kind", "unit", "state_index", "at_stop")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    UNIT_FIELD_NUMBER: _ClassVar[int]
+    STATE_INDEX_FIELD_NUMBER: _ClassVar[int]
+    AT_STOP_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    kind: DimensionKind
+    unit: str
+    state_index: int
+    at_stop: AtStop
+    def __init__(self, name: _Optional[str] = ..., kind: _Optional[_Union[DimensionKind, str]] = ..., unit: _Optional[str] = ..., state_index: _Optional[int] = ..., at_stop: _Optional[_Union[AtStop, str]] = ...) -> None: ...
+
 class Robot(_message.Message):
-    __slots__ = ("name", "command_low", "command_high", "max_step", "initial_command", "cameras", "image_height", "image_width", "num_proprio", "is_simulated", "max_lead", "state_low", "state_high")
+    __slots__ = ("name", "command_low", "command_high", "max_step", "initial_command", "cameras", "image_height", "image_width", "num_proprio", "is_simulated", "max_lead", "state_low", "state_high", "dimensions", "control_hz", "stop_ticks", "max_picture_age_ns", "max_picture_skew_ns", "max_picture_still_ns", "at_exit", "home")
     NAME_FIELD_NUMBER: _ClassVar[int]
     COMMAND_LOW_FIELD_NUMBER: _ClassVar[int]
     COMMAND_HIGH_FIELD_NUMBER: _ClassVar[int]
@@ -184,6 +235,14 @@ class Robot(_message.Message):
     MAX_LEAD_FIELD_NUMBER: _ClassVar[int]
     STATE_LOW_FIELD_NUMBER: _ClassVar[int]
     STATE_HIGH_FIELD_NUMBER: _ClassVar[int]
+    DIMENSIONS_FIELD_NUMBER: _ClassVar[int]
+    CONTROL_HZ_FIELD_NUMBER: _ClassVar[int]
+    STOP_TICKS_FIELD_NUMBER: _ClassVar[int]
+    MAX_PICTURE_AGE_NS_FIELD_NUMBER: _ClassVar[int]
+    MAX_PICTURE_SKEW_NS_FIELD_NUMBER: _ClassVar[int]
+    MAX_PICTURE_STILL_NS_FIELD_NUMBER: _ClassVar[int]
+    AT_EXIT_FIELD_NUMBER: _ClassVar[int]
+    HOME_FIELD_NUMBER: _ClassVar[int]
     name: str
     command_low: _containers.RepeatedScalarFieldContainer[float]
     command_high: _containers.RepeatedScalarFieldContainer[float]
@@ -197,7 +256,15 @@ class Robot(_message.Message):
     max_lead: _containers.RepeatedScalarFieldContainer[float]
     state_low: _containers.RepeatedScalarFieldContainer[float]
     state_high: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, name: _Optional[str] = ..., command_low: _Optional[_Iterable[float]] = ..., command_high: _Optional[_Iterable[float]] = ..., max_step: _Optional[_Iterable[float]] = ..., initial_command: _Optional[_Iterable[float]] = ..., cameras: _Optional[_Iterable[str]] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., num_proprio: _Optional[int] = ..., is_simulated: _Optional[bool] = ..., max_lead: _Optional[_Iterable[float]] = ..., state_low: _Optional[_Iterable[float]] = ..., state_high: _Optional[_Iterable[float]] = ...) -> None: ...
+    dimensions: _containers.RepeatedCompositeFieldContainer[Dimension]
+    control_hz: int
+    stop_ticks: int
+    max_picture_age_ns: int
+    max_picture_skew_ns: int
+    max_picture_still_ns: int
+    at_exit: AtExit
+    home: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, name: _Optional[str] = ..., command_low: _Optional[_Iterable[float]] = ..., command_high: _Optional[_Iterable[float]] = ..., max_step: _Optional[_Iterable[float]] = ..., initial_command: _Optional[_Iterable[float]] = ..., cameras: _Optional[_Iterable[str]] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., num_proprio: _Optional[int] = ..., is_simulated: _Optional[bool] = ..., max_lead: _Optional[_Iterable[float]] = ..., state_low: _Optional[_Iterable[float]] = ..., state_high: _Optional[_Iterable[float]] = ..., dimensions: _Optional[_Iterable[_Union[Dimension, _Mapping]]] = ..., control_hz: _Optional[int] = ..., stop_ticks: _Optional[int] = ..., max_picture_age_ns: _Optional[int] = ..., max_picture_skew_ns: _Optional[int] = ..., max_picture_still_ns: _Optional[int] = ..., at_exit: _Optional[_Union[AtExit, str]] = ..., home: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class EpisodeInfo(_message.Message):
     __slots__ = ("header", "task", "suite", "seed", "difficulty", "instruction", "schedule", "robot", "t0_unix_ns", "versions", "policy", "has_demo")
@@ -304,7 +371,7 @@ class ChannelSpec(_message.Message):
     def __init__(self, payload: _Optional[_Union[PayloadKind, str]] = ..., consumer: _Optional[_Union[ConsumerKind, str]] = ..., reads_age: _Optional[bool] = ..., null: _Optional[_Union[NullKind, str]] = ...) -> None: ...
 
 class Contract(_message.Message):
-    __slots__ = ("proc", "num_carriers", "hidden_size", "horizon", "action_dim", "preferred_codec", "infer_p50_ns", "infer_p99_ns", "model_hash", "is_fake", "version", "context_tokens", "max_context_tokens", "demonstrations", "boot_id", "channels")
+    __slots__ = ("proc", "num_carriers", "hidden_size", "horizon", "action_dim", "preferred_codec", "infer_p50_ns", "infer_p99_ns", "model_hash", "is_fake", "version", "context_tokens", "max_context_tokens", "demonstrations", "boot_id", "channels", "control_hz")
     PROC_FIELD_NUMBER: _ClassVar[int]
     NUM_CARRIERS_FIELD_NUMBER: _ClassVar[int]
     HIDDEN_SIZE_FIELD_NUMBER: _ClassVar[int]
@@ -321,6 +388,7 @@ class Contract(_message.Message):
     DEMONSTRATIONS_FIELD_NUMBER: _ClassVar[int]
     BOOT_ID_FIELD_NUMBER: _ClassVar[int]
     CHANNELS_FIELD_NUMBER: _ClassVar[int]
+    CONTROL_HZ_FIELD_NUMBER: _ClassVar[int]
     proc: str
     num_carriers: int
     hidden_size: int
@@ -337,7 +405,8 @@ class Contract(_message.Message):
     demonstrations: DemoSampling
     boot_id: int
     channels: _containers.RepeatedCompositeFieldContainer[ChannelSpec]
-    def __init__(self, proc: _Optional[str] = ..., num_carriers: _Optional[int] = ..., hidden_size: _Optional[int] = ..., horizon: _Optional[int] = ..., action_dim: _Optional[int] = ..., preferred_codec: _Optional[_Union[_common_pb2.ImageCodec, str]] = ..., infer_p50_ns: _Optional[int] = ..., infer_p99_ns: _Optional[int] = ..., model_hash: _Optional[str] = ..., is_fake: _Optional[bool] = ..., version: _Optional[str] = ..., context_tokens: _Optional[int] = ..., max_context_tokens: _Optional[int] = ..., demonstrations: _Optional[_Union[DemoSampling, _Mapping]] = ..., boot_id: _Optional[int] = ..., channels: _Optional[_Iterable[_Union[ChannelSpec, _Mapping]]] = ...) -> None: ...
+    control_hz: int
+    def __init__(self, proc: _Optional[str] = ..., num_carriers: _Optional[int] = ..., hidden_size: _Optional[int] = ..., horizon: _Optional[int] = ..., action_dim: _Optional[int] = ..., preferred_codec: _Optional[_Union[_common_pb2.ImageCodec, str]] = ..., infer_p50_ns: _Optional[int] = ..., infer_p99_ns: _Optional[int] = ..., model_hash: _Optional[str] = ..., is_fake: _Optional[bool] = ..., version: _Optional[str] = ..., context_tokens: _Optional[int] = ..., max_context_tokens: _Optional[int] = ..., demonstrations: _Optional[_Union[DemoSampling, _Mapping]] = ..., boot_id: _Optional[int] = ..., channels: _Optional[_Iterable[_Union[ChannelSpec, _Mapping]]] = ..., control_hz: _Optional[int] = ...) -> None: ...
 
 class ContractRequest(_message.Message):
     __slots__ = ("header",)

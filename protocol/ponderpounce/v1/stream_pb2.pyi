@@ -98,7 +98,7 @@ SERVING_STATE_FAILED: ServingState
 SERVING_STATE_CLOSING: ServingState
 
 class Observation(_message.Message):
-    __slots__ = ("header", "tick", "source_ns", "proprio", "images", "status", "reason", "robot_state", "robot_text")
+    __slots__ = ("header", "tick", "source_ns", "proprio", "images", "status", "reason", "robot_state", "robot_text", "captured_ns")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     TICK_FIELD_NUMBER: _ClassVar[int]
     SOURCE_NS_FIELD_NUMBER: _ClassVar[int]
@@ -108,6 +108,7 @@ class Observation(_message.Message):
     REASON_FIELD_NUMBER: _ClassVar[int]
     ROBOT_STATE_FIELD_NUMBER: _ClassVar[int]
     ROBOT_TEXT_FIELD_NUMBER: _ClassVar[int]
+    CAPTURED_NS_FIELD_NUMBER: _ClassVar[int]
     header: _common_pb2.Header
     tick: int
     source_ns: int
@@ -117,7 +118,8 @@ class Observation(_message.Message):
     reason: str
     robot_state: RobotState
     robot_text: str
-    def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ..., tick: _Optional[int] = ..., source_ns: _Optional[int] = ..., proprio: _Optional[_Iterable[float]] = ..., images: _Optional[_Iterable[_Union[_common_pb2.Image, _Mapping]]] = ..., status: _Optional[_Union[_common_pb2.TaskStatus, str]] = ..., reason: _Optional[str] = ..., robot_state: _Optional[_Union[RobotState, str]] = ..., robot_text: _Optional[str] = ...) -> None: ...
+    captured_ns: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ..., tick: _Optional[int] = ..., source_ns: _Optional[int] = ..., proprio: _Optional[_Iterable[float]] = ..., images: _Optional[_Iterable[_Union[_common_pb2.Image, _Mapping]]] = ..., status: _Optional[_Union[_common_pb2.TaskStatus, str]] = ..., reason: _Optional[str] = ..., robot_state: _Optional[_Union[RobotState, str]] = ..., robot_text: _Optional[str] = ..., captured_ns: _Optional[_Iterable[int]] = ...) -> None: ...
 
 class Query(_message.Message):
     __slots__ = ("header", "query", "tick", "source_ns")
@@ -268,7 +270,7 @@ class Action(_message.Message):
     def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ..., tick: _Optional[int] = ..., deadline_ns: _Optional[int] = ..., level: _Optional[_Union[Level, str]] = ..., values: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Tick(_message.Message):
-    __slots__ = ("header", "tick", "deadline_ns", "decided_ns", "late_ns", "level", "invocation", "t_row0", "row", "ref_query", "age_ns", "observation_tick", "state", "action", "raw_row", "limits_hit", "seam_jump", "age_ms", "late_ms", "robot_state")
+    __slots__ = ("header", "tick", "deadline_ns", "decided_ns", "late_ns", "level", "invocation", "t_row0", "row", "ref_query", "age_ns", "observation_tick", "state", "action", "raw_row", "limits_hit", "seam_jump", "age_ms", "late_ms", "robot_state", "picture_age_ns", "picture_still_ns")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     TICK_FIELD_NUMBER: _ClassVar[int]
     DEADLINE_NS_FIELD_NUMBER: _ClassVar[int]
@@ -289,6 +291,8 @@ class Tick(_message.Message):
     AGE_MS_FIELD_NUMBER: _ClassVar[int]
     LATE_MS_FIELD_NUMBER: _ClassVar[int]
     ROBOT_STATE_FIELD_NUMBER: _ClassVar[int]
+    PICTURE_AGE_NS_FIELD_NUMBER: _ClassVar[int]
+    PICTURE_STILL_NS_FIELD_NUMBER: _ClassVar[int]
     header: _common_pb2.Header
     tick: int
     deadline_ns: int
@@ -309,7 +313,9 @@ class Tick(_message.Message):
     age_ms: float
     late_ms: float
     robot_state: RobotState
-    def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ..., tick: _Optional[int] = ..., deadline_ns: _Optional[int] = ..., decided_ns: _Optional[int] = ..., late_ns: _Optional[int] = ..., level: _Optional[_Union[Level, str]] = ..., invocation: _Optional[int] = ..., t_row0: _Optional[int] = ..., row: _Optional[int] = ..., ref_query: _Optional[int] = ..., age_ns: _Optional[int] = ..., observation_tick: _Optional[int] = ..., state: _Optional[_Iterable[float]] = ..., action: _Optional[_Iterable[float]] = ..., raw_row: _Optional[_Iterable[float]] = ..., limits_hit: _Optional[int] = ..., seam_jump: _Optional[float] = ..., age_ms: _Optional[float] = ..., late_ms: _Optional[float] = ..., robot_state: _Optional[_Union[RobotState, str]] = ...) -> None: ...
+    picture_age_ns: _containers.RepeatedScalarFieldContainer[int]
+    picture_still_ns: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ..., tick: _Optional[int] = ..., deadline_ns: _Optional[int] = ..., decided_ns: _Optional[int] = ..., late_ns: _Optional[int] = ..., level: _Optional[_Union[Level, str]] = ..., invocation: _Optional[int] = ..., t_row0: _Optional[int] = ..., row: _Optional[int] = ..., ref_query: _Optional[int] = ..., age_ns: _Optional[int] = ..., observation_tick: _Optional[int] = ..., state: _Optional[_Iterable[float]] = ..., action: _Optional[_Iterable[float]] = ..., raw_row: _Optional[_Iterable[float]] = ..., limits_hit: _Optional[int] = ..., seam_jump: _Optional[float] = ..., age_ms: _Optional[float] = ..., late_ms: _Optional[float] = ..., robot_state: _Optional[_Union[RobotState, str]] = ..., picture_age_ns: _Optional[_Iterable[int]] = ..., picture_still_ns: _Optional[_Iterable[int]] = ...) -> None: ...
 
 class Subgoal(_message.Message):
     __slots__ = ("header", "kind", "text", "tick", "query", "token_ids", "is_truncated")

@@ -85,7 +85,7 @@ def bench_with(new_rig: Callable[..., Any], robot_with: Callable[..., m.Robot]) 
             return robot_with(image_height=image_px[0], image_width=image_px[1])
 
         values: dict[str, Any] = {
-            "schedule": lambda seed: replace(base, seed=seed),
+            "schedule": lambda seed, horizon: replace(base, seed=seed),
             "num_rows": 1,
             "body": Body(DIM, describe),
             "suite": "tests",

@@ -109,6 +109,15 @@ def test_held_the_first_six_steps_count_as_by_the_official_server(
     assert next(disagreements(record), None) is None
 
 
+def test_more_rows_than_a_chunk_has_are_refused_and_the_next_client_may_try(
+    bench_with: Callable[..., Any], step_of: StepOf
+) -> None:
+    bench = bench_with(num_rows=21)
+    for client in ("anna", "bert"):
+        with pytest.raises(Refused, match="--rows 21: POUNCE's chunks have 20 rows"):
+            bench.ask(step_of(begins=True), client)
+
+
 def _every(num_ticks: int) -> m.Schedule:
     return replace(schedules.paper(), invoke_period_ticks=num_ticks)
 

@@ -14,13 +14,19 @@ from hypothesis import strategies as st
 from clock import schedules
 from dual_system.models.ponder.demo_sampling import DemoSampling
 from protocol import messages as m
-from sim_client.episode import STOPPED_TICKS
+from sim_client.episode import STOPPED_S
 from sim_client.gateway.node import LiveNode, LockstepNode, Measurement
 from sim_client.gateway.rule import ahead, sampled
 
 TICK_NS = 50_000_000
 START_NS = 300_000_000
 SHOWN = Measurement((), np.zeros(3, np.float32))
+LIMIT = np.full(3, 9, np.float32)
+ROBOT = m.Robot(
+    name="arm", command_low=-LIMIT, command_high=LIMIT, max_step=LIMIT, initial_command=0 * LIMIT, cameras=(),
+    image_height=1, image_width=1, num_proprio=3, is_simulated=True,
+)  # fmt: skip
+STOPPED_TICKS = STOPPED_S * schedules.CONTROL_HZ
 
 
 def commanded(tick: int, level: m.Level = m.Level.PLAY) -> m.Action:
@@ -76,7 +82,7 @@ def _info() -> m.EpisodeInfo:
     """Hypothesis runs outside of fixtures: what a lockstep node reads of it."""
     return m.EpisodeInfo(
         task="", suite="", seed=0, difficulty="", instruction="", schedule=schedules.paper(),
-        robot=None, t0_unix_ns=0,  # type: ignore[arg-type]
+        robot=ROBOT, t0_unix_ns=0,
     )  # fmt: skip
 
 
@@ -118,11 +124,11 @@ def test_a_held_command_needs_no_chunk(info: m.EpisodeInfo) -> None:
 
 def test_live_a_request_is_answered_with_the_newest_command(info: m.EpisodeInfo) -> None:
     node = LiveNode(info, 1)
-    assert node.answer() is None
+    assert node.answer(0) is None
     assert (node.show(SHOWN, 7).tick, node.show(SHOWN, 7).source_ns) == (0, 7)
     for tick in (0, 1, 4, 2):  # the fourth comes late
         node.on_action(commanded(tick), 0)
-    answer = node.answer()
+    answer = node.answer(0)
     assert answer is not None
     assert (answer.tick, answer.levels) == (4, (m.Level.PLAY,))
     assert answer.rows_NA.tolist() == [commanded(4).values.tolist()]
@@ -134,7 +140,7 @@ def test_live_several_rows_are_the_command_and_what_its_chunk_has_ahead(info: m.
     node.commands.on_chunk(chunk_from(0, value=0.05))
     node.on_action(commanded(18), 0)
     node.commands.on_account(account_of(commanded(18), invocation=0))
-    answer = node.answer()
+    answer = node.answer(0)
     assert answer is not None
     assert answer.levels == (m.Level.PLAY, m.Level.PLAY, m.Level.HOLD, m.Level.HOLD)
     assert answer.rows_NA[:, 0].tolist() == pytest.approx([commanded(18).values[0], 0.05, 0.05, 0.05], abs=1e-6)

@@ -31,7 +31,6 @@ is_simulated = true
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"rows": 21}, "--rows 21.*20 rows"),
         ({"rows": 0}, "--rows 0"),
         ({"dialect": "vla-eval", "rows": 5}, "plays one row"),
         ({"rows": 8, "timing": ScheduleOptions(invoke_every_ticks=20)}, "no multiple of --rows 8"),
