@@ -206,9 +206,10 @@ SCHEDULE = st.builds(
     invoke_delay=DELAY, delivery=DELIVERY, wait=chosen(m.WaitKind), seam=SEAM, max_age_ns=INSTANT,
     stale_limit_ns=INSTANT, hold_limit_ticks=U32, decelerate_ticks=U32, max_ticks=U32, seed=U64,
 )  # fmt: skip
+OF_ANY_RATE = robots().map(lambda robot: dataclasses.replace(robot, control_hz=0))
 INFO = st.builds(
     m.EpisodeInfo, header=HEADER, task=TEXT, suite=TEXT, seed=U64, difficulty=TEXT, instruction=TEXT,
-    schedule=SCHEDULE, robot=robots(),
+    schedule=SCHEDULE, robot=OF_ANY_RATE,
     t0_unix_ns=st.integers(0, MAX_UNIX_NS), versions=maps(TEXT), policy=TEXT, has_demo=st.booleans(),
 )  # fmt: skip
 RESULT = st.builds(
