@@ -151,8 +151,8 @@ def test_live_an_answer_comes_after_a_tick_and_with_its_deadline_on_the_host_s_c
     for tick, late_ns in ((3, 900), (4, 200), (5, 500)):  # what is least late shows where episode time began
         action = replace(commanded(tick), deadline_ns=1000 * tick, header=m.Header(at_ns=1000 * tick))
         node.on_action(action, 70_000 + 1000 * tick + late_ns)
-    assert node.answer(5) is None
-    answer = node.answer(4)
+    assert node.answer(0, 5) is None
+    answer = node.answer(0, 4)
     assert answer is not None
     assert (answer.tick, answer.deadline_ns) == (5, 75_200)
 
