@@ -58,6 +58,7 @@ class Membership:
         self._is_clock_there = False
         self._clock_lost_ns = 0
         self._refused = ""
+        self._left = ""
         self._is_lockstep = False
         self._is_draining = False
 
@@ -88,8 +89,9 @@ class Membership:
         return self._asked is not None
 
     def leave(self) -> None:
-        """Ends the running episode here, and lets the clock service be asked for the next one at once: for shadows."""
+        """Ends the running episode here for good, and asks the clock service for another one at once: for shadows."""
         if self._link.episode:
+            self._left = self._link.episode
             self._leave()
         self._ask_again_ns = 0
 
@@ -106,7 +108,7 @@ class Membership:
         if reply.error != self._refused:
             self._refused = reply.error
             log.log(logging.ERROR if reply.error else logging.INFO, "rejoin %s", reply.error or "is possible again")
-        if reply.open is None or reply.open.info.header.episode == self._link.episode:
+        if reply.open is None or reply.open.info.header.episode in (self._link.episode, self._left):
             return None
         opened = self._on_open(reply.open, announce=False)
         if opened.error:

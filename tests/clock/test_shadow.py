@@ -145,6 +145,23 @@ def test_a_ponder_that_does_not_keep_up_leaves_and_has_no_hole_in_its_context(
     assert "shadow_left" in [event.name for event in record.events]
 
 
+def test_one_that_left_early_does_not_answer_twice(
+    rig: Any, shadows: Shadows, episode_info: Info, paper: m.Schedule, tmp_path: Path
+) -> None:
+    has_left: list[int] = []
+
+    def leave() -> None:
+        if not has_left and rig.clock.conductor.num_invocations == 2:
+            has_left.append(1)
+            shadows.ponder._membership.leave()
+
+    rig.meanwhile = leave
+    record, _ = recorded(rig, episode_info(paper), tmp_path / "log.mcap")
+    assert has_left
+    assert next(disagreements(record), None) is None
+    assert 1 <= len(record.shadow_cognitions) <= 3
+
+
 @pytest.fixture
 def record(rig: Any, shadows: Shadows, episode_info: Info, paper: m.Schedule, tmp_path: Path) -> EpisodeRecord:
     return recorded(rig, episode_info(paper), tmp_path / "log.mcap")[0]
