@@ -1,4 +1,4 @@
-"""Commands with verbs: ``pp-collect``, ``pp-export``, ``pp-parity`` and ``pp-diagnose``.
+"""Commands with verbs: ``pp-collect``, ``pp-export``, ``pp-parity``, ``pp-replay`` and ``pp-diagnose``.
 
 ``pp-collect --out DIR`` runs the command's default module, ``pp-collect correct LOG...`` the module of a verb. Modules
 are imported by name when they run, so each needs only its own dependencies: pp-collect runs without torch, pp-export hf
@@ -66,6 +66,14 @@ COMMANDS = {
             ),
         },
     ),
+    "pp-replay": Command(
+        "sim_client.replay",
+        {
+            "through": Verb(
+                "sim_client.replay_through", "Answer a log's invocations with another POUNCE, and compare row by row."
+            )
+        },
+    ),
     "pp-diagnose": Command(
         "dual_system.training.diagnose",
         {
@@ -99,6 +107,12 @@ def parity(argv: list[str] | None = None) -> int:
 def diagnose(argv: list[str] | None = None) -> int:
     """``pp-diagnose``."""
     return _run("pp-diagnose", sys.argv[1:] if argv is None else argv)
+
+
+@command("pp-replay")
+def replay(argv: list[str] | None = None) -> int:
+    """``pp-replay``."""
+    return _run("pp-replay", sys.argv[1:] if argv is None else argv)
 
 
 def _run(name: str, argv: list[str]) -> int:

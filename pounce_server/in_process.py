@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 
 from pounce_server.__main__ import build_engine
 from pounce_server.config import PathName, PounceOptions, SpeedOptions
-from pounce_server.contract import EngineSpec, Request
+from pounce_server.contract import EngineSpec, Request, check_robot
+from pounce_server.node import PounceNode
 from pounce_server.serve import PounceServer
 from pounce_server.subgoal_text import Source
 from protocol.bus import Bus
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
+from protocol.messages import EpisodeInfo, Invocation, Observation
 from protocol.process import host_clock_id
 from protocol.version import version
 
@@ -75,3 +77,28 @@ def build_actor(checkpoint: Path | None, *, path: PathName = "eager", **options:
         )
 
     return act, engine.spec
+
+
+def build_answerer(
+    checkpoint: Path, info: EpisodeInfo, **options: Any
+) -> tuple[Callable[[Invocation, Observation], Floats], str, int]:
+    """A POUNCE for a recorded episode: its answer to an invocation, the hash of its weights, and its cameras.
+
+    The path is the server's: the same node, the same engine. ``options``: further ones of `PounceOptions`.
+    """
+    engine = build_engine(PounceOptions(checkpoint=checkpoint, **options))
+    check_robot(info.robot, engine.spec)
+    node = PounceNode(engine.spec)
+
+    def answer(invocation: Invocation, observation: Observation) -> Floats:
+        node.open(info)  # whatever came before it
+        node.on_observation(observation)
+        node.on_invocation(invocation)
+        work = node.next_work()
+        if work is None:
+            raise ValueError(
+                f"invocation {invocation.invocation} and the observation of tick {observation.tick} differ"
+            )
+        return engine.invoke(work.request)
+
+    return answer, engine.spec.model_hash, engine.spec.num_cameras
