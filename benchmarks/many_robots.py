@@ -118,7 +118,8 @@ def _row(options: ManyRobotsOptions, count: int, arguments: list[str]) -> tuple[
         with log.open("wb") as out:
             gateway = subprocess.Popen(command, stdout=out, stderr=out)
         try:
-            _await_servers(Path(folder), count, daemons)
+            daemons.await_line(["ponder", "pounce"], " ready infer", READY_S, count)
+            daemons.await_line(["gateway"], " ready dialect", READY_S)
             refusals: list[str] = []
             clients = [
                 threading.Thread(target=_play, args=(port, index, options, refusals), daemon=True)
@@ -134,18 +135,6 @@ def _row(options: ManyRobotsOptions, count: int, arguments: list[str]) -> tuple[
         for refusal in refusals:
             print(f"refused: {refusal}")
         return [read_log(path) for path in Path(folder).rglob("*.mcap")], len(refusals)
-
-
-def _await_servers(folder: Path, count: int, daemons: Daemons) -> None:
-    """Waits until both servers are ready for every robot, and the gateway listens."""
-    wanted = {"ponder": (" ready infer", count), "pounce": (" ready infer", count), "gateway": (" ready dialect", 1)}
-    deadline_s = time.monotonic() + READY_S
-    while any((folder / f"{name}.log").read_text().count(text) < times for name, (text, times) in wanted.items()):
-        if (why := daemons.dead()) or time.monotonic() > deadline_s:
-            raise RuntimeError(
-                why or f"not ready within {READY_S:.0f} s: {(folder / 'gateway.log').read_text()[-500:]}"
-            )
-        time.sleep(0.1)
 
 
 def _play(port: int, index: int, options: ManyRobotsOptions, refusals: list[str]) -> None:

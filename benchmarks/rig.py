@@ -95,6 +95,10 @@ class Rig:
         self._players.append(player)
         return player
 
+    def endpoint(self, name: str) -> str:
+        """Where a daemon listens."""
+        return self._endpoints[name]
+
     def restart(self, name: str) -> None:
         """Starts a daemon, for instance a killed one, at its endpoint."""
         arguments = ["--link.robot", ROBOT, "--link.listen", self._listens[name]]

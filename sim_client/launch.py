@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -59,6 +60,24 @@ class Daemons:
         command = [sys.executable, "-m", module, *arguments]
         self.processes[name] = subprocess.Popen(command, stdout=file, stderr=file, env=environment)
         return self.processes[name]
+
+    def stop(self, name: str) -> None:
+        """Ends one daemon, as leaving ends all of them."""
+        process = self.processes.pop(name)
+        process.terminate()
+        try:
+            process.wait(_GRACE_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+    def await_line(self, names: Sequence[str], text: str, patience_s: float, count: int = 1) -> None:
+        """Waits until each of these daemons has said ``text`` so often. Raises RuntimeError if one died or did not."""
+        deadline_s = time.monotonic() + patience_s
+        while any((self._logs / f"{name}.log").read_text(errors="replace").count(text) < count for name in names):
+            if (why := self.dead()) or time.monotonic() > deadline_s:
+                raise RuntimeError(why or f"{', '.join(names)} did not say {text!r} within {patience_s:.0f} s")
+            time.sleep(0.1)
 
     def sockets(self) -> Path:
         """A folder for sockets that only this user may enter, and that goes with the daemons."""
