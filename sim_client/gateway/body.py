@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from clock.schedules import CONTROL_HZ
-from dual_system.tasks.panda import PANDA_WRISTCAM
+from dual_system.tasks.panda import PANDA_STICK, PANDA_WRISTCAM
 from protocol.messages import Floats, Robot
 from sim_client.robot import simulated_robot
 from sim_client.robot_file import read_robot
@@ -25,16 +25,18 @@ class Body:
     control_hz: int = CONTROL_HZ
 
     def example(self) -> Robot:
-        """The description for a state of zeros and pictures of one pixel."""
-        return self.describe(np.zeros(self.num_proprio, np.float32), (1, 1))
+        """The description for a state of ones and pictures of one pixel."""
+        return self.describe(np.ones(self.num_proprio, np.float32), (1, 1))
 
 
 def _panda(state: Floats, image_px: tuple[int, int]) -> Robot:
-    return replace(simulated_robot(PANDA_WRISTCAM, state), image_height=image_px[0], image_width=image_px[1])
+    """RoboMME's episodes begin with an open gripper, or with a stick, whose finger it reports as exactly 0."""
+    robot = PANDA_WRISTCAM if state[7] else PANDA_STICK
+    return replace(simulated_robot(robot, state), image_height=image_px[0], image_width=image_px[1])
 
 
 PANDA = Body(8, _panda)
-"""The Panda of our tasks and of RoboMME: absolute joint targets and a gripper; with a stick, the last is ignored."""
+"""The Panda of our tasks and of RoboMME: absolute joint targets and a gripper's, which a stick ignores."""
 
 
 def read_body(path: Path) -> Body:

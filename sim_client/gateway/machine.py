@@ -34,7 +34,7 @@ from protocol.process import host_clock_id
 from protocol.topics import ACTION, CHUNK, EVENT, HEALTH, OBSERVATION, SHADOW_OF, TICK
 from sim_client.episode import CLOCK_SILENCE_NS
 from sim_client.gateway.body import Body
-from sim_client.gateway.exchange import Answer, Finish, Frames, Refused, Step, Trial
+from sim_client.gateway.exchange import Answer, Finish, Frames, Observed, Refused, Step, Trial
 from sim_client.gateway.lease import Lease
 from sim_client.gateway.node import LiveNode, LockstepNode, Measurement, Node
 from sim_client.gateway.pictures import resized
@@ -256,19 +256,16 @@ class Machine:
             raise Refused(f"the episode is over: {episode.over}. Reset, and begin another one.")
         for state in (*(seen.state for seen in step.since), step.state):
             _check_state(state, episode.info.robot)
-        height, width = episode.info.robot.image_height, episode.info.robot.image_width
-        for name, frame in frames.items():
-            if frame.shape[:2] != (height, width):
-                came = f"{frame.shape[0]} x {frame.shape[1]}"
-                raise Refused(f"{name}: expected {height} x {width} px as at first, came {came}. See --image-px.")
+        size = (episode.info.robot.image_height, episode.info.robot.image_width)
+        since = [Observed(resized(seen.frames, self._plan.image_px), seen.state) for seen in step.since]
+        for pictures in (*(seen.frames for seen in since), frames):
+            _check_size(pictures, size, "as at first")
         if step.trial is not None:
             job.future.set_result(None)
             return
         now = Measurement(self._packed(frames), step.state, step.robot_state, step.robot_text)
         if isinstance(episode.node, LockstepNode):
-            px = self._plan.image_px
-            since = [Measurement(self._packed(resized(seen.frames, px)), seen.state) for seen in step.since]
-            self._show(episode.node.show(since, now))
+            self._show(episode.node.show([Measurement(self._packed(seen.frames), seen.state) for seen in since], now))
             job.future.set_result(self._play(episode, episode.node))
             return
         self._show_live(episode, episode.node, now, step.taken_ns)
@@ -381,8 +378,10 @@ class Machine:
         if self._is_draining:
             self._end(m.TaskStatus.ONGOING, "another episode was begun")
             raise Refused("the gateway is draining: it leaves now, and another process takes its place")
-        image_px = next(iter(frames.values())).shape[:2]
-        robot = self._plan.body.describe(step.state, (image_px[0], image_px[1]))
+        camera, first = next(iter(frames.items()))
+        height, width, _ = first.shape
+        _check_size(frames, (height, width), f"as of the {camera} camera")
+        robot = self._plan.body.describe(step.state, (height, width))
         _check_state(step.state, robot)
         self._end(m.TaskStatus.ONGOING, "another episode was begun")
         seed, horizon = self._plan.seed + self._num_episodes, self._horizon(client)
@@ -418,7 +417,7 @@ class Machine:
         try:
             demo = self._demonstration(step.demo if info.has_demo else (), info.schedule.control_hz)
             opened = self._robot_end.open(m.OpenRequest(info=info, demo=demo))
-        except (TransportError, ProtocolError) as error:
+        except (Refused, TransportError, ProtocolError) as error:  # Refused: a picture of the video is none
             self._end(m.TaskStatus.ABORTED, str(error))
             with self._lock:
                 self._lease.release(client)
@@ -431,7 +430,9 @@ class Machine:
             self._misshapen[health.header.proc] = health.dropped.get(DropReason.WRONG_SHAPE, 0)
         if trial.is_dry:
             self._tell("dry_run", "a dry run: the robot is sent nothing")
-        log.info("episode=%s client=%r demo=%d log=%s", info.header.episode, client, len(demo), path)
+        log.info(
+            "episode=%s client=%r robot=%s demo=%d log=%s", info.header.episode, client, robot.name, len(demo), path
+        )
         for warning in opened.warnings:
             log.warning("episode=%s %s", info.header.episode, warning)
         return episode
@@ -490,6 +491,14 @@ def _refuse(future: Future[Answer | None], sentence: str) -> None:
 
 def _without_lead(robot: m.Robot) -> m.Robot:
     return replace(robot, max_lead=np.zeros(robot.action_dim, np.float32))
+
+
+def _check_size(frames: Frames, size: tuple[int, int], reason: str) -> None:
+    """Raises Refused: a picture is not of ``size``, height and width in px."""
+    for camera, frame in frames.items():
+        if frame.shape[:2] != size:
+            expected, came = (f"{height} x {width}" for height, width in (size, frame.shape[:2]))
+            raise Refused(f"{camera}: expected {expected} px {reason}, came {came}. See --image-px.")
 
 
 def _check_state(state: m.Floats, robot: m.Robot) -> None:

@@ -17,7 +17,7 @@ from clock.timebase import NS_PER_MS
 from protocol import files
 from protocol.checks import MAX_HORIZON
 from protocol.errors import TransportError
-from protocol.messages import Delay, DelayKind, Mode, Schedule, WaitKind
+from protocol.messages import Delay, DelayKind, Delivery, DeliveryKind, Mode, Schedule, WaitKind
 from protocol.options import DaemonOptions, LinkOptions
 from protocol.peers.mapping import PolicyMapping, read_mapping
 from protocol.sockets import endpoint
@@ -59,6 +59,8 @@ class ScheduleOptions:
     chunks have rows in lockstep, half of that in real time."""
     delay_ms: int = 300
     """PONDER's modelled delay in ms, in lockstep (paper: 300)."""
+    cognition: Literal["real", "null"] = "real"
+    """Cognition that POUNCE is conditioned on. real: PONDER's; null: the learned null. PONDER is queried in both."""
     wait: Literal["stand-still", "hold"] = "stand-still"
     """Behaviour until the first chunk. stand-still: the first answer waits for it. hold: ticks count from the first
     observation and the arm is held, for 6 ticks in the paper's schedule, as by the official server."""
@@ -277,6 +279,7 @@ class GatewayOptions:
             query_period_ns=self.timing.query_period_ms * NS_PER_MS,
             invoke_period_ticks=self.timing.invoke_every_ticks or every_ticks,
             query_delay=base.query_delay if self.is_realtime else fixed,
+            delivery=Delivery(kind=DeliveryKind.NULL if self.timing.cognition == "null" else DeliveryKind.EVERY),
             wait=WaitKind.HOLD if self.timing.wait == "hold" else WaitKind.STAND_STILL,
             max_age_ns=self.timing.max_age_ms * NS_PER_MS,
             stale_limit_ns=self.timing.stale_limit_ms * NS_PER_MS,

@@ -66,6 +66,20 @@ def test_a_log_is_read_back_and_agrees_with_itself(episode: str, tmp_path: Path)
     assert "61 from front (jpeg), 61 from wrist (jpeg)" in told  # one before every action, one after the last
 
 
+@pytest.mark.sim
+@pytest.mark.slow
+def test_robomme_s_scores_are_read_from_logs_and_name_the_benchmark_s_scene(episode: str, tmp_path: Path) -> None:
+    log = Path(episode.splitlines()[-1])
+    records = [
+        {"task": "PickHighlight", "episode": number, "seed": 620000 + number, "difficulty": "hard"} for number in (0, 1)
+    ]
+    (tmp_path / "list.json").write_text(json.dumps({"records": records}))
+    told = printed("robomme/scores.py", "list.json", str(log.parents[2]), "scores", cwd=tmp_path)
+    assert told == "0 of 1 solved\n"
+    (found,) = json.loads((tmp_path / "scores" / "results.json").read_text())["episodes"]
+    assert (found["seed"], found["difficulty"], found["steps"], found["null_invocations"]) == (620000, "hard", 60, 0)
+
+
 def test_the_worth_of_memory_is_counted_scene_by_scene(tmp_path: Path) -> None:
     for name, successes in {"real": [True, True, False, True], "null": [False, True, True, False]}.items():
         episodes = [

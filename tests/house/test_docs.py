@@ -21,7 +21,8 @@ from protocol.messages import Delivery, Level, Mode
 ROOT = Path(__file__).parents[2]
 PAGES = {
     path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8")
-    for path in (*sorted((ROOT / "docs").glob("*.md")), *sorted(ROOT.glob("*.md")))
+    for folder in (ROOT / "docs", ROOT, ROOT / "examples")
+    for path in sorted(folder.glob("*.md"))
 }
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 ROOMS = ("protocol", "clock", "model_server", "dual_system", "ponder_server", "pounce_server", "sim_client")
@@ -68,8 +69,11 @@ def _options() -> set[str]:
 
 @every_page
 def test_options_that_are_named_exist(page: str) -> None:
-    strangers = re.compile(r"^.*\b(?:pip|docker|apt-get|git|uv run|python gr00t\S*) .*$", re.MULTILINE)
-    named = set(re.findall(r"(?<![\w-])--[a-z][\w.-]*\w", code(strangers.sub("", PAGES[page]))))
+    strangers = re.compile(
+        r"^.*\b(?:pip|docker|apt-get|git|uv run|python gr00t\S*|vla-eval run|evaluator\.py) .*$", re.MULTILINE
+    )
+    whole_lines = PAGES[page].replace("\\\n", " ")
+    named = set(re.findall(r"(?<![\w-])--[a-z][\w.-]*\w", code(strangers.sub("", whole_lines))))
     assert named - _options() - {"--serve", "--nproc-per-node"} == set()  # an example's own; torchrun's
 
 

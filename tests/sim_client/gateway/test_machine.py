@@ -18,6 +18,8 @@ from protocol.mcap_log import read_log
 from protocol.topics import HEALTH, QUERY, TICK
 from sim_client.gateway.exchange import Busy, Finish, Observed, Refused, Step
 from sim_client.gateway.options import GatewayOptions, ScheduleOptions
+from sim_client.gateway.pictures import EncodedPicture
+from sim_client.gateway.reading import videos
 
 StepOf = Callable[..., Step]
 
@@ -118,6 +120,20 @@ def test_more_rows_than_a_chunk_has_are_refused_and_the_next_client_may_try(
             bench.ask(step_of(begins=True), client)
 
 
+def test_with_null_cognition_ponder_is_queried_and_pounce_reads_none_of_it(
+    bench_with: Callable[..., Any], step_of: StepOf, tmp_path: Path
+) -> None:
+    options = GatewayOptions(dialect="vla-eval", timing=ScheduleOptions(cognition="null"))
+    bench = bench_with(options.schedule(0), out=tmp_path)
+    play(bench, step_of, 45)
+    bench.tell(Finish())
+    (path,) = tmp_path.rglob("*.mcap")
+    record = read_log(path)
+    assert len(record.cognitions) == 3
+    assert [each.ref_query for each in record.invocations] == [None] * 3
+    assert next(disagreements(record), None) is None
+
+
 def _every(num_ticks: int) -> m.Schedule:
     return replace(schedules.paper(), invoke_period_ticks=num_ticks)
 
@@ -212,6 +228,42 @@ def test_pictures_that_change_their_size_are_refused_and_the_episode_goes_on(ben
     with pytest.raises(Refused, match="expected 4 x 4 px as at first, came 8 x 8"):
         bench.ask(step_of(frames={"front": big, "wrist": big}))
     assert bench.ask(step_of()).tick == 1
+
+
+def test_a_camera_of_another_size_is_refused_before_an_episode_begins(
+    bench_with: Callable[..., Any], step_of: StepOf, picture_of: Callable[[int], np.ndarray], tmp_path: Path
+) -> None:
+    bench = bench_with(out=tmp_path)
+    frames = {"front": picture_of(0), "wrist": np.zeros((2, 2, 3), np.uint8)}
+    with pytest.raises(Refused, match=r"wrist: expected 4 x 4 px as of the front camera, came 2 x 2\. See --image-px"):
+        bench.ask(step_of(begins=True, frames=frames))
+    assert bench.rig.clock.conductor is None
+    assert not [*tmp_path.rglob("*.mcap")]
+
+
+def test_pictures_of_another_size_seen_in_between_are_refused_and_the_episode_goes_on(
+    bench_with: Callable[..., Any], step_of: StepOf, picture_of: Callable[[int], np.ndarray]
+) -> None:
+    bench = bench_with(_every(2), num_rows=2)
+    bench.ask(step_of(begins=True))
+    seen = Observed({"front": picture_of(0), "wrist": np.zeros((2, 2, 3), np.uint8)}, step_of().state)
+    with pytest.raises(Refused, match="wrist: expected 4 x 4 px as at first, came 2 x 2"):
+        bench.ask(step_of(since=[seen]))
+    assert bench.ask(step_of()).tick == 2
+
+
+def test_a_video_that_cannot_be_read_ends_its_episode_and_the_next_may_try(
+    bench_with: Callable[..., Any], step_of: StepOf, tmp_path: Path
+) -> None:
+    bench = bench_with(out=tmp_path)
+    broken = videos({"front": [EncodedPicture("png", b"none", (4, 4, 3))], "wrist": [np.zeros((4, 4, 3), np.uint8)]})
+    with pytest.raises(Refused, match="cannot be read as png"):
+        bench.ask(step_of(begins=True, demo=broken), client="anna")
+    (path,) = tmp_path.rglob("*.mcap")
+    record = read_log(path)
+    assert record.result is not None
+    assert record.result.status == m.TaskStatus.ABORTED
+    assert bench.ask(step_of(begins=True), client="bert").tick == 0
 
 
 @pytest.mark.parametrize("state", [[45, 0, 0], [0, -1e30, 0]])

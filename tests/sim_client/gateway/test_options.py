@@ -110,6 +110,17 @@ def test_the_panda_holds_where_it_is_until_its_first_command() -> None:
     assert robot.initial_command.tolist() == pytest.approx([*HOME_QPOS, 1.0])
 
 
+@pytest.mark.parametrize(
+    ("finger_m", "name", "gripper"),
+    [(0.0, "panda_stick", -1.0), (0.04, "panda_wristcam", 1.0), (1e-6, "panda_wristcam", 1.0)],
+)
+def test_a_finger_of_exactly_nothing_is_a_stick_whose_gripper_never_opens(
+    finger_m: float, name: str, gripper: float
+) -> None:
+    robot = PANDA.describe(np.append(HOME_QPOS, finger_m).astype(np.float32), (256, 256))
+    assert (robot.name, robot.initial_command[7], robot.command_high[7]) == (name, gripper, gripper)
+
+
 def test_a_robot_can_be_told_by_a_file(tmp_path: Path) -> None:
     file = tmp_path / "robot.toml"
     file.write_text(ROBOT)
