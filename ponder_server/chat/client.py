@@ -38,6 +38,10 @@ class ChatEndpoint:
         A URL with a user, a query or a fragment is refused: it is written into logs.
         """
         parts = urlsplit(url)
+        try:
+            port = parts.port
+        except ValueError as error:
+            raise ValueError(f"--url: {error}") from None
         is_plain = not (parts.username or parts.password or parts.query or parts.fragment)
         if parts.scheme not in ("http", "https") or not parts.hostname or not is_plain:
             raise ValueError("--url: expected http://HOST:PORT/v1 or https://..., without user, password or query")
@@ -45,7 +49,7 @@ class ChatEndpoint:
             raise ValueError("the key in --key-variable has characters that no header may have")
         self.url = url.rstrip("/")
         self.host = parts.netloc
-        self._is_tls, self._where = parts.scheme == "https", (parts.hostname, parts.port)
+        self._is_tls, self._where = parts.scheme == "https", (parts.hostname, port)
         self._path = f"{parts.path.rstrip('/')}/chat/completions"
         self._key = key
 

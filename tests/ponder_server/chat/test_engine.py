@@ -155,10 +155,11 @@ def test_an_endpoint_that_refuses_is_told_at_once(
         "http://" + "user:hidden@h/v1",
         "https://h/v1?key=hidden",
         "https://h/v1#k",
+        "http://h:99999/v1",
     ],
 )
 def test_a_url_that_is_none_or_would_tell_a_secret_is_refused(url: str) -> None:
-    with pytest.raises(ValueError, match="--url: expected http") as refused:
+    with pytest.raises(ValueError, match="--url: ") as refused:
         ChatEndpoint(url)
     assert "hidden" not in str(refused.value)
 
