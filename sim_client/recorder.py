@@ -19,6 +19,7 @@ from protocol.topics import EVENT, HEALTH, INFO, OBSERVATION, PHASE, RESULT, STR
 
 log = logging.getLogger(__name__)
 
+_RANK = {topic.name: rank for rank, topic in enumerate(STREAMS)}
 KEEP = 512  # per topic, between two drains; drains come every tick
 
 
@@ -30,9 +31,9 @@ class Recorder:
         self._pixels: Literal["jpeg", "exact"] = pixels
         self._streams: list[tuple[Topic[object], Stream[object]]] = [
             (topic, link.subscribe(topic, keep=8 if topic is OBSERVATION else KEEP))
-            for topic in sorted(STREAMS, key=lambda topic: topic is not EVENT)  # events say who is admitted
+            for topic in sorted(reversed(STREAMS), key=lambda topic: topic is EVENT)
             if topic is not INFO
-        ]
+        ]  # what follows from others comes first: whatever arrives between two drains, the log has its cause
         self._log: EpisodeLog | None = None
         self._unrecorded = ""
         self.ticks: list[m.Tick] = []
@@ -58,13 +59,14 @@ class Recorder:
 
     def step(self) -> None:
         """Takes what has come since the last call."""
+        taken = [(topic, each) for topic, stream in self._streams for each in stream.receive()]
+        taken.sort(key=lambda pair: pair[0] is not EVENT)  # events say who is admitted
         received = []
-        for topic, stream in self._streams:
-            for each in stream.receive():
-                if self._is_of_log(topic, each.message.header):  # type: ignore[attr-defined]
-                    self._admit(each.message)
-                    received.append((topic, each))
-        received.sort(key=lambda pair: _episode_ns(pair[1]))  # per topic the order is kept: sort is stable
+        for topic, each in taken:
+            if self._is_of_log(topic, each.message.header):  # type: ignore[attr-defined]
+                self._admit(each.message)
+                received.append((topic, each))
+        received.sort(key=lambda pair: (_episode_ns(pair[1]), _RANK[pair[0].name]))  # within a topic it is stable
         for topic, (message, sample) in received:
             self._remember(message)
             if self._log is not None:

@@ -1,0 +1,51 @@
+"""What the log has although messages arrive while it is being written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from clock import schedules
+from protocol import messages as m
+from protocol.bus import LocalBus
+from protocol.link import Link, Stream
+from protocol.mcap_log import read_log
+from protocol.topics import ACTION, TICK
+from sim_client.recorder import Recorder
+
+COMMAND = np.zeros(3, np.float32)
+
+
+def test_a_tick_in_the_log_has_its_action_whenever_they_arrive(
+    episode_info: Callable[..., m.EpisodeInfo], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The clock publishes another action and its account before each topic is drained."""
+    bus = LocalBus()
+    info = episode_info(schedules.realtime())
+    clock, sim = (Link(bus, robot=info.header.robot, proc=proc) for proc in ("clock", "sim"))
+    header = info.header
+    clock_is = m.Member(proc="clock", boot_id=clock.boot_id)
+    for link in (clock, sim):
+        link.enter_episode(header.session, header.episode, header.epoch, (clock_is,))
+    recorder = Recorder(sim, "jpeg")
+    recorder.begin(info, tmp_path / "episode.mcap")
+    tick, receive = 0, Stream.receive
+
+    def late(stream: Stream[Any]) -> Any:
+        nonlocal tick
+        clock.publish(ACTION, m.Action(tick=tick, deadline_ns=tick, level=m.Level.HOLD, values=COMMAND), at_ns=tick)
+        told = m.Tick(tick=tick, deadline_ns=tick, decided_ns=tick, late_ns=0, level=m.Level.HOLD, action=COMMAND)
+        clock.publish(TICK, told, at_ns=tick)
+        tick += 1
+        return receive(stream)
+
+    monkeypatch.setattr(Stream, "receive", late)
+    recorder.step()
+    recorder.end(m.EpisodeResult(status=m.TaskStatus.TIMEOUT, is_success=False, reason="", num_ticks=tick))
+    record = read_log(tmp_path / "episode.mcap")
+    assert len(record.ticks) > 2
+    assert {each.tick for each in record.ticks} <= {each.tick for each in record.actions}
