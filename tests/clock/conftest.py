@@ -101,7 +101,7 @@ def schedule(**changes: Any) -> m.Schedule:
     return m.Schedule(**(values | changes))
 
 
-def episode_info(timing: m.Schedule, policy: str = "servers") -> m.EpisodeInfo:
+def episode_info(timing: m.Schedule, policy: str = "servers", robot: m.Robot | None = None) -> m.EpisodeInfo:
     return m.EpisodeInfo(
         policy=policy,
         header=m.Header(robot="arm", session="s1", episode="pick-11", epoch=1, proc="clock"),
@@ -111,7 +111,8 @@ def episode_info(timing: m.Schedule, policy: str = "servers") -> m.EpisodeInfo:
         difficulty="easy",
         instruction="Pick the cubes that were highlighted.",
         schedule=timing,
-        robot=m.Robot(
+        robot=robot
+        or m.Robot(
             name="arm",
             command_low=np.full(ACTION_DIM, -1.0, np.float32),
             command_high=np.full(ACTION_DIM, 1.0, np.float32),
@@ -149,12 +150,15 @@ def act(invocation: m.Invocation, info: m.EpisodeInfo, rng: np.random.Generator)
     horizon = info.schedule.horizon
     phase = 0.07 * (invocation.tick + np.arange(horizon))[:, None] + np.arange(ACTION_DIM)
     rows = 1.1 * np.sin(phase + 0.2 * rng.standard_normal())
+    if info.robot.dimensions:
+        rows = rows_near(info.robot, invocation.tick, horizon)
     return m.ActionChunk(
         invocation=invocation.invocation,
         t_row0=invocation.tick,
         horizon=horizon,
-        action_dim=ACTION_DIM,
+        action_dim=rows.shape[1],
         dt_ns=50 * MS,
+        reference_state=state_of(info.robot, invocation.tick),
         rows=rows.astype(np.float32).ravel(),
         source_ns=invocation.now_ns,
         ref_query=invocation.ref_query,
@@ -173,12 +177,39 @@ def scene(tick: int, camera: int) -> Any:
     return frame
 
 
-def look(tick: int, source_ns: int, num_ticks: int, *, has_images: bool) -> m.Observation:
-    frames = {"front": scene(tick, 0), "wrist": scene(tick, 1)} if has_images else {}
+def state_of(robot: m.Robot, tick: int) -> m.Floats:
+    """A slow wave, within what the robot can measure if it says so."""
+    wave = np.sin(0.02 * tick + np.arange(robot.num_proprio))
+    if not robot.dimensions:
+        return (0.5 * np.sin(0.07 * tick + np.arange(robot.num_proprio))).astype(np.float32)
+    middle, half = (robot.state_low + robot.state_high) / 2, (robot.state_high - robot.state_low) / 2
+    return (middle + 0.4 * half * wave).astype(np.float32)
+
+
+def rows_near(robot: m.Robot, tick: int, horizon: int) -> Any:
+    """(horizon, action_dim): joints go where they will be, grippers and velocities anywhere within their limits."""
+    states = np.stack([state_of(robot, tick + row) for row in range(horizon + 1)])
+    waves = np.sin(0.3 * (tick + np.arange(horizon))[:, None] + np.arange(robot.action_dim))
+    rows = np.where(waves > 0, robot.command_high, -robot.command_low) * waves
+    for dim, each in enumerate(robot.dimensions):
+        if each.kind == m.DimensionKind.DELTA:
+            rows[:, dim] = np.diff(states[:, each.state_index])
+        elif each.kind == m.DimensionKind.POSITION:
+            rows[:, dim] = states[:-1, each.state_index]
+    return rows
+
+
+def look(
+    tick: int, source_ns: int, num_ticks: int, *, has_images: bool, robot: m.Robot, frozen_from: int | None = None
+) -> m.Observation:
+    frames = {name: scene(tick, camera) for camera, name in enumerate(robot.cameras)} if has_images else {}
+    is_frozen = frozen_from is not None and tick > frozen_from
+    frozen_ns = deadline_ns(0, frozen_from or 0, robot.control_hz or 20)
     return m.Observation(
         tick=tick,
         source_ns=source_ns,
-        proprio=(0.5 * np.sin(0.07 * tick + np.arange(ACTION_DIM))).astype(np.float32),
+        proprio=state_of(robot, tick),
+        captured_ns=(frozen_ns,) * len(frames) if is_frozen else (),
         images=images.pack(frames, m.ImageCodec.RAW),
         status=m.TaskStatus.SUCCESS if tick >= num_ticks else m.TaskStatus.ONGOING,
     )
@@ -199,12 +230,15 @@ def run_lockstep(
     has_images: bool = False,
     residual: ResidualHead | None = None,
     policy: str = "servers",
+    robot: m.Robot | None = None,
+    frozen_from: int | None = None,
 ) -> Episode:
     """Virtual time; answers are handed over in any order and as late as ``is_waiting`` allows."""
     rng = np.random.default_rng(seed)
-    episode = Episode(episode_info(timing, policy))
+    episode = Episode(episode_info(timing, policy, robot))
     conductor = _conductor(episode, residual)
-    inbox: list[Any] = [look(0, 0, num_ticks, has_images=has_images)]
+    robot = episode.info.robot
+    inbox: list[Any] = [look(0, 0, num_ticks, has_images=has_images, robot=robot)]
     now_ns = 0
     while conductor.stage != Stage.ENDED:
         for effect in conductor.poll(now_ns):
@@ -215,7 +249,8 @@ def run_lockstep(
                 inbox.append(act(signed, episode.info, rng))
             elif isinstance(effect, m.Action):
                 due_ns = conductor.deadline_ns(effect.tick + 1)
-                inbox.append(look(effect.tick + 1, due_ns, num_ticks, has_images=has_images))
+                seen = {"has_images": has_images, "robot": robot, "frozen_from": frozen_from}
+                inbox.append(look(effect.tick + 1, due_ns, num_ticks, **seen))
         due_ns = conductor.next_ns(now_ns)
         has_to_wait = conductor.is_waiting(now_ns) or due_ns is None
         ready = [x for x in inbox if not isinstance(x, m.Observation) or x.source_ns <= now_ns]
@@ -237,6 +272,7 @@ def run_realtime(
     silence: range = range(0),
     residual: ResidualHead | None = None,
     policy: str = "servers",
+    robot: m.Robot | None = None,
 ) -> Episode:
     """Real time, simulated: everything takes as long as it takes, and the clock service itself is late or stalls.
 
@@ -246,7 +282,7 @@ def run_realtime(
         residual: corrects every row.
     """
     rng = np.random.default_rng(seed)
-    episode = Episode(episode_info(dataclasses.replace(timing, mode=m.Mode.REALTIME), policy))
+    episode = Episode(episode_info(dataclasses.replace(timing, mode=m.Mode.REALTIME), policy, robot))
     conductor = _conductor(episode, residual)
     coming: list[tuple[int, int, Any]] = []
 
@@ -255,7 +291,8 @@ def run_realtime(
 
     for tick in range(num_ticks + 1):
         source_ns = deadline_ns(0, tick, timing.control_hz) + int(rng.integers(0, 3 * MS))
-        post(source_ns + int(rng.integers(1 * MS, 30 * MS)), look(tick, source_ns, num_ticks, has_images=False))
+        seen = look(tick, source_ns, num_ticks, has_images=robot is not None, robot=episode.info.robot)
+        post(source_ns + int(rng.integers(1 * MS, 30 * MS)), seen)
     while conductor.stage != Stage.ENDED:
         now_ns = coming[0][0]
         if rng.random() < stalls:
