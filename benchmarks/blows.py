@@ -79,6 +79,12 @@ class Scene:
         for name in names:
             self.process(name).send_signal(number)  # does nothing if it is dead
 
+    def kill(self, names: tuple[str, ...]) -> None:
+        """Kills, and waits until they are gone: on a busy machine that takes its time."""
+        self.signal(names, signal.SIGKILL)
+        for name in names:
+            self.process(name).wait(60)
+
 
 def draw(seed: int, index: int) -> Fault:
     """The fault of trial ``index``; kinds come in turn, everything else is drawn."""
@@ -98,7 +104,7 @@ def draw(seed: int, index: int) -> Fault:
 
 @contextmanager
 def _killed(fault: Fault, scene: Scene) -> Iterator[None]:
-    scene.signal(fault.victims, signal.SIGKILL)
+    scene.kill(fault.victims)
     yield
 
 
@@ -117,7 +123,7 @@ def _frozen_then_killed(fault: Fault, scene: Scene) -> Iterator[None]:
     try:
         yield
     finally:
-        scene.signal(fault.victims, signal.SIGKILL)
+        scene.kill(fault.victims)
 
 
 @contextmanager
