@@ -49,7 +49,7 @@ class FaultsOptions:
     max_steps: int = 80
     """Length of an episode [ticks]; 4 s."""
     minutes: float = 1e9
-    """No new rig is started after this time."""
+    """No new trial is started after this time."""
     keep: Path = Path("out/faults")
     """Folder for what belongs to a wrong outcome."""
     report: bool = True
@@ -266,6 +266,8 @@ def main(argv: list[str] | None = None) -> int:
             continue
         with place_for(place) as (rig, folder):
             for trial in trials:
+                if time.monotonic() > deadline_s:
+                    break
                 run(trial, rig, folder, options)
                 done.append(trial)
                 print(json.dumps(dataclasses.asdict(trial)), flush=True)
