@@ -220,7 +220,7 @@ class Machine:
         is_live = self._episode is not None and isinstance(self._episode.node, LiveNode)
         with contextlib.suppress(queue.Empty):
             self._work(self._jobs.get(block=not is_live, timeout=_IDLE_NS / 1e9))
-        self._turn(_IDLE_NS if is_live else 0)
+        self._turn(_IDLE_NS if is_live and self._jobs.empty() else 0)
         if is_live:
             self._look_after_live()
 

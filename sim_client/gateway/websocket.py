@@ -25,6 +25,8 @@ from sim_client.gateway.openpi import metadata
 log = logging.getLogger("pp-gateway")
 
 _PING_S = 20.0
+LIVE_UNDER_WAY = 16
+"""A client that asks faster than it is answered waits: what it has sent is not stored without end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +76,7 @@ class WebsocketSide:
         client = f"{host}:{port}"
         dialect = self.new_dialect(self.terms)
         under_way: set[asyncio.Task[None]] = set()
+        closed = asyncio.ensure_future(connection.wait_closed())
         log.info("client=%s connected", client)
         try:
             if (greeting := dialect.greeting()) is not None:
@@ -89,16 +92,23 @@ class WebsocketSide:
                 task = asyncio.create_task(self._reply(connection, dialect, asked, future))
                 under_way.add(task)
                 task.add_done_callback(under_way.discard)
-                if self.terms.mode == Mode.LOCKSTEP:  # in live mode the next observation is read immediately
-                    await task
+                while len(under_way) >= self._most_under_way:
+                    await asyncio.wait({*under_way, closed}, return_when=asyncio.FIRST_COMPLETED)
+                    if closed.done():
+                        break
         except ConnectionClosed as error:
             log.info("client=%s closed: %s", client, error)
         finally:
-            for task in under_way:
+            for task in (*under_way, closed):
                 task.cancel()
             with contextlib.suppress(Refused):  # the gateway is being stopped, and ends the episode itself
                 self.door.submit(client, Finish(reason="the client left"))
             log.info("client=%s left", client)
+
+    @property
+    def _most_under_way(self) -> int:
+        """Requests of one client before the next is read. Live, a new observation waits for no old answer."""
+        return 1 if self.terms.mode == Mode.LOCKSTEP else LIVE_UNDER_WAY
 
     async def _reply(
         self, connection: ServerConnection, dialect: Dialect, asked: ClientRequest, future: Future[Answer | None] | None

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import http.client
 import threading
+import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from typing import Any
 
 import numpy as np
@@ -12,12 +14,13 @@ import pytest
 from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
+from protocol.messages import Mode
 from sim_client.gateway import challenge, openpi
 from sim_client.gateway.arrays import pack, unpack
 from sim_client.gateway.exchange import Terms
 from sim_client.gateway.http_form import HttpSide
 from sim_client.gateway.memory import Memory
-from sim_client.gateway.websocket import WebsocketSide
+from sim_client.gateway.websocket import LIVE_UNDER_WAY, WebsocketSide
 
 PictureOf = Callable[[int], np.ndarray]
 MAX_BYTES = 20_000
@@ -122,6 +125,35 @@ def test_of_two_clients_one_drives_and_the_other_is_told(openpi_port: int, pictu
         anna.send(pack({"reset": True}, "openpi"))
         assert unpack(anna.recv(20)) == {"reset_finished": True}  # type: ignore[arg-type]
         assert ticks_of(berta, good, 2) == [0, 1]
+
+
+def test_a_flood_is_read_no_faster_than_it_is_answered(
+    picture_of: PictureOf, terms_with: Callable[..., Terms], listening: Callable[..., Any]
+) -> None:
+    """Live, and nothing is ever answered: what lies in memory has an end, and another client is heard."""
+    asked: list[str] = []
+
+    class Silent:
+        def submit(self, client: str, request: Any) -> Future[Any]:
+            asked.append(client)
+            return Future()
+
+    terms = terms_with(mode=Mode.REALTIME, cameras=openpi.CAMERAS, state_key=openpi.STATE_KEY)
+    side = WebsocketSide(Silent(), terms, openpi.OpenpiDialect, MAX_BYTES)
+    with listening(side) as port, client_at(port) as flooding, client_at(port) as patient:
+        for client in (flooding, patient):
+            client.recv(20)
+        for _ in range(10 * LIVE_UNDER_WAY):
+            flooding.send(openpi_message(picture_of))
+        while len(asked) < LIVE_UNDER_WAY:
+            time.sleep(0.01)
+        patient.send(openpi_message(picture_of))
+        while len(set(asked)) < 2:
+            time.sleep(0.01)
+        assert len(asked) == LIVE_UNDER_WAY + 1
+        flooding.socket.shutdown(2)  # and one that leaves in the middle of it is noticed
+        while len(asked) == LIVE_UNDER_WAY + 1:
+            time.sleep(0.01)
 
 
 @pytest.mark.parametrize("path", ["/healthz", "/health", "/metadata"])
