@@ -33,6 +33,7 @@ from benchmarks.roofline import measure_ceilings
 from dual_system.models.fp8 import has_products
 from dual_system.models.gpu import current, settle
 from dual_system.models.graphs import directly, graphs_for
+from dual_system.models.kernels.launch import cuda_time_ms, missing_for
 from dual_system.models.ponder import configs as ponder_configs
 from dual_system.models.ponder.configs import PonderConfig
 from dual_system.models.ponder.context import Row
@@ -40,22 +41,27 @@ from dual_system.models.ponder.network import Ponder
 from dual_system.models.pounce import configs as pounce_configs
 from dual_system.models.pounce.family import AnyPounceConfig, random_model
 from dual_system.models.pounce.precision import cast_streams
-from ponder_server.contract import Opening, WeightsName
+from ponder_server.contract import Frame, Opening, WeightsName
 from ponder_server.draft import Draft, TrieDraft
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
+from ponder_server.operations import KERNELS, choose
+from ponder_server.rehearsal import rehearse
+from ponder_server.slots import SlotMemory
+from ponder_server.stack import Stack
 from pounce_server.compiled import compiled_sampler
 from pounce_server.contract import DTypeName
 from pounce_server.fused import FusedPounce, fused_for
 from pounce_server.fused_stream import TWINS
-from pounce_server.kernels.launch import missing_for
 
 Result = TypeVar("Result")
 
 PREDICTED_MS = {
-    "fire at 800 tokens": 22.0,
-    "fire at 14000 tokens": 27.0,
-    "45 tokens, one by one": 615.0,
+    "fire at 800 tokens": 13.0,
+    "fire at 14000 tokens": 14.0,
+    "fire at 800 tokens, twins": 22.0,
+    "fire at 14000 tokens, twins": 27.0,
+    "45 tokens, one by one": 330.0,
     "45 tokens, a draft that knows them": 95.0,
     "pi0.5 fused": 18.0,
     "GR00T as graphs": 12.0,
@@ -208,10 +214,24 @@ def probe(day: Day) -> None:
 
 
 def kernels(day: Day) -> None:
-    """The tests that need a GPU. They fail where there is none, so that a CPU runs none of them."""
+    """The tests that need a GPU, and PONDER's kernels beside their twins. A CPU runs none of them."""
     if day.device.type != "cuda":
         day.row("pytest -m gpu", lambda: "needs a GPU")
         return
+    ponder = _random(day, replace(day.size.ponder, num_layers=4), getattr(torch, day.dtype))
+    text_model, config = ponder.qwen.model.language_model, ponder.qwen.config.text_config
+    tokens = max(day.size.contexts)
+    memory = SlotMemory(config, num_slots=1, max_tokens=tokens, device=ponder.device, dtype=ponder.dtype)
+    stack = Stack.of(text_model)
+
+    def verdicts(length: int) -> dict[str, str]:
+        samples = rehearse(stack, memory, num_rows=1, length=length)
+        _, told = choose(samples, KERNELS, cuda_time_ms)
+        return {one.operation: f"{'kernel' if one.is_taken else 'twin'}: {one.why}" for one in told}
+
+    with torch.inference_mode():
+        for length in (1, 16, 160):
+            day.row(f"PONDER's kernels, {length} tokens after {tokens}", partial(verdicts, length))
     options = ["-q", "--noconftest", "--continue-on-collection-errors", "-m", "gpu", "-p", "no:cacheprovider"]
     paths = ["tests/models/test_graphs.py", "tests/models/test_fp8.py", "tests/pounce_server/test_fused_gpu.py"]
     paths += ["tests/ponder_server/test_captured_engine.py"]
@@ -254,13 +274,15 @@ def ponder_fire(day: Day) -> None:
     """A fire, two frames to a cognition on the host, beside its parts and the baseline: the context encoded again."""
     ponder = _ponder(day)
     longest = max(day.size.contexts)
-    engine = _warm(day, ponder, longest)
-    frames = engine.example_frames()
-    for length in day.size.contexts:
-        context = _open(engine, "day", length)
-        restore = partial(context.restore, context.save())
-        day.time(f"fire at {length} tokens", partial(engine.fire, "day", frames), after=restore)
-        engine.close("day")
+    frames: tuple[Frame, ...] = ()
+    for name, has_kernels in (("", True), (", twins", False)):
+        engine = _warm(day, ponder, longest, kernels=has_kernels)
+        frames = engine.example_frames()
+        for length in day.size.contexts:
+            context = _open(engine, "day", length)
+            restore = partial(context.restore, context.save())
+            day.time(f"fire at {length} tokens{name}", partial(engine.fire, "day", frames), after=restore)
+            engine.close("day")
     pictures = torch.from_numpy(np.stack(frames)).to(day.device)
     day.time("vision tower, two frames", partial(ponder.image_features, pictures))
     row, seen = _row(ponder, max(1, longest // sum(len(segment) for segment in ponder.format.query(2))))
@@ -418,9 +440,11 @@ def _row(ponder: Ponder, queries: int) -> tuple[Row, Tensor]:
     return row, torch.zeros(row.num_images, *ponder.image_px, 3, dtype=torch.uint8, device=ponder.device)
 
 
-def _warm(day: Day, ponder: Ponder, tokens: int, draft: Draft | None = None, *, max_sessions: int = 1) -> QwenEngine:
+def _warm(
+    day: Day, ponder: Ponder, tokens: int, draft: Draft | None = None, *, max_sessions: int = 1, kernels: bool = True
+) -> QwenEngine:
     """An engine with room for two queries after ``tokens``."""
-    config = EngineConfig(max_context_tokens=tokens + 600, max_sessions=max_sessions)
+    config = EngineConfig(max_context_tokens=tokens + 600, max_sessions=max_sessions, kernels=kernels)
     engine = QwenEngine(ponder, config, draft)
     if day.device.type == "cuda":
         engine.warm_up()

@@ -70,6 +70,7 @@ def build_engine(options: PonderOptions) -> BatchingEngine:
         attention_threads=min(speed.attention_threads, num_cores),
         weights=speed.weights,
         graphs=speed.graphs,
+        kernels=speed.kernels,
     )
     drafts: list[Draft] = []
     if speed.draft_texts is not None:

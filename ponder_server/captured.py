@@ -5,13 +5,14 @@ are index tensors. A shape is rows, tokens per row, and positions that attention
 the same operations, so its CUDA graph serves every slot and every length. The tests compare it with ``decode`` on a
 CPU, where it runs without a graph.
 
-Attention gathers the slots' keys and values, and repeats the first position in place of those past the last one. So it
-reads only valid memory. It computes at most twice as much as with the exact length, because buckets are powers of two.
+Without its kernel, attention gathers the slots' keys and values, and repeats the first position in place of those past
+the last one. So it reads only valid memory. It computes at most twice as much as with the exact length, because buckets
+are powers of two.
 
-# B rows, T tokens of a row with its padding, H hidden, D head dimension, Q query heads, G key heads
-# K positions that are read, W hidden states returned per row
+# B rows, T tokens of a row with its padding, R = B T, H hidden, W hidden states returned per row
 """
 
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import product
@@ -19,11 +20,18 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from dual_system.models.graphs import Capture, Work
-from ponder_server.decoder import Place, decode, gated_delta, project
-from ponder_server.slots import AttentionMemory, SlotMemory
+from dual_system.models.kernels.launch import Timer
+from dual_system.models.kernels.rms_norm import Residual, Style
+from ponder_server.decoder import Place, decode
+from ponder_server.kernels.rotate_store import Window
+from ponder_server.operations import KERNELS, TWINS, Operations, choose
+from ponder_server.rehearsal import rehearse
+from ponder_server.slots import SlotMemory
+from ponder_server.stack import AttentionLayer, Stack
+
+log = logging.getLogger(__name__)
 
 LEAST_POSITIONS = 1024
 """Smallest bucket of positions: shorter ones would save no time on a GPU, and each is another graph."""
@@ -70,9 +78,16 @@ class CapturedDecoder:
         *,
         num_read: int,
         least_positions: int = LEAST_POSITIONS,
+        timer: Timer | None = None,
     ) -> None:
-        """``num_read``: most hidden states returned per row; a forward that needs more runs through ``decode``."""
+        """``num_read``: most hidden states returned per row; a forward that needs more runs through ``decode``.
+
+        With a ``timer``, kernels are tried (``operations``); without one the twins run.
+        """
         self._text_model = text_model
+        self._stack = Stack.of(text_model)
+        self._timer = timer
+        self._operations: dict[tuple[int, int], Operations] = {}
         self._memory = memory
         self._capture = capture
         self._num_read = num_read
@@ -95,8 +110,8 @@ class CapturedDecoder:
         if max(place.num_wanted for place in places) > min(length, self._num_read):
             return decode(self._text_model, self._memory, places, embeds_BTH, positions_3BT)
         longest = max(place.num_past + place.num_new for place in places)
-        num_positions = next(bucket for bucket in self.position_buckets if bucket >= longest)
-        forward = self.forward(num_rows, length, num_positions)
+        buckets = self._buckets(num_rows, length)
+        forward = self.forward(num_rows, length, next(bucket for bucket in buckets if bucket >= longest))
         forward.load(places, embeds_BTH[:num_rows], positions_3BT[:, :num_rows])
         (forward.run if self._replays else forward.work)()
         return forward.hidden(places)
@@ -116,36 +131,63 @@ class CapturedDecoder:
         Raises RuntimeError if the device has not enough memory or cannot record them; the message has the way out.
         """
         # Large ones first, so that the others reuse their memory in the pool.
-        for shape in product(range(max_rows, 0, -1), sorted(lengths, reverse=True), reversed(self.position_buckets)):
-            try:
-                self.forward(*shape)
-            except RuntimeError as error:
-                raise RuntimeError(
-                    f"the forward of {shape[0]} rows of {shape[1]} tokens over {shape[2]} positions could not be "
-                    f"captured after {len(self)} others: {error}. If memory lacks, lower --max-sessions or "
-                    "--max-context-tokens; ponder-serve --no-graphs does without graphs."
-                ) from error
+        for num_rows, length in product(range(max_rows, 0, -1), sorted(lengths, reverse=True)):
+            for num_positions in reversed(self._buckets(num_rows, length)):
+                try:
+                    self.forward(num_rows, length, num_positions)
+                except RuntimeError as error:
+                    raise RuntimeError(
+                        f"the forward of {num_rows} rows of {length} tokens over {num_positions} positions could not "
+                        f"be captured after {len(self)} others: {error}. If memory lacks, lower --max-sessions or "
+                        "--max-context-tokens; ponder-serve --no-graphs does without graphs."
+                    ) from error
 
     def forward(self, num_rows: int, length: int, num_positions: int) -> "Forward":
         """The forward of this shape. Captures it if it is new, which leaves the memory unchanged."""
         key = (num_rows, length, num_positions)
         if key not in self._forwards:
+            operations = self.operations(num_rows, length)
             num_read = min(length, self._num_read)
-            self._forwards[key] = Forward(self._text_model, self._memory, key, num_read, self._capture)
+            self._forwards[key] = Forward(self._stack, self._memory, operations, key, num_read, self._capture)
         return self._forwards[key]
+
+    def operations(self, num_rows: int, length: int) -> Operations:
+        """What forwards of these rows run between their products; kernels are tried at the first use."""
+        key = (num_rows, length)
+        if self._timer is None:
+            return TWINS
+        if key not in self._operations:
+            samples = rehearse(self._stack, self._memory, num_rows=num_rows, length=length)
+            self._operations[key], verdicts = choose(samples, KERNELS, self._timer)
+            for verdict in verdicts:
+                taken = "kernel" if verdict.is_taken else "twin"
+                log.info("rows=%d tokens=%d %s: %s, %s", num_rows, length, verdict.operation, taken, verdict.why)
+        return self._operations[key]
+
+    def _buckets(self, num_rows: int, length: int) -> tuple[int, ...]:
+        """Numbers of positions of which each is a graph; the kernel reads what is valid, so that one serves all."""
+        is_any = self.operations(num_rows, length).attend is KERNELS.attend
+        return self.position_buckets[-1:] if is_any else self.position_buckets
 
 
 class Forward:
     """Static buffers of one shape, and the captured work over them."""
 
     def __init__(
-        self, text_model: Any, memory: SlotMemory, shape: tuple[int, int, int], num_read: int, capture: Capture
+        self,
+        stack: Stack,
+        memory: SlotMemory,
+        operations: Operations,
+        shape: tuple[int, int, int],
+        num_read: int,
+        capture: Capture,
     ) -> None:
         num_rows, length, num_positions = shape
-        self._text_model = text_model
+        self._stack = stack
         self._memory = memory
+        self._operations = operations
         self._num_positions = num_positions
-        weight: Tensor = text_model.norm.weight
+        weight = stack.norm.scale.to(stack.dtype)
         self._embeds_BTH = weight.new_zeros(num_rows, length, len(weight))
         self._hidden_BWH = weight.new_zeros(num_rows, num_read, len(weight))
         # All numbers in one tensor, for one copy to the device.
@@ -178,97 +220,52 @@ class Forward:
 
     def work(self) -> None:
         """``decode`` without Python numbers: what is captured."""
-        device, length = self._embeds_BTH.device, self._embeds_BTH.shape[1]
-        token_T = torch.arange(length, device=device)
+        do, stack, memory = self._operations, self._stack, self._memory
+        num_rows, length, width = self._embeds_BTH.shape
+        token_T = torch.arange(length, device=self._embeds_BTH.device)
         num_read = self._hidden_BWH.shape[1]
-        read_BW = (self._num_new_B - self._num_wanted_B)[:, None] + token_T[:num_read]
-        read_BW.clamp_(0, length - 1)
-        row_B1 = torch.arange(len(read_BW), device=device)[:, None]
-        window = _Window(self._slot_B, self._num_past_B, self._num_new_B, token_T, self._num_positions)
-        cos_sin = self._text_model.rotary_emb(self._embeds_BTH, self._positions_3BT)
-        bias_BTK = window.bias(self._embeds_BTH.dtype)
-        hidden, last = self._embeds_BTH, len(self._text_model.layers) - 1
-        for index, layer in enumerate(self._text_model.layers):
-            normed_BTH = layer.input_layernorm(hidden)
-            if index in self._memory.attention:
-                # The last layer computes only the wanted queries.
-                asking_BW = (row_B1, read_BW) if index == last else None
-                mixed = _attention(
-                    layer.self_attn, self._memory.attention[index], window, normed_BTH, cos_sin, bias_BTK, asking_BW
+        read_BW = ((self._num_new_B - self._num_wanted_B)[:, None] + token_T[:num_read]).clamp_(0, length - 1)
+        all_BT = token_T.repeat(num_rows, 1)
+        row_B1 = torch.arange(num_rows, device=token_T.device)[:, None]
+        window = Window(self._slot_B, self._num_past_B, self._num_new_B)
+        cos_sin = stack.rotary(self._embeds_BTH, self._positions_3BT)
+        hidden_RH, branch_RH = self._embeds_BTH.view(-1, width).clone(), None
+
+        def normed(style: Style, out: Tensor | None = None) -> Tensor:
+            """Adds the last branch to the stream; the norm of the sum."""
+            out_RH = torch.empty_like(hidden_RH) if out is None else out.view(hidden_RH.shape)
+            do.norm(hidden_RH, out_RH, style, None if branch_RH is None else Residual(branch_RH))
+            return out_RH
+
+        for layer in stack.layers:
+            normed_BTH = normed(layer.input_norm).view(num_rows, -1, width)
+            # The last layer computes only what is wanted.
+            asking_BW = read_BW if layer is stack.layers[-1] else all_BT
+            if isinstance(layer.mixer, AttentionLayer):
+                keys, values = memory.attention[layer.index].keys, memory.attention[layer.index].values
+                projected = layer.mixer.project(normed_BTH)
+                queries = do.rotate_store(projected, layer.mixer.norms, cos_sin, keys, values, window)
+                seen_BWX = do.attend(
+                    queries, projected.query_gate_BTX, keys, values, asking_BW, window, self._num_positions
                 )
+                mixed_BWH = layer.mixer.out(seen_BWX)
             else:
-                memory = self._memory.recurrent[index]
-                mixed = gated_delta(layer.linear_attn, memory, self._slot_B, self._num_new_B, normed_BTH)
-                mixed = mixed[row_B1, read_BW] if index == last else mixed
-            hidden = (hidden[row_B1, read_BW] if index == last else hidden) + mixed
-            hidden = hidden + layer.mlp(layer.post_attention_layernorm(hidden))
-        self._hidden_BWH.copy_(self._text_model.norm(hidden))
-
-
-class _Window:
-    """Indices at which rows write and read keys and values, in the first K positions of their slots."""
-
-    def __init__(
-        self, slot_B: Tensor, num_past_B: Tensor, num_new_B: Tensor, token_T: Tensor, num_positions: int
-    ) -> None:
-        num_past_B1, num_new_B1 = num_past_B[:, None], num_new_B[:, None]
-        position_K = torch.arange(num_positions, device=token_T.device)
-        self.slot_B1 = slot_B[:, None]
-        self.stored_BT = token_T * (token_T < num_new_B1)
-        """Tokens whose keys and values are written. Padding repeats the first token, so that the order of writes does
-        not matter: the slot may end before the bucket does, so padding has no place of its own."""
-        self.places_BT = num_past_B1 + self.stored_BT
-        self.seen_BK = position_K * (position_K < num_past_B1 + num_new_B1)
-        """Positions that are read; those past the last one hold garbage, which may be NaN, and are replaced by 0."""
-        self._is_visible_BTK = position_K <= (num_past_B1 + token_T)[..., None]
-
-    def bias(self, dtype: torch.dtype) -> Tensor:
-        """Causal attention bias (B, T, K). Padding attends to something too, so that no row is NaN."""
-        is_hidden_BTK = ~self._is_visible_BTK
-        return torch.zeros_like(is_hidden_BTK, dtype=dtype).masked_fill_(is_hidden_BTK, float("-inf"))
-
-    def store(self, memory: Tensor, new_BGTD: Tensor) -> None:
-        """Writes the rows' new keys or values (B, G, T, D) into ``memory`` (N, G, S, D)."""
-        stored_BT1 = self.stored_BT[:, :, None, None].expand(-1, -1, new_BGTD.shape[1], new_BGTD.shape[3])
-        memory[self.slot_B1, :, self.places_BT] = new_BGTD.transpose(1, 2).gather(1, stored_BT1)
-
-    def read(self, memory: Tensor) -> Tensor:
-        """The rows' keys or values (B, G, K, D)."""
-        head_G1 = torch.arange(memory.shape[1], device=memory.device)[:, None]
-        return memory[self.slot_B1[..., None], head_G1, self.seen_BK[:, None]]
-
-
-def _attention(
-    attention: Any,
-    memory: AttentionMemory,
-    window: _Window,
-    hidden_BTH: Tensor,
-    cos_sin: tuple[Tensor, Tensor],
-    bias_BTK: Tensor,
-    asking: tuple[Tensor, Tensor] | None,
-) -> Tensor:
-    """Stores every row's keys and values; attention output (B, T, H), or (B, W, H) of the tokens ``asking``."""
-    queries, keys, values, gate = project(attention, hidden_BTH, cos_sin)
-    window.store(memory.keys, keys)
-    window.store(memory.values, values)
-    if asking is not None:
-        queries, gate, bias_BTK = queries.transpose(1, 2)[asking].transpose(1, 2), gate[asking], bias_BTK[asking]
-    seen_BTQD = _attend(queries, window.read(memory.keys), window.read(memory.values), bias_BTK).transpose(1, 2)
-    mixed: Tensor = attention.o_proj((seen_BTQD.reshape(gate.shape) * gate.sigmoid()).flatten(2))
-    return mixed
-
-
-def _attend(queries_BQTD: Tensor, keys_BGKD: Tensor, values_BGKD: Tensor, bias_BTK: Tensor) -> Tensor:
-    """Attention output (B, Q, T, D). Key heads become rows and their query heads the heads: torch's kernels with masks
-    do not support grouped heads, and repeating the keys would copy them for every query head."""
-    num_rows, num_heads, num_queries, head_dim = queries_BQTD.shape
-    num_key_heads = keys_BGKD.shape[1]
-    group = num_heads // num_key_heads
-
-    def shared(x_BGKD: Tensor) -> Tensor:
-        return x_BGKD.flatten(0, 1)[:, None].expand(-1, group, -1, -1)
-
-    bias = bias_BTK[:, None].expand(-1, num_key_heads, -1, -1).flatten(0, 1)[:, None].expand(-1, group, -1, -1)
-    queries = queries_BQTD.reshape(num_rows * num_key_heads, group, num_queries, head_dim)
-    seen = F.scaled_dot_product_attention(queries, shared(keys_BGKD), shared(values_BGKD), attn_mask=bias)
-    return seen.view(queries_BQTD.shape)
+                delta, states = layer.mixer, memory.recurrent[layer.index]
+                mixed = do.conv_silu(
+                    delta.inputs(normed_BTH), delta.conv_CW, states.conv, self._slot_B, self._num_new_B
+                )
+                speed_beta = delta.speed_beta(normed_BTH)
+                read_BTVE = do.delta(
+                    mixed, speed_beta, delta.a_log_V, delta.dt_bias_V, states.state, self._slot_B, self._num_new_B
+                )
+                gate_RX = delta.gate(normed_BTH).view(num_rows * length, -1)
+                read_RVE = read_BTVE.reshape(num_rows * length, *read_BTVE.shape[2:])
+                gated_RX = do.gated_norm(read_RVE, gate_RX, delta.norm_E, delta.eps)
+                mixed_BWH = delta.out(gated_RX).view(num_rows, length, -1)
+                mixed_BWH = mixed_BWH[row_B1, read_BW] if layer is stack.layers[-1] else mixed_BWH
+            if layer is stack.layers[-1]:
+                hidden_RH = hidden_RH.view(num_rows, length, width)[row_B1, read_BW].view(-1, width)
+            branch_RH = mixed_BWH.reshape(-1, width)
+            normed_RH = normed(layer.mlp_norm)
+            branch_RH = layer.down(do.swiglu(layer.gate(normed_RH), layer.up(normed_RH)))
+        normed(stack.norm, out=self._hidden_BWH)

@@ -55,6 +55,8 @@ class SpeedOptions:
     cognition is measured at start and logged. fp8 products need a GPU of compute capability 8.9 or more."""
     graphs: bool = True
     """Do not record forwards as CUDA graphs at start, on a GPU."""
+    kernels: bool = True
+    """Do not try Triton kernels in them; each is taken only where it is right and faster."""
     attention_threads: int = 1
     """Threads for long-context attention on a CPU; at most the number of usable cores. The answers stay the same. 1
     leaves the other cores to POUNCE, whose deadlines are shorter."""

@@ -22,6 +22,7 @@ from torch import Tensor
 from dual_system.models.action_space import ROBOT_DIM
 from dual_system.models.gpu import settle
 from dual_system.models.graphs import Capture, graphs_for
+from dual_system.models.kernels.launch import cuda_time_ms, missing_for
 from dual_system.models.ponder.checkpoint import weights_hash
 from dual_system.models.ponder.context import SegmentKind
 from dual_system.models.ponder.network import Ponder
@@ -135,7 +136,10 @@ class QwenEngine:
         if capture is None and config.graphs:
             capture = graphs_for(ponder.device)
         if capture is not None:  # last, because captured graphs keep their weights
-            self._runner.capture(capture, num_read=max(MAX_CHECKED_TOKENS, 1 + self._format.num_carriers))
+            has_kernels = config.kernels and ponder.device.type == "cuda" and not missing_for(ponder.device)
+            timer = cuda_time_ms if has_kernels else None
+            num_read = max(MAX_CHECKED_TOKENS, 1 + self._format.num_carriers)
+            self._runner.capture(capture, num_read=num_read, timer=timer)
 
     @property
     def spec(self) -> EngineSpec:

@@ -37,6 +37,8 @@ class EngineConfig:
     """int8, fp8: one byte per layer weight; the change of cognition is measured when the engine is built."""
     graphs: bool = True
     """Run forwards as CUDA graphs on a GPU (``captured``)."""
+    kernels: bool = True
+    """In graphs, take Triton kernels where they are right and faster on this GPU (``operations``)."""
 
     def __post_init__(self) -> None:
         for name in self.__slots__:

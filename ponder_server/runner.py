@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from dual_system.models.graphs import Capture
+from dual_system.models.kernels.launch import Timer
 from dual_system.models.ponder.network import Ponder
 from ponder_server.captured import CapturedDecoder, check_captured
 from ponder_server.contract import ContextFull, SessionError
@@ -100,13 +101,13 @@ class Runner:
         self._free_slots = list(reversed(range(num_slots)))
         self._saved = [tuple(self._blank_state(slot) for _ in range(NUM_SAVED_STATES)) for slot in range(num_slots)]
 
-    def capture(self, capture: Capture, *, num_read: int) -> None:
+    def capture(self, capture: Capture, *, num_read: int, timer: Timer | None = None) -> None:
         """Turns on capturing of forwards (``captured``), at their first use or by :meth:`prepare`.
 
         Captured forwards keep their weights: replace none afterwards. They return at most ``num_read`` hidden states
-        per row; a forward that needs more runs uncaptured.
+        per row; a forward that needs more runs uncaptured. With a ``timer``, they try kernels.
         """
-        self._captured = CapturedDecoder(self._text_model, self.memory, capture, num_read=num_read)
+        self._captured = CapturedDecoder(self._text_model, self.memory, capture, num_read=num_read, timer=timer)
 
     def prepare(self, num_tokens: int, *, max_rows: int) -> int:
         """Captures all forwards for appends of up to ``num_tokens`` to up to ``max_rows`` sessions at once, and for any

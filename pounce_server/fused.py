@@ -17,13 +17,13 @@ from torch import Tensor
 
 from dual_system.models.flow import EulerStep
 from dual_system.models.graphs import Capture, Work, cuda_graphs, directly
+from dual_system.models.kernels.launch import cuda_time_ms, missing_for
+from dual_system.models.kernels.rms_norm import Style
 from dual_system.models.pi05.gemma import RmsNorm
 from dual_system.models.pi05.network import Pi05, Prefix
 from dual_system.models.pi05.pounce import Pounce, PounceInputs
 from pounce_server.fused_stream import KERNELS, FusedStream, Norm, Operations, Run
-from pounce_server.kernels.choice import Choices, ChosenProduct, cuda_time_ms, default_cache, machine_name, preferring
-from pounce_server.kernels.launch import missing_for
-from pounce_server.kernels.rms_norm import Style
+from pounce_server.kernels.choice import Choices, ChosenProduct, default_cache, machine_name, preferring
 
 BUCKET_TOKENS = 64
 """Prompts of at most 200 tokens need four or five buckets; 63 unseen tokens cost less than half a millisecond."""

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from dual_system.models.kernels.rms_norm import Residual, Style, norm_eager, norm_fused
 from dual_system.models.pi05.gemma import ExpertLayer, GemmaConfig, GemmaLayer, Rotation, attend
 from pounce_server.kernels.choice import product
 from pounce_server.kernels.euler import euler_eager, euler_fused
 from pounce_server.kernels.geglu import geglu_eager, geglu_fused
-from pounce_server.kernels.rms_norm import Residual, Style, norm_eager, norm_fused
 from pounce_server.kernels.rope import Slots, rope_eager, rope_fused
 
 

@@ -18,11 +18,10 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
-LIBRARIES = ("cublas", "cublaslt")
-REPEATS = 20
+from dual_system.models.kernels.launch import Timer
 
-Timer: TypeAlias = Callable[[Callable[[], None]], float]
-"""Returns the duration of work, in any unit."""
+LIBRARIES = ("cublas", "cublaslt")
+
 Switch: TypeAlias = Callable[[str], AbstractContextManager[None]]
 """Returns a context in which torch uses the named library."""
 
@@ -105,15 +104,3 @@ def preferring(library: str) -> Iterator[None]:
         yield
     finally:
         torch.backends.cuda.preferred_blas_library(before)
-
-
-def cuda_time_ms(work: Callable[[], None]) -> float:
-    """Mean duration [ms] of `REPEATS` runs in the current stream, after a warm-up run."""
-    work()
-    start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-    start.record()
-    for _ in range(REPEATS):
-        work()
-    end.record()
-    end.synchronize()
-    return float(start.elapsed_time(end)) / REPEATS

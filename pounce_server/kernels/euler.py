@@ -7,7 +7,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pounce_server.kernels.launch import Tolerance, block_size, check_tensor, kernel, tl
+from dual_system.models.kernels.launch import Tolerance, block_size, check_tensor, kernel, tl
 
 TOLERANCE = {torch.float32: Tolerance(rtol=1e-6, atol=1e-6)}  # actions and velocities are float32 in every precision
 

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pounce_server.kernels.launch import Tolerance, block_size, check_tensor, kernel, tl
+from dual_system.models.kernels.launch import Tolerance, block_size, check_tensor, kernel, tl
 
 TOLERANCE = {
     torch.float32: Tolerance(rtol=1e-5, atol=1e-6),

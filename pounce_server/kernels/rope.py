@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dual_system.models.kernels.launch import Tolerance, block_size, check_tensor, kernel, tl
 from dual_system.models.pi05.gemma import Rotation
-from pounce_server.kernels.launch import Tolerance, block_size, check_tensor, kernel, tl
 
 TOLERANCE = {
     torch.float32: Tolerance(rtol=1e-5, atol=1e-6),

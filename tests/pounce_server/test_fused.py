@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from dual_system.models.graphs import Capture, Work, directly
+from dual_system.models.kernels.launch import missing_for
 from dual_system.models.pi05.gemma import GemmaConfig
 from dual_system.models.pi05.pounce import Pounce, PounceConfig, PounceInputs
 from dual_system.models.pounce.checkpoint import random_bundle
@@ -20,7 +21,6 @@ from pounce_server.contract import DTypeName, example_request
 from pounce_server.engine import EagerEngine
 from pounce_server.fused import BUCKET_TOKENS, SLOT_MULTIPLE, FusedPounce, fused_for
 from pounce_server.fused_stream import KERNELS, TWINS, Operations
-from pounce_server.kernels.launch import missing_for
 
 MAE = {"float32": 1e-5, "bfloat16": 4e-3}
 """Stated tolerance: mean absolute error of the normalised actions after the last step."""
@@ -226,7 +226,7 @@ def test_operations_are_the_ones_given(config: PounceConfig) -> None:
 def test_without_triton_the_fused_path_says_what_to_install(
     config: PounceConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pounce_server.kernels.launch.triton", None)
+    monkeypatch.setattr("dual_system.models.kernels.launch.triton", None)
     with pytest.raises(ValueError, match=r"--path fused cannot run here. Triton is not installed: pip install"):
         fused_for(model_of(config), torch.device("cuda"))
 

@@ -10,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from dual_system.models.kernels import rms_norm
+from dual_system.models.kernels.launch import Tolerance, block_size, missing_for
 from dual_system.models.pi05.gemma import AdaRmsNorm, GeGlu, GemmaConfig, RmsNorm, Rotation
-from pounce_server.kernels import euler, geglu, rms_norm, rope
-from pounce_server.kernels.launch import Tolerance, block_size, missing_for
+from pounce_server.kernels import euler, geglu, rope
 
 LACK = missing_for(torch.device("cpu"))
 interpreted = pytest.mark.skipif(bool(LACK), reason=LACK)
@@ -213,7 +214,8 @@ def test_block_size_is_the_next_power_of_two(count: int) -> None:
 def test_twins_need_no_triton() -> None:
     script = (
         "import sys, torch; sys.modules['triton'] = None\n"
-        "from pounce_server.kernels import euler, geglu, launch, rms_norm, rope\n"
+        "from dual_system.models.kernels import launch, rms_norm\n"
+        "from pounce_server.kernels import euler, geglu, rope\n"
         "geglu.geglu_eager(torch.ones(2, 4), torch.empty(2, 2))\n"
         "print(launch.missing_for(torch.device('cuda')))"
     )

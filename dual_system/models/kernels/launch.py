@@ -1,10 +1,10 @@
-"""Triton if it is installed, the conditions for running kernels, and the checks of their tensors."""
+"""Triton if it is installed, the conditions for running kernels, the checks of their tensors, and their time."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor
@@ -15,7 +15,12 @@ try:
 except ModuleNotFoundError:
     triton = tl = None
 
-__all__ = ["Tolerance", "block_size", "check_tensor", "kernel", "missing_for", "tl"]
+__all__ = ["Timer", "Tolerance", "block_size", "check_tensor", "cuda_time_ms", "kernel", "missing_for", "tl"]
+
+REPEATS = 20
+
+Timer: TypeAlias = Callable[[Callable[[], object]], float]
+"""Returns the duration of work, in any unit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,3 +63,15 @@ def check_tensor(name: str, tensor: Tensor, shape: tuple[int, ...], dtype: torch
         raise ValueError(
             f"{name}: expected {shape} {dtype} contiguous, came {tuple(tensor.shape)} {tensor.dtype} {layout}"
         )
+
+
+def cuda_time_ms(work: Callable[[], object]) -> float:
+    """Mean duration [ms] of `REPEATS` runs in the current stream, after a warm-up run."""
+    work()
+    start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+    start.record()
+    for _ in range(REPEATS):
+        work()
+    end.record()
+    end.synchronize()
+    return float(start.elapsed_time(end)) / REPEATS

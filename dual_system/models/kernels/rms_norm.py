@@ -1,7 +1,7 @@
-"""Gemma's RMSNorm, plain or styled by time (adaRMS), together with the gated residual that precedes it.
+"""RMSNorm, plain or styled by time (adaRMS), together with the gated residual that precedes it.
 
-Between two GEMMs of a pi0.5 stream comes x <- x + gate * branch, then norm(x): six passes over memory as eager
-operations, one here.
+Between two GEMMs of a stream comes x <- x + gate * branch, then norm(x): six passes over memory as eager operations,
+one here.
 """
 
 # R rows (batch times tokens), E width
@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dual_system.models.pi05.gemma import RMS_NORM_EPS
-from pounce_server.kernels.launch import Tolerance, block_size, check_tensor, kernel, tl
+from dual_system.models.kernels.launch import Tolerance, block_size, check_tensor, kernel, tl
 
 TOLERANCE = {
     torch.float32: Tolerance(rtol=1e-5, atol=1e-6),
@@ -30,6 +29,7 @@ class Style:
     scale: Tensor
     """1 + w of a plain norm, 1 + scale of a styled one."""
     shift: Tensor | None = None
+    eps: float = 1e-6  # Gemma's and Qwen's
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,7 +47,7 @@ def norm_eager(x_RE: Tensor, out_RE: Tensor, style: Style, residual: Residual | 
     if residual is not None:
         gated_RE = residual.branch if residual.gate is None else residual.gate.to(x_RE.dtype) * residual.branch
         x_RE += gated_RE
-    normed_RE = torch.nn.functional.rms_norm(x_RE.float(), x_RE.shape[-1:], None, RMS_NORM_EPS) * style.scale
+    normed_RE = torch.nn.functional.rms_norm(x_RE.float(), x_RE.shape[-1:], None, style.eps) * style.scale
     out_RE.copy_(normed_RE if style.shift is None else normed_RE + style.shift)
 
 
@@ -77,7 +77,7 @@ def norm_fused(x_RE: Tensor, out_RE: Tensor, style: Style, residual: Residual | 
         out_RE,
         WIDTH=width,
         BLOCK=block_size(width),
-        EPS=RMS_NORM_EPS,
+        EPS=style.eps,
         HAS_BRANCH=residual is not None,
         HAS_GATE=has_gate,
         HAS_SHIFT=style.shift is not None,

@@ -1,0 +1,112 @@
+"""Every kernel goes through Triton's whole compiler, at the public sizes, for GPUs that need not be here: none may keep
+a register in memory."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from dual_system.models.kernels.launch import missing_for
+
+LACK = missing_for(torch.device("cuda"))
+
+SCRIPT = """
+import re, subprocess, sys, tempfile
+from pathlib import Path
+import triton
+from triton.backends.compiler import GPUTarget
+import triton.backends.nvidia as nvidia
+from dual_system.models.kernels import rms_norm
+from ponder_server.kernels import attention, conv_silu, delta, gated_norm, rotate_store, swiglu
+from pounce_server.kernels import euler, geglu, rope
+
+def compile_for(capability, warps, kernel, pointers, integers=(), **constants):
+    types = dict(pointers) | dict.fromkeys(integers, "i32") | dict.fromkeys(constants, "constexpr")
+    types = {name: types[name] for name in kernel.arg_names}
+    aligned = {(i,): [["tt.divisibility", 16]] for i, kind in enumerate(types.values()) if kind.startswith("*")}
+    source = triton.compiler.ASTSource(kernel, types, constants, aligned)
+    options = {"num_warps": warps, "num_stages": 2}
+    binary = triton.compile(source, target=GPUTarget("cuda", capability, 32), options=options)
+    with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
+        file.write(binary.asm["cubin"]); file.flush()
+        dump = [Path(nvidia.__file__).parent / "bin" / "cuobjdump", "--dump-resource-usage", file.name]
+        use = dict(re.findall(r"(REG|STACK|LOCAL):(\\d+)", subprocess.run(dump, capture_output=True, text=True).stdout))
+    print(capability, kernel.__name__, use["REG"], use["STACK"], use["LOCAL"], binary.metadata.shared)
+
+half, full, long = "*bf16", "*fp32", "*i64"
+norm = dict(x_ptr=half, branch_ptr=half, gate_ptr=full, scale_ptr=full, shift_ptr=full, out_ptr=half)
+turn = dict(qkv_ptr=half, cos_ptr=full, sin_ptr=full, q_ptr=half, k_ptr=half, v_ptr=half)
+window = dict(slot_ptr=long, num_past_ptr=long, num_new_ptr=long)
+
+def pi05(capability):
+    for width, is_styled in ((2048, False), (1024, True)):
+        compile_for(capability, 4, rms_norm._norm, norm, WIDTH=width, BLOCK=width, EPS=1e-6,
+                    HAS_BRANCH=True, HAS_GATE=is_styled, HAS_SHIFT=is_styled)
+    compile_for(capability, 4, geglu._geglu, dict(gate_up_ptr=half, out_ptr=half), WIDTH=4096, BLOCK=1024)
+    compile_for(capability, 4, rope._rope, turn, ("num_tokens", "num_slots", "first_slot"),
+                Q_HEADS=8, KV_HEADS=1, PAIRS=128, HEAD_BLOCK=16, PAIR_BLOCK=128)
+    compile_for(capability, 4, euler._euler, dict(x_ptr=full, velocity_ptr=full, bias_ptr=full),
+                WIDTH=32, BLOCK=32, STEPS=10)
+
+def qwen35_9b(capability):
+    compile_for(capability, 4, rms_norm._norm, norm, WIDTH=4096, BLOCK=4096, EPS=1e-6,
+                HAS_BRANCH=True, HAS_GATE=False, HAS_SHIFT=False)
+    compile_for(capability, 4, swiglu._swiglu, dict(gate_ptr=half, up_ptr=half, out_ptr=half), ("count",), BLOCK=1024)
+    compile_for(capability, 4, conv_silu._conv_silu,
+                dict(x_ptr=half, weight_ptr=half, state_ptr=half, slot_ptr=long, num_new_ptr=long, out_ptr=half),
+                ("length", "slot_stride"), CHANNELS=8192, WIDTH=4, BLOCK_T=16, BLOCK_C=128)
+    compile_for(capability, 1, delta._delta,
+                dict(mixed_ptr=half, speed_beta_ptr=half, a_log_ptr=full, dt_bias_ptr=half, state_ptr=full,
+                     slot_ptr=long, num_new_ptr=long, read_ptr=half),
+                ("length", "slot_stride"), KEY_HEADS=16, HEADS=32, KEY_DIM=128, VALUE_DIM=128, BLOCK=8, SCALE=128**-0.5)
+    compile_for(capability, 1, gated_norm._gated_norm,
+                dict(read_ptr=half, gate_ptr=half, weight_ptr=half, out_ptr=half), HEADS=32, SIZE=128, EPS=1e-6)
+    compile_for(capability, 1, rotate_store._rotate_store,
+                window | dict(query_gate_ptr=half, keys_ptr=half, values_ptr=half, query_norm_ptr=full,
+                              key_norm_ptr=full, cos_ptr=half, sin_ptr=half, stored_keys_ptr=half,
+                              stored_values_ptr=half, queries_ptr=half),
+                ("length", "num_positions"), HEADS=16, KEY_HEADS=4, SIZE=256, ROTARY=64, EPS=1e-6)
+    for rows, warps, splits in ((64, 8, 4), (16, 4, 32)):
+        compile_for(capability, warps, attention._attend_split,
+                    window | dict(queries_ptr=half, keys_ptr=half, values_ptr=half, token_ptr=long, parts_ptr=full,
+                                  weights_ptr=full),
+                    ("length", "num_asking", "slot_positions"), HEADS=16, KEY_HEADS=4, SIZE=256, SPLITS=splits,
+                    BLOCK_ROWS=rows, BLOCK_POSITIONS=64, LOG2_SCALE=0.09, PRECISION="tf32")
+    compile_for(capability, 4, attention._join_splits,
+                dict(parts_ptr=full, weights_ptr=full, query_gate_ptr=half, token_ptr=long, out_ptr=half), ("length",),
+                HEADS=16, SIZE=256, SPLITS=32)
+
+pi05(80)
+pi05(90)
+for capability in map(int, sys.argv[1:]):
+    qwen35_9b(capability)
+"""
+NUM_PI05, NUM_PONDER = 5, 9
+SHARED_BYTES = 227 << 10
+"""Most shared memory of a program on Hopper and on Blackwell."""
+
+
+@pytest.mark.skipif(bool(LACK), reason=LACK)
+def test_every_kernel_compiles_and_keeps_its_registers(tmp_path: os.PathLike[str]) -> None:
+    """In a process of its own: this one interprets, and Triton is told so when it is imported."""
+    environment = os.environ | {"TRITON_INTERPRET": "0", "TRITON_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, "90", "100"],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=240,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    built = [line.split() for line in done.stdout.splitlines()]
+    assert len(built) == 2 * (NUM_PI05 + NUM_PONDER)
+    for capability, name, registers, stack, local, shared in built:
+        told = (
+            f"{name} for sm_{capability}: {registers} registers, {stack} bytes of stack, {local} local, {shared} shared"
+        )
+        assert (int(stack), int(local)) == (0, 0), told
+        assert 0 < int(registers) <= 255, told
+        assert int(shared) <= SHARED_BYTES, told
