@@ -169,7 +169,7 @@ def process_row(proc: str, looks: list[Look]) -> Row:
 
 
 def latency_rows(name: str, episodes: list[list[float]]) -> list[Row]:
-    """Of the first and the last tenth of the episodes, without the first one."""
+    """The first and the last tenth of the episodes, without the first one."""
     counted = episodes[1:]
     tenth = max(1, len(counted) // 10)
     parts = (("first tenth", counted[:tenth]), ("last tenth", counted[-tenth:]))

@@ -347,9 +347,9 @@ class EpisodeRecord:
     phases: list[m.Phase] = field(default_factory=list)
     healths: list[m.Health] = field(default_factory=list)
     shadow_cognitions: list[m.Cognition] = field(default_factory=list)
-    """Of a PONDER that is asked like the other and never used."""
+    """Answers of a PONDER that is asked like the other and never used."""
     shadow_chunks: list[m.ActionChunk] = field(default_factory=list)
-    """Of a POUNCE that is asked like the other and never played."""
+    """Answers of a POUNCE that is asked like the other and never played."""
 
 
 _LISTS: dict[type, str] = {
