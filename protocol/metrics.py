@@ -99,6 +99,10 @@ class Metrics(Collector):
             f"{PREFIX}context_tokens", "Tokens in PONDER's context after its last answer.", IDENTITY,
             registry=self._counted,
         )  # fmt: skip
+        self.picture_age = Gauge(
+            f"{PREFIX}picture_age_seconds", "Age of a camera's picture at the last tick; -1 if none has come.",
+            (*IDENTITY, "camera"), registry=self._counted,
+        )  # fmt: skip
         self.events = counter("events_total", "Events reported, as in the episode's log.", "severity", "name")
 
     @property
@@ -170,6 +174,7 @@ class _Tally:
         self._to = metrics
         self._end = end
         self._has_played = False
+        self._cameras: tuple[str, ...] = ()
 
     def __call__(self, message: object) -> None:
         to = self._to
@@ -189,7 +194,7 @@ class _Tally:
             case m.ActionChunk():
                 to.infer.labels(*self._end.identity).observe(message.infer_ns / 1e9)
             case m.EpisodeInfo():
-                self._has_played = False
+                self._has_played, self._cameras = False, message.robot.cameras
                 to.episodes.labels(*self._end.identity).inc()
                 for level in filter(None, m.Level):  # from 0 on, so that the first tick of a rung is an increase
                     to.ticks.labels(*self._end.identity, level.name.lower())
@@ -203,6 +208,8 @@ class _Tally:
         if tick.level == m.Level.SKIPPED:
             return
         to.late.labels(*identity).observe(tick.late_ns / 1e9)
+        for camera, age_ns in zip(self._cameras, tick.picture_age_ns, strict=False):
+            to.picture_age.labels(*identity, camera).set(age_ns / 1e9 if age_ns >= 0 else -1)
         if tick.limits_hit:
             to.limited.labels(*identity).inc()
         if self._has_played and not len(tick.raw_row):  # as ``clock.report.num_starved`` counts from the log

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -54,6 +54,7 @@ class Step:
     the observations between the last request and this one, for protocols that send them.
 
     A robot's own program says more: ``taken_ns``, the instant of ``state`` (this host's monotonic clock; None: now);
+    ``captured_ns``, those of its pictures by camera (one without is as old as the state);
     what the robot says of itself; and, live, the newest tick that it was told of, to wait for a later one. ``trial``
     are its terms if the request only opens an episode.
     """
@@ -67,6 +68,7 @@ class Step:
     since: Sequence[Observed] = ()
     task: str = ""
     taken_ns: int | None = None
+    captured_ns: Mapping[str, int] = field(default_factory=dict)
     robot_state: RobotState = RobotState.UNSPECIFIED
     robot_text: str = ""
     after_tick: int = -1

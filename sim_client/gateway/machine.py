@@ -268,19 +268,21 @@ class Machine:
             self._show(episode.node.show([Measurement(self._packed(seen.frames), seen.state) for seen in since], now))
             job.future.set_result(self._play(episode, episode.node))
             return
-        self._show_live(episode, episode.node, now, step.taken_ns)
+        self._show_live(episode, episode.node, now, step)
         self._waiting.append((job.future, step.after_tick))
         self._look_after_live()
 
-    def _show_live(self, episode: _Episode, node: LiveNode, now: Measurement, taken_ns: int | None) -> None:
+    def _show_live(self, episode: _Episode, node: LiveNode, now: Measurement, step: Step) -> None:
         """A real robot's observations have this host's instants, which the clock service converts."""
         if episode.clock is None:
             episode.clock = MonotonicClock()
-        host_ns = time.monotonic_ns() if taken_ns is None else taken_ns
-        if episode.info.robot.is_simulated:
-            self._show(node.show(now, host_ns - episode.clock.zero_ns))
-        else:
-            self._show(node.show(now, host_ns), host_clock_id())
+        host_ns = time.monotonic_ns() if step.taken_ns is None else step.taken_ns
+        is_simulated = episode.info.robot.is_simulated
+        zero_ns = episode.clock.zero_ns if is_simulated else 0
+        cameras = [image.camera for image in now.pictures] if step.captured_ns else []
+        captured_ns = tuple(step.captured_ns.get(camera, host_ns) - zero_ns for camera in cameras)
+        observation = replace(node.show(now, host_ns - zero_ns), captured_ns=captured_ns)
+        self._show(observation, m.EPISODE_CLOCK if is_simulated else host_clock_id())
 
     def _play(self, episode: _Episode, node: LockstepNode) -> Answer:
         """Lockstep: all ticks that the client has played since its last request, and the one that it asks about."""

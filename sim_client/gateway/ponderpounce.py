@@ -53,6 +53,13 @@ class PonderpounceDialect:
                 "command_low": robot.command_low.tolist(),
                 "command_high": robot.command_high.tolist(),
                 "max_step": robot.max_step.tolist(),
+                "dimensions": [
+                    {"name": each.name, "kind": each.kind.name.lower(), "at_stop": each.at_stop.name.lower()}
+                    for each in robot.dimensions
+                ],
+                "stop_ticks": robot.stop_ticks,
+                "at_exit": robot.at_exit.name.lower(),
+                "home": robot.home.tolist(),
             },
         )
 
@@ -90,6 +97,13 @@ class PonderpounceDialect:
     def refuse(self, sentence: str) -> bytes:
         return _message("refused", self._seq, why=sentence)
 
+    def _captured_ns(self, message: Mapping[Any, Any]) -> Mapping[str, int]:
+        """Instants of the pictures by our cameras' names; a client may leave out any."""
+        given = message.get("captured_ns", {})
+        if not isinstance(given, Mapping):
+            raise Refused(f"captured_ns: expected instants by camera, came {type(given).__name__}")
+        return {name: _instant(given, key) for name, key in self._terms.cameras.items() if key in given}
+
     def _step(self, message: Mapping[Any, Any], trial: Trial | None) -> Step:
         key, said = self._terms.state_key, message.get("robot_state", "ok")
         if not isinstance(said, str) or said not in _STATES:
@@ -105,6 +119,7 @@ class PonderpounceDialect:
             begins=trial is not None,
             task=task if isinstance(task, str) else "",
             taken_ns=_instant(message, "state_ns"),
+            captured_ns=self._captured_ns(message),
             robot_state=_STATES[said],
             robot_text=str(message.get("robot_text", ""))[:MAX_TEXT],
             after_tick=self._told_tick,
@@ -113,7 +128,7 @@ class PonderpounceDialect:
 
 
 def _instant(message: Mapping[Any, Any], key: str) -> int:
-    value = reading.field(message, key, "when the joints were measured, on this host's monotonic clock")
+    value = reading.field(message, key, "an instant on this host's monotonic clock")
     if type(value) is not int or abs(value) >= 1 << 62:
         raise Refused(f"{key}: expected nanoseconds, came {str(value)[:80]!r}")
     return value

@@ -18,7 +18,7 @@ from protocol.bus import LocalBus
 from protocol.drops import DropReason
 from protocol.link import Link
 from protocol.metrics import IDENTITY, PREFIX, End, Metrics
-from protocol.topics import CHUNK, EVENT, INVOCATION, OBSERVATION, STAMP, TICK
+from protocol.topics import CHUNK, EVENT, INFO, INVOCATION, OBSERVATION, STAMP, TICK
 
 READY = m.Health(state=m.ServingState.READY, model_hash="abc", version="1.0")
 
@@ -47,6 +47,17 @@ def metrics(link: Link) -> Metrics:
     metrics = Metrics()
     metrics.watch(end_of(link))
     return metrics
+
+
+def test_a_camera_s_age_is_that_of_the_last_tick(
+    link: Link, metrics: Metrics, episode_info: Callable[..., m.EpisodeInfo], paper: m.Schedule
+) -> None:
+    link.publish(INFO, episode_info(paper), at_ns=0)
+    tick = m.Tick(tick=0, deadline_ns=0, decided_ns=0, late_ns=0, level=m.Level.HOLD)
+    for age_ns in (40_000_000, 90_000_000):
+        link.publish(TICK, replace(tick, picture_age_ns=(age_ns, -1)), at_ns=0)
+    assert value(metrics, "picture_age_seconds", camera="front") == 0.09
+    assert value(metrics, "picture_age_seconds", camera="wrist") == -1
 
 
 def test_an_episode_is_counted_as_its_messages_say(

@@ -111,6 +111,27 @@ def test_held_the_first_six_steps_count_as_by_the_official_server(
     assert next(disagreements(record), None) is None
 
 
+def test_the_horizon_of_a_schedule_is_pounce_s_own(
+    bench_with: Callable[..., Any], step_of: StepOf, tmp_path: Path
+) -> None:
+    plan = GatewayOptions(dialect="openpi")
+    bench = bench_with(plan.schedule(0, 16), out=tmp_path)
+    bench.rig.pounce_engine.spec = replace(bench.rig.pounce_engine.spec, horizon=16, control_hz=20)
+    play(bench, step_of, 20)
+    bench.tell(Finish())
+    (path,) = tmp_path.rglob("*.mcap")
+    record = read_log(path)
+    assert {(chunk.horizon, chunk.t_row0) for chunk in record.chunks} == {(16, 0), (16, 16)}
+    assert next(disagreements(record), None) is None
+
+
+def test_a_policy_of_another_rate_is_refused_by_name(bench_with: Callable[..., Any], step_of: StepOf) -> None:
+    bench = bench_with()
+    bench.rig.pounce_engine.spec = replace(bench.rig.pounce_engine.spec, control_hz=15)
+    with pytest.raises(Refused, match="POUNCE's rows are for 15 Hz, arm takes 20 commands a second"):
+        bench.ask(step_of(begins=True))
+
+
 def test_more_rows_than_a_chunk_has_are_refused_and_the_next_client_may_try(
     bench_with: Callable[..., Any], step_of: StepOf
 ) -> None:

@@ -47,6 +47,16 @@ def understood(asked: ClientRequest) -> Step:
     return asked.request
 
 
+def test_pictures_bring_their_instants_by_the_camera_s_name(
+    dialect: PonderpounceDialect, picture_of: PictureOf
+) -> None:
+    assert understood(dialect.read(observe(picture_of))).captured_ns == {}
+    assert understood(dialect.read(observe(picture_of, captured_ns={"wrist": -7}))).captured_ns == {"wrist": -7}
+    for odd in ([5], {"wrist": "now"}, {"front": 1 << 62}):
+        with pytest.raises(Refused, match=r"captured_ns|wrist|front"):
+            dialect.read(observe(picture_of, captured_ns=odd))
+
+
 @given(
     row=st.lists(st.floats(-3, 3, width=32), min_size=1, max_size=9),
     tick=st.integers(0, 10**6),
