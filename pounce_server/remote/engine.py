@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pounce_server.contract import EngineSpec, Progress, Request, check_request, no_progress
+from pounce_server.remote.dimensions import fitting_dims
 from pounce_server.remote.peer import Lost, Patience, Peer, PeerError
 from protocol.errors import EpisodeRefused
 from protocol.messages import EpisodeInfo, Refusal
@@ -38,6 +39,7 @@ class RemoteEngine:
         """
         self._peer, self._mapping, self._url, self._answer_s = peer, mapping, url, answer_s
         self._cameras = tuple(camera.camera for camera in mapping.cameras)
+        self._as_they_are: frozenset[int] = frozenset()
         try:
             facts = self._first_answer(start_s)
         except ValueError:
@@ -78,6 +80,7 @@ class RemoteEngine:
                 f"{self._mapping.name} maps the cameras {names}, the robot has {', '.join(robot.cameras) or 'none'}; "
                 "one that the policy does not read is written as {ignored = true}",
             )
+        self._as_they_are = fitting_dims(self._mapping, robot)
         self._cameras = robot.cameras
         try:
             self._peer.begin(Patience(self._answer_s))
@@ -110,7 +113,8 @@ class RemoteEngine:
         }  # fmt: skip
         values = request_of(self._mapping, frames, request.proprio, request.instruction, request.subgoal)
         try:
-            return rows_of(self._mapping, self._peer.infer(values, patience), request.proprio)
+            answer = self._peer.infer(values, patience)
+            return rows_of(self._mapping, answer, request.proprio, self._as_they_are)
         except (PeerError, OSError) as error:
             raise PeerError(self._sentence(error)) from error
 

@@ -7,7 +7,7 @@ Pure. A peer's values are a dict by `mapping.Key`; each wire nests or flattens t
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -66,8 +66,13 @@ def fitted(frame: Pixels, camera: Camera) -> Pixels:
     return np.ascontiguousarray(frame.transpose(2, 0, 1) if camera.layout == "chw" else frame)
 
 
-def rows_of(mapping: PolicyMapping, answer: Mapping[Key, Any], proprio_P: Floats) -> Floats:
-    """An answer's rows as absolute commands of ours, (N, A) float32.
+def rows_of(
+    mapping: PolicyMapping, answer: Mapping[Key, Any], proprio_P: Floats, as_they_are: Collection[int] = ()
+) -> Floats:
+    """An answer's rows as commands of ours, (N, A) float32.
+
+    Velocities, deltas and offsets become absolute targets, but in the commands ``as_they_are``, which the robot takes
+    as velocities or deltas itself.
 
     Raises:
         WrongAnswer: other arrays, shapes or rows than the mapping file says, or a number that is not finite.
@@ -77,12 +82,13 @@ def rows_of(mapping: PolicyMapping, answer: Mapping[Key, Any], proprio_P: Floats
     for each in mapping.actions:
         if each.kind == "ignored":
             continue
-        theirs = arrays[each.key][:, list(each.columns)] * each.scale + each.offset
+        theirs = absolute = arrays[each.key][:, list(each.columns)] * each.scale + each.offset
         if each.kind in ("velocity", "delta"):
-            theirs = np.cumsum(theirs / (mapping.rate_hz if each.kind == "velocity" else 1), axis=0)
+            absolute = np.cumsum(theirs / (mapping.rate_hz if each.kind == "velocity" else 1), axis=0)
         if each.measured:
-            theirs = theirs + proprio_P[list(each.measured)]
-        rows_HA[:, list(each.dims)] = theirs
+            absolute = absolute + proprio_P[list(each.measured)]
+        is_theirs = np.isin(each.dims, list(as_they_are))
+        rows_HA[:, list(each.dims)] = np.where(is_theirs, theirs, absolute)
     return _at_play_rate(mapping, rows_HA).astype(np.float32)
 
 
