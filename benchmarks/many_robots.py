@@ -31,7 +31,7 @@ from sim_client.gateway.seats import seat_names
 from sim_client.launch import Daemons, free_ports, start_local
 
 WAYS = {"in common batches": [], "one at a time": ["--max-batch-rows", "1"]}
-READY_S = 120.0
+READY_S = 300.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -27,7 +27,7 @@ from sim_client.launch import Daemons
 
 WAYS = ("without", "with shadows")
 SHADOWS = ("ponder", "pounce")
-READY_S = 120.0
+READY_S = 300.0
 TICKS_PER_S = 20
 
 
