@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 from typing import Any
@@ -104,6 +105,19 @@ def test_rows_of_another_rate_are_between_their_neighbours(rows: np.ndarray, rat
 def test_another_answer_is_never_rows(answer: dict[Key, Any], said: str) -> None:
     with pytest.raises(WrongAnswer, match=said):
         rows_of(mapping_of(), answer, np.zeros(3, np.float32))
+
+
+PLAIN = st.none() | st.booleans() | st.integers(-5, 5) | st.floats() | st.text(max_size=3) | st.binary(max_size=3)
+ARRAYS = hnp.arrays(st.sampled_from([np.float32, np.int64, np.bool_]), hnp.array_shapes(max_dims=3, max_side=5))
+ANYTHING = st.recursive(PLAIN | ARRAYS, lambda inner: st.lists(inner, max_size=4))
+
+
+@given(answer=st.dictionaries(st.sampled_from([ACTIONS, ("x",)]), ANYTHING))
+def test_whatever_a_policy_answers_is_finite_rows_or_is_refused(answer: dict[Key, Any]) -> None:
+    with contextlib.suppress(ValueError):
+        rows = rows_of(mapping_of(), answer, np.zeros(3, np.float32))
+        assert rows.shape == (4, 3)
+        assert np.isfinite(rows).all()
 
 
 @pytest.mark.parametrize(("fit", "black"), [("stretch", 0), ("pad", 4 * 8)])

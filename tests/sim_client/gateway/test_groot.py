@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import io
 import json
@@ -13,6 +14,8 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from protocol.messages import Level
 from protocol.peers.mapping import Camera, Numbers, PolicyMapping, Prompt
@@ -172,6 +175,23 @@ def test_what_is_not_served_is_refused_with_a_sentence(dialect: GrootDialect, re
     with pytest.raises(Refused, match=said) as refused:
         dialect.read(request_)
     assert unpacked(dialect.refuse(str(refused.value))) == {"error": str(refused.value)}
+
+
+PLAIN = st.none() | st.booleans() | st.integers(-5, 5) | st.floats() | st.text(max_size=3) | st.binary(max_size=3)
+NAMES = st.sampled_from(["observation", "video", "state", "language", "ego_view", "arm", "gripper", "video.ego_view"])
+ANYTHING = st.recursive(
+    PLAIN | st.just(PICTURE) | st.just(PICTURE[None, None]),
+    lambda inner: st.lists(inner, max_size=2) | st.dictionaries(NAMES | st.integers(0, 2), inner, max_size=4),
+    max_leaves=8,
+)
+
+
+@given(data=ANYTHING, is_flat=st.booleans(), endpoint=st.sampled_from(["get_action", "reset", "ping"]))
+def test_whatever_a_client_sends_is_a_step_or_is_refused(terms: Terms, data: Any, is_flat: bool, endpoint: str) -> None:
+    dialect = (GrootN15Dialect if is_flat else GrootDialect)(terms)
+    for packet in (packed(endpoint, data), msgpack.packb(data, default=spelled)):
+        with contextlib.suppress(Refused):
+            dialect.read(packet)
 
 
 def test_a_token_is_wanted_where_there_is_one(terms: Terms) -> None:
