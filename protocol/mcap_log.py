@@ -160,6 +160,10 @@ class EpisodeLog:
         except queue.Full:
             self._overflowed[topic.name] += 1
 
+    def miss(self, topic: Topic[T], count: int) -> None:
+        """Counts messages that never came here as dropped."""
+        self._overflowed[topic.name] += count
+
     def close(self, result: m.EpisodeResult | None = None) -> Closing:
         """Finishes and renames the file, and reports losses. Closing again returns the same answer.
 

@@ -87,6 +87,7 @@ class RobotSide:
                     continue
                 heard_ns = time.monotonic_ns()
                 snapshot = self._obey(info, action)
+                self.recorder.step()  # each time: many commands may wait, and it keeps few observations
                 on_tick(self._tick)
                 if snapshot.status is not Status.ONGOING:
                     return Outcome(status=status_of(snapshot), reason=snapshot.reason, num_ticks=self._tick)

@@ -36,6 +36,7 @@ class Recorder:
         ]  # what follows from others comes first: whatever arrives between two drains, the log has its cause
         self._log: EpisodeLog | None = None
         self._unrecorded = ""
+        self._superseded: dict[str, int] = {}
         self.ticks: list[m.Tick] = []
         self.stamps: list[m.Stamp] = []
         self.invocations: list[m.Invocation] = []
@@ -47,6 +48,7 @@ class Recorder:
         """
         self.ticks, self.stamps, self.invocations = [], [], []
         self._log, self._unrecorded = None, ""
+        self._superseded = {topic.name: stream.subscription.num_superseded for topic, stream in self._streams}
         waits = info.schedule.mode == m.Mode.LOCKSTEP  # there the world has time, and a log with gaps is no proof
         if path is not None:
             try:
@@ -78,6 +80,9 @@ class Recorder:
         if self._log is not None:
             self._link.publish(RESULT, result, at_ns=max((t.decided_ns for t in self.ticks), default=0))
             self.step()
+            for topic, stream in self._streams:
+                if lost := stream.subscription.num_superseded - self._superseded[topic.name]:
+                    self._log.miss(topic, lost)
             closing = self._log.close(result)
             self._log = None
             if closing.error:

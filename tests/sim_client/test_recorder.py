@@ -14,10 +14,26 @@ from protocol import messages as m
 from protocol.bus import LocalBus
 from protocol.link import Link, Stream
 from protocol.mcap_log import read_log
-from protocol.topics import ACTION, TICK
-from sim_client.recorder import Recorder
+from protocol.topics import ACTION, SUBGOAL, TICK
+from sim_client.recorder import KEEP, Recorder
 
 COMMAND = np.zeros(3, np.float32)
+
+
+def test_what_newer_messages_pushed_out_unread_is_told_in_the_log(
+    episode_info: Callable[..., m.EpisodeInfo], tmp_path: Path
+) -> None:
+    bus = LocalBus()
+    info = episode_info(schedules.realtime())
+    sim = Link(bus, robot=info.header.robot, proc="sim")
+    sim.enter_episode(info.header.session, info.header.episode, info.header.epoch)
+    recorder = Recorder(sim, "jpeg")
+    recorder.begin(info, tmp_path / "episode.mcap")
+    for tick in range(KEEP + 3):
+        sim.publish(SUBGOAL, m.Subgoal(kind=m.SubgoalKind.TASK_SIMPLE, text="", tick=tick), at_ns=tick)
+    result = m.EpisodeResult(status=m.TaskStatus.TIMEOUT, is_success=False, reason="", num_ticks=0)
+    assert any("'subgoal': 3" in sentence for sentence in recorder.end(result))
+    assert read_log(tmp_path / "episode.mcap").metadata["ponderpounce.result"]["dropped_messages"] == "3"
 
 
 def test_a_tick_in_the_log_has_its_action_whenever_they_arrive(
