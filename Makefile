@@ -11,7 +11,7 @@ export MUJOCO_GL ?= egl
 export OMP_NUM_THREADS ?= 1
 
 # `make help` lists the rest.
-.PHONY: help setup demo test unit oldest peers accept soak lint types proto bench clean
+.PHONY: help setup demo test unit oldest peers accept soak images lint types proto bench clean
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
 
@@ -89,6 +89,10 @@ accept: setup
 ## make soak    a million mutated messages, in lockstep and in real time (about half an hour)
 soak: setup
 	$(BIN)/python -m benchmarks.fuzz
+
+## make images  builds the four container images and plays an episode with them (root, buildah)
+images: setup
+	$(BIN)/python -m benchmarks.images
 
 ## make lint    style, types, import contracts
 lint: setup
