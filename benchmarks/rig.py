@@ -97,7 +97,7 @@ class Rig:
 
     def endpoint(self, name: str) -> str:
         """Where a daemon listens."""
-        return self._endpoints[name]
+        return self._reached[name]
 
     def restart(self, name: str) -> None:
         """Starts a daemon, for instance a killed one, at its endpoint."""

@@ -7,6 +7,7 @@ bootstrap over whole seconds: ticks of one second are late together.
 
 from __future__ import annotations
 
+import json
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -95,9 +96,8 @@ def _block(rig: Rig, way: str, options: LatenessOptions, out: Path) -> Block:
             player = rig.play(arguments, folder)
             rig.listen(lambda player=player: player.poll() is not None, left / TICKS_PER_S + READY_S)  # type: ignore[misc]
             if len(rig.ticks()) <= options.warm_up_ticks:
-                raise RuntimeError(
-                    f"block {out.name}: the episode never ran: {(folder / 'sim.log').read_text()[-500:]}"
-                )
+                why = [each["reason"] for path in folder.glob("results.json") for each in _episodes(path)]
+                raise RuntimeError(f"block {out.name}: the episode never ran: {', '.join(why) or 'see sim.log'}")
             ticks += rig.ticks()[options.warm_up_ticks :]
             records = [read_log(path) for path in folder.rglob("*.mcap")]
             num_answers += sum(len(each.shadow_cognitions) + len(each.shadow_chunks) for each in records)
@@ -108,6 +108,10 @@ def _block(rig: Rig, way: str, options: LatenessOptions, out: Path) -> Block:
     late_ms = np.array([tick.late_ns / 1e6 for tick in counted if tick.level != m.Level.SKIPPED])
     skipped = len(counted) - len(late_ms)
     return Block(late_ms=late_ms, starved=num_starved(counted), skipped=skipped, shadow_answers=num_answers)
+
+
+def _episodes(results: Path) -> list[dict[str, str]]:
+    return json.loads(results.read_text())["episodes"]  # type: ignore[no-any-return]
 
 
 @contextmanager
