@@ -26,6 +26,7 @@ from PIL import Image
 from dual_system.data.errors import DatasetError
 from dual_system.data.lerobot_v3 import DATA_PATH, INFO_PATH, VERSION, VIDEO_PATH
 from dual_system.data.video import read_frames, read_header
+from dual_system.hub import local_folder
 from protocol.files import read_object, require_file
 
 EPISODES_GLOB = "meta/episodes/chunk-*/file-*.parquet"
@@ -61,7 +62,7 @@ class LeRobotFolder:
     """
 
     def __init__(self, root: Path) -> None:
-        self.root = root
+        self.root = root = local_folder(root, "dataset")
         if not (root / INFO_PATH).exists():
             raise DatasetError(f"{root} holds no dataset (no {INFO_PATH}); pp-collect makes one")
         with reading(root / INFO_PATH):

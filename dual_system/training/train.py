@@ -35,6 +35,7 @@ from dual_system.training.collate import collate_ponder, collate_pounce
 from dual_system.training.data import PictureSizes, TrainingSet
 from dual_system.training.example import make_example
 from dual_system.training.joint import JointModel, PonderBatch, PounceBatch
+from dual_system.training.memory import memory_of, require_room, sentence
 from dual_system.training.parallel import World, gather, joined, require_alike, shard
 from dual_system.training.prefetch import Prefetcher
 from dual_system.training.recipe import Recipe
@@ -220,6 +221,10 @@ def train(options: TrainOptions) -> None:
                 f"least 1 of each, and together at most {share}, the episodes that every process has of a batch"
             )
         model, bundle = build(run, data, options.start)
+        needed = memory_of(model, run.train.optim, world.size if machine.weights == "sharded" else 1)
+        if world.is_first:
+            sys.stderr.write(f"pp-train: {run.name} needs {sentence(needed, world.size)}\n")
+        require_room(needed, world.size, torch.device(machine.device))
         _prepare(model, machine, world)
         data = TrainingSet(
             *options.data,

@@ -22,6 +22,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from transformers.models.qwen3_5 import Qwen3_5Config
 
+from dual_system.hub import local_folder
 from dual_system.models.config_json import from_json
 from dual_system.models.ponder.context import ContextFormat, OpeningForm
 from dual_system.models.ponder.demo_sampling import PAPER_SAMPLING, DemoSampling
@@ -68,13 +69,14 @@ class StoredPonder:
 
 
 def load_ponder(directory: Path, *, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Ponder:
-    """Reads a checkpoint folder.
+    """Reads a checkpoint folder, ours or the hub's (`local_folder`).
 
     Raises:
         OSError: a file is missing or may not be read.
         CheckpointError: tensors are missing, unknown, misshapen, quantised or not finite; the message names them.
         ValueError: a file is broken or a Git LFS pointer, or the configuration is inconsistent.
     """
+    directory = local_folder(directory)
     config_path = directory / CONFIG_NAME
     if not config_path.exists() and not config_path.is_symlink():
         raise FileNotFoundError(f"{config_path}: not a checkpoint folder (--checkpoint DIR needs config.json).")

@@ -12,6 +12,7 @@ from typing import Any, Final, Literal, TypeAlias
 
 import torch
 
+from dual_system.hub import local_folder
 from dual_system.models.config_json import deviations, from_json
 from dual_system.models.groot.folder import groot_config_of
 from dual_system.models.groot.pounce import GrootPounceConfig
@@ -163,7 +164,7 @@ def save_bundle(bundle: PounceBundle, folder: Path) -> None:
 
 def declares_config(folder: Path) -> bool:
     """Whether a folder's config.json is in our format; a public folder's is not."""
-    return _read_config(folder / CONFIG_FILE)[1] is not None
+    return _read_config(local_folder(folder) / CONFIG_FILE)[1] is not None
 
 
 def load_bundle(
@@ -176,8 +177,8 @@ def load_bundle(
 ) -> PounceBundle:
     """Reads our own folder, or a public one; the latter's statistics are its own, or else RoboMME's, and are logged.
 
-    Public folders: openpi's pi0.5 (PyTorch, or JAX in ``params/``) and lerobot's; NVIDIA's GR00T N1.5, in shards or
-    not, and lerobot's ``groot``.
+    Either may be on the hub (`local_folder`). Public folders: openpi's pi0.5 (PyTorch, or JAX in ``params/``) and
+    lerobot's; NVIDIA's GR00T N1.5, in shards or not, and lerobot's ``groot``.
 
     Args:
         config: for a public folder; default that of `public_config`.
@@ -191,6 +192,7 @@ def load_bundle(
         ValueError: a file is broken or a Git LFS pointer, a public folder's statistics are not of this robot, or
             ``config`` or ``statistics`` is given although the folder has its own.
     """
+    folder = local_folder(folder)
     is_jax = (folder / JAX_FOLDER / METADATA_FILE).is_file()
     tensors = None if is_jax else StoredTensors.of(folder / WEIGHTS_FILE)
     values, stored = _read_config(folder / CONFIG_FILE)
@@ -235,6 +237,7 @@ def public_config(folder: Path) -> AnyPounceConfig:
 
     Raises: as `load_bundle`.
     """
+    folder = local_folder(folder)
     is_jax = (folder / JAX_FOLDER / METADATA_FILE).is_file()
     values, _ = _read_config(folder / CONFIG_FILE)
     return _public_config(None if is_jax else StoredTensors.of(folder / WEIGHTS_FILE), values, folder)

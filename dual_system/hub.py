@@ -1,0 +1,47 @@
+"""Folders on the Hugging Face hub, wherever a folder is asked for: ``hf:ORG/NAME`` or ``hf:ORG/NAME@REVISION``.
+
+The prefix is asked for because a mistyped path must not become the download of a stranger's policy. What was fetched
+once is found without a network (HF_HUB_OFFLINE=1), in the hub's own cache, whose files are symbolic links.
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+from pathlib import Path
+from typing import Any, Literal
+
+_ID = re.compile(r"hf:/*(?P<repo>[\w.-]+/[\w.-]+)(@(?P<revision>[\w./-]+))?")
+_FILES = {
+    "model": ["*.json", "*.safetensors", "*.model", "params/**", "assets/**", "experiment_cfg/**"],
+    "dataset": ["meta/**", "data/**", "videos/**"],
+}
+"""What a loader may read: no pickles, and no second copy of the weights in another format."""
+
+
+def local_folder(path: Path, kind: Literal["model", "dataset"] = "model") -> Path:
+    """Returns ``path``, or the snapshot of the hub's repository that it names.
+
+    Raises:
+        ValueError: the id has another form, or the hub's client is not installed.
+        FileNotFoundError: the hub does not give it.
+    """
+    if not str(path).startswith("hf:"):
+        return path
+    named = _ID.fullmatch(str(path))
+    if named is None:
+        raise ValueError(f"{path}: expected hf:ORG/NAME or hf:ORG/NAME@REVISION")
+    try:
+        hub: Any = importlib.import_module("huggingface_hub")
+    except ImportError:
+        raise ValueError(
+            f"{path}: fetching needs the hub's client: pip install huggingface_hub (extra `hub`)"
+        ) from None
+    try:
+        found = hub.snapshot_download(
+            named["repo"], repo_type=kind, revision=named["revision"], allow_patterns=_FILES[kind]
+        )
+    except (OSError, ValueError, RuntimeError) as error:  # its errors are these: no network, no such id, no access
+        told = " ".join(str(error).split())[:300]
+        raise FileNotFoundError(f"{path}: the Hugging Face hub did not give it: {told}") from error
+    return Path(found)
