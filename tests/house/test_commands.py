@@ -21,6 +21,7 @@ ENTRIES = {
     "pp-export": commands.export,
     "pp-parity": commands.parity,
     "pp-diagnose": commands.diagnose,
+    "pp-replay": commands.replay,
 }
 VERBS = [(name, verb) for name, command in COMMANDS.items() for verb in command.verbs]
 

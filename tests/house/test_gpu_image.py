@@ -13,6 +13,8 @@ NEED_THEM = (
     "inspect_folder",
 )  # fmt: skip
 """Command lines and daemons: the last part of their modules' names."""
+NETWORKED = ("ponder_server.chat", "pounce_server.remote")
+"""Rooms that ask other programs, and need no GPU."""
 SCRIPT = f"""
 import importlib, importlib.util, pkgutil, sys
 from pathlib import Path
@@ -21,7 +23,7 @@ for name in {LACKING}:
 import benchmarks.gpu_day, dual_system.models, ponder_server, pounce_server
 for room in (dual_system.models, ponder_server, pounce_server):
     for module in pkgutil.walk_packages(room.__path__, room.__name__ + "."):
-        if module.name.rsplit(".", 1)[-1] not in {NEED_THEM}:
+        if module.name.rsplit(".", 1)[-1] not in {NEED_THEM} and not module.name.startswith({NETWORKED}):
             importlib.import_module(module.name)
 for path in Path("tests").rglob("test_*.py"):
     if "@pytest.mark.gpu\\n" in path.read_text() and path.parent.name != "house":
