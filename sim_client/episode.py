@@ -19,7 +19,7 @@ from dual_system.tasks.environment import Environment, Snapshot
 from protocol import images
 from protocol import messages as m
 from protocol.drops import DropReason
-from protocol.link import Link
+from protocol.link import Link, Stream
 from protocol.topics import ACTION, EVENT, OBSERVATION, PHASE, SUBGOAL, TICK
 from sim_client.recorder import Recorder
 from sim_client.robot import observation, status_of
@@ -57,6 +57,8 @@ class RobotSide:
     """Runs one episode with the publisher of actions. A tick for which ``looks`` is False is not rendered."""
 
     link: Link
+    actions: Stream[m.Action]
+    """The link's subscription, one for all episodes: each is a thread of the bus."""
     environment: Environment
     recorder: Recorder
     let_others: Others
@@ -72,7 +74,7 @@ class RobotSide:
 
     def run(self, info: m.EpisodeInfo, first: Snapshot, on_tick: Callable[[int], None]) -> Outcome:
         """Plays until the task ends, or the servers do."""
-        actions = self.link.subscribe(ACTION)
+        self.actions.drain()  # of the last episode
         snapshot = first
         self._begin(info)
         self._show(snapshot, 0)
@@ -80,7 +82,7 @@ class RobotSide:
         heard_ns = time.monotonic_ns()
         while True:
             self.recorder.step()
-            for action in actions.drain():
+            for action in self.actions.drain():
                 if not self.link.is_from(action.header, "clock") or action.tick < self._tick:
                     continue
                 if not is_sound(self.link, action, self._obeyed, snapshot.state):

@@ -23,6 +23,7 @@ from protocol import messages as m
 from protocol.command_line import flat
 from protocol.errors import EpisodeRefused, TransportError
 from protocol.link import Link
+from protocol.topics import ACTION
 from protocol.version import DISTRIBUTION, version
 from sim_client.config import SimOptions
 from sim_client.episode import Outcome, RobotSide, play_oracle
@@ -52,6 +53,7 @@ class Suite:
     ) -> None:
         self._options = options
         self._link = link
+        self._actions = link.subscribe(ACTION)
         self._recorder = Recorder(link, options.log.pixels)
         self._patience_ns = round(options.servers.patience_s * 1e9)
         self._end = RobotEnd(link, clock, self._recorder, patience_ns=self._patience_ns, dead_server=dead_server)
@@ -108,7 +110,9 @@ class Suite:
         horizon, why_not = self._horizon()
         info = self._info(environment, first, task, seed, run, horizon)
         path = self._log_path(info) if self._options.log.record else None
-        side = RobotSide(self._link, environment, self._recorder, self._end.take_turn, self._patience_ns, self._looks)
+        side = RobotSide(
+            self._link, self._actions, environment, self._recorder, self._end.take_turn, self._patience_ns, self._looks
+        )
         opened = m.OpenReply()
         self._recorder.begin(info, path)
         if info.policy == "oracle":

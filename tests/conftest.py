@@ -36,7 +36,7 @@ from protocol import messages as m
 from protocol.bus import LocalBus
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
-from protocol.topics import OBSERVATION
+from protocol.topics import ACTION, OBSERVATION
 from sim_client.episode import Outcome, RobotSide, always
 
 hypothesis.settings.register_profile("house", deadline=None, max_examples=30)  # a deadline reads the wall clock
@@ -246,6 +246,7 @@ class Rig:
     def __post_init__(self) -> None:
         self.links = {proc: Link(self.bus, robot=ROBOT, proc=proc) for proc in ("clock", "ponder", "pounce", "sim")}
         self.listener = Link(self.bus, robot=ROBOT, proc="listener")
+        self.actions = self.links["sim"].subscribe(ACTION)
         self.clock = ClockService(self.links["clock"], self.config)
         self.ponder = self.start_ponder(self.links["ponder"], self.ponder_engine)
         self.pounce = self.start_pounce(self.links["pounce"], self.pounce_engine)
@@ -304,7 +305,8 @@ class Rig:
             self.meanwhile()
             self.bus.run_participants()
 
-        side = RobotSide(self.links["sim"], world, NoRecorder(), let_others, self.patience_ns, looks)  # type: ignore[arg-type]
+        link, patience_ns = self.links["sim"], self.patience_ns
+        side = RobotSide(link, self.actions, world, NoRecorder(), let_others, patience_ns, looks)  # type: ignore[arg-type]
         outcome = side.run(info, world.look(), lambda tick: None)
         self.settle()
         return outcome, world

@@ -42,7 +42,8 @@ class Robot:
         def let_others(longest_ns: int) -> None:
             self._now_ns += next(coming, lambda: 20 * MS)()
 
-        side = RobotSide(self.robot, self._world, self._recorder, let_others, 10**10)  # type: ignore[arg-type]
+        actions = self.robot.subscribe(topics.ACTION)
+        side = RobotSide(self.robot, actions, self._world, self._recorder, let_others, 10**10)  # type: ignore[arg-type]
         return side.run(self._info, self._world.look(), lambda tick: None)
 
 

@@ -126,6 +126,7 @@ def test_an_episode_without_a_ponder_asks_for_no_demonstration(tmp_path: Path) -
     options = SimOptions(
         task="VideoUnmask",
         seed=3,
+        episodes=2,
         in_process=True,
         ponder="none",
         out=tmp_path,
@@ -133,7 +134,11 @@ def test_an_episode_without_a_ponder_asks_for_no_demonstration(tmp_path: Path) -
     )
     with Daemons(tmp_path) as daemons:
         harness = open_harness(options, daemons)
-        episode = Suite(options, harness.link, harness.clock, lambda: "").run()["episodes"][0]
+        assert isinstance(harness.link.bus, LocalBus)
+        subscriptions, counts = harness.link.bus._subscriptions, set[int]()
+        suite = Suite(options, harness.link, harness.clock, lambda: "")
+        episode = suite.run(lambda index, tick: counts.add(len(subscriptions)))["episodes"][0]
+    assert len(counts) == 1, "an episode subscribes to nothing anew: each subscription is a thread of the bus for good"
     assert (set(episode["models"]), episode["steps"]) == ({"pounce"}, 5)
     record = read_log(tmp_path / episode["mcap"])
     assert (record.info.policy, record.info.has_demo) == ("pounce", False)
