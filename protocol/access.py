@@ -48,7 +48,7 @@ _CALLS: dict[str, tuple[tuple[str, Call], ...]] = {
     "pounce-shadow": (("clock", topics.ACTIVE),),
     "robot": (
         *(("clock", call) for call in (topics.OPEN, topics.CLOSE, topics.TIME, topics.ENGAGE)),
-        ("ponder", topics.CONTRACT),
+        *((proc, topics.CONTRACT) for proc in ("ponder", "pounce")),
     ),
 }
 

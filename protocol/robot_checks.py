@@ -14,6 +14,7 @@ from protocol.messages import AtExit, AtStop, Dimension, DimensionKind, Robot
 
 MIN_CONTROL_HZ, MAX_CONTROL_HZ = 5, 100
 _MAX_TEXT = 128
+_MAX_PICTURE_NS = 3600 * 10**9
 
 AT_STOP = {
     DimensionKind.POSITION: (AtStop.HOLD, AtStop.MEASURED),
@@ -29,8 +30,8 @@ def faults(robot: Robot) -> Iterator[tuple[str, str, object]]:
     if robot.control_hz and not MIN_CONTROL_HZ <= robot.control_hz <= MAX_CONTROL_HZ:
         yield "control_hz", f"{MIN_CONTROL_HZ} to {MAX_CONTROL_HZ}", robot.control_hz
     for name in ("max_picture_age_ns", "max_picture_skew_ns", "max_picture_still_ns"):
-        if getattr(robot, name) < 0:
-            yield name, "0 or more", getattr(robot, name)
+        if not 0 <= getattr(robot, name) <= _MAX_PICTURE_NS:
+            yield name, "0 to an hour", getattr(robot, name)
     yield from _home(robot)
     if not robot.dimensions:
         return

@@ -119,10 +119,11 @@ def test_every_topic_is_somebodys() -> None:
     said = {
         key for rule in rules if "put" in rule["messages"] and rule["flows"] == ["ingress"] for key in rule["key_exprs"]
     }
+    models = ("ponder", "pounce", *topics.SHADOW_OF)
     assert said == {
         topics.stream_key(topic, "*", "*", proc)
         for topic in topics.STREAMS
-        for proc in (("clock", "ponder", "pounce", "sim") if topic is topics.PHASE else ("ponder", "pounce"))
+        for proc in (("clock", "sim", *models) if topic is topics.PHASE else models)
     }
 
 

@@ -25,7 +25,6 @@ from dual_system.training.example import Example, ExampleConfig, make_example, s
 from dual_system.training.joint import Draws, JointModel
 from pounce_server.contract import Request, example_request
 from pounce_server.engine import EagerEngine
-from protocol import messages as m
 
 PONDER = Ponder.random(replace(tiny_ponder(), image_px=(64, 64), num_layers=4), seed=1)
 POUNCE = replace(tiny_cpu(num_carriers=0, horizon=6), reads_subgoal=True)
@@ -135,13 +134,3 @@ def test_an_engine_acts_on_the_text_and_another_refuses_it() -> None:
     plain = EagerEngine(random_bundle(replace(POUNCE, reads_subgoal=False), seed=0))
     with pytest.raises(ValueError, match="reads no subgoals, came 'pick'"):
         plain.invoke(replace(request, subgoal="pick"))
-
-
-def test_the_servers_protocol_brings_no_text_and_says_so_before_motion(
-    new_rig: Any, episode_info: Any, robot_with: Any, paper: m.Schedule
-) -> None:
-    rig = new_rig(pounce_engine=EagerEngine(random_bundle(replace(POUNCE, pi05=tiny_cpu().pi05), seed=0)))
-    low, high, step = (np.full(8, value, np.float32) for value in (-3, 3, 0.2))
-    robot = robot_with(command_low=low, command_high=high, max_step=step, initial_command=0 * low, num_proprio=8)
-    reply = rig.open(episode_info(paper, robot=robot))
-    assert "reads PONDER's subgoals in place of cognition" in reply.error
