@@ -78,6 +78,8 @@ class _Drive:
         self._sent: np.ndarray | None = None
         self._trouble: tuple[str, str] | None = None
         self._start: Any = None
+        step = np.asarray(client.welcome["robot"]["max_step"], np.float32) * np.float32(settings.speed)
+        self._step = np.where(step > 0, step, np.float32(np.inf))
 
     def run(self, ask: Callable[[str], str]) -> str:
         settings, client = self._settings, self._client
@@ -161,11 +163,14 @@ class _Drive:
             self._trouble = None
 
     def _send(self, command: Command) -> None:
-        if self._settings.is_dry:
-            return
+        if self._settings.is_dry or self._watchdog.has_fired or time.monotonic_ns() > command.expires_ns:
+            return  # a program that stood still has an old command in its hand
+        values = command.values
+        if self._sent is not None:  # a tick may have been left out: two steps at once are none that the limits allow
+            values = self._sent + np.clip(values - self._sent, -self._step, self._step)
         self._watchdog.feed(command.expires_ns)  # first: the driver may hang
-        self._robot.obey(command.values, command.expires_ns)
-        self._sent = command.values
+        self._robot.obey(values, command.expires_ns)
+        self._sent = values
 
     def _leave(self, is_orderly: bool) -> None:
         """What --at-exit says. A robot that was stopped, or lost its gateway, is not parked."""
@@ -183,18 +188,17 @@ class _Drive:
     def _park(self, sent: np.ndarray) -> None:
         """At most a step per tick to the home of the robot's file, or to where the program found the robot."""
         robot = self._client.welcome["robot"]
-        step = np.asarray(robot["max_step"], np.float32) * np.float32(self._settings.speed)
         home = np.asarray(robot.get("home") or [], np.float32)
         target = sent.copy()
         wanted = home if len(home) == len(sent) else self._start[: len(sent)]
         target[: len(wanted)] = wanted
-        target = np.where(step > 0, target, sent)  # a gripper stays as it is
+        target = np.where(np.isfinite(self._step), target, sent)  # a gripper stays as it is
         period_ns = self._client.period_ns
         while np.abs(target - sent).max() > 1e-6:
             if self._robot.observe().robot_state != "ok" or self._watchdog.has_fired:
                 self._say("parking ended: the robot was stopped")
                 return
-            sent = (sent + np.clip(target - sent, -step, step)).astype(np.float32)
+            sent = (sent + np.clip(target - sent, -self._step, self._step)).astype(np.float32)
             expires_ns = time.monotonic_ns() + 3 * period_ns
             self._watchdog.feed(expires_ns)
             self._robot.obey(sent, expires_ns)
@@ -206,7 +210,7 @@ def _row(values: Any) -> str:
 
 
 def main(
-    new_robot: Callable[[], Robot],
+    new_robot: Callable[[dict[str, Any]], Robot],
     stop: Callable[..., Any],
     stop_arguments: tuple[Any, ...] = (),
     argv: list[str] | None = None,
@@ -215,7 +219,7 @@ def main(
     """The command line of a robot's program; returns its exit code.
 
     Args:
-        new_robot: connects to the robot.
+        new_robot: connects to the robot, and is given the cameras of ``--camera`` by name.
         stop: stops it, called in the watchdog's process with ``stop_arguments``.
     """
     parser = argparse.ArgumentParser(description=description)
@@ -228,6 +232,11 @@ def main(
     parser.add_argument("--yes", action="store_true", help="do not ask before the first row")
     parser.add_argument("--at-exit", choices=("hold", "park", "release"), default="hold", help="how to leave the robot")
     parser.add_argument("--max-s", type=float, help="longest time in seconds")
+    parser.add_argument(
+        "--camera", action="append", default=[], metavar="NAME=SOURCE",
+        help="device number, file or rtsp:// address of a camera; repeat it for each",
+    )  # fmt: skip
+    parser.add_argument("--camera-px", type=int, default=256, help="side of the squares that pictures are resized to")
     said = parser.parse_args(argv)
     if not 0.1 <= said.speed <= 1:
         parser.error(f"--speed {said.speed:g}: expected 0.1 to 1")
@@ -242,14 +251,27 @@ def main(
     watchdog = Watchdog(stop, *stop_arguments)
     try:
         with Client(said.url, key) as client:
-            why = drive(new_robot(), client, settings, watchdog)
-    except (Lost, Refused) as error:
+            why = drive(new_robot(_cameras(said.camera, said.camera_px)), client, settings, watchdog)
+    except (Lost, Refused, OSError, ValueError, ImportError) as error:
         why = str(error)
     finally:
         watchdog.close()
     if why:
         sys.stderr.write(f"{why}\n")
     return 1 if why else 0
+
+
+def _cameras(pairs: list[str], side_px: int) -> dict[str, Any]:
+    """Raises OSError or ValueError."""
+    found = {}
+    for pair in pairs:
+        from ponderpounce_client.cameras import Camera  # OpenCV is needed here alone
+
+        name, _, source = pair.partition("=")
+        if not name or not source:
+            raise ValueError(f"--camera {pair}: expected NAME=SOURCE, e.g. front=0")
+        found[name] = Camera(int(source) if source.isdecimal() else source, (side_px, side_px))
+    return found
 
 
 def _interrupted(number: int, frame: Any) -> None:

@@ -27,6 +27,7 @@ from protocol.messages import Health, ServingState
 from protocol.metrics import End, Metrics
 from protocol.options import LinkOptions
 from protocol.process import StopFlag
+from protocol.sockets import endpoint
 from protocol.status import status_of
 from protocol.version import version
 from protocol.zenoh_bus import open_bus
@@ -79,8 +80,21 @@ def _seats(options: GatewayOptions, daemons: Daemons, metrics: Metrics) -> Itera
             ponder_checkpoint=options.ponder_checkpoint,
             pounce_checkpoint=options.pounce_checkpoint,
         )
+        if options.runs_clock_daemon:
+            log.info("to let a stopped robot move again: pp-engage --link.connect %s", link.connect[0])
     with ExitStack() as opened:
+        if options.watch is not None:
+            # Not among the servers: an episode goes on without a page.
+            link = _watched(opened.enter_context(Daemons(options.out)), link, options.watch)
         yield Seats([_machine(options, replace(link, robot=robot), daemons, metrics, opened) for robot in robots])
+
+
+def _watched(daemons: Daemons, link: LinkOptions, listen: str) -> LinkOptions:
+    """Starts a page for the robot of ``link``; returns how to reach it as well."""
+    at_viewer = endpoint("viewer", daemons.sockets())
+    arguments = ["--listen", listen, "--link.robot", link.robot, "--link.listen", at_viewer]
+    daemons.start("watch", "sim_client.watch", [*arguments, "--link.connect", *link.connect])
+    return replace(link, connect=(*link.connect, at_viewer))
 
 
 def _machine(

@@ -151,6 +151,8 @@ class GatewayOptions:
     """POUNCE's checkpoint, with --local. None: random weights."""
     seats: int = 1
     """Number of robots, hence of clients at a time. Their names are --link.robot, and that with -1, -2 and so on."""
+    watch: str | None = None
+    """HOST:PORT of a page with the live status of --link.robot, by a pp-watch of its own. None: no page."""
     out: Path = Path("out")
     """Folder for one MCAP per episode."""
     clients: tyro.conf.OmitArgPrefixes[ClientsOptions] = field(default_factory=ClientsOptions)

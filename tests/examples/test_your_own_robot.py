@@ -1,0 +1,218 @@
+"""The example's robot is stopped by its own watchdog, whoever of ours is killed or frozen, and nothing snaps back.
+
+The real gateway with a clock service and the shipped pair, a fake arm in a process of its own, and the example itself.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from ponderpounce_client.fake_arm import FakeArm
+
+from clock.check import disagreements
+from protocol.mcap_log import read_log
+from protocol.messages import Robot
+from sim_client.gateway.body import PANDA
+from sim_client.launch import free_ports
+
+pytestmark = [pytest.mark.e2e, pytest.mark.realtime, pytest.mark.slow]
+
+ROOT = Path(__file__).parents[2]
+SMALL = ROOT / "checkpoints" / "small"
+EXAMPLE = ROOT / "examples" / "06_your_own_robot.py"
+REACTION_S = 0.6
+"""A command expires three ticks (150 ms) after its deadline; the rest is for machines with other work."""
+STEP_RAD = 2.61 / 20 + 1e-4
+ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "client"), str(ROOT)]), "OMP_NUM_THREADS": "1"}
+
+
+def eventually(what: Callable[[], Any], why: str, longest_s: float = 150.0) -> Any:
+    """Waits for another process."""
+    until_s = time.monotonic() + longest_s
+    while not (found := what()):
+        assert time.monotonic() < until_s, why
+        time.sleep(0.02)
+    return found
+
+
+def described(panda: Robot) -> str:
+    """The file of a Panda that is not simulated."""
+    limits = ("command_low", "command_high", "max_step", "max_lead", "state_low", "state_high")
+    lines = [f"{name} = {getattr(panda, name).tolist()}" for name in limits]
+    cameras, num_proprio = list(panda.cameras), panda.num_proprio
+    lines += [f"cameras = {cameras}", f"num_proprio = {num_proprio}", 'name = "arm"', "is_simulated = false"]
+    return "\n".join(lines)
+
+
+class Bench:
+    """The arm, the gateway and the example, each a process. ``arm`` is a person's hand on the robot."""
+
+    def __init__(self, folder: Path) -> None:
+        self.out = folder
+        self._files: list[Any] = []
+        self._processes: list[subprocess.Popen[bytes]] = []
+        self.address, self.port = (f"127.0.0.1:{port}" for port in free_ports(2))
+        self.arm = FakeArm(self.address)
+
+    def start(self) -> None:
+        self._start("arm", "-m", "ponderpounce_client.fake_arm", self.address)
+        eventually(self._answers, "the arm does not answer")
+        robot_file = self.out / "robot.toml"
+        robot_file.write_text(described(PANDA.example()))
+        self.gateway = self._start(
+            "gateway", "-m", "sim_client.gateway", "--dialect", "ponderpounce", "--local", "--out", str(self.out),
+            "--robot-file", str(robot_file), "--listen", self.port, "--ponder-checkpoint", str(SMALL / "ponder"),
+            "--pounce-checkpoint", str(SMALL / "pounce"),
+        )  # fmt: skip
+        eventually(lambda: " ready " in self.said("gateway"), "the gateway is not ready")
+
+    def _start(self, name: str, *arguments: str, **options: Any) -> subprocess.Popen[bytes]:
+        file = (self.out / f"{name}.txt").open("wb")
+        self._files.append(file)
+        environment = ENVIRONMENT | {"ROBOT": self.address, "PYTHONUNBUFFERED": "1"}
+        command = [sys.executable, *arguments]
+        self._processes.append(subprocess.Popen(command, stdout=file, stderr=file, env=environment, **options))
+        return self._processes[-1]
+
+    def _answers(self) -> bool:
+        try:
+            return bool(self.arm.call("read"))
+        except OSError:
+            return False
+
+    def said(self, name: str) -> str:
+        return (self.out / f"{name}.txt").read_text()
+
+    def program(self, *arguments: str, **options: Any) -> subprocess.Popen[bytes]:
+        self.arm.call("reset")
+        begin = ["--url", f"ws://{self.port}", "--instruction", "pick the highlighted cube", *arguments]
+        return self._start("program", str(EXAMPLE), *begin, **options)
+
+    def moving(self, more: int = 10) -> None:
+        """Waits until the arm was moved so many times more."""
+        before = self.arm.call("history")["num_moves"]
+        eventually(lambda: self.arm.call("history")["num_moves"] >= before + more, f"no motion: {self.said('program')}")
+
+    def stopped_after(self, then_ns: int) -> float:
+        """Seconds from an instant until the arm was stopped."""
+        return (eventually(lambda: self._stopped(then_ns), "the arm was not stopped", 10) - then_ns) / 1e9
+
+    def _stopped(self, then_ns: int) -> int:
+        stopped_ns = int(self.arm.call("history")["stopped_ns"])
+        return stopped_ns if stopped_ns > then_ns else 0
+
+    def engage(self) -> None:
+        """What the gateway's log says a person has to type."""
+        command = re.findall(r"pp-engage (--link\.connect \S+)", self.said("gateway"))[-1].split()
+        run = [sys.executable, "-m", "clock.engage", *command]
+        eventually(lambda: subprocess.run(run, env=ENVIRONMENT, check=False).returncode == 0, "not engaged", 20)
+
+    def close(self) -> None:
+        for process in reversed(self._processes):
+            if process.poll() is None:
+                process.send_signal(signal.SIGCONT)
+                process.terminate()
+                process.wait(30)
+            if process.stdin is not None:
+                process.stdin.close()
+        for file in self._files:
+            file.close()
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    made = Bench(tmp_path_factory.mktemp("robot"))
+    try:
+        made.start()
+        yield made
+    finally:
+        made.close()
+
+
+def test_a_dry_run_is_the_whole_loop_and_sends_nothing(bench: Bench) -> None:
+    program = bench.program("--dry-run", "--max-s", "2", "--at-exit", "release")
+    assert program.wait(60) == 0, bench.said("program")
+    assert "PLAY" in bench.said("program")
+    assert bench.arm.call("history")["num_moves"] == 0
+    assert bench.arm.call("read")["says"] == "ok"
+
+
+def test_nothing_is_sent_before_a_person_confirms_the_first_row(bench: Bench) -> None:
+    program = bench.program(stdin=subprocess.PIPE)
+    eventually(lambda: "Send rows to the robot?" in bench.said("program"), "nobody was asked")
+    assert bench.arm.call("history")["num_moves"] == 0
+    program.communicate(b"n\n", timeout=30)
+    assert program.returncode == 1
+    assert "not confirmed" in bench.said("program")
+    assert bench.arm.call("history")["num_moves"] == 0
+
+
+def test_stop_displace_release_engage_and_the_arm_goes_on_from_there(bench: Bench) -> None:
+    program = bench.program("--yes")
+    bench.moving()
+    bench.arm.call("stop", says="user_stop", text="a person")
+    before = bench.arm.call("history")["num_moves"]
+    eventually(lambda: "STOPPED" in bench.said("program") or "user_stop" in bench.said("program"), "not told")
+    bench.arm.call("displace", by=0.5)
+    bench.arm.call("reset")
+    time.sleep(0.5)  # nothing comes: there is nothing to wait on
+    assert bench.arm.call("history")["num_moves"] == before
+    bench.engage()
+    bench.moving()
+    assert max(move for _, move in bench.arm.call("history")["moves"]) <= STEP_RAD
+    program.send_signal(signal.SIGINT)
+    assert program.wait(30) == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGKILL])
+def test_the_watchdog_stops_the_arm_of_a_program_that_died_or_froze(bench: Bench, number: int) -> None:
+    program = bench.program("--yes")
+    bench.moving()
+    then_ns = time.monotonic_ns()
+    program.send_signal(number)
+    assert bench.stopped_after(then_ns) < REACTION_S
+    program.kill()
+    program.wait(10)
+    eventually(lambda: "the client left" in bench.said("gateway"), "the gateway did not notice")
+
+
+def test_parking_goes_back_in_steps(bench: Bench) -> None:
+    start = bench.arm.call("read")["state"][:7]
+    program = bench.program("--yes", "--at-exit", "park", "--speed", "0.5")
+    bench.moving(30)
+    program.send_signal(signal.SIGINT)
+    assert program.wait(60) == 0, bench.said("program")
+    assert bench.arm.call("read")["state"][:7] == pytest.approx(start, abs=1e-3)
+    assert max(move for _, move in bench.arm.call("history")["moves"][-20:]) <= STEP_RAD / 2 + 1e-4
+
+
+def test_every_log_agrees_with_the_schedule(bench: Bench) -> None:
+    eventually(lambda: bench.said("gateway").count(" over ") >= 7, "an episode is still open")
+    paths = sorted(bench.out.rglob("*.mcap"))
+    assert len(paths) >= 7
+    assert [(path, found) for path in paths if (found := next(disagreements(read_log(path)), None)) is not None] == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGKILL])
+def test_the_watchdog_stops_the_arm_when_our_gateway_dies_or_freezes(bench: Bench, number: int) -> None:
+    """The last tests: the gateway is gone then."""
+    program = bench.program("--yes", "--at-exit", "park")
+    bench.moving()
+    then_ns = time.monotonic_ns()
+    bench.gateway.send_signal(number)
+    assert bench.stopped_after(then_ns) < REACTION_S
+    assert program.wait(30) == 1
+    assert re.search("no answer within|left", bench.said("program"))
+    assert bench.arm.call("read")["says"] == "protective_stop"  # and it was not parked
+    if number == signal.SIGSTOP:
+        bench.gateway.send_signal(signal.SIGCONT)
+        eventually(lambda: bench.said("gateway").rstrip().endswith("left"), "the gateway did not notice")
