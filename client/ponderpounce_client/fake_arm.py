@@ -95,13 +95,16 @@ def serve(address: tuple[str, int]) -> None:
 
 
 class FakeArm:
-    """A driver of the fake arm. A call that is not answered within a tick raises OSError."""
+    """A driver of the fake arm. A call that is not answered within ``answer_s``, a tick, raises OSError."""
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, answer_s: float = _ANSWER_S) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.settimeout(_ANSWER_S)
+        self._socket.settimeout(answer_s)
         self._socket.connect(address_of(address))
         self._number = 0
+
+    def close(self) -> None:
+        self._socket.close()
 
     def call(self, op: str, **values: Any) -> dict[str, Any]:
         """The controller's reply. Raises OSError: it does not answer."""

@@ -18,6 +18,7 @@ import numpy as np
 from ponderpounce_client.client import Client, Command, Lost, Observation, Refused
 from ponderpounce_client.watchdog import Watchdog
 
+AT_EXIT = ("hold", "park", "release")
 _SAY_TICKS = 20
 
 
@@ -230,7 +231,7 @@ def main(
     parser.add_argument("--speed", type=float, default=1.0, help="share of the robot's step limits, 0.1 to 1")
     parser.add_argument("--dry-run", action="store_true", help="the whole loop, but send the robot nothing")
     parser.add_argument("--yes", action="store_true", help="do not ask before the first row")
-    parser.add_argument("--at-exit", choices=("hold", "park", "release"), default="hold", help="how to leave the robot")
+    parser.add_argument("--at-exit", choices=AT_EXIT, help="how to leave the robot; else as its file says")
     parser.add_argument("--max-s", type=float, help="longest time in seconds")
     parser.add_argument(
         "--camera", action="append", default=[], metavar="NAME=SOURCE",
@@ -240,9 +241,6 @@ def main(
     said = parser.parse_args(argv)
     if not 0.1 <= said.speed <= 1:
         parser.error(f"--speed {said.speed:g}: expected 0.1 to 1")
-    settings = Settings(
-        said.instruction, said.task, said.speed, said.dry_run, said.yes, said.at_exit, said.max_s
-    )  # fmt: skip
     try:
         key = said.api_key_file.read_text(encoding="utf-8").strip() if said.api_key_file else ""
     except OSError as error:
@@ -251,6 +249,11 @@ def main(
     watchdog = Watchdog(stop, *stop_arguments)
     try:
         with Client(said.url, key) as client:
+            at_exit = said.at_exit or client.welcome["robot"].get("at_exit")
+            settings = Settings(
+                said.instruction, said.task, said.speed, said.dry_run, said.yes,
+                at_exit if at_exit in AT_EXIT else "hold", said.max_s,
+            )  # fmt: skip
             why = drive(new_robot(_cameras(said.camera, said.camera_px)), client, settings, watchdog)
     except (Lost, Refused, OSError, ValueError, ImportError) as error:
         why = str(error)

@@ -42,7 +42,7 @@ class Watchdog:
         if not is_there.wait(_START_S):
             self.process.kill()
             raise RuntimeError("the watchdog's process did not start; see what it said above")
-        atexit.register(self._leave)
+        atexit.register(self.close)
 
     @property
     def has_fired(self) -> bool:
@@ -59,19 +59,15 @@ class Watchdog:
         self._state.value = _ASLEEP
 
     def close(self) -> None:
-        """Ends its process; the robot is not stopped."""
-        atexit.unregister(self._leave)
+        """Ends its process. One that is armed fires first: a program that leaves in order lets it ``rest`` before."""
+        atexit.unregister(self.close)
+        until_s = time.monotonic() + _START_S
+        while self._state.value == _ARMED and self.process.is_alive() and time.monotonic() < until_s:
+            time.sleep(_POLL_S)
         self._state.value = _CLOSED
         self.process.join(5)
         if self.process.is_alive():
             self.process.kill()
-
-    def _leave(self) -> None:
-        """When a program ends that did not close it: an armed watchdog fires first."""
-        until_s = time.monotonic() + _START_S
-        while self._state.value == _ARMED and self.process.is_alive() and time.monotonic() < until_s:
-            time.sleep(_POLL_S)
-        self.close()
 
 
 def _watch(until_ns: Any, state: Any, is_there: Any, parent_pid: int, stop: Callable[..., Any], arguments: Any) -> None:

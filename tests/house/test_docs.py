@@ -64,7 +64,8 @@ def _options() -> set[str]:
                             name = field.target.id.replace("_", "-")
                             prefix = "link." if node.name == "LinkOptions" else ""
                             found |= {f"--{prefix}{name}", f"--{prefix}no-{name}"}
-    return found
+    program = (ROOT / "client" / "ponderpounce_client" / "program.py").read_text(encoding="utf-8")
+    return found | set(re.findall(r'"(--[a-z-]+)"', program))
 
 
 @every_page
