@@ -71,7 +71,8 @@ COMMANDS = {
         {
             "through": Verb(
                 "sim_client.replay_through", "Answer a log's invocations with another POUNCE, and compare row by row."
-            )
+            ),
+            "watch": Verb("sim_client.watch.__main__", "Show a robot's live status as a page for a browser."),
         },
     ),
     "pp-diagnose": Command(

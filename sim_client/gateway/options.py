@@ -152,7 +152,7 @@ class GatewayOptions:
     seats: int = 1
     """Number of robots, hence of clients at a time. Their names are --link.robot, and that with -1, -2 and so on."""
     watch: str | None = None
-    """HOST:PORT of a page with the live status of --link.robot, by a pp-watch of its own. None: no page."""
+    """HOST:PORT of a page with the live status of --link.robot, by a process of its own. None: no page."""
     out: Path = Path("out")
     """Folder for one MCAP per episode."""
     clients: tyro.conf.OmitArgPrefixes[ClientsOptions] = field(default_factory=ClientsOptions)

@@ -1,4 +1,4 @@
-"""``pp-watch``: a robot's live status in a browser. It hears what is on the bus and says nothing there."""
+"""``pp-replay watch``: a robot's live status in a browser. It hears what is on the bus and says nothing there."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from protocol.zenoh_bus import open_bus
 from sim_client.watch.page import served
 from sim_client.watch.view import View
 
-log = logging.getLogger("pp-watch")
+log = logging.getLogger("pp-replay watch")
 
 _TOPICS: tuple[Any, ...] = (INFO, OBSERVATION, TICK, SUBGOAL, EVENT, PHASE, HEALTH)  # an episode's terms come first
 _KEEP = 512
@@ -87,9 +87,9 @@ class Watcher:
         return found.image if found is not None else None
 
 
-@command("pp-watch")
-def main(argv: list[str] | None = None) -> int:
-    options = parse(WatchOptions, argv, prog="pp-watch")
+@command("pp-replay watch")
+def main(argv: list[str] | None = None, prog: str = "pp-replay watch") -> int:
+    options = parse(WatchOptions, argv, prog=prog)
     should_stop = StopFlag()
     set_up_logging()
     address = options.address

@@ -16,7 +16,7 @@ from protocol import images
 from protocol.errors import MalformedMessage, TransportError
 from protocol.messages import Image, ImageCodec
 
-log = logging.getLogger("pp-watch")
+log = logging.getLogger("pp-replay watch")
 
 HTML = Path(__file__).with_name("page.html")
 _SILENT_S = 10.0
