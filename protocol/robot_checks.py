@@ -14,7 +14,7 @@ from protocol.messages import AtExit, AtStop, Dimension, DimensionKind, Robot
 
 MIN_CONTROL_HZ, MAX_CONTROL_HZ = 5, 100
 _MAX_TEXT = 128
-_MAX_PICTURE_NS = 3600 * 10**9
+_MAX_PICTURE_NS = 10**18  # as instants
 
 AT_STOP = {
     DimensionKind.POSITION: (AtStop.HOLD, AtStop.MEASURED),
@@ -31,7 +31,7 @@ def faults(robot: Robot) -> Iterator[tuple[str, str, object]]:
         yield "control_hz", f"{MIN_CONTROL_HZ} to {MAX_CONTROL_HZ}", robot.control_hz
     for name in ("max_picture_age_ns", "max_picture_skew_ns", "max_picture_still_ns"):
         if not 0 <= getattr(robot, name) <= _MAX_PICTURE_NS:
-            yield name, "0 to an hour", getattr(robot, name)
+            yield name, "0 to 31 years", getattr(robot, name)
     yield from _home(robot)
     if not robot.dimensions:
         return
