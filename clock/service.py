@@ -12,13 +12,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from clock.channels import misfit, null_of
+from clock.agreement import agree
+from clock.channels import null_of
 from clock.conductor import Conductor, Stage
-from clock.feasibility import check_feasible
 from clock.offset import Offset, from_exchange, narrowest
 from clock.policies import SERVERS, has_ponder, servers_of
 from clock.report import ADMITTED_EVENT
-from clock.residual import RESIDUAL_EVENT, ResidualHead, check_head
+from clock.residual import RESIDUAL_EVENT, ResidualHead
 from clock.timebase import NS_PER_S, MonotonicClock, VirtualClock
 from clock.watch import HEARTBEAT_TIMEOUT_NS, Watch
 from protocol import codec
@@ -384,7 +384,9 @@ class ClockService:
             self._enter(header)
             self._measure_offsets(procs if info.robot.is_simulated else (*procs, ROBOT))
             contracts = tuple(self._open_at(proc, request) for proc in procs)
-            warnings, committed_ticks = self._agree(info, contracts)
+            warnings, committed_ticks = agree(
+                info, contracts, residual=self._config.residual, allow_starved=self._config.allow_starved
+            )
         except (CallFailed, ProtocolError) as error:
             self._close_servers(procs, None)
             self._link.leave_episode()
@@ -476,49 +478,6 @@ class ClockService:
             raise EpisodeRefused(reply.refusal, f"{proc} refuses the episode: {why}", try_again=reply.try_again)
         self._link.admit(m.Member(proc=proc, boot_id=contract.boot_id))
         return contract
-
-    def _agree(self, info: m.EpisodeInfo, contracts: Sequence[m.Contract]) -> tuple[list[str], int]:
-        """Checks that the parts fit; returns warnings and the ticks that an invocation takes.
-
-        Raises:
-            EpisodeRefused: the parts do not fit, the schedule is infeasible, or untrained weights would move a robot.
-        """
-        *ponder, pounce = contracts
-        if ponder and (why_not := misfit(ponder[0], pounce)):
-            raise EpisodeRefused(m.Refusal.MODELS, why_not)
-        if (pounce.horizon, pounce.action_dim) != (info.schedule.horizon, info.robot.action_dim):
-            raise EpisodeRefused(
-                m.Refusal.ROBOT,
-                f"POUNCE gives chunks of ({pounce.horizon}, {pounce.action_dim}), the episode was opened for "
-                f"({info.schedule.horizon}, {info.robot.action_dim}). Load another checkpoint.",
-            )
-        rate_hz = info.schedule.control_hz
-        if pounce.control_hz not in (0, rate_hz):
-            raise EpisodeRefused(
-                m.Refusal.SCHEDULE,
-                f"POUNCE's rows are for {pounce.control_hz} Hz, {info.robot.name} takes {rate_hz} commands a second. "
-                "Rows are not resampled: load a checkpoint of the robot's rate, or say the other control_hz in the "
-                "robot's file if the robot can keep it.",
-            )
-        if self._config.residual is not None:
-            try:
-                check_head(self._config.residual, info.robot)
-            except ValueError as error:
-                raise EpisodeRefused(m.Refusal.ROBOT, str(error)) from error
-        fake = [c.proc for c in contracts if c.is_fake]
-        if fake and not info.robot.is_simulated:
-            raise EpisodeRefused(
-                m.Refusal.MODELS, f"{' and '.join(fake)} run untrained weights, which never move a real robot."
-            )
-        warnings = [f"{proc} runs untrained weights: expect motion, not skill" for proc in fake]
-        if not pounce.control_hz and not info.robot.is_simulated:
-            warnings.append(f"POUNCE does not say for which rate its rows are: they are played at {rate_hz} Hz")
-        feasibility = check_feasible(info.schedule, pounce.infer_p99_ns)
-        if not feasibility.is_feasible:
-            if info.schedule.mode == m.Mode.REALTIME and not self._config.allow_starved:
-                raise EpisodeRefused(m.Refusal.SCHEDULE, f"the schedule cannot be kept: {feasibility.sentence()}")
-            warnings.append(feasibility.sentence())
-        return warnings, feasibility.delay_ticks
 
     def close(self, request: m.CloseRequest) -> m.CloseReply:
         """Ends the episode here and at the servers."""

@@ -6,6 +6,7 @@ layer's weights and at the forward's shape, and takes it only if it is right and
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
@@ -26,7 +27,8 @@ Function = Callable[..., Any]
 
 MOST_ERROR = {torch.float32: 1e-4, torch.bfloat16: 2e-2}
 """Largest relative L2 distance of a kernel that is taken. A twin rounds in other places, and chunks sum in another
-order: on a CPU they differ by 1e-6 and 5e-3."""
+order: in the interpreter they differ by up to 3e-7, and in bfloat16 by up to 3e-3 (attention not counted, which it
+multiplies wrongly in bfloat16)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,9 +94,10 @@ def _compare(twin: Function, kernel: Function, sample: tuple[Any, ...], timer: T
         came = _outcome(kernel, sample)
     except Exception as failure:  # a compiler's or a driver's own; whatever it is, the twin runs
         return False, f"it does not run: {type(failure).__name__}: {failure}"[:300]
-    error = max((_distance(*pair) for pair in zip(came, expected, strict=True)), default=0.0)
+    errors = [_distance(*pair) for pair in zip(came, expected, strict=True)]
+    error = next(filter(math.isnan, errors), max(errors))  # max alone passes over a NaN
     most = MOST_ERROR[next(tensor.dtype for tensor in _tensors(sample) if tensor.dtype in MOST_ERROR)]
-    if not error <= most:  # NaN too
+    if not error <= most:
         return False, f"it differs from its twin by {error:.1e} (relative L2), at most {most:.0e}"
     copy = _copied(sample)
     kernel_time, twin_time = timer(lambda: kernel(*copy)), timer(lambda: twin(*copy))

@@ -44,16 +44,13 @@ class RobotServer(PounceServer):
     def num_superseded(self) -> int:
         return super().num_superseded + self._num_replaced
 
-    def listen(self) -> bool:
-        """Reads all messages; returns whether there is anything to do because of them."""
+    def step(self) -> bool:
+        """Reads all messages; returns whether there is anything to do because of them. The fleet does it."""
         worked, work = self._listen()
         if work is not None:
             self._num_replaced += self.waiting is not None
             self.waiting = work
         return worked or work is not None
-
-    def step(self) -> bool:
-        raise NotImplementedError("the fleet steps all of its robots together")
 
     def take(self) -> Work:
         """Removes the waiting invocation, and reports that it is being answered."""
@@ -123,7 +120,7 @@ class PounceFleet:
 
     def step(self) -> bool:
         """Reads every robot's messages, then answers those who have waited longest, in one batch."""
-        worked = [server.listen() for server in self._servers]
+        worked = [server.step() for server in self._servers]
         waiting = sorted(
             (each for each in self._servers if each.waiting is not None), key=lambda each: each.answered_ns
         )

@@ -33,7 +33,9 @@ venv/bin/pip install --quiet -r "$here/requirements.txt"
 
 cat > environment <<END
 # source this before a simulator is started
-driver=\$(ls "$into"/mesa/usr/share/vulkan/icd.d/lvp_icd*.json 2>/dev/null || ls /usr/share/vulkan/icd.d/lvp_icd*.json)
+for driver in "$into"/mesa/usr/share/vulkan/icd.d/lvp_icd*.json /usr/share/vulkan/icd.d/lvp_icd*.json; do
+  [ ! -f "\$driver" ] || break  # the unpacked one first
+done
 export ROBOMME_LAVAPIPE_ICD=\$driver VK_ICD_FILENAMES=\$driver VK_DRIVER_FILES=\$driver
 [ ! -d "$into/mesa" ] || export LD_LIBRARY_PATH="$into/mesa/usr/lib/x86_64-linux-gnu"
 export LP_NUM_THREADS=1 OMP_NUM_THREADS=1 MKL_NUM_THREADS=1  # more threads only wait for each other at 256 px

@@ -11,9 +11,8 @@ import time
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from dual_system.models.ponder.observation import Pictures, Size, check_pictures
+from dual_system.models.ponder.observation import Pictures, Size, WholeViews, check_pictures
 from ponder_server.chat.ask import Ask
 from ponder_server.chat.client import ChatEndpoint, ChatError
 from ponder_server.chat.rule import BrokenReply, History, body_of, reply_of
@@ -28,25 +27,12 @@ _ASK_AGAIN_S = 1.0
 _NO_CARRIERS = np.zeros((0, 0), np.float32)
 
 
-class AnyViews:
-    """An ``ObservationReader`` of any number of cameras of any size, of which each becomes a picture of the request."""
-
-    @property
-    def state_rows(self) -> range:
-        return range(0)
-
-    def num_images(self, num_views: int) -> int:
-        return num_views
+class AnyViews(WholeViews):
+    """Any number of cameras of any size, of which each becomes a picture of the request."""
 
     def images(self, views: Sequence[Pictures], image_px: Size) -> Pictures:
         check_pictures(views)
         return np.stack(views)
-
-    def state_ids(self, proprio: ArrayLike | None) -> tuple[int, ...]:
-        return ()
-
-    def readable_sizes(self, image_px: Size) -> list[Size]:
-        return [image_px]
 
     def unreadable(self, sizes: Sequence[Size], image_px: Size) -> tuple[int, str] | None:
         return None

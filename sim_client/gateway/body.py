@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from clock.schedules import CONTROL_HZ
-from dual_system.tasks.panda import PANDA_STICK, PANDA_WRISTCAM
+from dual_system.tasks import panda
 from protocol.messages import Floats, Robot
 from sim_client.robot import simulated_robot
 from sim_client.robot_file import read_robot
@@ -30,13 +30,22 @@ class Body:
 
 
 def _panda(state: Floats, image_px: tuple[int, int]) -> Robot:
+    return _at(panda.PANDA_WRISTCAM, state, image_px)
+
+
+def _robomme(state: Floats, image_px: tuple[int, int]) -> Robot:
     """RoboMME's episodes begin with an open gripper, or with a stick, whose finger it reports as exactly 0."""
-    robot = PANDA_WRISTCAM if state[7] else PANDA_STICK
+    return _at(panda.PANDA_WRISTCAM if state[7] else panda.PANDA_STICK, state, image_px)
+
+
+def _at(robot: panda.Robot, state: Floats, image_px: tuple[int, int]) -> Robot:
     return replace(simulated_robot(robot, state), image_height=image_px[0], image_width=image_px[1])
 
 
 PANDA = Body(8, _panda)
-"""The Panda of our tasks and of RoboMME: absolute joint targets and a gripper's, which a stick ignores."""
+"""The Panda of our tasks: absolute joint targets and a gripper's."""
+ROBOMME = Body(8, _robomme)
+"""The Panda of RoboMME's clients, in some tasks with a stick, which ignores the gripper's target."""
 
 
 def read_body(path: Path) -> Body:

@@ -34,6 +34,7 @@ DialectName = Literal[
     "ponderpounce", "openpi", "challenge", "challenge-http", "mme-vla", "vla-eval", "groot", "groot-n1.5"
 ]
 GROOT: tuple[DialectName, ...] = ("groot", "groot-n1.5")
+_OF_ROBOMME: tuple[DialectName, ...] = ("challenge", "challenge-http", "mme-vla", "vla-eval")
 _SPOKEN: dict[DialectName, tuple[type[Dialect], Mapping[str, str], str, int]] = {
     # by name: who speaks it, where it has the cameras (if empty: by their names) and the state, and how many rows an
     # answer usually has
@@ -290,7 +291,9 @@ class GatewayOptions:
 
     def body(self) -> body.Body:
         """The robot that clients drive. Raises OSError or FileError if its file does not describe one."""
-        return body.read_body(self.robot_file) if self.robot_file else body.PANDA
+        if self.robot_file:
+            return body.read_body(self.robot_file)
+        return body.ROBOMME if self.dialect in _OF_ROBOMME else body.PANDA
 
     def plan(self) -> Plan:
         """The common plan of all episodes. Raises TransportError as ``body``."""

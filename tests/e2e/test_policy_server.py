@@ -23,34 +23,7 @@ from sim_client.launch import free_ports
 pytestmark = [pytest.mark.e2e, pytest.mark.realtime, pytest.mark.sim, pytest.mark.slow]
 
 MAPPING = Path(__file__).parents[2] / "examples" / "policies" / "openpi_panda.toml"
-SERVER = """
-import importlib.util, os, sys
-import numpy as np
-from openpi_client import base_policy, msgpack_numpy
-from websockets.sync.server import serve
-
-class Policy(base_policy.BasePolicy):
-    def infer(self, observation):
-        rows = np.tile(observation["observation/state"], (20, 1))
-        rows[:, 0] += 0.01 * np.arange(20)
-        return {"actions": rows}
-
-    def reset(self):
-        pass
-
-def converse(connection):
-    connection.send(msgpack_numpy.packb({}))
-    for packet in connection:
-        connection.send(msgpack_numpy.packb(Policy().infer(msgpack_numpy.unpackb(packet))))
-
-port, theirs = int(sys.argv[1]), os.environ.get("PP_OPENPI_SERVER")
-if theirs:
-    spec = importlib.util.spec_from_file_location("websocket_policy_server", theirs)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    module.WebsocketPolicyServer(Policy(), host="127.0.0.1", port=port).serve_forever()
-serve(converse, "127.0.0.1", port, compression=None, max_size=None).serve_forever()
-"""
+SERVER = Path(__file__).with_name("openpi_server.py")
 
 
 class Policy:
@@ -61,7 +34,7 @@ class Policy:
         self.start()
 
     def start(self) -> None:
-        self.process = subprocess.Popen([sys.executable, "-c", SERVER, str(self.port)])
+        self.process = subprocess.Popen([sys.executable, str(SERVER), str(self.port)])
 
     def kill(self) -> None:
         self.process.kill()

@@ -30,38 +30,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 PATIENCE_S = 300.0  # simulated time waits for everybody
 PRESS = "press the button"
 SCENE = ["--difficulty", "easy", "--max-steps", "140", "--record-hz", "1"]
-SERVER = """
-import importlib.util, os, sys
-import numpy as np
-from openpi_client import base_policy, msgpack_numpy
-from websockets.sync.server import serve
-
-shown = np.load(sys.argv[2])
-
-class Policy(base_policy.BasePolicy):
-    def infer(self, observation):
-        state = observation["observation/state"]
-        if observation["prompt"] != "press the button":
-            return {"actions": np.tile(np.append(state[:7], 1.0), (20, 1))}
-        nearest = int(np.linalg.norm(shown["states"] - state, axis=1).argmin())
-        return {"actions": shown["rows"][np.minimum(nearest + np.arange(20), len(shown["rows"]) - 1)]}
-
-    def reset(self):
-        pass
-
-def converse(connection):
-    connection.send(msgpack_numpy.packb({}))
-    for packet in connection:
-        connection.send(msgpack_numpy.packb(Policy().infer(msgpack_numpy.unpackb(packet))))
-
-port, theirs = int(sys.argv[1]), os.environ.get("PP_OPENPI_SERVER")
-if theirs:
-    spec = importlib.util.spec_from_file_location("websocket_policy_server", theirs)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    module.WebsocketPolicyServer(Policy(), host="127.0.0.1", port=port).serve_forever()
-serve(converse, "127.0.0.1", port, compression=None, max_size=None).serve_forever()
-"""
+SERVER = Path(__file__).with_name("openpi_server.py")
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +72,7 @@ def policy(
     states, rows = np.stack([tick.state for tick in pressed]), np.stack([tick.action for tick in pressed])
     np.savez(folder / "shown.npz", states=states, rows=rows)
     port = free_ports(1)[0]
-    process = subprocess.Popen([sys.executable, "-c", SERVER, str(port), str(folder / "shown.npz")])
+    process = subprocess.Popen([sys.executable, str(SERVER), str(port), str(folder / "shown.npz")])
     yield f"ws://127.0.0.1:{port}"
     process.kill()
     process.wait()

@@ -156,7 +156,7 @@ def test_the_culprit_of_a_refused_batch_is_told_and_the_others_have_their_rows(h
 def test_what_is_newer_replaces_what_has_not_been_answered(hall: Hall) -> None:
     hall.ask("r0", 0)
     (server, *_) = hall.fleet.shells
-    server.listen()
+    server.step()
     hall.ask("r0", 1)
     hall.fleet.step()
     assert [chunk.invocation for chunk in hall.said("r0", m.ActionChunk)] == [1]
@@ -165,7 +165,7 @@ def test_what_is_newer_replaces_what_has_not_been_answered(hall: Hall) -> None:
 
 def test_a_closed_episode_leaves_nothing_to_answer(hall: Hall) -> None:
     hall.ask("r0", 0)
-    hall.fleet.shells[0].listen()
+    hall.fleet.shells[0].step()
     hall.clocks["r0"].call(topics.CLOSE, "pounce", m.CloseRequest(), timeout_ns=1)
     hall.fleet.step()
     assert hall.engine.batches == []

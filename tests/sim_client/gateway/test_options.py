@@ -11,7 +11,7 @@ import pytest
 from dual_system.tasks.panda import HOME_QPOS
 from protocol.errors import FileError, TransportError
 from protocol.messages import DelayKind, Mode
-from sim_client.gateway.body import PANDA, read_body
+from sim_client.gateway.body import PANDA, ROBOMME, Body, read_body
 from sim_client.gateway.options import ClientsOptions, GatewayOptions, ScheduleOptions
 
 ROBOT = """
@@ -114,11 +114,18 @@ def test_the_panda_holds_where_it_is_until_its_first_command() -> None:
     ("finger_m", "name", "gripper"),
     [(0.0, "panda_stick", -1.0), (0.04, "panda_wristcam", 1.0), (1e-6, "panda_wristcam", 1.0)],
 )
-def test_a_finger_of_exactly_nothing_is_a_stick_whose_gripper_never_opens(
+def test_to_robomme_a_finger_of_exactly_nothing_is_a_stick_whose_gripper_never_opens(
     finger_m: float, name: str, gripper: float
 ) -> None:
-    robot = PANDA.describe(np.append(HOME_QPOS, finger_m).astype(np.float32), (256, 256))
+    robot = ROBOMME.describe(np.append(HOME_QPOS, finger_m).astype(np.float32), (256, 256))
     assert (robot.name, robot.initial_command[7], robot.command_high[7]) == (name, gripper, gripper)
+
+
+@pytest.mark.parametrize(("dialect", "body"), [("openpi", PANDA), ("challenge", ROBOMME), ("vla-eval", ROBOMME)])
+def test_to_everybody_else_it_is_a_gripper_that_is_closed(dialect: Any, body: Body) -> None:
+    assert GatewayOptions(dialect=dialect).body() is body
+    closed = PANDA.describe(np.append(HOME_QPOS, 0.0).astype(np.float32), (256, 256))
+    assert (closed.name, closed.command_high[7]) == ("panda_wristcam", 1.0)
 
 
 def test_a_robot_can_be_told_by_a_file(tmp_path: Path) -> None:
