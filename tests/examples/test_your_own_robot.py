@@ -24,7 +24,7 @@ from protocol.messages import Robot
 from sim_client.gateway.body import PANDA
 from sim_client.launch import free_ports
 
-pytestmark = [pytest.mark.e2e, pytest.mark.realtime, pytest.mark.slow, pytest.mark.peers]
+pytestmark = [pytest.mark.e2e, pytest.mark.realtime, pytest.mark.slow]
 
 ROOT = Path(__file__).parents[2]
 CLIENT_PYTHON = os.environ.get("PONDERPOUNCE_CLIENT_PYTHON", sys.executable)
