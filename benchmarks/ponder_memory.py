@@ -124,14 +124,12 @@ def storages() -> Iterator[Tensor]:
     """Storage of every live tensor, each once, as a bytes tensor."""
     seen: set[int] = set()
     for each in gc.get_objects():
-        if not issubclass(type(each), Tensor) or each.is_meta:  # isinstance would trigger deprecation warnings
+        # Subclasses are left out: fake tensors name a device and have no memory there. isinstance would ask objects
+        # for their __class__, which makes lazy ones warn.
+        if type(each) not in (Tensor, torch.nn.Parameter) or each.is_meta:
             continue
         storage = each.untyped_storage()
-        try:
-            address = storage.data_ptr()
-        except RuntimeError:  # torch.compile's fake tensors have no memory
-            continue
-        if address not in seen:
+        if (address := storage.data_ptr()) not in seen:
             seen.add(address)
             yield torch.empty(0, dtype=torch.uint8, device=each.device).set_(storage)
 

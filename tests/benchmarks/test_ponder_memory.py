@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from benchmarks.ponder_memory import made_by
 from dual_system.models.ponder.configs import tiny_cpu
@@ -50,6 +51,16 @@ def test_sessions_take_what_was_computed(
     which_tokens_are_text_bytes = 2 * ponder.vocab_size  # the writer's masks, one of a kind
     expected_bytes = num_sessions * engine.spec.session_bytes + which_tokens_are_text_bytes
     assert sum(memory.nbytes for memory in made) == expected_bytes
+
+
+def test_tensors_without_memory_are_not_counted() -> None:
+    def build() -> list[torch.Tensor]:
+        with FakeTensorMode():
+            fake = [torch.empty(8, device="cuda"), torch.nn.Parameter(torch.empty(8, device="cuda"))]
+        return [*fake, torch.empty(8, device="meta"), torch.zeros(8)]
+
+    built, made = made_by(build)
+    assert [memory.nbytes for memory in made] == [built[-1].nbytes]
 
 
 def test_an_episode_keeps_nothing_beside_its_session() -> None:
