@@ -15,10 +15,10 @@ from typing import Any
 from clock.agreement import agree
 from clock.channels import null_of
 from clock.conductor import Conductor, Stage
-from clock.offset import Offset, from_exchange, narrowest
 from clock.policies import SERVERS, has_ponder, servers_of
 from clock.report import ADMITTED_EVENT
 from clock.residual import RESIDUAL_EVENT, ResidualHead
+from clock.servers import Servers
 from clock.timebase import NS_PER_S, MonotonicClock, VirtualClock
 from clock.watch import HEARTBEAT_TIMEOUT_NS, Watch
 from protocol import codec
@@ -54,10 +54,7 @@ from protocol.topics import (
 log = logging.getLogger(__name__)
 
 ROBOT = "sim"
-NUM_TIME_EXCHANGES = 8
 ROBOT_SILENCE_NS = 1_000_000_000
-_CALL_NS = 2_000_000_000
-OPEN_NS = 120_000_000_000  # a long demonstration is encoded inside this call
 MAX_SHADOW_QUERIES = 4  # for later ones it would fetch a journal from this thread, while rows are played
 _TOPIC_OF: dict[type, Topic[object]] = {
     t.cls: t  # type: ignore[misc]
@@ -128,9 +125,15 @@ class ClockService:
         self._config = config
         self._host = host_clock or MonotonicClock(zero_ns=0)
         self._watch = Watch(timeout_ns=config.heartbeat_timeout_ns)
+        self._servers = Servers(
+            link=link,
+            host=self._host,
+            watch=self._watch,
+            watches=config.watches,
+            max_clock_bound_ns=config.max_clock_bound_ns,
+        )
         self._episode: _Episode | None = None
         self._last_epoch: dict[str, int] = {}
-        self._offsets: dict[str, Offset] = {}
         self._is_stepping = False
         self._is_draining = False
         self._robot_heard_ns = 0
@@ -246,7 +249,7 @@ class ClockService:
             self._link.drop(observation.header.proc, DropReason.WRONG_SHAPE, detail)
             return False
         if observation.header.clock_id != m.EPISODE_CLOCK:
-            offset = self._offsets.get(observation.header.proc)
+            offset = self._servers.offsets.get(observation.header.proc)
             if offset is None:
                 self._link.drop(observation.header.proc, DropReason.UNKNOWN_CLOCK, observation.header.clock_id)
                 return False
@@ -377,25 +380,22 @@ class ClockService:
         procs = servers_of(info.policy)
         if not procs:
             return self._begin(request, contracts=(), warnings=(), committed_ticks=0)
-        not_ready = self.not_ready(procs) if self._config.watches else ""
-        if not_ready:
+        if self._config.watches and (not_ready := self._servers.not_ready(procs)):
             return m.OpenReply(error=not_ready, refusal=m.Refusal.NOT_READY, try_again=True)
         try:
             self._enter(header)
-            self._measure_offsets(procs if info.robot.is_simulated else (*procs, ROBOT))
-            contracts = tuple(self._open_at(proc, request) for proc in procs)
+            self._servers.measure_offsets(procs if info.robot.is_simulated else (*procs, ROBOT))
+            contracts = tuple(self._servers.open(proc, request) for proc in procs)
             warnings, committed_ticks = agree(
                 info, contracts, residual=self._config.residual, allow_starved=self._config.allow_starved
             )
         except (CallFailed, ProtocolError) as error:
-            self._close_servers(procs, None)
+            self._servers.close(procs, None)
             self._link.leave_episode()
             if isinstance(error, EpisodeRefused):
                 return m.OpenReply(error=str(error), refusal=error.refusal, try_again=error.try_again)
-            was_lost = (
-                isinstance(error, CallFailed) and self._config.watches
-            )  # whether it still is there is seen next time
-            return m.OpenReply(error=str(error), try_again=was_lost)
+            may_be_lost = isinstance(error, CallFailed) and self._config.watches  # the next opening sees it
+            return m.OpenReply(error=str(error), try_again=may_be_lost)
         return self._begin(request, contracts, warnings, committed_ticks)
 
     def _begin(
@@ -421,63 +421,18 @@ class ClockService:
             self._event(m.Severity.INFO, "no_ponder", f"POUNCE plays alone: it reads {null_of(contracts[0])}")
         for warning in warnings:
             self._event(m.Severity.WARNING, "warning", warning)
-        for proc, offset in self._offsets.items():
+        for proc, offset in self._servers.offsets.items():
             text = f"{proc}: {offset.offset_ns / 1e6:+.3f} ms, known to {offset.bound_ns / 1e6:.3f} ms"
             self._event(m.Severity.INFO, "clock_offset", text, proc=proc)
-        return m.OpenReply(contracts=tuple(contracts), warnings=tuple(warnings), members=self._members())
+        return m.OpenReply(contracts=tuple(contracts), warnings=tuple(warnings), members=self._servers.members())
 
     def _enter(self, header: m.Header) -> None:
         robot = m.Member(proc=ROBOT, boot_id=header.boot_id)
         self._link.enter_episode(header.session, header.episode, header.epoch, (robot,))
 
-    def _members(self) -> tuple[m.Member, ...]:
-        return tuple(m.Member(proc=proc, boot_id=boot_id) for proc, boot_id in self._link.members.items())
-
-    def not_ready(self, procs: Sequence[str] | None = None) -> str:
-        """Why no episode of these servers can be opened, unless one runs already; "" if one can."""
-        for proc in self._config.servers if procs is None else procs:
-            health = self._watch.health_of(proc)
-            if health is None:
-                return f"{proc} is not there: start {proc}-serve, or check its endpoint"
-            if self._watch.has_rival(proc, self._host.now_ns()):
-                return f"two processes answer to the name of {proc}: stop one of them"
-            if health.state == m.ServingState.FAILED:
-                return f"{proc} failed: {health.detail}"
-            if health.state != m.ServingState.READY:
-                return f"{proc} is {health.state.name.lower()} ({health.progress:.0%}) {health.detail}".strip()
-        return ""
-
-    def _measure_offsets(self, procs: Sequence[str]) -> None:
-        """Raises ProtocolError if another host's clock offset is too uncertain."""
-        self._offsets = {}
-        for proc in procs:
-            exchanges = []
-            clock_id = ""
-            for _ in range(NUM_TIME_EXCHANGES):
-                t0_ns = self._host.now_ns()
-                reply = self._link.call(TIME, proc, m.TimeRequest(t0_ns=t0_ns), timeout_ns=_CALL_NS)
-                try:
-                    exchanges.append(from_exchange(t0_ns, reply.t1_ns, reply.t2_ns, self._host.now_ns()))
-                except ValueError as error:
-                    raise ProtocolError(f"the clock of {proc} ({reply.clock_id}): {error}") from None
-                clock_id = reply.clock_id
-            offset = narrowest(exchanges)
-            if clock_id != host_clock_id() and offset.bound_ns > self._config.max_clock_bound_ns:
-                raise ProtocolError(
-                    f"the clock of {proc} ({clock_id}) is known to {offset.bound_ns / 1e6:.2f} ms only, the limit is "
-                    f"{self._config.max_clock_bound_ns / 1e6:.2f} ms. Use a quieter link or --max-clock-bound-ms."
-                )
-            self._offsets[proc] = offset
-
-    def _open_at(self, proc: str, request: m.OpenRequest) -> m.Contract:
-        """Opens the episode at a server. Raises EpisodeRefused if it refuses, CallFailed if it does not answer."""
-        reply = self._link.call(OPEN, proc, replace(request, members=self._members()), timeout_ns=OPEN_NS)
-        contract = reply.contract
-        if reply.error or contract is None:
-            why = reply.error or "it sent no contract"
-            raise EpisodeRefused(reply.refusal, f"{proc} refuses the episode: {why}", try_again=reply.try_again)
-        self._link.admit(m.Member(proc=proc, boot_id=contract.boot_id))
-        return contract
+    def not_ready(self) -> str:
+        """Why no episode of the configured servers can be opened, unless one runs already; "" if one can."""
+        return self._servers.not_ready(self._config.servers)
 
     def close(self, request: m.CloseRequest) -> m.CloseReply:
         """Ends the episode here and at the servers."""
@@ -491,18 +446,9 @@ class ClockService:
     def _finish(self, result: m.EpisodeResult | None) -> None:
         episode, self._episode = self._episode, None  # first, so that a server with a late query cannot rejoin it
         if episode is not None:
-            self._close_servers(episode.servers, result)
+            self._servers.close(episode.servers, result)
         self._watch.enter({}, self._host.now_ns())  # a server that restarts between episodes is not lost
         self._link.leave_episode()
-
-    def _close_servers(self, procs: Sequence[str], result: m.EpisodeResult | None) -> None:
-        for proc in procs:
-            if self._config.watches and (self._watch.is_lost(proc) or self._watch.is_gone(proc)):
-                continue
-            try:
-                self._link.call(CLOSE, proc, m.CloseRequest(result=result), timeout_ns=_CALL_NS)
-            except CallFailed as error:
-                log.warning("close proc=%s %s", proc, error)
 
     def _on_active(self, request: m.ActiveRequest) -> m.ActiveReply:
         if self._episode is None or self._plays_without(request.header.proc):
@@ -516,7 +462,7 @@ class ClockService:
             opened = replace(opened, demo=())  # megabytes that a POUNCE does not read, while rows are played
         is_owed = invoked is not None and invoked.invocation == conductor.owed_invocation
         return m.ActiveReply(
-            open=replace(opened, members=self._members()),
+            open=replace(opened, members=self._servers.members()),
             num_queries=len(self._episode.journal),
             owed_query=conductor.owed_query,
             owed_invocation=codec.encode(invoked) if is_owed else b"",

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from clock.service import OPEN_NS, ClockService
+from clock.servers import OPEN_NS
+from clock.service import ClockService
 from protocol.link import Link
 from protocol.messages import Health, ServingState
 from protocol.metrics import End

@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from typing import Protocol, TypeVar
 
 from model_server.shell import ModelShell
-from protocol.errors import TransportError
+from protocol.daemon import daemon
+from protocol.errors import CommandError
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
-from protocol.logs import set_up_logging
 from protocol.messages import ServingState
-from protocol.metrics import End, Metrics
+from protocol.metrics import End
 from protocol.options import DaemonOptions, LinkOptions
-from protocol.process import StopFlag, host_clock_id, run
+from protocol.process import host_clock_id, run
 from protocol.sockets import endpoint
-from protocol.status import status_of
 from protocol.version import version
-from protocol.watchdog import watchdog
-from protocol.zenoh_bus import open_bus
 
 EngineT = TypeVar("EngineT")
 
@@ -49,7 +44,7 @@ def serve_model(
     *,
     is_shadow: bool = False,
 ) -> int:
-    """Runs a model server until SIGTERM or SIGINT; returns the exit status, 2 if it could not start.
+    """Runs a model server until SIGTERM or SIGINT; returns the exit status.
 
     It joins the bus before it loads, so that others see it loading, or why it fails.
 
@@ -60,32 +55,22 @@ def serve_model(
         make: builds the server around the engine.
         operations: what it tells its operators, and how it leaves; None: logs on standard error.
         is_shadow: answer for the log only, beside the server that is used.
+
+    Raises:
+        CommandError, OSError, ValueError: it could not start; the message is for the user.
     """
     if is_shadow:
         link_options = behind(link_options, proc)
-    operations = operations or DaemonOptions()
-    should_stop = StopFlag(drains=True, sigterm_drains=operations.drain)
-    metrics = Metrics()
-    with ExitStack() as opened:
-        try:
-            set_up_logging(options=operations)
-            opened.enter_context(status_of(metrics, operations, lambda: should_stop.is_draining))
-            bus = open_bus(link_options)
-        except TransportError as error:
-            print(f"{proc}-serve: {error}", file=sys.stderr)  # noqa: T201
-            return 2
-        opened.callback(bus.close)
-        opened.enter_context(watchdog(metrics))
+    with daemon(link_options, operations or DaemonOptions()) as (bus, metrics, should_stop):
         link = Link(bus, robot=link_options.robot, proc=f"{proc}-shadow" if is_shadow else proc)
         heartbeat = Heartbeat(link, version(), host_clock_id())
         metrics.watch(_end(link, heartbeat))
         heartbeat.set(state=ServingState.LOADING, detail=weights)
         try:
             engine = load()
-        except (OSError, ValueError) as error:
+        except (CommandError, OSError, ValueError) as error:
             heartbeat.set(state=ServingState.FAILED, detail=str(error)[:2000])
-            print(f"{proc}-serve: {error}", file=sys.stderr)  # noqa: T201
-            return 2
+            raise
         server = make(link, engine, heartbeat, version())
         try:
             server.warm_up()

@@ -6,9 +6,10 @@ import socket
 
 import pytest
 
-from model_server import daemon
-from protocol import topics
+from model_server.daemon import serve_model
+from protocol import daemon, topics
 from protocol.bus import LocalBus
+from protocol.errors import TransportError
 from protocol.link import Link, Stream
 from protocol.messages import Health, ServingState
 from protocol.options import DaemonOptions, LinkOptions
@@ -41,21 +42,21 @@ def healths(monkeypatch: pytest.MonkeyPatch) -> Stream[Health]:
 
 
 def test_a_checkpoint_that_cannot_be_loaded_is_reported(healths: Stream[Health]) -> None:
-    assert daemon.serve_model("ponder", LinkOptions(), "random", unreadable, lambda *_: Broken()) == 2
+    with pytest.raises(ValueError, match="not a folder"):
+        serve_model("ponder", LinkOptions(), "random", unreadable, lambda *_: Broken())
     last = healths.drain()[-1]
     assert (last.state, last.detail) == (ServingState.FAILED, "not a folder")
 
 
 def test_a_warm_up_that_fails_is_reported(healths: Stream[Health]) -> None:
     with pytest.raises(RuntimeError, match="no kernel image"):
-        daemon.serve_model("ponder", LinkOptions(), "random", object, lambda *_: Broken())
+        serve_model("ponder", LinkOptions(), "random", object, lambda *_: Broken())
     last = healths.drain()[-1]
     assert (last.state, last.detail) == (ServingState.FAILED, "warm-up: no kernel image is available")
 
 
-def test_a_taken_metrics_port_is_a_sentence(healths: Stream[Health], capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_taken_metrics_port_is_a_sentence(healths: Stream[Health]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         options = DaemonOptions(metrics=f"127.0.0.1:{taken.getsockname()[1]}")
-        assert daemon.serve_model("ponder", LinkOptions(), "random", object, lambda *_: Broken(), options) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"ponder-serve: --metrics {options.metrics}: Address already in use")
+        with pytest.raises(TransportError, match=f"--metrics {options.metrics}: Address already in use"):
+            serve_model("ponder", LinkOptions(), "random", object, lambda *_: Broken(), options)
