@@ -34,6 +34,7 @@ from dual_system.models.fp8 import has_products
 from dual_system.models.gpu import current, settle
 from dual_system.models.graphs import directly, graphs_for
 from dual_system.models.kernels.launch import cuda_time_ms, missing_for
+from dual_system.models.kernels.trial import choose
 from dual_system.models.ponder import configs as ponder_configs
 from dual_system.models.ponder.configs import PonderConfig
 from dual_system.models.ponder.context import Row
@@ -45,7 +46,8 @@ from ponder_server.contract import Frame, Opening, WeightsName
 from ponder_server.draft import Draft, TrieDraft
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
-from ponder_server.operations import KERNELS, choose
+from ponder_server.operations import KERNELS
+from ponder_server.operations import TWINS as PONDER_TWINS
 from ponder_server.rehearsal import rehearse
 from ponder_server.slots import SlotMemory
 from ponder_server.stack import Stack
@@ -226,7 +228,7 @@ def kernels(day: Day) -> None:
 
     def verdicts(length: int) -> dict[str, str]:
         samples = rehearse(stack, memory, num_rows=1, length=length)
-        _, told = choose(samples, KERNELS, cuda_time_ms)
+        _, told = choose(samples, PONDER_TWINS, KERNELS, cuda_time_ms)
         return {one.operation: f"{'kernel' if one.is_taken else 'twin'}: {one.why}" for one in told}
 
     with torch.inference_mode():
@@ -277,6 +279,7 @@ def ponder_fire(day: Day) -> None:
     frames: tuple[Frame, ...] = ()
     for name, has_kernels in (("", True), (", twins", False)):
         engine = _warm(day, ponder, longest, kernels=has_kernels)
+        day.row(f"kernels taken{name}", lambda engine=engine: engine.spec.kernels or "none tried")  # type: ignore[misc]
         frames = engine.example_frames()
         for length in day.size.contexts:
             context = _open(engine, "day", length)
@@ -334,6 +337,7 @@ def pounce(day: Day) -> None:
         return last.actions
 
     day.time("pi0.5 fused", sampled)
+    day.row("pi0.5 kernels taken", lambda: fused.kernels or "none tried")
     day.row("pi0.5 fused against eager, mean", lambda: float((sampled() - expected).abs().mean()))
 
 

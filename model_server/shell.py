@@ -33,6 +33,11 @@ class Spec(Protocol):
         """True if untrained weights decide the answers."""
         ...
 
+    @property
+    def kernels(self) -> str:
+        """Which kernels of ours it runs and why not others, once it is warm; "" if it tried none."""
+        ...
+
 
 class Engine(Protocol):
     """The part of an engine that the shell uses."""
@@ -94,7 +99,7 @@ class ModelShell(ABC):
         """Ends the episode."""
 
     def _weights_note(self) -> str:
-        """The error of narrow weights, for logs; "" for float weights."""
+        """The error of narrow weights, for heartbeats and logs; "" for float weights."""
         return ""
 
     def warm_up(self) -> None:
@@ -112,7 +117,7 @@ class ModelShell(ABC):
             is_fake=spec.is_fake,
             progress=1.0,
         )
-        if note := self._weights_note():
+        if note := "; ".join(filter(None, (self._weights_note(), spec.kernels))):
             self._heartbeat.set(detail=note)
             log.info("%s", note)
 

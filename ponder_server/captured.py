@@ -24,9 +24,10 @@ from torch import Tensor
 from dual_system.models.graphs import Capture, Work
 from dual_system.models.kernels.launch import Timer
 from dual_system.models.kernels.rms_norm import Residual, Style
+from dual_system.models.kernels.trial import Verdict, choose, told
 from ponder_server.decoder import Place, decode
 from ponder_server.kernels.rotate_store import Window
-from ponder_server.operations import KERNELS, TWINS, Operations, choose
+from ponder_server.operations import KERNELS, TWINS, Operations
 from ponder_server.rehearsal import rehearse
 from ponder_server.slots import SlotMemory
 from ponder_server.stack import AttentionLayer, Stack
@@ -88,6 +89,7 @@ class CapturedDecoder:
         self._stack = Stack.of(text_model)
         self._timer = timer
         self._operations: dict[tuple[int, int], Operations] = {}
+        self._tried: dict[str, list[Verdict]] = {}
         self._memory = memory
         self._capture = capture
         self._num_read = num_read
@@ -158,11 +160,17 @@ class CapturedDecoder:
             return TWINS
         if key not in self._operations:
             samples = rehearse(self._stack, self._memory, num_rows=num_rows, length=length)
-            self._operations[key], verdicts = choose(samples, KERNELS, self._timer)
+            self._operations[key], verdicts = choose(samples, TWINS, KERNELS, self._timer)
+            self._tried[f"{num_rows}x{length}"] = verdicts
             for verdict in verdicts:
                 taken = "kernel" if verdict.is_taken else "twin"
                 log.info("rows=%d tokens=%d %s: %s, %s", num_rows, length, verdict.operation, taken, verdict.why)
         return self._operations[key]
+
+    @property
+    def kernels(self) -> str:
+        """Which kernels were taken, of how many shapes of rows x tokens, and why not."""
+        return told(self._tried)
 
     def _buckets(self, num_rows: int, length: int) -> tuple[int, ...]:
         """Numbers of positions of which each is a graph; the kernel reads what is valid, so that one serves all."""

@@ -84,6 +84,8 @@ class EngineSpec:
     weights: WeightsName = "float"
     cognition_error: float = 0.0
     """Relative L2 change of C by narrow ``weights``, measured in the warm-up's short context."""
+    kernels: str = ""
+    """Which kernels captured forwards run and why not others, known after the warm-up; "" if it tried none."""
 
     @property
     def is_fake(self) -> bool:

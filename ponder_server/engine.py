@@ -330,6 +330,7 @@ class QwenEngine:
         longest = max(self._num_query_ids, MAX_CHECKED_TOKENS)
         if self._runner.prepare(longest, max_rows=self._config.max_batch_rows):
             self._runner.check(self._example_cognition)
+            self._spec = replace(self._spec, kernels=self._runner.kernels)
         frames = self.example_frames()
         self.open(WARM_UP_SESSION, WARM_UP_OPENING)
         try:

@@ -120,6 +120,11 @@ class Runner:
         self._captured.prepare(self._buckets, max_rows=1)
         return len(self._captured)
 
+    @property
+    def kernels(self) -> str:
+        """Which kernels captured forwards took and why not; "" if they tried none."""
+        return "" if self._captured is None else self._captured.kernels
+
     def check(self, appended: Callable[[], Tensor]) -> None:
         """Raises RuntimeError if ``appended`` returns another result by replays than by the captured work itself."""
         assert self._captured is not None, "nothing is captured"

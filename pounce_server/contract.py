@@ -66,6 +66,8 @@ class EngineSpec:
     """Rows a second; 0: not known."""
     reads_subgoal: bool = False
     """True if the engine reads PONDER's newest subgoal in place of cognition (then K = 0)."""
+    kernels: str = ""
+    """Which kernels of the fused path it runs and why not others, known after the warm-up; "" if it tried none."""
 
     @property
     def is_fake(self) -> bool:

@@ -40,7 +40,7 @@ from pounce_server.contract import (
     example_request,
     no_progress,
 )
-from pounce_server.fused import fused_for
+from pounce_server.fused import FusedPounce, fused_for
 from pounce_server.guidance import given, guide, with_committed
 from pounce_server.int8 import quantise
 from pounce_server.roll_forward import placed, rolled
@@ -113,9 +113,12 @@ class EagerEngine:
             reads_subgoal=config.reads_subgoal,
         )
         model = cast_streams(bundle.model, dtype).to(self._device).eval().requires_grad_(False)
+        self._fused = (
+            fused_for(_fusable(model, continuity), self._device, autotune=autotune) if path == "fused" else None
+        )
         make_sampler = _sampler
-        if path == "fused":
-            make_sampler = partial(_fused_sampler, autotune=autotune)
+        if self._fused is not None:
+            make_sampler = partial(_fused_sampler, self._fused)
         elif path != "eager":
             make_sampler = partial(_compiled_sampler, mode=path)
         self._sample = make_sampler(model, bundle, self._device, continuity)
@@ -199,6 +202,8 @@ class EagerEngine:
             start_ns = time.perf_counter_ns()
             self.invoke(request)
             durations_ns.append(time.perf_counter_ns() - start_ns)
+        if self._fused is not None:
+            self.spec = replace(self.spec, kernels=self._fused.kernels)
         return durations_ns[WARM_UP_UNMEASURED:]
 
     def _noise(self, seed: int) -> Tensor:
@@ -313,14 +318,17 @@ def _compiled_sampler(
     return sample
 
 
-def _fused_sampler(
-    model: AnyPounce, bundle: PounceBundle, device: torch.device, continuity: Continuity, *, autotune: bool
-) -> Sampler:
+def _fusable(model: AnyPounce, continuity: Continuity) -> Pounce:
     if not isinstance(model, Pounce) or continuity != "none":
         raise ValueError("the fused path is for pi0.5 without --continuity; leave --path fused out")
-    pi05, statistics, tokenizer = model, bundle.statistics, bundle.tokenizer
-    assert isinstance(tokenizer, Tokenizer), "the bundle checks this"
-    fused, text = fused_for(pi05, device, autotune=autotune), tokenizer
+    return model
+
+
+def _fused_sampler(
+    fused: FusedPounce, model: AnyPounce, bundle: PounceBundle, device: torch.device, continuity: Continuity
+) -> Sampler:
+    pi05, statistics, text = _fusable(model, continuity), bundle.statistics, bundle.tokenizer
+    assert isinstance(text, Tokenizer), "the bundle checks this"
 
     def sample(requests: Sequence[Request], noise_BNA: Tensor) -> Iterator[tuple[list[int], EulerStep]]:
         inputs = [pi05_inputs(request, pi05.config, text, statistics, device) for request in requests]

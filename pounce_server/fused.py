@@ -8,6 +8,7 @@ spells the state in digits, so its length changes from one invocation to the nex
 
 # B batch, T prefix tokens with padding, N horizon, A padded action dim, E expert width, S slots of keys
 
+import logging
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -17,13 +18,17 @@ from torch import Tensor
 
 from dual_system.models.flow import EulerStep
 from dual_system.models.graphs import Capture, Work, cuda_graphs, directly
-from dual_system.models.kernels.launch import cuda_time_ms, missing_for
+from dual_system.models.kernels.launch import Timer, cuda_time_ms, missing_for
 from dual_system.models.kernels.rms_norm import Style
+from dual_system.models.kernels.trial import Verdict, told
 from dual_system.models.pi05.gemma import RmsNorm
 from dual_system.models.pi05.network import Pi05, Prefix
 from dual_system.models.pi05.pounce import Pounce, PounceInputs
 from pounce_server.fused_stream import KERNELS, FusedStream, Norm, Operations, Run
 from pounce_server.kernels.choice import Choices, ChosenProduct, default_cache, machine_name, preferring
+from pounce_server.rehearsal import rehearse
+
+log = logging.getLogger(__name__)
 
 BUCKET_TOKENS = 64
 """Prompts of at most 200 tokens need four or five buckets; 63 unseen tokens cost less than half a millisecond."""
@@ -38,12 +43,27 @@ class FusedPounce:
     """
 
     @torch.no_grad()
-    def __init__(self, model: Pounce, operations: Operations = KERNELS, capture: Capture = directly) -> None:
+    def __init__(
+        self,
+        model: Pounce,
+        operations: Operations = KERNELS,
+        capture: Capture = directly,
+        timer: Timer | None = None,
+    ) -> None:
+        """With a ``timer``, each of ``operations`` is tried before the first capture, and is taken if it is right and
+        faster than its twin (``trial``); without one they run untried."""
         pi05 = model.pi05
         self._model = model
         self._capture = capture
+        self._timer = timer
         self._buckets: dict[tuple[int, int], Bucket] = {}
+        self._tried: dict[str, list[Verdict]] = {}
         self._network = FusedNetwork(pi05, operations, model.config.num_steps)
+
+    @property
+    def kernels(self) -> str:
+        """Which kernels were taken, of prefill and flow step, and why not; "" if none was tried."""
+        return told(self._tried)
 
     def sample(self, inputs: PounceInputs, noise_BNA: Tensor) -> Iterator[EulerStep]:
         """Yields the sampler's steps. Their tensors are the bucket's buffers, which the next step overwrites."""
@@ -64,12 +84,15 @@ class FusedPounce:
         """The buckets of all prompts, the longest first so that the others reuse its memory in the pool."""
         most = _bucket_tokens(num_beside_text + self._model.config.max_prompt_tokens)
         for length in range(most, num_beside_text, -BUCKET_TOKENS):
-            bucket = Bucket(self._network, _padded(prefix, length), self._capture)
+            bucket = Bucket(self._network, _padded(prefix, length))
+            if self._timer is not None and not self._tried:
+                self._tried = bucket.try_kernels(self._timer)
+            bucket.capture(self._capture)
             self._buckets[prefix.is_real.shape[0], length] = bucket
 
 
 def fused_for(model: Pounce, device: torch.device, *, autotune: bool = False) -> FusedPounce:
-    """Builds the fast path on ``device``: graphs on a GPU, plain calls in Triton's interpreter.
+    """Builds the fast path on ``device``: graphs and tried kernels on a GPU, plain calls in Triton's interpreter.
 
     ``autotune``: large products use the library that was fastest on this GPU (`kernels.choice`).
 
@@ -84,7 +107,7 @@ def fused_for(model: Pounce, device: torch.device, *, autotune: bool = False) ->
     if autotune:
         chosen = ChosenProduct(Choices(default_cache(), machine_name(device)), cuda_time_ms, preferring)
         operations = replace(KERNELS, product=chosen)
-    return FusedPounce(model, operations, cuda_graphs(device))
+    return FusedPounce(model, operations, cuda_graphs(device), cuda_time_ms)
 
 
 def _bucket_tokens(num_tokens: int) -> int:
@@ -107,7 +130,6 @@ class FusedNetwork:
 
     def __init__(self, pi05: Pi05, operations: Operations, num_steps: int) -> None:
         self.config = pi05.config
-        self.operations = operations
         self.num_steps = num_steps
         self.language = FusedStream(pi05.language.layers, operations)
         self.expert = FusedStream(pi05.expert.layers, operations)
@@ -132,7 +154,10 @@ def _styled(styles_M3E: Tensor) -> list[Norm]:
 class Bucket:
     """Static buffers for prefixes of one shape, and the captured work over them."""
 
-    def __init__(self, network: FusedNetwork, prefix: Prefix, capture: Capture) -> None:
+    prefill: Work
+    steps: list[Work]
+
+    def __init__(self, network: FusedNetwork, prefix: Prefix) -> None:
         config, horizon = network.config, network.config.horizon
         batch_size, num_prefix = prefix.is_real.shape
         embeds = prefix.embeds
@@ -152,8 +177,25 @@ class Bucket:
         ]
         self.actions = torch.zeros(batch_size * horizon, config.action_dim, device=embeds.device)
         self.velocity = torch.zeros_like(self.actions)
-        self.prefill: Work = capture(self._prefill)
-        self.steps: list[Work] = [capture(self._step(norms)) for norms in network.step_norms]
+
+    def try_kernels(self, timer: Timer) -> dict[str, list[Verdict]]:
+        """Replaces the network's operations by those that are right and faster at this bucket's shapes."""
+        network = self._network
+        prefix_run = max(self._prefix_runs, key=lambda run: len(run.x))
+        prefix = rehearse(prefix_run, network.prefix_norms[1], *self._cache[0])
+        step = rehearse(self._action_run, network.step_norms[0][1], *self._cache[0])
+        step["euler"] = (torch.randn_like(self.actions), torch.randn_like(self.actions), network.action_out.bias, 1)
+        tried = {"prefill": network.language.choose(prefix, timer), "step": network.expert.choose(step, timer)}
+        for part, verdicts in tried.items():
+            for verdict in verdicts:
+                taken = "kernel" if verdict.is_taken else "twin"
+                log.info("%s %s: %s, %s", part, verdict.operation, taken, verdict.why)
+        return tried
+
+    def capture(self, capture: Capture) -> None:
+        """Records the prefill and the flow steps; their runs overwrite the buffers."""
+        self.prefill = capture(self._prefill)
+        self.steps = [capture(self._step(norms)) for norms in self._network.step_norms]
 
     def load(self, prefix: Prefix, noise_BNA: Tensor) -> None:
         for stream, run in zip(prefix.streams(), self._prefix_runs, strict=True):
@@ -177,6 +219,6 @@ class Bucket:
             run.x.copy_(network.action_in(self.actions))
             network.expert(run, norms, self._cache)
             torch.mm(run.normed.float(), network.action_out.weight.T, out=self.velocity)
-            network.operations.euler(self.actions, self.velocity, network.action_out.bias, network.num_steps)
+            network.expert.do.euler(self.actions, self.velocity, network.action_out.bias, network.num_steps)
 
         return step

@@ -7,12 +7,15 @@ Per layer: four GEMMs (q|k|v and gate|up are one each), one attention, and four 
 # h/g query/key heads, D head dim
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from dual_system.models.kernels.launch import Timer
 from dual_system.models.kernels.rms_norm import Residual, Style, norm_eager, norm_fused
+from dual_system.models.kernels.trial import Verdict, choose
 from dual_system.models.pi05.gemma import ExpertLayer, GemmaConfig, GemmaLayer, Rotation, attend
 from pounce_server.kernels.choice import product
 from pounce_server.kernels.euler import euler_eager, euler_fused
@@ -109,7 +112,13 @@ class FusedStream:
 
     def __init__(self, layers: Iterable[GemmaLayer | ExpertLayer], operations: Operations) -> None:
         self._layers = [PackedLayer.of(layer) for layer in layers]
-        self._do = operations
+        self.do = operations
+
+    def choose(self, samples: dict[str, tuple[Any, ...]], timer: Timer) -> list[Verdict]:
+        """Leaves of its operations those that are right and faster than their twins; see ``trial.choose``."""
+        twins = replace(TWINS, product=self.do.product)
+        self.do, verdicts = choose(samples, twins, self.do, timer)
+        return verdicts
 
     def __call__(self, run: Run, norms: Sequence[Norm], cache: Sequence[tuple[Tensor, Tensor]]) -> None:
         """Runs ``run.x`` through the layers; keys and values go into ``cache``, the last norm into ``run.normed``.
@@ -120,16 +129,16 @@ class FusedStream:
         residual: Residual | None = None
         for index, (layer, (keys, values)) in enumerate(zip(self._layers, cache, strict=True)):
             before_attention, before_mlp = norms[2 * index : 2 * index + 2]
-            self._do.norm(run.x, run.normed, before_attention.style, residual)
-            self._do.product(run.normed, layer.qkv, run.qkv)
-            self._do.rope(run.qkv, run.rotation, run.queries, Slots(keys, values, run.first))
+            self.do.norm(run.x, run.normed, before_attention.style, residual)
+            self.do.product(run.normed, layer.qkv, run.qkv)
+            self.do.rope(run.qkv, run.rotation, run.queries, Slots(keys, values, run.first))
             if index == len(self._layers) - 1 and len(norms) == 2 * len(self._layers):
                 return
             mixed = attend(run.queries, keys[:, :, run.seen], values[:, :, run.seen], run.bias)
-            self._do.product(mixed.flatten(0, 1), layer.attention_out, run.branch)
-            self._do.norm(run.x, run.normed, before_mlp.style, Residual(run.branch, before_attention.gate))
-            self._do.product(run.normed, layer.gate_up, run.gate_up)
-            self._do.geglu(run.gate_up, run.activated)
-            self._do.product(run.activated, layer.down, run.branch)
+            self.do.product(mixed.flatten(0, 1), layer.attention_out, run.branch)
+            self.do.norm(run.x, run.normed, before_mlp.style, Residual(run.branch, before_attention.gate))
+            self.do.product(run.normed, layer.gate_up, run.gate_up)
+            self.do.geglu(run.gate_up, run.activated)
+            self.do.product(run.activated, layer.down, run.branch)
             residual = Residual(run.branch, before_mlp.gate)
-        self._do.norm(run.x, run.normed, norms[-1].style, residual)
+        self.do.norm(run.x, run.normed, norms[-1].style, residual)

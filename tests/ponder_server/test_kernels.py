@@ -15,11 +15,14 @@ from torch import Tensor
 
 from dual_system.models.graphs import directly
 from dual_system.models.kernels.launch import missing_for
+from dual_system.models.kernels.trial import MOST_ERROR, Verdict, choose
 from dual_system.models.ponder.configs import tiny_cpu
 from dual_system.models.ponder.network import Ponder
 from ponder_server.captured import CapturedDecoder
+from ponder_server.engine import QwenEngine
+from ponder_server.engine_config import EngineConfig
 from ponder_server.kernels.rotate_store import HeadNorms, Projected, Window
-from ponder_server.operations import KERNELS, MOST_ERROR, TWINS, Verdict, choose
+from ponder_server.operations import KERNELS, TWINS
 from ponder_server.rehearsal import rehearse
 from ponder_server.runner import Append, Runner, Session
 from ponder_server.slots import SlotMemory
@@ -272,13 +275,13 @@ def test_what_is_right_and_faster_is_taken_and_nothing_else(samples: dict[str, t
         delta=own,
         attend=leaves_no_number_in_memory,
     )
-    chosen, verdicts = choose(samples, mixed, Timer(1.0, 2.0))
+    chosen, verdicts = choose(samples, TWINS, mixed, Timer(1.0, 2.0))
     assert chosen == replace(TWINS, delta=own)
     assert {verdict.operation for verdict in verdicts if verdict.is_taken} == {"norm", "delta"}
     assert "differs from its twin" in verdict_of(verdicts, "swiglu").why
     assert "differs from its twin by nan" in verdict_of(verdicts, "gated_norm").why
     assert "no kernel image" in verdict_of(verdicts, "rotate_store").why
-    slower, verdicts = choose(samples, mixed, Timer(2.0, 1.0))
+    slower, verdicts = choose(samples, TWINS, mixed, Timer(2.0, 1.0))
     assert slower == TWINS
     assert not any(verdict.is_taken for verdict in verdicts)
 
@@ -290,7 +293,7 @@ def test_the_kernels_themselves_are_right_by_the_server_s_own_measure(
 ) -> None:
     monkeypatch.setattr("ponder_server.kernels.attention._PROGRAMS", 4)
     before = {name: [x.clone() for x in sample if isinstance(x, Tensor)] for name, sample in samples.items()}
-    chosen, verdicts = choose(samples, KERNELS, Timer(1.0, 2.0))
+    chosen, verdicts = choose(samples, TWINS, KERNELS, Timer(1.0, 2.0))
     assert chosen == KERNELS, verdicts
     for name, sample in samples.items():
         tensors = [x for x in sample if isinstance(x, Tensor)]
@@ -312,3 +315,14 @@ def test_a_shape_is_tried_once_and_the_memory_is_left_alone(ponder: Ponder, monk
     captured.prepare([1], max_rows=2)
     assert timer.num_calls == num_calls
     assert all((tensor == 7.0).all() for tensor in memory.states(1))
+
+
+def test_a_warm_engine_says_which_kernels_it_took(ponder: Ponder, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ponder_server.captured.KERNELS", replace(TWINS, swiglu=lambda gate, up: gate))
+    options = EngineConfig(max_sessions=1, max_context_tokens=512, buckets=(64,), max_batch_rows=1)
+    engine = QwenEngine(ponder, options, capture=directly)
+    engine._runner.capture(directly, num_read=64, timer=Timer(1.0, 2.0))
+    assert engine.spec.kernels == ""
+    engine.warm_up()
+    assert engine.spec.kernels.startswith("kernels: norm 2/2, swiglu 0/2 (1x16: it differs from its twin by")
+    assert engine.spec.kernels.endswith("attend 2/2")

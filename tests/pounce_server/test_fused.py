@@ -19,8 +19,12 @@ from dual_system.models.pounce.precision import cast_streams
 from dual_system.models.siglip import VisionConfig
 from pounce_server.contract import DTypeName, example_request
 from pounce_server.engine import EagerEngine
-from pounce_server.fused import BUCKET_TOKENS, SLOT_MULTIPLE, FusedPounce, fused_for
+from pounce_server.fused import BUCKET_TOKENS, SLOT_MULTIPLE, Bucket, FusedPounce, fused_for
 from pounce_server.fused_stream import KERNELS, TWINS, Operations
+from pounce_server.serve import PounceServer
+from protocol.bus import LocalBus
+from protocol.heartbeat import Heartbeat
+from protocol.link import Link
 
 MAE = {"float32": 1e-5, "bfloat16": 4e-3}
 """Stated tolerance: mean absolute error of the normalised actions after the last step."""
@@ -231,6 +235,59 @@ def test_without_triton_the_fused_path_says_what_to_install(
         fused_for(model_of(config), torch.device("cuda"))
 
 
+# -- which kernels are taken
+
+
+class Timer:
+    """Says that kernels take ``kernel`` and twins ``twin``: they are timed in this order."""
+
+    def __init__(self, kernel: float, twin: float) -> None:
+        self.times, self.num_calls = (kernel, twin), 0
+
+    def __call__(self, work: Callable[[], object]) -> float:
+        work()
+        self.num_calls += 1
+        return self.times[(self.num_calls - 1) % 2]
+
+
+def test_a_kernel_that_is_wrong_broken_or_slow_is_not_taken_and_the_heartbeat_says_so(config: PounceConfig) -> None:
+    def wrong(gate_up: Tensor, out: Tensor) -> None:
+        TWINS.geglu(gate_up, out)
+        out *= 1.01
+
+    def broken(*arguments: object) -> None:
+        raise RuntimeError("no kernel image is available")
+
+    def own(x: Tensor, velocity: Tensor, bias: Tensor, num_steps: int) -> None:
+        TWINS.euler(x, velocity, bias, num_steps)
+
+    operations = replace(TWINS, geglu=wrong, rope=broken, euler=own)
+    model, inputs, noise = model_of(config), with_tokens(config, 3), noise_for(config, 1)
+    expected = eager_actions(model, inputs, noise)
+    fused = FusedPounce(model, operations, Recorder(), Timer(1e-3, 2e-3))
+    assert fused.kernels == ""
+    assert mean_error(fused_actions(fused, inputs, noise), expected) <= MAE["float32"]
+    assert fused._network.expert.do == replace(TWINS, euler=own)
+    assert fused.kernels.startswith("kernels: norm 2/2, rope 0/2 (prefill: it does not run: RuntimeError: no kernel")
+    assert "geglu 0/2 (prefill: it differs from its twin by 1.0e-02" in fused.kernels
+    assert fused.kernels.endswith("euler 1/1")
+    slow = FusedPounce(model, operations, Recorder(), Timer(2e-3, 1e-3))
+    fused_actions(slow, inputs, noise)
+    assert slow._network.expert.do == slow._network.language.do == TWINS
+    assert "norm 0/2 (prefill: 2 us, its twin 1; it differs by 0.0e+00)" in slow.kernels
+
+
+@pytest.mark.skipif(bool(LACK), reason=LACK)
+@pytest.mark.usefixtures("rounding_interpreter")
+@torch.inference_mode()
+def test_the_kernels_themselves_are_right_by_the_server_s_own_measure() -> None:
+    config = small(2)
+    model = model_of(config)
+    bucket = Bucket(FusedPounce(model, KERNELS)._network, model.embed_prefix(with_tokens(config, 3)))
+    tried = bucket.try_kernels(Timer(1.0, 2.0))
+    assert all(verdict.is_taken for verdicts in tried.values() for verdict in verdicts), tried
+
+
 # -- as an engine
 
 
@@ -244,6 +301,18 @@ def test_a_fused_engine_gives_the_eager_engine_s_rows() -> None:
     request = example_request(eager.spec)
     assert fused.spec == eager.spec
     np.testing.assert_allclose(fused.invoke(request), eager.invoke(request), rtol=0, atol=1e-5)
+
+
+def test_a_heartbeat_says_which_kernels_were_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    def tried(model: Pounce, device: torch.device, *, autotune: bool) -> FusedPounce:
+        return FusedPounce(model, TWINS, directly, Timer(1.0, 2.0))
+
+    monkeypatch.setattr("pounce_server.engine.fused_for", tried)
+    engine = EagerEngine(random_bundle(small(1), 0), path="fused")
+    link = Link(LocalBus(), robot="r0", proc="pounce")
+    heartbeat = Heartbeat(link, "test", "host/monotonic")
+    PounceServer(link, engine, heartbeat, "test").warm_up()
+    assert heartbeat.health.detail == engine.spec.kernels == "kernels: norm 2/2, rope 2/2, geglu 2/2, euler 1/1"
 
 
 def test_what_the_fused_path_cannot_do_is_refused() -> None:
