@@ -18,8 +18,10 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from clock.alarms import Alarms
+from clock.asked import Asked, Request
 from clock.commander import NO_ROW, Commander, Decision
-from clock.delays import in_order, modelled_ns
+from clock.delays import modelled_ns
 from clock.dimensions import dimensions_of
 from clock.ladder import Ladder
 from clock.limits import Hit, out_of_range
@@ -27,7 +29,7 @@ from clock.playback import Chunk, Join, covering, deadline_ns, row_of, seam_poli
 from clock.policies import has_ponder
 from clock.reference import Ready, latest_ready, refer, text_age_ns
 from clock.residual import Due, ResidualHead, corrected
-from clock.sight import Sight, unfit, unfit_text
+from clock.sight import Sight, unfit
 from clock.timebase import NS_PER_S
 from protocol.messages import (
     Action,
@@ -67,26 +69,6 @@ class Stage(Enum):
 
 
 @dataclass(slots=True)
-class _Pending:
-    """A pending query or invocation. ``ready_ns`` is known beforehand only if the delay is modelled."""
-
-    index: int
-    source_ns: int
-    delay_ns: int | None
-    terms: tuple[int, int | None, int] = (0, None, 0)
-    """Tick of row 0, ref(j) and Delta(j) of an invocation, which its chunk must repeat."""
-    state: Floats = field(default_factory=lambda: NO_ROW)
-    """That of an invocation's observation, to which increments are added; its chunk must repeat it as well."""
-    answer: Cognition | ActionChunk | None = None
-    arrived_ns: int = 0
-
-    @property
-    def due_ns(self) -> int:
-        """Lower bound of the instants that depend on the answer."""
-        return self.source_ns + (self.delay_ns or 0)
-
-
-@dataclass(slots=True)
 class Conductor:
     """One episode's schedule. All instants are episode time.
 
@@ -110,21 +92,18 @@ class Conductor:
     num_invocations: int = 0
     _absent: set[str] = field(default_factory=set)
     _newest: Observation | None = None
-    _queries: list[_Pending] = field(default_factory=list)
-    _invocations: list[_Pending] = field(default_factory=list)
     _ready: list[Ready] = field(default_factory=list)
     _cognitions: dict[int, Cognition] = field(default_factory=dict)
     _chunks: list[Chunk] = field(default_factory=list)
-    _last_ready_ns: dict[StampKind, int] = field(default_factory=dict)
     _query_due_ns: int = 0
     _invoke_due_tick: int = 0
     _queried_tick: int = -1
     _queried_in: int = -1  # tick
     _invoked_in: int = -1
-    _told_state: RobotState = RobotState.UNSPECIFIED
-    _told_sight: Hit = Hit.NONE
-    _emitted: set[str] = field(default_factory=set)
     _has_ponder: bool = field(init=False)
+    _queries: Asked = field(init=False)
+    _invocations: Asked = field(init=False)
+    _alarms: Alarms = field(init=False)
     _sight: Sight = field(init=False)
     _join: Join = field(init=False)
     _commander: Commander = field(init=False)
@@ -133,6 +112,9 @@ class Conductor:
 
     def __post_init__(self) -> None:
         self._has_ponder = has_ponder(self.info.policy)
+        self._queries = Asked(StampKind.COGNITION, self._is_lockstep)
+        self._invocations = Asked(StampKind.CHUNK, self._is_lockstep)
+        self._alarms = Alarms(self.info)
         self._commander = Commander(self.info)
         self._sight = Sight(self.info.robot)
         self._join = seam_policy(self.info.schedule.seam, self._is_gripper_A)
@@ -151,7 +133,7 @@ class Conductor:
 
     def on_cognition(self, cognition: Cognition, now_ns: int) -> bool:
         """Takes PONDER's answer; returns False if it was not asked for (late, duplicate, unknown)."""
-        return _take(self._queries, cognition.query, cognition, cognition.infer_ns, now_ns, self._is_lockstep)
+        return self._queries.take(cognition.query, cognition, now_ns)
 
     def on_chunk(self, chunk: ActionChunk, now_ns: int) -> bool:
         """Takes POUNCE's answer; returns False if it was not asked for, or its shape, space or terms are wrong."""
@@ -159,21 +141,19 @@ class Conductor:
             return False
         if chunk.action_space != ActionSpace.JOINT_TARGET:
             return False
-        terms = (chunk.t_row0, chunk.ref_query, chunk.age_ns)
-        asked = next((a for a in self._invocations if a.index == chunk.invocation and a.terms == terms), None)
+        asked = self._invocations.find(chunk.invocation, (chunk.t_row0, chunk.ref_query, chunk.age_ns))
         if asked is None:
             return False
         if len(dimensions_of(self.info.robot).deltas) and asked.state.tobytes() != chunk.reference_state.tobytes():
             return False
-        return _take(self._invocations, chunk.invocation, chunk, chunk.infer_ns, now_ns, self._is_lockstep)
+        return self._invocations.take(chunk.invocation, chunk, now_ns)
 
     def on_lost(self, proc: str) -> None:
         """Notes a lost server. In real time its pending answers will not come; in lockstep the world waits for it."""
         if self._is_lockstep:
             return
         self._absent.add(proc)
-        unanswered = self._queries if proc == "ponder" else self._invocations
-        unanswered[:] = [asked for asked in unanswered if asked.answer is not None]
+        (self._queries if proc == "ponder" else self._invocations).forget_unanswered()
 
     def on_back(self, proc: str) -> None:
         self._absent.discard(proc)
@@ -228,7 +208,7 @@ class Conductor:
             self._settle(now_ns, effects)
             if self._chunks:
                 self._start(now_ns)
-            elif not self._is_lockstep and not self._is_busy(self._invocations, now_ns, self._overdue_ns):
+            elif not self._is_lockstep and not self._invocations.is_busy(now_ns, self._overdue_ns):
                 # The answer was lost or refused, or POUNCE died: ask again.
                 self.stage = Stage.WAIT_COGNITION
         while self.stage == Stage.RUNNING and self.deadline_ns(self.tick) <= now_ns:
@@ -240,7 +220,7 @@ class Conductor:
         """Latest instant at which ``poll`` has something to do; None if only a message can change anything."""
         if self.stage == Stage.RUNNING:
             return self.deadline_ns(self.tick)
-        modelled = [a.due_ns for a in (*self._queries, *self._invocations) if a.delay_ns is not None]
+        modelled = [a.due_ns for a in (*self._queries.waiting, *self._invocations.waiting) if a.delay_ns is not None]
         return min((due for due in modelled if due > now_ns), default=None)
 
     def will_look(self, tick: int) -> bool:
@@ -258,7 +238,7 @@ class Conductor:
             return True
         if self.stage == Stage.RUNNING and self.deadline_ns(self.tick) <= now_ns and self._newest.tick < self.tick:
             return True
-        return self._is_owed_by(now_ns)
+        return self._queries.is_owed_by(now_ns) or self._invocations.is_owed_by(now_ns)
 
     def deadline_ns(self, tick: int) -> int:
         return deadline_ns(self.start_ns, tick, self.info.schedule.control_hz)
@@ -272,16 +252,6 @@ class Conductor:
     @property
     def _is_lockstep(self) -> bool:
         return self.info.schedule.mode == Mode.LOCKSTEP
-
-    def _is_owed_by(self, now_ns: int) -> bool:
-        return any(a.answer is None and a.due_ns <= now_ns for a in (*self._queries, *self._invocations))
-
-    def _is_busy(self, asked: list[_Pending], now_ns: int, overdue_ns: int) -> bool:
-        """In real time a server gets one request at a time, so that the next one is about a fresh observation.
-
-        An overdue answer (lost or refused) no longer blocks the next request, but is still taken if it comes.
-        """
-        return any(a.answer is None and now_ns - a.source_ns < overdue_ns for a in asked)
 
     @property
     def _overdue_ns(self) -> int:
@@ -303,12 +273,12 @@ class Conductor:
     @property
     def owed_query(self) -> int | None:
         """The oldest query without an answer."""
-        return next((a.index for a in self._queries if a.answer is None), None)
+        return self._queries.owed
 
     @property
     def owed_invocation(self) -> int | None:
         """The oldest invocation without a chunk."""
-        return next((a.index for a in self._invocations if a.answer is None), None)
+        return self._invocations.owed
 
     def _start(self, now_ns: int) -> None:
         self.stage, self.start_ns = Stage.RUNNING, now_ns
@@ -340,7 +310,7 @@ class Conductor:
 
     def _settle(self, now_ns: int, effects: list[Effect]) -> bool:
         """Admits ready answers; returns False if one that must be ready by now has not come (lockstep)."""
-        if self._is_lockstep and self._is_owed_by(now_ns):
+        if self._is_lockstep and (self._queries.is_owed_by(now_ns) or self._invocations.is_owed_by(now_ns)):
             return False
         self._stamp_answers(now_ns, effects)
         return True
@@ -349,8 +319,7 @@ class Conductor:
         """Logs whole ticks as skipped that passed while the clock service stalled; they are not caught up."""
         newest = tick_at(self.start_ns, now_ns, self.info.schedule.control_hz)
         if newest > self.tick:
-            text = f"ticks {self.tick}..{newest - 1} passed unplayed: the clock service was not running"
-            self._tell(effects, Severity.ERROR, "ticks_skipped", text, always=True)
+            effects += self._alarms.skipped(self.tick, newest)
         for tick in range(self.tick, newest):
             effects.append(self._account(tick, now_ns, _SKIPPED, NO_ROW))
         if newest > self.tick:
@@ -363,8 +332,9 @@ class Conductor:
             return
         if newest is not None and tau_ns >= self._query_due_ns and newest.tick > self._queried_tick:
             if "ponder" in self._absent:
-                self._tell(effects, Severity.WARNING, "query_skipped", "PONDER is away: no queries until it is back")
-            elif self._is_lockstep or not self._is_busy(self._queries, tau_ns, self.info.schedule.max_age_ns):
+                text = "PONDER is away: no queries until it is back"
+                effects += self._alarms.once(self.tick, Severity.WARNING, "query_skipped", text)
+            elif self._is_lockstep or not self._queries.is_busy(tau_ns, self.info.schedule.max_age_ns):
                 self._ask_ponder(newest, effects)
                 while self._query_due_ns <= tau_ns:
                     self._query_due_ns += self.info.schedule.query_period_ns
@@ -374,13 +344,9 @@ class Conductor:
         has_cognition = latest_ready(self._ready, tau_ns) is not None or not self._has_ponder
         if self.tick >= self._invoke_due_tick and has_cognition:
             if "pounce" in self._absent:
-                self._tell(
-                    effects,
-                    Severity.WARNING,
-                    "invocation_skipped",
-                    "POUNCE is away: no invocations until it is back",
-                )
-            elif self._is_lockstep or not self._is_busy(self._invocations, tau_ns, self._overdue_ns):
+                text = "POUNCE is away: no invocations until it is back"
+                effects += self._alarms.once(self.tick, Severity.WARNING, "invocation_skipped", text)
+            elif self._is_lockstep or not self._invocations.is_busy(tau_ns, self._overdue_ns):
                 if not self.num_invocations:  # after a hold: the period counts from the first invocation
                     self._invoke_due_tick = self.tick
                 self._ask_pounce(self.tick, tau_ns, effects)
@@ -389,8 +355,8 @@ class Conductor:
 
     def _ask_ponder(self, observation: Observation, effects: list[Effect]) -> None:
         delay = modelled_ns(self.info.schedule.query_delay, self._query_rng)
-        asked = _Pending(self.num_queries, observation.source_ns, delay)
-        self._queries.append(asked)
+        asked = Request(self.num_queries, observation.source_ns, delay)
+        self._queries.add(asked)
         effects.append(Query(query=asked.index, tick=observation.tick, source_ns=observation.source_ns))
         self.num_queries += 1
         self._queried_tick = observation.tick
@@ -400,8 +366,8 @@ class Conductor:
         delay = modelled_ns(self.info.schedule.invoke_delay, self._invoke_rng)
         row0_tick = self._newest.tick if self._newest is not None else tick
         state = NO_ROW if self._newest is None else self._newest.proprio
-        asked = _Pending(self.num_invocations, tau_ns, delay, (row0_tick, reference.query, reference.age_ns), state)
-        self._invocations.append(asked)
+        asked = Request(self.num_invocations, tau_ns, delay, (row0_tick, reference.query, reference.age_ns), state)
+        self._invocations.add(asked)
         tail = self._unplayed_rows(tick)
         given = None if reference.query is None else self._cognitions[reference.query]
         effects.append(
@@ -429,7 +395,7 @@ class Conductor:
 
     def _stamp_answers(self, now_ns: int, effects: list[Effect]) -> None:
         """Admits every ready answer; the log's stamp is authoritative."""
-        for asked, stamp in self._ripe(self._queries, StampKind.COGNITION, now_ns):
+        for asked, stamp in self._queries.ripe(now_ns):
             answer = asked.answer
             assert isinstance(answer, Cognition)
             self._ready.append(
@@ -443,15 +409,12 @@ class Conductor:
             self._cognitions[stamp.index] = answer
             self._forget_cognitions()
             effects.append(stamp)
-        for asked, stamp in self._ripe(self._invocations, StampKind.CHUNK, now_ns):
+        for asked, stamp in self._invocations.ripe(now_ns):
             answer = asked.answer
             assert isinstance(answer, ActionChunk)
             self._chunks.append(Chunk.of(answer, self.info.robot))
             effects.append(stamp)
         self._chunks = [c for c in self._chunks if c.t_row0 + len(c.rows_NA) > self.tick]
-
-    def _ripe(self, asked: list[_Pending], kind: StampKind, now_ns: int) -> list[tuple[_Pending, Stamp]]:
-        return _ripe(asked, kind, self._last_ready_ns, now_ns, self._is_lockstep)
 
     def _forget_cognitions(self) -> None:
         """Keeps only cognitions that a delivery may refer to: the newest, the first, and the last two transitions'.
@@ -475,51 +438,26 @@ class Conductor:
             known = self.last_command if state is None else state
             due = Due(row_A=row_A, state=known, row=self.tick - chunk.t_row0, age_ns=chunk.age_ns)
             raw = corrected(self.residual, due, self._is_gripper_A)
-        before, was_playing, was_blocked = self.ladder.level, self.ladder.has_played, self._commander.is_blocked
+        before, was_playing = self.ladder.level, self.ladder.has_played
         state_ticks = self.tick - self.newest_tick
         sight = self._look(effects)
         decided = self._commander.step(raw, chunk, state, robot_state, state_ticks=state_ticks, sight=sight)
-        self._tell_limits(effects, decided.hit, chunk, was_blocked)
-        self._tell_robot(effects, robot_state)
+        effects += self._alarms.limits(self.tick, decided.hit, chunk, newest)
+        effects += self._alarms.blocked(self.tick, is_blocked=self._commander.is_blocked)
+        effects += self._alarms.robot(self.tick, robot_state, "" if newest is None else newest.robot_text)
         if decided.level != before and (was_playing or decided.level != Level.PLAY):
-            self._tell_level(effects, before, decided.level)
+            effects += self._alarms.level(self.tick, before, decided.level)
         due_ns = self.deadline_ns(self.tick)
         effects.append(Action(tick=self.tick, deadline_ns=due_ns, level=decided.level, values=decided.command))
         effects.append(self._account(self.tick, now_ns, decided, raw))
 
     def _look(self, effects: list[Effect]) -> Hit:
         """Whether the pictures are a ground to move on at this tick; tells when that changes."""
-        due_ns, robot = self.deadline_ns(self.tick), self.info.robot
+        due_ns = self.deadline_ns(self.tick)
         age_ns, still_ns = self._sight.age_ns(due_ns), self._sight.still_ns(due_ns)
-        hit = unfit(robot, age_ns, still_ns)
-        if hit and hit != self._told_sight:
-            text = f"{unfit_text(robot, hit, age_ns, still_ns)}. Held."
-            self._tell(effects, Severity.ERROR, "pictures_unfit", text, always=True)
-        elif self._told_sight and not hit:
-            self._tell(effects, Severity.INFO, "pictures_fit", "the pictures are fresh again", always=True)
-        self._told_sight = hit
+        hit = unfit(self.info.robot, age_ns, still_ns)
+        effects += self._alarms.pictures(self.tick, hit, age_ns, still_ns)
         return hit
-
-    def _tell_limits(self, effects: list[Effect], hit: Hit, chunk: Chunk | None, was_blocked: bool) -> None:
-        robot, newest = self.info.robot, self._newest
-        if Hit.NON_FINITE in hit and chunk is not None:
-            self._tell(effects, Severity.ERROR, "non_finite_row", f"chunk {chunk.invocation} has a NaN row: held")
-        elif clipped := hit & ~(Hit.STATE | Hit.SIGHT):
-            text = f"first row clipped to the robot's limits: {clipped.name}"
-            self._tell(effects, Severity.WARNING, "limit_hit", text)
-        if Hit.STATE in hit and newest is not None:
-            text = f"{out_of_range(newest.proprio, robot)} Held."
-            self._tell(effects, Severity.ERROR, "state_out_of_range", text)
-        if self._commander.is_blocked and not was_blocked:
-            text = "the arm does not follow its commands: held. Is it blocked, or is max_lead too small?"
-            self._tell(effects, Severity.ERROR, "blocked", text, always=True)
-
-    def _tell_robot(self, effects: list[Effect], state: RobotState) -> None:
-        if state != self._told_state and not (state.obeys and self._told_state.obeys):
-            said = f": {self._newest.robot_text}" if self._newest is not None and self._newest.robot_text else ""
-            name, severity = ("robot_ok", Severity.INFO) if state.obeys else ("robot_stopped", Severity.ERROR)
-            self._tell(effects, severity, name, f"the robot says {state.name}{said}", always=True)
-        self._told_state = state
 
     def _account(self, tick: int, now_ns: int, decided: Decision, raw: Floats) -> Tick:
         due_ns, chunk = self.deadline_ns(tick), decided.chunk
@@ -549,74 +487,7 @@ class Conductor:
             picture_still_ns=self._sight.still_ns(due_ns),
         )
 
-    def _tell_level(self, effects: list[Effect], before: Level, level: Level) -> None:
-        severity = {Level.PLAY: Severity.INFO, Level.STALE: Severity.WARNING}.get(level, Severity.ERROR)
-        why = {
-            Level.PLAY: "rows of a chunk with fresh cognition",
-            Level.STALE: f"cognition older than {self.info.schedule.max_age_ns / 1e6:.0f} ms",
-            Level.HOLD: "no usable row: the last commanded row is held",
-            Level.DECELERATE: f"held for {self.info.schedule.hold_limit_ticks} ticks: towards the measured joints",
-            Level.STOPPED: "stopped until somebody engages again",
-        }[level]
-        self._tell(effects, severity, "level", f"{before.name} -> {level.name}: {why}", always=True)
-
-    def _tell(self, effects: list[Effect], severity: Severity, name: str, text: str, *, always: bool = False) -> None:
-        """Emits an event; one that would repeat every tick is emitted once per episode and counted in the ticks."""
-        if always or name not in self._emitted:
-            self._emitted.add(name)
-            effects.append(Event(severity=severity, name=name, text=text, tick=self.tick))
-
 
 def invocation_seed(episode_seed: int, invocation: int) -> int:
     """Seed of the flow noise, a function of the episode's seed and the invocation's number alone."""
     return int(np.random.SeedSequence([episode_seed, invocation]).generate_state(1, np.uint64)[0] >> 1)
-
-
-def _take(
-    asked: list[_Pending],
-    index: int,
-    answer: Cognition | ActionChunk,
-    infer_ns: int,
-    now_ns: int,
-    is_lockstep: bool,
-) -> bool:
-    found = next((a for a in asked if a.index == index and a.answer is None), None)
-    if found is None or answer.source_ns != found.source_ns:
-        return False
-    found.answer, found.arrived_ns = answer, now_ns
-    if found.delay_ns is None:  # measured: compute time (lockstep) or arrival (real time)
-        found.delay_ns = infer_ns if is_lockstep else now_ns - found.source_ns
-    return True
-
-
-def _ripe(
-    asked: list[_Pending], kind: StampKind, last_ready_ns: dict[StampKind, int], now_ns: int, is_lockstep: bool
-) -> list[tuple[_Pending, Stamp]]:
-    """Removes and stamps the answers that are ready at ``now_ns``, in the order of their requests.
-
-    No answer is ready before an earlier one. In real time an answer that arrives after its modelled delay is ready on
-    arrival, and later ones do not wait for an earlier one, which may never come. In lockstep time steps from tick to
-    tick and then waits, so an answer's arrival in between must not matter.
-    """
-    ripe: list[tuple[_Pending, Stamp]] = []
-    for head in list(asked):
-        if head.answer is None or head.delay_ns is None:
-            if is_lockstep:
-                break
-            continue
-        came_ns = head.due_ns if is_lockstep else max(head.due_ns, head.arrived_ns)
-        ready_ns = in_order(came_ns, last_ready_ns.get(kind))
-        if ready_ns > now_ns:
-            break
-        last_ready_ns[kind] = ready_ns
-        asked.remove(head)
-        stamp = Stamp(
-            kind=kind,
-            index=head.index,
-            source_ns=head.source_ns,
-            ready_ns=ready_ns,
-            arrived_ns=head.arrived_ns,
-            is_transition=isinstance(head.answer, Cognition) and head.answer.is_transition,
-        )
-        ripe.append((head, stamp))
-    return ripe
