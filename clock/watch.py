@@ -25,6 +25,7 @@ class _Seen:
     has_token: bool = True
     rival_ns: int | None = None  # when a second process of this name was heard
     is_lost: bool = False
+    opened_ns: int | None = None  # when it answered an opening that none of its heartbeats has named yet
 
 
 @dataclass(slots=True)
@@ -76,7 +77,7 @@ class Watch:
             seen.is_lost = False
         self.members = members
         for proc in members:  # what was heard before says nothing of this episode
-            self._seen[proc] = _Seen(heard_ns=now_ns)
+            self._seen[proc] = _Seen(heard_ns=now_ns, opened_ns=now_ns)
 
     def poll(self, procs: tuple[str, ...], episode: str, now_ns: int) -> list[Change]:
         """Changes of ``procs``, which have all opened ``episode``, since the last poll."""
@@ -101,6 +102,9 @@ class Watch:
             return "it was restarted and has not said anything yet" if seen.is_lost else ""
         if seen.health.state != ServingState.READY:
             return f"it is {seen.health.state.name.lower()} {seen.health.detail}".strip()
-        if seen.health.open_episode != episode:
-            return "it was restarted and does not know the episode yet"
-        return ""
+        if seen.health.open_episode == episode:
+            seen.opened_ns = None
+            return ""
+        if seen.opened_ns is not None and not seen.is_lost and now_ns - seen.opened_ns <= self.timeout_ns:
+            return ""  # the heartbeat is from before the opening, and was on its way
+        return "it was restarted and does not know the episode yet"

@@ -127,6 +127,25 @@ def test_a_new_episode_forgets_old_losses(watch: Watch) -> None:
     assert watch.poll(PROCS, "e2", 10**12 + HEARTBEAT_TIMEOUT_NS) == []
 
 
+def test_a_heartbeat_from_before_the_opening_is_no_loss(watch: Watch) -> None:
+    watch.enter({"ponder": 0}, 10**12)
+    watch.on_health(health(episode="e1"), 10**12)
+    assert watch.poll(PROCS, "e2", 10**12) == []
+    watch.on_health(health(episode="e2"), 10**12 + 1)
+    assert watch.poll(PROCS, "e2", 10**12 + 1) == []
+    watch.on_health(health(episode="e1"), 10**12 + 2)
+    assert [change.is_lost for change in watch.poll(PROCS, "e2", 10**12 + 2)] == [True]
+
+
+def test_a_server_that_never_names_the_episode_is_lost(watch: Watch) -> None:
+    watch.enter({"ponder": 0}, 0)
+    told = []
+    for now_ns in (0, HEARTBEAT_TIMEOUT_NS, HEARTBEAT_TIMEOUT_NS + 1):
+        watch.on_health(health(episode=""), now_ns)
+        told.append([change.is_lost for change in watch.poll(PROCS, "e2", now_ns)])
+    assert told == [[], [], [True]]
+
+
 def test_one_loss_is_not_the_others(watch: Watch) -> None:
     watch.on_health(health(proc="pounce"), 0)
     watch.on_token("pounce", False)
