@@ -24,7 +24,8 @@ from dual_system.data.dart import DART, NoiseKind
 from dual_system.data.episode import Package, Rejection, unpack
 from dual_system.data.errors import DatasetError
 from dual_system.data.jobs import DIFFICULTY_CYCLE, RECOVERY_SHARE, Job, Look, jobs_of
-from dual_system.data.lerobot_v3 import COLLECTION_PATH, INFO_PATH, DatasetWriter
+from dual_system.data.lerobot_files import INFO_PATH
+from dual_system.data.lerobot_v3 import COLLECTION_PATH, DatasetWriter
 from dual_system.data.rollout import UNSOLVED, work_out
 from dual_system.data.seeds import TRAIN_SEED
 from dual_system.data.shove import SHOVES

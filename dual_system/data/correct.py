@@ -28,7 +28,8 @@ from dual_system.data.episode import About, EpisodeWriter, Package, unpack
 from dual_system.data.errors import DatasetError
 from dual_system.data.export import texts_by_tick
 from dual_system.data.jobs import Look
-from dual_system.data.lerobot_v3 import INFO_PATH, DatasetWriter
+from dual_system.data.lerobot_files import INFO_PATH
+from dual_system.data.lerobot_v3 import DatasetWriter
 from dual_system.data.rollout import Scribe, UnsolvedError, asked, check_solved, kept_environment
 from dual_system.data.workers import LocalWorkers, Workers
 from dual_system.tasks.engine import Status

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dual_system.data import lerobot_files as layout
 from dual_system.data import lerobot_v3 as v3
 from dual_system.data.episode import CAMERAS, OPTIONAL, Rows, from_table
 from dual_system.data.errors import DatasetError
@@ -53,12 +54,12 @@ class Dataset:
         missing = sorted({*_LISTED} - self._folder.listed[0].keys())
         if missing:
             raise DatasetError(
-                f"{root} is a LeRobot {v3.VERSION} dataset, but not one of ours: meta/episodes lacks "
+                f"{root} is a LeRobot {layout.VERSION} dataset, but not one of ours: meta/episodes lacks "
                 f"{', '.join(missing)}; pp-collect and pp-export write ours"
             )
         if self._folder.fps != FPS:
             raise DatasetError(f"{root} has {self._folder.fps} rows a second; datasets here have {FPS}")
-        shapes = {camera: self._folder.features.get(v3.video_key(camera), {}).get("shape") for camera in CAMERAS}
+        shapes = {camera: self._folder.features.get(layout.video_key(camera), {}).get("shape") for camera in CAMERAS}
         self.image_px = _side_px(root, shapes)
         self.episodes = tuple(_entry(root, listed) for listed in self._folder.listed)
 
@@ -84,7 +85,7 @@ class Dataset:
             IndexError: the episode has no such row.
             DatasetError: the video is broken.
         """
-        return self._folder.frames(episode, v3.video_key(camera), rows)
+        return self._folder.frames(episode, layout.video_key(camera), rows)
 
 
 _SAME = ("task", "seed", "difficulty", "origin", "is_success", "recovery", "num_rejected", "num_demonstration_rows")
@@ -104,8 +105,8 @@ def _side_px(root: Path, shapes: Mapping[str, Any]) -> int:
         is_square = isinstance(shape, list) and len(shape) == 3 and shape[0] == shape[1] and type(shape[0]) is int
         if not is_square or shape != next(iter(shapes.values())):
             raise DatasetError(
-                f"{root / v3.INFO_PATH}: the video {v3.video_key(camera)} has the shape {shape}; expected square "
-                f"pictures [px, px, 3], of one size in {' and '.join(map(v3.video_key, shapes))}"
+                f"{root / layout.INFO_PATH}: the video {layout.video_key(camera)} has the shape {shape}; expected "
+                f"square pictures [px, px, 3], of one size in {' and '.join(map(layout.video_key, shapes))}"
             )
     return int(next(iter(shapes.values()))[0])
 

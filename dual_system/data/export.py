@@ -1,15 +1,16 @@
-"""``pp-export``: exports recorded episodes as a dataset of the same format, every row an exact join by tick.
+"""``pp-export``: exports recorded episodes as a LeRobot v3 dataset, every row an exact join by tick.
 
-Row k is the observation of tick k, the texts in force then, and the action that was commanded for tick k. A log holds
-no demonstration. Since a seed decides the scene, the demonstration is performed again and put before the rows; the
-state after it must equal the first state of the log.
+Row k is the observation of tick k, the texts in force then, and the action that was commanded for tick k. Any robot's
+log becomes rows ``recorded`` (`recording`). A log of a task here may also become rows for ``training``: it holds no
+demonstration, but a seed decides the scene, so the demonstration is performed again and put before the rows; the state
+after it must equal the first state of the log.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -19,16 +20,23 @@ from tqdm import tqdm
 
 from dual_system.data.episode import CAMERAS, About, Episode, EpisodeWriter, Row, unpack
 from dual_system.data.errors import DatasetError
-from dual_system.data.lerobot_v3 import INFO_PATH, DatasetWriter
+from dual_system.data.lerobot_files import INFO_PATH
+from dual_system.data.lerobot_v3 import DatasetWriter
+from dual_system.data.recorded import commands, joined, recording_of, unpacked, why_unfit
+from dual_system.data.recording import RecordingWriter
 from dual_system.data.rollout import Narrator
 from dual_system.data.video import FPS, Frame
 from dual_system.tasks.environment import Environment, Snapshot, make_environment
+from dual_system.tasks.task import task_names
 from protocol import files, images
 from protocol import messages as m
 from protocol.command_line import command, parse
-from protocol.mcap_log import EpisodeRecord, Picture, read_log, read_pictures
+from protocol.errors import FileError
+from protocol.mcap_log import EpisodeRecord, read_log, read_pictures
 
-DONE, REFUSED = 0, 2
+DONE = 0
+SUITE = "RoboMME"
+"""Of the tasks that are simulated here."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,10 +47,17 @@ class ExportOptions:
     """MCAP logs of sim-client or pp-eval."""
     out: Path
     """Folder of the new dataset."""
+    rows: Literal["auto", "training", "recorded"] = "auto"
+    """training: a set that pp-train reads, with demonstrations; of tasks simulated here only. recorded: what the logs
+    hold, of any one robot, at its own rate, with LeRobot's language columns. auto: training if the first log is of a
+    task here, else recorded."""
+    unfit: Literal["refuse", "leave-out"] = "refuse"
+    """A log that is cut, has a gap or does not agree with its schedule. refuse: stop and name it; leave-out: go on
+    without it and say why."""
     texts: Literal["logged", "follow"] = "logged"
-    """Subgoal texts. logged: as recorded; follow: replay every action and write the texts as the scene then stands.
-    A dropped object is to be picked up again, coordinates follow pushed objects, and of several objects that all count
-    the next one is one that is left. Use follow to train PONDER on policy rollouts."""
+    """Subgoal texts of training rows. logged: as recorded; follow: replay every action and write the texts as the scene
+    then stands. A dropped object is to be picked up again, coordinates follow pushed objects, and of several objects
+    that all count the next one is one that is left. Use follow to train PONDER on policy rollouts."""
     demonstration_hz: Literal[1, 2, 4, 5, 10, 20] = 20
     """Rate of a demonstration's pictures in Hz; its last frame is always rendered. Training reads 1 Hz by default."""
     only_success: bool = False
@@ -54,36 +69,78 @@ class ExportOptions:
 @command("pp-export")
 def main(argv: list[str] | None = None) -> int:
     options = parse(ExportOptions, argv, prog="pp-export")
-    num_episodes = export(options)
+    num_episodes, left_out = export(options)
+    for told in left_out:
+        sys.stderr.write(f"pp-export: left out: {told}\n")
     sys.stdout.write(f"{num_episodes} of {len(options.files)} episodes in {options.out}\n")
     return DONE
 
 
-def export(options: ExportOptions) -> int:
-    """Writes the dataset and returns the number of its episodes.
+def export(options: ExportOptions) -> tuple[int, list[str]]:
+    """Writes the dataset; returns the number of its episodes, and why logs were left out.
 
     Raises:
-        DatasetError: there is a dataset already, nothing is left to write, or a log cannot be joined.
+        DatasetError: there is a dataset already, nothing is left to write, or a log is unfit.
         OSError, ProtocolError: a log cannot be read.
         TaskError: a log of a task that does not exist here.
     """
     if (options.out / INFO_PATH).exists():
         raise DatasetError(f"{options.out} holds a dataset already; use another --out")
-    writer = DatasetWriter(files.folder(options.out))
-    num_episodes = 0
+    if not options.files:
+        raise DatasetError("name at least one log")
+    writer = (_Training if _is_for_training(options) else _Recorded)(options)
+    num_episodes, left_out = 0, list[str]()
     for path in tqdm(options.files, unit="episode", disable=not options.progress):
-        record = read_log(path)
-        if options.only_success and not (record.result and record.result.is_success):
+        try:
+            record = read_log(path)
+            if options.only_success and not (record.result and record.result.is_success):
+                continue
+            if why := why_unfit(path, record):
+                raise DatasetError(f"{path}: {why}")
+            with files.writing(options.out):
+                writer.add(path, record)
+        except (DatasetError, FileError) as error:
+            if options.unfit == "refuse":
+                raise DatasetError(f"{error}. --unfit leave-out goes on without such logs") from None
+            left_out.append(str(error))
             continue
-        episode = read_episode(path, record, texts=options.texts, demonstration_hz=options.demonstration_hz)
-        with files.writing(options.out):
-            writer.add(episode)
         num_episodes += 1
     if not num_episodes:
-        raise DatasetError("none of the logs is of an episode that succeeded; leave out --only-success")
+        why = "; ".join(left_out) or "none of the logs is of an episode that succeeded; leave out --only-success"
+        raise DatasetError(f"nothing to write: {why}")
     with files.writing(options.out):
         writer.finish()
-    return num_episodes
+    return num_episodes, left_out
+
+
+class _Training:
+    """Rows for training, of tasks here."""
+
+    def __init__(self, options: ExportOptions) -> None:
+        self._options, self._writer = options, DatasetWriter(files.folder(options.out))
+        self.finish = self._writer.finish
+
+    def add(self, path: Path, record: EpisodeRecord) -> None:
+        of = self._options
+        self._writer.add(read_episode(path, record, texts=of.texts, demonstration_hz=of.demonstration_hz))
+
+
+class _Recorded:
+    """Rows as they were recorded, of any robot."""
+
+    def __init__(self, options: ExportOptions) -> None:
+        self._writer = RecordingWriter(files.folder(options.out))
+        self.finish = self._writer.finish
+
+    def add(self, path: Path, record: EpisodeRecord) -> None:
+        self._writer.add(recording_of(path, record))
+
+
+def _is_for_training(options: ExportOptions) -> bool:
+    if options.rows == "auto":
+        info = read_log(options.files[0]).info
+        return info.suite == SUITE and info.task in task_names()
+    return options.rows == "training"
 
 
 def read_episode(
@@ -105,11 +162,16 @@ def read_episode(
     """
     info = record.info
     if info.schedule.control_hz != FPS:
-        raise DatasetError(f"{path}: {info.schedule.control_hz} commands a second; datasets here have {FPS} rows")
-    observations, actions = _joined(path, record)
+        raise DatasetError(
+            f"{path}: {info.schedule.control_hz} commands a second; training rows have {FPS}: give --rows recorded"
+        )
+    observations, ticks = joined(path, record)
+    actions = commands(info.robot, ticks)
     height_px, width_px = info.robot.image_height, info.robot.image_width
     if height_px != width_px:
-        raise DatasetError(f"{path}: pictures of {height_px} x {width_px} px; datasets here have square ones")
+        raise DatasetError(
+            f"{path}: pictures of {height_px} x {width_px} px; training rows have square ones: give --rows recorded"
+        )
     writer = EpisodeWriter(height_px)
     follows = texts == "follow"
     max_steps = len(actions) + 1  # it ended as it did
@@ -186,20 +248,6 @@ def _again(
     return Narrator(environment), snapshot
 
 
-def _joined(path: Path, record: EpisodeRecord) -> tuple[list[m.Observation], list[m.Floats]]:
-    """Returns observations and actions of ticks 0, 1, 2 ...; the observation after the last action is left out."""
-    seen = {each.tick: each for each in record.observations}
-    done = {each.tick: each.action for each in record.ticks}
-    num_ticks = record.result.num_ticks if record.result else len(done)
-    missing = [tick for tick in range(num_ticks) if tick not in seen or tick not in done]
-    if missing or not num_ticks:
-        what = f"ticks {missing[:5]} of {num_ticks}" if missing else "every tick"
-        raise DatasetError(
-            f"{path}: the log lacks the observation or the account of {what}: an episode with gaps cannot be trained on"
-        )
-    return [seen[tick] for tick in range(num_ticks)], [done[tick] for tick in range(num_ticks)]
-
-
 def texts_by_tick(subgoals: Sequence[m.Subgoal], num_ticks: int) -> list[tuple[str, str, bool]]:
     """Returns the simulator's plain and grounded text in force at each tick, and whether a subgoal begins there.
 
@@ -232,19 +280,12 @@ def _pictures(path: Path, observations: Sequence[m.Observation]) -> Iterator[dic
         for picture in logged:
             if picture.source_ns == observation.source_ns and picture.camera in CAMERAS:
                 with files.reading(path, f"log with a picture of tick {observation.tick}"):
-                    found[picture.camera] = _pixels(picture, observation)
+                    found[picture.camera] = unpacked(picture, observation)
             if len(found) == len(CAMERAS):
                 break
         else:
             raise DatasetError(f"{path}: no pictures of tick {observation.tick}; record with cameras")
         yield found
-
-
-def _pixels(picture: Picture, observation: m.Observation) -> Frame:
-    """Decodes a logged picture, which must have the size that the observation announced."""
-    (announced,) = (image for image in observation.images if image.camera == picture.camera)
-    codec = m.ImageCodec[picture.format.upper()]
-    return images.unpack(replace(announced, codec=codec, data=picture.data))
 
 
 if __name__ == "__main__":

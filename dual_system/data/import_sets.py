@@ -19,7 +19,8 @@ from tqdm import tqdm
 
 from dual_system.data.episode import About, Episode, EpisodeWriter, Row, unpack
 from dual_system.data.errors import DatasetError
-from dual_system.data.lerobot_v3 import INFO_PATH, DatasetWriter
+from dual_system.data.lerobot_files import INFO_PATH
+from dual_system.data.lerobot_v3 import DatasetWriter
 from dual_system.data.mapping import SourceMapping, read_mapping
 from dual_system.data.robomme_h5 import SUFFIXES, RobommeFile
 from dual_system.data.source import NO_PICTURE, LeRobotSource, SourceEpisode, at_20_hz, frame_at

@@ -28,12 +28,11 @@ _PERSISTENT = [*_EVENT[:3], pa.field("timestamp", pa.float32(), nullable=False),
 TYPES = {PERSISTENT: pa.list_(pa.struct(_PERSISTENT)), EVENTS: pa.list_(pa.struct(_EVENT))}
 
 
-def language_columns(rows: Rows) -> dict[str, pa.Array]:
-    """Both columns of an episode: its subgoals as the assistant's subtasks, its reasoning as the assistant's memory."""
-    spoken = spoken_in(rows)
+def language_columns(spoken: list[dict[str, Any]], num_rows: int) -> dict[str, pa.Array]:
+    """Both columns of an episode: ``spoken``, made by `said`, and no events."""
     return {
-        PERSISTENT: pa.array([spoken] * len(rows), TYPES[PERSISTENT]),
-        EVENTS: pa.array([[]] * len(rows), TYPES[EVENTS]),
+        PERSISTENT: pa.array([spoken] * num_rows, TYPES[PERSISTENT]),
+        EVENTS: pa.array([[]] * num_rows, TYPES[EVENTS]),
     }
 
 
@@ -43,19 +42,20 @@ def spoken_in(rows: Rows) -> list[dict[str, Any]]:
     for row in range(len(rows)):
         text = rows.grounded_subgoal[row] or rows.subgoal[row]
         if rows.demonstration_reasoning[row]:
-            found.append(_said(rows.demonstration_reasoning[row], "memory", row))
+            found.append(said(rows.demonstration_reasoning[row], "memory", row / FPS))
         if text and (text != subtask or rows.is_transition[row]):
-            found.append(_said(text, "subtask", row))
+            found.append(said(text, "subtask", row / FPS))
             subtask = text
     return found
 
 
-def _said(content: str, style: str, row: int) -> dict[str, Any]:
+def said(content: str, style: str, at_s: float) -> dict[str, Any]:
+    """One persistent row, of the assistant's: a subgoal is its "subtask", its reasoning is "memory"."""
     return {
         "role": "assistant",
         "content": content,
         "style": style,
-        "timestamp": row / FPS,
+        "timestamp": at_s,
         "camera": None,
         "tool_calls": None,
     }

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dual_system.data.errors import DatasetError
-from dual_system.data.lerobot_v3 import DATA_PATH, INFO_PATH, VERSION, VIDEO_PATH
+from dual_system.data.lerobot_files import DATA_PATH, INFO_PATH, VERSION, VIDEO_PATH
 from dual_system.data.video import read_frames, read_header
 from dual_system.hub import local_folder
 from protocol.files import read_object, require_file

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 FPS = 20
 CODEC, PIXEL_FORMAT = "h264", "yuv420p"
 FRAMES_PER_KEY = 10
-_TIME_BASE = Fraction(1, FPS)
 _OPTIONS = {
     "crf": "18",
     "preset": "veryfast",
@@ -31,17 +30,19 @@ _OPTIONS = {
     "threads": "1",
 }
 
-Frame = NDArray[np.uint8]  # (image_px, image_px, 3) RGB
+Frame = NDArray[np.uint8]  # (height, width, 3) RGB
 
 
 class VideoWriter:
     """Encodes one episode of one camera into memory: about a megabyte a minute at 256 px."""
 
-    def __init__(self, image_px: int) -> None:
+    def __init__(self, height_px: int, width_px: int = 0, fps: int = FPS) -> None:
+        """Args: width_px: 0: as high. Both must be even: colours have half as many pixels."""
+        self._time_base = Fraction(1, fps)
         self._file = io.BytesIO()
         self._container = av.open(self._file, "w", format="mp4")
-        self._stream: Any = self._container.add_stream("libx264", rate=FPS, options=_OPTIONS)
-        self._stream.width = self._stream.height = image_px
+        self._stream: Any = self._container.add_stream("libx264", rate=fps, options=_OPTIONS)
+        self._stream.height, self._stream.width = height_px, width_px or height_px
         self._stream.pix_fmt = PIXEL_FORMAT
         self._stream.codec_context.thread_count = 1
         self._num_frames = 0
@@ -57,7 +58,7 @@ class VideoWriter:
             self._last = picture.reformat(format=PIXEL_FORMAT)  # once, however often it is repeated
         if self._last is None:
             raise ValueError("the first frame of a video must be a picture; look at the first row of an episode")
-        self._last.pts, self._last.time_base = self._num_frames, _TIME_BASE
+        self._last.pts, self._last.time_base = self._num_frames, self._time_base
         self._num_frames += 1
         for packet in self._stream.encode(self._last):
             self._container.mux(packet)
@@ -73,7 +74,8 @@ class VideoWriter:
 class VideoJoiner:
     """Appends finished videos to one file, packet by packet."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, fps: int = FPS) -> None:
+        self._time_base = Fraction(1, fps)
         path.parent.mkdir(parents=True, exist_ok=True)
         self._container = av.open(str(path), "w", format="mp4")
         self._stream: Any = None
@@ -86,12 +88,12 @@ class VideoJoiner:
             stream = source.streams.video[0]
             if self._stream is None:
                 self._stream = self._container.add_stream_from_template(stream)
-                self._stream.time_base = _TIME_BASE
+                self._stream.time_base = self._time_base
             for packet in source.demux(stream):
                 if packet.size == 0:  # the demuxer's way to say that it is through
                     continue
                 packet.stream = self._stream
-                packet.time_base = _TIME_BASE
+                packet.time_base = self._time_base
                 packet.pts = packet.dts = self.num_frames
                 packet.duration = 1
                 self._container.mux(packet)

@@ -38,7 +38,7 @@ def record(log: Path) -> EpisodeRecord:
 @pytest.fixture(scope="module")
 def exported(log: Path, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     out = tmp_path_factory.mktemp("exported") / "dataset"
-    assert export(ExportOptions(files=(log,), out=out, progress=False)) == 1
+    assert export(ExportOptions(files=(log,), out=out, progress=False)) == (1, [])
     return Dataset(out)
 
 

@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from dual_system.data import card
+from dual_system.data import lerobot_files as layout
 from dual_system.data import lerobot_v3 as v3
 from dual_system.data.dataset import Dataset
 from dual_system.data.episode import Package, unpack
@@ -22,8 +23,8 @@ from dual_system.data.errors import DatasetError
 from dual_system.data.video import read_frames
 
 LENGTHS = (5, 9, 4)
-DATA = v3.DATA_PATH.format(chunk_index=0, file_index=0)
-VIDEO = v3.VIDEO_PATH.format(video_key=v3.video_key("front"), chunk_index=0, file_index=0)
+DATA = layout.DATA_PATH.format(chunk_index=0, file_index=0)
+VIDEO = layout.VIDEO_PATH.format(video_key=layout.video_key("front"), chunk_index=0, file_index=0)
 POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 7\n"
 
 
@@ -59,13 +60,13 @@ def assert_own_rows_and_frames(folder: Path, base: Path) -> Dataset:
 
 
 def edit_info(folder: Path, **changes: Any) -> None:
-    path = folder / v3.INFO_PATH
+    path = folder / layout.INFO_PATH
     values = {**json.loads(path.read_text()), **changes}
     path.write_text(json.dumps({name: value for name, value in values.items() if value is not None}))
 
 
 def listed(folder: Path) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = pq.read_table(folder / v3.EPISODES_PATH).to_pylist()
+    found: list[dict[str, Any]] = pq.read_table(folder / layout.EPISODES_PATH).to_pylist()
     return found
 
 
@@ -73,7 +74,7 @@ def edit_episodes(folder: Path, edit: Callable[[list[dict[str, Any]]], Any]) -> 
     rows = listed(folder)
     edit(rows)
     pq.write_table(
-        pa.Table.from_pylist(rows, schema=pq.read_schema(folder / v3.EPISODES_PATH)), folder / v3.EPISODES_PATH
+        pa.Table.from_pylist(rows, schema=pq.read_schema(folder / layout.EPISODES_PATH)), folder / layout.EPISODES_PATH
     )
 
 
@@ -96,7 +97,7 @@ def test_rows_may_be_those_of_pandas(folder: Path, base: Path) -> None:
 
 
 def test_episodes_may_be_listed_in_several_files_and_chunks(folder: Path, base: Path) -> None:
-    table = pq.read_table(folder / v3.EPISODES_PATH)
+    table = pq.read_table(folder / layout.EPISODES_PATH)
     for name, begin in (("chunk-000/file-000", 0), ("chunk-000/file-001", 1), ("chunk-001/file-000", 2)):
         path = folder / "meta" / "episodes" / f"{name}.parquet"
         path.parent.mkdir(exist_ok=True)
@@ -106,7 +107,7 @@ def test_episodes_may_be_listed_in_several_files_and_chunks(folder: Path, base: 
 
 @pytest.mark.parametrize("kept", [[0, 2], [1, 2], [2, 0]])
 def test_episodes_may_be_taken_out_and_leave_a_gap(folder: Path, base: Path, kept: list[int]) -> None:
-    pq.write_table(pq.read_table(folder / v3.EPISODES_PATH).take(kept), folder / v3.EPISODES_PATH)
+    pq.write_table(pq.read_table(folder / layout.EPISODES_PATH).take(kept), folder / layout.EPISODES_PATH)
     assert [each.index for each in assert_own_rows_and_frames(folder, base).episodes] == kept
 
 
@@ -158,8 +159,8 @@ def point_at_another(rows: list[dict[str, Any]]) -> None:
 
 
 def share_frames(rows: list[dict[str, Any]]) -> None:
-    rows[1][f"videos/{v3.video_key('wrist')}/from_timestamp"] -= 0.05
-    rows[1][f"videos/{v3.video_key('wrist')}/to_timestamp"] -= 0.05
+    rows[1][f"videos/{layout.video_key('wrist')}/from_timestamp"] -= 0.05
+    rows[1][f"videos/{layout.video_key('wrist')}/to_timestamp"] -= 0.05
 
 
 def double(rows: list[dict[str, Any]]) -> None:
@@ -229,18 +230,18 @@ def test_an_info_json_of_something_else_is_refused(folder: Path, changes: dict[s
 
 
 @pytest.mark.parametrize(
-    "column", ["episode_index", "dataset_to_index", f"videos/{v3.video_key('wrist')}/from_timestamp"]
+    "column", ["episode_index", "dataset_to_index", f"videos/{layout.video_key('wrist')}/from_timestamp"]
 )
 def test_a_listing_without_lerobot_s_columns_is_refused(folder: Path, column: str) -> None:
-    table = pq.read_table(folder / v3.EPISODES_PATH)
-    pq.write_table(table.drop_columns([column]), folder / v3.EPISODES_PATH)
+    table = pq.read_table(folder / layout.EPISODES_PATH)
+    pq.write_table(table.drop_columns([column]), folder / layout.EPISODES_PATH)
     with pytest.raises(DatasetError, match=f"expected a number for {column}, came None"):
         Dataset(folder)
 
 
 def test_a_dataset_of_lerobot_s_own_columns_is_not_ours(folder: Path) -> None:
-    table = pq.read_table(folder / v3.EPISODES_PATH)
-    pq.write_table(table.drop_columns(["seed", "difficulty"]), folder / v3.EPISODES_PATH)
+    table = pq.read_table(folder / layout.EPISODES_PATH)
+    pq.write_table(table.drop_columns(["seed", "difficulty"]), folder / layout.EPISODES_PATH)
     with pytest.raises(DatasetError, match="not one of ours: meta/episodes lacks difficulty, seed"):
         Dataset(folder)
 
@@ -252,7 +253,7 @@ def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
-@pytest.mark.parametrize("name", [v3.INFO_PATH, v3.EPISODES_PATH, DATA, VIDEO])
+@pytest.mark.parametrize("name", [layout.INFO_PATH, layout.EPISODES_PATH, DATA, VIDEO])
 @pytest.mark.parametrize(
     "damage", [cut, Path.unlink, lambda path: path.write_text(POINTER)], ids=["cut", "gone", "lfs"]
 )
@@ -262,7 +263,7 @@ def test_a_broken_file_is_named(
     damage(folder / name)
     assert card.main([str(folder)]) == 2
     said = capsys.readouterr().err
-    assert (name if name != v3.EPISODES_PATH else "meta/episodes") in said
+    assert (name if name != layout.EPISODES_PATH else "meta/episodes") in said
     assert "Traceback" not in said
 
 
@@ -272,13 +273,13 @@ def test_a_parquet_file_that_declares_too_much_is_not_read(folder: Path, monkeyp
         Dataset(folder)
 
 
-@pytest.mark.parametrize("name", [v3.EPISODES_PATH, DATA])
+@pytest.mark.parametrize("name", [layout.EPISODES_PATH, DATA])
 def test_a_text_that_is_repeated_without_end_is_not_spelled_out(
     folder: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     monkeypatch.setattr("dual_system.data.lerobot_folder.MAX_TEXT_BYTES", 2000)
     table = pq.read_table(folder / name)
-    column = "difficulty" if name == v3.EPISODES_PATH else "subgoal"
+    column = "difficulty" if name == layout.EPISODES_PATH else "subgoal"
     texts = pa.array(["x" * 1000] * len(table))
     pq.write_table(table.set_column(table.column_names.index(column), column, texts), folder / name)
     with pytest.raises(DatasetError, match=r"its texts have \d+ bytes, at most 2000"):

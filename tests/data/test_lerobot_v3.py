@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from dual_system.data import lerobot_files as layout
 from dual_system.data import lerobot_v3 as v3
 from dual_system.data.dataset import Dataset
 from dual_system.data.episode import CAMERAS, EXECUTED, Episode, Package, unpack
@@ -72,8 +73,8 @@ def test_the_numbers_that_lerobot_counts_by(dataset: Dataset) -> None:
 
 
 def test_the_folder_describes_itself(dataset: Dataset) -> None:
-    described = json.loads((dataset.root / v3.INFO_PATH).read_text())
-    listed = pq.read_table(dataset.root / v3.EPISODES_PATH).to_pylist()
+    described = json.loads((dataset.root / layout.INFO_PATH).read_text())
+    listed = pq.read_table(dataset.root / layout.EPISODES_PATH).to_pylist()
     assert described["codebase_version"] == "v3.0"
     assert (described["total_episodes"], described["total_frames"], described["total_tasks"]) == (3, 18, 2)
     assert [(each["dataset_from_index"], each["dataset_to_index"]) for each in listed] == [(0, 5), (5, 14), (14, 18)]
@@ -82,19 +83,19 @@ def test_the_folder_describes_itself(dataset: Dataset) -> None:
     assert stored == {name for name, feature in features.items() if feature["dtype"] != "video"}
     for each in listed:
         for camera in CAMERAS:
-            key = v3.video_key(camera)
+            key = layout.video_key(camera)
             place = {name: each[f"videos/{key}/{name}"] for name in ("chunk_index", "file_index")}
             assert (dataset.root / described["video_path"].format(video_key=key, **place)).exists()
 
 
 def test_instructions_are_found_by_their_text(dataset: Dataset) -> None:
-    table = pq.read_table(dataset.root / v3.TASKS_PATH)
+    table = pq.read_table(dataset.root / layout.TASKS_PATH)
     assert table.to_pydict() == {"task_index": [0, 1], "task": ["count to 0", "count to 1"]}
     assert json.loads(table.schema.metadata[b"pandas"])["index_columns"] == ["task"]
 
 
 def test_statistics_of_actions_leave_demonstrations_out(dataset: Dataset, episodes: list[Episode]) -> None:
-    found = json.loads((dataset.root / v3.STATS_PATH).read_text())
+    found = json.loads((dataset.root / layout.STATS_PATH).read_text())
     own = np.concatenate([episode.rows.action[~episode.rows.is_demonstration] for episode in episodes])
     np.testing.assert_allclose(found["action"]["mean"], own.astype(np.float64).mean(0))
     assert found["action"]["count"] == [len(own)] == [12]
@@ -122,14 +123,14 @@ def test_what_was_executed_under_noise_is_a_column_of_its_own(package: Callable[
     assert set(pq.read_table(tmp_path / "data").column_names) == {
         name for name, feature in features.items() if feature["dtype"] != "video"
     }
-    found = json.loads((tmp_path / v3.STATS_PATH).read_text())
+    found = json.loads((tmp_path / layout.STATS_PATH).read_text())
     assert found[EXECUTED]["count"] == found["action"]["count"] == [6]
     assert found[EXECUTED]["mean"] != found["action"]["mean"]
 
 
 def test_a_dataset_without_noise_has_no_such_column(dataset: Dataset) -> None:
     assert EXECUTED not in dataset.described["features"]
-    assert "noise_rad" not in pq.read_table(dataset.root / v3.EPISODES_PATH).column_names
+    assert "noise_rad" not in pq.read_table(dataset.root / layout.EPISODES_PATH).column_names
     assert dataset.rows(0).executed_action is None
     assert {each.noise_rad for each in dataset.episodes} == {0.0}
 

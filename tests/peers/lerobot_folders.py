@@ -2,6 +2,7 @@
 
 python lerobot_folders.py write ROOT     ten frames a second, two cameras; also merged, cut, and without videos
 python lerobot_folders.py read FOLDER    JSON on stdout
+python lerobot_folders.py rows FOLDER    the same, of any robot's: every row
 """
 
 import json
@@ -69,6 +70,26 @@ def read(root: Path) -> dict:
     }
 
 
+def rows(root: Path) -> dict:
+    data = LeRobotDataset("test/rows", root=root, video_backend="pyav")
+    items = [data[row] for row in range(len(data))]
+    return {
+        "fps": data.fps,
+        "robot": data.meta.robot_type,
+        "names": [data.features[name]["names"] for name in ("observation.state", "action")],
+        "state": [item["observation.state"].tolist() for item in items],
+        "action": [item["action"].tolist() for item in items],
+        "level": [item["level"] for item in items],
+        "task": [item["task"] for item in items],
+        "persistent": [row["language_persistent"] for row in data.hf_dataset],
+        "events": [row["language_events"] for row in data.hf_dataset],
+        "pictures": {
+            key: [(255 * item[key].permute(1, 2, 0)).round().int().tolist() for item in items[:3]]
+            for key in data.meta.camera_keys
+        },
+    }
+
+
 if __name__ == "__main__":
     verb, place = sys.argv[1], Path(sys.argv[2])
     if verb == "write":
@@ -77,4 +98,5 @@ if __name__ == "__main__":
         delete_episodes(videos, [1], output_dir=place / "cut", repo_id="test/cut")
         merge_datasets([videos, others], output_repo_id="test/merged", output_dir=place / "merged")
     else:
-        sys.stdout.write(json.dumps(read(place), default=str) + "\n")
+        told = {"read": read, "rows": rows}[verb](place)
+        sys.stdout.write(json.dumps(told, default=str) + "\n")
