@@ -57,8 +57,8 @@ class Fault:
 
     @property
     def spoils_logs(self) -> bool:
-        """Whether a log may end early, or not be there."""
-        return "sim" in self.struck or self.kind in ("disk_full", "folder_read_only")
+        """Whether a log may end early, have gaps, or not be there."""
+        return "sim" in self.struck or self.kind in ("disk_full", "folder_read_only", "tcp_stalled", "tcp_cut")
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from clock.check import main as pp_check
+from clock.check_gaps import before_gaps
 from protocol import messages as m
 from protocol.errors import FileError
 from protocol.mcap_log import EpisodeRecord, read_log
@@ -39,7 +40,7 @@ def verdict(path: Path) -> tuple[str, str]:
 def unbidden_in(path: Path) -> list[str]:
     """``unbidden`` of a log; an unreadable one has nothing to tell."""
     try:
-        record = read_log(path)
+        record, _ = before_gaps(read_log(path))
     except (OSError, FileError):
         return []  # the verdict has it
     return list(unbidden(record))

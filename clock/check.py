@@ -17,6 +17,7 @@ import tyro
 
 from clock.check_answers import answers_of, check_invocations, check_queries, check_stamps
 from clock.check_findings import Disagreement, compare
+from clock.check_gaps import before_gaps
 from clock.check_robot import check_robot
 from clock.check_shadow import check_shadows
 from clock.check_ticks import check_deadlines, check_rows
@@ -107,7 +108,7 @@ def _check(path: Path, config: CheckConfig, head: ResidualHead | None) -> int:
         if config.recover is not None:
             recover(path, config.recover)
             path = config.recover
-        record = read_log(path)
+        record, gaps = before_gaps(read_log(path))
         with files.reading(path, "log of an episode"):  # an odd number may fail anywhere in the derivation
             found = next(disagreements(record, head), None)
             dropped = int(record.metadata.get("ponderpounce.result", {}).get("dropped_messages", "0"))
@@ -131,7 +132,7 @@ def _check(path: Path, config: CheckConfig, head: ResidualHead | None) -> int:
         text += f"; {shadows} answers of shadows, never used"
     if record.recovered:
         text += f"; {record.why}"
-    if dropped:
+    if dropped and not gaps:
         text += f"; the recorder dropped {dropped} messages, which may be all that is missing"
     _tell(config, fields, text)
     return AGREES if found is None else DISAGREES
