@@ -21,6 +21,8 @@ log = logging.getLogger(__name__)
 
 _RANK = {topic.name: rank for rank, topic in enumerate(STREAMS)}
 KEEP = 512  # per topic, between two drains; drains come every tick
+_OWED_S = 0.5
+_LOOK_NS = 10_000_000
 
 
 class Recorder:
@@ -40,6 +42,7 @@ class Recorder:
         self.ticks: list[m.Tick] = []
         self.stamps: list[m.Stamp] = []
         self.invocations: list[m.Invocation] = []
+        self._answered: set[tuple[m.StampKind, int]] = set()
 
     def begin(self, info: m.EpisodeInfo, path: Path | None) -> None:
         """Starts an episode; without a path nothing is written, and on a full disk neither.
@@ -47,6 +50,7 @@ class Recorder:
         Raises OSError if the log cannot be made for another reason.
         """
         self.ticks, self.stamps, self.invocations = [], [], []
+        self._answered.clear()
         self._log, self._unrecorded = None, ""
         self._superseded = {topic.name: stream.subscription.num_superseded for topic, stream in self._streams}
         waits = info.schedule.mode == m.Mode.LOCKSTEP  # there the world has time, and a log with gaps is no proof
@@ -80,6 +84,7 @@ class Recorder:
         if self._log is not None:
             self._link.publish(RESULT, result, at_ns=max((t.decided_ns for t in self.ticks), default=0))
             self.step()
+            self._await_answers()
             for topic, stream in self._streams:
                 if lost := stream.subscription.num_superseded - self._superseded[topic.name]:
                     self._log.miss(topic, lost)
@@ -90,6 +95,14 @@ class Recorder:
             if closing.dropped:
                 missing.append(f"log {closing.path.name}: dropped {closing.dropped}")
         return missing
+
+    def _await_answers(self) -> None:
+        """A stamp may come before the answer that it admits, which another process sent on another link."""
+        owed = {(stamp.kind, stamp.index) for stamp in self.stamps[-4:]}
+        until_s = time.monotonic() + _OWED_S
+        while not owed <= self._answered and time.monotonic() < until_s:
+            self._link.bus.wait(_LOOK_NS)
+            self.step()
 
     def _is_of_log(self, topic: Topic[object], header: m.Header) -> bool:
         """Whether a message belongs into this episode's log: nobody outside of it can write there."""
@@ -111,6 +124,10 @@ class Recorder:
             self.stamps.append(message)
         elif isinstance(message, m.Invocation):
             self.invocations.append(message)
+        elif isinstance(message, m.Cognition) and message.header.proc == "ponder":
+            self._answered.add((m.StampKind.COGNITION, message.query))
+        elif isinstance(message, m.ActionChunk) and message.header.proc == "pounce":
+            self._answered.add((m.StampKind.CHUNK, message.invocation))
 
 
 def _episode_ns(received: Received[object]) -> int:

@@ -172,6 +172,20 @@ def test_of_a_clock_that_was_killed_the_last_account_may_be_missing(
     assert not found if agrees else [each.field for each in found] == ["num_ticks"]
 
 
+@pytest.mark.parametrize("has_left", [True, False])
+def test_only_a_last_tick_after_the_robot_left_may_lack_its_action(
+    has_left: bool, timing: Any, realtime: Any, record_of: Any
+) -> None:
+    record = record_of(realtime(timing(), 40, seed=2))
+    last = record.ticks[-1].tick
+    num_ticks = last if has_left else last + 1
+    result = replace(record.result, num_ticks=num_ticks, stream_sha256=stream_sha256(record.ticks[:num_ticks]))
+    cut = replace(record, actions=[each for each in record.actions if each.tick != last], result=result)
+    assert [(e.message, e.index) for e in disagreements(cut)] == ([] if has_left else [("Action", last)])
+    found = [(each.message, each.index) for each in disagreements(without(cut, "actions", 20))]
+    assert ("Action", cut.actions[20].tick) in found
+
+
 def changed(record: EpisodeRecord, name: str, index: int, **fields: Any) -> EpisodeRecord:
     """The record with some fields of one message replaced."""
     messages = list(getattr(record, name))

@@ -14,7 +14,7 @@ from protocol import messages as m
 from protocol.bus import LocalBus
 from protocol.link import Link, Stream
 from protocol.mcap_log import read_log
-from protocol.topics import ACTION, SUBGOAL, TICK
+from protocol.topics import ACTION, CHUNK, STAMP, SUBGOAL, TICK
 from sim_client.recorder import KEEP, Recorder
 
 COMMAND = np.zeros(3, np.float32)
@@ -65,3 +65,41 @@ def test_a_tick_in_the_log_has_its_action_whenever_they_arrive(
     record = read_log(tmp_path / "episode.mcap")
     assert len(record.ticks) > 2
     assert {each.tick for each in record.ticks} <= {each.tick for each in record.actions}
+
+
+@pytest.mark.parametrize("comes", [True, False])
+def test_a_log_waits_for_an_answer_whose_stamp_was_faster(
+    episode_info: Callable[..., m.EpisodeInfo], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, comes: bool
+) -> None:
+    bus, info = LocalBus(), episode_info(schedules.realtime())
+    clock, pounce, sim = (Link(bus, robot=info.header.robot, proc=proc) for proc in ("clock", "pounce", "sim"))
+    members = [m.Member(proc=link.proc, boot_id=link.boot_id) for link in (clock, pounce)]
+    for link in (clock, pounce, sim):
+        link.enter_episode(info.header.session, info.header.episode, info.header.epoch, members)
+    recorder = Recorder(sim, "jpeg")
+    recorder.begin(info, tmp_path / "episode.mcap")
+    clock.publish(STAMP, m.Stamp(kind=m.StampKind.CHUNK, index=0, source_ns=0, ready_ns=1, arrived_ns=1), at_ns=1)
+    num_looks = 0
+
+    def wait(timeout_ns: int) -> None:
+        nonlocal num_looks
+        num_looks += 1
+        if comes and num_looks == 3:
+            horizon, action_dim = info.schedule.horizon, info.robot.action_dim
+            answer = m.ActionChunk(
+                invocation=0,
+                t_row0=0,
+                horizon=horizon,
+                action_dim=action_dim,
+                dt_ns=50_000_000,
+                rows=np.zeros(horizon * action_dim, np.float32),
+                source_ns=0,
+                ref_query=None,
+                age_ns=0,
+            )
+            pounce.publish(CHUNK, answer, at_ns=1)
+
+    monkeypatch.setattr(bus, "wait", wait)
+    recorder.end(m.EpisodeResult(status=m.TaskStatus.TIMEOUT, is_success=False, reason="", num_ticks=0))
+    record = read_log(tmp_path / "episode.mcap")
+    assert (len(record.stamps), len(record.chunks)) == (1, int(comes))
