@@ -24,11 +24,8 @@ from protocol.topics import ACTION, EVENT, OBSERVATION, PHASE, SUBGOAL, TICK
 from sim_client.recorder import Recorder
 from sim_client.robot import observation, status_of
 from sim_client.robot_end import is_sound
+from sim_client.silence import CLOCK_SILENCE_NS, STALL_NS, Silence
 
-CLOCK_SILENCE_NS = 500 * NS_PER_MS
-"""Real time: commands that stay away this long mean that the clock service is gone. The servos hold meanwhile."""
-STALL_NS = 200 * NS_PER_MS
-"""Real time: a turn of 20 ms that takes this long means that this process stood still, and heard nobody meanwhile."""
 HOLD_S = 0.5
 """Time for which the robot then holds before it ends the episode."""
 STOPPED_S = 3
@@ -79,7 +76,8 @@ class RobotSide:
         self._begin(info)
         self._show(snapshot, 0)
         self.link.publish(PHASE, m.Phase(state="running"), at_ns=0)
-        heard_ns = time.monotonic_ns()
+        is_lockstep = info.schedule.mode == m.Mode.LOCKSTEP  # there others may compute in this process, as they please
+        silence = Silence(time.monotonic_ns(), self.patience_ns if is_lockstep else STALL_NS)
         while True:
             self.recorder.step()
             for action in self.actions.drain():
@@ -87,10 +85,10 @@ class RobotSide:
                     continue
                 if not is_sound(self.link, action, self._obeyed, snapshot.state):
                     continue
-                heard_ns = time.monotonic_ns()
                 snapshot = self._obey(info, action)
                 self.recorder.step()  # each time: many commands may wait, and it keeps few observations
                 on_tick(self._tick)
+                silence.heard(time.monotonic_ns())
                 if snapshot.status is not Status.ONGOING:
                     return Outcome(status=status_of(snapshot), reason=snapshot.reason, num_ticks=self._tick)
                 if self._stopped_ticks > STOPPED_S * self._control_hz:
@@ -101,31 +99,21 @@ class RobotSide:
                 )
                 self._hold()
                 return self._abort(self.link.second_sender)
-            silent_ns = time.monotonic_ns() - heard_ns
-            if silent_ns > self._limit_ns(info):
+            if silence.total_ns > self._limit_ns(info):
                 if self._tick == 0:
-                    return self._abort(f"no command came within {silent_ns / 1e9:.0f} s")
-                text = f"no command for {silent_ns / 1e6:.0f} ms: holding the last one"
+                    return self._abort(f"no command came within {silence.total_ns / 1e9:.0f} s")
+                text = f"no command for {silence.total_ns / 1e6:.0f} ms: holding the last one"
                 self._tell(m.Severity.ERROR, CLOCK_LOST_EVENT, text)
                 self._hold()
                 return self._abort("clock lost")
-            heard_ns += self._rest(info)
+            self.let_others(20 * NS_PER_MS)
+            if away_ns := silence.look(time.monotonic_ns()):
+                text = f"the robot's own process stood still for {away_ns / NS_PER_MS:.0f} ms"
+                self._tell(m.Severity.WARNING, "robot_stalled", text)
 
     def _begin(self, info: m.EpisodeInfo) -> None:
         self._control_hz = info.schedule.control_hz
         self._obeyed = Obeyed(info.robot, self._control_hz)
-
-    def _rest(self, info: m.EpisodeInfo) -> int:
-        """Lets the others run; returns for how long this process stood still, which is nobody's silence but its own."""
-        left_ns = time.monotonic_ns()
-        self.let_others(20 * NS_PER_MS)
-        away_ns = time.monotonic_ns() - left_ns
-        if info.schedule.mode == m.Mode.LOCKSTEP or away_ns < STALL_NS:
-            return 0
-        self._tell(
-            m.Severity.WARNING, "robot_stalled", f"the robot's own process stood still for {away_ns / 1e6:.0f} ms"
-        )
-        return away_ns
 
     def _limit_ns(self, info: m.EpisodeInfo) -> int:
         waits = info.schedule.mode == m.Mode.LOCKSTEP or self._tick == 0

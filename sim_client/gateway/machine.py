@@ -15,7 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -32,7 +32,6 @@ from protocol.errors import EpisodeRefused, ProtocolError, TransportError
 from protocol.link import Link, Stream
 from protocol.process import host_clock_id
 from protocol.topics import ACTION, CHUNK, EVENT, HEALTH, OBSERVATION, SHADOW_OF, TICK
-from sim_client.episode import CLOCK_SILENCE_NS
 from sim_client.gateway.body import Body
 from sim_client.gateway.exchange import Answer, Finish, Frames, Observed, Refused, Step, Trial
 from sim_client.gateway.lease import Lease
@@ -41,6 +40,7 @@ from sim_client.gateway.pictures import resized
 from sim_client.gateway.rule import sampled
 from sim_client.recorder import Recorder
 from sim_client.robot_end import RobotEnd, is_sound
+from sim_client.silence import CLOCK_SILENCE_NS, Silence
 from sim_client.suite import versions
 
 log = logging.getLogger("pp-gateway")
@@ -84,7 +84,7 @@ class _Episode:
     info: m.EpisodeInfo
     node: Node
     clock: MonotonicClock | None = None  # of the host, from the first observation on
-    heard_ns: int = 0  # the newest command, on that clock
+    silence: Silence = field(default_factory=lambda: Silence(time.monotonic_ns()))
     over: str = ""  # why it ended although the client did not end it
 
 
@@ -316,12 +316,13 @@ class Machine:
         self._take_background(node)
         for action in self._commands(episode):
             node.on_action(action, time.monotonic_ns())
-            episode.heard_ns = episode.clock.now_ns()
-        silent_ns = episode.clock.now_ns() - episode.heard_ns
+            episode.silence.heard(time.monotonic_ns())
+        if away_ns := episode.silence.look(time.monotonic_ns()):
+            log.warning("this process stood still for %.0f ms", away_ns / 1e6)
         limit_ns = self._plan.patience_ns if node.commands.newest is None else CLOCK_SILENCE_NS
         why = episode.node.over() or self._objection()
-        if not why and silent_ns > limit_ns:
-            why = f"no command for {silent_ns / 1e6:.0f} ms"
+        if not why and episode.silence.total_ns > limit_ns:
+            why = f"no command for {episode.silence.total_ns / 1e6:.0f} ms"
         waiting, self._waiting = self._waiting, []
         for future, after_tick in waiting:
             if (answer := node.answer(time.monotonic_ns(), after_tick)) is not None:

@@ -8,11 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from clock import schedules
 from protocol import messages as m
 from protocol import topics
-from sim_client.episode import CLOCK_SILENCE_NS, RobotSide
+from sim_client.episode import RobotSide
+from sim_client.silence import CLOCK_SILENCE_NS, STALL_NS, Silence
 
 MS = 1_000_000
 
@@ -75,6 +78,34 @@ def test_a_robot_that_stood_still_blames_nobody_else(robot: Robot) -> None:
     assert outcome.num_ticks == 15
     names = [(event.name, event.severity) for event in robot.events.drain()]
     assert names[0] == ("robot_stalled", m.Severity.WARNING)
+
+
+@given(steps=st.lists(st.one_of(st.none(), st.integers(0, 3 * STALL_NS)), max_size=50))
+def test_silence_is_the_time_listened_to_since_a_command(steps: list[int | None]) -> None:
+    """None is a command; a number is the time until the next look."""
+    now_ns, silence, expected_ns = 0, Silence(0), 0
+    for step in steps:
+        if step is None:
+            silence.heard(now_ns)
+            expected_ns = 0
+            continue
+        now_ns += step
+        assert silence.look(now_ns) == (step if step >= STALL_NS else 0)
+        expected_ns += step if step < STALL_NS else 0
+        assert silence.total_ns == expected_ns
+
+
+def test_a_robot_whose_world_stood_still_blames_nobody_else(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was stopped within a step of the simulation, and what the clock sent meanwhile is not read yet."""
+    step = robot._world.step
+
+    def slow(*args: Any, **options: Any) -> Any:
+        robot._now_ns += 2 * CLOCK_SILENCE_NS
+        return step(*args, **options)
+
+    monkeypatch.setattr(robot._world, "step", slow)
+    outcome = robot.run([after(robot, 0), lambda: 20 * MS, after(robot, 14)])
+    assert outcome.num_ticks == 15
 
 
 def test_an_episode_that_ends_in_ticks_that_the_clock_skipped_is_over_there(robot: Robot) -> None:
