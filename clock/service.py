@@ -238,7 +238,7 @@ class ClockService:
         self._link.drop(source_of(header), DropReason.OTHER_MODEL, f"the episode was opened with {agreed}, came {came}")
         if header.boot_id not in episode.others and len(episode.others) < 16:
             episode.others.add(header.boot_id)
-            text = f"{proc} answers with {came}; the episode was opened with {agreed}: its answers are not played"
+            text = f"{proc} answers with another model, {came}; the episode has {agreed}: its answers are not played"
             self._event(m.Severity.ERROR, "other_model", text)
         return False
 

@@ -36,7 +36,7 @@ from protocol.mcap_log import EpisodeRecord, read_log, read_pictures
 
 DONE = 0
 SUITE = "RoboMME"
-"""Of the tasks that are simulated here."""
+"""The suite of the tasks that are simulated here."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
