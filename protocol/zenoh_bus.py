@@ -54,6 +54,7 @@ class Endpoints:
     connect: tuple[str, ...] = ()
     tls: Tls | None = None
     shared_memory: bool = True
+    lease_ms: int = LEASE_MS
 
     def __post_init__(self) -> None:
         for endpoint in (*self.listen, *self.connect):
@@ -99,7 +100,7 @@ def zenoh_config(endpoints: Endpoints) -> zenoh.Config:
         "connect/timeout_ms": -1,  # with the next line: keep trying in the background; 0 would try once
         "connect/exit_on_failure": False,
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 400, "period_increase_factor": 2},
-        "transport/link/tx/lease": LEASE_MS,
+        "transport/link/tx/lease": endpoints.lease_ms,
         "transport/link/tx/keep_alive": 5,
         # Sixteen batches per class, the maximum; the default is two. A raw observation takes seven, and the clock's
         # poll sends several small messages at once: on a busy host the third would be dropped after 1 ms.
@@ -185,7 +186,7 @@ class ZenohBus:
 
         def asked(query: zenoh.Query) -> None:
             payload = query.payload.to_bytes() if query.payload is not None else b""
-            inbox.put(Request(payload, _replier(query, key)))
+            inbox.put(Request(payload, _replier(query)))
             self._bell.ring()
 
         self._declared.append(self._session.declare_queryable(key, asked, complete=True))
@@ -246,9 +247,9 @@ def _copy(sample: zenoh.Sample) -> Sample:
     return Sample(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding), attachment)
 
 
-def _replier(query: zenoh.Query, key: str) -> Callable[[bytes], None]:
+def _replier(query: zenoh.Query) -> Callable[[bytes], None]:
     def reply(payload: bytes) -> None:
-        query.reply(key, payload)
+        query.reply(query.key_expr, payload)  # of the question: what is served may have wildcards
         query.drop()  # the caller waits for the end of the replies, not for the first
 
     return reply

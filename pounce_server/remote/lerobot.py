@@ -19,15 +19,22 @@ from clock.timebase import NS_PER_S
 from pounce_server.remote.peer import Lost, Patience, PeerError
 from protocol.bus import Bus
 from protocol.errors import CallFailed, TransportError
-from protocol.peers.arrays import NotAMessage, pack, unpack
+from protocol.peers.lerobot import (
+    Envelope,
+    WireError,
+    deployment_key,
+    instance_key,
+    is_name,
+    pack,
+    session_key,
+    unpack,
+)
 from protocol.peers.mapping import Key, PolicyMapping
 from protocol.peers.translation import Values, named
 from protocol.topics import Priority
 from protocol.zenoh_bus import Endpoints, ZenohBus
 
-VERSION = 1
 ACTION = ("action",)
-_ROOT = "lerobot/inference/v1/deployments"
 _CALL_S = 5.0
 _LEAVE_NS = 300_000_000
 _KEEP_ANSWERS = 4
@@ -110,7 +117,8 @@ class LerobotPeer:
         self._bus = ZenohBus(self._endpoints)
         self._session, self._generation, self._sequence = "", 0, 0
         try:
-            descriptor = self._call(f"{_ROOT}/{self._deployment}/describe", "describe", {}, "descriptor", patience)[1]
+            key = f"{deployment_key(self._deployment)}/describe"
+            descriptor = self._call(key, "describe", {}, "descriptor", patience).body
             self._compare(descriptor)
             if self._descriptor and descriptor["artifact_identity"] != self._descriptor["artifact_identity"]:
                 raise PeerError("it serves another artifact than at first; start pounce-serve again")
@@ -123,7 +131,7 @@ class LerobotPeer:
     def _open(self, patience: Patience) -> None:
         found = self._descriptor
         capabilities = found["capabilities"]
-        instance = f"{_ROOT}/{self._deployment}/instances/{found['instance_id']}"
+        instance = instance_key(self._deployment, found["instance_id"])
         body = {
             "expected_artifact": found["artifact_identity"],
             "features": capabilities["features"],
@@ -133,8 +141,8 @@ class LerobotPeer:
             "mode": "chunk",
             "encoding": "raw",
         }
-        envelope, _ = self._call(f"{instance}/open", "open", body, "accepted", patience)
-        self._session = f"{instance}/sessions/{envelope['session_id']}"
+        envelope = self._call(f"{instance}/open", "open", body, "accepted", patience)
+        self._session = session_key(self._deployment, found["instance_id"], envelope.session_id)
         bus = self._opened()
         self._answers = bus.subscribe(f"{self._session}/act", keep=_KEEP_ANSWERS)
         bus.subscribe(f"{self._session}/language/result", keep=1)  # the server waits for it, also without language
@@ -146,6 +154,8 @@ class LerobotPeer:
         mapping, capabilities = self._mapping, found.get("capabilities")
         if not isinstance(capabilities, Mapping) or not isinstance(capabilities.get("features"), list):
             raise PeerError(f"expected a descriptor with capabilities, came {str(found)[:_MAX_ERROR]}")
+        if not is_name(found.get("instance_id")):
+            raise PeerError(f"instance_id {str(found.get('instance_id'))[:80]!r}: expected a name")
         features = {str(each.get("name")): each for each in capabilities["features"] if isinstance(each, Mapping)}
         ours = {named(camera.key): "rgb" for camera in mapping.cameras if camera.key is not None}
         ours |= {named(key): "tensor" for key in mapping.state_keys()}
@@ -157,6 +167,11 @@ class LerobotPeer:
                 raise PeerError(
                     f"its {named(key)} is {features[named(key)].get('shape')}; {mapping.name} has ({width},)"
                 )
+        for key, names in mapping.names.items():
+            feature: Any = features.get(named(key)) or capabilities.get("action_feature")
+            told = feature.get("names") if isinstance(feature, Mapping) else None
+            if told and list(told) != list(names):
+                raise PeerError(f"its {named(key)} is {', '.join(map(str, told))}; {mapping.name} has {names}")
         if "chunk" not in capabilities.get("modes", ()):
             raise PeerError(f"its modes are {capabilities.get('modes')}, expected chunk among them")
         rows, rate_hz = capabilities.get("execution_steps"), 1 / float(capabilities.get("action_interval") or np.inf)
@@ -169,17 +184,15 @@ class LerobotPeer:
             raise Lost(f"it is not ready: {found.get('failure') or found.get('session_status')}")
 
     def _control(self, operation: str, patience: Patience) -> None:
-        _, ack = self._call(f"{self._session}/control", "control", {"operation": operation}, "ack", patience)
+        ack = self._call(f"{self._session}/control", "control", {"operation": operation}, "ack", patience).body
         if ack.get("applied_generation") != self._generation:
             self.close()
             raise PeerError(
                 f"{operation}: expected generation {self._generation}, came {ack.get('applied_generation')}"
             )
 
-    def _call(
-        self, key: str, kind: str, body: Mapping[str, Any], expected: str, patience: Patience
-    ) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
-        """The reply's envelope and body. Raises Lost: nobody serves it; PeerError: an error, or no answer in time."""
+    def _call(self, key: str, kind: str, body: Mapping[str, Any], expected: str, patience: Patience) -> Envelope:
+        """The reply. Raises Lost: nobody serves it; PeerError: an error, or no answer in time."""
         request = secrets.token_hex(16)
         asked = self._opened().ask(key, self._enveloped(kind, request, body), timeout_ns=round(_CALL_S * NS_PER_S))
         try:
@@ -200,35 +213,32 @@ class LerobotPeer:
                 for sample in self._answers.drain():
                     packet = sample.payload
                     if request.encode() in packet:
-                        return self._read(packet, "action", request)[1]
+                        return self._read(packet, "action", request).body
                 self._opened().wait(round(patience.look_s() * NS_PER_S))
         except PeerError:
             self.close()
             raise
 
     def _enveloped(self, kind: str, request: str, body: Mapping[str, Any]) -> bytes:
-        envelope = {
-            "version": VERSION,
-            "message_type": kind,
-            "instance_id": self._descriptor.get("instance_id", "") if kind != "describe" else "",
-            "session_id": self._session.rpartition("/")[2],
-            "request_id": request,
-            "generation": self._generation,
-            "body": dict(body),
-        }
-        return pack(envelope, "lerobot")
+        return pack(
+            Envelope(
+                kind=kind,
+                body=body,
+                instance_id=self._descriptor.get("instance_id", "") if kind != "describe" else "",
+                session_id=self._session.rpartition("/")[2],
+                request_id=request,
+                generation=self._generation,
+            )
+        )
 
-    def _read(self, packet: bytes, expected: str, request: str) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+    def _read(self, packet: bytes, expected: str, request: str) -> Envelope:
         """Raises PeerError for an error, and for what is no reply to this request."""
         try:
             envelope = unpack(packet)
-        except NotAMessage as error:
-            raise PeerError(f"expected LeRobot's msgpack, came {error}") from None
-        body = envelope.get("body") if isinstance(envelope, Mapping) else None
-        if not isinstance(body, Mapping) or envelope.get("version") != VERSION:
-            raise PeerError(f"expected a message of version {VERSION} with a body, came {str(envelope)[:_MAX_ERROR]}")
-        if envelope.get("message_type") == "error":
-            raise PeerError(f"it says: {body.get('code')}: {str(body.get('message'))[:_MAX_ERROR]}")
-        if envelope.get("message_type") != expected or envelope.get("request_id") != request:
-            raise PeerError(f"expected {expected}, came {envelope.get('message_type')}")
-        return envelope, body
+        except WireError as error:
+            raise PeerError(f"expected LeRobot's messages, came {error}") from None
+        if envelope.kind == "error":
+            raise PeerError(f"it says: {envelope.body.get('code')}: {str(envelope.body.get('message'))[:_MAX_ERROR]}")
+        if envelope.kind != expected or envelope.request_id != request:
+            raise PeerError(f"expected {expected}, came {envelope.kind}")
+        return envelope

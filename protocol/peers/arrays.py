@@ -1,6 +1,6 @@
 """msgpack with numpy arrays, read as a stranger's bytes: no pickle, no objects, no size that the bytes do not have.
 
-Five spellings of an array are in use. All are read, whichever comes; `pack` writes the one that a peer reads.
+Four spellings of an array are in use. All are read, whichever comes; `pack` writes the one that a peer reads.
 """
 
 from __future__ import annotations
@@ -18,15 +18,13 @@ from numpy.typing import NDArray
 
 from protocol.errors import ProtocolError
 
-Spelling = Literal["openpi", "vla-eval", "groot", "msgpack-numpy", "lerobot"]
+Spelling = Literal["openpi", "vla-eval", "groot", "msgpack-numpy"]
 """openpi: keys of bytes. vla-eval: keys of text; it also sends pictures as PNG or JPEG. groot: an ``.npy`` file, of
-GR00T N1.5 and N1.6. msgpack-numpy: that library's, of the newest GR00T N1.7. lerobot: pictures have a kind of their
-own."""
+GR00T N1.5 and N1.6. msgpack-numpy: that library's, of the newest GR00T N1.7."""
 
 MAX_DIMENSIONS = 8
 _DTYPE = re.compile(r"[<>|=]?(?:[iu][1248]|f[248]|b1)")
 """Numbers and truth values. A dtype is only made of a text that matches: others can mean objects or structures."""
-_DTYPE_NAME = re.compile(r"u?int(?:8|16|32|64)|float(?:16|32|64)|bool")
 _TEXT_DTYPE = re.compile(r"[<>=]?U[1-9][0-9]{0,3}")
 """Texts of up to so many characters, as numpy holds them: some clients send the prompt in an array."""
 _MAX_ITEMS = 1_000_000
@@ -94,19 +92,9 @@ def _spelled(array: NDArray[Any], spelling: Spelling) -> dict[Any, Any]:
         return {
             b"nd": True, b"type": array.dtype.str, b"kind": b"", b"shape": list(array.shape), b"data": array.tobytes(),
         }  # fmt: skip
-    if spelling == "lerobot":
-        return _spelled_by_lerobot(array)
     key: Any = str.encode if spelling == "openpi" else str
     fields = {"__ndarray__": True, "data": array.tobytes(), "dtype": array.dtype.str, "shape": list(array.shape)}
     return {key(name): content for name, content in fields.items()}
-
-
-def _spelled_by_lerobot(array: NDArray[Any]) -> dict[str, Any]:
-    fields = {"dtype": array.dtype.name, "shape": list(array.shape), "data": array.tobytes()}
-    if array.dtype == np.uint8 and array.ndim == 3:
-        return {"__lerobot_type__": "rgb", "encoding": "raw", "channel_order": "RGB", **fields}
-    endianness = "big" if array.dtype.str.startswith(">") else "little"
-    return {"__lerobot_type__": "tensor", "endianness": endianness, **fields}
 
 
 def _unspell(item: dict[Any, Any], picture: Picture | None) -> Any:
@@ -121,8 +109,6 @@ def _unspell(item: dict[Any, Any], picture: Picture | None) -> Any:
             return _msgpack_numpy(*(item.get(key(name)) for name in ("nd", "data", "type", "shape")))
         if key("__ModalityConfig_class__") in item or key("__ModalityConfig__") in item:
             return _modality(item.get(key("as_json")))
-    if "__lerobot_type__" in item:
-        return _lerobot(item)
     if "__image__" in item:
         if item.get("format") == "raw":
             return _array(item.get("data"), item.get("dtype"), item.get("shape"))
@@ -130,14 +116,6 @@ def _unspell(item: dict[Any, Any], picture: Picture | None) -> Any:
             raise NotAMessage("an encoded picture, where none is expected")
         return picture(item)
     return item
-
-
-def _lerobot(item: dict[Any, Any]) -> Any:
-    name = item.get("dtype")
-    if item.get("encoding", "raw") != "raw" or not isinstance(name, str) or not _DTYPE_NAME.fullmatch(name):
-        raise NotAMessage(f"an array of type {name!r}, {item.get('encoding', 'raw')!r}: expected raw numbers")
-    dtype = np.dtype(name).newbyteorder(">" if item.get("endianness") == "big" else "<")
-    return _array(item.get("data"), dtype.str, item.get("shape"))
 
 
 def _modality(content: Any) -> Any:

@@ -11,7 +11,7 @@ import math
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
 
@@ -103,6 +103,8 @@ class PolicyMapping:
     actions: tuple[Numbers, ...]
     constants: tuple[tuple[Key, Any], ...] = ()
     """Further values of every request, for peers that want them."""
+    names: Mapping[Key, tuple[str, ...]] = field(default_factory=dict)
+    """The components of vectors and arrays, for peers that compare them."""
     digest: str = ""
 
     @property
@@ -139,7 +141,7 @@ def read_mapping(path: Path) -> PolicyMapping:
 
 def _mapping(given: dict[str, Any], name: str, digest: str) -> PolicyMapping:
     known = {"rate_hz", "play_hz", "horizon", "num_proprio", "num_commands", "prompt", "cameras", "state", "action"}
-    _only(given, known | {"constants"}, "the file")
+    _only(given, known | {"constants", "names"}, "the file")
     rate_hz = _integer(given, "rate_hz", MIN_HZ, MAX_HZ)
     found = PolicyMapping(
         name=name,
@@ -156,7 +158,20 @@ def _mapping(given: dict[str, Any], name: str, digest: str) -> PolicyMapping:
         digest=digest,
     )
     _check_dims(found)
-    return found
+    return replace(found, names=_names(given.get("names", {}), found))
+
+
+def _names(given: Mapping[str, Any], found: PolicyMapping) -> dict[Key, tuple[str, ...]]:
+    widths = {".".join(key): (key, width) for key, width in (found.state_keys() | found.action_keys()).items()}
+    names = {}
+    for key, components in given.items():
+        if key not in widths:
+            raise ValueError(f"[names] {key!r}: expected one of {', '.join(widths)}")
+        is_list = isinstance(components, list) and all(isinstance(each, str) and each.strip() for each in components)
+        if not is_list or len(set(components)) != len(components) or len(components) != widths[key][1]:
+            raise ValueError(f"[names] {key!r} = {components!r}: expected {widths[key][1]} different names")
+        names[widths[key][0]] = tuple(components)
+    return names
 
 
 def _prompt(given: Mapping[str, Any]) -> Prompt:

@@ -33,6 +33,7 @@ from protocol.version import version
 from protocol.zenoh_bus import open_bus
 from sim_client.gateway.groot import GrootDialect
 from sim_client.gateway.http_form import HttpSide
+from sim_client.gateway.lerobot_side import LerobotSide
 from sim_client.gateway.machine import Machine
 from sim_client.gateway.memory import Memory
 from sim_client.gateway.options import GatewayOptions
@@ -119,7 +120,14 @@ def _machine(
 def _serving(options: GatewayOptions, seats: Seats) -> Iterator[None]:
     """Listens in its own thread for as long as the block lasts. Raises TransportError if it cannot."""
     host, port = options.address
-    max_bytes, terms, dialect = options.clients.max_message_mb << 20, options.terms(), options.dialect_class()
+    max_bytes, terms = options.clients.max_message_mb << 20, options.terms()
+    if options.dialect == "lerobot":
+        lerobot = LerobotSide((host, port), seats, terms, options.seats)
+        log.info("deployment=%s semantics=%s", lerobot.deployment.name, lerobot.deployment.semantics)
+        with _in_thread(lerobot.serve_forever, lerobot.shutdown):
+            yield
+        return
+    dialect = options.dialect_class()
     memory = Memory(options.clients.max_memory_mb << 20)
     if options.dialect == "challenge-http":
         http = HttpSide((host, port), seats, terms, dialect, max_bytes, options.api_key(), memory)

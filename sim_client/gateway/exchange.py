@@ -83,6 +83,18 @@ class Finish:
     reason: str = "the client went on without saying how the episode ended"
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Behind:
+    """What is behind a command, as far as it is known: the newest subgoal that has come from PONDER with its age, the
+    age of the cognition that the command's chunk was conditioned on, and how long both models took."""
+
+    subgoal: str = ""
+    subgoal_age_ns: int = 0
+    cognition_age_ns: int = 0
+    ponder_ns: int = 0
+    pounce_ns: int = 0
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Answer:
     """Commands for ``tick`` and the ticks after it, one row each, and the rung of the ladder that each came from.
@@ -94,6 +106,7 @@ class Answer:
     tick: int
     levels: tuple[Level, ...]
     deadline_ns: int = 0
+    behind: Behind = Behind()
 
 
 class ClientRequest(NamedTuple):
@@ -110,7 +123,7 @@ class Terms:
 
     ``cameras`` are our names with the client's keys; an empty key: the client's pictures in their own order.
     ``robot`` is described for a state of zeros and pictures of one pixel. ``mapping``: names and units of a policy's
-    client, for GR00T's dialects.
+    client, for the dialects of GR00T and LeRobot. ``has_ponder``: PONDER's subgoals can be asked for.
     """
 
     mode: Mode
@@ -121,6 +134,7 @@ class Terms:
     robot: Robot
     version: str
     mapping: PolicyMapping | None = None
+    has_ponder: bool = True
 
     @property
     def num_proprio(self) -> int:

@@ -31,7 +31,7 @@ from protocol.drops import DropReason
 from protocol.errors import EpisodeRefused, ProtocolError, TransportError
 from protocol.link import Link, Stream
 from protocol.process import host_clock_id
-from protocol.topics import ACTION, CHUNK, EVENT, HEALTH, OBSERVATION, SHADOW_OF, TICK
+from protocol.topics import ACTION, CHUNK, COGNITION, EVENT, HEALTH, OBSERVATION, SHADOW_OF, SUBGOAL, TICK
 from sim_client.gateway.body import Body
 from sim_client.gateway.exchange import Answer, Finish, Frames, Observed, Refused, Step, Trial
 from sim_client.gateway.lease import Lease
@@ -46,6 +46,7 @@ from sim_client.suite import versions
 log = logging.getLogger("pp-gateway")
 
 _IDLE_NS = 20_000_000
+_SILENCE_NS = 5_000_000_000
 _STOPPED = "the gateway was stopped"
 T = TypeVar("T")
 
@@ -116,7 +117,10 @@ class Machine:
         self._actions = link.subscribe(ACTION)
         self._accounts = link.subscribe(TICK)
         self._chunks = link.subscribe(CHUNK)
+        self._cognitions = link.subscribe(COGNITION)
+        self._subgoals = link.subscribe(SUBGOAL)
         self._healths = link.subscribe(HEALTH)
+        self._heard: dict[str, tuple[m.Health, int]] = {}  # by process: the newest, and when it came
         self._misshapen: dict[str, int] = {}  # by server: observations it had dropped for their shape at the start
         self._session = f"{_id_of(plan.suite)}-{secrets.token_hex(4)}"
         self._num_episodes = 0
@@ -144,6 +148,25 @@ class Machine:
     def holder(self) -> str:
         """The client that has the robot; "" if it is free."""
         return self._lease.holder
+
+    def unready(self) -> str:
+        """Why no episode could begin: a sentence; "" if the model servers say that they are ready."""
+        if self._is_closed:
+            return _STOPPED
+        now_ns, heard = time.monotonic_ns(), dict(self._heard)
+        for proc in servers_of(self._plan.policy):
+            health, heard_ns = heard.get(proc, (None, 0))
+            if health is None or now_ns - heard_ns > _SILENCE_NS:
+                return f"{proc} is not there"
+            if health.state != m.ServingState.READY:
+                return f"{proc} is {health.state.name.lower()} ({health.progress:.0%}) {health.detail}".strip()
+        return ""
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """The hashes of the models that were heard of last."""
+        heard = dict(self._heard)
+        return tuple(heard[proc][0].model_hash for proc in servers_of(self._plan.policy) if proc in heard)
 
     def submit(self, client: str, request: Step | Finish) -> Future[Answer | None]:
         """Hands in a request; the future holds its answer (None if it asks for no rows), or raises Refused.
@@ -175,7 +198,7 @@ class Machine:
         deadline_ns = time.monotonic_ns() + self._plan.patience_ns
         procs = servers_of(self._plan.policy)
         while any(states.get(proc) != "ready" for proc in procs):
-            for health in self._healths.drain():
+            for health in self._health():
                 state = (
                     f"{health.state.name.lower()} ({health.progress:.0%})"
                     if health.state != m.ServingState.READY
@@ -223,6 +246,13 @@ class Machine:
         self._turn(_IDLE_NS if is_live and self._jobs.empty() else 0)
         if is_live:
             self._look_after_live()
+        if self._episode is None:
+            self._health()  # who is ready, for those who ask before an episode
+
+    def _health(self) -> list[m.Health]:
+        news, now_ns = self._healths.drain(), time.monotonic_ns()
+        self._heard |= {health.header.proc: (health, now_ns) for health in news}
+        return news
 
     def _work(self, job: _Job) -> None:
         try:
@@ -337,7 +367,7 @@ class Machine:
         """A sentence if an episode cannot go on: a server was built for other pictures or joints, or has a double."""
         if self._link.second_sender:
             return self._link.second_sender
-        for health in self._healths.drain():
+        for health in self._health():
             is_member = self._link.members.get(health.header.proc) == health.header.boot_id
             if not is_member or health.header.proc in SHADOW_OF:
                 continue
@@ -347,11 +377,15 @@ class Machine:
         return ""
 
     def _take_background(self, node: Node) -> None:
-        """Reads the sources of forecast rows: the records of ticks, and chunks."""
+        """Reads the sources of forecast rows, and what is behind them."""
         for account in self._from("clock", self._accounts):
             node.commands.on_account(account)
         for chunk in self._from("pounce", self._chunks):
             node.commands.on_chunk(chunk)
+        for cognition in self._from("ponder", self._cognitions):
+            node.commands.on_cognition(cognition)
+        for subgoal in self._from("ponder", self._subgoals):
+            node.commands.on_subgoal(subgoal)
 
     def _commands(self, episode: _Episode) -> Iterator[m.Action]:
         """The commands to carry out, one at a time: whether one is sound depends on those before it."""
@@ -427,9 +461,9 @@ class Machine:
             if isinstance(error, EpisodeRefused) and error.refusal == m.Refusal.CAMERAS:
                 raise Refused(f"{error}. See --image-px") from error  # the gateway can make them another size
             raise
-        for stale in (self._actions, self._accounts, self._chunks):
+        for stale in (self._actions, self._accounts, self._chunks, self._cognitions, self._subgoals):
             stale.drain()
-        for health in self._healths.drain():
+        for health in self._health():
             self._misshapen[health.header.proc] = health.dropped.get(DropReason.WRONG_SHAPE, 0)
         if trial.is_dry:
             self._tell("dry_run", "a dry run: the robot is sent nothing")

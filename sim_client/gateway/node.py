@@ -22,7 +22,7 @@ from clock.playback import deadline_ns
 from clock.timebase import NS_PER_S
 from protocol import messages as m
 from sim_client.episode import STOPPED_S
-from sim_client.gateway.exchange import Answer
+from sim_client.gateway.exchange import Answer, Behind
 from sim_client.gateway.rule import ahead
 
 _KEEP_CHUNKS = 8
@@ -48,6 +48,8 @@ class Commands:
     newest: m.Action | None = None
     _account: m.Tick | None = None
     _chunks: dict[int, m.ActionChunk] = field(default_factory=dict)
+    _cognition: m.Cognition | None = None
+    _subgoal: m.Subgoal | None = None
 
     def __post_init__(self) -> None:
         self.obeyed = Obeyed(self.robot, self.control_hz)
@@ -64,6 +66,14 @@ class Commands:
         while len(self._chunks) > _KEEP_CHUNKS:
             del self._chunks[min(self._chunks)]
 
+    def on_cognition(self, cognition: m.Cognition) -> None:
+        self._cognition = cognition
+
+    def on_subgoal(self, subgoal: m.Subgoal) -> None:
+        """Keeps the newest one that PONDER has told; a blank one says that none is in force."""
+        if subgoal.kind == m.SubgoalKind.SUBGOAL:
+            self._subgoal = subgoal
+
     def answer(self, num_rows: int) -> Answer | None:
         """The newest command and its forecast; None while the forecast is unknown."""
         newest, account = self.newest, self._account
@@ -76,7 +86,18 @@ class Commands:
             if account.invocation is not None and (chunk := self._chunks.get(account.invocation)) is None:
                 return None
         rows, levels = ahead(newest, chunk, self.robot, num_rows)
-        return Answer(rows_NA=rows, tick=newest.tick, levels=levels)
+        return Answer(rows_NA=rows, tick=newest.tick, levels=levels, behind=self._behind(newest))
+
+    def _behind(self, newest: m.Action) -> Behind:
+        account, subgoal = self._account, self._subgoal
+        chunk = self._chunks.get(account.invocation) if account and account.invocation is not None else None
+        return Behind(
+            subgoal=subgoal.text.strip() if subgoal is not None else "",
+            subgoal_age_ns=max(0, newest.tick - subgoal.tick) * NS_PER_S // self.control_hz if subgoal else 0,
+            cognition_age_ns=account.age_ns if account is not None else 0,
+            ponder_ns=self._cognition.infer_ns if self._cognition is not None else 0,
+            pounce_ns=chunk.infer_ns if chunk is not None else 0,
+        )
 
 
 @dataclass(slots=True)

@@ -23,7 +23,7 @@ from protocol.peers.mapping import PolicyMapping, read_mapping
 from protocol.sockets import endpoint
 from protocol.topics import SHADOW_OF
 from protocol.version import version
-from sim_client.gateway import body, challenge, groot, mme_vla, openpi, ponderpounce, vla_eval
+from sim_client.gateway import body, challenge, groot, lerobot, mme_vla, openpi, ponderpounce, vla_eval
 from sim_client.gateway.exchange import Dialect, Terms
 from sim_client.gateway.machine import Plan
 
@@ -31,21 +31,24 @@ MAX_SEATS = 64
 """Each is a thread, a bus and, in real time, a clock of its own: more robots want another gateway on another host."""
 
 DialectName = Literal[
-    "ponderpounce", "openpi", "challenge", "challenge-http", "mme-vla", "vla-eval", "groot", "groot-n1.5"
+    "ponderpounce", "openpi", "challenge", "challenge-http", "mme-vla", "vla-eval", "groot", "groot-n1.5", "lerobot"
 ]
-GROOT: tuple[DialectName, ...] = ("groot", "groot-n1.5")
+_MAPPED: tuple[DialectName, ...] = ("groot", "groot-n1.5", "lerobot")
+_LIVE: tuple[DialectName, ...] = ("ponderpounce", "lerobot")
+"""Of real robots: in real time unless told otherwise, and a stopped episode waits for a person."""
 _OF_ROBOMME: tuple[DialectName, ...] = ("challenge", "challenge-http", "mme-vla", "vla-eval")
-_SPOKEN: dict[DialectName, tuple[type[Dialect], Mapping[str, str], str, int]] = {
-    # by name: who speaks it, where it has the cameras (if empty: by their names) and the state, and how many rows an
-    # answer usually has
+_SPOKEN: dict[DialectName, tuple[type[Dialect] | None, Mapping[str, str], str, int]] = {
+    # by name: who speaks it (None: a side of its own), where it has the cameras (if empty: by their names) and the
+    # state, and how many rows an answer usually has
     "ponderpounce": (ponderpounce.PonderpounceDialect, {}, ponderpounce.STATE_KEY, 1),
     "openpi": (openpi.OpenpiDialect, openpi.CAMERAS, openpi.STATE_KEY, 1),
     "challenge": (challenge.ChallengeDialect, challenge.CAMERAS, challenge.JOINTS_KEY, challenge.ROWS),
     "challenge-http": (challenge.ChallengeDialect, challenge.CAMERAS, challenge.JOINTS_KEY, challenge.ROWS),
     "mme-vla": (mme_vla.MmeVlaDialect, openpi.CAMERAS, openpi.STATE_KEY, mme_vla.ROWS),
     "vla-eval": (vla_eval.VlaEvalDialect, vla_eval.CAMERAS, "states", 1),
-    "groot": (groot.GrootDialect, {}, "", 0),  # these two have all of it in a mapping file
+    "groot": (groot.GrootDialect, {}, "", 0),  # these three have all of it in a mapping file
     "groot-n1.5": (groot.GrootN15Dialect, {}, "", 0),
+    "lerobot": (None, {}, "", 0),
 }
 
 
@@ -117,7 +120,7 @@ class LogOptions:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GatewayOptions:
     """Lets a robot's own program drive PONDER and POUNCE, and clients of other protocols: openpi, RoboMME's two
-    evaluators, vla-eval, GR00T."""
+    evaluators, vla-eval, GR00T, LeRobot."""
 
     dialect: DialectName
     """Protocol of the clients."""
@@ -126,18 +129,18 @@ class GatewayOptions:
     mode: Literal["lockstep", "realtime"] | None = None
     """Clock. lockstep: a request is --rows ticks of virtual time, and models may take their time. realtime: the
     schedule runs by itself, and a request is answered immediately with the action commanded at that moment. None:
-    realtime for the dialect ponderpounce, lockstep for the others."""
+    realtime for the dialects ponderpounce and lerobot, lockstep for the others."""
     rows: int | None = None
     """Number of rows in an answer, played by the client before its next request. None: 1, 20 for the challenge, and the
-    mapping file's horizon for GR00T."""
+    mapping file's horizon for GR00T and LeRobot."""
     robot_file: Path | None = None
     """TOML description of the robot, see docs/robots.md. None: the Panda of our tasks and of RoboMME."""
     cameras: tuple[str, ...] = ()
     """Pairs NAME=KEY, one per camera of ours, e.g. front=observation/image wrist=observation/wrist_image. Empty: the
     dialect's usual keys; in vla-eval the first picture is the front camera's and the second the wrist's."""
     mapping: Path | None = None
-    """TOML file with the client's names and units for cameras, state and actions, for the dialects of GR00T; see
-    docs/policies.md."""
+    """TOML file with the client's names and units for cameras, state and actions, for the dialects of GR00T and
+    LeRobot; see docs/policies.md."""
     state_key: str | None = None
     """Key of the measured joints. None: the dialect's usual key."""
     image_px: int | None = None
@@ -170,7 +173,7 @@ class GatewayOptions:
         if self.ponder == "none" and self.ponder_checkpoint is not None:
             raise TransportError("--ponder none starts no PONDER: leave --ponder-checkpoint out")
         host, _ = self.address
-        if self.dialect in GROOT and self.mapping is None:
+        if self.dialect in _MAPPED and self.mapping is None:
             raise TransportError(f"--dialect {self.dialect} needs a --mapping file: its clients name every number")
         rows = self.terms().rows
         if not 1 <= self.seats <= MAX_SEATS:
@@ -202,14 +205,19 @@ class GatewayOptions:
             )
         if self.clients.api_key_file and self.dialect == "vla-eval":
             raise TransportError("--api-key-file: vla-eval sends no key; use --open-to-anyone, or a tunnel")
+        if self.dialect == "lerobot" and not _is_loopback(host):
+            raise TransportError(f"--listen {self.listen}: LeRobot's clients have neither key nor TLS; use a tunnel")
 
     def _check_mapping(self, mapping: PolicyMapping) -> None:
         """Raises TransportError or FileError for a client that this robot could not be."""
         assert self.mapping is not None, "it was read"
-        if self.dialect not in GROOT:
+        if self.dialect not in _MAPPED:
             raise TransportError(f"--mapping: --dialect {self.dialect} has names of its own; see --cameras")
         with files.reading(self.mapping, "mapping file for this robot"):
-            groot.check_mapping(mapping)
+            if self.dialect == "lerobot":
+                lerobot.check_mapping(mapping, self.body().example().cameras)
+            else:
+                groot.check_mapping(mapping)
             num_proprio, control_hz = self.body().num_proprio, self.body().control_hz
             if mapping.num_proprio != num_proprio:
                 raise ValueError(f"num_proprio is {mapping.num_proprio}, the robot's {num_proprio}; see --robot-file")
@@ -218,7 +226,7 @@ class GatewayOptions:
 
     @property
     def is_realtime(self) -> bool:
-        return (self.mode or ("realtime" if self.dialect == "ponderpounce" else "lockstep")) == "realtime"
+        return (self.mode or ("realtime" if self.dialect in _LIVE else "lockstep")) == "realtime"
 
     @property
     def address(self) -> tuple[str, int]:
@@ -239,7 +247,9 @@ class GatewayOptions:
         return files.read_word(file, "word for --api-key-file") if file else ""
 
     def dialect_class(self) -> type[Dialect]:
-        return _SPOKEN[self.dialect][0]
+        found = _SPOKEN[self.dialect][0]
+        assert found is not None, f"{self.dialect} has a side of its own"
+        return found
 
     def terms(self) -> Terms:
         """The terms for the dialect. Raises TransportError for a camera that is not NAME=KEY."""
@@ -258,6 +268,7 @@ class GatewayOptions:
             robot=described,
             version=version(),
             mapping=mapping,
+            has_ponder=self.ponder != "none",
         )
 
     def policy_mapping(self) -> PolicyMapping | None:
@@ -311,7 +322,7 @@ class GatewayOptions:
             pixels=self.log.pixels,
             patience_ns=round(self.servers.patience_s * 1e9),
             idle_ns=round(self.clients.idle_s * 1e9),
-            waits_for_person=self.dialect == "ponderpounce",
+            waits_for_person=self.dialect in _LIVE,
         )
 
 

@@ -53,6 +53,15 @@ class Seats:
             "finished or left, or start pp-gateway with more --seats, and its servers with as many robots."
         )
 
+    def unready(self) -> str:
+        """Why no seat could begin an episode; "" if one can, were it free."""
+        return min((machine.unready() for machine in self._machines), key=len)
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """The hashes of the models behind the seats, which share them."""
+        return self._machines[0].models
+
     def await_servers(self, should_stop: Callable[[], bool]) -> None:
         """Waits until both model servers are ready for every seat. Raises TransportError as a machine does."""
         for machine in self._machines:

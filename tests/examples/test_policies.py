@@ -9,7 +9,7 @@ import pytest
 
 from protocol.peers.mapping import read_mapping
 from protocol.peers.translation import request_of, rows_of
-from sim_client.gateway.groot import check_mapping
+from sim_client.gateway import groot, lerobot
 
 FOLDER = Path(__file__).parents[2] / "examples" / "policies"
 FILES = sorted(FOLDER.glob("*.toml"))
@@ -28,7 +28,9 @@ def test_a_mapping_file_fits_our_panda(path: Path) -> None:
     assert (mapping.play_hz, mapping.num_proprio, mapping.num_commands) == (20, 8, 8)
     assert sorted(camera.camera for camera in mapping.cameras) == ["front", "wrist"]
     if path.stem.startswith("groot"):
-        check_mapping(mapping)
+        groot.check_mapping(mapping)
+    if path.stem.startswith("lerobot"):
+        lerobot.check_mapping(mapping, ("front", "wrist"))
 
 
 def test_droid_s_numbers_become_ours() -> None:

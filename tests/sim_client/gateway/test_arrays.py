@@ -21,7 +21,7 @@ from sim_client.gateway.pictures import EncodedPicture, resized
 
 NUMBERS = st.sampled_from([np.uint8, np.int64, np.float32, np.float64, np.bool_]).map(np.dtype)
 ARRAYS = hnp.arrays(NUMBERS, hnp.array_shapes(min_dims=0, max_dims=4, min_side=0, max_side=5))
-SPELLINGS = ("openpi", "vla-eval", "groot", "msgpack-numpy", "lerobot")
+SPELLINGS = ("openpi", "vla-eval", "groot", "msgpack-numpy")
 
 
 def png(frame: np.ndarray, format: str = "PNG") -> bytes:
