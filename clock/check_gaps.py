@@ -60,14 +60,14 @@ def _of_clock(record: EpisodeRecord) -> Iterator[Gap]:
 
 
 def _of_answers(record: EpisodeRecord) -> Iterator[Gap]:
-    """Answers are missing where they are first used: at their stamp."""
+    """Answers that were stamped and are missing between others, or at the end; from where they are first used."""
     for kind, index, stamp_kind in _ANSWERS:
         messages = getattr(record, kind)
-        lost = list(_gaps(kind, messages))
         known = {getattr(each, index) for each in messages}
-        used = (s for s in record.stamps if s.kind == stamp_kind and s.index not in known)
-        if lost and (stamp := next(used, None)) is not None:
-            yield Gap(stamp.header.at_ns, lost[0].proc, kind, sum(gap.num_missing for gap in lost))
+        missing = [s for s in record.stamps if s.kind == stamp_kind and s.index not in known]
+        if missing and (any(_gaps(kind, messages)) or missing[0].index > max(known, default=-1)):
+            proc = "ponder" if stamp_kind == StampKind.COGNITION else "pounce"
+            yield Gap(missing[0].header.at_ns, proc, kind, len({stamp.index for stamp in missing}))
 
 
 def _gaps(kind: str, messages: Sequence[Any]) -> Iterator[Gap]:

@@ -63,8 +63,10 @@ def test_what_is_before_a_gap_agrees(start_tick: int, num_ticks: int, kinds: set
         assert len(part.ticks) < start_tick + 1
 
 
-def test_a_lost_answer_ends_it_where_it_was_first_used(whole: EpisodeRecord) -> None:
-    cut = replace(whole, chunks=[*whole.chunks[:1], *whole.chunks[2:]])
+@pytest.mark.parametrize("position", [1, -1])
+def test_a_lost_answer_ends_it_where_it_was_first_used(position: int, whole: EpisodeRecord) -> None:
+    """The last one has no later number beside it."""
+    cut = replace(whole, chunks=[each for each in whole.chunks if each is not whole.chunks[position]])
     assert next(disagreements(cut), None) is not None
     part, why = before_gaps(cut)
     assert next(disagreements(part), None) is None
