@@ -11,7 +11,7 @@ export MUJOCO_GL ?= egl
 export OMP_NUM_THREADS ?= 1
 
 # `make help` lists the rest.
-.PHONY: help setup demo test unit oldest peers accept soak images lint types proto bench clean
+.PHONY: help setup demo test unit oldest peers accept soak images site lint types proto bench clean
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
 
@@ -93,6 +93,18 @@ soak: setup
 ## make images  builds the four container images and plays an episode with them (root, buildah)
 images: setup
 	$(BIN)/python -m benchmarks.images
+
+## make site    the documents as a site, links checked, in out/site/html
+SITE := $(VENV)/site
+$(SITE)/.ready: site/requirements.txt
+	$(PYTHON) -m venv $(SITE)
+	$(SITE)/bin/pip install --quiet -r site/requirements.txt
+	touch $@
+site: $(SITE)/.ready
+	rm -rf out/site
+	mkdir -p out/site/pages
+	git ls-files --cached --others --exclude-standard -- '*.md' 'docs/*' 'examples/*' 'docker/*' '*.py' | grep -v '^tests/.*\.md' | xargs cp --parents -t out/site/pages
+	$(SITE)/bin/mkdocs build --quiet --strict --config-file site/mkdocs.yaml
 
 ## make lint    style, types, import contracts
 lint: setup

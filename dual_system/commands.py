@@ -1,8 +1,8 @@
-"""Commands with verbs: ``pp-collect``, ``pp-export``, ``pp-parity``, ``pp-replay`` and ``pp-diagnose``.
+"""Commands whose modules are imported when they run: those with verbs, and those that need packages of an extra.
 
-``pp-collect --out DIR`` runs the command's default module, ``pp-collect correct LOG...`` the module of a verb. Modules
-are imported by name when they run, so each needs only its own dependencies: pp-collect runs without torch, pp-export hf
-without MuJoCo.
+``pp-collect --out DIR`` runs the command's default module, ``pp-collect correct LOG...`` the module of a verb. Each
+needs only its own dependencies (pp-collect runs without torch, pp-export hf without MuJoCo), and says which extra has
+them where they are missing.
 """
 
 from __future__ import annotations
@@ -35,6 +35,10 @@ class Command:
 
 
 COMMANDS = {
+    "sim-client": Command("sim_client.__main__"),
+    "pp-eval": Command("sim_client.evaluate"),
+    "pp-train": Command("dual_system.training.train"),
+    "pp-gateway": Command("sim_client.gateway.__main__"),
     "pp-collect": Command(
         "dual_system.data.collect",
         {
@@ -86,6 +90,30 @@ COMMANDS = {
 }
 
 
+@command("sim-client")
+def sim_client(argv: list[str] | None = None) -> int:
+    """``sim-client``."""
+    return _run("sim-client", sys.argv[1:] if argv is None else argv)
+
+
+@command("pp-eval")
+def evaluate(argv: list[str] | None = None) -> int:
+    """``pp-eval``."""
+    return _run("pp-eval", sys.argv[1:] if argv is None else argv)
+
+
+@command("pp-train")
+def train(argv: list[str] | None = None) -> int:
+    """``pp-train``."""
+    return _run("pp-train", sys.argv[1:] if argv is None else argv)
+
+
+@command("pp-gateway")
+def gateway(argv: list[str] | None = None) -> int:
+    """``pp-gateway``."""
+    return _run("pp-gateway", sys.argv[1:] if argv is None else argv)
+
+
 @command("pp-collect")
 def collect(argv: list[str] | None = None) -> int:
     """``pp-collect``."""
@@ -120,7 +148,7 @@ def _run(name: str, argv: list[str]) -> int:
     command, first = COMMANDS[name], argv[0] if argv else ""
     if first in command.verbs:
         return _main(command.verbs[first].module, argv[1:], prog=f"{name} {first}")
-    if _is_mistyped(first):
+    if command.verbs and _is_mistyped(first):
         close = difflib.get_close_matches(first, command.verbs, n=1)
         hint = f"Did you mean {close[0]!r}? " if close else ""
         sys.stderr.write(f"{name}: {first!r} is neither a verb nor a file. {hint}Verbs: {', '.join(command.verbs)}.\n")
@@ -128,7 +156,7 @@ def _run(name: str, argv: list[str]) -> int:
     try:
         return _main(command.default, argv)
     finally:
-        if {"-h", "--help"} & set(argv):
+        if command.verbs and {"-h", "--help"} & set(argv):
             sys.stdout.write(_listed(name, command.verbs))
 
 

@@ -8,8 +8,7 @@ from typing import Literal
 
 import tyro
 
-from ponder_server.context_policy import PolicyName
-from ponder_server.contract import WeightsName
+from ponder_server.contract import PolicyName, WeightsName
 from protocol.options import DaemonOptions, LinkOptions
 from protocol.sockets import endpoint
 

@@ -8,9 +8,10 @@ model should be trained, or at least tested, with the policy it is served with.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import TypeAlias
 
 from dual_system.models.ponder.context import SegmentKind
+from ponder_server.contract import PolicyName
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,8 +24,6 @@ class Span:
 
 Policy: TypeAlias = Callable[[Sequence[Span], int], list[bool]]
 """(spans of the context, tokens to free) -> which spans stay. If it frees fewer tokens, the query is refused."""
-
-PolicyName: TypeAlias = Literal["refuse", "pin-and-slide", "carriers-only"]
 
 _OF_A_QUERY = (SegmentKind.OBSERVATION, SegmentKind.TEXT, SegmentKind.CARRIERS)
 

@@ -24,6 +24,7 @@ Proprio: TypeAlias = npt.NDArray[np.float32]
 Result = TypeVar("Result")
 
 WeightsName: TypeAlias = Literal["float", "int8", "fp8"]
+PolicyName: TypeAlias = Literal["refuse", "pin-and-slide", "carriers-only"]
 
 Progress: TypeAlias = Callable[[], None]
 """Called between pieces of work, so that the heartbeat comes from the working loop and not from a timer."""

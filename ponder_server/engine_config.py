@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ponder_server.context_policy import PolicyName
-from ponder_server.contract import WeightsName
+from ponder_server.contract import PolicyName, WeightsName
 from ponder_server.runner import BUCKETS
 
 

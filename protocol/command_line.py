@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 import tyro
 
-from protocol import disk
+from protocol import disk, extras
 from protocol.errors import CommandError
 from protocol.options import LinkOptions
 
@@ -32,8 +32,9 @@ REFUSED, INTERRUPTED, READER_LEFT = 2, 130, 141  # the latter two as a shell cou
 def command(prog: str) -> Callable[[Main], Main]:
     """Decorates the ``main(argv)`` of a command; ``prog`` is its name, unless it is called with another.
 
-    Whatever a person can mend (CommandError, OSError, ValueError) becomes one sentence on stderr and exit code 2. Other
-    exceptions are defects of ours and keep their traceback. A reader that leaves (``| head``) ends a command silently.
+    Whatever a person can mend (CommandError, OSError, ValueError, a package of an extra that is not installed) becomes
+    one sentence on stderr and exit code 2. Other exceptions are defects of ours and keep their traceback. A reader that
+    leaves (``| head``) ends a command silently.
     """
 
     def decorate(main: Main) -> Main:
@@ -52,6 +53,11 @@ def command(prog: str) -> Callable[[Main], Main]:
             except KeyboardInterrupt:
                 sys.stderr.write(f"{name}: interrupted\n")
                 return INTERRUPTED
+            except ModuleNotFoundError as error:
+                if (way_out := extras.way_out(error)) is None:
+                    raise
+                sys.stderr.write(f"{name}: {way_out}\n")
+                return REFUSED
             except (CommandError, OSError, ValueError) as error:
                 sys.stderr.write(f"{name}: {sentence(error)}\n")
                 return REFUSED

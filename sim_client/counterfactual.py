@@ -32,7 +32,7 @@ from protocol import files
 from protocol.command_line import command, flat, parse
 from sim_client.config import ModelsOptions
 from sim_client.ledger import write_json
-from sim_client.robot import CAMERAS
+from sim_client.panda_robot import CAMERAS
 
 Views = tuple[NDArray[np.uint8], ...]
 Floats = NDArray[np.float32]

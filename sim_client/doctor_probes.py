@@ -117,7 +117,7 @@ def packages(role: Role, version_of: Callable[[str], str | None] = _installed) -
         elif not _is_within(version, bound):
             wrong.append(f"{name} is {version}, not {bound}")
     if wrong:
-        way_out = "make setup, or: pip install -r requirements.txt"
+        way_out = f"make setup, or: pip install '{DISTRIBUTION}[{','.join(extras)}]'"
         return Finding("packages", Level.FAILED, "; ".join(wrong), way_out)
     return Finding("packages", Level.OK, f"{DISTRIBUTION} {ours} and the {len(bounds)} it needs")
 
@@ -256,7 +256,7 @@ def zenoh_loopback(pass_a_frame: Callable[[], Passed] = _pass_a_frame) -> Findin
     try:
         passed = pass_a_frame()
     except (ImportError, OSError, RuntimeError) as error:
-        way_out = "pip install -r requirements.txt; let 127.0.0.1 be reachable (container networks, firewalls)"
+        way_out = "make setup; let 127.0.0.1 be reachable (container networks, firewalls)"
         return Finding(name, Level.FAILED, f"no loopback session: {error}", way_out)
     if not passed.is_same:
         return Finding(name, Level.FAILED, "a message arrived changed", "Report this, please.")
@@ -278,7 +278,7 @@ def torch(run: Run = run) -> Finding:
         return Finding("torch", Level.FAILED, f"does not import: {ran.last_line}", way_out)
     if knows != "True":
         text = f"{versions}: this transformers does not know Qwen3.5"
-        return Finding("torch", Level.FAILED, text, "pip install -r requirements.txt")
+        return Finding("torch", Level.FAILED, text, f"make setup, or: pip install '{DISTRIBUTION}[serve]'")
     return Finding("torch", Level.OK, versions)
 
 
@@ -327,7 +327,7 @@ def rerun(
     """The viewer, and the software Vulkan that it needs to draw without a screen."""
     version = version_of("rerun-sdk")
     if version is None:
-        way_out = "pip install -r requirements.txt; logs can be checked (pp-check) without it"
+        way_out = f"pip install '{DISTRIBUTION}[replay]'; logs can be checked (pp-check) without it"
         return Finding("rerun", Level.WARNING, "rerun-sdk is not installed", way_out)
     if not any(name.startswith("lvp_icd") for name in drivers()):
         text = f"rerun-sdk {version}; no software Vulkan (lavapipe): no pictures without a GPU and a screen"

@@ -23,13 +23,11 @@ from protocol.link import Link, Stream
 from protocol.topics import ACTION, EVENT, OBSERVATION, PHASE, SUBGOAL, TICK
 from sim_client.recorder import Recorder
 from sim_client.robot import observation, status_of
-from sim_client.robot_end import is_sound
+from sim_client.robot_end import STOPPED_S, is_sound
 from sim_client.silence import CLOCK_SILENCE_NS, STALL_NS, Silence
 
 HOLD_S = 0.5
 """Time for which the robot then holds before it ends the episode."""
-STOPPED_S = 3
-"""Time after which an episode that the ladder stopped ends unless it is engaged again."""
 
 Others = Callable[[int], None]
 """Lets the other participants run: returns when a message may have come, or after the given nanoseconds."""

@@ -28,12 +28,13 @@ from protocol.bus import Bus
 from protocol.command_line import command, parse
 from protocol.link import Link
 from protocol.logs import set_up_logging
+from protocol.version import versions
 from sim_client.condition import EvalOptions, EvaluationError, Job
 from sim_client.harness import BuildServer, ServerStep, open_harness
 from sim_client.launch import Daemons
 from sim_client.ledger import Ledger, write_json
 from sim_client.null_ponder import NullPonder, cognition_shape
-from sim_client.suite import Suite, versions
+from sim_client.suite import Suite
 from sim_client.swapped_ponder import SwappedPonder
 
 DONE, REFUSED, INTERRUPTED = 0, 2, 130

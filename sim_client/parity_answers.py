@@ -68,7 +68,7 @@ def stored_episode(task: str, seed: int, seconds: int) -> Arrays:
     """The script's episode: instruction, demo (D, V, h, w, 3) at 1 Hz, frames (Q, V, h, w, 3), states (Q, 8)."""
     from clock.schedules import CONTROL_HZ
     from dual_system.tasks.environment import make_environment
-    from sim_client.robot import CAMERAS
+    from sim_client.panda_robot import CAMERAS
 
     with make_environment(task) as environment:
         now = environment.reset(seed)

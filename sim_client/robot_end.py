@@ -24,6 +24,9 @@ from protocol.process import host_clock_id
 from protocol.topics import CLOSE, CONTRACT, OPEN, TIME, alive_key
 from sim_client.recorder import Recorder
 
+STOPPED_S = 3
+"""Time after which an episode that the ladder stopped ends unless it is engaged again."""
+
 _CONTRACT_NS = 5_000_000_000
 _OPEN_NS = 130_000_000_000
 _CLOSE_NS = 5_000_000_000

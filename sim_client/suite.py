@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import platform
 import secrets
 import time
 from collections.abc import Callable
 from functools import partial
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +22,13 @@ from protocol.command_line import flat
 from protocol.errors import EpisodeRefused, TransportError
 from protocol.link import Link
 from protocol.topics import ACTION
-from protocol.version import DISTRIBUTION, version
+from protocol.version import versions
 from sim_client.config import SimOptions
 from sim_client.episode import Outcome, RobotSide, play_oracle
 from sim_client.ledger import write_json
+from sim_client.panda_robot import simulated_robot
 from sim_client.recorder import Recorder
-from sim_client.robot import demonstration, simulated_robot
+from sim_client.robot import demonstration
 from sim_client.robot_end import RobotEnd
 
 OnTick = Callable[[int, int], None]
@@ -190,17 +189,6 @@ class Suite:
     def _log_path(self, info: m.EpisodeInfo) -> Path:
         day = time.strftime("%Y-%m-%d", time.gmtime())
         return self._options.out / day / info.task / f"{info.seed}-{info.header.episode}.mcap"
-
-
-def versions() -> dict[str, str]:
-    """Versions of the software and the machine, for every log and result."""
-    found = {DISTRIBUTION: version(), "python": platform.python_version(), "machine": platform.machine()}
-    for name in ("mujoco", "numpy", "eclipse-zenoh", "protobuf", "mcap"):
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
-    return found
 
 
 def run_seed(seed: int, run: int) -> int:

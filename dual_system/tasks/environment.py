@@ -23,7 +23,7 @@ from dual_system.tasks.rendering import Cameras
 from dual_system.tasks.scene import FRONT, table_scene
 from dual_system.tasks.task import Subtask, Task, TaskError, make_task
 
-IMAGE_PX = 256  # upstream's; grounded texts count in these pixels
+IMAGE_PX = panda.IMAGE_PX
 _MAX_DRAWS = 20
 _PUSHED_M = 0.01  # texts that follow are corrected from this distance on
 MAX_STEPS = 1300  # the paper's limit; upstream's own default is 10000

@@ -21,8 +21,8 @@ from dual_system.tasks.panda import (
     STIFF_SOLREF,
     WORLD_BIT,
     Robot,
-    panda_spec,
 )
+from dual_system.tasks.panda_model import panda_spec
 
 FRONT, WRIST = "front", "wrist"
 CAMERAS = (FRONT, WRIST)  # upstream calls them base_camera and hand_camera

@@ -11,10 +11,6 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
 
-import dual_system.tasks.headless  # noqa: F401 - before anything that imports mujoco
-
-# isort: split
-
 from clock.policies import policy_of, servers_of
 from clock.service import ClockService, ServiceConfig
 from clock.status import end_of

@@ -11,7 +11,7 @@ import numpy as np
 from clock.schedules import CONTROL_HZ
 from dual_system.tasks import panda
 from protocol.messages import Floats, Robot
-from sim_client.robot import simulated_robot
+from sim_client.panda_robot import simulated_robot
 from sim_client.robot_file import read_robot
 
 

@@ -32,6 +32,7 @@ from protocol.errors import EpisodeRefused, ProtocolError, TransportError
 from protocol.link import Link, Stream
 from protocol.process import host_clock_id
 from protocol.topics import ACTION, CHUNK, COGNITION, EVENT, HEALTH, OBSERVATION, SHADOW_OF, SUBGOAL, TICK
+from protocol.version import versions
 from sim_client.gateway.body import Body
 from sim_client.gateway.exchange import Answer, Finish, Frames, Observed, Refused, Step, Trial
 from sim_client.gateway.lease import Lease
@@ -41,7 +42,6 @@ from sim_client.gateway.rule import sampled
 from sim_client.recorder import Recorder
 from sim_client.robot_end import RobotEnd, is_sound
 from sim_client.silence import CLOCK_SILENCE_NS, Silence
-from sim_client.suite import versions
 
 log = logging.getLogger("pp-gateway")
 

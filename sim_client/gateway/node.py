@@ -21,9 +21,9 @@ from clock.obeyed import Obeyed
 from clock.playback import deadline_ns
 from clock.timebase import NS_PER_S
 from protocol import messages as m
-from sim_client.episode import STOPPED_S
 from sim_client.gateway.exchange import Answer, Behind
 from sim_client.gateway.rule import ahead
+from sim_client.robot_end import STOPPED_S
 
 _KEEP_CHUNKS = 8
 _LATE_TICKS = 2  # a command may be on its way for one

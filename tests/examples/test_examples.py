@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from clock.check import disagreements
+from protocol.mcap_log import read_log
 from protocol.probe import HEALTHY
 from protocol.probe import main as probe
 from sim_client.launch import free_ports
@@ -116,3 +118,34 @@ def test_a_policy_of_one_s_own_stands_in_for_pounce_serve(tmp_path: Path) -> Non
         finally:
             server.terminate()
         assert server.wait(10) == 0
+
+
+@pytest.mark.sim
+@pytest.mark.e2e
+@pytest.mark.slow
+def test_openpi_s_own_client_plays_through_the_gateway(tmp_path: Path) -> None:
+    pytest.importorskip("openpi_client", reason="pip install --no-deps openpi-client==0.1.2")
+    at_pounce, port = f"tcp/127.0.0.1:{free_ports(1)[0]}", free_ports(1)[0]
+    policy = [sys.executable, str(EXAMPLES / "04_your_own_policy.py"), "--serve", at_pounce]
+    gateway = [sys.executable, "-m", "sim_client.gateway", "--dialect", "openpi", "--rows", "10", "--ponder", "none"]
+    gateway += ["--link.connect", at_pounce, "--listen", f"127.0.0.1:{port}", "--out", str(tmp_path)]
+    with (
+        (tmp_path / "gateway.txt").open("wb") as told,
+        subprocess.Popen(policy, env=ENVIRONMENT) as served,
+        subprocess.Popen(gateway, env=ENVIRONMENT, stderr=told) as serving,
+    ):
+        try:
+            deadline_s = time.monotonic() + 60
+            while " ready " not in (tmp_path / "gateway.txt").read_text():
+                assert time.monotonic() < deadline_s
+                assert serving.poll() is None
+                time.sleep(0.05)  # another process's log: there is nothing to wait on
+            lines = printed("07_openpi_client.py", f"127.0.0.1:{port}", cwd=tmp_path).splitlines()
+            serving.terminate()
+            assert serving.wait(30) == 0
+        finally:
+            serving.kill()
+            served.terminate()
+    assert lines[1:] == [f"tick {tick:3}: 10 rows, {{'PLAY'}}" for tick in (0, 10, 20, 30)]
+    (log,) = tmp_path.rglob("*.mcap")
+    assert next(disagreements(read_log(log)), None) is None

@@ -17,6 +17,10 @@ from dual_system import commands
 from dual_system.commands import COMMANDS, REFUSED
 
 ENTRIES = {
+    "sim-client": commands.sim_client,
+    "pp-eval": commands.evaluate,
+    "pp-train": commands.train,
+    "pp-gateway": commands.gateway,
     "pp-collect": commands.collect,
     "pp-export": commands.export,
     "pp-parity": commands.parity,

@@ -16,6 +16,7 @@ from dual_system.models import arm
 from dual_system.tasks import panda
 from dual_system.tasks.geometry import rotation_log
 from dual_system.tasks.kinematics import Kinematics
+from dual_system.tasks.panda_model import panda_spec
 
 within_limits = arrays(np.float64, 7, elements=st.floats(0, 1)).map(
     lambda share: arm.JOINT_LOW_RAD + share * (arm.JOINT_HIGH_RAD - arm.JOINT_LOW_RAD)
@@ -27,7 +28,7 @@ vectors = arrays(np.float64, 3, elements=st.floats(-1.8, 1.8))
 
 @pytest.fixture(scope="module")
 def mujoco_arm() -> Kinematics:
-    return Kinematics(panda.panda_spec().compile())
+    return Kinematics(panda_spec().compile())
 
 
 @settings(deadline=None, max_examples=100)

@@ -13,8 +13,8 @@ from dual_system.models.ponder.configs import tiny_cpu
 from dual_system.models.ponder.context import SegmentKind
 from dual_system.models.ponder.network import Ponder
 from dual_system.models.ponder.vocabulary import Vocabulary
-from ponder_server.context_policy import POLICIES, PolicyName, Span, carriers_only, pin_and_slide, refuse
-from ponder_server.contract import ContextFull, Frame, Opening
+from ponder_server.context_policy import POLICIES, Span, carriers_only, pin_and_slide, refuse
+from ponder_server.contract import ContextFull, Frame, Opening, PolicyName
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
 

@@ -12,7 +12,7 @@ from dual_system.models.pounce.configs import tiny_cpu
 from dual_system.tasks import panda
 from pounce_server.contract import Request, check_robot
 from pounce_server.engine import EagerEngine
-from sim_client.robot import simulated_robot
+from sim_client.panda_robot import simulated_robot
 
 PANDA = simulated_robot(panda.PANDA_WRISTCAM, np.append(panda.HOME_QPOS, 0.04))
 CONFIG = replace(tiny_cpu(cognition_size=64), num_cameras=0)

@@ -23,7 +23,7 @@ from pounce_server.engine import EagerEngine
 from protocol import messages as m
 from protocol.mcap_log import EpisodeRecord, read_log
 from sim_client.__main__ import main as sim_client
-from sim_client.robot import simulated_robot
+from sim_client.panda_robot import simulated_robot
 
 NUM_TICKS = 22  # two invocations of the paper's schedule
 FAMILIES = {"pi05": tiny_cpu, "groot": tiny_groot}

@@ -49,7 +49,7 @@ def never(*arguments: object) -> int:
         (look.zenoh_loopback(lambda: Passed(is_same=True, is_shared=False)), WARNING, "/dev/shm"),
         (look.zenoh_loopback(lambda: Passed(is_same=False, is_shared=True)), FAILED, "Report"),
         (look.torch(ends(0, "torch 2.13.0, transformers 5.23.0, CPU only|True")), OK, ""),
-        (look.torch(ends(0, "torch 2.13.0, transformers 4.40.0, CPU only|False")), FAILED, "requirements.txt"),
+        (look.torch(ends(0, "torch 2.13.0, transformers 4.40.0, CPU only|False")), FAILED, "[serve]"),
         (look.torch(ends(1, "ModuleNotFoundError: No module named 'torch'")), FAILED, "make setup"),
         (look.rerun({}.get, lambda: []), WARNING, "pp-check"),
         (look.rerun({"rerun-sdk": "0.41.0"}.get, lambda: ["radeon_icd.json"]), WARNING, "mesa-vulkan-drivers"),

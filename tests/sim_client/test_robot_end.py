@@ -26,8 +26,9 @@ from sim_client.config import LogOptions, ScheduleOptions, SimOptions
 from sim_client.harness import open_harness
 from sim_client.launch import Daemons
 from sim_client.null_ponder import NullPonder
+from sim_client.panda_robot import CAMERAS
 from sim_client.recorder import Recorder
-from sim_client.robot import CAMERAS, demonstration
+from sim_client.robot import demonstration
 from sim_client.robot_end import RobotEnd
 from sim_client.suite import Suite
 

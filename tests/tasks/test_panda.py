@@ -9,20 +9,21 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from dual_system.tasks import panda
+from dual_system.tasks.panda_model import cluster
 from dual_system.tasks.physics import Physics
 
 
 @given(hnp.arrays(np.float64, (30, 3), elements=st.floats(-0.1, 0.1)))
 def test_clustering_moves_no_vertex_farther_than_a_cell(vertices: np.ndarray) -> None:
     faces = np.arange(30, dtype=np.int32).reshape(10, 3)
-    merged, _ = panda.cluster(vertices, faces, cell_m=0.01)
+    merged, _ = cluster(vertices, faces, cell_m=0.01)
     distance_m = np.abs(vertices[:, None] - merged[None]).max(axis=2).min(axis=1)
     assert distance_m.max() <= 0.01 + 1e-12
 
 
 @given(hnp.arrays(np.float64, (30, 3), elements=st.floats(-0.1, 0.1)))
 def test_clustered_faces_are_valid_and_not_degenerate(vertices: np.ndarray) -> None:
-    merged, faces = panda.cluster(vertices, np.arange(30, dtype=np.int32).reshape(10, 3), cell_m=0.02)
+    merged, faces = cluster(vertices, np.arange(30, dtype=np.int32).reshape(10, 3), cell_m=0.02)
     if len(faces):
         assert faces.min() >= 0
         assert faces.max() < len(merged)
@@ -32,7 +33,7 @@ def test_clustered_faces_are_valid_and_not_degenerate(vertices: np.ndarray) -> N
 def test_a_fine_grid_changes_nothing() -> None:
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     faces = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
-    merged, kept = panda.cluster(vertices, faces, cell_m=1e-3)
+    merged, kept = cluster(vertices, faces, cell_m=1e-3)
     assert {tuple(map(tuple, merged[face])) for face in kept} == {tuple(map(tuple, vertices[face])) for face in faces}
 
 

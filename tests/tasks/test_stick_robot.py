@@ -19,7 +19,7 @@ from dual_system.tasks.panda import PANDA_STICK, PANDA_WRISTCAM, Robot
 from dual_system.tasks.physics import Physics
 from dual_system.tasks.props import add_block, add_dot
 from dual_system.tasks.scene import table_scene
-from sim_client.robot import simulated_robot
+from sim_client.panda_robot import simulated_robot
 
 HOME = np.append(panda.HOME_QPOS, -1.0)
 ROBOTS = (PANDA_WRISTCAM, PANDA_STICK)

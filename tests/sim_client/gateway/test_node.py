@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from clock import schedules
 from dual_system.models.ponder.demo_sampling import DemoSampling
 from protocol import messages as m
-from sim_client.episode import STOPPED_S
 from sim_client.gateway.node import LiveNode, LockstepNode, Measurement
 from sim_client.gateway.rule import ahead, sampled
+from sim_client.robot_end import STOPPED_S
 
 TICK_NS = 50_000_000
 START_NS = 300_000_000
