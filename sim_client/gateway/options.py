@@ -35,7 +35,7 @@ DialectName = Literal[
 ]
 _MAPPED: tuple[DialectName, ...] = ("groot", "groot-n1.5", "lerobot")
 _LIVE: tuple[DialectName, ...] = ("ponderpounce", "lerobot")
-"""Of real robots: in real time unless told otherwise, and a stopped episode waits for a person."""
+"""Dialects of real robots: real time unless --mode says otherwise, and a stopped episode waits for a person."""
 _OF_ROBOMME: tuple[DialectName, ...] = ("challenge", "challenge-http", "mme-vla", "vla-eval")
 _SPOKEN: dict[DialectName, tuple[type[Dialect] | None, Mapping[str, str], str, int]] = {
     # by name: who speaks it (None: a side of its own), where it has the cameras (if empty: by their names) and the
