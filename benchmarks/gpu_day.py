@@ -33,6 +33,7 @@ from benchmarks.roofline import measure_ceilings
 from dual_system.models.fp8 import has_products
 from dual_system.models.gpu import current, settle
 from dual_system.models.graphs import directly, graphs_for
+from dual_system.models.kernels.fp8 import FEW_ROWS, few_rows_fused, quantise_eager
 from dual_system.models.kernels.launch import cuda_time_ms, missing_for
 from dual_system.models.kernels.trial import choose
 from dual_system.models.ponder import configs as ponder_configs
@@ -63,6 +64,7 @@ PREDICTED_MS = {
     "fire at 14000 tokens": 14.0,
     "fire at 800 tokens, twins": 22.0,
     "fire at 14000 tokens, twins": 27.0,
+    "fire at 800 tokens, fp8": 10.0,
     "45 tokens, one by one": 330.0,
     "45 tokens, a draft that knows them": 95.0,
     "pi0.5 fused": 18.0,
@@ -208,11 +210,21 @@ def probe(day: Day) -> None:
         attend = partial(F.scaled_dot_product_attention, q, k, k, attn_mask=bias)
         day.time(f"attention of a pi0.5 {what}, heads as rows", attend, 5)
     if has_products(device):
-        x, weight = (torch.randn(160, 4096, device=device).to(torch.float8_e4m3fn) for _ in range(2))
-        one = torch.ones(160, 1, device=device)
-        for is_fast in (False, True):
-            scaled = partial(torch._scaled_mm, x, weight.t(), scale_a=one, scale_b=one.t(), out_dtype=torch.bfloat16)
-            day.time(f"an fp8 product, fast accumulation {is_fast}", partial(scaled, use_fast_accum=is_fast))
+        weight = torch.randn(4096, 4096, device=device)
+        rows_OI = quantise_eager(weight)
+        for count in (1, 16, 160):
+            x = torch.randn(count, 4096, device=device, dtype=torch.bfloat16)
+            day.time(f"{count} rows times bfloat16 weights", partial(F.linear, x, weight.bfloat16()))
+            if count <= FEW_ROWS and not missing_for(device):
+                day.time(f"{count} rows times fp8 weights, our kernel", partial(few_rows_fused, x, *rows_OI))
+            rows = quantise_eager(x)
+            scales = {"scale_a": rows.scale_M[:, None], "scale_b": rows_OI.scale_M[None]}
+            scaled = partial(
+                torch._scaled_mm, rows.narrow_MI, rows_OI.narrow_MI.t(), out_dtype=torch.bfloat16, **scales
+            )
+            for is_fast in (False, True):
+                name = f"{count} rows, an fp8 product, fast accumulation {is_fast}"
+                day.time(name, partial(scaled, use_fast_accum=is_fast))
 
 
 def kernels(day: Day) -> None:
@@ -276,20 +288,25 @@ def ponder_fire(day: Day) -> None:
     """A fire, two frames to a cognition on the host, beside its parts and the baseline: the context encoded again."""
     ponder = _ponder(day)
     longest = max(day.size.contexts)
-    frames: tuple[Frame, ...] = ()
-    for name, has_kernels in (("", True), (", twins", False)):
-        engine = _warm(day, ponder, longest, kernels=has_kernels)
-        day.row(f"kernels taken{name}", lambda engine=engine: engine.spec.kernels or "none tried")  # type: ignore[misc]
+
+    def fires(name: str, **options: Any) -> tuple[Frame, ...]:
+        engine = _warm(day, ponder, longest, **options)
+        day.row(f"kernels taken{name}", lambda: engine.spec.kernels or "none tried")
         frames = engine.example_frames()
         for length in day.size.contexts:
             context = _open(engine, "day", length)
             restore = partial(context.restore, context.save())
             day.time(f"fire at {length} tokens{name}", partial(engine.fire, "day", frames), after=restore)
             engine.close("day")
+        return frames
+
+    fires("")
+    frames = fires(", twins", kernels=False)
     pictures = torch.from_numpy(np.stack(frames)).to(day.device)
     day.time("vision tower, two frames", partial(ponder.image_features, pictures))
     row, seen = _row(ponder, max(1, longest // sum(len(segment) for segment in ponder.format.query(2))))
     day.time(f"baseline: {len(row.ids)} tokens encoded again", partial(ponder.encode_row, row, seen), 3)
+    fires(", fp8", weights="fp8")  # last: it replaces the network's layers
 
 
 def ponder_text(day: Day) -> None:
@@ -414,7 +431,7 @@ STAGES = {
     "probe": Stage(probe, 45),
     "kernels": Stage(kernels, 75),
     "ponder_right": Stage(ponder_right, 90),
-    "ponder_fire": Stage(ponder_fire, 150),
+    "ponder_fire": Stage(ponder_fire, 200),
     "ponder_text": Stage(ponder_text, 75),
     "pounce": Stage(pounce, 150),
     "groot": Stage(groot, 60),
@@ -444,11 +461,9 @@ def _row(ponder: Ponder, queries: int) -> tuple[Row, Tensor]:
     return row, torch.zeros(row.num_images, *ponder.image_px, 3, dtype=torch.uint8, device=ponder.device)
 
 
-def _warm(
-    day: Day, ponder: Ponder, tokens: int, draft: Draft | None = None, *, max_sessions: int = 1, kernels: bool = True
-) -> QwenEngine:
-    """An engine with room for two queries after ``tokens``."""
-    config = EngineConfig(max_context_tokens=tokens + 600, max_sessions=max_sessions, kernels=kernels)
+def _warm(day: Day, ponder: Ponder, tokens: int, draft: Draft | None = None, **options: Any) -> QwenEngine:
+    """An engine with room for two queries after ``tokens``; ``options`` are more of `EngineConfig`'s."""
+    config = EngineConfig(**{"max_sessions": 1, **options}, max_context_tokens=tokens + 600)
     engine = QwenEngine(ponder, config, draft)
     if day.device.type == "cuda":
         engine.warm_up()

@@ -21,16 +21,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dual_system.models.fp8 import Fp8Linear
 from dual_system.models.graphs import Capture, Work
+from dual_system.models.kernels.fp8 import FEW_ROWS, Quantised
 from dual_system.models.kernels.launch import Timer
 from dual_system.models.kernels.rms_norm import Residual, Style
 from dual_system.models.kernels.trial import Verdict, choose, told
 from ponder_server.decoder import Place, decode
-from ponder_server.kernels.rotate_store import Window
+from ponder_server.kernels.rotate_store import Projected, Window
 from ponder_server.operations import KERNELS, TWINS, Operations
 from ponder_server.rehearsal import rehearse
 from ponder_server.slots import SlotMemory
-from ponder_server.stack import AttentionLayer, Stack
+from ponder_server.stack import AttentionLayer, Product, Stack
 
 log = logging.getLogger(__name__)
 
@@ -239,41 +241,60 @@ class Forward:
         cos_sin = stack.rotary(self._embeds_BTH, self._positions_3BT)
         hidden_RH, branch_RH = self._embeds_BTH.view(-1, width).clone(), None
 
-        def normed(style: Style, out: Tensor | None = None) -> Tensor:
-            """Adds the last branch to the stream; the norm of the sum."""
-            out_RH = torch.empty_like(hidden_RH) if out is None else out.view(hidden_RH.shape)
-            do.norm(hidden_RH, out_RH, style, None if branch_RH is None else Residual(branch_RH))
-            return out_RH
+        # Few rows take the weights alone in fp8, if that kernel was taken; more are quantised and multiplied in fp8.
+        is_few = do.few_rows is not TWINS.few_rows and num_rows * length <= FEW_ROWS
+        multiplies = stack.multiplies_fp8 and not is_few
+
+        def quantised(x: Tensor) -> Quantised | None:
+            return do.quantise(x.reshape(-1, x.shape[-1])) if multiplies else None
+
+        def times(x: Tensor, linear: Product, rows: Quantised | None) -> Tensor:
+            """``x`` times a layer's weight, (..., O); ``rows`` are ``x`` in fp8."""
+            if rows is not None and isinstance(linear, Fp8Linear):
+                return linear.product_of(rows).view(*x.shape[:-1], -1)
+            if is_few and isinstance(linear, Fp8Linear) and linear.multiplies:
+                few_RO: Tensor = do.few_rows(x.reshape(-1, x.shape[-1]), linear.weight_OI, linear.scale_O)
+                return few_RO.view(*x.shape[:-1], -1)
+            return linear(x)
+
+        def normed(style: Style) -> tuple[Tensor, Quantised | None]:
+            """Adds the last branch to the stream; the norm of the sum, and that in fp8."""
+            out_RH = torch.empty_like(hidden_RH)
+            rows = Quantised.blank(out_RH) if multiplies else None
+            do.norm(hidden_RH, out_RH, style, None if branch_RH is None else Residual(branch_RH), rows)
+            return out_RH, rows
 
         for layer in stack.layers:
-            normed_BTH = normed(layer.input_norm).view(num_rows, -1, width)
+            normed_RH, rows = normed(layer.input_norm)
+            normed_BTH = normed_RH.view(num_rows, -1, width)
             # The last layer computes only what is wanted.
             asking_BW = read_BW if layer is stack.layers[-1] else all_BT
             if isinstance(layer.mixer, AttentionLayer):
                 keys, values = memory.attention[layer.index].keys, memory.attention[layer.index].values
-                projected = layer.mixer.project(normed_BTH)
+                projected = Projected(*(times(normed_BTH, product, rows) for product in layer.mixer.inputs))
                 queries = do.rotate_store(projected, layer.mixer.norms, cos_sin, keys, values, window)
                 seen_BWX = do.attend(
                     queries, projected.query_gate_BTX, keys, values, asking_BW, window, self._num_positions
                 )
-                mixed_BWH = layer.mixer.out(seen_BWX)
+                mixed_BWH = times(seen_BWX, layer.mixer.out, quantised(seen_BWX))
             else:
                 delta, states = layer.mixer, memory.recurrent[layer.index]
-                mixed = do.conv_silu(
-                    delta.inputs(normed_BTH), delta.conv_CW, states.conv, self._slot_B, self._num_new_B
-                )
+                inputs_BTC = times(normed_BTH, delta.inputs, rows)
+                mixed = do.conv_silu(inputs_BTC, delta.conv_CW, states.conv, self._slot_B, self._num_new_B)
                 speed_beta = delta.speed_beta(normed_BTH)
                 read_BTVE = do.delta(
                     mixed, speed_beta, delta.a_log_V, delta.dt_bias_V, states.state, self._slot_B, self._num_new_B
                 )
-                gate_RX = delta.gate(normed_BTH).view(num_rows * length, -1)
+                gate_RX = times(normed_RH, delta.gate, rows)
                 read_RVE = read_BTVE.reshape(num_rows * length, *read_BTVE.shape[2:])
                 gated_RX = do.gated_norm(read_RVE, gate_RX, delta.norm_E, delta.eps)
-                mixed_BWH = delta.out(gated_RX).view(num_rows, length, -1)
+                mixed_BWH = times(gated_RX, delta.out, quantised(gated_RX)).view(num_rows, length, -1)
                 mixed_BWH = mixed_BWH[row_B1, read_BW] if layer is stack.layers[-1] else mixed_BWH
             if layer is stack.layers[-1]:
                 hidden_RH = hidden_RH.view(num_rows, length, width)[row_B1, read_BW].view(-1, width)
             branch_RH = mixed_BWH.reshape(-1, width)
-            normed_RH = normed(layer.mlp_norm)
-            branch_RH = layer.down(do.swiglu(layer.gate(normed_RH), layer.up(normed_RH)))
-        normed(stack.norm, out=self._hidden_BWH)
+            normed_RH, rows = normed(layer.mlp_norm)
+            active_RM = do.swiglu(times(normed_RH, layer.gate, rows), times(normed_RH, layer.up, rows))
+            branch_RH = times(active_RM, layer.down, quantised(active_RM))
+        assert branch_RH is not None, "a stack has layers"
+        do.norm(hidden_RH, self._hidden_BWH.view(hidden_RH.shape), stack.norm, Residual(branch_RH))

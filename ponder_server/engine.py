@@ -46,7 +46,7 @@ from ponder_server.draft import Draft, NoDraft
 from ponder_server.engine_config import EngineConfig
 from ponder_server.episode import Episode, Query
 from ponder_server.heartbeats import heartbeats
-from ponder_server.narrow import check_weights, quantise
+from ponder_server.narrow import check_change, check_weights, quantise
 from ponder_server.opening import Opener
 from ponder_server.runner import NUM_SAVED_STATES, Append, Runner, Session, fitted
 from ponder_server.slots import slot_size
@@ -77,8 +77,8 @@ class QwenEngine:
 
         ``capture`` captures forwards; default: CUDA graphs on a GPU, none on a CPU.
 
-        Raises ValueError if the sessions do not fit in memory, if the network cannot read the cameras, or if its device
-        does not support ``config.weights``.
+        Raises ValueError if the sessions do not fit in memory, if the network cannot read the cameras, if its device
+        does not support ``config.weights``, or if these change cognition too much.
         """
         check_weights(config.weights, ponder.device)
         self._ponder = ponder
@@ -131,6 +131,7 @@ class QwenEngine:
             exact_KH = self._example_cognition()
             quantise(ponder, config.weights)
             change = float((self._example_cognition() - exact_KH).norm() / exact_KH.norm())
+            check_change(config.weights, change, is_random=ponder.is_random)
             hash_ = f"{self._spec.model_hash}-{config.weights}"
             self._spec = replace(self._spec, weights=config.weights, model_hash=hash_, cognition_error=change)
         if capture is None and config.graphs:

@@ -17,6 +17,9 @@ from ponder_server.contract import WeightsName
 _NARROW = ("model.language_model.layers.", "model.visual.blocks.", "model.visual.merger.")
 _KEPT = ("linear_attn.in_proj_a.weight", "linear_attn.in_proj_b.weight")
 _LAYERS: Final = {"int8": Int8Linear, "fp8": Fp8Linear}
+MOST_CHANGE = 0.2
+"""Largest relative L2 change of cognition that trained weights may take: four times what fp8 does to the trained pair
+of this repository, in float32 or bfloat16."""
 
 
 def check_weights(weights: WeightsName, device: torch.device) -> None:
@@ -25,6 +28,15 @@ def check_weights(weights: WeightsName, device: torch.device) -> None:
         raise ValueError("int8 weights are for a CPU; take --weights fp8, or leave it out and take --dtype bfloat16.")
     if weights == "fp8" and (missing := missing_for(device)):
         raise ValueError(f"{missing}; take --weights int8 on a CPU, or leave it out and take --dtype bfloat16.")
+
+
+def check_change(weights: WeightsName, change: float, *, is_random: bool) -> None:
+    """Raises ValueError if narrow weights change cognition too much; random ones, which say nothing, may."""
+    if not is_random and not change <= MOST_CHANGE:  # also refuses NaN
+        raise ValueError(
+            f"{weights} weights change cognition by {change:.1e} (relative L2), at most {MOST_CHANGE:.0e} is allowed: "
+            "this network does not bear them. Leave --weights out, and take --dtype bfloat16."
+        )
 
 
 def quantise(ponder: Ponder, weights: WeightsName) -> int:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from dual_system.models.kernels.fp8 import few_rows_eager, few_rows_fused, quantise_eager, quantise_fused
 from dual_system.models.kernels.rms_norm import norm_eager, norm_fused
 from ponder_server.kernels.attention import attend_eager, attend_fused
 from ponder_server.kernels.conv_silu import conv_silu_eager, conv_silu_fused
@@ -31,6 +32,9 @@ class Operations:
     gated_norm: Function
     rotate_store: Function
     attend: Function
+    quantise: Function
+    """Of fp8 weights alone, as is ``few_rows``."""
+    few_rows: Function
 
 
 TWINS = Operations(
@@ -41,6 +45,8 @@ TWINS = Operations(
     gated_norm=gated_norm_eager,
     rotate_store=rotate_store_eager,
     attend=attend_eager,
+    quantise=quantise_eager,
+    few_rows=few_rows_eager,
 )
 KERNELS = Operations(
     norm=norm_fused,
@@ -50,4 +56,6 @@ KERNELS = Operations(
     gated_norm=gated_norm_fused,
     rotate_store=rotate_store_fused,
     attend=attend_fused,
+    quantise=quantise_fused,
+    few_rows=few_rows_fused,
 )

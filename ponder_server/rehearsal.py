@@ -10,8 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dual_system.models.fp8 import Fp8Linear
+from dual_system.models.kernels.fp8 import FEW_ROWS, Quantised
 from dual_system.models.kernels.rms_norm import Residual
-from ponder_server.kernels.rotate_store import Window
+from ponder_server.kernels.rotate_store import Projected, Window
 from ponder_server.slots import SlotMemory
 from ponder_server.stack import AttentionLayer, DeltaLayer, Stack
 
@@ -36,7 +38,7 @@ def rehearse(stack: Stack, memory: SlotMemory, *, num_rows: int, length: int) ->
     num_channels, width = delta.conv_CW.shape
     num_heads, key_dim, size = next(iter(memory.recurrent.values())).state.shape[1:]
     _, key_heads, _, head_size = next(iter(memory.attention.values())).keys.shape
-    projected = attention.project(x_BTH)
+    projected = Projected(*(product(x_BTH) for product in attention.inputs))
     query_heads = projected.query_gate_BTX.shape[-1] // (2 * head_size)
     keys, values = (drawn(num_rows, key_heads, num_positions, head_size) for _ in range(2))
     positions = torch.arange(length, device=device).expand(3, num_rows, -1)
@@ -45,8 +47,16 @@ def rehearse(stack: Stack, memory: SlotMemory, *, num_rows: int, length: int) ->
     x_RH = x_BTH.flatten(0, 1)
     cos_sin = tuple(stack.rotary(x_BTH, positions))
     queries = drawn(num_rows, length, query_heads, head_size)
+    norm = x_RH, torch.zeros_like(x_RH), first.input_norm, Residual(drawn(*x_RH.shape))
+    narrow: dict[str, tuple[Any, ...]] = {}
+    if stack.multiplies_fp8:
+        assert isinstance(first.gate, Fp8Linear)
+        blank = Quantised(*(part.zero_() for part in Quantised.blank(x_RH)))
+        narrow = {"norm": (*norm, blank), "quantise": (gate_BTM.flatten(0, 1),)}
+        if num_rows * length <= FEW_ROWS:
+            narrow["few_rows"] = x_RH, first.gate.weight_OI, first.gate.scale_O
     return {
-        "norm": (x_RH, torch.zeros_like(x_RH), first.input_norm, Residual(drawn(*x_RH.shape))),
+        "norm": norm,
         "swiglu": (gate_BTM, first.up(x_BTH)),
         "conv_silu": (inputs_BTC, delta.conv_CW, drawn(num_rows, num_channels, width), rows, window.num_new_B),
         "delta": (
@@ -56,4 +66,5 @@ def rehearse(stack: Stack, memory: SlotMemory, *, num_rows: int, length: int) ->
         "gated_norm": (*(drawn(num_rows * length, num_heads, size), gate_BTX.flatten(0, 1), delta.norm_E, delta.eps),),
         "rotate_store": (projected, attention.norms, cos_sin, keys, values, window),
         "attend": (queries, projected.query_gate_BTX, keys, values, asking_BT, window, num_positions),
+        **narrow,
     }

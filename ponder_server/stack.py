@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from dual_system.models.fp8 import Fp8Linear
 from dual_system.models.kernels.rms_norm import Style
-from ponder_server.kernels.rotate_store import HeadNorms, Projected
+from ponder_server.kernels.rotate_store import HeadNorms
 
 Product = Callable[[Tensor], Tensor]
 
@@ -33,8 +34,10 @@ class AttentionLayer:
         norms = HeadNorms(_scale(attention.q_norm), _scale(attention.k_norm), attention.q_norm.eps)
         return cls(attention.q_proj, attention.k_proj, attention.v_proj, norms, attention.o_proj)
 
-    def project(self, normed_BTH: Tensor) -> Projected:
-        return Projected(self.queries_gates(normed_BTH), self.keys(normed_BTH), self.values(normed_BTH))
+    @property
+    def inputs(self) -> tuple[Product, Product, Product]:
+        """Those of `Projected`."""
+        return self.queries_gates, self.keys, self.values
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,6 +96,12 @@ class Stack:
     rotary: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
     """(embeddings, positions (3, B, T)) -> cos and sin (B, T, rotary dimensions)."""
     dtype: torch.dtype
+
+    @property
+    def multiplies_fp8(self) -> bool:
+        """Whether products are fp8 products, of rows that are quantised before them."""
+        product = self.layers[0].gate
+        return isinstance(product, Fp8Linear) and product.multiplies and self.dtype == torch.bfloat16
 
     @classmethod
     def of(cls, text_model: Any) -> "Stack":

@@ -372,7 +372,8 @@ def rounding_interpreter() -> Iterator[None]:
     """Triton's interpreter (3.6), made to round as a GPU does, and to count as NumPy 2.4 wants it.
 
     It cuts float32 to bfloat16, where a GPU rounds to the nearest, ties to even: cut numbers are all too small, and the
-    error would add up over layers as no GPU's does. Its `range(loaded)` asks `int` for an array's number, which raises.
+    error would add up over layers as no GPU's does. Its fp8 has no carry of a rounded number and no NaN. Its
+    `range(loaded)` asks `int` for an array's number, which raises.
     """
     try:
         import triton.language as tl
@@ -388,6 +389,13 @@ def rounding_interpreter() -> Iterator[None]:
             return interpreter.TensorHandle(nearest, target_type.scalar)
         return cut(self, source, target_type)
 
+    def to_or_from_fp8(self: Any, source: Any, target_type: Any, rounding_mode: Any) -> Any:
+        types = {tl.float8e4nv: torch.float8_e4m3fn, tl.float32: torch.float32, tl.bfloat16: torch.bfloat16}
+        bits = {tl.float8e4nv: torch.uint8, tl.float32: torch.float32, tl.bfloat16: torch.uint16}
+        values = torch.from_numpy(source.data.copy()).view(types[source.dtype.scalar]).float()
+        held = values.to(types[target_type.scalar]).view(bits[target_type.scalar]).numpy()
+        return interpreter.TensorHandle(held, target_type.scalar)
+
     class OfArrays(type):
         def __instancecheck__(cls, value: object) -> bool:
             return isinstance(value, int)
@@ -398,5 +406,6 @@ def rounding_interpreter() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(interpreter.InterpreterBuilder, "cast_impl", rounded)
+        patch.setattr(interpreter.InterpreterBuilder, "create_fp_to_fp", to_or_from_fp8)
         patch.setattr(interpreter, "int", Integer, raising=False)
         yield

@@ -5,7 +5,8 @@ relative error is at most 1/16. int8's absolute error is the same for every weig
 large ones, larger for the small ones.
 
 On a GPU of compute capability 8.9 or more, bfloat16 activations are quantised to fp8 as well, with one dynamic scale
-per row (``torch._scaled_mm``). Everywhere else weights are widened when a layer is called, as int8's are.
+per row (``torch._scaled_mm``), by the layer, or before it by whoever has the rows at hand (``kernels.fp8``). Everywhere
+else weights are widened when a layer is called, as int8's are.
 """
 
 # O output rows, R rows of either matrix, I input columns, M rows of activations
@@ -13,11 +14,11 @@ per row (``torch._scaled_mm``). Everywhere else weights are widened when a layer
 import torch
 from torch import Tensor, nn
 
-from dual_system.models.narrow_linear import NarrowLinear, row_scale
+from dual_system.models.kernels.fp8 import Quantised, quantise_eager
+from dual_system.models.narrow_linear import NarrowLinear
 
 LEAST_CAPABILITY = (8, 9)
 """Ada and Hopper: the first GPUs with fp8 products."""
-_MOST = 448.0
 _MULTIPLE = 16
 """``torch._scaled_mm`` requires multiples of this many rows and columns."""
 
@@ -39,30 +40,37 @@ def has_products(device: torch.device) -> bool:
 
 
 class Fp8Linear(NarrowLinear):
-    """`nn.Linear` over fp8 weights. Do not move it: the kind of product is chosen for its first device."""
+    """`nn.Linear` over fp8 weights. Do not move it: the kind of product is chosen for its first device.
+
+    Attributes:
+        multiplies: whether the product of bfloat16 rows is an fp8 product.
+    """
 
     def __init__(self, linear: nn.Linear) -> None:
         super().__init__(linear)
         is_even = all(size % _MULTIPLE == 0 for size in linear.weight.shape)
-        self._multiplies = is_even and has_products(linear.weight.device)
+        self.multiplies = is_even and has_products(linear.weight.device)
 
     @staticmethod
     def narrowed(exact_RI: Tensor) -> tuple[Tensor, Tensor]:
-        """See `NarrowLinear.narrowed`. NaN and infinity are kept."""
-        scale_R = row_scale(exact_RI, _MOST)
-        # Conversion overflows to NaN, and rounding in the division may pass the largest number.
-        return (exact_RI / scale_R[:, None]).clamp(-_MOST, _MOST).to(torch.float8_e4m3fn), scale_R
+        """See `NarrowLinear.narrowed`."""
+        return quantise_eager(exact_RI)
 
     def product(self, x: Tensor) -> Tensor:
         # fp8 products return bfloat16, less precision than a float32 network asks for.
-        if self._multiplies and x.dtype == torch.bfloat16:
-            return _product(x.flatten(0, -2), self.weight_OI, self.scale_O).unflatten(0, x.shape[:-1])
+        if self.multiplies and x.dtype == torch.bfloat16:
+            rows = quantise_eager(x.flatten(0, -2))
+            return self.product_of(rows).unflatten(0, x.shape[:-1])
         return super().product(x)
 
-
-def _product(x_MI: Tensor, weight_OI: Tensor, scale_O: Tensor) -> Tensor:
-    """Returns (M, O) bfloat16. ``_scaled_mm`` wants its second matrix column-major: the weight's transpose."""
-    narrow_MI, scale_M = Fp8Linear.narrowed(x_MI.float())
-    return torch._scaled_mm(
-        narrow_MI, weight_OI.t(), scale_a=scale_M[:, None], scale_b=scale_O[None], out_dtype=torch.bfloat16
-    )
+    def product_of(self, rows: Quantised) -> Tensor:
+        """The fp8 product without the bias, (M, O) bfloat16, where the layer ``multiplies``."""
+        return torch._scaled_mm(
+            rows.narrow_MI,
+            self.weight_OI.t(),  # it wants its second matrix column-major
+            scale_a=rows.scale_M[:, None],
+            scale_b=self.scale_O[None],
+            out_dtype=torch.bfloat16,
+            # Without it Hopper is much slower (pytorch#147971), and the numbers were rounded to a sixteenth before.
+            use_fast_accum=True,
+        )

@@ -18,7 +18,7 @@ from pathlib import Path
 import triton
 from triton.backends.compiler import GPUTarget
 import triton.backends.nvidia as nvidia
-from dual_system.models.kernels import rms_norm
+from dual_system.models.kernels import fp8, rms_norm
 from ponder_server.kernels import attention, conv_silu, delta, gated_norm, rotate_store, swiglu
 from pounce_server.kernels import euler, geglu, rope
 
@@ -35,15 +35,16 @@ def compile_for(capability, warps, kernel, pointers, integers=(), **constants):
         use = dict(re.findall(r"(REG|STACK|LOCAL):(\\d+)", subprocess.run(dump, capture_output=True, text=True).stdout))
     print(capability, kernel.__name__, use["REG"], use["STACK"], use["LOCAL"], binary.metadata.shared)
 
-half, full, long = "*bf16", "*fp32", "*i64"
-norm = dict(x_ptr=half, branch_ptr=half, gate_ptr=full, scale_ptr=full, shift_ptr=full, out_ptr=half)
+half, full, long, byte = "*bf16", "*fp32", "*i64", "*fp8e4nv"
+norm = dict(x_ptr=half, branch_ptr=half, gate_ptr=full, scale_ptr=full, shift_ptr=full, out_ptr=half,
+            narrow_ptr=half, narrow_scale_ptr=full)
 turn = dict(qkv_ptr=half, cos_ptr=full, sin_ptr=full, q_ptr=half, k_ptr=half, v_ptr=half)
 window = dict(slot_ptr=long, num_past_ptr=long, num_new_ptr=long)
 
 def pi05(capability):
     for width, is_styled in ((2048, False), (1024, True)):
         compile_for(capability, 4, rms_norm._norm, norm, WIDTH=width, BLOCK=width, EPS=1e-6,
-                    HAS_BRANCH=True, HAS_GATE=is_styled, HAS_SHIFT=is_styled)
+                    HAS_BRANCH=True, HAS_GATE=is_styled, HAS_SHIFT=is_styled, HAS_NARROW=False)
     compile_for(capability, 4, geglu._geglu, dict(gate_up_ptr=half, out_ptr=half), WIDTH=4096, BLOCK=1024)
     compile_for(capability, 4, rope._rope, turn, ("num_tokens", "num_slots", "first_slot"),
                 Q_HEADS=8, KV_HEADS=1, PAIRS=128, HEAD_BLOCK=16, PAIR_BLOCK=128)
@@ -51,8 +52,14 @@ def pi05(capability):
                 WIDTH=32, BLOCK=32, STEPS=10)
 
 def qwen35_9b(capability):
-    compile_for(capability, 4, rms_norm._norm, norm, WIDTH=4096, BLOCK=4096, EPS=1e-6,
-                HAS_BRANCH=True, HAS_GATE=False, HAS_SHIFT=False)
+    for has_narrow in (False, True):
+        pointers = norm | (dict(narrow_ptr=byte) if has_narrow else {})
+        compile_for(capability, 4, rms_norm._norm, pointers, WIDTH=4096, BLOCK=4096, EPS=1e-6,
+                    HAS_BRANCH=True, HAS_GATE=False, HAS_SHIFT=False, HAS_NARROW=has_narrow)
+    compile_for(capability, 8, fp8._quantise, dict(x_ptr=half, narrow_ptr=byte, scale_ptr=full),
+                WIDTH=12288, BLOCK=16384)
+    compile_for(capability, 4, fp8._few_rows, dict(x_ptr=half, weight_ptr=byte, scale_ptr=full, out_ptr=half),
+                ("num_rows",), INPUTS=12288, OUTPUTS=4096, ROWS=16, BLOCK_O=16, BLOCK_I=256, PRECISION="tf32")
     compile_for(capability, 4, swiglu._swiglu, dict(gate_ptr=half, up_ptr=half, out_ptr=half), ("count",), BLOCK=1024)
     compile_for(capability, 4, conv_silu._conv_silu,
                 dict(x_ptr=half, weight_ptr=half, state_ptr=half, slot_ptr=long, num_new_ptr=long, out_ptr=half),
@@ -83,7 +90,7 @@ pi05(90)
 for capability in map(int, sys.argv[1:]):
     qwen35_9b(capability)
 """
-NUM_PI05, NUM_PONDER = 5, 9
+NUM_PI05, NUM_PONDER = 5, 12
 SHARED_BYTES = 227 << 10
 """Most shared memory of a program on Hopper and on Blackwell."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,12 @@ import numpy as np
 import pytest
 import torch
 
+from dual_system.models import fp8
 from dual_system.models.fp8 import Fp8Linear
+from dual_system.models.graphs import directly
 from dual_system.models.int8 import Int8Linear
+from dual_system.models.kernels.fp8 import FEW_ROWS, few_rows_eager, quantise_eager
+from dual_system.models.kernels.trial import choose
 from dual_system.models.ponder.checkpoint import save_ponder
 from dual_system.models.ponder.configs import tiny_cpu
 from dual_system.models.ponder.network import Ponder
@@ -21,8 +26,12 @@ from ponder_server.config import ContextOptions, PonderOptions, SpeedOptions
 from ponder_server.contract import Opening, WeightsName
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
-from ponder_server.narrow import quantise
+from ponder_server.narrow import check_change, quantise
+from ponder_server.operations import TWINS
+from ponder_server.rehearsal import rehearse
 from ponder_server.serve import PonderServer
+from ponder_server.slots import SlotMemory
+from ponder_server.stack import Stack
 from protocol.heartbeat import Heartbeat
 
 MODEL = replace(tiny_cpu(), num_layers=4, hidden_size=48, ffn_size=96, image_px=(32, 32), num_carriers=2)
@@ -130,3 +139,56 @@ def test_a_torch_without_fp8_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(torch, "float8_e4m3fn")
     with pytest.raises(ValueError, match=r"torch .* has no float8_e4m3fn; take --weights int8 on a CPU"):
         engine_of("fp8")
+
+
+def test_weights_that_change_a_trained_network_s_cognition_too_much_are_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("ponder_server.narrow.MOST_CHANGE", 1e-3)
+    trained = Ponder.random(MODEL, seed=1)
+    trained.is_random = False
+    with pytest.raises(ValueError, match=r"fp8 weights change cognition by .* at most 1e-03 .* Leave --weights out"):
+        QwenEngine(trained, replace(CONFIG, weights="fp8"))
+    check_change("fp8", 9.0, is_random=True)
+    with pytest.raises(ValueError, match="by nan"):
+        check_change("int8", float("nan"), is_random=False)
+
+
+EVEN = replace(MODEL, hidden_size=64, ffn_size=96)
+
+
+def test_a_captured_forward_of_fp8_products_is_the_network_s(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a GPU: torch's ``_scaled_mm`` runs on a CPU too. Rows are quantised by norms and before two products."""
+    monkeypatch.setattr(fp8, "has_products", lambda device: True)
+    engines = [
+        QwenEngine(Ponder.random(EVEN, seed=1, dtype=torch.bfloat16), replace(CONFIG, weights="fp8"), capture=capture)
+        for capture in (None, directly)
+    ]
+    captured = engines[1]._runner._captured
+    assert captured is not None
+    assert captured._stack.multiplies_fp8
+    expected, came = (engine._example_cognition() for engine in engines)
+    assert len(captured) == 2, "the opening and the query"
+    change = float((came - expected).norm() / expected.norm())
+    assert change < engines[0].spec.cognition_error
+
+
+def test_kernels_of_fp8_are_tried_where_their_rows_are() -> None:
+    """Few rows by a product of their own; whatever is not tried stays a twin."""
+    ponder = Ponder.random(EVEN, seed=1, dtype=torch.bfloat16)
+    quantise(ponder, "fp8")
+    for layer in ponder.qwen.modules():
+        if isinstance(layer, Fp8Linear):
+            layer.multiplies = True
+    config = ponder.qwen.config.text_config
+    memory = SlotMemory(config, num_slots=1, max_tokens=64, device=ponder.device, dtype=ponder.dtype)
+    stack = Stack.of(ponder.qwen.model.language_model)
+    wrong, right = (lambda x: quantise_eager(2 * x)), (lambda x, *weight: few_rows_eager(x, *weight))
+    kernels = replace(TWINS, quantise=wrong, few_rows=right)
+    times = cycle((1.0, 2.0))  # a kernel's, and its twin's
+    with torch.inference_mode():
+        for length, tried in ((FEW_ROWS, {"quantise": False, "few_rows": True}), (FEW_ROWS + 1, {"quantise": False})):
+            samples = rehearse(stack, memory, num_rows=1, length=length)
+            _, verdicts = choose(samples, TWINS, kernels, lambda work: next(times))
+            taken = {one.operation: one.is_taken for one in verdicts}
+            assert {name: taken[name] for name in ("quantise", "few_rows") if name in taken} == tried

@@ -1,7 +1,7 @@
 """RMSNorm, plain or styled by time (adaRMS), together with the gated residual that precedes it.
 
 Between two GEMMs of a stream comes x <- x + gate * branch, then norm(x): six passes over memory as eager operations,
-one here.
+one here. The norm may also be given in fp8, for products with fp8 weights.
 """
 
 # R rows (batch times tokens), E width
@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dual_system.models.kernels.fp8 import NARROW, Quantised, quantise_eager, store_quantised
 from dual_system.models.kernels.launch import Tolerance, block_size, check_tensor, kernel, tl
 
 TOLERANCE = {
@@ -42,16 +43,26 @@ class Residual:
     """(E,) float32; None adds the branch ungated."""
 
 
-def norm_eager(x_RE: Tensor, out_RE: Tensor, style: Style, residual: Residual | None = None) -> None:
-    """Adds ``residual`` to ``x_RE`` in place and writes the norm of the sum to ``out_RE``, as the models do."""
+def norm_eager(
+    x_RE: Tensor, out_RE: Tensor, style: Style, residual: Residual | None = None, narrow: Quantised | None = None
+) -> None:
+    """Adds ``residual`` to ``x_RE`` in place and writes the norm of the sum to ``out_RE``, as the models do.
+
+    ``narrow``: where to write the norm, as stored, in fp8 too.
+    """
     if residual is not None:
         gated_RE = residual.branch if residual.gate is None else residual.gate.to(x_RE.dtype) * residual.branch
         x_RE += gated_RE
     normed_RE = torch.nn.functional.rms_norm(x_RE.float(), x_RE.shape[-1:], None, style.eps) * style.scale
     out_RE.copy_(normed_RE if style.shift is None else normed_RE + style.shift)
+    if narrow is not None:
+        for place, rows in zip(narrow, quantise_eager(out_RE), strict=True):
+            place.copy_(rows)
 
 
-def norm_fused(x_RE: Tensor, out_RE: Tensor, style: Style, residual: Residual | None = None) -> None:
+def norm_fused(
+    x_RE: Tensor, out_RE: Tensor, style: Style, residual: Residual | None = None, narrow: Quantised | None = None
+) -> None:
     """`norm_eager` in one launch, one program per row. It sums in float32, and normalises the sum as stored.
 
     Raises:
@@ -67,6 +78,9 @@ def norm_fused(x_RE: Tensor, out_RE: Tensor, style: Style, residual: Residual | 
         check_tensor("branch", residual.branch, (num_rows, width), x_RE.dtype)
         if residual.gate is not None:
             check_tensor("gate", residual.gate, (width,), torch.float32)
+    if narrow is not None:
+        check_tensor("narrow", narrow.narrow_MI, (num_rows, width), NARROW)
+        check_tensor("narrow scale", narrow.scale_M, (num_rows,), torch.float32)
     has_gate = residual is not None and residual.gate is not None
     _norm[(num_rows,)](
         x_RE,
@@ -75,12 +89,15 @@ def norm_fused(x_RE: Tensor, out_RE: Tensor, style: Style, residual: Residual | 
         style.scale,
         style.scale if style.shift is None else style.shift,
         out_RE,
+        out_RE if narrow is None else narrow.narrow_MI,
+        style.scale if narrow is None else narrow.scale_M,
         WIDTH=width,
         BLOCK=block_size(width),
         EPS=style.eps,
         HAS_BRANCH=residual is not None,
         HAS_GATE=has_gate,
         HAS_SHIFT=style.shift is not None,
+        HAS_NARROW=narrow is not None,
     )
 
 
@@ -92,16 +109,20 @@ def _norm(
     scale_ptr: tl.tensor,
     shift_ptr: tl.tensor,
     out_ptr: tl.tensor,
+    narrow_ptr: tl.tensor,
+    narrow_scale_ptr: tl.tensor,
     WIDTH: tl.constexpr,
     BLOCK: tl.constexpr,
     EPS: tl.constexpr,
     HAS_BRANCH: tl.constexpr,
     HAS_GATE: tl.constexpr,
     HAS_SHIFT: tl.constexpr,
+    HAS_NARROW: tl.constexpr,
 ) -> None:
     column = tl.arange(0, BLOCK)
     is_inside = column < WIDTH
-    at = tl.program_id(0).to(tl.int64) * WIDTH + column
+    row = tl.program_id(0).to(tl.int64)
+    at = row * WIDTH + column
     x = tl.load(x_ptr + at, mask=is_inside, other=0.0).to(tl.float32)
     if HAS_BRANCH:
         branch = tl.load(branch_ptr + at, mask=is_inside, other=0.0).to(tl.float32)
@@ -114,4 +135,7 @@ def _norm(
     y = y * tl.load(scale_ptr + column, mask=is_inside, other=0.0)
     if HAS_SHIFT:
         y = y + tl.load(shift_ptr + column, mask=is_inside, other=0.0)
-    tl.store(out_ptr + at, y.to(out_ptr.dtype.element_ty), mask=is_inside)
+    normed = y.to(out_ptr.dtype.element_ty)
+    tl.store(out_ptr + at, normed, mask=is_inside)
+    if HAS_NARROW:
+        store_quantised(normed.to(tl.float32), row, column, narrow_ptr, narrow_scale_ptr, WIDTH)
