@@ -1,9 +1,9 @@
 """POUNCE's fast path for pi0.5: packed weights, static buffers, fused operations, and a graph per shape of the prefix.
 
 The prefix is padded to a multiple of 64 tokens; padding is masked and takes no position, so it changes nothing but
-rounding. A bucket's work is captured once: the prefill, and each flow step with its own styles, so that heartbeats
-fit between steps. The first sample, which is the warm-up's, captures all buckets that any prompt may need: the prompt
-spells the state in digits, so its length changes from one invocation to the next.
+rounding. The vision tower is captured once a batch size, and a bucket's work once: the prefill, and each flow step with
+its own styles, so that heartbeats fit between steps. The first sample, which is the warm-up's, captures all buckets that
+any prompt may need: the prompt spells the state in digits, so its length changes from one invocation to the next.
 """
 
 # B batch, T prefix tokens with padding, N horizon, A padded action dim, E expert width, S slots of keys
@@ -57,6 +57,7 @@ class FusedPounce:
         self._capture = capture
         self._timer = timer
         self._buckets: dict[tuple[int, int], Bucket] = {}
+        self._eyes: dict[int, Eyes] = {}
         self._tried: dict[str, list[Verdict]] = {}
         self._network = FusedNetwork(pi05, operations, model.config.num_steps)
 
@@ -67,7 +68,7 @@ class FusedPounce:
 
     def sample(self, inputs: PounceInputs, noise_BNA: Tensor) -> Iterator[EulerStep]:
         """Yields the sampler's steps. Their tensors are the bucket's buffers, which the next step overwrites."""
-        prefix = self._model.embed_prefix(inputs)
+        prefix = self._model.embed_prefix(inputs, self._see(inputs.images))
         batch_size, num_tokens = prefix.is_real.shape
         prefix = _padded(prefix, _bucket_tokens(num_tokens))
         key = (batch_size, prefix.is_real.shape[1])
@@ -79,6 +80,16 @@ class FusedPounce:
         for index, step in enumerate(bucket.steps):
             step()
             yield EulerStep(index, bucket.velocity.view_as(noise_BNA), bucket.actions.view_as(noise_BNA))
+
+    def _see(self, images_BV3PP: Tensor) -> Tensor:
+        """Embeds the images; the result is overwritten by the next call."""
+        batch_size = len(images_BV3PP)
+        if batch_size not in self._eyes:
+            self._eyes[batch_size] = Eyes(self._model.pi05, images_BV3PP, self._capture)
+        eyes = self._eyes[batch_size]
+        eyes.images.copy_(images_BV3PP)
+        eyes.look()
+        return eyes.seen
 
     def _capture_all(self, prefix: Prefix, num_beside_text: int) -> None:
         """The buckets of all prompts, the longest first so that the others reuse its memory in the pool."""
@@ -123,6 +134,19 @@ def _padded(prefix: Prefix, length: int) -> Prefix:
         num_cognition=prefix.num_cognition,
         is_isolated=prefix.is_isolated,
     )
+
+
+class Eyes:
+    """Static buffers for the views of a batch, and the captured vision tower over them."""
+
+    def __init__(self, pi05: Pi05, images_BV3PP: Tensor, capture: Capture) -> None:
+        self.images = images_BV3PP.clone()
+        self.seen = pi05.embed_images(self.images).clone()
+
+        def look() -> None:
+            self.seen.copy_(pi05.embed_images(self.images))
+
+        self.look: Work = capture(look)
 
 
 class FusedNetwork:

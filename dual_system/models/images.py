@@ -31,12 +31,16 @@ def resized(frame: NDArray[np.uint8], size_px: int) -> NDArray[np.uint8]:
     return _resized(frame, size_px).permute(1, 2, 0).contiguous().numpy()
 
 
+def fitted_size(height_px: int, width_px: int, size_px: int) -> tuple[int, int]:
+    """Height and width with the longer side scaled to ``size_px``."""
+    longest_px = max(height_px, width_px)
+    return max(1, height_px * size_px // longest_px), max(1, width_px * size_px // longest_px)
+
+
 def _resized(frame: NDArray[np.uint8], size_px: int) -> Tensor:
     """Returns (3, h, w) uint8."""
     height_px, width_px = frame.shape[:2]
-    longest_px = max(height_px, width_px)
-    new_height_px = max(1, height_px * size_px // longest_px)
-    new_width_px = max(1, width_px * size_px // longest_px)
+    new_height_px, new_width_px = fitted_size(height_px, width_px, size_px)
     # Copied: frames off the wire are read-only views of bytes, which torch warns about, and may have any strides.
     pixels = torch.from_numpy(np.array(frame, order="C")).permute(2, 0, 1)
     if (new_height_px, new_width_px) == (height_px, width_px):

@@ -23,6 +23,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from triton.runtime.jit import KernelInterface
 
+from dual_system.models import fp8
 from dual_system.models.graphs import directly
 from dual_system.models.groot.pounce import GrootPounce
 from dual_system.models.ponder.configs import qwen35_9b
@@ -32,6 +33,7 @@ from dual_system.models.pounce.configs import tiny_cpu, tiny_groot
 from dual_system.models.pounce.family import blank_model
 from dual_system.models.pounce.precision import cast_streams
 from ponder_server.captured import CapturedDecoder
+from ponder_server.narrow import quantise
 from ponder_server.operations import KERNELS
 from ponder_server.slots import SlotMemory
 from pounce_server.fused import FusedPounce
@@ -138,27 +140,54 @@ class LaunchCounter:
         return launch
 
 
-@pytest.mark.parametrize("length", [1, 160])
-def test_a_9b_forward_of_kernels(length: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of 3,766 launches for 160 tokens, one in eight is left."""
+@pytest.fixture
+def counter(monkeypatch: pytest.MonkeyPatch) -> LaunchCounter:
+    """In place of all of PONDER's kernels."""
     counter = LaunchCounter()
     modules = {getattr(KERNELS, field.name).__module__ for field in fields(KERNELS)}
     for module in map(importlib.import_module, modules):
         for name in [name for name, value in vars(module).items() if isinstance(value, KernelInterface)]:
             monkeypatch.setattr(module, name, counter)
+    return counter
+
+
+def forward_of_kernels(length: int, counter: LaunchCounter, *, is_fp8: bool) -> int:
+    """Launches that torch sees in a forward of 9B, ``length`` tokens; those of kernels are in ``counter``."""
     ponder = Ponder.random(qwen35_9b(), seed=0, device="meta", dtype=torch.bfloat16)
+    if is_fp8:
+        quantise(ponder, "fp8")
     with FakeTensorMode():
         on_gpu(ponder)
         text_model, config = ponder.qwen.model.language_model, ponder.qwen.config.text_config
         memory = SlotMemory(config, num_slots=1, max_tokens=1024, device=ponder.device, dtype=ponder.dtype)
         captured = CapturedDecoder(text_model, memory, directly, num_read=16)
-        monkeypatch.setattr(captured, "operations", lambda num_rows, length: KERNELS)
+        captured.operations = lambda num_rows, length: KERNELS  # type: ignore[method-assign]
         with torch.inference_mode():
             forward = captured.forward(1, length, 1024)
         counter.count = 0
-        seen_by_torch = launched(forward.run)
-    assert counter.count == 65 + 32 + 24 * 3 + 8 * 3
+        return launched(forward.run)
+
+
+OWN = 65 + 32 + 24 * 3 + 8 * 3
+"""Launches of our kernels in a forward: norms, SwiGLU, three in each recurrent layer, three in each attention layer."""
+
+
+@pytest.mark.parametrize("length", [1, 160])
+def test_a_9b_forward_of_kernels(length: int, counter: LaunchCounter) -> None:
+    """Of 3,766 launches for 160 tokens, one in eight is left."""
+    seen_by_torch = forward_of_kernels(length, counter, is_fp8=False)
+    assert counter.count == OWN
     assert seen_by_torch + counter.count <= 440
+
+
+@pytest.mark.parametrize(("length", "narrow"), [(1, 24 * 3 + 8 * 4 + 32 * 3), (160, 32 * 2)])
+def test_a_9b_forward_in_fp8(length: int, narrow: int, counter: LaunchCounter, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few rows: our kernel is the product. More: norms give their rows in fp8, and two products a layer are
+    quantised for. Before there were kernels for it, both forwards were 2,114 launches."""
+    monkeypatch.setattr(fp8, "has_products", lambda device: True)
+    seen_by_torch = forward_of_kernels(length, counter, is_fp8=True)
+    assert counter.count == OWN + narrow
+    assert seen_by_torch + counter.count <= 498
 
 
 def test_ponder_s_vision_tower(ponder: Ponder) -> None:
@@ -202,5 +231,7 @@ def test_a_fused_prefill_and_flow_step() -> None:
         with torch.inference_mode():
             noise = torch.zeros(1, model.config.horizon, model.config.padded_action_dim, device="cuda")
             list(FusedPounce(model, TWINS, capture).sample(inputs_of(model), noise))
-        assert launched(works[0]) <= 98
-        assert launched(works[1]) <= 140
+        look, prefill, step, *_ = works
+        assert launched(look) <= 60
+        assert launched(prefill) <= 98
+        assert launched(step) <= 140

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from dual_system.models.images import PADDING, camera_batch, resize_with_pad
+from dual_system.models.resize import resized_views, weights_of
 
 SIZE_PX = 56
 
@@ -50,6 +51,23 @@ def test_shrinking_is_pil_bilinear_within_one_level(side_px: int) -> None:
     resized = Image.fromarray(frame).resize((SIZE_PX, SIZE_PX), Image.Resampling.BILINEAR)
     ours = (resize_with_pad(frame, SIZE_PX).permute(1, 2, 0).numpy() + 1.0) * 127.5
     assert np.abs(ours - np.asarray(resized)).max() <= 1.001
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 300), st.integers(1, 300), st.integers(1, 120), st.sampled_from([1, 255]), st.integers(0, 2**31))
+def test_a_gpu_s_resize_has_the_bits_of_a_cpu_s(
+    height_px: int, width_px: int, size_px: int, step: int, seed: int
+) -> None:
+    """Its own arithmetic, whatever the device: whole numbers in matrices. Noise, and only black and white."""
+    frame = _frame(height_px, width_px, seed) // step * step
+    expected, _ = camera_batch((frame, None), size_px)
+    assert torch.equal(resized_views((frame, None), size_px, torch.device("cpu")), expected)
+
+
+def test_a_picture_that_shrinks_much_needs_more_bits_than_float32_has() -> None:
+    frame = _frame(1, 4000)
+    assert weights_of(4000, 14, torch.device("cpu")).matrix.dtype == torch.float64
+    assert torch.equal(resized_views((frame,), 14, torch.device("cpu")), camera_batch((frame,), 14)[0])
 
 
 def test_a_missing_camera_is_black_and_flagged() -> None:

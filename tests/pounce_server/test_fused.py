@@ -185,7 +185,9 @@ def test_what_is_captured_once_is_replayed_over_new_inputs(config: PounceConfig)
     fused = FusedPounce(model, TWINS, recorder)
     for inputs, actions in zip(requests, expected, strict=True):
         assert mean_error(fused_actions(fused, inputs, noise), actions) <= MAE["float32"]
-    assert recorder.events == "c" * 11 * NUM_BUCKETS + "r" * 33, "prefill and ten steps, captured once"
+    invocation = "r" * 11
+    captured = "cr" + "c" * 11 * NUM_BUCKETS + invocation
+    assert recorder.events == captured + ("r" + invocation) * 2, "vision, prefill and ten steps, captured once"
 
 
 def test_no_prompt_waits_for_a_capture(config: PounceConfig) -> None:
@@ -198,7 +200,9 @@ def test_no_prompt_waits_for_a_capture(config: PounceConfig) -> None:
     fused = FusedPounce(model, TWINS, recorder)
     for inputs, actions in zip(requests, expected, strict=True):
         assert mean_error(fused_actions(fused, inputs, noise), actions) <= MAE["float32"]
-    assert recorder.events == "c" * 11 * NUM_BUCKETS + "r" * 11 * len(requests)
+    invocation = "r" * 11
+    captured = "cr" + "c" * 11 * NUM_BUCKETS + invocation
+    assert recorder.events == captured + ("r" + invocation) * (len(requests) - 1)
 
 
 def test_the_keys_of_an_action_fill_whole_slots(config: PounceConfig) -> None:

@@ -153,14 +153,17 @@ class Pi05(nn.Module):
         state_B1W: Tensor | None = None,
         is_isolated: bool = False,
         is_cognition_last: bool = False,
+        seen_BSW: Tensor | None = None,
     ) -> Prefix:
         """Assembles [P][views][text][state], or [views][text][state][P] if ``is_cognition_last``.
+
+        ``seen_BSW``: :meth:`embed_images` of the images, if they have been embedded.
 
         A missing camera keeps its slots but is masked and takes no positions.
 
         ``cognition_BPW`` and ``state_B1W`` are not multiplied by sqrt(W): like image tokens and unlike text.
         """
-        image_embeds = self.embed_images(images_BV3PP)  # no tokens if there is no view
+        image_embeds = self.embed_images(images_BV3PP) if seen_BSW is None else seen_BSW  # no tokens without a view
         is_image = has_view_BV.repeat_interleave(self.config.vision.num_patches, dim=1)
         parts = [image_embeds, self.language.embed(token_ids_BT)]
         is_real = [is_image, is_token_BT]

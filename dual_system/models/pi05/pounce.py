@@ -157,8 +157,10 @@ class Pounce(nn.Module):
     def backbone(self) -> Backbone:
         return Backbone(vision=(self.pi05.vision, self.pi05.projector), language=self.pi05.language)
 
-    def embed_prefix(self, inputs: PounceInputs) -> Prefix:
+    def embed_prefix(self, inputs: PounceInputs, seen_BSW: Tensor | None = None) -> Prefix:
         """Embeds [P][images][text][state], or P last (`CognitionConfig.place`).
+
+        ``seen_BSW``: the images as the vision tower and its projector embed them, if they have.
 
         Raises:
             ValueError: ``state_input`` is "token" and the state is missing.
@@ -180,6 +182,7 @@ class Pounce(nn.Module):
             state_B1W=state_B1W,
             is_isolated=self.config.cognition.attention == "isolated",
             is_cognition_last=self.config.cognition.place == "after_text",
+            seen_BSW=seen_BSW,
         )
 
     def prefill(self, inputs: PounceInputs) -> PrefixCache:

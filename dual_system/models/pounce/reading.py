@@ -19,6 +19,7 @@ from dual_system.models.normalisation import Floats, RobotStatistics
 from dual_system.models.pi05 import prompt as prompt
 from dual_system.models.pi05.pounce import PounceConfig, PounceInputs
 from dual_system.models.pi05.prompt import Tokenizer
+from dual_system.models.resize import resized_views
 
 
 class Moment(Protocol):
@@ -57,15 +58,15 @@ def pi05_inputs(
     Raises:
         ValueError: the prompt is too long.
     """
-    images, has_view = camera_batch(moment.frames, config.image_px)
+    images, has_view = _views(moment.frames, config.image_px, device)
     state = statistics.normalise_states(moment.proprio)
     has_token = config.state_input == "token"
     text = _STATELESS[config.stateless_prompt] if has_token else partial(prompt.prompt_text, state=state)
     token_ids = tokenizer.encode(text(_instruction(moment, config.reads_subgoal)))
     _check_length(len(token_ids), config.max_prompt_tokens, moment.instruction)
     return PounceInputs(
-        images=images.to(device),
-        has_view=has_view.to(device),
+        images=images,
+        has_view=has_view,
         token_ids=torch.tensor([token_ids], device=device),
         is_token=torch.ones(1, len(token_ids), dtype=torch.bool, device=device),
         age_ns=torch.tensor([moment.age_ns], device=device),
@@ -86,7 +87,7 @@ def groot_inputs(
     Raises:
         ValueError: the prompt is too long, or its image tokens are not one per patch of the frames.
     """
-    images, _ = camera_batch(moment.frames, config.image_px)
+    images, _ = _views(moment.frames, config.image_px, device)
     num_patches = config.groot.eagle.vision.num_patches
     instruction = _instruction(moment, config.reads_subgoal)
     token_ids = tokenizer.encode(groot_prompt.prompt_text(instruction, config.num_cameras, num_patches))
@@ -102,7 +103,7 @@ def groot_inputs(
     state = torch.zeros(1, config.groot.state_dim)
     state[0, : config.robot_state_dim] = torch.from_numpy(statistics.normalise_states(moment.proprio))
     return GrootInputs(
-        images=images.to(device),
+        images=images,
         token_ids=torch.tensor([token_ids], device=device),
         is_token=torch.ones(1, len(token_ids), dtype=torch.bool, device=device),
         state=state.to(device),
@@ -110,6 +111,15 @@ def groot_inputs(
         age_ns=torch.tensor([moment.age_ns], device=device),
         cognition=_cognition(moment, device),
     )
+
+
+def _views(frames: Sequence[NDArray[np.uint8] | None], size_px: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """`camera_batch`, resized where it costs less: a GPU's views have the same bits."""
+    if device.type != "cuda":
+        images, has_view = camera_batch(frames, size_px)
+        return images.to(device), has_view.to(device)
+    has_view = torch.tensor([[frame is not None for frame in frames]], dtype=torch.bool, device=device)
+    return resized_views(frames, size_px, device), has_view
 
 
 _STATELESS = {"instruction": prompt.stateless_prompt_text, "task": prompt.task_only_prompt_text}
