@@ -33,7 +33,7 @@ class Operations:
     rotate_store: Function
     attend: Function
     quantise: Function
-    """Of fp8 weights alone, as is ``few_rows``."""
+    """``quantise`` and ``few_rows`` are called where weights are fp8."""
     few_rows: Function
 
 

@@ -2,8 +2,8 @@
 
 The prefix is padded to a multiple of 64 tokens; padding is masked and takes no position, so it changes nothing but
 rounding. The vision tower is captured once a batch size, and a bucket's work once: the prefill, and each flow step with
-its own styles, so that heartbeats fit between steps. The first sample, which is the warm-up's, captures all buckets that
-any prompt may need: the prompt spells the state in digits, so its length changes from one invocation to the next.
+its own styles, so that heartbeats fit between steps. The first sample, which is the warm-up's, captures all buckets
+that any prompt may need: the prompt spells the state in digits, so its length changes from one invocation to the next.
 """
 
 # B batch, T prefix tokens with padding, N horizon, A padded action dim, E expert width, S slots of keys

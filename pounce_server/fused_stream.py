@@ -11,12 +11,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from dual_system.models.kernels.launch import Timer
 from dual_system.models.kernels.rms_norm import Residual, Style, norm_eager, norm_fused
 from dual_system.models.kernels.trial import Verdict, choose
-from dual_system.models.pi05.gemma import ExpertLayer, GemmaConfig, GemmaLayer, Rotation, attend
+from dual_system.models.pi05.gemma import ExpertLayer, GemmaConfig, GemmaLayer, Rotation
 from pounce_server.kernels.choice import product
 from pounce_server.kernels.euler import euler_eager, euler_fused
 from pounce_server.kernels.geglu import geglu_eager, geglu_fused
@@ -91,13 +92,21 @@ class Run:
         self.normed = torch.empty_like(self.x)
         self.branch = torch.empty_like(self.x)
         self.qkv = like.new_empty(num_rows, (num_heads + 2 * num_kv_heads) * head_dim)
-        self.queries = like.new_empty(batch_size, num_heads, num_tokens, head_dim)
+        self.queries = like.new_empty(batch_size, num_kv_heads, num_heads // num_kv_heads * num_tokens, head_dim)
         self.gate_up = like.new_empty(num_rows, 2 * config.mlp_width)
         self.activated = like.new_empty(num_rows, config.mlp_width)
         pairs = torch.zeros(batch_size, 1, num_tokens, head_dim // 2, device=device)
         self.rotation = Rotation(pairs, pairs.clone())
         self.bias = like.new_zeros(batch_size, 1, 1, seen.stop - seen.start)
         """0 for slots that are seen, else -inf; from a bool torch would make it again in every layer."""
+
+    def attend(self, keys: Tensor, values: Tensor) -> Tensor:
+        """The tokens' mixed values (R, h * D); with one key head nothing is copied, as a token's heads are rows."""
+        (batch_size, groups, _, _), num_tokens = self.queries.shape, len(self.x) // len(self.queries)
+        mixed = F.scaled_dot_product_attention(
+            self.queries, keys[:, :, self.seen], values[:, :, self.seen], attn_mask=self.bias
+        )
+        return mixed.view(batch_size, groups, num_tokens, -1).transpose(1, 2).reshape(len(self.x), -1)
 
     def place(self, positions_BT: Tensor, visible_BS: Tensor) -> None:
         """Loads the tokens' positions, and which of the attended slots are real."""
@@ -134,8 +143,7 @@ class FusedStream:
             self.do.rope(run.qkv, run.rotation, run.queries, Slots(keys, values, run.first))
             if index == len(self._layers) - 1 and len(norms) == 2 * len(self._layers):
                 return
-            mixed = attend(run.queries, keys[:, :, run.seen], values[:, :, run.seen], run.bias)
-            self.do.product(mixed.flatten(0, 1), layer.attention_out, run.branch)
+            self.do.product(run.attend(keys, values), layer.attention_out, run.branch)
             self.do.norm(run.x, run.normed, before_mlp.style, Residual(run.branch, before_attention.gate))
             self.do.product(run.normed, layer.gate_up, run.gate_up)
             self.do.geglu(run.gate_up, run.activated)

@@ -28,16 +28,19 @@ class Slots:
 
 
 def rope_eager(qkv: Tensor, rotation: Rotation, queries: Tensor, slots: Slots) -> None:
-    """Writes rotated queries (B, h, T, D), and rotated keys and plain values into T of the slots.
+    """Writes rotated queries, and rotated keys and plain values into T of the slots.
 
     ``qkv`` is (B * T, (h + 2g) * D), per token the heads of q, k and v. ``rotation`` holds (B, 1, T, C) float32.
+    Queries are (B, g, T * h/g, D): heads that share a key head are rows, and those of a token lie side by side.
     """
-    batch_size, num_heads, num_tokens, head_dim = queries.shape
-    num_kv_heads = slots.keys.shape[1]
+    batch_size, num_kv_heads, num_rows, head_dim = queries.shape
+    num_tokens = len(qkv) // batch_size
+    num_heads = num_kv_heads * num_rows // num_tokens
     heads = qkv.view(batch_size, num_tokens, num_heads + 2 * num_kv_heads, head_dim).transpose(1, 2)
     q, k, v = heads.split([num_heads, num_kv_heads, num_kv_heads], dim=1)
     here = slice(slots.first, slots.first + num_tokens)
-    queries.copy_(rotation(q))
+    grouped = rotation(q).unflatten(1, (num_kv_heads, -1)).transpose(2, 3)
+    queries.view(grouped.shape).copy_(grouped)
     slots.keys[:, :, here].copy_(rotation(k))
     slots.values[:, :, here].copy_(v)
 
@@ -48,11 +51,12 @@ def rope_fused(qkv: Tensor, rotation: Rotation, queries: Tensor, slots: Slots) -
     Raises:
         ValueError: shapes, dtypes or layouts do not match, or the tokens do not fit into the slots.
     """
-    batch_size, num_heads, num_tokens, head_dim = queries.shape
-    _, num_kv_heads, num_slots, _ = slots.keys.shape
+    batch_size, num_kv_heads, num_rows, head_dim = queries.shape
+    num_slots, num_tokens = slots.keys.shape[2], max(1, len(qkv) // batch_size)
+    num_heads = num_kv_heads * num_rows // num_tokens
     num_all = num_heads + 2 * num_kv_heads
     check_tensor("qkv", qkv, (batch_size * num_tokens, num_all * head_dim), qkv.dtype)
-    check_tensor("queries", queries, (batch_size, num_heads, num_tokens, head_dim), qkv.dtype)
+    check_tensor("queries", queries, (batch_size, num_kv_heads, num_rows, head_dim), qkv.dtype)
     for name, buffer in (("keys", slots.keys), ("values", slots.values)):
         check_tensor(name, buffer, (batch_size, num_kv_heads, num_slots, head_dim), qkv.dtype)
     for name, table in (("cos", rotation.cos), ("sin", rotation.sin)):
@@ -113,7 +117,9 @@ def _rope(
     turned_first = tl.where(is_v, first, first * cos - second * sin).to(q_ptr.dtype.element_ty)
     turned_second = tl.where(is_v, second, second * cos + first * sin).to(q_ptr.dtype.element_ty)
 
-    q_at = q_ptr + ((sample * Q_HEADS + head) * num_tokens + token) * (2 * PAIRS) + pair
+    GROUP: tl.constexpr = Q_HEADS // KV_HEADS
+    q_row = ((sample * KV_HEADS + head // GROUP) * num_tokens + token) * GROUP + head % GROUP
+    q_at = q_ptr + q_row * (2 * PAIRS) + pair
     tl.store(q_at, turned_first, mask=is_q & is_pair)
     tl.store(q_at + PAIRS, turned_second, mask=is_q & is_pair)
     slot = first_slot + token

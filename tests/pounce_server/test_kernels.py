@@ -121,7 +121,7 @@ def test_rope(batch: int, tokens: int, share: int, kv_heads: int, pairs: int, dt
     rotation = Rotation.at(positions, 2 * pairs)
     results = []
     for run in (rope.rope_eager, rope.rope_fused):
-        queries = arena.poisoned(batch, heads, tokens, 2 * pairs)
+        queries = arena.poisoned(batch, kv_heads, share * tokens, 2 * pairs)
         keys, values = (arena.poisoned(batch, kv_heads, slots, 2 * pairs) for _ in range(2))
         run(qkv, rotation, queries, rope.Slots(keys, values, first))
         for buffer in (keys, values):
