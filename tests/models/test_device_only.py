@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -246,11 +247,14 @@ def test_a_fused_prefill_and_flow_step() -> None:
         assert launched(step) <= 140
 
 
-def test_a_pi05_of_kernels(counter: LaunchCounter) -> None:
+def test_a_pi05_of_kernels(counter: LaunchCounter, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of 394 launches of a prefill 156 are left, of 420 of a flow step 168."""
+    # One kernel on a GPU; a build of torch without CUDA takes it apart.
+    monkeypatch.setattr(F, "scaled_dot_product_attention", lambda q, k, v, attn_mask: torch.sin(q))
     mode = FakeTensorMode()
     _, prefill, step, *_ = works_of(pi05_base(num_carriers=8), POUNCE_KERNELS, mode)
     for work, most in ((prefill, 156), (step, 168)):
         counter.count = 0
         with mode:
-            assert launched(work) + counter.count <= most
+            seen_by_torch = launched(work)
+        assert seen_by_torch + counter.count == most
