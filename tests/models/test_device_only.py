@@ -45,7 +45,7 @@ CUDA, META = 1, 14
 """Places in torch's list of device types."""
 NO_KERNEL = (
     *("prim.", "view", "reshape", "unsqueeze", "squeeze", "transpose", "permute", "expand", "slice", "select", "split"),
-    *("unbind", "detach", "alias", "as_strided", "t.", "empty", "new_empty", "unflatten", "chunk"),
+    *("unbind", "detach", "alias", "as_strided", "t.", "numpy_T", "empty", "new_empty", "unflatten", "chunk"),
 )
 
 
@@ -248,12 +248,12 @@ def test_a_fused_prefill_and_flow_step() -> None:
 
 
 def test_a_pi05_of_kernels(counter: LaunchCounter, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of 394 launches of a prefill 156 are left, of 420 of a flow step 168."""
+    """Of 394 launches of a prefill 156 are left, of 420 of a flow step 167, and one in place that is not counted."""
     # One kernel on a GPU; a build of torch without CUDA takes it apart.
-    monkeypatch.setattr(F, "scaled_dot_product_attention", lambda q, k, v, attn_mask: torch.sin(q))
+    monkeypatch.setattr(F, "scaled_dot_product_attention", lambda q, k, v, attn_mask=None: torch.sin(q))
     mode = FakeTensorMode()
     _, prefill, step, *_ = works_of(pi05_base(num_carriers=8), POUNCE_KERNELS, mode)
-    for work, most in ((prefill, 156), (step, 168)):
+    for work, most in ((prefill, 156), (step, 167)):
         counter.count = 0
         with mode:
             seen_by_torch = launched(work)
