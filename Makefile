@@ -77,7 +77,7 @@ $(LEROBOT)/.ready:
 	$(LEROBOT)/bin/pip install --quiet 'datasets<5' 'pandas<3' 'av<16' 'draccus<0.12' 'huggingface-hub<2' jsonlines einops \
 		gymnasium opencv-python-headless termcolor deepdiff requests 'setuptools<82'
 	touch $@
-peers: setup $(LEROBOT)/.ready
+peers: setup site $(LEROBOT)/.ready
 	for version in 3.12 3.13; do $(MAKE) setup VENV=$(VENV)/peers/$$version PYTHON=python$$version || exit 1; done
 	$(BIN)/python -m benchmarks.peers --pythons $(BIN)/python $(VENV)/peers/3.12/bin/python $(VENV)/peers/3.13/bin/python \
 		--lerobot $(LEROBOT)/bin/python
