@@ -68,7 +68,7 @@ oldest: setup
 	test -d $(OLDEST)/httpx || $(BIN)/pip install --quiet --target $(OLDEST) 'huggingface-hub<2' httpx
 	PYTHONPATH=$(OLDEST) $(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile -m "not gpu" tests/models tests/ponder_server
 
-## make peers   unit under Python 3.12 and 3.13, and LeRobot beside us; writes benchmarks/reports/peers.json (an hour)
+## make peers   unit under Python 3.12 and 3.13, LeRobot and rosbags beside us; writes benchmarks/reports/peers.json (an hour)
 LEROBOT := $(VENV)/peers/lerobot
 $(LEROBOT)/.ready:
 	python3.12 -m venv $(LEROBOT)
@@ -77,10 +77,15 @@ $(LEROBOT)/.ready:
 	$(LEROBOT)/bin/pip install --quiet 'datasets<5' 'pandas<3' 'av<16' 'draccus<0.12' 'huggingface-hub<2' jsonlines einops \
 		gymnasium opencv-python-headless termcolor deepdiff requests 'setuptools<82'
 	touch $@
-peers: setup site $(LEROBOT)/.ready
+ROSBAGS := $(VENV)/peers/rosbags
+$(ROSBAGS)/.ready:
+	$(PYTHON) -m venv $(ROSBAGS)
+	$(ROSBAGS)/bin/pip install --quiet rosbags==0.11.9 pillow
+	touch $@
+peers: setup site $(LEROBOT)/.ready $(ROSBAGS)/.ready
 	for version in 3.12 3.13; do $(MAKE) setup VENV=$(VENV)/peers/$$version PYTHON=python$$version || exit 1; done
 	$(BIN)/python -m benchmarks.peers --pythons $(BIN)/python $(VENV)/peers/3.12/bin/python $(VENV)/peers/3.13/bin/python \
-		--lerobot $(LEROBOT)/bin/python
+		--lerobot $(LEROBOT)/bin/python --rosbags $(ROSBAGS)/bin/python
 
 ## make accept  a hundred oracle episodes of every task (about ten minutes)
 accept: setup

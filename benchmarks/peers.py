@@ -29,6 +29,8 @@ class PeersOptions:
     """Interpreters with our packages; the first runs the tests beside other projects."""
     lerobot: Path | None = None
     """Interpreter with lerobot 0.6. None: those tests are skipped, and counted so."""
+    rosbags: Path | None = None
+    """Interpreter with rosbags and Pillow. None: that test is skipped, and counted so."""
     jobs: int = 1
     """Processes that share the unit tests."""
 
@@ -52,7 +54,8 @@ def main() -> int:
         _stage("unit tests", python, ["-m", UNIT, "-n", str(options.jobs), "--dist", "loadfile"], {})
         for python in options.pythons
     ]
-    beside = {} if options.lerobot is None else {"LEROBOT_PYTHON": str(options.lerobot)}
+    others = {"LEROBOT_PYTHON": options.lerobot, "ROSBAGS_PYTHON": options.rosbags}
+    beside = {name: str(python) for name, python in others.items() if python is not None}
     rows.append(_stage("beside other projects, and public folders", options.pythons[0], ["-m", "peers"], beside))
     report.add_table("By stage", rows)
     if options.lerobot is not None:

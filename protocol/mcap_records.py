@@ -24,6 +24,7 @@ MAX_RECORD_BYTES = 64 << 20  # a larger length is damaged: a chunk of ours has 1
 MAX_UNPACKED_BYTES = 1 << 30  # of all chunks, and 16 times the file: an episode's raw frames at 8 MB/s have 520 MB
 MAX_MESSAGES = 300_000  # and one for 100 bytes of the file: an hour at 20 Hz with cameras has 600,000 in 700 MB
 
+_UNKNOWN = ("", "")
 _RECORD = struct.Struct("<BQ")  # opcode, length
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 
@@ -47,7 +48,7 @@ class Records:
         self.num_bytes = os.fstat(file.fileno()).st_size
         self._file = file
         self._schemas: dict[int, str] = {}
-        self._channels: dict[int, str] = {}
+        self._channels: dict[int, tuple[str, str]] = {}
         self._bytes_left = MAX_UNPACKED_BYTES + 16 * self.num_bytes
         self._messages_left = MAX_MESSAGES + self.num_bytes // 100
         self._records = self._flat()
@@ -66,16 +67,25 @@ class Records:
             if isinstance(record, Schema):
                 self._schemas[record.id] = record.name
             elif isinstance(record, Channel):
-                self._channels[record.id] = self._schemas.get(record.schema_id, "")
+                self._channels[record.id] = (self._schemas.get(record.schema_id, ""), record.topic)
             elif isinstance(record, Message):
                 self._messages_left -= 1
                 if self._messages_left < 0:
                     raise TooLarge(f"more than {MAX_MESSAGES} messages in {self.num_bytes} bytes")
             yield record
 
+    @staticmethod
+    def is_message(record: Any) -> bool:
+        """Whether a record is a message: for those who do without the library's classes."""
+        return isinstance(record, Message)
+
     def schema_of(self, message: Message) -> str:
         """Name of a message's schema; "" if it has none."""
-        return self._channels.get(message.channel_id, "")
+        return self._channels.get(message.channel_id, _UNKNOWN)[0]
+
+    def topic_of(self, message: Message) -> str:
+        """A message's topic; "" if its channel is not described."""
+        return self._channels.get(message.channel_id, _UNKNOWN)[1]
 
     def _flat(self) -> Iterator[Any]:
         reader = StreamReader(self._file, emit_chunks=True, validate_crcs=True, record_size_limit=MAX_RECORD_BYTES)

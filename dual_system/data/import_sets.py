@@ -97,6 +97,8 @@ def _shown(path: Path, mapping: SourceMapping, options: ImportOptions) -> Iterat
         bar = tqdm(zip(range(count), source), total=count, desc=path.name, disable=not options.progress)  # noqa: B905
         yield from (episode for _, episode in bar)
 
+    if path.suffix == ".mcap":
+        raise DatasetError(f"{path} is MCAP: pp-collect bags reads rosbag2's, pp-export our logs")
     if path.suffix in SUFFIXES:
         with RobommeFile(path) as file:
             yield from some(file)
