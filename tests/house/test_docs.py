@@ -71,7 +71,9 @@ def _options() -> set[str]:
 @every_page
 def test_options_that_are_named_exist(page: str) -> None:
     strangers = re.compile(
-        r"^.*\b(?:pip|docker|apt-get|git|uv run|python gr00t\S*|vla-eval run|evaluator\.py) .*$", re.MULTILINE
+        r"^.*\b(?:pip|docker|apt-get|git|uv run|python gr00t\S*|vla-eval run|evaluator\.py"
+        r"|lerobot-rollout|lerobot-eval|lerobot_policy_ponderpounce) .*$",
+        re.MULTILINE,
     )
     whole_lines = PAGES[page].replace("\\\n", " ")
     named = set(re.findall(r"(?<![\w-])--[a-z][\w.-]*\w", code(strangers.sub("", whole_lines))))
