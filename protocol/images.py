@@ -73,6 +73,11 @@ def unpack(image: Image) -> NDArray[np.uint8]:
     height, width = claimed_size(data)
     if (height, width) != (image.height, image.width):
         raise MalformedMessage("Image", "data", f"{image.height} x {image.width} px", f"{height} x {width} px")
+    return from_jpeg(data)
+
+
+def from_jpeg(data: bytes) -> NDArray[np.uint8]:
+    """Pixels (height, width, 3) uint8 RGB. Raises MalformedMessage: it is none. ``claimed_size`` comes first."""
     try:
         decoded: NDArray[np.uint8] = simplejpeg.decode_jpeg(data, colorspace="RGB")
     except ValueError as error:

@@ -12,12 +12,11 @@ import struct
 from typing import Any, NamedTuple
 
 import numpy as np
-import simplejpeg
 from numpy.typing import NDArray
 from PIL import Image as Pillow
 
 from protocol.checks import MAX_IMAGE_SIDE_PX
-from protocol.images import claimed_size
+from protocol.images import claimed_size, from_jpeg
 
 IMAGE, COMPRESSED, JOINTS = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "JointState"))
 Pixels = NDArray[np.uint8]
@@ -139,6 +138,5 @@ def picture_of(schema: str, data: bytes) -> Pixels:
 def _decompressed(data: bytes) -> Pixels:
     claimed_size(data)
     if data.startswith(_JPEG):
-        decoded: Pixels = simplejpeg.decode_jpeg(data, colorspace="RGB")
-        return decoded
+        return from_jpeg(data)
     return np.array(Pillow.open(io.BytesIO(data)).convert("RGB"))

@@ -10,6 +10,7 @@ import pytest
 from benchmarks import report, training_throughput
 
 
+@pytest.mark.peers
 @pytest.mark.parametrize("recipe", ["tiny", "tiny_groot"])
 def test_every_part_is_timed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recipe: str) -> None:
     monkeypatch.setattr(report, "REPORTS", tmp_path)

@@ -18,7 +18,7 @@ from protocol import extras
 from protocol.command_line import REFUSED, command
 
 BUILD = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
-NOT_INSTALLED = ("tests", "benchmarks", "examples", "docs", "docker", "checkpoints", "client", "site")
+NOT_INSTALLED = ("tests", "benchmarks", "examples", "docs", "docker", "checkpoints", "client", "plugins", "site")
 DISTRIBUTION_OF = {"PIL": "pillow", "rerun": "rerun-sdk", "zmq": "pyzmq", "tokenizers": "transformers"}
 
 

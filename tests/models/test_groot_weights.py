@@ -119,6 +119,7 @@ def _assert_same(loaded: GrootPounce, model: GrootPounce) -> None:
         assert torch.equal(loaded.state_dict()[name], tensor), name
 
 
+@pytest.mark.peers
 def test_a_file_of_full_depth_round_trips(tmp_path: Path) -> None:
     """Every published name, in small: nothing is lost, nothing added, no bit differs."""
     tiny, full = tiny_groot(num_carriers=0), groot_n1_5().groot

@@ -46,7 +46,7 @@ def run(model: nn.Module, optimiser: Optimiser, steps: range) -> list[float]:
 
 
 @given(steps=st.integers(1, 40), rate=st.sampled_from([1e-6, 1e-5, 1e-3]), seed=st.integers(0, 100))
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=8)
 def test_rounded_weights_are_the_whole_ones_rounded(steps: int, rate: float, seed: int) -> None:
     config = replace(CONFIG, learning_rate=rate)
     rounded, whole = network(torch.bfloat16, seed), network(torch.float32, seed)
