@@ -245,7 +245,8 @@ def main(
         key = said.api_key_file.read_text(encoding="utf-8").strip() if said.api_key_file else ""
     except OSError as error:
         parser.error(str(error))
-    signal.signal(signal.SIGTERM, _interrupted)
+    for number in (signal.SIGINT, signal.SIGTERM):  # SIGINT too: a script's background jobs begin with it ignored
+        signal.signal(number, _interrupted)
     watchdog = Watchdog(stop, *stop_arguments)
     try:
         with Client(said.url, key) as client:
