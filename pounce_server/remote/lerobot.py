@@ -156,6 +156,9 @@ class LerobotPeer:
             raise PeerError(f"expected a descriptor with capabilities, came {str(found)[:_MAX_ERROR]}")
         if not is_name(found.get("instance_id")):
             raise PeerError(f"instance_id {str(found.get('instance_id'))[:80]!r}: expected a name")
+        texts = {name: found.get(name) for name in ("artifact_identity", "semantics")}
+        if not all(isinstance(text, str) for text in texts.values()) or "action_feature" not in capabilities:
+            raise PeerError(f"expected texts and an action_feature in its descriptor, came {str(found)[:_MAX_ERROR]}")
         features = {str(each.get("name")): each for each in capabilities["features"] if isinstance(each, Mapping)}
         ours = {named(camera.key): "rgb" for camera in mapping.cameras if camera.key is not None}
         ours |= {named(key): "tensor" for key in mapping.state_keys()}
@@ -163,18 +166,21 @@ class LerobotPeer:
         if theirs != ours:
             raise PeerError(f"its features are {theirs}; {mapping.name} has {ours}")
         for key, width in mapping.state_keys().items():
-            if list(features[named(key)].get("shape", ())) != [width]:
+            if features[named(key)].get("shape") != [width]:
                 raise PeerError(
                     f"its {named(key)} is {features[named(key)].get('shape')}; {mapping.name} has ({width},)"
                 )
         for key, names in mapping.names.items():
             feature: Any = features.get(named(key)) or capabilities.get("action_feature")
             told = feature.get("names") if isinstance(feature, Mapping) else None
-            if told and list(told) != list(names):
-                raise PeerError(f"its {named(key)} is {', '.join(map(str, told))}; {mapping.name} has {names}")
-        if "chunk" not in capabilities.get("modes", ()):
-            raise PeerError(f"its modes are {capabilities.get('modes')}, expected chunk among them")
-        rows, rate_hz = capabilities.get("execution_steps"), 1 / float(capabilities.get("action_interval") or np.inf)
+            if told and told != list(names):
+                raise PeerError(f"its {named(key)} is {told}; {mapping.name} has {list(names)}")
+        modes, interval_s = capabilities.get("modes"), capabilities.get("action_interval")
+        if not isinstance(modes, list) or "chunk" not in modes:
+            raise PeerError(f"its modes are {modes}, expected chunk among them")
+        if not isinstance(interval_s, (int, float)) or not interval_s > 0:
+            raise PeerError(f"its action_interval is {interval_s!r}, expected seconds")
+        rows, rate_hz = capabilities.get("execution_steps"), 1 / interval_s
         if rows != mapping.horizon or abs(rate_hz - mapping.rate_hz) > 1e-3:
             raise PeerError(
                 f"it answers {rows} rows at {rate_hz:.4g} Hz; {mapping.name} has horizon {mapping.horizon} at "

@@ -193,6 +193,9 @@ def test_the_exchange_is_the_published_one(named: PolicyMapping, episode_info: C
     ("change", "said"),
     [
         ({"features": [feature(STATE, (3,), "tensor")]}, "its features are"),
+        ({"modes": 3}, "its modes are 3"),
+        ({"action_interval": "fast"}, "its action_interval is 'fast'"),
+        ({"action_interval": 0}, "its action_interval is 0"),
         (
             {"features": [feature(STATE, (6,), "tensor"), feature(FRONT, (8, 8, 3), "rgb")]},
             r"is \[6\]; test has \(3,\)",
