@@ -78,6 +78,14 @@ def _instant(message: Any, *names: str) -> None:
             raise _broken(message, name, "nanoseconds within 31 years", value)
 
 
+def _anchor(message: Any, *names: str) -> None:
+    """Instants from which others count on: what they come to must be an instant as well."""
+    for name in names:
+        value = getattr(message, name)
+        if abs(value) > MAX_INSTANT_NS // 2:
+            raise _broken(message, name, "nanoseconds within 15 years", value)
+
+
 def _duration(message: Any, *names: str) -> None:
     for name in names:
         value = getattr(message, name)
@@ -249,7 +257,7 @@ def check_action_chunk(c: m.ActionChunk) -> None:
 
 def check_action(a: m.Action) -> None:
     _ordinal(a, "tick")
-    _instant(a, "deadline_ns")
+    _anchor(a, "deadline_ns")
     _chosen(a, "level")
     _vector(a, "values", low=1)
 
@@ -257,7 +265,8 @@ def check_action(a: m.Action) -> None:
 def check_tick(t: m.Tick) -> None:
     _index(t, "tick", "t_row0", "row", "observation_tick")
     _reference(t, "invocation", "ref_query")
-    _instant(t, "deadline_ns", "decided_ns", "late_ns", "age_ns")
+    _anchor(t, "deadline_ns")
+    _instant(t, "decided_ns", "late_ns", "age_ns")
     _chosen(t, "level")
     for name in ("state", "action"):
         _vector(t, name)

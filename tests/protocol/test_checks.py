@@ -81,6 +81,8 @@ def with_schedule(**changes: Any) -> m.Schedule:
 BROKEN: list[tuple[type, dict[str, Any], str]] = [
     (m.Query, {"query": -1}, r"Query\.query: expected 0\.\.9007199254740991, came -1"),
     (m.Query, {"tick": 2**53 + 1}, r"Query\.tick: expected 0\.\."),
+    (m.Action, {"deadline_ns": 10**18}, r"Action\.deadline_ns: expected nanoseconds within 15 years, came 1000"),
+    (m.Tick, {"deadline_ns": 10**18}, r"Tick\.deadline_ns: expected nanoseconds within 15 years, came 1000"),
     (m.Query, {"source_ns": 10**18 + 1}, r"Query\.source_ns: expected nanoseconds within 31 years, came 1000"),
     (m.Query, {"header": m.Header(robot=LONG_ID)}, r"Header\.robot: expected at most 128 characters, came 129"),
     (m.Query, {"header": m.Header(episode=LONG_ID)}, r"Header\.episode: "),

@@ -28,6 +28,7 @@ INDEX = st.integers(0, MAX_INDEX - 1)
 U32 = st.integers(0, 2**32 - 1)
 U64 = st.integers(0, 2**64 - 1)
 INSTANT = st.integers(-MAX_INSTANT_NS, MAX_INSTANT_NS)
+ANCHOR = st.integers(-MAX_INSTANT_NS // 2, MAX_INSTANT_NS // 2)
 DURATION = st.integers(0, MAX_INSTANT_NS)
 TEXT = st.text(max_size=30)
 NUMBER = st.floats(width=32, allow_nan=False, allow_infinity=False)
@@ -248,10 +249,10 @@ MESSAGES: dict[type, st.SearchStrategy[Any]] = {
     m.Invocation: invocations(),
     m.ActionChunk: chunks(),
     m.Action: st.builds(
-        m.Action, header=HEADER, tick=INDEX, deadline_ns=INSTANT, level=chosen(m.Level), values=floats(1)
+        m.Action, header=HEADER, tick=INDEX, deadline_ns=ANCHOR, level=chosen(m.Level), values=floats(1)
     ),
     m.Tick: st.builds(
-        m.Tick, header=HEADER, tick=INDEX, deadline_ns=INSTANT, decided_ns=INSTANT, late_ns=INSTANT,
+        m.Tick, header=HEADER, tick=INDEX, deadline_ns=ANCHOR, decided_ns=INSTANT, late_ns=INSTANT,
         level=chosen(m.Level), invocation=st.none() | INDEX, t_row0=INDEX, row=U32, ref_query=st.none() | INDEX,
         age_ns=INSTANT, observation_tick=INDEX, state=floats(), action=floats(), raw_row=any_row, limits_hit=U32,
         seam_jump=NUMBER, age_ms=DOUBLE, late_ms=DOUBLE, picture_age_ns=tuples_of(INSTANT),
