@@ -33,7 +33,8 @@ EXAMPLE = ROOT / "examples" / "06_your_own_robot.py"
 REACTION_S = 0.6
 """A command expires three ticks (150 ms) after its deadline; the rest is for machines with other work."""
 STEP_RAD = 2.61 / 20 + 1e-4
-ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "client"), str(ROOT)]), "OMP_NUM_THREADS": "1"}
+PATHS = (ROOT / "integrations" / "ponderpounce_client", ROOT)
+ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, PATHS)), "OMP_NUM_THREADS": "1"}
 
 
 def eventually(what: Callable[[], Any], why: str, longest_s: float = 150.0) -> Any:

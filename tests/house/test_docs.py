@@ -26,7 +26,7 @@ PAGES = {
 }
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 ROOMS = ("protocol", "clock", "model_server", "dual_system", "ponder_server", "pounce_server", "sim_client")
-FOLDERS = (*ROOMS, "benchmarks", "tests", "examples", "docker", "docs")
+FOLDERS = (*ROOMS, "integrations", "benchmarks", "tests", "examples", "docker", "docs")
 every_page = pytest.mark.parametrize("page", PAGES)
 
 
@@ -64,7 +64,8 @@ def _options() -> set[str]:
                             name = field.target.id.replace("_", "-")
                             prefix = "link." if node.name == "LinkOptions" else ""
                             found |= {f"--{prefix}{name}", f"--{prefix}no-{name}"}
-    program = (ROOT / "client" / "ponderpounce_client" / "program.py").read_text(encoding="utf-8")
+    client = ROOT / "integrations" / "ponderpounce_client" / "ponderpounce_client"
+    program = (client / "program.py").read_text(encoding="utf-8")
     return found | set(re.findall(r'"(--[a-z-]+)"', program))
 
 

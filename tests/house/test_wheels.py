@@ -18,7 +18,8 @@ from protocol import extras
 from protocol.command_line import REFUSED, command
 
 BUILD = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
-NOT_INSTALLED = ("tests", "benchmarks", "examples", "docs", "docker", "checkpoints", "client", "plugins", "site")
+INTEGRATIONS = Path(__file__).parents[2] / "integrations"
+NOT_INSTALLED = ("tests", "benchmarks", "examples", "docs", "docker", "checkpoints", "integrations", "site")
 DISTRIBUTION_OF = {"PIL": "pillow", "rerun": "rerun-sdk", "zmq": "pyzmq", "tokenizers": "transformers"}
 
 
@@ -65,10 +66,14 @@ def test_every_command_of_the_wheel_leads_to_a_module_in_it(server: zipfile.ZipF
     assert modules <= set(server.namelist())
 
 
-def test_the_client_s_wheel_is_its_one_package(root: Path, files: tuple[str, ...], tmp_path: Path) -> None:
-    wheel = built(root, files, "client", tmp_path)
-    installed = {f"client/{name}" for name in wheel.namelist() if ".dist-info/" not in name}
-    assert installed == {name for name in files if name.startswith("client/ponderpounce_client/")}
+@pytest.mark.parametrize("folder", sorted(path.parent.name for path in INTEGRATIONS.glob("*/pyproject.toml")))
+def test_an_integration_s_wheel_is_its_one_package(
+    folder: str, root: Path, files: tuple[str, ...], tmp_path: Path
+) -> None:
+    place = f"{INTEGRATIONS.name}/{folder}"
+    wheel = built(root, files, place, tmp_path)
+    installed = {f"{place}/{name}" for name in wheel.namelist() if ".dist-info/" not in name}
+    assert installed == {name for name in files if name.startswith(f"{place}/{folder}/")}
 
 
 @pytest.mark.parametrize(("package", "extra"), extras.EXTRA_OF.items())

@@ -23,7 +23,7 @@ from sim_client.launch import free_ports
 pytestmark = [pytest.mark.peers, pytest.mark.e2e]
 
 SCRIPT = Path(__file__).with_name("lerobot_policy.py")
-PLUGIN = Path(__file__).parents[2] / "plugins" / "lerobot_policy_ponderpounce"
+PLUGIN = Path(__file__).parents[2] / "integrations" / "lerobot_policy_ponderpounce"
 PATIENCE_S = 180.0
 
 

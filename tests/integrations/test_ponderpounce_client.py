@@ -14,7 +14,7 @@ from ponderpounce_client.watchdog import Watchdog
 from protocol.images import jpeg
 
 ROOT = Path(__file__).parents[2]
-FILES = sorted((ROOT / "client" / "ponderpounce_client").glob("*.py"))
+FILES = sorted((ROOT / "integrations" / "ponderpounce_client" / "ponderpounce_client").glob("*.py"))
 ALLOWED = {"ponderpounce_client", "numpy", "msgpack", "websockets", "cv2"}
 
 
