@@ -11,9 +11,11 @@ import itertools
 import json
 import logging
 import os
+import shutil
 import sys
 import tempfile
 import time
+import uuid
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -37,6 +39,8 @@ from protocol.link import Link
 from protocol.mcap_log import read_log
 from protocol.topics import CLOSE, CONTRACT, ENGAGE, JOURNAL, OPEN, STREAMS, TIME, Call, Priority
 
+KEEP = Path("out/fuzz")
+"""Folder for logs that are disputed."""
 _ENUM, _MESSAGE, _STRING, _BYTES = 14, 11, 9, 12
 _INTEGERS = (0, 1, -1, 255, 2**31 - 1, 2**32 - 1, 2**53, 2**53 + 1, 10**18, 2**63 - 1, -(2**63), 2**64 - 1)
 _NUMBERS = (0.0, float("nan"), float("inf"), -1e30, 1e-45, 3.4e38)
@@ -295,14 +299,20 @@ def _judge(path: Path, outcome: Outcome) -> None:
     record = read_log(path)
     outcome.robot = record.info.robot
     outcome.unsound += _num_unsound(record.info.robot, record.actions)
-    outcome.disagree += next(disagreements(record), None) is not None
+    if dispute := next(disagreements(record), None):
+        outcome.disagree += 1
+        KEEP.mkdir(parents=True, exist_ok=True)
+        print(f"{dispute}; kept as {shutil.copy(path, KEEP / f'{uuid.uuid4().hex[:8]}.mcap')}", flush=True)
 
 
 def _num_unsound(robot: m.Robot, actions: Sequence[m.Action]) -> int:
-    """Number of commands out of the limits, or farther than a step from the one before."""
+    """Number of commands of another size, out of the limits, or farther than a step from the one before."""
     num_unsound, last = 0, robot.initial_command
     largest = np.where(robot.max_step > 0, robot.max_step, np.inf) + 1e-4
     for action in actions:
+        if action.values.shape != last.shape:
+            num_unsound += 1
+            continue
         step = np.abs(action.values - last)
         num_unsound += not bool(((robot.command_low <= action.values) & (action.values <= robot.command_high)).all())
         num_unsound += not bool((step <= largest).all())
