@@ -7,10 +7,12 @@ subscriber drains its subscription when it is ready, so no model ever runs on a 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import threading
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
+from operator import itemgetter
 from typing import NamedTuple, Protocol
 
 from protocol.errors import CallFailed
@@ -28,37 +30,71 @@ class Sample(NamedTuple):
     attachment: bytes
 
 
+def anybody(attachment: bytes) -> bool:
+    """Expects every sample."""
+    return True
+
+
 class Subscription:
     """A ring of the newest ``keep`` samples (zenoh's RingChannel, with a bell): older ones are dropped and counted.
 
-    One thread fills it, another drains it; operations on both ends of a deque with ``maxlen`` are atomic.
+    Samples whose attachment ``is_expected`` refuses wait in a second ring, so that a stranger's flood pushes out
+    nobody else's. One thread fills them, another drains them; operations on both ends of a deque with ``maxlen`` are
+    atomic.
     """
 
-    def __init__(self, keep: int) -> None:
-        self._ring: deque[Callable[[], Sample]] = deque(maxlen=keep)
-        self.num_received = 0
-        self._num_drained = 0
+    def __init__(self, keep: int, is_expected: Callable[[bytes], bool] = anybody) -> None:
+        self._is_expected = is_expected
+        self._expected, self._others = _Ring(keep), _Ring(keep)
+        self._numbers = itertools.count()
 
-    def put(self, sample: Callable[[], Sample]) -> None:
+    def put(self, sample: Callable[[], Sample], attachment: bytes = b"") -> None:
         """Stores a function that copies the sample out of the transport, so that dropped samples are never copied."""
-        self._ring.append(sample)
-        self.num_received += 1
+        ring = self._expected if self._is_expected(attachment) else self._others
+        ring.put((next(self._numbers), sample))
 
     def drain(self) -> list[Sample]:
         """Removes and returns all waiting samples, oldest first."""
-        samples = []
-        while self._ring:
-            try:
-                samples.append(self._ring.popleft()())
-            except IndexError:  # the other thread pushed the last one out meanwhile
-                break
-        self._num_drained += len(samples)
-        return samples
+        waiting = self._expected.drain()
+        if others := self._others.drain():
+            waiting = sorted([*waiting, *others], key=itemgetter(0))
+        return [sample() for _, sample in waiting]
 
     @property
     def num_superseded(self) -> int:
         """Number of unread samples that newer ones pushed out."""
-        return max(0, self.num_received - self._num_drained - len(self._ring))
+        return self._expected.num_superseded
+
+    @property
+    def num_strange_superseded(self) -> int:
+        """As ``num_superseded``, of those that were not expected."""
+        return self._others.num_superseded
+
+
+class _Ring:
+    """Numbered samples, of which the newest stay."""
+
+    def __init__(self, keep: int) -> None:
+        self._waiting: deque[tuple[int, Callable[[], Sample]]] = deque(maxlen=keep)
+        self._num_received = self._num_drained = 0
+
+    def put(self, sample: tuple[int, Callable[[], Sample]]) -> None:
+        self._waiting.append(sample)
+        self._num_received += 1
+
+    def drain(self) -> list[tuple[int, Callable[[], Sample]]]:
+        drained = []
+        while self._waiting:
+            try:
+                drained.append(self._waiting.popleft())
+            except IndexError:  # the other thread pushed the last one out meanwhile
+                break
+        self._num_drained += len(drained)
+        return drained
+
+    @property
+    def num_superseded(self) -> int:
+        return max(0, self._num_received - self._num_drained - len(self._waiting))
 
 
 class Request(NamedTuple):
@@ -91,7 +127,10 @@ class Bus(Protocol):
     """True if every peer shares this host, so that raw pixels are cheap to send."""
 
     def publish(self, key: str, payload: bytes, *, encoding: str, attachment: bytes, priority: Priority) -> None: ...
-    def subscribe(self, expression: str, *, keep: int) -> Subscription: ...
+    def subscribe(self, expression: str, *, keep: int, is_expected: Callable[[bytes], bool] = anybody) -> Subscription:
+        """``is_expected`` is given attachments, by the transport's thread."""
+        ...
+
     def serve(self, key: str) -> Inbox: ...
     def call(self, key: str, payload: bytes, *, timeout_ns: int) -> bytes:
         """Sends a request and returns the reply. Raises CallFailed if no reply comes in time."""
@@ -140,10 +179,10 @@ class LocalBus:
         sample = Sample(key, payload, encoding, attachment)
         for expression, subscription in self._subscriptions:
             if matches(expression, key):
-                subscription.put(lambda: sample)
+                subscription.put(lambda: sample, attachment)
 
-    def subscribe(self, expression: str, *, keep: int) -> Subscription:
-        subscription = Subscription(keep)
+    def subscribe(self, expression: str, *, keep: int, is_expected: Callable[[bytes], bool] = anybody) -> Subscription:
+        subscription = Subscription(keep, is_expected)
         self._subscriptions.append((expression, subscription))
         return subscription
 

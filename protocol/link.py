@@ -60,6 +60,7 @@ class Link:
         self.episode = ""
         self.epoch = 0
         self.members: dict[str, int] = {}
+        self._boots: frozenset[int] = frozenset()  # those of the members; the transport's thread reads it
         self.second_sender = ""
         self._heard_ns: dict[str, int] = {}
         self._strangers: set[int] = set()
@@ -86,10 +87,11 @@ class Link:
     def admit(self, *members: Member) -> None:
         """Lets processes take part in the running episode, each in the place of the last one of its name."""
         self.members |= {member.proc: member.boot_id for member in members}
+        self._boots = frozenset(self.members.values())
 
     def leave_episode(self) -> None:
         self.episode, self.epoch = "", 0
-        self.members = {}
+        self.members, self._boots = {}, frozenset()
 
     def header(self, topic: str, at_ns: int, clock_id: str = EPISODE_CLOCK) -> Header:
         seq = self._seqs[topic]
@@ -184,9 +186,13 @@ class Link:
     def subscribe(self, topic: Topic[T], *, keep: int | None = None, proc: str = "*") -> Stream[T]:
         """Subscribes to ``topic`` for this robot, in all episodes; the nodes filter by episode."""
         expression = topics.stream_key(topic, self.robot, "*", proc)
-        stream = Stream(self, topic, self.bus.subscribe(expression, keep=keep or topic.keep))
+        subscription = self.bus.subscribe(expression, keep=keep or topic.keep, is_expected=self._is_expected)
+        stream = Stream(self, topic, subscription)
         self._streams.append(stream)
         return stream
+
+    def _is_expected(self, attachment: bytes) -> bool:
+        return not self._boots or _boot_of(attachment) in self._boots
 
     def num_superseded(self) -> dict[str, int]:
         """Number of unread messages that newer ones pushed out, by topic."""
@@ -260,6 +266,7 @@ class Stream(Generic[T]):
         self.topic = topic
         self._encoding = _encoding(topic.cls)  # type: ignore[arg-type]
         self._last_seq: dict[int, int] = {}  # by boot id, of members
+        self._num_turned_away = 0
         self.subscription = subscription
 
     def drain(self) -> list[T]:
@@ -272,6 +279,9 @@ class Stream(Generic[T]):
             message = self._accept(sample)
             if message is not None:
                 accepted.append(Received(message, sample))
+        if more := self.subscription.num_strange_superseded - self._num_turned_away:
+            self._num_turned_away += more
+            self._link.dropped[DropReason.STRANGER] += more
         return accepted
 
     def _accept(self, sample: Sample) -> T | None:
@@ -310,11 +320,11 @@ def _encoding(cls: Any) -> str:
 
 
 def _source(sample: Sample) -> str:
-    return f"{sample.key}#{_boot_of(sample)}"
+    return f"{sample.key}#{_boot_of(sample.attachment)}"
 
 
-def _boot_of(sample: Sample) -> int:
-    return _ATTACHMENT.unpack(sample.attachment)[2] if len(sample.attachment) == _ATTACHMENT.size else 0
+def _boot_of(attachment: bytes) -> int:
+    return _ATTACHMENT.unpack(attachment)[2] if len(attachment) == _ATTACHMENT.size else 0
 
 
 class Service:

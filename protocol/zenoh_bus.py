@@ -21,7 +21,7 @@ from typing import Any
 import zenoh
 
 from protocol.access import access_control
-from protocol.bus import Bell, Inbox, Request, Sample, Subscription
+from protocol.bus import Bell, Inbox, Request, Sample, Subscription, anybody
 from protocol.errors import CallFailed, TransportError
 from protocol.memory import keep_freed_memory
 from protocol.options import LinkOptions
@@ -171,11 +171,12 @@ class ZenohBus:
             self._publishers[key] = publisher
         publisher.put(payload, attachment=attachment)
 
-    def subscribe(self, expression: str, *, keep: int) -> Subscription:
-        subscription = Subscription(keep)
+    def subscribe(self, expression: str, *, keep: int, is_expected: Callable[[bytes], bool] = anybody) -> Subscription:
+        subscription = Subscription(keep, is_expected)
 
         def arrived(sample: zenoh.Sample) -> None:
-            subscription.put(lambda: _copy(sample))
+            attachment = _attachment(sample)
+            subscription.put(lambda: _copy(sample, attachment), attachment)
             self._bell.ring()
 
         self._declared.append(self._session.declare_subscriber(expression, arrived))
@@ -242,8 +243,11 @@ class ZenohBus:
         self._session.close()  # type: ignore[no-untyped-call, unused-ignore]
 
 
-def _copy(sample: zenoh.Sample) -> Sample:
-    attachment = sample.attachment.to_bytes() if sample.attachment is not None else b""
+def _attachment(sample: zenoh.Sample) -> bytes:
+    return sample.attachment.to_bytes() if sample.attachment is not None else b""
+
+
+def _copy(sample: zenoh.Sample, attachment: bytes) -> Sample:
     return Sample(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding), attachment)
 
 

@@ -48,6 +48,18 @@ def test_what_fell_out_of_a_ring_is_counted(keep: int, count: int) -> None:
     assert subscription.num_superseded == max(0, count - keep)
 
 
+@given(keep=st.integers(1, 4), expected=st.lists(st.booleans(), max_size=20))
+def test_who_is_not_expected_pushes_out_nobody_else_and_the_order_is_kept(keep: int, expected: list[bool]) -> None:
+    subscription = Subscription(keep, lambda attachment: attachment == b"expected")
+    for number, is_expected in enumerate(expected):
+        attachment = b"expected" if is_expected else b"other"
+        subscription.put(lambda number=number: Sample("k", bytes([number]), "", b""), attachment)  # type: ignore[misc]
+    kinds = [[n for n, each in enumerate(expected) if each is kind] for kind in (True, False)]
+    assert payloads(subscription) == [bytes([n]) for n in sorted(kinds[0][-keep:] + kinds[1][-keep:])]
+    assert subscription.num_superseded == max(0, len(kinds[0]) - keep)
+    assert subscription.num_strange_superseded == max(0, len(kinds[1]) - keep)
+
+
 def test_what_falls_out_of_a_ring_is_never_copied() -> None:
     copied = []
     subscription = Subscription(1)

@@ -251,6 +251,18 @@ def test_a_stranger_is_one_alarm_however_much_it_says(bus: LocalBus, sender: Lin
     assert receiver.dropped["stranger"] == 8
 
 
+def test_a_strangers_flood_pushes_no_members_message_out(bus: LocalBus, sender: Link, receiver: Link) -> None:
+    stranger = Link(bus, robot="r0", proc="clock", boot_id=9)
+    stranger.enter_episode("s1", "e1", 2)
+    queries = receiver.subscribe(topics.QUERY, keep=4)
+    for link in (sender, *[stranger] * 100, sender, *[stranger] * 100):
+        link.publish(topics.QUERY, QUERY, at_ns=0)
+    obeyed = [query.header for query in queries.drain() if receiver.is_from(query.header, "clock")]
+    assert [(header.boot_id, header.seq) for header in obeyed] == [(7, 0), (7, 1)]
+    assert receiver.dropped["stranger"] == 200
+    assert receiver.num_superseded() == {"query": 0}
+
+
 def test_two_senders_under_one_name_are_noticed_and_the_second_is_not_heard(
     bus: LocalBus, sender: Link, receiver: Link
 ) -> None:
