@@ -108,7 +108,7 @@ $(SITE)/.ready: site/requirements.txt
 site: $(SITE)/.ready
 	rm -rf out/site
 	mkdir -p out/site/pages
-	git ls-files --cached --others --exclude-standard -- '*.md' 'docs/*' 'examples/*' 'docker/*' '*.py' | grep -v '^tests/.*\.md' | xargs cp --parents -t out/site/pages
+	git ls-files --cached --others --exclude-standard -- '*.md' 'docs/*' 'examples/*' 'docker/*' '*.py' '*.png' 'site/*.css' | grep -v '^tests/.*\.md' | xargs cp --parents -t out/site/pages
 	$(SITE)/bin/mkdocs build --quiet --strict --config-file site/mkdocs.yaml
 
 ## make lint    style, types, import contracts

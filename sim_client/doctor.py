@@ -28,7 +28,7 @@ class Probe:
     name: str
     look: Callable[[], Finding]
     is_required: bool = True
-    roles: tuple[Role, ...] = ("robot", "models")
+    roles: tuple[Role, ...] = ("robot", "models", "clock")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,7 +36,10 @@ class DoctorConfig:
     """Checks this computer; exit code 1: something required is missing. `pp-doctor certs` makes TLS certificates."""
 
     role: Role = "all"
-    """Role of this computer. robot: simulator and logs, no torch; models: PONDER and POUNCE, no MuJoCo; all: both."""
+    """Role of this computer. robot: simulator and logs, no torch; models: PONDER and POUNCE, no MuJoCo; all: both.
+    clock: neither, as beside a real robot or in front of a policy that runs elsewhere."""
+    extras: tuple[str, ...] = ()
+    """Further extras of ponderpounce-server, such as gateway, whose packages are checked."""
     required_only: bool = False
     """Check only what episodes need."""
     json: bool = False
@@ -62,12 +65,12 @@ def probes(config: DoctorConfig) -> list[Probe]:
     other = "osmesa" if backend == "egl" else "egl"
     found = [
         Probe(name="python", look=look.python),
-        Probe(name="packages", look=partial(look.packages, config.role)),
+        Probe(name="packages", look=partial(look.packages, config.role, config.extras)),
         Probe(name="zenoh", look=look.zenoh_loopback),
         Probe(name="torch", look=look.torch, roles=("models",)),
         Probe(name=f"gl {backend}", look=partial(look.gl, backend), roles=("robot",)),
         Probe(name="robosuite", look=look.robosuite, roles=("robot",)),
-        Probe(name="disk", look=partial(look.disk, config.out), roles=("robot",)),
+        Probe(name="disk", look=partial(look.disk, config.out), roles=("robot", "clock")),
         Probe(name="sockets", look=look.sockets, is_required=False),
         Probe(name="cpu", look=look.cpu, is_required=False),
         Probe(name="clock", look=look.clock, is_required=False),

@@ -21,8 +21,9 @@ from typing import Literal, NamedTuple
 
 from protocol.version import DISTRIBUTION
 
-Role = Literal["all", "robot", "models"]
+Role = Literal["all", "robot", "models", "clock"]
 
+_EXTRAS: dict[Role, tuple[str, ...]] = {"all": ("sim", "serve"), "robot": ("sim",), "models": ("serve",), "clock": ()}
 GL_PACKAGES = {
     "egl": ("libegl1", "libegl-mesa0", "libgl1-mesa-dri", "libopengl0"),
     "osmesa": ("libosmesa6",),
@@ -101,15 +102,19 @@ def _installed(name: str) -> str | None:
         return None
 
 
-def packages(role: Role, version_of: Callable[[str], str | None] = _installed) -> Finding:
-    """The bounds of our own distribution against what is installed."""
+def packages(role: Role, further: Sequence[str] = (), version_of: Callable[[str], str | None] = _installed) -> Finding:
+    """The bounds of our own distribution and of its extras, the role's and ``further``, against what is installed."""
     ours = version_of(DISTRIBUTION)
     if ours is None:
         way_out = "make setup, or: pip install --no-deps -e ."
         return Finding("packages", Level.FAILED, f"{DISTRIBUTION} is not installed", way_out)
-    extras = {"all": ("sim", "serve"), "robot": ("sim",), "models": ("serve",)}[role]
+    extras = (*_EXTRAS[role], *further)
     wrong = []
-    bounds = list(_requirements(metadata.requires(DISTRIBUTION) or [], extras))
+    lines = metadata.requires(DISTRIBUTION) or []
+    if unknown := sorted(set(further) - set(metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") or ())):
+        way_out = "docs/install.md lists the extras"
+        return Finding("packages", Level.FAILED, f"{DISTRIBUTION} has no extra {', '.join(unknown)}", way_out)
+    bounds = list(dict(_requirements(lines, extras)).items())
     for name, bound in bounds:
         version = version_of(name)
         if version is None:
@@ -117,18 +122,25 @@ def packages(role: Role, version_of: Callable[[str], str | None] = _installed) -
         elif not _is_within(version, bound):
             wrong.append(f"{name} is {version}, not {bound}")
     if wrong:
-        way_out = f"make setup, or: pip install '{DISTRIBUTION}[{','.join(extras)}]'"
+        name = f"{DISTRIBUTION}[{','.join(extras)}]" if extras else DISTRIBUTION
+        way_out = f"make setup, or: pip install '{name}' (docs/install.md)"
         return Finding("packages", Level.FAILED, "; ".join(wrong), way_out)
     return Finding("packages", Level.OK, f"{DISTRIBUTION} {ours} and the {len(bounds)} it needs")
 
 
 def _requirements(lines: Sequence[str], extras: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """(name, bounds) of those that are always needed or by one of ``extras``: ``mujoco``, ``<3.10,>=3.4``."""
+    """(name, bounds) of those that are always needed or by one of ``extras``: ``mujoco``, ``<3.10,>=3.4``.
+
+    An extra that is made of others brings theirs.
+    """
     for line in lines:
         requirement, _, marker = (part.strip() for part in line.partition(";"))
         extra = re.search(r"extra\s*==\s*['\"]([\w-]+)['\"]", marker)
         if (extra is None or extra[1] in extras) and (parts := re.match(r"([\w.-]+)\s*(.*)", requirement)):
-            yield parts[1], parts[2]
+            if parts[1] == DISTRIBUTION:
+                yield from _requirements(lines, re.findall(r"[\w-]+", parts[2]))
+            else:
+                yield parts[1], parts[2]
 
 
 def _is_within(version: str, bounds: str) -> bool:

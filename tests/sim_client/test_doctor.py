@@ -35,7 +35,7 @@ def never(*arguments: object) -> int:
     [
         (look.python((3, 10, 14)), FAILED, "3.11"),
         (look.python((3, 11, 0)), OK, ""),
-        (look.packages("all", {}.get), FAILED, "make setup"),
+        (look.packages("all", (), {}.get), FAILED, "make setup"),
         (look.gl("egl", ends(1, "ImportError: Cannot initialize a EGL device display")), FAILED, "libegl-mesa0"),
         (look.gl("egl", ends(0, "contrast 255")), OK, ""),
         (look.gl("egl", ends(0, "contrast 0")), FAILED, "libgl1-mesa-dri"),
@@ -85,7 +85,7 @@ def test_a_message_that_never_arrives_is_told() -> None:
 
 def test_packages_name_what_is_missing_and_what_is_too_new() -> None:
     installed = {name: "999" for name in ("numpy", "protobuf", "eclipse-zenoh", "tyro", "mujoco", "tqdm")}
-    finding = look.packages("robot", {**installed, "ponderpounce-server": "0.1.0"}.get)
+    finding = look.packages("robot", (), {**installed, "ponderpounce-server": "0.1.0"}.get)
     assert finding.level is FAILED
     assert "mcap is missing" in finding.text
     assert "mujoco is 999, not" in finding.text
@@ -117,6 +117,17 @@ def test_a_bound_that_is_not_understood_is_no_silent_yes() -> None:
 def test_requirements_of_other_roles_are_not_asked_for() -> None:
     lines = ["numpy>=1.26", 'torch>=2.10; extra == "serve"', "mujoco<3.10,>=3.4; extra == 'sim'"]
     assert list(look._requirements(lines, ["sim"])) == [("numpy", ">=1.26"), ("mujoco", "<3.10,>=3.4")]
+
+
+def test_an_extra_made_of_others_brings_theirs() -> None:
+    lines = ["numpy>=1.26", 'torch>=2; extra == "serve"', "ponderpounce-server[serve]; extra == 'train'"]
+    assert dict(look._requirements(lines, ["train"])) == {"numpy": ">=1.26", "torch": ">=2"}
+
+
+def test_further_extras_are_asked_for_and_a_mistyped_one_is_no_silent_yes() -> None:
+    assert "pyzmq is missing" in look.packages("clock", ["groot"], {"ponderpounce-server": "0.1.0"}.get).text
+    finding = look.packages("clock", ["gr00t"], lambda name: "999")
+    assert (finding.level, finding.text) == (FAILED, "ponderpounce-server has no extra gr00t")
 
 
 # -- sockets
@@ -166,6 +177,7 @@ def test_a_probe_that_raises_has_failed_and_the_next_one_is_still_asked() -> Non
         (DoctorConfig(), {"torch", "gl egl", "rerun", "sockets"}, {"ponder checkpoint"}),
         (DoctorConfig(role="robot"), {"gl egl", "rerun"}, {"torch"}),
         (DoctorConfig(role="models"), {"torch"}, {"gl egl", "gl osmesa", "robosuite", "rerun", "disk"}),
+        (DoctorConfig(role="clock"), {"packages", "disk", "zenoh"}, {"torch", "gl egl", "robosuite", "rerun"}),
         (DoctorConfig(required_only=True), {"torch", "gl egl"}, {"rerun", "sockets", "gl osmesa", "cpu", "clock"}),
         (DoctorConfig(ponder_checkpoint=Path("x")), {"ponder checkpoint"}, {"pounce checkpoint"}),
     ],
