@@ -92,7 +92,7 @@ WAYS = (
     Way(name="openpi-client 0.1.2: websocket, msgpack-numpy", wire="openpi", messages=2),
     Way(name="openpi-client, our allocator setting lent to it", wire="openpi", messages=2, keeps_memory=True),
     Way(name="zenoh TCP, observation -> chunk", wire="observation", messages=2),
-    Way(name="zenoh Unix socket, observation -> chunk", wire="observation", messages=2, unix=True),
+    Way(name="zenoh Unix socket (our default), observation -> chunk", wire="observation", messages=2, unix=True),
     Way(name="zenoh shared memory, observation -> chunk", wire="observation", messages=2, shared_memory=True),
     Way(
         name="zenoh Unix socket and shared memory, observation -> chunk",
@@ -104,9 +104,8 @@ WAYS = (
     Way(name="zenoh shared memory, bare bytes (floor of the row above)", wire="bytes", messages=2, shared_memory=True),
     Way(name="zenoh TCP, JPEG, observation -> chunk", wire="observation", messages=2, codec=m.ImageCodec.JPEG),
     Way(name="zenoh TCP, pounce-serve", wire="pounce", messages=3),
-    Way(name="zenoh Unix socket, pounce-serve", wire="pounce", messages=3, unix=True),
+    Way(name="zenoh Unix socket (our default), pounce-serve", wire="pounce", messages=3, unix=True),
     Way(name="zenoh shared memory, pounce-serve", wire="pounce", messages=3, shared_memory=True),
-    Way(name="zenoh, as by default, pounce-serve", wire="pounce", messages=3, shared_memory=True, unix=True),
 )
 
 

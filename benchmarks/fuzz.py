@@ -36,7 +36,7 @@ from protocol.command_line import parse
 from protocol.drops import DropReason
 from protocol.errors import CallFailed
 from protocol.link import Link
-from protocol.mcap_log import read_log
+from protocol.mcap_log import EpisodeRecord, read_log
 from protocol.topics import CLOSE, CONTRACT, ENGAGE, JOURNAL, OPEN, STREAMS, TIME, Call, Priority
 
 KEEP = Path("out/fuzz")
@@ -185,11 +185,10 @@ def members(options: FuzzOptions) -> Outcome:
     accepts_any, Link.in_order = Link.in_order, lambda self, header, last_seq: True  # type: ignore[method-assign]
     try:
         with tempfile.TemporaryDirectory() as folder:
-            outcome = _lockstep(bus, Path(folder), lambda: bus.num_sent.total() < count, lambda tick: None, 0.3)
+            outcome = _lockstep(bus, Path(folder), lambda: bus.num_sent.total() < count, lambda tick: None, 0.3, _read)
     finally:
         Link.in_order = accepts_any  # type: ignore[method-assign]
-    outcome.sent, outcome.disagree = bus.num_sent.total(), 0  # a damaged account is in the log, and is disputed rightly
-    outcome.unsound = 0
+    outcome.sent = bus.num_sent.total()
     for _, played in itertools.groupby(bus.actions, key=lambda action: action.header.episode):
         outcome.unsound += _num_unsound(outcome.robot, list(played))  # type: ignore[arg-type]
     return outcome
@@ -217,7 +216,7 @@ def strangers(options: FuzzOptions) -> Outcome:
             bus.run_participants()
 
     with tempfile.TemporaryDirectory() as folder:
-        outcome = _lockstep(bus, Path(folder), lambda: sent.total() < count, throw, 20)
+        outcome = _lockstep(bus, Path(folder), lambda: sent.total() < count, throw, 20, _judge)
     outcome.sent = sent.total()
     return outcome
 
@@ -244,7 +243,12 @@ def _call(bus: LocalBus, proc: str, call: Call, mutate: Mutator, ear: Link, sent
 
 
 def _lockstep(
-    bus: LocalBus, out: Path, goes_on: Callable[[], bool], on_tick: Callable[[int], None], patience_s: float
+    bus: LocalBus,
+    out: Path,
+    goes_on: Callable[[], bool],
+    on_tick: Callable[[int], None],
+    patience_s: float,
+    judge: Callable[[Path, Outcome], object],
 ) -> Outcome:
     """Plays episodes with all participants in this thread while ``goes_on()``."""
     import dual_system.tasks.headless  # noqa: F401, I001 - before anything that imports mujoco
@@ -280,7 +284,7 @@ def _lockstep(
         suite = Suite(plays, robot, clock, dead_server=lambda: "")
         (episode,) = suite.run(on_tick=lambda index, tick: on_tick(tick))["episodes"]
         outcome.episodes += 1
-        _judge(out / episode["mcap"], outcome)
+        judge(out / episode["mcap"], outcome)
         if outcome.episodes == 1:
             before_mb = _rss_mb("self")
     outcome.growth_mb = f"{_rss_mb('self') - before_mb:+.0f} of {before_mb:.0f}"
@@ -294,10 +298,16 @@ def _half(options: FuzzOptions) -> int:
     return (options.messages - options.messages // 100) // 2
 
 
-def _judge(path: Path, outcome: Outcome) -> None:
-    """Counts unsound commands, and whether the log follows from itself."""
+def _read(path: Path, outcome: Outcome) -> EpisodeRecord:
+    """A log that damaged accounts of members are in: it is whole, and would be disputed rightly."""
     record = read_log(path)
     outcome.robot = record.info.robot
+    return record
+
+
+def _judge(path: Path, outcome: Outcome) -> None:
+    """Counts unsound commands, and whether the log follows from itself."""
+    record = _read(path, outcome)
     outcome.unsound += _num_unsound(record.info.robot, record.actions)
     if dispute := next(disagreements(record), None):
         outcome.disagree += 1

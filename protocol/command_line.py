@@ -26,6 +26,8 @@ from protocol.options import LinkOptions
 Options = TypeVar("Options")
 Main = Callable[..., int]
 
+_GONE = frozenset({"--link.no-shared-memory"})
+"""Options that scripts may still name, and that ask for what is done anyway."""
 REFUSED, INTERRUPTED, READER_LEFT = 2, 130, 141  # the latter two as a shell counts SIGINT and SIGPIPE
 
 
@@ -93,6 +95,7 @@ def _settle_in() -> None:
 
 def parse(kind: type[Options], argv: Sequence[str] | None, *, prog: str) -> Options:
     """Returns the options in ``argv`` (None: the process's). Exits the process after ``--help`` or an error."""
+    argv = [argument for argument in (sys.argv[1:] if argv is None else argv) if argument not in _GONE]
     return tyro.cli(kind, args=argv, prog=prog, description=kind.__doc__, config=(tyro.conf.FlagCreatePairsOff,))
 
 

@@ -24,8 +24,6 @@ class LinkOptions:
     """This process's certificate, in PEM."""
     tls_key: Path | None = None
     """Private key of that certificate, in PEM."""
-    shared_memory: bool = True
-    """Do not send raw frames through shared memory to processes of the same host."""
 
     def tls_files(self) -> tuple[Path, Path, Path] | None:
         """Returns (ca, certificate, key), or None.

@@ -122,7 +122,6 @@ def start_local(
     with_clock: bool,
     other_robots: Sequence[str] = (),
     allow_starved: bool = False,
-    shared_memory: bool = True,
     ponder: Sequence[str] | None,
     pounce: Sequence[str],
 ) -> tuple[str, ...]:
@@ -133,14 +132,13 @@ def start_local(
     """
     models = {"pounce": pounce} if ponder is None else {"ponder": ponder, "pounce": pounce}
     at_models = [endpoint(proc, daemons.sockets()) for proc in models]
-    memory = [] if shared_memory else ["--link.no-shared-memory"]
     robots = ["--link.robot", robot, *(["--other-robots", *other_robots] if other_robots else [])]
     for (proc, arguments), at_model in zip(models.items(), at_models, strict=True):
-        daemons.start(proc, f"{proc}_server", [*robots, *memory, "--link.listen", at_model, *arguments])
+        daemons.start(proc, f"{proc}_server", [*robots, "--link.listen", at_model, *arguments])
     if not with_clock:
         return tuple(at_models)
     at_clocks = []
-    options = [*memory, *(["--ponder", "none"] if ponder is None else []), *(["--allow-starved"] * allow_starved)]
+    options = [*(["--ponder", "none"] if ponder is None else []), *(["--allow-starved"] * allow_starved)]
     for index, each in enumerate((robot, *other_robots)):
         name = f"clock-{index}" if index else "clock"
         at_clocks.append(endpoint(name, daemons.sockets()))
@@ -169,7 +167,6 @@ def local_link(
         other_robots=other_robots,
         with_clock=with_clock,
         allow_starved=allow_starved,
-        shared_memory=link.shared_memory,
         ponder=_arguments(ponder_checkpoint, models.of_ponder()) if with_ponder else None,
         pounce=_arguments(pounce_checkpoint, models.of_pounce()),
     )

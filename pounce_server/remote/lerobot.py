@@ -50,7 +50,7 @@ class LerobotPeer:
         if not self._deployment or "/" not in endpoint:
             raise ValueError(f"--url {url}: expected tcp/HOST:PORT#DEPLOYMENT")
         try:
-            self._endpoints = Endpoints(connect=(endpoint,), shared_memory=False)
+            self._endpoints = Endpoints(connect=(endpoint,))
         except TransportError as error:
             raise ValueError(f"--url {url}: {error} LeRobot's server has no TLS of its own: use a tunnel") from None
         self._mapping = mapping

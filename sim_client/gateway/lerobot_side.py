@@ -64,7 +64,7 @@ class LerobotSide:
             )
         self._seats = seats
         self.deployment = Deployment(terms, num_seats)
-        self._bus: Bus = ZenohBus(Endpoints(listen=(where,), shared_memory=False, lease_ms=_LEASE_MS))
+        self._bus: Bus = ZenohBus(Endpoints(listen=(where,), lease_ms=_LEASE_MS))
         self._pending: list[_Pending] = []
         self._should_stop = threading.Event()
         root = instance_key(self.deployment.name, self.deployment.instance_id)

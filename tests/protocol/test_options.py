@@ -94,12 +94,12 @@ def test_the_lease_notices_a_frozen_peer_in_half_a_second() -> None:
 @pytest.mark.parametrize(
     ("endpoints", "expected"),
     [
-        (Endpoints(connect=("tcp/127.0.0.1:1",)), "true"),
-        (Endpoints(connect=("tcp/127.0.0.1:1",), shared_memory=False), "false"),
-        (Endpoints(connect=("tls/robot.lan:1",), tls=TLS), "false"),
+        (Endpoints(connect=("tcp/127.0.0.1:1",)), "false"),
+        (Endpoints(connect=("tcp/127.0.0.1:1",), shared_memory=True), "true"),
+        (Endpoints(connect=("tls/robot.lan:1",), tls=TLS, shared_memory=True), "false"),
     ],
 )
-def test_shared_memory_is_for_one_host(endpoints: Endpoints, expected: str) -> None:
+def test_shared_memory_is_asked_for_and_for_one_host(endpoints: Endpoints, expected: str) -> None:
     assert setting(endpoints, "transport/shared_memory/enabled") == expected
 
 

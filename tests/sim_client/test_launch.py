@@ -27,11 +27,8 @@ def started(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
     return found
 
 
-@pytest.mark.parametrize("shared_memory", [True, False])
-def test_local_servers_obey_the_options_of_the_link(
-    started: dict[str, list[str]], tmp_path: Path, shared_memory: bool
-) -> None:
-    asked = LinkOptions(robot="r7", shared_memory=shared_memory)
+def test_local_servers_obey_the_options_of_the_link(started: dict[str, list[str]], tmp_path: Path) -> None:
+    asked = LinkOptions(robot="r7")
     with Daemons(tmp_path) as daemons:
         link = local_link(
             daemons,
@@ -42,11 +39,10 @@ def test_local_servers_obey_the_options_of_the_link(
             ponder_checkpoint=None,
             pounce_checkpoint=None,
         )
-        assert (link.robot, link.shared_memory, len(link.connect)) == ("r7", shared_memory, 3)
+        assert (link.robot, len(link.connect)) == ("r7", 3)
         (folder,) = {path.parent for path in map(socket_path, link.connect) if path}
         assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     assert not folder.exists()
-    assert {"--link.no-shared-memory" in arguments for arguments in started.values()} == {not shared_memory}
     assert all(arguments[:2] == ["--link.robot", "r7"] for arguments in started.values())
 
 

@@ -100,7 +100,7 @@ class LerobotServer:
 
     @contextmanager
     def running(self) -> Iterator[LerobotServer]:
-        bus = ZenohBus(Endpoints(listen=(f"tcp/127.0.0.1:{self.port}",), shared_memory=False))
+        bus = ZenohBus(Endpoints(listen=(f"tcp/127.0.0.1:{self.port}",)))
         instance = f"{ROOT}/instances/{'1' * 32}"
         inboxes = [
             bus.serve(f"{ROOT}/describe"),
