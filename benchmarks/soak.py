@@ -1,4 +1,4 @@
-"""Hours of episodes with one set of processes: does anything grow, leak or slow down, and does every log agree?
+"""Hours of episodes with one set of servers and robots that come and go: does anything grow, and does every log agree?
 
 python -m benchmarks.soak                                     # two hours of lockstep
 python -m benchmarks.soak --mode realtime --minutes 30        # on a machine that does nothing else
@@ -8,6 +8,7 @@ Each log is checked like ``pp-check`` does when its episode is over, read for it
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import subprocess
@@ -15,6 +16,7 @@ import sys
 import tempfile
 import time
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +30,7 @@ from protocol.mcap_log import EpisodeRecord, read_log
 from sim_client.config import ModeName
 
 _STOP_S = 60.0
+_GROWN_UP_S = 60.0  # a robot's process imports, and makes its renderer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,6 +45,8 @@ class SoakOptions:
     """Time between two looks at the processes [s]."""
     max_steps: int = 400
     """Length of an episode [ticks]."""
+    robot_minutes: float = 5.0
+    """Life of a robot's process; then comes another one."""
     task: str = "PickHighlight"
     beside: str = "nothing"
     """What else ran on the machine; it is in the report."""
@@ -124,24 +129,31 @@ def soak(options: SoakOptions) -> Soak:
     ):
         out = Path(name) / "out"
         words = ["--episodes", "1000000", "--max-steps", str(options.max_steps), "--task", options.task]
-        player = rig.play(words, out, mode=options.mode)
-        start_s = time.monotonic()
-        processes = {**rig.daemons.processes, "sim": player}
+        robots = (rig.play(words, out / str(number), mode=options.mode) for number in itertools.count())
+        player = next(robots)
+        start_s = born_s = time.monotonic()
         left: list[str] = []
         while (now_s := time.monotonic() - start_s) < 60 * options.minutes and not left:
-            rig.listen(lambda: player.poll() is not None, options.every_s)
+            rig.listen(partial(_has_left, player), options.every_s)
             rig.heard.clear()
+            if start_s + now_s - born_s > 60 * options.robot_minutes:
+                _stop(player)
+                player, born_s = next(robots), time.monotonic()
             for log in sorted(out.rglob("*.mcap")):
                 seen.take(log)
                 log.unlink()
-            for proc, process in processes.items():
+            for proc, process in {**rig.daemons.processes, "sim": player}.items():
                 if process.poll() is not None:
                     left.append(f"{proc} left with exit code {process.returncode}")
-                else:
+                elif proc != "sim" or time.monotonic() - born_s > _GROWN_UP_S:
                     seen.looks.setdefault(proc, []).append(look(process.pid, now_s))
         seen.wrong += left
         _stop(player)
     return seen
+
+
+def _has_left(player: subprocess.Popen[bytes]) -> bool:
+    return player.poll() is not None
 
 
 def _stop(player: subprocess.Popen[bytes]) -> None:
