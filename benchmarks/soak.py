@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import itertools
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -157,11 +156,12 @@ def _has_left(player: subprocess.Popen[bytes]) -> bool:
 
 
 def _stop(player: subprocess.Popen[bytes]) -> None:
-    player.send_signal(signal.SIGINT)
+    player.terminate()
     try:
         player.wait(_STOP_S)
     except subprocess.TimeoutExpired:
         player.kill()
+        player.wait()
 
 
 def process_row(proc: str, looks: list[Look]) -> Row:

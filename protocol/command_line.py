@@ -11,8 +11,10 @@ import getpass
 import io
 import os
 import pwd
+import signal
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -36,7 +38,7 @@ def command(prog: str) -> Callable[[Main], Main]:
 
     Whatever a person can mend (CommandError, OSError, ValueError, a package of an extra that is not installed) becomes
     one sentence on stderr and exit code 2. Other exceptions are defects of ours and keep their traceback. A reader that
-    leaves (``| head``) ends a command silently.
+    leaves (``| head``) ends a command silently. SIGTERM (docker stop, systemd) ends it as Ctrl-C does: logs are closed.
     """
 
     def decorate(main: Main) -> Main:
@@ -78,8 +80,17 @@ def sentence(error: BaseException) -> str:
     return f"{where}{error.strerror}{way_out}"
 
 
+def _interrupted(number: int, frame: object) -> None:
+    raise KeyboardInterrupt
+
+
 def _settle_in() -> None:
     """Makes up for what a container may lack: a name and a home for its user, and an encoding that has every letter."""
+    is_ours = (
+        threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    )
+    if is_ours:
+        signal.signal(signal.SIGTERM, _interrupted)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import getpass
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -48,6 +49,20 @@ def test_a_verb_is_called_by_its_name(capsys: pytest.CaptureFixture[str]) -> Non
 
 def test_an_interrupted_command_ends_as_a_shell_expects(capsys: pytest.CaptureFixture[str]) -> None:
     assert that_raises(KeyboardInterrupt())([]) == 130
+    assert capsys.readouterr().err == "pp-thing: interrupted\n"
+
+
+def test_sigterm_ends_a_command_as_ctrl_c_does(capsys: pytest.CaptureFixture[str]) -> None:
+    @command("pp-thing")
+    def main(argv: list[str] | None = None) -> int:
+        os.kill(os.getpid(), signal.SIGTERM)
+        return 0
+
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    try:
+        assert main([]) == 130
+    finally:
+        signal.signal(signal.SIGTERM, before)
     assert capsys.readouterr().err == "pp-thing: interrupted\n"
 
 
