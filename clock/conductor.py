@@ -79,12 +79,14 @@ class Conductor:
         info: the episode's terms, agreed when it was opened.
         committed_ticks: number of ticks that will be played whatever a new chunk contains; POUNCE receives it.
         residual: head that corrects every row with the newest joints; None: no correction.
+        picture_ticks: offsets of the pictures that POUNCE looks at, against an invocation's tick.
         start_ns: deadline of tick 0, once known.
     """
 
     info: EpisodeInfo
     committed_ticks: int = 0
     residual: ResidualHead | None = None
+    picture_ticks: tuple[int, ...] = (0,)
     stage: Stage = Stage.WAIT_OBSERVATION
     start_ns: int = 0
     tick: int = 0
@@ -230,7 +232,10 @@ class Conductor:
         """
         if not self._is_lockstep or self.stage != Stage.RUNNING:
             return True
-        return tick >= self._invoke_due_tick or (self._has_ponder and self.deadline_ns(tick) >= self._query_due_ns)
+        if tick >= self._invoke_due_tick or (self._has_ponder and self.deadline_ns(tick) >= self._query_due_ns):
+            return True
+        ahead, period = self._invoke_due_tick - tick, self.info.schedule.invoke_period_ticks
+        return any((ahead + offset) % period == 0 for offset in self.picture_ticks)  # of this invocation or a later one
 
     def is_waiting(self, now_ns: int) -> bool:
         """In lockstep: whether time must stop at ``now_ns`` because an answer or an observation is due."""

@@ -8,8 +8,10 @@ rebuilds its context. It has one thread; nothing here blocks while an episode ru
 from __future__ import annotations
 
 import logging
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import accumulate
 from typing import Any
 
 from clock.agreement import agree
@@ -55,6 +57,7 @@ log = logging.getLogger(__name__)
 
 ROBOT = "sim"
 ROBOT_SILENCE_NS = 1_000_000_000
+MAX_RECENT_BYTES = 32 << 20  # half of what a message may be
 MAX_SHADOW_QUERIES = 4  # for later ones it would fetch a journal from this thread, while rows are played
 _TOPIC_OF: dict[type, Topic[object]] = {
     t.cls: t  # type: ignore[misc]
@@ -89,6 +92,8 @@ class _Episode:
     journal: list[m.JournalEntry] = field(default_factory=list)
     journal_bytes: int = 0
     newest_payload: bytes = b""
+    recent: deque[bytes] = field(default_factory=lambda: deque(maxlen=0))
+    """Lockstep: the observations before the newest in POUNCE's window, for one that restarts."""
     invoked: m.Invocation | None = None
     """The newest invocation, for a POUNCE that restarts before it has answered."""
     phase: str = ""
@@ -264,6 +269,8 @@ class ClockService:
         if episode.clock is None:
             episode.clock = VirtualClock() if episode.is_lockstep else MonotonicClock()
         if episode.conductor.on_observation(observation):
+            if episode.newest_payload:
+                episode.recent.append(episode.newest_payload)
             episode.newest_payload = payload
         return True
 
@@ -408,8 +415,13 @@ class ClockService:
         self.models = "+".join(contract.model_hash for contract in contracts)
         procs = servers_of(request.info.policy)
         head = self._config.residual if procs else None
-        conductor = Conductor(request.info, committed_ticks=committed_ticks, residual=head)
+        window = contracts[-1].window or m.ObservationWindow() if contracts else m.ObservationWindow()
+        conductor = Conductor(
+            request.info, committed_ticks=committed_ticks, residual=head, picture_ticks=window.video_ticks
+        )
         self._episode = _Episode(request, conductor, contracts=dict(zip(procs, contracts, strict=True)))
+        if self._episode.is_lockstep:  # in real time a restarted POUNCE has seen its window before it is warm
+            self._episode.recent = deque(maxlen=window.reach_ticks)
         self._robot_heard_ns = self._host.now_ns()
         members = {proc: self._link.members[proc] for proc in procs}
         self._watch.enter(members, self._robot_heard_ns)
@@ -467,6 +479,7 @@ class ClockService:
             owed_query=conductor.owed_query,
             owed_invocation=codec.encode(invoked) if is_owed else b"",
             observation=self._episode.newest_payload,
+            recent=_within(self._episode.recent, MAX_RECENT_BYTES) if request.header.proc != "ponder" else (),
         )
 
     def _plays_without(self, proc: str) -> bool:
@@ -525,6 +538,13 @@ class ClockService:
             return m.EngageReply(error=why_not)
         self._event(m.Severity.WARNING, "engaged", f"motion may start again, says {request.operator}")
         return m.EngageReply(level=self._episode.conductor.ladder.level.name)
+
+
+def _within(payloads: Sequence[bytes], limit_bytes: int) -> tuple[bytes, ...]:
+    """The newest payloads, in order, that are no longer than ``limit_bytes`` together."""
+    sums = accumulate(len(payload) for payload in reversed(payloads))
+    num = sum(total <= limit_bytes for total in sums)
+    return tuple(payloads)[len(payloads) - num :]
 
 
 def _named(model_hash: str, is_fake: bool) -> str:

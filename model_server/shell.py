@@ -52,13 +52,22 @@ class Engine(Protocol):
 class ModelShell(ABC):
     """One model server on a bus. ``step`` does one piece of work and returns whether there was any."""
 
-    def __init__(self, link: Link, engine: Engine, heartbeat: Heartbeat, version: str) -> None:
+    def __init__(
+        self,
+        link: Link,
+        engine: Engine,
+        heartbeat: Heartbeat,
+        version: str,
+        *,
+        keep_observations: int = KEEP_OBSERVATIONS,
+    ) -> None:
+        """``keep_observations``: how many wait while an answer is computed; of more, the oldest are lost."""
         self.link = self._link = link
         self.heartbeat = self._heartbeat = heartbeat
         self._version = version
         self._warmed_engine = engine
         self._membership = Membership(link, heartbeat, self._contract, self._open, self._close)
-        self._observations = link.subscribe(topics.OBSERVATION, keep=KEEP_OBSERVATIONS)
+        self._observations = link.subscribe(topics.OBSERVATION, keep=keep_observations)
         self._is_shadow = link.proc in topics.SHADOW_OF
         self._infos = link.subscribe(topics.INFO) if self._is_shadow else None
 
@@ -145,9 +154,9 @@ class ModelShell(ABC):
                 self._take(observation)
 
     def _take_newest(self, rejoined: m.ActiveReply) -> None:
-        """Takes the observation that came before this server did: the next request may name it."""
-        if rejoined.observation:
-            self._take(codec.decode(m.Observation, rejoined.observation))
+        """Takes the observations that came before this server did: the next request may name the newest."""
+        for payload in filter(None, (*rejoined.recent, rejoined.observation)):
+            self._take(codec.decode(m.Observation, payload))
 
     def _take(self, observation: m.Observation) -> None:
         source = source_of(observation.header)

@@ -3,7 +3,7 @@
 The node and the shell need only this file, so a fake engine can test them in milliseconds.
 """
 
-# N horizon, K carriers, H carrier size
+# N horizon, K carriers, H carrier size, T instants of a window, P measured numbers
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dual_system.models.action_space import ActionSpace
 from dual_system.models.arm import JOINT_HIGH_RAD, JOINT_LOW_RAD, NUM_ARM_JOINTS
 from protocol.errors import EpisodeRefused
-from protocol.messages import EpisodeInfo, Refusal, Robot
+from protocol.messages import EpisodeInfo, ObservationWindow, Refusal, Robot
 
 DTypeName: TypeAlias = Literal["float32", "bfloat16"]
 WeightsName: TypeAlias = Literal["float", "int8"]
@@ -66,6 +66,8 @@ class EngineSpec:
     """Rows a second; 0: not known."""
     reads_subgoal: bool = False
     """True if the engine reads PONDER's newest subgoal in place of cognition (then K = 0)."""
+    window: ObservationWindow | None = None
+    """The ticks at which it looks; None: the present alone, and requests have no ``window``."""
     kernels: str = ""
     """Which kernels of the fused path it runs and why not others, known after the warm-up; "" if it tried none."""
 
@@ -73,6 +75,18 @@ class EngineSpec:
     def is_fake(self) -> bool:
         """True if untrained weights decide the answers."""
         return self.is_random or self.has_fresh_prefix
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Window:
+    """What was seen at the ticks of a policy's window, the oldest first and the present last."""
+
+    frames: tuple[tuple[NDArray[np.uint8], ...], ...]
+    """For each camera T frames (h, w, 3) uint8; () if the engine reads none."""
+    states_TP: NDArray[np.float32]
+    is_video_padded_T: NDArray[np.bool_]
+    """Where the frames are another tick's."""
+    is_state_padded_T: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -98,6 +112,8 @@ class Request:
     """Number of previous rows that will be played whatever the new chunk contains."""
     subgoal: str = ""
     """PONDER's newest subgoal, for engines that read it; empty before there is one."""
+    window: Window | None = None
+    """What was seen at the ticks of ``EngineSpec.window``; None if it has none."""
 
 
 def no_progress() -> None:

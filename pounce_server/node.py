@@ -1,18 +1,20 @@
 """Selects the invocation that POUNCE answers, and builds the answer. Pure: messages in, work and messages out.
 
 POUNCE is stateless: each invocation contains its cognition and names its observation, so a restarted POUNCE continues
-as if it had never stopped.
+as if it had never stopped. Only an engine with a window looks at the ticks before as well (`past`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 
 from clock.playback import tick_at
 from model_server.rendezvous import Rendezvous
-from pounce_server.contract import EngineSpec, Request
+from pounce_server.contract import EngineSpec, Request, Window
+from pounce_server.past import Past
 from pounce_server.subgoal_text import OracleText
 from protocol import images
 from protocol import messages as m
@@ -33,6 +35,7 @@ class Work:
 class PounceNode:
     def __init__(self, spec: EngineSpec, oracle: OracleText | None = None) -> None:
         self._spec = spec
+        self._past: Past | None = None
         self._oracle = oracle
         self._rendezvous: Rendezvous[m.Invocation] = Rendezvous(keep_requests=KEEP_INVOCATIONS)
         self._info: m.EpisodeInfo | None = None
@@ -45,6 +48,7 @@ class PounceNode:
     def open(self, info: m.EpisodeInfo | None) -> None:
         """Starts an episode; None ends it."""
         self._rendezvous.clear()
+        self._past = None if self._spec.window is None else Past(self._spec.window)
         self._info = info
         self._next_asked = 0
         if self._oracle is not None:
@@ -57,13 +61,18 @@ class PounceNode:
             MalformedMessage: the engine cannot read its joints or cameras; the observation displaces no other.
         """
         num_cameras = self._spec.num_cameras
-        if num_cameras and not observation.images:
+        is_blind = num_cameras > 0 and not observation.images
+        if is_blind and self._past is None:
             return
         for field, expected in (("proprio", self._spec.proprio_dim), ("images", num_cameras)):
             came = len(getattr(observation, field))
-            if came != expected and (field != "images" or num_cameras):  # an engine without cameras accepts any
+            # An engine without cameras accepts any; a state without pictures is for windows.
+            if came != expected and (field != "images" or (num_cameras and not is_blind)):
                 raise MalformedMessage("Observation", field, f"{expected} of them", f"{came}")
-        self._rendezvous.on_observation(observation)
+        if self._past is not None:
+            self._past.on_observation(observation)
+        if not is_blind:
+            self._rendezvous.on_observation(observation)
 
     def on_subgoal(self, subgoal: m.Subgoal) -> None:
         if self._oracle is not None:
@@ -114,6 +123,7 @@ class PounceNode:
             previous_row0=max(0, late_ticks),
             committed_rows=invocation.committed_rows,
             subgoal=self._subgoal(invocation) if self._spec.reads_subgoal else "",
+            window=None if self._past is None else self._past.window_at(observation.tick),
         )
         return Work(invocation=invocation, request=request)
 
@@ -125,6 +135,7 @@ class PounceNode:
         info, invocation = self._info, work.invocation
         rate_hz = info.schedule.control_hz if info is not None else 1
         horizon, action_dim = rows_NA.shape
+        video, state = self._padded(work.request.window)
         return m.ActionChunk(
             invocation=invocation.invocation,
             t_row0=invocation.tick,
@@ -142,4 +153,14 @@ class PounceNode:
             is_fake=self._spec.is_random or self._spec.has_fresh_prefix,
             previous_rows=invocation.previous_rows,
             committed_rows=invocation.committed_rows,
+            padded_video_ticks=video,
+            padded_state_ticks=state,
         )
+
+    def _padded(self, window: Window | None) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """The offsets at which a window has another tick's pictures, and another tick's state."""
+        if window is None or self._spec.window is None:
+            return (), ()
+        offsets = self._spec.window
+        video = tuple(compress(offsets.video_ticks, window.is_video_padded_T))
+        return video, tuple(compress(offsets.state_ticks, window.is_state_padded_T))

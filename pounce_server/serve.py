@@ -6,7 +6,7 @@ import time
 
 from clock.channels import PREFIX, PROMPT
 from clock.feasibility import delay_ticks
-from model_server.shell import ModelShell
+from model_server.shell import KEEP_OBSERVATIONS, ModelShell
 from pounce_server.contract import Episodic, PounceEngine, check_robot
 from pounce_server.node import PounceNode, Work
 from pounce_server.subgoal_text import OracleText, Source
@@ -26,7 +26,8 @@ class PounceServer(ModelShell):
         self, link: Link, engine: PounceEngine, heartbeat: Heartbeat, version: str, subgoals: Source | None = None
     ) -> None:
         """``subgoals``: source of the texts for an engine that must read them. None, "ponder": the invocation's."""
-        super().__init__(link, engine, heartbeat, version)
+        reach_ticks = 0 if engine.spec.window is None else engine.spec.window.reach_ticks
+        super().__init__(link, engine, heartbeat, version, keep_observations=KEEP_OBSERVATIONS + reach_ticks)
         self._engine = engine
         self._has_subgoals = subgoals is not None
         oracle = OracleText() if subgoals == "oracle" else None
@@ -143,6 +144,7 @@ class PounceServer(ModelShell):
             version=self._version,
             channels=self._channels(),
             control_hz=spec.control_hz,
+            window=spec.window,
         )
 
     def _channels(self) -> tuple[m.ChannelSpec, ...]:

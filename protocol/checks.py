@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,10 @@ MAX_CHANNELS = 8
 DEMO_VIDEO_HZ = 20
 MAX_DECAY = 10  # per chunk: exp(-10) is negligible
 MAX_JOURNAL_ENTRIES = 64
+MAX_WINDOW = 16  # ticks at which a policy looks
+MAX_REACH_TICKS = 100  # raw pictures of so many ticks are 40 MB in a model server
+MAX_WINDOW = 16  # ticks at which a policy looks
+MAX_REACH_TICKS = 100  # raw pictures of so many ticks are 40 MB in a model server
 
 
 def _broken(message: object, field: str, expected: str, came: object) -> MalformedMessage:
@@ -250,6 +255,9 @@ def check_action_chunk(c: m.ActionChunk) -> None:
     _vector(c, "rows", low=size, high=size)
     _vector(c, "reference_state")
     _vector(c, "previous_rows", high=MAX_HORIZON * MAX_DIM)
+    for name in ("padded_video_ticks", "padded_state_ticks"):
+        if why_not := no_window((*getattr(c, name), 0)):
+            raise _broken(c, name, "offsets of past ticks", why_not)
     _chosen(c, "action_space")
     _require(len(c.features) <= 1 << 20, c, "features", "at most 1 MiB", len(c.features))
     _text(c, "model_hash", limit=MAX_ID)
@@ -381,11 +389,23 @@ def check_open_request(r: m.OpenRequest) -> None:
     _members(r, r.members)
 
 
+def no_window(offsets: tuple[int, ...]) -> str:
+    """Why ``offsets`` are not the ticks at which a policy looks, against the present one; "" if they are."""
+    if not offsets or offsets[-1] != 0 or any(after <= before for before, after in pairwise(offsets)):
+        return f"{list(offsets)}: they ascend, and end with 0, the present"
+    if len(offsets) > MAX_WINDOW or offsets[0] < -MAX_REACH_TICKS:
+        return f"{list(offsets)}: at most {MAX_WINDOW} of them, and none before {-MAX_REACH_TICKS}"
+    return ""
+
+
 def check_contract(c: m.Contract) -> None:
     _text(c, "proc", "model_hash", "version", limit=MAX_ID)
     _duration(c, "infer_p50_ns", "infer_p99_ns")
     _require(len(c.channels) <= MAX_CHANNELS, c, "channels", f"at most {MAX_CHANNELS}", len(c.channels))
     _require(0 <= c.control_hz <= MAX_CONTROL_HZ, c, "control_hz", f"0..{MAX_CONTROL_HZ}", c.control_hz)
+    for name in ("video_ticks", "state_ticks") if c.window is not None else ():
+        if why_not := no_window(getattr(c.window, name)):
+            raise _broken(c, f"window.{name}", "offsets of a window", why_not)
     if c.demonstrations is not None:
         hz = c.demonstrations.hz
         _require(hz > 0 and DEMO_VIDEO_HZ % hz == 0, c, "demonstrations.hz", f"a divisor of {DEMO_VIDEO_HZ}", hz)

@@ -306,6 +306,8 @@ class ActionChunk:
     previous_rows: Floats = field(default_factory=_no_floats)
     committed_rows: int = 0
     features: bytes = b""
+    padded_video_ticks: tuple[int, ...] = ()
+    padded_state_ticks: tuple[int, ...] = ()
 
     @property
     def rows_NA(self) -> Floats:
@@ -530,6 +532,17 @@ class ChannelSpec:
     null: NullKind = NullKind.UNSPECIFIED
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ObservationWindow:
+    video_ticks: tuple[int, ...] = (0,)
+    state_ticks: tuple[int, ...] = (0,)
+
+    @property
+    def reach_ticks(self) -> int:
+        """How many ticks before the present its oldest observation is."""
+        return -min(*self.video_ticks, *self.state_ticks)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Contract:
     proc: str
@@ -549,6 +562,7 @@ class Contract:
     boot_id: int = 0
     channels: tuple[ChannelSpec, ...] = ()
     control_hz: int = 0
+    window: ObservationWindow | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -597,6 +611,7 @@ class ActiveReply:
     owed_query: int | None = None
     owed_invocation: bytes = b""
     observation: bytes = b""
+    recent: tuple[bytes, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

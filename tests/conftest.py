@@ -148,6 +148,9 @@ class FakePounce:
         for array in (*request.frames, request.proprio, request.cognition):
             digest.update(b"null" if array is None else array.tobytes())
         digest.update(f"{request.age_ns} {request.seed}".encode())
+        if (seen := request.window) is not None:
+            for array in (*(frame for frames in seen.frames for frame in frames), seen.states_TP):
+                digest.update(array.tobytes())
         shape = (self.spec.horizon, self.spec.action_dim)
         return (request.proprio + np.cumsum(0.01 * floats_of(digest.digest(), shape), axis=0)).astype(np.float32)
 

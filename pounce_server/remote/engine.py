@@ -9,13 +9,13 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from pounce_server.contract import EngineSpec, Progress, Request, check_request, no_progress
+from pounce_server.contract import EngineSpec, Progress, Request, Window, check_request, no_progress
 from pounce_server.remote.dimensions import fitting_dims
 from pounce_server.remote.peer import Lost, Patience, Peer, PeerError
 from protocol.errors import EpisodeRefused
-from protocol.messages import EpisodeInfo, Refusal
+from protocol.messages import EpisodeInfo, ObservationWindow, Refusal
 from protocol.peers.mapping import PolicyMapping
-from protocol.peers.translation import WrongAnswer, request_of, rows_of
+from protocol.peers.translation import WrongAnswer, request_of, rows_of, windows_of
 
 log = logging.getLogger(__name__)
 
@@ -62,6 +62,7 @@ class RemoteEngine:
             has_fresh_prefix=False,
             dtype="float32",
             reads_subgoal=mapping.prompt.reads_subgoal,
+            window=mapping.window,
         )
 
     def begin(self, info: EpisodeInfo) -> None:
@@ -112,6 +113,11 @@ class RemoteEngine:
             if frame is not None
         }  # fmt: skip
         values = request_of(self._mapping, frames, request.proprio, request.instruction, request.subgoal)
+        if (seen := request.window) is not None:
+            pictures = dict(zip(self._cameras, seen.frames, strict=True))
+            values |= windows_of(
+                self._mapping, pictures, seen.states_TP, seen.is_video_padded_T, seen.is_state_padded_T
+            )
         try:
             answer = self._peer.infer(values, patience)
             return rows_of(self._mapping, answer, request.proprio, self._as_they_are)
@@ -152,6 +158,17 @@ class RemoteEngine:
             cognition=None,
             age_ns=0,
             seed=0,
+            window=None if self._mapping.window is None else self._example_window(self._mapping.window),
+        )
+
+    def _example_window(self, window: ObservationWindow) -> Window:
+        num_video, num_state = len(window.video_ticks), len(window.state_ticks)
+        black = np.zeros((*PROBE_PX, 3), np.uint8)
+        return Window(
+            frames=((black,) * num_video,) * len(self._cameras),
+            states_TP=np.zeros((num_state, self._mapping.num_proprio), np.float32),
+            is_video_padded_T=np.zeros(num_video, np.bool_),
+            is_state_padded_T=np.zeros(num_state, np.bool_),
         )
 
     def _sentence(self, error: Exception) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 import zmq
 
 from pounce_server.remote.peer import Patience, PeerError
+from protocol.messages import ObservationWindow
 from protocol.peers.arrays import NotAMessage, pack, unpack
 from protocol.peers.mapping import Key, PolicyMapping
 from protocol.peers.translation import Values, named
@@ -21,11 +22,14 @@ _MAX_ERROR = 500
 class GrootPeer:
     """A server of ``gr00t/eval/run_gr00t_server.py`` (N1.6, N1.7) or ``inference_service.py`` (N1.5, ``is_flat``).
 
-    Its modality configuration is compared with the mapping file: keys, one frame and one state, the horizon. A request
+    Its modality configuration is compared with the mapping file: keys, the window, the horizon. A request
     without an answer costs the socket: ZMQ's REQ cannot send again, and the late answer must not be the next one's.
     """
 
     def __init__(self, url: str, mapping: PolicyMapping, *, is_flat: bool, api_token: str = "") -> None:
+        """Raises ValueError: the mapping has a mask, for which this wire has no field."""
+        if mapping.video_pad or mapping.state_pad:
+            raise ValueError(f"{mapping.name}: GR00T's observations have no masks; leave video_pad and state_pad out")
         self._url, self._mapping, self._is_flat, self._token = url, mapping, is_flat, api_token
         self._socket: zmq.Socket[bytes] | None = None
 
@@ -56,17 +60,25 @@ class GrootPeer:
             self._socket = None
 
     def _nested(self, values: Values) -> dict[str, Any]:
-        """Arrays (batch 1, time 1, ...), the prompt [[text]]."""
+        """Arrays (batch 1, time, ...), the prompt [[text]]."""
+        flat = self._timed(values)
         return {
-            "video": {named(c.key): values[c.key][None, None] for c in self._mapping.cameras if c.key is not None},
-            "state": {named(key): values[key][None, None] for key in self._mapping.state_keys()},
+            "video": {named(c.key): flat[c.key][None] for c in self._mapping.cameras if c.key is not None},
+            "state": {named(key): flat[key][None] for key in self._mapping.state_keys()},
             "language": {named(self._mapping.prompt.key): [[values[self._mapping.prompt.key]]]},
         }
 
+    def _timed(self, values: Values) -> Values:
+        """The arrays (time, ...), as a window of several instants has them already."""
+        keys = {camera.key: 3 for camera in self._mapping.cameras if camera.key is not None}
+        keys |= dict.fromkeys(self._mapping.state_keys(), 1)
+        return {key: values[key] if values[key].ndim > ndim else values[key][None] for key, ndim in keys.items()}
+
     def _flat(self, values: Values) -> dict[str, Any]:
-        """Arrays (time 1, ...), the prompt [text]."""
-        pictures = {f"video.{named(c.key)}": values[c.key][None] for c in self._mapping.cameras if c.key is not None}
-        states = {f"state.{named(key)}": values[key][None] for key in self._mapping.state_keys()}
+        """Arrays (time, ...), the prompt [text]."""
+        flat = self._timed(values)
+        pictures = {f"video.{named(c.key)}": flat[c.key] for c in self._mapping.cameras if c.key is not None}
+        states = {f"state.{named(key)}": flat[key] for key in self._mapping.state_keys()}
         return {**pictures, **states, named(self._mapping.prompt.key): [values[self._mapping.prompt.key]]}
 
     def _unbatched(self, array: Any) -> Any:
@@ -92,12 +104,23 @@ class GrootPeer:
                     f"its {name} keys are {', '.join(sorted(theirs))}; {self._mapping.name} has "
                     f"{', '.join(sorted(keys)) or 'none'}"
                 )
-            num, wanted = len(each["delta_indices"]), self._mapping.horizon if name == "action" else 1
-            if num != wanted:
-                raise PeerError(
-                    f"its {name} has {num} steps, expected {wanted}"
-                    + (" (horizon)" if name == "action" else ": a history of observations is not served")
-                )
+            indices = each["delta_indices"]
+            if name == "action" and len(indices) != self._mapping.horizon:
+                raise PeerError(f"its action has {len(indices)} steps, expected {self._mapping.horizon} (horizon)")
+            if name == "language" and len(indices) != 1:
+                raise PeerError(f"its language has {len(indices)} steps, expected 1")
+            if name in ("video", "state") and len(keys) and (why_not := self._other_window(name, indices)):
+                raise PeerError(f"its {name} has the steps {indices}, {self._mapping.name} {why_not}")
+
+    def _other_window(self, name: str, indices: list[Any]) -> str:
+        """What the mapping file has instead of a modality's steps, which are the policy's rows; "" if they agree."""
+        mapping, window = self._mapping, self._mapping.window or ObservationWindow()
+        ours = window.video_ticks if name == "video" else window.state_ticks
+        theirs = [each * mapping.play_hz for each in indices if isinstance(each, int)]
+        if theirs == [offset * mapping.rate_hz for offset in ours]:
+            return ""
+        ticks = "" if mapping.play_hz == mapping.rate_hz else f" ticks at {mapping.play_hz} Hz"
+        return f"looks at {list(ours)}{ticks}; say so in [window] {name}"
 
     def _call(self, endpoint: str, data: Any, patience: Patience) -> Any:
         """Raises PeerError: no answer in time, an error, or bytes that are none of theirs."""

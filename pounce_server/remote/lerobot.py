@@ -45,7 +45,7 @@ class LerobotPeer:
     """``url``: zenoh's endpoint and the deployment, ``tcp/127.0.0.1:7447#DEPLOYMENT``."""
 
     def __init__(self, url: str, mapping: PolicyMapping) -> None:
-        """Raises ValueError: no deployment, or an endpoint that other hosts can read."""
+        """Raises ValueError: no deployment, an endpoint that other hosts can read, or a mapping with a window."""
         endpoint, _, self._deployment = url.partition("#")
         if not self._deployment or "/" not in endpoint:
             raise ValueError(f"--url {url}: expected tcp/HOST:PORT#DEPLOYMENT")
@@ -53,6 +53,8 @@ class LerobotPeer:
             self._endpoints = Endpoints(connect=(endpoint,))
         except TransportError as error:
             raise ValueError(f"--url {url}: {error} LeRobot's server has no TLS of its own: use a tunnel") from None
+        if mapping.window is not None:
+            raise ValueError(f"{mapping.name}: LeRobot's server reads the current observation only; leave [window] out")
         self._mapping = mapping
         self._bus: Bus | None = None
         self._descriptor: Mapping[str, Any] = {}
@@ -175,6 +177,8 @@ class LerobotPeer:
             told = feature.get("names") if isinstance(feature, Mapping) else None
             if told and told != list(names):
                 raise PeerError(f"its {named(key)} is {told}; {mapping.name} has {list(names)}")
+        if capabilities.get("current_observation_only") is False:
+            raise PeerError("its policy reads earlier observations too, for which LeRobot's wire has no field")
         modes, interval_s = capabilities.get("modes"), capabilities.get("action_interval")
         if not isinstance(modes, list) or "chunk" not in modes:
             raise PeerError(f"its modes are {modes}, expected chunk among them")

@@ -28,6 +28,12 @@ class VlaEvalPeer:
     """
 
     def __init__(self, url: str, mapping: PolicyMapping) -> None:
+        """Raises ValueError: no websocket's address, or a mapping with a window."""
+        if mapping.window is not None:
+            raise ValueError(
+                f"{mapping.name}: vla-eval's model servers read one observation, and keep their own history of those "
+                "that they are asked with; leave [window] out"
+            )
         self._socket, self._mapping = Socket(url, {}), mapping
         self._hello: Mapping[Any, Any] = {}
         self._seq = 0

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
 
 from protocol import checks, files
+from protocol.messages import ObservationWindow
 
 Key: TypeAlias = tuple[str, ...]
 """Where a value is in a peer's message: a name, or the names of nested maps from the outermost on."""
@@ -101,6 +102,11 @@ class PolicyMapping:
     cameras: tuple[Camera, ...]
     state: tuple[Numbers, ...]
     actions: tuple[Numbers, ...]
+    window: ObservationWindow | None = None
+    """The ticks, at ``play_hz``, at which the policy looks; None: the present alone."""
+    video_pad: Key | None = None
+    """Where a policy is told which of a window's pictures are padding; None: it is not told."""
+    state_pad: Key | None = None
     constants: tuple[tuple[Key, Any], ...] = ()
     """Further values of every request, for peers that want them."""
     names: Mapping[Key, tuple[str, ...]] = field(default_factory=dict)
@@ -141,7 +147,7 @@ def read_mapping(path: Path) -> PolicyMapping:
 
 def _mapping(given: dict[str, Any], name: str, digest: str) -> PolicyMapping:
     known = {"rate_hz", "play_hz", "horizon", "num_proprio", "num_commands", "prompt", "cameras", "state", "action"}
-    _only(given, known | {"constants", "names"}, "the file")
+    _only(given, known | {"constants", "names", "window"}, "the file")
     rate_hz = _integer(given, "rate_hz", MIN_HZ, MAX_HZ)
     found = PolicyMapping(
         name=name,
@@ -154,6 +160,7 @@ def _mapping(given: dict[str, Any], name: str, digest: str) -> PolicyMapping:
         cameras=tuple(_camera(camera, each) for camera, each in given.get("cameras", {}).items()),
         state=tuple(_numbers(each, index, "state", "from") for index, each in enumerate(given.get("state", []))),
         actions=tuple(_numbers(each, index, "action", "to") for index, each in enumerate(given["action"])),
+        **_window(given["window"]) if "window" in given else {},
         constants=tuple((_key(name, "constants"), value) for name, value in given.get("constants", {}).items()),
         digest=digest,
     )
@@ -172,6 +179,19 @@ def _names(given: Mapping[str, Any], found: PolicyMapping) -> dict[Key, tuple[st
             raise ValueError(f"[names] {key!r} = {components!r}: expected {widths[key][1]} different names")
         names[widths[key][0]] = tuple(components)
     return names
+
+
+def _window(given: Mapping[str, Any]) -> dict[str, Any]:
+    """The window and where its masks go, by field of `PolicyMapping`."""
+    _only(given, {"video", "state", "video_pad", "state_pad"}, "[window]")
+    ticks = {}
+    for modality in ("video", "state"):
+        offsets = _integers(given.get(modality, [0]), f"[window] {modality}", -checks.MAX_REACH_TICKS, 0)
+        if why_not := checks.no_window(offsets):
+            raise ValueError(f"[window] {modality} = {why_not}")
+        ticks[f"{modality}_ticks"] = offsets
+    pads = {name: _key(given[name], f"[window] {name}") for name in ("video_pad", "state_pad") if name in given}
+    return {"window": ObservationWindow(**ticks), **pads}
 
 
 def _prompt(given: Mapping[str, Any]) -> Prompt:
@@ -255,10 +275,15 @@ def _check_dims(found: PolicyMapping) -> None:
     beyond = [dim for each in found.state for dim in each.dims] + [i for each in found.actions for i in each.measured]
     if beyond and max(beyond) >= found.num_proprio:
         raise ValueError(f"measured number {max(beyond)}: expected 0 to {found.num_proprio - 1} (num_proprio)")
+    seen = {"video": any(camera.key for camera in found.cameras), "state": bool(found.state)}
+    for modality, is_read in seen.items():
+        if found.window is not None and not is_read and getattr(found.window, f"{modality}_ticks") != (0,):
+            raise ValueError(f"[window] {modality}: the policy reads none")
     if not found.state and not any(camera.key for camera in found.cameras):
         raise ValueError("expected a camera or a [[state]]: this policy would see nothing")
     keys = [found.prompt.key, *(c.key for c in found.cameras if c.key), *found.state_keys()]
     keys += [key for key, _ in found.constants]
+    keys += [key for key in (found.video_pad, found.state_pad) if key is not None]
     for key in keys:
         if sum(other[: len(key)] == key for other in keys) > 1:  # one map cannot hold both
             raise ValueError(f"key {'.'.join(key)}: expected another key for every value")

@@ -43,11 +43,42 @@ def request_of(
         if camera.camera not in frames:
             raise ValueError(f"no picture of the {camera.camera} camera, which the policy reads")
         values[camera.key] = fitted(frames[camera.camera], camera)
-    for key, width in mapping.state_keys().items():
-        values[key] = np.zeros(width, np.float32)
+    values |= _vectors(mapping, proprio_P)
+    values[mapping.prompt.key] = mapping.prompt.said(instruction, subgoal)
+    return values
+
+
+def windows_of(
+    mapping: PolicyMapping,
+    frames: Mapping[str, Sequence[Pixels]],
+    states_TP: Floats,
+    is_video_padded_T: NDArray[np.bool_],
+    is_state_padded_T: NDArray[np.bool_],
+) -> Values:
+    """What a mapping's window adds to `request_of`: pictures and vectors with an axis of time in front, and its masks.
+
+    A modality of one instant, the present, has no such axis, as without a window. ``frames``: T pictures by camera.
+
+    Raises:
+        ValueError: pictures of one camera have different sizes.
+    """
+    values: Values = {}
+    for camera in mapping.cameras:
+        if camera.key is not None and len(is_video_padded_T) > 1:
+            values[camera.key] = np.stack([fitted(frame, camera) for frame in frames[camera.camera]])
+    if len(states_TP) > 1:
+        vectors = [_vectors(mapping, state_P) for state_P in states_TP]
+        values |= {key: np.stack([each[key] for each in vectors]) for key in mapping.state_keys()}
+    for key, mask_T in ((mapping.video_pad, is_video_padded_T), (mapping.state_pad, is_state_padded_T)):
+        if key is not None:
+            values[key] = mask_T
+    return values
+
+
+def _vectors(mapping: PolicyMapping, proprio_P: Floats) -> Values:
+    values: Values = {key: np.zeros(width, np.float32) for key, width in mapping.state_keys().items()}
     for each in mapping.state:
         values[each.key][list(each.columns)] = (proprio_P[list(each.dims)] - each.offset) / each.scale
-    values[mapping.prompt.key] = mapping.prompt.said(instruction, subgoal)
     return values
 
 

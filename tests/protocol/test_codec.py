@@ -129,6 +129,8 @@ def chunks(draw: st.DrawFn) -> m.ActionChunk:
         age_ns=draw(DURATION),
         infer_ns=draw(DURATION),
         action_space=draw(chosen(m.ActionSpace)),
+        padded_video_ticks=draw(PAST),
+        padded_state_ticks=draw(PAST),
         reference_state=draw(floats()),
         seed=draw(U64),
         model_hash=draw(TEXT),
@@ -225,11 +227,15 @@ CHANNEL = st.builds(
     m.ChannelSpec, payload=st.sampled_from(m.PayloadKind), consumer=st.sampled_from(m.ConsumerKind),
     reads_age=st.booleans(), null=st.sampled_from(m.NullKind),
 )  # fmt: skip
+PAST = st.sets(st.integers(-100, -1), max_size=8).map(lambda ticks: tuple(sorted(ticks)))
+OFFSETS = PAST.map(lambda ticks: (*ticks, 0))
+WINDOW = st.builds(m.ObservationWindow, video_ticks=OFFSETS, state_ticks=OFFSETS)
 CONTRACT = st.builds(
     m.Contract, proc=TEXT, num_carriers=U32, hidden_size=U32, horizon=U32, action_dim=U32,
     preferred_codec=chosen(m.ImageCodec), infer_p50_ns=DURATION, infer_p99_ns=DURATION, model_hash=TEXT,
     is_fake=st.booleans(), version=TEXT, context_tokens=U32, max_context_tokens=U32,
     demonstrations=st.none() | DEMO_SAMPLING, control_hz=st.integers(0, 100), channels=tuples_of(CHANNEL),
+    window=st.none() | WINDOW,
 )  # fmt: skip
 JOURNAL_ENTRY = st.builds(
     m.JournalEntry, query=INDEX, tick=INDEX, source_ns=INSTANT, observation=st.binary(max_size=40)
@@ -283,6 +289,7 @@ MESSAGES: dict[type, st.SearchStrategy[Any]] = {
     m.Member: MEMBER,
     m.DemoSampling: DEMO_SAMPLING,
     m.ChannelSpec: CHANNEL,
+    m.ObservationWindow: WINDOW,
     m.Contract: CONTRACT,
     m.ContractRequest: st.builds(m.ContractRequest, header=HEADER),
     m.ContractReply: st.builds(m.ContractReply, error=TEXT, contract=st.none() | CONTRACT),
@@ -295,7 +302,7 @@ MESSAGES: dict[type, st.SearchStrategy[Any]] = {
     m.ActiveRequest: st.builds(m.ActiveRequest, header=HEADER),
     m.ActiveReply: st.builds(
         m.ActiveReply, error=TEXT, open=st.none() | OPEN_REQUEST, num_queries=INDEX,
-        owed_query=st.none() | INDEX,
+        owed_query=st.none() | INDEX, recent=tuples_of(st.binary(max_size=40)),
     ),
     m.JournalRequest: st.builds(
         m.JournalRequest, header=HEADER, first_query=INDEX, max_queries=st.integers(1, 64)

@@ -370,8 +370,16 @@ class ChannelSpec(_message.Message):
     null: NullKind
     def __init__(self, payload: _Optional[_Union[PayloadKind, str]] = ..., consumer: _Optional[_Union[ConsumerKind, str]] = ..., reads_age: _Optional[bool] = ..., null: _Optional[_Union[NullKind, str]] = ...) -> None: ...
 
+class ObservationWindow(_message.Message):
+    __slots__ = ("video_ticks", "state_ticks")
+    VIDEO_TICKS_FIELD_NUMBER: _ClassVar[int]
+    STATE_TICKS_FIELD_NUMBER: _ClassVar[int]
+    video_ticks: _containers.RepeatedScalarFieldContainer[int]
+    state_ticks: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, video_ticks: _Optional[_Iterable[int]] = ..., state_ticks: _Optional[_Iterable[int]] = ...) -> None: ...
+
 class Contract(_message.Message):
-    __slots__ = ("proc", "num_carriers", "hidden_size", "horizon", "action_dim", "preferred_codec", "infer_p50_ns", "infer_p99_ns", "model_hash", "is_fake", "version", "context_tokens", "max_context_tokens", "demonstrations", "boot_id", "channels", "control_hz")
+    __slots__ = ("proc", "num_carriers", "hidden_size", "horizon", "action_dim", "preferred_codec", "infer_p50_ns", "infer_p99_ns", "model_hash", "is_fake", "version", "context_tokens", "max_context_tokens", "demonstrations", "boot_id", "channels", "control_hz", "window")
     PROC_FIELD_NUMBER: _ClassVar[int]
     NUM_CARRIERS_FIELD_NUMBER: _ClassVar[int]
     HIDDEN_SIZE_FIELD_NUMBER: _ClassVar[int]
@@ -389,6 +397,7 @@ class Contract(_message.Message):
     BOOT_ID_FIELD_NUMBER: _ClassVar[int]
     CHANNELS_FIELD_NUMBER: _ClassVar[int]
     CONTROL_HZ_FIELD_NUMBER: _ClassVar[int]
+    WINDOW_FIELD_NUMBER: _ClassVar[int]
     proc: str
     num_carriers: int
     hidden_size: int
@@ -406,7 +415,8 @@ class Contract(_message.Message):
     boot_id: int
     channels: _containers.RepeatedCompositeFieldContainer[ChannelSpec]
     control_hz: int
-    def __init__(self, proc: _Optional[str] = ..., num_carriers: _Optional[int] = ..., hidden_size: _Optional[int] = ..., horizon: _Optional[int] = ..., action_dim: _Optional[int] = ..., preferred_codec: _Optional[_Union[_common_pb2.ImageCodec, str]] = ..., infer_p50_ns: _Optional[int] = ..., infer_p99_ns: _Optional[int] = ..., model_hash: _Optional[str] = ..., is_fake: _Optional[bool] = ..., version: _Optional[str] = ..., context_tokens: _Optional[int] = ..., max_context_tokens: _Optional[int] = ..., demonstrations: _Optional[_Union[DemoSampling, _Mapping]] = ..., boot_id: _Optional[int] = ..., channels: _Optional[_Iterable[_Union[ChannelSpec, _Mapping]]] = ..., control_hz: _Optional[int] = ...) -> None: ...
+    window: ObservationWindow
+    def __init__(self, proc: _Optional[str] = ..., num_carriers: _Optional[int] = ..., hidden_size: _Optional[int] = ..., horizon: _Optional[int] = ..., action_dim: _Optional[int] = ..., preferred_codec: _Optional[_Union[_common_pb2.ImageCodec, str]] = ..., infer_p50_ns: _Optional[int] = ..., infer_p99_ns: _Optional[int] = ..., model_hash: _Optional[str] = ..., is_fake: _Optional[bool] = ..., version: _Optional[str] = ..., context_tokens: _Optional[int] = ..., max_context_tokens: _Optional[int] = ..., demonstrations: _Optional[_Union[DemoSampling, _Mapping]] = ..., boot_id: _Optional[int] = ..., channels: _Optional[_Iterable[_Union[ChannelSpec, _Mapping]]] = ..., control_hz: _Optional[int] = ..., window: _Optional[_Union[ObservationWindow, _Mapping]] = ...) -> None: ...
 
 class ContractRequest(_message.Message):
     __slots__ = ("header",)
@@ -461,20 +471,22 @@ class ActiveRequest(_message.Message):
     def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ...) -> None: ...
 
 class ActiveReply(_message.Message):
-    __slots__ = ("error", "open", "num_queries", "owed_query", "owed_invocation", "observation")
+    __slots__ = ("error", "open", "num_queries", "owed_query", "owed_invocation", "observation", "recent")
     ERROR_FIELD_NUMBER: _ClassVar[int]
     OPEN_FIELD_NUMBER: _ClassVar[int]
     NUM_QUERIES_FIELD_NUMBER: _ClassVar[int]
     OWED_QUERY_FIELD_NUMBER: _ClassVar[int]
     OWED_INVOCATION_FIELD_NUMBER: _ClassVar[int]
     OBSERVATION_FIELD_NUMBER: _ClassVar[int]
+    RECENT_FIELD_NUMBER: _ClassVar[int]
     error: str
     open: OpenRequest
     num_queries: int
     owed_query: int
     owed_invocation: bytes
     observation: bytes
-    def __init__(self, error: _Optional[str] = ..., open: _Optional[_Union[OpenRequest, _Mapping]] = ..., num_queries: _Optional[int] = ..., owed_query: _Optional[int] = ..., owed_invocation: _Optional[bytes] = ..., observation: _Optional[bytes] = ...) -> None: ...
+    recent: _containers.RepeatedScalarFieldContainer[bytes]
+    def __init__(self, error: _Optional[str] = ..., open: _Optional[_Union[OpenRequest, _Mapping]] = ..., num_queries: _Optional[int] = ..., owed_query: _Optional[int] = ..., owed_invocation: _Optional[bytes] = ..., observation: _Optional[bytes] = ..., recent: _Optional[_Iterable[bytes]] = ...) -> None: ...
 
 class JournalRequest(_message.Message):
     __slots__ = ("header", "first_query", "max_queries")

@@ -214,7 +214,7 @@ class Invocation(_message.Message):
     def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ..., invocation: _Optional[int] = ..., tick: _Optional[int] = ..., now_ns: _Optional[int] = ..., ref_query: _Optional[int] = ..., age_ns: _Optional[int] = ..., cognition: _Optional[_Union[_common_pb2.Tensor, _Mapping]] = ..., seed: _Optional[int] = ..., previous_rows: _Optional[_Iterable[float]] = ..., committed_rows: _Optional[int] = ..., num_samples: _Optional[int] = ..., text: _Optional[str] = ..., text_age_ns: _Optional[int] = ...) -> None: ...
 
 class ActionChunk(_message.Message):
-    __slots__ = ("header", "invocation", "t_row0", "horizon", "action_dim", "dt_ns", "rows", "source_ns", "ref_query", "age_ns", "infer_ns", "action_space", "reference_state", "seed", "model_hash", "is_fake", "previous_rows", "committed_rows", "features")
+    __slots__ = ("header", "invocation", "t_row0", "horizon", "action_dim", "dt_ns", "rows", "source_ns", "ref_query", "age_ns", "infer_ns", "action_space", "reference_state", "seed", "model_hash", "is_fake", "previous_rows", "committed_rows", "features", "padded_video_ticks", "padded_state_ticks")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     INVOCATION_FIELD_NUMBER: _ClassVar[int]
     T_ROW0_FIELD_NUMBER: _ClassVar[int]
@@ -234,6 +234,8 @@ class ActionChunk(_message.Message):
     PREVIOUS_ROWS_FIELD_NUMBER: _ClassVar[int]
     COMMITTED_ROWS_FIELD_NUMBER: _ClassVar[int]
     FEATURES_FIELD_NUMBER: _ClassVar[int]
+    PADDED_VIDEO_TICKS_FIELD_NUMBER: _ClassVar[int]
+    PADDED_STATE_TICKS_FIELD_NUMBER: _ClassVar[int]
     header: _common_pb2.Header
     invocation: int
     t_row0: int
@@ -253,7 +255,9 @@ class ActionChunk(_message.Message):
     previous_rows: _containers.RepeatedScalarFieldContainer[float]
     committed_rows: int
     features: bytes
-    def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ..., invocation: _Optional[int] = ..., t_row0: _Optional[int] = ..., horizon: _Optional[int] = ..., action_dim: _Optional[int] = ..., dt_ns: _Optional[int] = ..., rows: _Optional[_Iterable[float]] = ..., source_ns: _Optional[int] = ..., ref_query: _Optional[int] = ..., age_ns: _Optional[int] = ..., infer_ns: _Optional[int] = ..., action_space: _Optional[_Union[ActionSpace, str]] = ..., reference_state: _Optional[_Iterable[float]] = ..., seed: _Optional[int] = ..., model_hash: _Optional[str] = ..., is_fake: _Optional[bool] = ..., previous_rows: _Optional[_Iterable[float]] = ..., committed_rows: _Optional[int] = ..., features: _Optional[bytes] = ...) -> None: ...
+    padded_video_ticks: _containers.RepeatedScalarFieldContainer[int]
+    padded_state_ticks: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ..., invocation: _Optional[int] = ..., t_row0: _Optional[int] = ..., horizon: _Optional[int] = ..., action_dim: _Optional[int] = ..., dt_ns: _Optional[int] = ..., rows: _Optional[_Iterable[float]] = ..., source_ns: _Optional[int] = ..., ref_query: _Optional[int] = ..., age_ns: _Optional[int] = ..., infer_ns: _Optional[int] = ..., action_space: _Optional[_Union[ActionSpace, str]] = ..., reference_state: _Optional[_Iterable[float]] = ..., seed: _Optional[int] = ..., model_hash: _Optional[str] = ..., is_fake: _Optional[bool] = ..., previous_rows: _Optional[_Iterable[float]] = ..., committed_rows: _Optional[int] = ..., features: _Optional[bytes] = ..., padded_video_ticks: _Optional[_Iterable[int]] = ..., padded_state_ticks: _Optional[_Iterable[int]] = ...) -> None: ...
 
 class Action(_message.Message):
     __slots__ = ("header", "tick", "deadline_ns", "level", "values")

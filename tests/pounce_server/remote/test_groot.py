@@ -16,8 +16,9 @@ import msgpack
 import numpy as np
 import pytest
 
-from pounce_server.contract import example_request
+from pounce_server.contract import Window, example_request
 from pounce_server.remote.engine import RemoteEngine
+from protocol.messages import ObservationWindow
 from protocol.peers.mapping import Camera, Numbers, PolicyMapping, Prompt
 
 zmq = pytest.importorskip("zmq", reason="pip install pyzmq")
@@ -169,6 +170,50 @@ def test_rows_are_the_policys(server: GrootServer, named: PolicyMapping) -> None
     assert video.shape == ((1, 8, 8, 3) if server.is_flat else (1, 1, 8, 8, 3))
 
 
+@pytest.mark.parametrize("is_flat", [False, True])
+def test_a_window_is_seen_by_the_server(named: PolicyMapping, is_flat: bool) -> None:
+    window = ObservationWindow(video_ticks=(-15, 0), state_ticks=(-2, -1, 0))
+    server = GrootServer(is_flat=is_flat)
+    server.config["video"]["delta_indices"], server.config["state"]["delta_indices"] = [-15, 0], [-2, -1, 0]
+    states_TP = np.arange(9, dtype=np.float32).reshape(3, 3)
+    pictures = tuple(np.full((8, 8, 3), shade, np.uint8) for shade in (3, 200))
+    last = {"arm": np.zeros((1, 20, 2)), "gripper": np.zeros((1, 20, 1))}
+    flat = {f"action.{name}": array[0] for name, array in last.items()}
+    server.script = lambda seen: flat if is_flat else [last, {}]
+    with server.running():
+        engine = engine_of(server, dataclasses.replace(named, window=window))
+        seen = Window(
+            frames=(pictures, pictures), states_TP=states_TP, is_video_padded_T=np.array([True, False]),
+            is_state_padded_T=np.zeros(3, np.bool_),
+        )  # fmt: skip
+        engine.invoke(dataclasses.replace(request_of(engine), window=seen))
+        assert len(engine.warm_up()) == 20
+    probed, asked = server.seen[0], server.seen[1]
+    if not is_flat:
+        assert probed["video"]["ego_view"].shape == (1, 2, 256, 256, 3)
+        asked = {f"{name}.{key}": array[0] for name in ("video", "state") for key, array in asked[name].items()}
+    np.testing.assert_array_equal(asked["video.ego_view"], np.stack(pictures))
+    np.testing.assert_array_equal(asked["state.arm"], states_TP[:, :2])
+    np.testing.assert_array_equal(asked["state.gripper"], states_TP[:, 2:])
+
+
+def test_a_window_is_in_the_ticks_of_the_robot(named: PolicyMapping) -> None:
+    window = ObservationWindow(video_ticks=(-10, 0))
+    server = GrootServer()
+    server.config["video"]["delta_indices"] = [-5, 0]
+    with server.running():
+        engine_of(server, dataclasses.replace(named, window=window, play_hz=40))
+        with pytest.raises(ValueError, match=r"test looks at \[-5, 0\] ticks at 40 Hz"):
+            engine_of(server, dataclasses.replace(named, play_hz=40, window=ObservationWindow(video_ticks=(-5, 0))))
+
+
+def test_a_mask_has_no_place_on_this_wire(named: PolicyMapping) -> None:
+    from pounce_server.remote.groot import GrootPeer
+
+    with pytest.raises(ValueError, match="leave video_pad and state_pad out"):
+        GrootPeer("tcp://127.0.0.1:9", dataclasses.replace(named, video_pad=("pad",)), is_flat=False)
+
+
 def test_an_episode_begins_with_a_reset(named: PolicyMapping, episode_info: Callable[..., Any], paper: Any) -> None:
     with GrootServer().running() as server:
         engine_of(server, named).begin(episode_info(paper))
@@ -187,7 +232,10 @@ def test_an_episode_begins_with_a_reset(named: PolicyMapping, episode_info: Call
         ("action", {"modality_keys": ["arm", "gripper", "waist"]}, "its action keys are arm, gripper, waist"),
         ("language", {"modality_keys": ["task"]}, "its language keys are task"),
         ("action", {"delta_indices": list(range(16))}, r"its action has 16 steps, expected 20 \(horizon\)"),
-        ("video", {"delta_indices": [-15, 0]}, "its video has 2 steps, expected 1: a history"),
+        ("video", {"delta_indices": [-15, 0]}, r"its video has the steps \[-15, 0\], test looks at \[0\]; say so in"),
+        ("state", {"delta_indices": [-1]}, r"its state has the steps \[-1\], test looks at \[0\]"),
+        ("state", {"delta_indices": ["0"]}, r"its state has the steps \['0'\], test looks at \[0\]"),
+        ("language", {"delta_indices": [-1, 0]}, "its language has 2 steps, expected 1"),
         ("video", {"delta_indices": None}, "expected a modality configuration with video"),
     ],
 )

@@ -17,6 +17,7 @@ import pytest
 from pounce_server.contract import example_request
 from pounce_server.remote.engine import RemoteEngine
 from pounce_server.remote.lerobot import LerobotPeer
+from protocol.messages import ObservationWindow
 from protocol.peers.mapping import Camera, Numbers, PolicyMapping, Prompt
 from protocol.topics import Priority
 from protocol.zenoh_bus import Endpoints, ZenohBus
@@ -203,6 +204,7 @@ def test_the_exchange_is_the_published_one(named: PolicyMapping, episode_info: C
         ({"execution_steps": 50}, "it answers 50 rows at 20 Hz; test has horizon 20 at 20 Hz"),
         ({"action_interval": 1 / 30}, "rows at 30 Hz"),
         ({"modes": ["rtc_guided"]}, "expected chunk among them"),
+        ({"current_observation_only": False}, "its policy reads earlier observations too"),
     ],
 )
 def test_another_deployment_is_refused_before_anything_moves(
@@ -250,6 +252,12 @@ def test_a_late_answer_is_not_the_next_ones(named: PolicyMapping) -> None:
             except ValueError:
                 time.sleep(0.1)
         np.testing.assert_allclose(rows[0], [0.1, 0.2, 0.3], rtol=1e-6)
+
+
+def test_a_window_is_refused(named: PolicyMapping) -> None:
+    windowed = dataclasses.replace(named, window=ObservationWindow(video_ticks=(-1, 0)))
+    with pytest.raises(ValueError, match=r"reads the current observation only; leave \[window\] out"):
+        LerobotPeer("tcp/127.0.0.1:7447#arm", windowed)
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pounce_server.contract import Request, example_request
+from pounce_server.contract import Request, Window, example_request
 from pounce_server.remote.engine import RemoteEngine
 from pounce_server.remote.openpi import OpenpiPeer
+from protocol.messages import ObservationWindow
 from protocol.peers.mapping import Camera, PolicyMapping, Prompt
 
 FAST_S = 0.3
@@ -46,6 +47,40 @@ def test_the_spec_is_the_mapping_files(openpi_server: Any, mapping: PolicyMappin
     assert (spec.num_carriers, spec.is_fake, spec.reads_subgoal) == (0, False, False)
     other = dataclasses.replace(mapping, digest="another")
     assert engine_of(openpi_server, other).spec.model_hash != spec.model_hash
+
+
+def test_a_window_comes_stacked_with_its_masks(openpi_server: Any, mapping: PolicyMapping) -> None:
+    window = ObservationWindow(video_ticks=(-1, 0), state_ticks=(-2, -1, 0))
+    windowed = dataclasses.replace(mapping, window=window, video_pad=("is_pad",), state_pad=("pads", "state"))
+    openpi_server.policy.script = lambda seen: {"actions": np.zeros((20, 3), np.float32)}
+    engine = engine_of(openpi_server, windowed)
+    past, now = (np.full((8, 8, 3), shade, np.uint8) for shade in (3, 9))
+    seen = Window(
+        frames=((past, now), (now, past)), states_TP=np.arange(9, dtype=np.float32).reshape(3, 3),
+        is_video_padded_T=np.array([True, False]), is_state_padded_T=np.array([True, True, False]),
+    )  # fmt: skip
+    engine.invoke(request_of(engine, window=seen))
+    asked = openpi_server.policy.seen[-1]
+    np.testing.assert_array_equal(asked["image"], np.stack([past, now]))
+    np.testing.assert_array_equal(asked["wrist_image"], np.stack([now, past]))
+    np.testing.assert_array_equal(asked["state"], seen.states_TP)
+    assert (list(asked["is_pad"]), list(asked["pads"]["state"])) == ([True, False], [True, True, False])
+
+
+def test_a_window_of_the_present_alone_is_asked_as_without_one(openpi_server: Any, mapping: PolicyMapping) -> None:
+    plain, twin = (
+        engine_of(openpi_server, dataclasses.replace(mapping, window=each)) for each in (None, ObservationWindow())
+    )
+    now = np.full((8, 8, 3), 9, np.uint8)
+    present = np.array([0.1, 0.2, 0.3], np.float32)
+    seen = Window(
+        frames=((now,), (now,)), states_TP=present[None],
+        is_video_padded_T=np.zeros(1, np.bool_), is_state_padded_T=np.zeros(1, np.bool_),
+    )  # fmt: skip
+    rows = plain.invoke(request_of(plain, frames=(now, now)))
+    assert (twin.invoke(request_of(twin, frames=(now, now), window=seen)) == rows).all()
+    first, second = ({k: np.asarray(v).tobytes() for k, v in each.items()} for each in openpi_server.policy.seen[-2:])
+    assert first == second
 
 
 def test_the_newest_subgoal_is_the_prompt(openpi_server: Any, mapping: PolicyMapping) -> None:

@@ -14,6 +14,7 @@ import pytest
 from pounce_server.contract import example_request
 from pounce_server.remote.engine import RemoteEngine
 from pounce_server.remote.vla_eval import VlaEvalPeer
+from protocol.messages import ObservationWindow
 from protocol.peers.mapping import Camera, Numbers, PolicyMapping, Prompt
 
 anyio = pytest.importorskip("anyio", reason="pip install vla-eval==0.8.0")
@@ -143,3 +144,8 @@ def test_what_the_server_says_of_an_error_is_told(serving: Any, named: PolicyMap
 def test_another_protocol_is_refused(openpi_server: Any, named: PolicyMapping) -> None:
     with pytest.raises(ValueError, match=r"expected a message with type and payload, as vla-eval 0\.8 sends them"):
         engine_of(openpi_server.url, named)
+
+
+def test_a_window_is_refused(named: PolicyMapping) -> None:
+    with pytest.raises(ValueError, match=r"keep their own history.*leave \[window\] out"):
+        VlaEvalPeer("ws://127.0.0.1:9", dataclasses.replace(named, window=ObservationWindow(state_ticks=(-1, 0))))

@@ -119,6 +119,33 @@ def test_what_is_wrong_is_named(read: Callable[..., Any], old: str, new: str, sa
     assert said in str(refused.value)
 
 
+def test_a_window_has_the_present_where_it_says_nothing(read: Callable[..., Any]) -> None:
+    found = read(("rate_hz = 15", "window = {state = [-2, 0], state_pad = 'is_pad'}\nrate_hz = 15"))
+    assert (found.window.video_ticks, found.window.state_ticks) == ((0,), (-2, 0))
+    assert (found.video_pad, found.state_pad) == (None, ("is_pad",))
+    assert read().window is None
+
+
+@pytest.mark.parametrize(
+    ("window", "said"),
+    [
+        ("{video = [-1]}", "[window] video = [-1]: they ascend, and end with 0"),
+        ("{video = [0, -1]}", "they ascend"),
+        ("{video = [-1, -1, 0]}", "they ascend"),
+        ("{video = [0, 1]}", "expected whole numbers from -100 to 0"),
+        ("{state = [-101, 0]}", "expected whole numbers from -100 to 0"),
+        ("{state = [-0.5, 0]}", "expected whole numbers"),
+        ("{state = []}", "expected whole numbers"),
+        (f"{{state = {list(range(-16, 1))}}}", "at most 16 of them"),
+        ("{frames = [-1, 0]}", "[window]: frames is not known"),
+    ],
+)
+def test_a_window_that_is_none_is_refused(read: Callable[..., Any], window: str, said: str) -> None:
+    with pytest.raises(FileError) as refused:
+        read(("rate_hz = 15", f"window = {window}\nrate_hz = 15"))
+    assert said in str(refused.value)
+
+
 def test_another_file_has_another_digest(read: Callable[..., Any]) -> None:
     assert read().digest != read(("scale = -2.0", "scale = -1.0")).digest
 
