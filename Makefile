@@ -11,7 +11,7 @@ export MUJOCO_GL ?= egl
 export OMP_NUM_THREADS ?= 1
 
 # `make help` lists the rest.
-.PHONY: help setup demo test unit oldest peers accept soak images site lint types proto bench clean
+.PHONY: help setup demo test unit oldest peers wheels accept soak images site lint types proto bench clean
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
 
@@ -86,6 +86,10 @@ peers: setup site $(LEROBOT)/.ready $(ROSBAGS)/.ready
 	for version in 3.12 3.13; do $(MAKE) setup VENV=$(VENV)/peers/$$version PYTHON=python$$version || exit 1; done
 	$(BIN)/python -m benchmarks.peers --pythons $(BIN)/python $(VENV)/peers/3.12/bin/python $(VENV)/peers/3.13/bin/python \
 		--lerobot $(LEROBOT)/bin/python --rosbags $(ROSBAGS)/bin/python
+
+## make wheels  every extra from the built wheel in an environment of its own (python3.11 to 3.13; an hour)
+wheels: setup
+	$(BIN)/python -m benchmarks.wheels
 
 ## make accept  a hundred oracle episodes of every task (about ten minutes)
 accept: setup
