@@ -280,8 +280,8 @@ def _lockstep(
     )
     outcome = Outcome(0, 0, 0, 0, 0, Counter(), "")
     before_mb = _rss_mb("self")
+    suite = Suite(plays, robot, clock, dead_server=lambda: "")
     while goes_on():
-        suite = Suite(plays, robot, clock, dead_server=lambda: "")
         (episode,) = suite.run(on_tick=lambda index, tick: on_tick(tick))["episodes"]
         outcome.episodes += 1
         judge(out / episode["mcap"], outcome)
