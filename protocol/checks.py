@@ -38,8 +38,6 @@ MAX_DECAY = 10  # per chunk: exp(-10) is negligible
 MAX_JOURNAL_ENTRIES = 64
 MAX_WINDOW = 16  # ticks at which a policy looks
 MAX_REACH_TICKS = 100  # raw pictures of so many ticks are 40 MB in a model server
-MAX_WINDOW = 16  # ticks at which a policy looks
-MAX_REACH_TICKS = 100  # raw pictures of so many ticks are 40 MB in a model server
 
 
 def _broken(message: object, field: str, expected: str, came: object) -> MalformedMessage:
