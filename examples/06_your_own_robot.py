@@ -25,9 +25,11 @@ ADDRESS = os.environ.get("ROBOT", "127.0.0.1:9100")
 class MyRobot:
     """Everything that is about this robot. No call blocks for longer than a tick."""
 
-    def __init__(self, cameras):
+    def __init__(self, cameras, welcome):
         self._arm, self._cameras = FakeArm(ADDRESS), cameras
         self._state = self._arm.call("read")["state"]
+        if welcome["robot"]["num_proprio"] != len(self._state):
+            raise ValueError(f"expected a gateway for {len(self._state)} measured numbers, came {welcome['robot']}")
 
     def observe(self):
         """Joints, pictures, when each was taken, and what the robot says of itself."""

@@ -54,7 +54,13 @@ class PonderpounceDialect:
                 "command_high": robot.command_high.tolist(),
                 "max_step": robot.max_step.tolist(),
                 "dimensions": [
-                    {"name": each.name, "kind": each.kind.name.lower(), "at_stop": each.at_stop.name.lower()}
+                    {
+                        "name": each.name,
+                        "kind": each.kind.name.lower(),
+                        "at_stop": each.at_stop.name.lower(),
+                        "unit": each.unit,
+                        "state": each.state_index,
+                    }
                     for each in robot.dimensions
                 ],
                 "stop_ticks": robot.stop_ticks,

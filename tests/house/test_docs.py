@@ -66,6 +66,8 @@ def _options() -> set[str]:
                             found |= {f"--{prefix}{name}", f"--{prefix}no-{name}"}
     client = ROOT / "integrations" / "ponderpounce_client" / "ponderpounce_client"
     program = (client / "program.py").read_text(encoding="utf-8")
+    strategy = ROOT / "integrations" / "lerobot_strategy_ponderpounce" / "lerobot_strategy_ponderpounce"
+    program += (strategy / "__main__.py").read_text(encoding="utf-8")
     return found | set(re.findall(r'"(--[a-z-]+)"', program))
 
 
@@ -73,7 +75,7 @@ def _options() -> set[str]:
 def test_options_that_are_named_exist(page: str) -> None:
     strangers = re.compile(
         r"^.*\b(?:pip|docker|apt-get|git|uv run|python gr00t\S*|vla-eval run|evaluator\.py"
-        r"|lerobot-rollout|lerobot-eval|lerobot_policy_ponderpounce) .*$",
+        r"|lerobot-rollout|lerobot-eval|lerobot_policy_ponderpounce|lerobot_strategy_ponderpounce) .*$",
         re.MULTILINE,
     )
     whole_lines = PAGES[page].replace("\\\n", " ")

@@ -76,6 +76,10 @@ def test_lerobot_s_evaluation_plays_our_rows(python: str, gateway: tuple[str, Pa
     assert (told["type"], told["class"]) == ("ponderpounce", "PonderpouncePolicy")
     actions = np.array(told["actions"])
     assert actions.shape == (2, 1, 5, 8)  # episodes, environments, steps, commands
+    end_s = time.monotonic() + PATIENCE_S
+    while (out / "log").read_text().count(" over ") < 2:  # the second episode ends as the client leaves
+        assert time.monotonic() < end_s, (out / "log").read_text()
+        time.sleep(0.1)
     logs = sorted((read_log(path) for path in out.rglob("*.mcap")), key=lambda log: log.info.header.epoch)
     assert [log.info.instruction for log in logs] == ["pick the cube"] * 2
     for log, played in zip(logs, actions, strict=True):

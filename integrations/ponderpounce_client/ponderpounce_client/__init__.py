@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from ponderpounce_client.client import Client, Command, Lost, Observation, Refused
 from ponderpounce_client.program import Robot, Settings, drive, main
-from ponderpounce_client.watchdog import Watchdog
+from ponderpounce_client.watchdog import Watchdog, leave_holding
 
 __all__ = [
-    "Client", "Command", "Lost", "Observation", "Refused", "Robot", "Settings", "Watchdog", "drive", "main",
+    "Client", "Command", "Lost", "Observation", "Refused", "Robot", "Settings", "Watchdog", "drive", "leave_holding",
+    "main",
 ]  # fmt: skip

@@ -211,7 +211,7 @@ def _row(values: Any) -> str:
 
 
 def main(
-    new_robot: Callable[[dict[str, Any]], Robot],
+    new_robot: Callable[[dict[str, Any], dict[str, Any]], Robot],
     stop: Callable[..., Any],
     stop_arguments: tuple[Any, ...] = (),
     argv: list[str] | None = None,
@@ -220,7 +220,8 @@ def main(
     """The command line of a robot's program; returns its exit code.
 
     Args:
-        new_robot: connects to the robot, and is given the cameras of ``--camera`` by name.
+        new_robot: connects to the robot, and is given the cameras of ``--camera`` by name and the gateway's
+            ``Client.welcome``, whose ``robot`` it may compare with its own. ValueError ends the program.
         stop: stops it, called in the watchdog's process with ``stop_arguments``.
     """
     parser = argparse.ArgumentParser(description=description)
@@ -255,7 +256,8 @@ def main(
                 said.instruction, said.task, said.speed, said.dry_run, said.yes,
                 at_exit if at_exit in AT_EXIT else "hold", said.max_s,
             )  # fmt: skip
-            why = drive(new_robot(_cameras(said.camera, said.camera_px)), client, settings, watchdog)
+            cameras = _cameras(said.camera, said.camera_px)
+            why = drive(new_robot(cameras, client.welcome), client, settings, watchdog)
     except (Lost, Refused, OSError, ValueError, ImportError) as error:
         why = str(error)
     finally:

@@ -20,6 +20,10 @@ _START_S = 30.0
 _ASLEEP, _ARMED, _FIRED, _CLOSED = 0, 1, 2, 3
 
 
+def leave_holding() -> None:
+    """``stop`` of a robot whose servos hold their last target by themselves: the program sends nothing from then on."""
+
+
 class Watchdog:
     """Calls ``stop(*arguments)`` in its own process as soon as no newer command has come in time. It fires once.
 
