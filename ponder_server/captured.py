@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from dual_system.models.fp8 import Fp8Linear
+from dual_system.models.gpu import send
 from dual_system.models.graphs import Capture, Work
 from dual_system.models.kernels.fp8 import FEW_ROWS, Quantised
 from dual_system.models.kernels.launch import Timer
@@ -211,7 +212,7 @@ class Forward:
         """Fills the buffers; padding must be finite."""
         self._embeds_BTH.copy_(embeds_BTH)
         rows = [[getattr(p, name) for p in places] for name in ("slot", "num_past", "num_new", "num_wanted")]
-        self._numbers.copy_(torch.cat([torch.tensor(rows).flatten(), positions_3BT.cpu().flatten()]))
+        send(torch.cat([torch.tensor(rows).flatten(), positions_3BT.cpu().flatten()]), self._numbers)
 
     def hidden(self, places: Sequence[Place]) -> list[Tensor]:
         """Hidden states (num_wanted, H) per row of the last run; copies, because the next run overwrites them."""

@@ -206,9 +206,10 @@ class Bucket:
         """Replaces the network's operations by those that are right and faster at this bucket's shapes."""
         network = self._network
         prefix_run = max(self._prefix_runs, key=lambda run: len(run.x))
-        prefix = rehearse(prefix_run, network.prefix_norms[1], *self._cache[0])
-        step = rehearse(self._action_run, network.step_norms[0][1], *self._cache[0])
-        step["euler"] = (torch.randn_like(self.actions), torch.randn_like(self.actions), network.action_out.bias, 1)
+        prefix = rehearse(prefix_run, network.prefix_norms[1], *self._cache[0], network.language.layers[0].gate_up)
+        step = rehearse(self._action_run, network.step_norms[0][1], *self._cache[0], network.expert.layers[0].gate_up)
+        actions, velocity = torch.randn_like(self.actions), torch.randn_like(self.actions)
+        step.parts["euler"] = (actions, velocity, network.action_out.bias, 1)
         tried = {"prefill": network.language.choose(prefix, timer), "step": network.expert.choose(step, timer)}
         for part, verdicts in tried.items():
             for verdict in verdicts:

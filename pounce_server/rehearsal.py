@@ -2,27 +2,36 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
 from dual_system.models.kernels.rms_norm import Residual
-from pounce_server.fused_stream import Norm, Run
-from pounce_server.kernels.rope import Slots
+from pounce_server.fused_stream import Norm, Run, Samples
+from pounce_server.kernels.rope import Slots, empty_queries
 
 NAN = float("nan")
 
 
-def rehearse(run: Run, norm: Norm, keys: Tensor, values: Tensor) -> dict[str, tuple[Any, ...]]:
-    """Arguments by operation: random numbers in ``run``'s buffers, and NaN where a kernel must write all."""
+def rehearse(run: Run, norm: Norm, keys: Tensor, values: Tensor, gate_up: Tensor) -> Samples:
+    """Random numbers in ``run``'s buffers and in the slots, a third of which is hidden, and NaN where a kernel must
+    write all. ``gate_up``: a layer's weights."""
     generator = torch.Generator(run.x.device).manual_seed(0)
-    for read in (run.x, run.branch, run.qkv, run.gate_up, run.rotation.cos, run.rotation.sin):
+    for read in (run.x, run.branch, run.qkv, run.rotation.cos, run.rotation.sin, keys, values):
         read.normal_(generator=generator)
-    for written in (run.normed, run.queries, run.activated):
+    visible = torch.ones_like(run.seen.bias[:, 0, 0], dtype=torch.bool)
+    visible[:, : visible.shape[1] // 3] = False
+    run.seen.place(visible, len(run.x) // len(visible))
+    slots = Slots(keys, values, run.first)
+    queries = empty_queries(run.qkv, slots)
+    for written in (run.normed, queries, run.activated):
         written.fill_(NAN)
-    return {
-        "norm": (run.x, run.normed, norm.style, Residual(run.branch, norm.gate)),
-        "rope": (run.qkv, run.rotation, run.queries, Slots(keys, values, run.first)),
-        "geglu": (run.gate_up, run.activated),
-    }
+    gate_and_up = run.x.new_empty(len(run.x), len(gate_up)).normal_(generator=generator)
+    return Samples(
+        parts={
+            "norm": (run.x, run.normed, norm.style, Residual(run.branch, norm.gate)),
+            "rope": (run.qkv, run.rotation, queries, slots),
+            "geglu": (gate_and_up, run.activated),
+        },
+        attend=(run.qkv, run.rotation, slots, run.seen),
+        geglu_product=(run.x, gate_up, run.activated),
+    )

@@ -375,8 +375,8 @@ def rounding_interpreter() -> Iterator[None]:
     """Triton's interpreter (3.6), made to round as a GPU does, and to count as NumPy 2.4 wants it.
 
     It cuts float32 to bfloat16, where a GPU rounds to the nearest, ties to even: cut numbers are all too small, and the
-    error would add up over layers as no GPU's does. Its fp8 has no carry of a rounded number and no NaN. Its
-    `range(loaded)` asks `int` for an array's number, which raises.
+    error would add up over layers as no GPU's does. Its fp8 has no carry of a rounded number and no NaN. It multiplies
+    the bits of bfloat16 matrices as whole numbers. Its `range(loaded)` asks `int` for an array's number, which raises.
     """
     try:
         import triton.language as tl
@@ -384,7 +384,7 @@ def rounding_interpreter() -> Iterator[None]:
     except ModuleNotFoundError:
         yield
         return
-    cut = interpreter.InterpreterBuilder.cast_impl
+    cut, product = interpreter.InterpreterBuilder.cast_impl, interpreter.InterpreterBuilder.create_dot
 
     def rounded(self: Any, source: Any, target_type: Any) -> Any:
         if source.dtype.scalar == tl.float32 and target_type.scalar == tl.bfloat16:
@@ -399,6 +399,14 @@ def rounding_interpreter() -> Iterator[None]:
         held = values.to(types[target_type.scalar]).view(bits[target_type.scalar]).numpy()
         return interpreter.TensorHandle(held, target_type.scalar)
 
+    def dot(self: Any, a: Any, b: Any, d: Any, *options: Any) -> Any:
+        def wide(handle: Any) -> Any:
+            if handle.dtype.scalar != tl.bfloat16:
+                return handle
+            return interpreter.TensorHandle(cut(self, handle, tl.float32).data, tl.float32)
+
+        return product(self, wide(a), wide(b), d, *options)
+
     class OfArrays(type):
         def __instancecheck__(cls, value: object) -> bool:
             return isinstance(value, int)
@@ -410,5 +418,6 @@ def rounding_interpreter() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(interpreter.InterpreterBuilder, "cast_impl", rounded)
         patch.setattr(interpreter.InterpreterBuilder, "create_fp_to_fp", to_or_from_fp8)
+        patch.setattr(interpreter.InterpreterBuilder, "create_dot", dot)
         patch.setattr(interpreter, "int", Integer, raising=False)
         yield

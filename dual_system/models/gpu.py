@@ -3,6 +3,7 @@
 from contextlib import AbstractContextManager, nullcontext
 
 import torch
+from torch import Tensor
 
 
 def settle(device: torch.device, *, tf32: bool = False) -> None:
@@ -29,3 +30,12 @@ def generator_for(device: torch.device, seed: int) -> torch.Generator:
     One seed gives the same weights on every CPU, and others on a GPU.
     """
     return torch.Generator(device if device.type == "cuda" else "cpu").manual_seed(seed)
+
+
+def send(host: Tensor, to: Tensor) -> None:
+    """Copies ``host`` to ``to``; if that is on a GPU, from pinned memory, so that the host does not wait for the work
+    before it. torch gives that memory to nobody else before the copy has ended."""
+    if to.device.type == "cuda":
+        to.copy_(host.pin_memory(), non_blocking=True)
+    else:
+        to.copy_(host)

@@ -45,10 +45,15 @@ def _geglu(gate_up_ptr: tl.tensor, out_ptr: tl.tensor, WIDTH: tl.constexpr, BLOC
     gate_at = gate_up_ptr + row * 2 * WIDTH + column
     gate = tl.load(gate_at, mask=is_inside, other=0.0).to(tl.float32)
     up = tl.load(gate_at + WIDTH, mask=is_inside, other=0.0).to(tl.float32)
+    out_at = out_ptr + row * WIDTH + column
+    tl.store(out_at, geglu(gate, up).to(out_ptr.dtype.element_ty), mask=is_inside)
+
+
+@kernel
+def geglu(gate: tl.tensor, up: tl.tensor) -> tl.tensor:
+    """gelu_tanh(gate) * up in float32, for kernels."""
     # (1 + tanh(u)) / 2 is the sigmoid of 2u; from exp(-|2u|), which cannot overflow.
     twice_u = 1.5957691216057308 * (gate + 0.044715 * gate * gate * gate)  # 2 * sqrt(2 / pi)
     decay = tl.exp(-tl.abs(twice_u))
     half_one_plus_tanh = tl.where(twice_u >= 0, 1.0, decay) / (1.0 + decay)
-    tl.store(
-        out_ptr + row * WIDTH + column, (gate * half_one_plus_tanh * up).to(out_ptr.dtype.element_ty), mask=is_inside
-    )
+    return gate * half_one_plus_tanh * up

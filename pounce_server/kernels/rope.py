@@ -27,6 +27,14 @@ class Slots:
     first: int
 
 
+def empty_queries(qkv: Tensor, slots: Slots) -> Tensor:
+    """Where the rotated queries of ``qkv`` go, (B, g, T * h/g, D)."""
+    batch_size, num_kv_heads, _, head_dim = slots.keys.shape
+    num_heads = qkv.shape[1] // head_dim - 2 * num_kv_heads
+    num_rows = num_heads // num_kv_heads * (len(qkv) // batch_size)
+    return qkv.new_empty(batch_size, num_kv_heads, num_rows, head_dim)
+
+
 def rope_eager(qkv: Tensor, rotation: Rotation, queries: Tensor, slots: Slots) -> None:
     """Writes rotated queries, and rotated keys and plain values into T of the slots.
 
@@ -51,18 +59,8 @@ def rope_fused(qkv: Tensor, rotation: Rotation, queries: Tensor, slots: Slots) -
     Raises:
         ValueError: shapes, dtypes or layouts do not match, or the tokens do not fit into the slots.
     """
-    batch_size, num_kv_heads, num_rows, head_dim = queries.shape
-    num_slots, num_tokens = slots.keys.shape[2], max(1, len(qkv) // batch_size)
-    num_heads = num_kv_heads * num_rows // num_tokens
-    num_all = num_heads + 2 * num_kv_heads
-    check_tensor("qkv", qkv, (batch_size * num_tokens, num_all * head_dim), qkv.dtype)
-    check_tensor("queries", queries, (batch_size, num_kv_heads, num_rows, head_dim), qkv.dtype)
-    for name, buffer in (("keys", slots.keys), ("values", slots.values)):
-        check_tensor(name, buffer, (batch_size, num_kv_heads, num_slots, head_dim), qkv.dtype)
-    for name, table in (("cos", rotation.cos), ("sin", rotation.sin)):
-        check_tensor(name, table, (batch_size, 1, num_tokens, head_dim // 2), torch.float32)
-    if not 0 <= slots.first <= num_slots - num_tokens:
-        raise ValueError(f"{num_tokens} tokens from slot {slots.first} on do not fit into {num_slots} slots")
+    num_tokens, num_heads = check_rope(qkv, rotation, queries, slots)
+    batch_size, num_kv_heads, num_slots, head_dim = slots.keys.shape
     _rope[(batch_size * num_tokens,)](
         qkv,
         rotation.cos,
@@ -76,9 +74,29 @@ def rope_fused(qkv: Tensor, rotation: Rotation, queries: Tensor, slots: Slots) -
         Q_HEADS=num_heads,
         KV_HEADS=num_kv_heads,
         PAIRS=head_dim // 2,
-        HEAD_BLOCK=block_size(num_all),
+        HEAD_BLOCK=block_size(num_heads + 2 * num_kv_heads),
         PAIR_BLOCK=block_size(head_dim // 2),
     )
+
+
+def check_rope(qkv: Tensor, rotation: Rotation, queries: Tensor, slots: Slots) -> tuple[int, int]:
+    """Tokens and query heads.
+
+    Raises:
+        ValueError: shapes, dtypes or layouts do not match, or the tokens do not fit into the slots.
+    """
+    batch_size, num_kv_heads, num_rows, head_dim = queries.shape
+    num_slots, num_tokens = slots.keys.shape[2], max(1, len(qkv) // batch_size)
+    num_heads = num_kv_heads * num_rows // num_tokens
+    check_tensor("qkv", qkv, (batch_size * num_tokens, (num_heads + 2 * num_kv_heads) * head_dim), qkv.dtype)
+    check_tensor("queries", queries, (batch_size, num_kv_heads, num_rows, head_dim), qkv.dtype)
+    for name, buffer in (("keys", slots.keys), ("values", slots.values)):
+        check_tensor(name, buffer, (batch_size, num_kv_heads, num_slots, head_dim), qkv.dtype)
+    for name, table in (("cos", rotation.cos), ("sin", rotation.sin)):
+        check_tensor(name, table, (batch_size, 1, num_tokens, head_dim // 2), torch.float32)
+    if not 0 <= slots.first <= num_slots - num_tokens:
+        raise ValueError(f"{num_tokens} tokens from slot {slots.first} on do not fit into {num_slots} slots")
+    return num_tokens, num_heads
 
 
 @kernel

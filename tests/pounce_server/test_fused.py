@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -208,7 +209,7 @@ def test_no_prompt_waits_for_a_capture(config: PounceConfig) -> None:
 def test_the_keys_of_an_action_fill_whole_slots(config: PounceConfig) -> None:
     fused = FusedPounce(model_of(config), TWINS)
     fused_actions(fused, with_tokens(config, 3), noise_for(config, 1))
-    widths = [bucket._action_run.bias.shape[-1] for bucket in fused._buckets.values()]
+    widths = [bucket._action_run.seen.bias.shape[-1] for bucket in fused._buckets.values()]
     assert len(widths) == NUM_BUCKETS
     assert all(width % SLOT_MULTIPLE == 0 for width in widths)
 
@@ -265,16 +266,19 @@ def test_a_kernel_that_is_wrong_broken_or_slow_is_not_taken_and_the_heartbeat_sa
     def own(x: Tensor, velocity: Tensor, bias: Tensor, num_steps: int) -> None:
         TWINS.euler(x, velocity, bias, num_steps)
 
-    operations = replace(TWINS, geglu=wrong, rope=broken, euler=own)
+    def whole(*arguments: Any) -> Tensor:
+        return TWINS.attend(*arguments)
+
+    operations = replace(TWINS, geglu=wrong, rope=broken, euler=own, attend=whole)
     model, inputs, noise = model_of(config), with_tokens(config, 3), noise_for(config, 1)
     expected = eager_actions(model, inputs, noise)
     fused = FusedPounce(model, operations, Recorder(), Timer(1e-3, 2e-3))
     assert fused.kernels == ""
     assert mean_error(fused_actions(fused, inputs, noise), expected) <= MAE["float32"]
-    assert fused._network.expert.do == replace(TWINS, euler=own)
+    assert fused._network.expert.do == replace(TWINS, euler=own, attend=whole)
     assert fused.kernels.startswith("kernels: norm 2/2, rope 0/2 (prefill: it does not run: RuntimeError: no kernel")
     assert "geglu 0/2 (prefill: it differs from its twin by 1.0e-02" in fused.kernels
-    assert fused.kernels.endswith("euler 1/1")
+    assert fused.kernels.endswith("attend 2/2, geglu_product 2/2, euler 1/1")
     slow = FusedPounce(model, operations, Recorder(), Timer(2e-3, 1e-3))
     fused_actions(slow, inputs, noise)
     assert slow._network.expert.do == slow._network.language.do == TWINS
@@ -316,7 +320,11 @@ def test_a_heartbeat_says_which_kernels_were_taken(monkeypatch: pytest.MonkeyPat
     link = Link(LocalBus(), robot="r0", proc="pounce")
     heartbeat = Heartbeat(link, "test", "host/monotonic")
     PounceServer(link, engine, heartbeat, "test").warm_up()
-    assert heartbeat.health.detail == engine.spec.kernels == "kernels: norm 2/2, rope 2/2, geglu 2/2, euler 1/1"
+    assert (
+        heartbeat.health.detail
+        == engine.spec.kernels
+        == ("kernels: norm 2/2, rope 2/2, geglu 2/2, attend 2/2, geglu_product 2/2, euler 1/1")
+    )
 
 
 def test_what_the_fused_path_cannot_do_is_refused() -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 from dual_system.models.kernels import rms_norm
 from dual_system.models.kernels.launch import Tolerance, block_size, missing_for
 from dual_system.models.pi05.gemma import AdaRmsNorm, GeGlu, GemmaConfig, RmsNorm, Rotation
-from pounce_server.kernels import euler, geglu, rope
+from pounce_server.kernels import attention, choice, euler, geglu, geglu_product, rope
 
 LACK = missing_for(torch.device("cpu"))
 interpreted = pytest.mark.skipif(bool(LACK), reason=LACK)
@@ -131,6 +131,100 @@ def test_rope(batch: int, tokens: int, share: int, kv_heads: int, pairs: int, dt
         results.append((queries, keys[:, :, here], values[:, :, here]))
     for expected, actual in zip(*results, strict=True):
         check(actual, expected, rope.TOLERANCE)
+    arena.check_guards()
+
+
+def attended(
+    arena: Arena, batch: int, tokens: int, cached: int, heads: tuple[int, int], pairs: int, *, is_missing: bool
+) -> None:
+    """The kernel's mixed values, keys and values beside the twin's; its slots hold NaN where nothing is visible."""
+    share, kv_heads = heads
+    first_slot = 3  # those before it belong to another stream
+    slots = first_slot + cached + tokens + 1
+    qkv = arena.drawn(batch * tokens, (share + 2) * kv_heads * 2 * pairs)
+    rotation = Rotation.at(torch.randint(-9, 900, (batch, tokens), generator=arena.generator), 2 * pairs)
+    seen = attention.Seen.blank(slice(first_slot, slots - 1), tokens, batch, qkv)
+    visible = torch.rand(batch, cached + tokens, generator=arena.generator) < 0.7
+    visible[:, -1] = True
+    if is_missing:  # a camera
+        visible[0, cached // 4 : cached // 4 + 130] = False
+    seen.place(visible, tokens)
+    memory = [arena.drawn(batch, kv_heads, slots, 2 * pairs) for _ in "kv"]
+    results = []
+    for run in (attention.attend_eager, attention.attend_fused):
+        keys, values = (buffer.clone() for buffer in memory)
+        if run is attention.attend_fused:
+            is_hidden = torch.ones(batch, slots, dtype=torch.bool)
+            is_hidden[:, first_slot : slots - 1] = ~visible
+            keys.transpose(1, 2)[is_hidden] = values.transpose(1, 2)[is_hidden] = torch.nan
+        mixed = run(rope.rope_eager, qkv, rotation, rope.Slots(keys, values, first_slot + cached), seen)
+        own = slice(first_slot + cached, first_slot + cached + tokens)
+        results.append((mixed, keys[:, :, own], values[:, :, own]))
+        if run is attention.attend_fused:
+            assert keys[:, :, :first_slot].isnan().all()
+            assert keys[:, :, -1].isnan().all()
+    for expected, actual in zip(*results, strict=True):
+        check(actual, expected, attention.TOLERANCE)
+    arena.check_guards()
+
+
+@interpreted
+@settings(max_examples=6)
+@given(
+    st.integers(1, 2),
+    st.integers(1, 19),
+    st.integers(0, 200),
+    st.sampled_from([(1, 1), (3, 2), (8, 1)]),
+    st.integers(1, 9),
+    dtypes,
+    st.booleans(),
+    seeds,
+)
+def test_attention_of_few_tokens(
+    batch: int,
+    tokens: int,
+    cached: int,
+    heads: tuple[int, int],
+    pairs: int,
+    dtype: torch.dtype,
+    is_missing: bool,
+    seed: int,
+) -> None:
+    """They rotate their own keys, which nobody may read from the slots before."""
+    attended(Arena(seed, dtype), batch, tokens, cached, heads, pairs, is_missing=is_missing)
+
+
+@interpreted
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("cached", [0, 70])
+def test_attention_of_many_tokens(dtype: torch.dtype, cached: int) -> None:
+    tokens = attention.MOST_ROTATED + 50
+    attended(Arena(5, dtype), 1, tokens, cached, (2, 1), 5, is_missing=True)
+
+
+@interpreted
+def test_a_missing_camera_is_not_read() -> None:
+    """A block of slots without one that is seen costs nothing: 256 of 848 slots."""
+    seen = attention.Seen.blank(slice(0, 868), 20, 1, torch.empty(0))
+    visible = torch.ones(1, 868, dtype=torch.bool)
+    assert seen.blocks[0].tolist() == [14, *range(14)]
+    visible[:, 264:520] = False  # the second of three
+    visible[:, 837:848] = False  # the bucket's padding
+    seen.place(visible, 20)
+    assert seen.blocks[0, :12].tolist() == [11, 0, 1, 2, 3, 4, 8, 9, 10, 11, 12, 13]
+
+
+@interpreted
+@settings(max_examples=8)
+@given(st.integers(1, 140), st.integers(1, 70), st.integers(1, 70), dtypes, seeds)
+def test_the_product_that_ends_in_its_gate(rows: int, inputs: int, width: int, dtype: torch.dtype, seed: int) -> None:
+    arena = Arena(seed, dtype)
+    x, weight, out = arena.drawn(rows, inputs), arena.drawn(2 * width, inputs), arena.poisoned(rows, width)
+    weight /= inputs**0.5
+    expected = torch.empty_like(out)
+    geglu_product.geglu_product_eager(choice.product, geglu.geglu_eager, x, weight, expected)
+    geglu_product.geglu_product_fused(choice.product, geglu.geglu_fused, x, weight, out)
+    check(out, expected, geglu_product.TOLERANCE)
     arena.check_guards()
 
 

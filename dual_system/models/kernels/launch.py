@@ -31,7 +31,7 @@ class Tolerance:
     atol: float
 
 
-def kernel(function: Callable[..., None]) -> Any:
+def kernel(function: Callable[..., Any]) -> Any:
     """`triton.jit`, or the plain function without Triton, so that the module can be imported and its twin run.
 
     The environment variable TRITON_INTERPRET, read here, selects Triton's interpreter.
