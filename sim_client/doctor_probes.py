@@ -190,8 +190,10 @@ def gl(backend: str, run: Run = run) -> Finding:
     if ran.code == 0 and contrast and int(contrast[1]) > 0:
         return Finding("gl", Level.OK, "a 64 px frame came out")
     text = "the frame came out empty" if contrast else f"no frame: {ran.last_line}"
-    packages = GL_PACKAGES.get(backend)
-    if packages is None:
+    packages, platform = GL_PACKAGES.get(backend), os.environ.get("PYOPENGL_PLATFORM", backend)
+    if packages is not None and platform not in ("", backend):
+        way_out = f"PYOPENGL_PLATFORM={platform} contradicts MUJOCO_GL={backend}: unset it"
+    elif packages is None:
         way_out = f"MUJOCO_GL={backend} needs a display; without one use MUJOCO_GL=egl or osmesa"
     else:
         way_out = f"{_apt(*packages)}; then MUJOCO_GL={backend}"

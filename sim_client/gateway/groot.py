@@ -92,6 +92,10 @@ class GrootDialect:
             if camera.key is not None:
                 name, array = self._entry(observation, "video", camera.key)
                 frames[camera.camera] = reading.picture(self._current(array, name, 3), name)
+        read = {named(camera.key) for camera in self._mapping.cameras if camera.key is not None}
+        sent = observation if self.is_flat else self._within(observation, "video") if read else {}
+        videos = (str(key) for key in sent if not self.is_flat or str(key).startswith("video."))
+        reading.tell_unread(key for key in videos if key.removeprefix("video.") not in read)
         return frames
 
     def _state(self, observation: Mapping[Any, Any]) -> Any:

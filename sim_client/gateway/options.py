@@ -137,7 +137,8 @@ class GatewayOptions:
     """TOML description of the robot, see docs/robots.md. None: the Panda of our tasks and of RoboMME."""
     cameras: tuple[str, ...] = ()
     """Pairs NAME=KEY, one per camera of ours, e.g. front=observation/image wrist=observation/wrist_image. Empty: the
-    dialect's usual keys; in vla-eval the first picture is the front camera's and the second the wrist's."""
+    dialect's usual keys; in vla-eval our cameras' names, or else the first picture is the front camera's, the second
+    the wrist's, and a third is refused."""
     mapping: Path | None = None
     """TOML file with the client's names and units for cameras, state and actions, for the dialects of GR00T and
     LeRobot; see docs/policies.md."""

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+import logging
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -12,6 +15,8 @@ from protocol.messages import Floats
 from sim_client.gateway.arrays import unpack
 from sim_client.gateway.exchange import Frames, Packet, Refused
 from sim_client.gateway.pictures import EncodedPicture
+
+log = logging.getLogger(__name__)
 
 
 def message(packet: Packet) -> dict[Any, Any]:
@@ -39,6 +44,9 @@ def text(values: Mapping[Any, Any], key: str) -> str:
     value = field(values, key, "what the robot is to do")
     if isinstance(value, Sequence) and not isinstance(value, str | bytes) and value:
         value = value[0]
+    if isinstance(value, bytes):
+        with contextlib.suppress(UnicodeDecodeError):
+            value = value.decode()
     if not isinstance(value, str) or not value.strip():
         raise Refused(f"{key}: expected a sentence that says what to do, came {str(value)[:80]!r}")
     return value
@@ -69,19 +77,43 @@ def picture(value: Any, name: str) -> NDArray[np.uint8]:
 
 
 def frames(pictures: Mapping[Any, Any], cameras: Mapping[str, str]) -> Frames:
-    """One picture per camera of ours: under its key, or, where the key is empty, the next one in the client's order."""
-    rest = iter(pictures.items())
-    found: dict[str, NDArray[np.uint8]] = {}
-    for camera, key in cameras.items():
-        if key:
-            found[camera] = picture(field(pictures, key, f"the {camera} camera"), key)
-            continue
-        name, value = next(rest, (None, None))
-        if name is None:
+    """One picture per camera of ours: under its key; where that is empty, under our camera's own name, and for cameras
+    without one the others in the client's order. A picture that is read by no camera is named in the log.
+
+    Raises:
+        Refused: a camera has no picture, or more pictures came in the client's order than there are cameras for them.
+    """
+    keys = {camera: key or camera for camera, key in cameras.items() if key or camera in pictures}
+    found = {camera: picture(field(pictures, key, f"the {camera} camera"), key) for camera, key in keys.items()}
+    if len(keys) < len(cameras):
+        rest = [name for name in pictures if name not in keys.values()]
+        if len(rest) != len(cameras) - len(keys):
             expected = f"{len(cameras)} ({', '.join(cameras)})"
-            raise Refused(f"pictures: expected {expected}, came {len(pictures)} ({_names(pictures)})")
-        found[camera] = picture(value, str(name))
+            way_out = ". Say with --cameras NAME=KEY which camera is which" if len(pictures) > len(cameras) else ""
+            raise Refused(f"pictures: expected {expected}, came {len(pictures)} ({_names(pictures)}){way_out}")
+        unnamed = (camera for camera in cameras if camera not in keys)
+        return found | {camera: picture(pictures[name], str(name)) for camera, name in zip(unnamed, rest, strict=True)}
+    tell_unread(name for name in _pictures_in(pictures) if name not in keys.values())
     return found
+
+
+def tell_unread(names: Iterable[str]) -> None:
+    """Says in the log, once, under which names came pictures that no camera of ours is for."""
+    if unread := tuple(sorted(name[:80] for name in names))[:12]:
+        _tell_once(unread)
+
+
+@lru_cache(maxsize=64)
+def _tell_once(names: tuple[str, ...]) -> None:
+    log.warning("pictures that no camera of ours is for: %s; see --cameras and the mapping file", ", ".join(names))
+
+
+def _pictures_in(values: Mapping[Any, Any]) -> Iterator[str]:
+    for name, value in values.items():
+        for inner, each in value.items() if isinstance(value, Mapping) else (("", value),):
+            is_pixels = isinstance(each, np.ndarray) and each.dtype == np.uint8 and each.ndim >= 3
+            if is_pixels or isinstance(each, EncodedPicture):
+                yield f"{name}/{inner}" if inner else str(name)
 
 
 def videos(streams: Mapping[str, Any]) -> Sequence[Frames]:

@@ -266,3 +266,10 @@ def test_a_daemon_on_a_socket_is_recognised_by_its_token() -> None:
             assert look.sockets(Path(folder)).text == f"in {folder}: clock of r7"
         finally:
             bus.close()
+
+
+def test_gl_settings_that_contradict_each_other_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYOPENGL_PLATFORM", "osmesa")
+    said = "PYOPENGL_PLATFORM=osmesa contradicts MUJOCO_GL=egl: unset it"
+    assert look.gl("egl", ends(1, "AttributeError")).way_out == said
+    assert "libosmesa6" in look.gl("osmesa", ends(1, "")).way_out

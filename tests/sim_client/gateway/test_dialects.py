@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protocol import messages as m
-from sim_client.gateway import challenge, mme_vla, openpi, vla_eval
+from sim_client.gateway import challenge, mme_vla, openpi, reading, vla_eval
 from sim_client.gateway.arrays import pack, unpack
 from sim_client.gateway.exchange import Answer, ClientRequest, Finish, Refused, Step, Terms
 
@@ -267,7 +267,7 @@ def test_vla_eval_a_runner_of_the_other_mode_is_told_at_each_observation(
         ({"images": {}}, "expected 2 .front, wrist., came 0"),
         ({"images": [1]}, "expected pictures by camera"),
         ({"states": None}, "expected 3 numbers"),
-        ({"task_description": b"pick"}, "expected a sentence"),
+        ({"task_description": b"\xff\xfe"}, "expected a sentence"),
         ({"video_history": 3}, "a list of frames per camera"),
         ({"video_history": [1], "wrist_video_history": []}, "equally long"),
     ],
@@ -371,3 +371,62 @@ def test_mme_vla_a_client_that_plays_other_numbers_of_rows_is_told(
     speak_mme_vla.read(openpi_packet(picture_of))
     with pytest.raises(Refused, match="start pp-gateway with --rows 3"):
         speak_mme_vla.read(mme_vla_buffer(picture_of, [1, 2, 3]))
+
+
+TEXT = "按下 the button"
+
+
+def spelled(array: np.ndarray) -> dict[str, Any]:
+    return {"__ndarray__": True, "data": array.tobytes(), "dtype": array.dtype.str, "shape": list(array.shape)}
+
+
+def spelled_by_msgpack_numpy(array: np.ndarray) -> dict[bytes, Any]:
+    return {b"nd": True, b"type": array.dtype.str, b"shape": list(array.shape), b"data": array.tobytes()}
+
+
+@pytest.mark.parametrize("spell", [spelled, spelled_by_msgpack_numpy])
+@pytest.mark.parametrize("prompt", [TEXT, [TEXT, "other"], TEXT.encode(), np.asarray(TEXT), np.asarray([TEXT])])
+def test_a_prompt_is_read_however_it_is_spelled(prompt: Any, spell: Callable[[np.ndarray], Any]) -> None:
+    sent = spell(prompt) if isinstance(prompt, np.ndarray) else prompt
+    assert reading.text(unpack(pack({"prompt": sent}, "openpi")), "prompt") == TEXT
+
+
+CAMERAS = ("front", "wrist", "side")
+
+
+@given(
+    cameras=st.sets(st.sampled_from(CAMERAS), min_size=1).map(sorted),
+    sent=st.permutations([*CAMERAS, "agentview", "third"]).flatmap(
+        lambda names: st.integers(0, 5).map(lambda num: names[:num])
+    ),
+)
+def test_a_picture_goes_to_the_camera_that_its_name_says_and_none_is_dropped(
+    picture_of: PictureOf, cameras: list[str], sent: list[str]
+) -> None:
+    pictures = {name: picture_of(shade) for shade, name in enumerate(sent)}
+    by_name = set(cameras) <= set(sent)
+    if len(sent) != len(cameras) and not by_name:
+        with pytest.raises(Refused, match=f"expected {len(cameras)}"):
+            reading.frames(pictures, dict.fromkeys(cameras, ""))
+        return
+    frames = reading.frames(pictures, dict.fromkeys(cameras, ""))
+    shades = {camera: int(frame[0, 0, 0]) for camera, frame in frames.items()}
+    assert set(shades) == set(cameras)
+    for camera in set(cameras) & set(sent):
+        assert sent[shades[camera]] == camera
+    if not by_name:
+        assert sorted(shades.values()) == list(range(len(sent)))
+
+
+def test_a_picture_of_no_camera_is_told_once(
+    speak_openpi: openpi.OpenpiDialect, picture_of: PictureOf, caplog: pytest.LogCaptureFixture
+) -> None:
+    seen = {
+        "observation/image": picture_of(1), "observation/wrist_image": picture_of(2),
+        "observation/third_image": picture_of(3), "images": {"cam_4": picture_of(4), "depth": np.zeros(3)},
+        openpi.STATE_KEY: np.zeros(3, np.float32), "prompt": "pick",
+    }  # fmt: skip
+    for _ in range(2):
+        understood(speak_openpi.read(pack(seen, "openpi")))
+    (told,) = (record.getMessage() for record in caplog.records if "no camera" in record.getMessage())
+    assert "images/cam_4, observation/third_image; see --cameras" in told
