@@ -83,7 +83,9 @@ def _seats(options: GatewayOptions, daemons: Daemons, metrics: Metrics) -> Itera
         if options.watch is not None:
             # Not among the servers: an episode goes on without a page.
             link = _watched(opened.enter_context(Daemons(options.out)), link, options.watch)
-        yield Seats([_machine(options, replace(link, robot=robot), daemons, metrics, opened) for robot in robots])
+        machines = [_machine(options, replace(link, robot=robot), daemons, metrics, opened) for robot in robots]
+        # An HTTP client is its host: it comes back under the same name.
+        yield Seats(machines, resets_inherit=not options.is_realtime and options.dialect != "challenge-http")
 
 
 def _watched(daemons: Daemons, link: LinkOptions, listen: str) -> LinkOptions:

@@ -37,7 +37,7 @@ class ChallengeDialect:
     def read(self, packet: Packet) -> ClientRequest:
         message = reading.message(packet)
         if message.get("reset"):
-            return ClientRequest(Finish(), reply=pack(RESET_FINISHED, "openpi"))
+            return ClientRequest(Finish(is_reset=True), reply=pack(RESET_FINISHED, "openpi"))
         begins = bool(reading.field(message, "is_first_step", "whether an episode begins"))
         lists = {name: _list(message, key) for name, key in self._terms.cameras.items()}
         seen = reading.videos(lists)

@@ -81,6 +81,8 @@ class Finish:
 
     status: TaskStatus = TaskStatus.ONGOING
     reason: str = "the client went on without saying how the episode ended"
+    is_reset: bool = False
+    """A new episode is about to begin: whoever says so over a new connection may have left an old one open."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

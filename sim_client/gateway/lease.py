@@ -16,18 +16,19 @@ class Lease:
 
     idle_ns: int
     holder: str = ""
-    _heard_ns: int = 0
+    heard_ns: int = 0
+    """When the holder asked last."""
 
     def acquire(self, client: str, now_ns: int) -> None:
         """Raises Busy while another client holds it."""
-        silent_ns = now_ns - self._heard_ns
+        silent_ns = now_ns - self.heard_ns
         if self.holder not in ("", client) and silent_ns < self.idle_ns:
             raise Busy(
                 f"this robot is driven by {self.holder}, which asked {silent_ns / 1e9:.0f} s ago. Wait until it has "
                 f"finished, or been silent for {self.idle_ns / 1e9:.0f} s; or start another pp-gateway with servers "
                 "of its own."
             )
-        self.holder, self._heard_ns = client, now_ns
+        self.holder, self.heard_ns = client, now_ns
 
     def release(self, client: str) -> None:
         """Gives it back if this client holds it."""

@@ -149,6 +149,11 @@ class Machine:
         """The client that has the robot; "" if it is free."""
         return self._lease.holder
 
+    @property
+    def heard_ns(self) -> int:
+        """When the holder asked last (monotonic)."""
+        return self._lease.heard_ns
+
     def unready(self) -> str:
         """Why no episode could begin: a sentence; "" if the model servers say that they are ready."""
         if self._is_closed:

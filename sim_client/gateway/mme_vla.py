@@ -37,7 +37,7 @@ class MmeVlaDialect:
         message = reading.message(packet)
         if message.get("reset"):
             self._buffer, self._demo, self._last = [], [], None
-            return ClientRequest(Finish(), reply=pack({"reset_finished": True}, "openpi"))
+            return ClientRequest(Finish(is_reset=True), reply=pack({"reset_finished": True}, "openpi"))
         if message.get("add_buffer"):
             self._fill(message)
             return ClientRequest(None, reply=pack({"add_buffer_finished": True}, "openpi"))

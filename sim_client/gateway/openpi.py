@@ -33,7 +33,7 @@ class OpenpiDialect:
         message = reading.message(packet)
         if message.get("reset"):
             self._instruction = None
-            return ClientRequest(Finish(), reply=pack({"reset_finished": True}, "openpi"))
+            return ClientRequest(Finish(is_reset=True), reply=pack({"reset_finished": True}, "openpi"))
         instruction = reading.text(message, PROMPT_KEY)
         state = reading.field(message, self._terms.state_key, "the measured joints")
         step = Step(

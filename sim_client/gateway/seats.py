@@ -23,10 +23,16 @@ def seat_names(robot: str, count: int) -> tuple[str, ...]:
 
 
 class Seats:
-    """Hands each client's requests to its seat. ``submit`` is for network threads, as a machine's."""
+    """Hands each client's requests to its seat. ``submit`` is for network threads, as a machine's.
 
-    def __init__(self, machines: Sequence[Machine]) -> None:
+    ``resets_inherit``: whether a reset over a new connection, if no seat is free, ends the episode of the same host's
+    connection that has been silent for longest. The evaluator of RoboMME's policy repository opens one an episode and
+    closes none. For lockstep alone: there the robot is simulated.
+    """
+
+    def __init__(self, machines: Sequence[Machine], *, resets_inherit: bool = False) -> None:
         self._machines = machines
+        self._resets_inherit = resets_inherit
         self._lock = threading.Lock()  # of finding a seat and taking it
 
     def submit(self, client: str, request: Step | Finish) -> Future[Answer | None]:
@@ -38,6 +44,9 @@ class Seats:
         """
         with self._lock:
             theirs = [each for each in self._machines if each.holder == client]
+            if isinstance(request, Finish) and not theirs and request.is_reset and self._resets_inherit:
+                theirs = self._left_behind(client)
+                client = theirs[0].holder if theirs else client
             if theirs or isinstance(request, Finish):
                 return (theirs or self._machines)[0].submit(client, request)
             working = [each for each in self._machines if not each.is_closed] or self._machines
@@ -52,6 +61,13 @@ class Seats:
             f"all {len(working)} seats are taken, one of them by {working[-1].holder}. Wait until a client has "
             "finished or left, or start pp-gateway with more --seats, and its servers with as many robots."
         )
+
+    def _left_behind(self, client: str) -> list[Machine]:
+        """The seat that another connection of the client's host may have left behind; [] while a seat is free."""
+        if not all(each.holder for each in self._machines):
+            return []
+        of_host = [each for each in self._machines if _host(each.holder) == _host(client)]
+        return sorted(of_host, key=lambda each: each.heard_ns)[:1]
 
     def unready(self) -> str:
         """Why no seat could begin an episode; "" if one can, were it free."""
@@ -94,3 +110,8 @@ def _run(machine: Machine, should_stop: Callable[[], bool], is_draining: Callabl
         machine.run(should_stop, is_draining)
     except Exception:  # a bug: the others' robots are not to stop for it
         log.exception("seat=%s failed, and is closed", machine.robot)
+
+
+def _host(client: str) -> str:
+    """``client``: HOST:PORT."""
+    return client.rpartition(":")[0]

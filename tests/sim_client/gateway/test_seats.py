@@ -35,6 +35,10 @@ class Seat:
     def holder(self) -> str:
         return self.lease.holder
 
+    @property
+    def heard_ns(self) -> int:
+        return self.lease.heard_ns
+
     def submit(self, client: str, request: Step | Finish) -> Future[Answer | None]:
         if isinstance(request, Finish):
             self.lease.release(client)
@@ -44,9 +48,9 @@ class Seat:
         return Future()
 
 
-def hall(count: int, idle_ns: int = 10**12) -> tuple[Seats, list[Seat]]:
+def hall(count: int, idle_ns: int = 10**12, *, resets_inherit: bool = False) -> tuple[Seats, list[Seat]]:
     seats = [Seat(robot, Lease(idle_ns)) for robot in seat_names("r0", count)]
-    return Seats(seats), seats  # type: ignore[arg-type]
+    return Seats(seats, resets_inherit=resets_inherit), seats  # type: ignore[arg-type]
 
 
 clients = st.sampled_from("abcdef")
@@ -84,6 +88,34 @@ def test_a_free_seat_is_taken_before_one_whose_client_fell_silent() -> None:
     assert [seat.holder for seat in seats] == ["anna", "berta"]
     door.submit("carla", step())
     assert [seat.holder for seat in seats] == ["carla", "berta"]
+
+
+@pytest.mark.parametrize(
+    ("client", "request_", "left"),
+    [
+        ("10.0.0.1:9", Finish(is_reset=True), ["10.0.0.1:1", ""]),
+        ("10.0.0.1:9", Finish(), ["10.0.0.1:1", "10.0.0.1:2"]),
+        ("10.0.0.2:9", Finish(is_reset=True), ["10.0.0.1:1", "10.0.0.1:2"]),
+    ],
+    ids=["a reset of the same host", "a client that leaves", "another host's reset"],
+)
+def test_a_reset_over_a_new_connection_ends_what_the_last_one_left_open(
+    client: str, request_: Finish, left: list[str]
+) -> None:
+    """As RoboMME's policy repository's evaluator does it, once an episode."""
+    door, seats = hall(2, resets_inherit=True)
+    for number, seat in enumerate(seats):
+        seat.now_ns = 5 - number  # the second was silent for longer
+        door.submit(f"10.0.0.1:{number + 1}", step())
+    door.submit(client, request_)
+    assert [seat.holder for seat in seats] == left
+
+
+def test_a_reset_takes_nobodys_robot_while_a_seat_is_free_or_in_real_time() -> None:
+    for door, seats in (hall(2, resets_inherit=True), hall(1)):
+        door.submit("10.0.0.1:1", step())
+        door.submit("10.0.0.1:2", Finish(is_reset=True))
+        assert seats[0].holder == "10.0.0.1:1"
 
 
 def test_names_are_different_and_the_first_is_the_robots_own() -> None:
