@@ -29,6 +29,7 @@ from google.protobuf.message import Message as Proto
 from benchmarks.report import Report, Row, show
 from benchmarks.rig import ROBOT, Rig
 from clock.check import disagreements
+from clock.check_gaps import before_gaps
 from protocol import codec, topics
 from protocol import messages as m
 from protocol.bus import LocalBus
@@ -173,6 +174,8 @@ class Outcome:
     """Commands outside of the joint limits or farther than a step from the one before."""
     disagree: int
     """Logs that ``pp-check`` disputes."""
+    gaps: int
+    """Logs that end for it before messages that never reached the recorder."""
     dropped: Counter[str]
     growth_mb: str
     robot: m.Robot | None = None
@@ -278,7 +281,7 @@ def _lockstep(
     plays = SimOptions(
         in_process=True, schedule=ScheduleOptions(max_steps=200), out=out, servers=ServersOptions(patience_s=patience_s)
     )
-    outcome = Outcome(0, 0, 0, 0, 0, Counter(), "")
+    outcome = Outcome(0, 0, 0, 0, 0, 0, Counter(), "")
     before_mb = _rss_mb("self")
     suite = Suite(plays, robot, clock, dead_server=lambda: "")
     while goes_on():
@@ -307,7 +310,8 @@ def _read(path: Path, outcome: Outcome) -> EpisodeRecord:
 
 def _judge(path: Path, outcome: Outcome) -> None:
     """Counts unsound commands, and whether the log follows from itself."""
-    record = _read(path, outcome)
+    record, gap = before_gaps(_read(path, outcome))
+    outcome.gaps += bool(gap)
     outcome.unsound += _num_unsound(record.info.robot, record.actions)
     if dispute := next(disagreements(record), None):
         outcome.disagree += 1
@@ -333,7 +337,7 @@ def _num_unsound(robot: m.Robot, actions: Sequence[m.Action]) -> int:
 def realtime(options: FuzzOptions) -> Outcome:
     """Real processes over sockets: a stranger repeats what it hears, damaged, as fast as the machine allows."""
     count, mutate, sent = _half(options), Mutator(options.seed + 2), Counter[str]()
-    outcome = Outcome(0, 0, 0, 0, 0, Counter(), "")
+    outcome = Outcome(0, 0, 0, 0, 0, 0, Counter(), "")
     with tempfile.TemporaryDirectory() as name, Rig(Path(name)) as rig:
         folder, bus = Path(name), rig.bus
         ear = Link(bus, robot=ROBOT, proc="clock")
@@ -410,6 +414,7 @@ def _row(stage: str, each: Outcome) -> Row:
         "failures": each.failures,
         "unsound_commands": each.unsound,
         "logs_disputed": each.disagree,
+        "logs_with_gaps": each.gaps,
         "growth_mb": each.growth_mb,
         "dropped": ", ".join(f"{reason} {count}" for reason, count in sorted(each.dropped.items())),
     }
