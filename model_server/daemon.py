@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Protocol, TypeVar
@@ -19,6 +20,8 @@ from protocol.sockets import endpoint
 from protocol.version import version
 
 EngineT = TypeVar("EngineT")
+
+_SHADOW_NICENESS = 10  # a ninth of the processor time of whatever drives, where there is not enough
 
 
 class ModelServer(Protocol):
@@ -54,12 +57,13 @@ def serve_model(
         load: builds the engine; raises OSError or ValueError with a message for the user.
         make: builds the server around the engine.
         operations: what it tells its operators, and how it leaves; None: logs on standard error.
-        is_shadow: answer for the log only, beside the server that is used.
+        is_shadow: answer for the log only, beside the server that is used, and with a lower priority than whatever is.
 
     Raises:
         CommandError, OSError, ValueError: it could not start; the message is for the user.
     """
     if is_shadow:
+        os.nice(_SHADOW_NICENESS)  # before there are threads: each has its own
         link_options = behind(link_options, proc)
     with daemon(link_options, operations or DaemonOptions()) as (bus, metrics, should_stop):
         link = Link(bus, robot=link_options.robot, proc=f"{proc}-shadow" if is_shadow else proc)

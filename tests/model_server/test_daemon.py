@@ -60,3 +60,14 @@ def test_a_taken_metrics_port_is_a_sentence(healths: Stream[Health]) -> None:
         options = DaemonOptions(metrics=f"127.0.0.1:{taken.getsockname()[1]}")
         with pytest.raises(TransportError, match=f"--metrics {options.metrics}: Address already in use"):
             serve_model("ponder", LinkOptions(), "random", object, lambda *_: Broken(), options)
+
+
+@pytest.mark.parametrize(("is_shadow", "expected"), [(True, [10]), (False, [])])
+def test_a_shadow_alone_steps_back(
+    healths: Stream[Health], monkeypatch: pytest.MonkeyPatch, is_shadow: bool, expected: list[int]
+) -> None:
+    lowered: list[int] = []
+    monkeypatch.setattr("os.nice", lowered.append)
+    with pytest.raises(ValueError, match="not a folder"):
+        serve_model("ponder", LinkOptions(), "random", unreadable, lambda *_: Broken(), is_shadow=is_shadow)
+    assert lowered == expected
