@@ -183,14 +183,14 @@ def run(command: Sequence[str], environment: Mapping[str, str], *, limit_s: floa
     return Ran(done.returncode, done.stdout)
 
 
-def gl(backend: str, run: Run = run) -> Finding:
+def gl(backend: str, run: Run = run, environment: Mapping[str, str] = os.environ) -> Finding:
     """Renders one picture and checks that it is not empty."""
     ran = run([sys.executable, "-c", _RENDER], {"MUJOCO_GL": backend})
     contrast = re.search(r"^contrast (\d+)$", ran.output, re.MULTILINE)
     if ran.code == 0 and contrast and int(contrast[1]) > 0:
         return Finding("gl", Level.OK, "a 64 px frame came out")
     text = "the frame came out empty" if contrast else f"no frame: {ran.last_line}"
-    packages, platform = GL_PACKAGES.get(backend), os.environ.get("PYOPENGL_PLATFORM", backend)
+    packages, platform = GL_PACKAGES.get(backend), environment.get("PYOPENGL_PLATFORM", backend)
     if packages is not None and platform not in ("", backend):
         way_out = f"PYOPENGL_PLATFORM={platform} contradicts MUJOCO_GL={backend}: unset it"
     elif packages is None:
