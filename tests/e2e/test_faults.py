@@ -84,7 +84,11 @@ def test_without_pounce_the_robot_holds_slows_down_and_stops(ponder_struck: Any)
     (lost,) = (e.tick for e in record.events if e.name == "pounce_lost")
     levels = [level.name for level, _ in groupby(t.level for t in _decided(record) if t.tick >= lost)]
     assert levels == LADDER
-    assert (ponder_struck.result["status"], ponder_struck.result["steps"]) == ("ABORTED", len(record.ticks))
+    assert ponder_struck.result["status"] == "ABORTED"
+    assert len(record.ticks) - ponder_struck.result["steps"] in (
+        0,
+        1,
+    )  # the clock may decide one before it hears the end
     assert "stopped by the ladder" in ponder_struck.result["reason"]
 
 
