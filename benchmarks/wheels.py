@@ -16,9 +16,8 @@ import time
 import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from benchmarks.report import Report, Row, show
 from protocol.command_line import REFUSED, parse
@@ -104,10 +103,8 @@ class WheelsOptions:
 
     only: tuple[str, ...] = ()
     """Names of cases, such as `[serve,sim]`, or `no extra`. Empty: all."""
-    installer: Literal["as listed", "pip", "uv"] = "as listed"
-    """Program that installs; the list has both."""
-    write: bool = True
-    """Show the tables and write no report."""
+    report: bool = True
+    """Do not write the report."""
 
 
 def main() -> int:
@@ -125,17 +122,14 @@ def main() -> int:
         rows = []
         for case in CASES:
             if not options.only or case.name in options.only:
-                if options.installer != "as listed":
-                    case = replace(case, installer=options.installer)
                 rows.append(_row(case, wheels[0], log, place))
                 print(rows[-1], flush=True)
         report.add_table("Each environment", rows)
         if not options.only:
             report.add_table("Lockstep episodes between environments", _apart(wheels, place))
-    if options.write:
-        print(report.write())
-    else:
-        show(report)
+    if options.report:
+        report.write()
+    show(report)
     return int(any("failed" in str(row.values()) for table in report.tables for row in table["rows"]))
 
 

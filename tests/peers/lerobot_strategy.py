@@ -58,8 +58,8 @@ def refusal(what: Any) -> str:
     return "taken"
 
 
-def eventually(what: Any) -> Any:
-    until_s = time.monotonic() + 20
+def eventually(what: Any, longest_s: float = 20.0) -> Any:
+    until_s = time.monotonic() + longest_s
     while not (found := what()) and time.monotonic() < until_s:
         time.sleep(0.02)
     return found
@@ -119,7 +119,9 @@ def driven(folder: Path) -> dict[str, Any]:
         return eventually(lambda: (found := arm.observe()).robot_state == state and found)
 
     arm.obey(seen.state + 0.1, 0)
-    time.sleep(0.3)
+    for _ in range(2):  # the driver's thread sends before it reads: the second reading is after the command's turn
+        now_ns = time.monotonic_ns()
+        assert eventually(lambda now_ns=now_ns: arm.observe().state_ns > now_ns)
     told["expired"] = sent()
     arm.obey(seen.state + 0.1, far_ns)
     told["obeyed"] = eventually(sent)
@@ -177,8 +179,7 @@ def strategy(folder: Path, url: str) -> dict[str, Any]:
     )
 
     def end() -> None:
-        while not (folder / "end").exists():
-            time.sleep(0.05)
+        eventually((folder / "end").exists, 600.0)
         ctx.runtime.shutdown_event.set()
 
     threading.Thread(target=end, daemon=True).start()
