@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ import numpy as np
 from protocol import messages as m
 from protocol.errors import MalformedMessage
 from protocol.robot_checks import MAX_CONTROL_HZ, faults
+from protocol.window_checks import no_window
 
 MAX_MESSAGE_BYTES = 64 << 20  # an OpenRequest with a 48 s demonstration of two raw 256 px views is 19 MB
 MAX_PLAIN_MESSAGE_BYTES = 4 << 20  # without pictures; two bytes of protobuf can become a hundred in memory
@@ -36,8 +36,6 @@ MAX_CHANNELS = 8
 DEMO_VIDEO_HZ = 20
 MAX_DECAY = 10  # per chunk: exp(-10) is negligible
 MAX_JOURNAL_ENTRIES = 64
-MAX_WINDOW = 16  # ticks at which a policy looks
-MAX_REACH_TICKS = 100  # raw pictures of so many ticks are 40 MB in a model server
 
 
 def _broken(message: object, field: str, expected: str, came: object) -> MalformedMessage:
@@ -385,15 +383,6 @@ def check_open_request(r: m.OpenRequest) -> None:
     for frame in r.demo:
         _images(frame, frame.images)
     _members(r, r.members)
-
-
-def no_window(offsets: tuple[int, ...]) -> str:
-    """Why ``offsets`` are not the ticks at which a policy looks, against the present one; "" if they are."""
-    if not offsets or offsets[-1] != 0 or any(after <= before for before, after in pairwise(offsets)):
-        return f"{list(offsets)}: they ascend, and end with 0, the present"
-    if len(offsets) > MAX_WINDOW or offsets[0] < -MAX_REACH_TICKS:
-        return f"{list(offsets)}: at most {MAX_WINDOW} of them, and none before {-MAX_REACH_TICKS}"
-    return ""
 
 
 def check_contract(c: m.Contract) -> None:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
 
-from protocol import checks, files
+from protocol import checks, files, window_checks
 from protocol.messages import ObservationWindow
 
 Key: TypeAlias = tuple[str, ...]
@@ -186,8 +186,8 @@ def _window(given: Mapping[str, Any]) -> dict[str, Any]:
     _only(given, {"video", "state", "video_pad", "state_pad"}, "[window]")
     ticks = {}
     for modality in ("video", "state"):
-        offsets = _integers(given.get(modality, [0]), f"[window] {modality}", -checks.MAX_REACH_TICKS, 0)
-        if why_not := checks.no_window(offsets):
+        offsets = _integers(given.get(modality, [0]), f"[window] {modality}", -window_checks.MAX_REACH_TICKS, 0)
+        if why_not := window_checks.no_window(offsets):
             raise ValueError(f"[window] {modality} = {why_not}")
         ticks[f"{modality}_ticks"] = offsets
     pads = {name: _key(given[name], f"[window] {name}") for name in ("video_pad", "state_pad") if name in given}
