@@ -39,9 +39,13 @@ def check_change(weights: WeightsName, change: float, *, is_random: bool) -> Non
         )
 
 
+def is_narrow(name: str) -> bool:
+    """Whether the matrix of this parameter's name takes a byte per weight."""
+    return name.startswith(_NARROW) and not name.endswith(_KEPT)
+
+
 def quantise(ponder: Ponder, weights: WeightsName) -> int:
     """Replaces the layers in place; returns the number of bytes saved, 0 for float weights."""
     if weights == "float":
         return 0
-    kind = _LAYERS[weights]
-    return quantise_where(ponder.qwen, lambda name: name.startswith(_NARROW) and not name.endswith(_KEPT), kind)
+    return quantise_where(ponder.qwen, is_narrow, _LAYERS[weights])

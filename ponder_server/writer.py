@@ -25,6 +25,9 @@ Steps: TypeAlias = Generator[Append, Tensor, Result]
 
 TextKind: TypeAlias = Literal["subgoal", "demo_reasoning"]
 
+CLEARLY = 0.5
+"""A lead in logits that no rounding makes up: bfloat16 has steps of at most 0.25 below 64."""
+
 MAX_CHECKED_TOKENS = 16
 """Largest number of tokens in a decoding forward: the bucket after that of a single token."""
 
@@ -67,13 +70,18 @@ class TransitionWriter:
         self._draft = draft
         self._max_text_tokens = max_text_tokens
         self._t_yes = ponder.format.vocabulary.t_yes
+        self._gate = (self._t_yes, ponder.format.vocabulary.t_no)
         self._policy = ponder.format.texts
         self._ends = ends_of_text(ponder.format.vocabulary, self._policy)
         self._is_text_V, self._may_end_V = allowed_tokens(ponder, ends=False), allowed_tokens(ponder, ends=True)
 
     def wants_to_write(self, hidden_1H: Tensor) -> bool:
-        """Whether T_yes is the most likely of all next tokens."""
-        return int(self._ponder.logits(hidden_1H)[0].argmax()) == self._t_yes
+        """Whether T_yes is the most likely of all next tokens.
+
+        Mostly T_no leads it, and two rows of the head decide; the whole head is the largest matrix of the network.
+        """
+        yes, no = self._ponder.logits(hidden_1H, self._gate)[0].tolist()
+        return no - yes < CLEARLY and int(self._ponder.logits(hidden_1H)[0].argmax()) == self._t_yes
 
     def write(
         self,

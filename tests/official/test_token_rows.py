@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -75,8 +75,10 @@ def scripted(ponder: Ponder, says: list[list[int]]) -> Ponder:
     """A PONDER whose LM head answers what the script says, token after token."""
     answers = [id_ for fire in says for id_ in fire]
 
-    def logits(hidden_NH: torch.Tensor) -> torch.Tensor:
+    def logits(hidden_NH: torch.Tensor, tokens: Sequence[int] | None = None) -> torch.Tensor:
         assert len(hidden_NH) == 1
+        if tokens is not None:
+            return torch.zeros(1, len(tokens))  # undecided: the whole head is asked
         return 10.0 * torch.nn.functional.one_hot(torch.tensor([answers.pop(0)]), ponder.vocab_size).float()
 
     ponder.logits = logits  # type: ignore[method-assign]
@@ -174,7 +176,9 @@ def test_a_drafted_text_is_rolled_back_alike() -> None:
     rolled, silent = official(), scripted(official(), [[275], [275]])
     answers = iter([272, *(letter,) * 8])  # the gate; then whatever number of tokens is asked for
 
-    def logits(hidden_NH: torch.Tensor) -> torch.Tensor:
+    def logits(hidden_NH: torch.Tensor, tokens: Sequence[int] | None = None) -> torch.Tensor:
+        if tokens is not None:
+            return torch.zeros(1, len(tokens))
         ids = [next(answers, 275)] if len(hidden_NH) == 1 else [letter] * len(hidden_NH)
         return 10.0 * torch.nn.functional.one_hot(torch.tensor(ids), rolled.vocab_size).float()
 

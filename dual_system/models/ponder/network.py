@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 from transformers.models.qwen3_5 import Qwen3_5Config, Qwen3_5ForConditionalGeneration
 from transformers.models.qwen3_5.modeling_qwen3_5 import (
     Qwen3_5TextRotaryEmbedding,
@@ -199,10 +200,11 @@ class Ponder(nn.Module):
         hidden_BTH: Tensor = output.last_hidden_state
         return hidden_BTH
 
-    def logits(self, hidden_NH: Tensor) -> Tensor:
-        """LM logits (N, V) for the hidden states of selected positions."""
-        logits_NV: Tensor = self.qwen.lm_head(hidden_NH)
-        return logits_NV
+    def logits(self, hidden_NH: Tensor, tokens: Sequence[int] | None = None) -> Tensor:
+        """LM logits (N, V) for the hidden states of selected positions; (N, len(tokens)) if ``tokens`` are given."""
+        head = self.qwen.lm_head
+        logits: Tensor = head(hidden_NH) if tokens is None else F.linear(hidden_NH, head.weight[[*tokens]])
+        return logits
 
     def encode_row(self, row: Row, frames_NHW3: Tensor | None) -> Tensor:
         """Final hidden states (T, H) of a whole row in one pass without a cache, as in training."""
