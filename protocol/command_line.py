@@ -5,6 +5,8 @@ A switch that is off by default has ``--x``; one that is on has only ``--no-x``,
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import dataclasses
 import functools
 import getpass
@@ -31,6 +33,8 @@ Main = Callable[..., int]
 _GONE = frozenset({"--link.no-shared-memory"})
 """Options that scripts may still name, and that ask for what is done anyway."""
 REFUSED, INTERRUPTED, READER_LEFT = 2, 130, 141  # the latter two as a shell counts SIGINT and SIGPIPE
+
+_M_ARENA_MAX, _NUM_ARENAS = -8, 2  # glibc's malloc.h
 
 
 def command(prog: str) -> Callable[[Main], Main]:
@@ -86,6 +90,7 @@ def _interrupted(number: int, frame: object) -> None:
 
 def _settle_in() -> None:
     """Makes up for what a container may lack: a name and a home for its user, and an encoding that has every letter."""
+    _share_arenas()
     is_ours = (
         threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     )
@@ -102,6 +107,17 @@ def _settle_in() -> None:
         os.environ.setdefault("HOME", pwd.getpwuid(os.getuid()).pw_dir)
     except KeyError:
         os.environ["HOME"] = tempfile.gettempdir()
+
+
+def _share_arenas() -> None:
+    """Lets threads share two of glibc's heaps.
+
+    By default each of the bus's and the renderer's threads may have its own, whose freed blocks serve no other:
+    a server grew by 2 MB with every robot that came and went, a simulator by 2 MB an episode.
+    Other C libraries have none.
+    """
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, _NUM_ARENAS)
 
 
 def parse(kind: type[Options], argv: Sequence[str] | None, *, prog: str) -> Options:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import getpass
 import os
@@ -105,3 +106,37 @@ def test_a_reader_that_leaves_ends_it_silently_and_every_letter_can_be_said() ->
         process.stdout.close()
         assert process.stderr.read() == b""
     assert process.returncode == 141
+
+
+_MANY_THREADS = """
+import ctypes, sys, threading
+from protocol.command_line import command
+
+libc = ctypes.CDLL(None)
+libc.malloc.restype = ctypes.c_void_p
+libc.fopen.restype = ctypes.c_void_p
+
+@command("thread-maker")
+def main(argv=None):
+    barrier = threading.Barrier(16)
+
+    def allocate():
+        barrier.wait()
+        libc.malloc(ctypes.c_size_t(1000))
+        barrier.wait()
+
+    threads = [threading.Thread(target=allocate) for _ in range(16)]
+    for thread in threads: thread.start()
+    for thread in threads: thread.join()
+    libc.malloc_info(0, ctypes.c_void_p(libc.fopen(b"/dev/stdout", b"w")))
+    libc.fflush(None)
+    return 0
+
+sys.exit(main([]))
+"""
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_info"), reason="not glibc")
+def test_threads_share_two_heaps() -> None:
+    done = subprocess.run([sys.executable, "-c", _MANY_THREADS], capture_output=True, text=True, check=True)
+    assert done.stdout.count("<heap nr=") <= 2, done.stdout
