@@ -31,7 +31,7 @@ FREE = 0.85
 
 
 def weight_gb(model: nn.Module, *, is_fp8: bool = False) -> float:
-    """Of a model in bfloat16 on the meta device; with fp8, PONDER's narrow matrices take a byte and a scale a row."""
+    """Size of a model in bfloat16 on the meta device; with fp8, narrow matrices take a byte a number, a scale a row."""
     total = 0
     for name, each in model.named_parameters():
         narrow = is_fp8 and each.ndim == 2 and is_narrow(name)

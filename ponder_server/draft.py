@@ -10,6 +10,8 @@ from typing import Protocol
 
 from torch import Tensor, nn
 
+from dual_system.models.graphs import Capture
+
 MAX_SUFFIX = 8
 """Longest suffix of the text, in tokens, on which a draft token is conditioned."""
 MIN_SUFFIX = 2
@@ -25,6 +27,10 @@ class Draft(Protocol):
     parts: Sequence[nn.Module]
     """Modules that a proposal runs in turn, for heartbeats (``heartbeats``)."""
 
+    def capture(self, capture: Capture) -> None:
+        """Captures the forwards of proposals, if there are any."""
+        return
+
     def propose(self, written: Sequence[int], max_tokens: int, hidden_TH: Tensor | None = None) -> tuple[int, ...]:
         """At most ``max_tokens`` text tokens, without an end token, that may follow those ``written`` in this text.
 
@@ -32,7 +38,7 @@ class Draft(Protocol):
         """
 
 
-class NoDraft:
+class NoDraft(Draft):
     """Proposes nothing: plain greedy decoding."""
 
     parts: Sequence[nn.Module] = ()
@@ -41,19 +47,23 @@ class NoDraft:
         return ()
 
 
-class FirstOf:
+class FirstOf(Draft):
     """Returns the first non-empty proposal of several drafts."""
 
     def __init__(self, drafts: Sequence[Draft]) -> None:
         self._drafts = drafts
         self.parts: Sequence[nn.Module] = [part for draft in drafts for part in draft.parts]
 
+    def capture(self, capture: Capture) -> None:
+        for draft in self._drafts:
+            draft.capture(capture)
+
     def propose(self, written: Sequence[int], max_tokens: int, hidden_TH: Tensor | None = None) -> tuple[int, ...]:
         proposals = (draft.propose(written, max_tokens, hidden_TH) for draft in self._drafts)
         return next((guesses for guesses in proposals if guesses), ())
 
 
-class TrieDraft:
+class TrieDraft(Draft):
     """Proposes the token that most examples have after the same suffix.
 
     The trie holds every run of up to ``MAX_SUFFIX`` tokens in the examples, so that a text that left its template at a

@@ -141,6 +141,7 @@ class QwenEngine:
             timer = cuda_time_ms if has_kernels else None
             num_read = max(MAX_CHECKED_TOKENS, 1 + self._format.num_carriers)
             self._runner.capture(capture, num_read=num_read, timer=timer)
+            draft.capture(capture)
 
     @property
     def spec(self) -> EngineSpec:

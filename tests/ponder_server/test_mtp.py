@@ -18,11 +18,13 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn import functional as F
 
+from dual_system.models.graphs import directly
 from dual_system.models.ponder.checkpoint import load_ponder, mtp_shapes, save_ponder
 from dual_system.models.ponder.configs import tiny_cpu
 from dual_system.models.ponder.mtp import MtpHead
 from dual_system.models.ponder.network import Ponder
 from dual_system.models.ponder.vocabulary import Vocabulary
+from ponder_server import mtp
 from ponder_server.__main__ import build_engine
 from ponder_server.config import ContextOptions, PonderOptions, SpeedOptions
 from ponder_server.contract import Fire, Opening, Outcome
@@ -142,13 +144,15 @@ def said_without_a_cache(ponder: Ponder, written: list[int], hidden_TH: Tensor, 
 def test_it_proposes_what_a_cacheless_forward_of_its_layer_says(seed: int, length: int, most: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     PONDER.mtp = random_block(PONDER, seed)
-    draft = MtpDraft(PONDER, num_tokens=MAX_DRAFT_TOKENS)
+    draft, captured = (MtpDraft(PONDER, num_tokens=MAX_DRAFT_TOKENS) for _ in range(2))
+    captured.capture(directly)
     written = torch.randint(0, 380, (length,), generator=generator).tolist()
     hidden_TH = torch.randn(length, PONDER.hidden_size, generator=generator)
     proposed = draft.propose(written, most, hidden_TH)
     assert proposed == said_without_a_cache(PONDER, written[-WINDOW:], hidden_TH[-WINDOW:], most)
-    draft.propose(written[::-1], most, -hidden_TH)
-    assert draft.propose(written, most, hidden_TH) == proposed, "what was asked in between left something behind"
+    for one in (draft, captured):
+        one.propose(written[::-1], most, -hidden_TH)
+        assert one.propose(written, most, hidden_TH) == proposed, "what was asked in between left something behind"
 
 
 def test_untrained_heads_guess_something() -> None:
@@ -177,6 +181,22 @@ def test_texts_are_greedy_texts_whatever_the_weights(strength: float, num_tokens
         np.testing.assert_allclose(one.cognition, other.cognition, rtol=0, atol=1e-4)
 
 
+def test_texts_are_greedy_texts_though_rare_tokens_are_never_guessed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mtp, "NUM_ROWS", 200)
+    ponder = foreseen(0.0)
+    draft = MtpDraft(ponder, num_tokens=3)
+    names = [str(number) for number in range(8)]
+    greedy, _ = written_by(QwenEngine(ponder, CONFIG, NoDraft()), names)
+    guessed, _ = written_by(QwenEngine(ponder, CONFIG, draft), names)
+    assert tokens(guessed) == tokens(greedy)
+    assert any(token >= 200 for text in tokens(greedy) for token in text), "no text has a rare token"
+    with torch.inference_mode():
+        drafts = [MtpDraft(untrained(seed), num_tokens=4) for seed in range(9)]
+        guesses = {token for draft in drafts for token in draft.propose([70], 4, torch.ones(1, 48))}
+    assert len(guesses) > 3
+    assert max(guesses) < 200
+
+
 def test_the_writer_hands_over_the_state_before_every_token() -> None:
     """Also of tokens that were right in a forward that was undone: greedy decoding of each state is the token."""
     ponder = foreseen(0.3)
@@ -184,7 +204,7 @@ def test_the_writer_hands_over_the_state_before_every_token() -> None:
     is_text_V = allowed_tokens(ponder, ends=False)
     asked: list[int] = []
 
-    class Watched:
+    class Watched(Draft):
         parts = ()
 
         def propose(self, written: Sequence[int], max_tokens: int, hidden_TH: Tensor | None = None) -> tuple[int, ...]:
