@@ -6,6 +6,8 @@ import configparser
 import json
 import re
 import shlex
+import shutil
+import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -34,6 +36,7 @@ QUERIES = [rule["expr"] for rule in ALERTS] + [t["expr"] for panel in BOARD["pan
 QUERIES += [variable["definition"] for variable in BOARD["templating"]["list"] if "definition" in variable]
 DAEMONS: dict[str, type[Any]] = {"clock": ClockOptions, "ponder": PonderOptions, "pounce": PounceOptions}
 PROMETHEUS_ITS_OWN = {"up"}
+PROMTOOL = shutil.which("promtool")
 
 
 def series_of(query: str) -> list[tuple[str, dict[str, str]]]:
@@ -100,6 +103,25 @@ def test_alerts_say_who_is_woken_and_what_happened() -> None:
     assert {rule["labels"]["severity"] for rule in ALERTS} == {"page", "ticket"}
     assert all(len(rule["annotations"]["summary"]) > 20 for rule in ALERTS)
     assert len({rule["alert"] for rule in ALERTS}) == len(ALERTS)
+
+
+@pytest.mark.skipif(PROMTOOL is None, reason="promtool is not installed")
+@pytest.mark.parametrize("words", [("rules", "alerts.yaml"), ("config", "prometheus.yaml")], ids=lambda words: words[0])
+def test_promtool_understands_the_files(words: tuple[str, str]) -> None:
+    what, name = words
+    command = [str(PROMTOOL), "check", what, str(DOCKER / "prometheus" / name)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.peers
+def test_grafana_s_own_types_read_the_board_and_lose_nothing_that_is_drawn() -> None:
+    dashboard = pytest.importorskip("grafana_foundation_sdk.models.dashboard")
+    read = dashboard.Dashboard.from_json(BOARD)
+    assert read.title == BOARD["title"]
+    panels = zip(read.panels, BOARD["panels"], strict=True)
+    assert all(one.title == other["title"] and len(one.targets) == len(other["targets"]) for one, other in panels)
+    assert [variable.name for variable in read.templating.list_val] == [v["name"] for v in BOARD["templating"]["list"]]
 
 
 def test_the_board_s_panels_do_not_overlap() -> None:
