@@ -31,6 +31,8 @@ class PeersOptions:
     """Interpreter with lerobot 0.6. None: those tests are skipped, and counted so."""
     rosbags: Path | None = None
     """Interpreter with rosbags and Pillow. None: that test is skipped, and counted so."""
+    foxglove: Path | None = None
+    """Folder node_modules with @mcap/core and what it needs. None: that test is skipped, and counted so."""
     jobs: int = 1
     """Processes that share the unit tests."""
 
@@ -54,7 +56,11 @@ def main() -> int:
         _stage("unit tests", python, ["-m", UNIT, "-n", str(options.jobs), "--dist", "loadfile"], {})
         for python in options.pythons
     ]
-    others = {"LEROBOT_PYTHON": options.lerobot, "ROSBAGS_PYTHON": options.rosbags}
+    others = {
+        "LEROBOT_PYTHON": options.lerobot,
+        "ROSBAGS_PYTHON": options.rosbags,
+        "FOXGLOVE_MODULES": options.foxglove,
+    }
     beside = {name: str(python) for name, python in others.items() if python is not None}
     rows.append(_stage("beside other projects, and public folders", options.pythons[0], ["-m", "peers"], beside))
     report.add_table("By stage", rows)

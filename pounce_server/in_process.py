@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pounce_server.__main__ import build_engine
-from pounce_server.config import PathName, PounceOptions, SpeedOptions
-from pounce_server.contract import EngineSpec, Request, check_robot
+from pounce_server.__main__ import build_engine, build_remote
+from pounce_server.config import PathName, PounceOptions, RemoteOptions, SpeedOptions
+from pounce_server.contract import EngineSpec, Episodic, PounceEngine, Request, check_robot
 from pounce_server.node import PounceNode
 from pounce_server.serve import PounceServer
 from pounce_server.subgoal_text import Source
 from protocol.bus import Bus
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
-from protocol.messages import EpisodeInfo, Invocation, Observation
+from protocol.messages import ActionChunk, EpisodeInfo, Invocation, Observation
 from protocol.process import host_clock_id
 from protocol.version import version
 
@@ -79,26 +80,42 @@ def build_actor(checkpoint: Path | None, *, path: PathName = "eager", **options:
     return act, engine.spec
 
 
-def build_answerer(
-    checkpoint: Path, info: EpisodeInfo, **options: Any
-) -> tuple[Callable[[Invocation, Observation], Floats], str, int]:
-    """A POUNCE for a recorded episode: its answer to an invocation, the hash of its weights, and its cameras.
+@dataclass(frozen=True, slots=True)
+class Answerer:
+    """A POUNCE for a recorded episode: the server's own node and engine."""
 
-    The path is the server's: the same node, the same engine. ``options``: further ones of `PounceOptions`.
-    """
-    engine = build_engine(PounceOptions(checkpoint=checkpoint, **options))
-    check_robot(info.robot, engine.spec)
-    node = PounceNode(engine.spec)
+    spec: EngineSpec
+    _engine: PounceEngine
+    _node: PounceNode
 
-    def answer(invocation: Invocation, observation: Observation) -> Floats:
-        node.open(info)  # whatever came before it
-        node.on_observation(observation)
-        node.on_invocation(invocation)
-        work = node.next_work()
+    def answer(self, invocation: Invocation, observations: Iterable[Observation]) -> ActionChunk:
+        """The chunk for an invocation.
+
+        Args:
+            observations: those of the log up to the invocation's tick that no call had before: a window needs the past.
+
+        Raises:
+            ValueError: the observation that it names was never given, or the engine cannot read it.
+        """
+        for each in observations:
+            self._node.on_observation(each)
+        self._node.on_invocation(invocation)
+        work = self._node.next_work()
         if work is None:
-            raise ValueError(
-                f"invocation {invocation.invocation} and the observation of tick {observation.tick} differ"
-            )
-        return engine.invoke(work.request)
+            raise ValueError(f"the log has nothing that was seen at tick {invocation.tick}; record with cameras")
+        return self._node.answer(work, self._engine.invoke(work.request), infer_ns=0)
 
-    return answer, engine.spec.model_hash, engine.spec.num_cameras
+
+def build_answerer(info: EpisodeInfo, checkpoint: Path | None, remote: RemoteOptions, **options: Any) -> Answerer:
+    """Raises OSError, ValueError: there is no such checkpoint or policy server, or it is for another robot.
+
+    ``options``: further ones of `PounceOptions`.
+    """
+    chosen = PounceOptions(checkpoint=checkpoint, remote=remote, **options)
+    engine = build_engine(chosen) if chosen.backend == "own" else build_remote(chosen)
+    check_robot(info.robot, engine.spec)
+    if isinstance(engine, Episodic):
+        engine.begin(info)
+    node = PounceNode(engine.spec)
+    node.open(info)
+    return Answerer(engine.spec, engine, node)

@@ -1,7 +1,7 @@
 """``pp-replay through``: a log's invocations through another POUNCE, and how its rows differ from those in the log.
 
-The other checkpoint answers what was asked then: the same observation, cognition, age, committed rows and noise, by the
-code that serves. What it would have seen had it driven is another question: nothing here moves a robot.
+The other one answers what was asked then: the same observations, cognition, age, committed rows and noise, by the code
+that serves. What it would have seen had it driven is another question: nothing here moves a robot.
 """
 
 # N rows of a chunk, A dims of a row
@@ -13,7 +13,8 @@ import importlib
 import json
 import sys
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -25,12 +26,9 @@ from protocol import files
 from protocol import messages as m
 from protocol.command_line import command, parse
 from protocol.errors import CommandError
-from protocol.mcap_log import EpisodeRecord, read_log, read_pictures
+from protocol.mcap_log import EpisodeRecord, Picture, read_log, read_pictures
 
 AGREES, DIFFERS = 0, 1
-
-Answer = Callable[[m.Invocation, m.Observation], m.Floats]
-"""The rows (N, A) for an invocation and the observation that it names. Raises ValueError if it cannot read them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,7 +39,16 @@ class ThroughConfig:
     file: tyro.conf.Positional[Path]
     """Episode log (.mcap, or .mcap.partial of a killed process)."""
     pounce: Path | None = None
-    """Checkpoint folder of the other POUNCE, as of pounce-serve. None: what a shadow answered while it was recorded."""
+    """Checkpoint folder of the other POUNCE, as of pounce-serve. None, without --backend: what a shadow answered while
+    it was recorded."""
+    backend: Literal["own", "openpi", "vla-eval", "groot", "groot-n1.5", "lerobot"] = "own"
+    """As of pounce-serve: the others ask a policy server, whose noise is its own."""
+    url: str | None = None
+    """Address of the policy server, as of pounce-serve."""
+    mapping: Path | None = None
+    """The policy server's mapping file, as of pounce-serve."""
+    key_file: Path | None = None
+    """File with the word that the policy server wants, as of pounce-serve."""
     device: str = "cpu"
     """Device of the network: cpu, cuda or cuda:N."""
     dtype: Literal["float32", "bfloat16"] = "float32"
@@ -67,6 +74,8 @@ class Compared:
     model_hash: str
     pixels: str
     """"exact", "jpeg" if a picture is not what the model saw, or "" if it reads none."""
+    padded_otherwise: int = 0
+    """Chunks whose window had other instants padded than the other's: something was lost on one way, or came late."""
 
     @property
     def differences(self) -> m.Floats:
@@ -80,7 +89,8 @@ def main(argv: list[str] | None = None, prog: str = "pp-replay through") -> int:
     config = parse(ThroughConfig, argv, prog=prog)
     record = read_log(config.file)
     with files.reading(config.file, "log of an episode"):
-        compared = _shadow(record, config.file) if config.pounce is None else _through(record, config)
+        has_other = config.pounce is not None or config.backend != "own"
+        compared = _through(record, config) if has_other else _shadow(record, config.file)
     if not compared.chunks:
         why = next(iter(compared.refused.values()), "the log has no chunk")
         raise CommandError(f"{config.file}: nothing to compare: {why}")
@@ -117,6 +127,7 @@ def summary(compared: Compared, tolerance: float) -> dict[str, object]:
         "chunks": len(differences),
         "rows": len(rows_RA),
         "not_answered": len(compared.refused),
+        "padded_otherwise": compared.padded_otherwise,
         "max": float(rows_RA.max()),
         "p99": _p99(rows_RA.max(axis=1)),
         "max_per_dimension": [float(each) for each in rows_RA.max(axis=0)],
@@ -142,34 +153,36 @@ def _sentences(found: Mapping[str, object], compared: Compared, logged: str) -> 
         yield f"first: {where}: {first['logged']:.6g} in the log, {first['came']:.6g} now"  # type: ignore[index]
     if compared.pixels == "jpeg":
         yield "pictures are JPEGs and not what the model saw: record with --pixels exact to compare weights alone"
+    if compared.padded_otherwise:
+        yield f"{compared.padded_otherwise} windows were padded otherwise: that is no difference of weights"
     for invocation, why in list(compared.refused.items())[:1]:
         yield f"{len(compared.refused)} invocations were not answered, first {invocation}: {why}"
 
 
 def _through(record: EpisodeRecord, config: ThroughConfig) -> Compared:
-    """Raises OSError, ValueError: the folder is no checkpoint, or does not fit."""
-    build = importlib.import_module("pounce_server.in_process").build_answerer
-    answer, model_hash, num_cameras = build(config.pounce, record.info, device=config.device, dtype=config.dtype)
+    """Raises OSError, ValueError: there is no such POUNCE, or it does not fit."""
+    server = importlib.import_module("pounce_server.in_process")
+    remote = server.RemoteOptions(url=config.url, mapping=config.mapping, key_file=config.key_file)
+    other = server.build_answerer(
+        record.info, config.pounce, remote, backend=config.backend, device=config.device, dtype=config.dtype
+    )
     invocations = {each.invocation: each for each in record.invocations}
-    seen = _Observations(record, config.file if num_cameras else None)
+    seen = _Observations(record, config.file if other.spec.num_cameras else None)
     chunks, others, refused = [], [], {}
     for chunk in sorted(record.chunks, key=lambda each: each.invocation):
         invocation = invocations.get(chunk.invocation)
-        observation = None if invocation is None else seen.of(invocation)
-        if invocation is None or observation is None:
-            refused[chunk.invocation] = f"the log lacks its {'request' if invocation is None else 'observation'}"
+        if invocation is None:
+            refused[chunk.invocation] = "the log lacks its request"
             continue
         try:
-            rows_NA = answer(invocation, observation)
+            answer = other.answer(invocation, seen.until(invocation.tick))
         except ValueError as error:
             refused[chunk.invocation] = str(error)
             continue
-        if rows_NA.shape != chunk.rows_NA.shape:
-            raise ValueError(f"its chunks have {chunk.rows_NA.shape} numbers, the other POUNCE gives {rows_NA.shape}")
         chunks.append(chunk)
-        others.append(rows_NA)
-    pixels = seen.pixels if num_cameras else ""
-    return Compared(chunks=chunks, others=others, refused=refused, model_hash=model_hash, pixels=pixels)
+        others.append(answer)
+    pixels = seen.pixels if other.spec.num_cameras else ""
+    return _compared(chunks, others, refused, other.spec.model_hash, pixels)
 
 
 def _shadow(record: EpisodeRecord, path: Path) -> Compared:
@@ -178,49 +191,75 @@ def _shadow(record: EpisodeRecord, path: Path) -> Compared:
         raise CommandError(f"{path}: no shadow of POUNCE answered in it; name a checkpoint with --pounce")
     both = [chunk for chunk in record.chunks if chunk.invocation in shadows]
     missing = {each.invocation: "the shadow did not" for each in record.chunks if each.invocation not in shadows}
-    others = [shadows[chunk.invocation].rows_NA for chunk in both]
-    for chunk, rows_NA in zip(both, others, strict=True):
-        if chunk.rows_NA.shape != rows_NA.shape:
-            raise ValueError(f"its chunks have {chunk.rows_NA.shape} numbers, its shadow's {rows_NA.shape}")
     (model_hash, *_) = {each.model_hash for each in shadows.values()}
-    return Compared(chunks=both, others=others, refused=missing, model_hash=model_hash, pixels="")
+    return _compared(both, [shadows[chunk.invocation] for chunk in both], missing, model_hash, "")
+
+
+def _compared(
+    chunks: Sequence[m.ActionChunk],
+    others: Sequence[m.ActionChunk],
+    refused: Mapping[int, str],
+    model_hash: str,
+    pixels: str,
+) -> Compared:
+    """Raises ValueError if the other's chunks have another shape."""
+    padded_otherwise = 0
+    for chunk, other in zip(chunks, others, strict=True):
+        if chunk.rows_NA.shape != other.rows_NA.shape:
+            raise ValueError(
+                f"its chunks have {chunk.rows_NA.shape} numbers, the other POUNCE gives {other.rows_NA.shape}"
+            )
+        ours, theirs = ((each.padded_video_ticks, each.padded_state_ticks) for each in (chunk, other))
+        padded_otherwise += ours != theirs
+    return Compared(
+        chunks=chunks,
+        others=[other.rows_NA for other in others],
+        refused=refused,
+        model_hash=model_hash,
+        pixels=pixels,
+        padded_otherwise=padded_otherwise,
+    )
 
 
 class _Observations:
     """The observations of a log as POUNCE got them. ``path``: the log, if pictures are wanted."""
 
     def __init__(self, record: EpisodeRecord, path: Path | None) -> None:
-        self._of_tick: dict[int, list[m.Observation]] = {}
-        for each in record.observations:
-            self._of_tick.setdefault(each.tick, []).append(each)
+        self._left = deque(sorted(record.observations, key=lambda each: each.tick))  # of one tick as they were logged
         self._logged = iter(()) if path is None else read_pictures(path)
-        self._wants_pictures = path is not None
+        self._ahead: Picture | None = None
         self.pixels = "exact"
 
-    def of(self, invocation: m.Invocation) -> m.Observation | None:
-        """The observation that an invocation names; ask in the order of invocations."""
-        named = self._of_tick.get(invocation.tick, [])
-        if not self._wants_pictures:
-            return named[-1] if named else None
-        named = [each for each in named if each.images]
-        return self._with_pictures(named[-1]) if named else None
+    def until(self, tick: int) -> Iterator[m.Observation]:
+        """Those up to a tick that were not given before; ask in the order of invocations."""
+        while self._left and self._left[0].tick <= tick:
+            yield self._with_pictures(self._left.popleft())
 
     def _with_pictures(self, observation: m.Observation) -> m.Observation:
-        missing = [image for image in observation.images if image.codec == m.ImageCodec.ELSEWHERE]
+        """With its pictures from the cameras' channels, where they were logged there; without any if one is lost."""
+        missing = {image.camera: image for image in observation.images if image.codec == m.ImageCodec.ELSEWHERE}
         found: dict[str, m.Image] = {}
-        while len(found) < len(missing):
-            picture = next(self._logged, None)
-            if picture is None:
-                raise ValueError(f"it has no pictures of tick {observation.tick}; record with cameras")
-            if picture.source_ns != observation.source_ns:
+        for picture in self._pictures_of(observation.source_ns):
+            announced = missing.get(picture.camera)
+            if announced is None:
                 continue
-            (announced,) = (image for image in missing if image.camera == picture.camera)
             if zlib.crc32(picture.data) != announced.crc32:
                 self.pixels = "jpeg"
             found[picture.camera] = replace(
                 announced, codec=m.ImageCodec[picture.format.upper()], data=picture.data, crc32=zlib.crc32(picture.data)
             )
+        if found.keys() != missing.keys():
+            return replace(observation, images=())
         return replace(observation, images=tuple(found.get(image.camera, image) for image in observation.images))
+
+    def _pictures_of(self, source_ns: int) -> Iterator[Picture]:
+        """The log's next pictures up to those of an instant, and these alone are given."""
+        while (picture := self._ahead or next(self._logged, None)) is not None:
+            self._ahead = picture if picture.source_ns > source_ns else None
+            if self._ahead is not None:
+                return
+            if picture.source_ns == source_ns:
+                yield picture
 
 
 def _write(path: Path, compared: Compared) -> None:

@@ -18,6 +18,7 @@ from protocol import messages as m
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
 from protocol.mcap_log import EpisodeRecord, read_log
+from sim_client.episode import always
 from sim_client.recorder import Recorder
 
 Info = Callable[..., m.EpisodeInfo]
@@ -51,7 +52,7 @@ def shadows(rig: Any, fake_ponder: Any, fake_pounce: Any) -> Shadows:
 
 
 def recorded(
-    rig: Any, info: m.EpisodeInfo, path: Path, num_ticks: int = NUM_TICKS
+    rig: Any, info: m.EpisodeInfo, path: Path, num_ticks: int = NUM_TICKS, looks: Callable[[int], bool] = always
 ) -> tuple[EpisodeRecord, list[bytes]]:
     recorder = Recorder(rig.links["sim"], "jpeg")
     recorder.begin(info, path)
@@ -62,7 +63,7 @@ def recorded(
         meanwhile()
 
     rig.meanwhile = record
-    _, world = rig.run(info, num_ticks)
+    _, world = rig.run(info, num_ticks, looks)
     rig.meanwhile = meanwhile
     recorder.end(m.EpisodeResult(status=m.TaskStatus.ONGOING, is_success=False, reason="", num_ticks=num_ticks))
     return read_log(path), world.commands
@@ -94,6 +95,34 @@ def test_their_answers_are_in_the_log_beside_those_that_were_used(
     assert {each.model_hash for each in record.shadow_chunks} == {"another"}
     assert record.cognitions[0].vector.tobytes() == record.shadow_cognitions[0].vector.tobytes()
     assert record.chunks[0].rows.tobytes() == record.shadow_chunks[0].rows.tobytes()
+
+
+def test_one_with_a_window_sees_its_ticks_and_the_robot_makes_no_pictures_for_it(
+    new_rig: Callable[..., Any],
+    fake_ponder: Any,
+    fake_pounce: Any,
+    episode_info: Info,
+    paper: m.Schedule,
+    tmp_path: Path,
+) -> None:
+    window = m.ObservationWindow(video_ticks=(-1, 0), state_ticks=(-2, 0))
+    fake_pounce.spec = replace(fake_pounce.spec, window=window, model_hash="another")
+    commands = []
+    for name, padded in (("shown", ()), ("spared", (-1,))):
+        rig = new_rig()
+        Shadows(rig, fake_ponder, fake_pounce)
+        fake_pounce.requests.clear()
+        looks = always if name == "shown" else lambda tick, rig=rig: rig.clock.conductor.will_look(tick)
+        record, done = recorded(rig, episode_info(paper), tmp_path / f"{name}.mcap", looks=looks)
+        commands.append(done)
+        assert next(disagreements(record), None) is None
+        states = {each.tick: each.proprio for each in record.observations}
+        assert len(record.shadow_chunks) == len(record.chunks) >= 5
+        for chunk, request in zip(record.shadow_chunks[1:], fake_pounce.requests[1:], strict=True):
+            wanted = [states[chunk.t_row0 + offset] for offset in window.state_ticks]
+            np.testing.assert_array_equal(request.window.states_TP, wanted)
+            assert (chunk.padded_video_ticks, chunk.padded_state_ticks) == (padded, ())
+    assert commands[0] == commands[1]
 
 
 def test_they_are_there_in_the_next_episode_too(
