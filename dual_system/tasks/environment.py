@@ -106,8 +106,7 @@ class Environment:
         task.furnish(spec)
         self.physics = Physics(spec)
         self._image_px = image_px if render else None
-        self._cameras: Cameras | None = None
-        self._open_cameras()
+        self._cameras: Cameras | None = None  # opened by reset: a process that has a GL context cannot be forked
         self._max_steps = max_steps
         self._layout: Any = None
         self._memory: Any = None

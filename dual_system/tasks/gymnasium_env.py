@@ -2,6 +2,7 @@
 
     import gymnasium, dual_system.tasks.gymnasium_env
     env = gymnasium.make("ponderpounce/PickHighlight-v0")
+    several = gymnasium.make_vec("ponderpounce/PickHighlight-v0", num_envs=4, vectorization_mode="async")
 
 Observations: a dictionary of ``state`` (8,) and one (image_px, image_px, 3) picture per camera, seen before the action.
 Actions: (8,), as `Environment.step` takes them: radians, not normalised; wrap it in ``RescaleAction`` for that.
@@ -73,7 +74,6 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         self._environment = make_environment(task, image_px=image_px, render=cameras, max_steps=sys.maxsize)
         self._picture: NDArray[np.uint8] | None = None
         robot = self._environment.physics.robot
-        robot = self._environment.physics.robot
         slack = np.append(np.full(7, _SLACK_RAD), _SLACK_M)
         picture = spaces.Box(0, 255, (image_px, image_px, 3), np.uint8)
         self._spaces: dict[str, spaces.Space[Any]] = dict.fromkeys(CAMERAS if cameras else (), picture)
@@ -86,8 +86,9 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         """Starts an episode. Without a seed the next is drawn from the generator of the last one given.
 
         The only option is ``difficulty``; without it the seed decides. The info holds, besides that of `step`:
-        ``instruction``, ``difficulty``, ``seed``, and ``demonstration``, observations stacked along a first axis that
-        is 0 long where there is no video. Raises TaskError for other options.
+        ``instruction``, ``difficulty``, ``seed``, and ``demonstration``, a list of frames for each name of an
+        observation (a vector environment joins arrays of one length only), empty where there is no video. Raises
+        TaskError for other options.
         """
         super().reset(seed=seed)
         wanted = dict(options or {})
@@ -135,14 +136,9 @@ class TaskEnv(gymnasium.Env[Any, Any]):
             "subtask_index": snapshot.subtask_index,
         }
 
-    def _demonstration(self) -> Seen:
+    def _demonstration(self) -> dict[str, list[NDArray[Any]]]:
         frames = [_observation(frame) for frame in self._environment.demonstration(self._demo_hz)]
-        return {
-            name: np.stack([frame[name] for frame in frames])
-            if frames
-            else np.empty((0, *(space.shape or ())), space.dtype)
-            for name, space in self._spaces.items()
-        }
+        return {name: [frame[name] for frame in frames] for name in self._spaces}
 
 
 def environment_id(task: str) -> str:

@@ -16,13 +16,11 @@ from dual_system.tasks.scene import CAMERAS
 from protocol.errors import CommandError
 
 _UNSEEN_GROUPS = (0, 3, 4, 5)  # 0 holds the arm's collision shapes
-
-
 _SETTINGS = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "MUJOCO_EGL_DEVICE_ID")
 
 
 class RenderingError(CommandError):
-    """This computer has no GL context as the environment's variables want it."""
+    """There is no GL context as the environment's variables want it, or none in this process."""
 
 
 class Cameras:
@@ -34,7 +32,16 @@ class Cameras:
     cost of a software-rendered frame.
     """
 
+    _drawing_process = 0
+    """The process that drew first. Its forks inherit a GL library in use, where a new context waits for ever."""
+
     def __init__(self, physics: Physics, image_px: int) -> None:
+        Cameras._drawing_process = Cameras._drawing_process or os.getpid()
+        if Cameras._drawing_process != os.getpid():
+            raise RenderingError(
+                f"no pictures here: process {Cameras._drawing_process} has rendered and was then forked. Start processes "
+                'with "spawn" (AsyncVectorEnv and make_vec: context="spawn"), or before the first reset'
+            )
         self._physics = physics
         self._renderer = _renderer(physics.model, image_px)
         self._options = mujoco.MjvOption()

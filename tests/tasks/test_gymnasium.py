@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -37,6 +39,43 @@ def test_what_was_closed_opens_its_cameras_again_at_reset() -> None:
     observation, _ = env.reset(seed=SEED)
     env.close()
     assert env.observation_space.contains(observation)
+
+
+SEVERAL = """
+import sys, warnings
+import gymnasium, numpy as np
+import dual_system.tasks.gymnasium_env
+
+warnings.simplefilter("ignore")
+has_drawn, context = sys.argv[1] == "drawn", sys.argv[2]
+name = "dual_system.tasks.gymnasium_env:ponderpounce/PatternLock-v0"
+if __name__ == "__main__":
+    if has_drawn:
+        gymnasium.make(name, image_px=16).reset(seed=1)
+    each = gymnasium.make_vec(name, 2, "async", vector_kwargs={"context": context}, image_px=16)
+    seen, info = each.reset(seed=[0, 1])
+    lengths = [len(frames) for frames in info["demonstration"]["front"]]
+    seen, *_ = each.step(each.action_space.sample())
+    print(seen["front"].shape, len(set(lengths)), int(np.ptp(seen["front"])) > 0)
+    each.close()
+"""
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("before", "context", "said"),
+    [("new", "fork", "(2, 16, 16, 3) 2 True"), ("drawn", "spawn", "(2, 16, 16, 3) 2 True"), ("drawn", "fork", "")],
+)
+def test_several_in_processes_of_their_own_draw_whatever_is_set(
+    tmp_path: Path, before: str, context: str, said: str
+) -> None:
+    (tmp_path / "several.py").write_text(SEVERAL)
+    command = [sys.executable, str(tmp_path / "several.py"), before, context]
+    unset = {name: value for name, value in os.environ.items() if name not in ("MUJOCO_GL", "DISPLAY")}
+    ran = subprocess.run(command, env=unset, capture_output=True, text=True, timeout=120, check=False)
+    assert ran.stdout.strip() == said
+    assert said or 'context="spawn"' in ran.stderr
 
 
 def test_every_task_is_registered() -> None:
@@ -101,7 +140,7 @@ def test_the_conditioning_video_is_given(environment: EnvironmentOf) -> None:
 
 def test_no_video_is_an_empty_one(blind: gymnasium.Env) -> None:
     _, info = blind.reset(seed=SEED)
-    assert info["demonstration"]["state"].shape == (0, 8)
+    assert info["demonstration"] == {"state": []}
 
 
 @pytest.mark.sim
@@ -109,7 +148,7 @@ def test_the_pictures_are_those_of_the_cameras() -> None:
     env = TaskEnv("VideoUnmask", image_px=32, render_mode="rgb_array")
     observed, info = env.reset(seed=SEED)
     assert set(observed) == {"state", "front", "wrist"}
-    assert info["demonstration"]["front"].shape == (4, 32, 32, 3)
+    assert np.shape(info["demonstration"]["front"]) == (4, 32, 32, 3)
     picture = env.render()
     assert picture is not None
     np.testing.assert_array_equal(picture, observed["front"])

@@ -129,7 +129,7 @@ def test_gl_settings_that_this_computer_does_not_have_are_named(settings: dict[s
         "from dual_system.tasks.environment import make_environment\n"
         "@command('draw')\n"
         "def main(argv):\n"
-        "    make_environment('PickHighlight', image_px=16).close()\n"
+        "    make_environment('PickHighlight', image_px=16).reset(0)\n"
         "    return 0\n"
         "raise SystemExit(main([]))"
     )
