@@ -1,4 +1,4 @@
-"""Memory tasks in MuJoCo. Importing this package chooses how mujoco renders: EGL on Linux unless MUJOCO_GL says another.
+"""Memory tasks in MuJoCo. Importing this package chooses EGL on Linux, unless MUJOCO_GL says another renderer.
 
 mujoco reads the choice when it is first imported, and its own default there needs a display.
 """

@@ -39,8 +39,8 @@ class Cameras:
         Cameras._drawing_process = Cameras._drawing_process or os.getpid()
         if Cameras._drawing_process != os.getpid():
             raise RenderingError(
-                f"no pictures here: process {Cameras._drawing_process} has rendered and was then forked. Start processes "
-                'with "spawn" (AsyncVectorEnv and make_vec: context="spawn"), or before the first reset'
+                f"no pictures here: process {Cameras._drawing_process} has rendered and was then forked. Start "
+                'processes with "spawn" (AsyncVectorEnv: context="spawn"), or before the first reset'
             )
         self._physics = physics
         self._renderer = _renderer(physics.model, image_px)
