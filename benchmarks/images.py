@@ -21,7 +21,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,8 @@ class ImagesOptions:
     """Make the base image from Debian's packages (mmdebstrap) instead of pulling it."""
     mount: tuple[Path, ...] = ()
     """Folders with packages that the builds may read, at the same paths."""
+    torch: str = ""
+    """What is installed as torch: a requirement, or a wheel under --mount. "": the Dockerfiles' own, with CUDA."""
     episode: tuple[str, ...] = ("--task", "PickHighlight", "--difficulty", "easy", "--max-steps", "100")
     """Options of sim-client beside those of compose.yaml."""
     keep: bool = False
@@ -83,10 +85,11 @@ def make_stand_in() -> None:
 
 def build(name: str, options: ImagesOptions) -> Row:
     start_s = time.monotonic()
+    arguments = ["--build-arg", f"TORCH={options.torch}"] if options.torch else []
     mounts = [word for path in options.mount for word in ("--volume", f"{path}:{path}:ro")]
     pip = [word for key in os.environ if key.startswith("PIP_") for word in ("--env", f"{key}={os.environ[key]}")]
     buildah(
-        "build", "--pull-never" if options.stand_in else "--pull", "--network", "host", *mounts, *pip,
+        "build", "--pull-never" if options.stand_in else "--pull", "--network", "host", *mounts, *pip, *arguments,
         "--file", ROOT / "docker" / f"{name}.Dockerfile", "--tag", _tag(name), ROOT,
     )  # fmt: skip
     took_s = round(time.monotonic() - start_s)
@@ -186,7 +189,7 @@ def main(argv: list[str] | None = None) -> int:
     report = Report(
         name="images",
         question="Do the four images build, and does an episode play with them?",
-        config=options,
+        config=replace(options, mount=(), torch=Path(options.torch).name),  # no path of the machine
         warm_up="none",
     )
     if options.stand_in:
