@@ -74,7 +74,7 @@ def _options() -> set[str]:
 @every_page
 def test_options_that_are_named_exist(page: str) -> None:
     strangers = re.compile(
-        r"^.*\b(?:pip|docker|apt-get|git|uv run|python gr00t\S*|vla-eval run|evaluator\.py"
+        r"^.*\b(?:pip|docker|apt-get|git|hf download|uv run|python gr00t\S*|vla-eval run|evaluator\.py"
         r"|lerobot-rollout|lerobot-eval|lerobot_policy_ponderpounce|lerobot_strategy_ponderpounce) .*$",
         re.MULTILINE,
     )
