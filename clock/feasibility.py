@@ -58,5 +58,8 @@ def check_feasible(schedule: Schedule, invoke_p99_ns: int) -> Feasibility:
             ways_out.append(
                 f"A chunk of {h} rows cannot bridge {2 * d} ticks of delay: use a longer horizon or a faster model."
             )
-        ways_out.append("Or accept the gap: --allow-starved holds the last row there and counts it.")
+        ways_out.append(
+            "Or accept the gap: clock-serve --allow-starved (with --local the same option here) holds the last row "
+            "there and counts it."
+        )
     return Feasibility(horizon=h, invoke_ticks=s, delay_ticks=d, ways_out=tuple(ways_out))
