@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import ast
+import os
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from ponderpounce_client import watchdog
 from ponderpounce_client.client import _picture
 from ponderpounce_client.watchdog import Watchdog
 
@@ -51,6 +54,19 @@ def test_a_watchdog_fires_once_it_is_armed_and_not_before(tmp_path: Path) -> Non
         time.sleep(0.01)  # another process
     assert stopped.exists()
     watchdog.close()
+
+
+class Deadly:
+    """Whoever reads it from another process dies."""
+
+    def __reduce__(self) -> tuple[Any, tuple[int]]:
+        return os._exit, (3,)
+
+
+def test_a_watchdog_that_dies_at_its_start_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(watchdog, "_START_S", float("inf"))
+    with pytest.raises(RuntimeError, match="did not start"):
+        Watchdog(print, Deadly())
 
 
 def test_a_program_that_closes_an_armed_watchdog_leaves_a_stopped_robot(tmp_path: Path) -> None:

@@ -16,7 +16,9 @@ import traceback
 from typing import Any, Callable
 
 _POLL_S = 0.005
-_START_S = 30.0
+_START_S = 120.0
+"""It imports the program's own module again: LeRobot's takes a busy computer a minute."""
+_END_S = 30.0
 _ASLEEP, _ARMED, _FIRED, _CLOSED = 0, 1, 2, 3
 
 
@@ -43,9 +45,11 @@ class Watchdog:
         target = (self._until_ns, self._state, is_there, os.getpid(), stop, arguments)
         self.process = spawn.Process(target=_watch, args=target, daemon=False, name="watchdog")
         self.process.start()
-        if not is_there.wait(_START_S):
-            self.process.kill()
-            raise RuntimeError("the watchdog's process did not start; see what it said above")
+        until_s = time.monotonic() + _START_S
+        while not is_there.wait(0.2):
+            if not self.process.is_alive() or time.monotonic() > until_s:
+                self.process.kill()
+                raise RuntimeError("the watchdog's process did not start; see what it said above")
         atexit.register(self.close)
 
     @property
@@ -65,7 +69,7 @@ class Watchdog:
     def close(self) -> None:
         """Ends its process. One that is armed fires first: a program that leaves in order lets it ``rest`` before."""
         atexit.unregister(self.close)
-        until_s = time.monotonic() + _START_S
+        until_s = time.monotonic() + _END_S
         while self._state.value == _ARMED and self.process.is_alive() and time.monotonic() < until_s:
             time.sleep(_POLL_S)
         self._state.value = _CLOSED
