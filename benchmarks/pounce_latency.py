@@ -114,7 +114,7 @@ class Ways:
 
         return chunk
 
-    def fused(self, model: Pounce, device: torch.device) -> Call:
+    def fused(self, model: AnyPounce, device: torch.device) -> Call:
         """Packs the model's weights; the eager ways then use views of them."""
         fused: FusedPounce = fused_for(model, device)
 
@@ -219,7 +219,7 @@ def _measure(
             calls["eager, int8 weights"] = Ways(narrow, batch, device).eager
         if batch == 1:
             calls |= _compiled(ways, modes, f"{family}, {shape.name}", notes)
-        if device.type == "cuda" and isinstance(model, Pounce):  # Triton's interpreter is not worth timing
+        if device.type == "cuda":  # Triton's interpreter is not worth timing
             calls[FUSED] = ways.fused(model, device)
         calls |= _engine_call(engine, batch)
         steps = f"{model.config.num_steps} steps"

@@ -36,7 +36,7 @@ class SpeedOptions:
 
     path: PathName = "eager"
     """compile, max-autotune: torch.compile, for either family; takes a minute at start. fused: Triton kernels, static
-    buffers and CUDA graphs for pi0.5; needs a GPU and Triton."""
+    buffers and CUDA graphs, for either family; needs a GPU and Triton."""
     autotune: bool = False
     """With --path fused: time cuBLAS against cuBLASLt for every product, once per GPU; the choice is stored in the
     user's cache folder."""

@@ -5,8 +5,7 @@
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import torch
@@ -40,7 +39,7 @@ from pounce_server.contract import (
     example_request,
     no_progress,
 )
-from pounce_server.fused import FusedPounce, fused_for
+from pounce_server.fused import fused_for
 from pounce_server.guidance import given, guide, with_committed
 from pounce_server.int8 import quantise
 from pounce_server.roll_forward import placed, rolled
@@ -63,8 +62,8 @@ class EagerEngine:
 
     Raises:
         ValueError: the options exclude each other, or model or device do not support them. ``continuity`` needs pi0.5
-            and the eager path, and "trained" a model trained for it; the fused path needs pi0.5 and Triton; int8
-            needs the eager path on a CPU; rolling forward excludes ``continuity`` "trained".
+            and the eager path, and "trained" a model trained for it; the fused path needs Triton; int8 needs the eager
+            path on a CPU; rolling forward excludes ``continuity`` "trained".
     """
 
     def __init__(
@@ -113,20 +112,22 @@ class EagerEngine:
             reads_subgoal=config.reads_subgoal,
         )
         model = cast_streams(bundle.model, dtype).to(self._device).eval().requires_grad_(False)
-        self._fused = (
-            fused_for(_fusable(model, continuity), self._device, autotune=autotune) if path == "fused" else None
-        )
-        make_sampler = _sampler
+        if path != "eager" and continuity != "none":
+            raise ValueError(f"the path {path!r} knows no --continuity; leave one of them out")
+        self._fused = fused_for(model, self._device, autotune=autotune) if path == "fused" else None
         if self._fused is not None:
-            make_sampler = partial(_fused_sampler, self._fused)
+            self._sample = _batched_sampler(model, bundle, self._device, self._fused.sample)
         elif path != "eager":
-            make_sampler = partial(_compiled_sampler, mode=path)
-        self._sample = make_sampler(model, bundle, self._device, continuity)
+            with torch.inference_mode():
+                run = compiled_sampler(model, path)
+            self._sample = _batched_sampler(model, bundle, self._device, run)
+        else:
+            self._sample = _sampler(model, bundle, self._device, continuity)
         if weights == "int8":
             examples = [example_request(self.spec, seed=seed) for seed in range(NUM_COMPARED)]
             exact = self._network_actions(examples, no_progress)
             quantise(model)
-            self._sample = make_sampler(model, bundle, self._device, continuity)
+            self._sample = _sampler(model, bundle, self._device, continuity)
             error = float((self._network_actions(examples, no_progress) - exact).abs().mean())
             hash_ = f"{self.spec.model_hash}-int8"
             self.spec = replace(self.spec, weights=weights, model_hash=hash_, action_error=error)
@@ -293,14 +294,14 @@ def _groot_sampler(groot: GrootPounce, read: Callable[[Request], GrootInputs]) -
     return sample
 
 
-@torch.inference_mode()
-def _compiled_sampler(
-    model: AnyPounce, bundle: PounceBundle, device: torch.device, continuity: Continuity, *, mode: str
+def _batched_sampler(
+    model: AnyPounce,
+    bundle: PounceBundle,
+    device: torch.device,
+    run: Callable[[Any, Tensor], Iterator[EulerStep]],
 ) -> Sampler:
-    if continuity != "none":
-        raise ValueError(f"the path {mode!r} knows no --continuity; leave one of them out")
+    """Requests through ``run``, which samples from inputs and noise: all of pi0.5's at once, GR00T's by length."""
     statistics, tokenizer = bundle.statistics, bundle.tokenizer
-    run = compiled_sampler(model, mode)
 
     def sample(requests: Sequence[Request], noise_BNA: Tensor) -> Iterator[tuple[list[int], EulerStep]]:
         if isinstance(model, Pounce):
@@ -314,25 +315,5 @@ def _compiled_sampler(
         for alike in of_equal_length(seen):
             for step in run(joined_groot([seen[index] for index in alike]), noise_BNA[alike]):
                 yield alike, step
-
-    return sample
-
-
-def _fusable(model: AnyPounce, continuity: Continuity) -> Pounce:
-    if not isinstance(model, Pounce) or continuity != "none":
-        raise ValueError("the fused path is for pi0.5 without --continuity; leave --path fused out")
-    return model
-
-
-def _fused_sampler(
-    fused: FusedPounce, model: AnyPounce, bundle: PounceBundle, device: torch.device, continuity: Continuity
-) -> Sampler:
-    pi05, statistics, text = _fusable(model, continuity), bundle.statistics, bundle.tokenizer
-    assert isinstance(text, Tokenizer), "the bundle checks this"
-
-    def sample(requests: Sequence[Request], noise_BNA: Tensor) -> Iterator[tuple[list[int], EulerStep]]:
-        inputs = [pi05_inputs(request, pi05.config, text, statistics, device) for request in requests]
-        for step in fused.sample(joined_pi05(inputs), noise_BNA):
-            yield list(range(len(requests))), step
 
     return sample

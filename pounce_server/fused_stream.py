@@ -7,56 +7,20 @@ rotation, and two norms.
 # B batch, T tokens of the run, R = B * T rows, S slots of the cache, W width, M MLP width
 # h/g query/key heads, D head dim
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from dual_system.models.kernels.launch import Timer
-from dual_system.models.kernels.rms_norm import Residual, Style, norm_eager, norm_fused
-from dual_system.models.kernels.trial import Verdict, choose
+from dual_system.models.kernels.rms_norm import Residual, Style
+from dual_system.models.kernels.trial import Verdict
 from dual_system.models.pi05.gemma import ExpertLayer, GemmaConfig, GemmaLayer, Rotation
-from pounce_server.kernels.attention import Rope, Seen, attend_eager, attend_fused
-from pounce_server.kernels.choice import product
-from pounce_server.kernels.euler import euler_eager, euler_fused
-from pounce_server.kernels.geglu import geglu_eager, geglu_fused
-from pounce_server.kernels.geglu_product import Geglu, Product, geglu_product_eager, geglu_product_fused
-from pounce_server.kernels.rope import Slots, empty_queries, rope_eager, rope_fused
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Operations:
-    """One implementation of the GEMMs and of all operations between them."""
-
-    norm: Callable[[Tensor, Tensor, Style, Residual | None], None]
-    rope: Rope
-    geglu: Geglu
-    euler: Callable[[Tensor, Tensor, Tensor, int], None]
-    attend: Callable[[Rope, Tensor, Rotation, Slots, Seen], Tensor]
-    """Its twin is `rope` and torch's attention."""
-    geglu_product: Callable[[Product, Geglu, Tensor, Tensor, Tensor], None]
-    """Its twin is `product` and `geglu`."""
-    product: Product = product
-
-
-TWINS = Operations(
-    norm=norm_eager,
-    rope=rope_eager,
-    geglu=geglu_eager,
-    euler=euler_eager,
-    attend=attend_eager,
-    geglu_product=geglu_product_eager,
-)
-KERNELS = Operations(
-    norm=norm_fused,
-    rope=rope_fused,
-    geglu=geglu_fused,
-    euler=euler_fused,
-    attend=attend_fused,
-    geglu_product=geglu_product_fused,
-)
+from pounce_server.kernels.attention import Seen
+from pounce_server.kernels.rope import Slots, empty_queries
+from pounce_server.operations import Operations, Samples, tried
+from pounce_server.packed import Matrix
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,19 +45,11 @@ class PackedLayer:
         """Packs ``layer``, whose parameters become views, so that no weight is stored twice."""
         attention, mlp = layer.self_attn, layer.mlp
         return cls(
-            qkv=_joined(attention.q_proj, attention.k_proj, attention.v_proj),
+            qkv=Matrix.of(attention.q_proj, attention.k_proj, attention.v_proj).weight,
             attention_out=attention.o_proj.weight.data,
-            gate_up=_joined(mlp.gate_proj, mlp.up_proj),
+            gate_up=Matrix.of(mlp.gate_proj, mlp.up_proj).weight,
             down=mlp.down_proj.weight.data,
         )
-
-
-def _joined(*projections: nn.Linear) -> Tensor:
-    joined = torch.cat([projection.weight.data for projection in projections])
-    parts = joined.split([projection.out_features for projection in projections])
-    for projection, part in zip(projections, parts, strict=True):
-        projection.weight.data = part
-    return joined
 
 
 class Run:
@@ -124,16 +80,6 @@ class Run:
         self.seen.place(visible_BS, positions_BT.shape[1])
 
 
-class Samples(NamedTuple):
-    """Arguments of a stream's operations, for a trial."""
-
-    parts: dict[str, tuple[Any, ...]]
-    attend: tuple[Any, ...]
-    """Without the rotation that was taken."""
-    geglu_product: tuple[Any, ...]
-    """Without the product and the gate that were taken."""
-
-
 class FusedStream:
     """The layers of one stream, packed."""
 
@@ -142,18 +88,9 @@ class FusedStream:
         self.do = operations
 
     def choose(self, samples: Samples, timer: Timer) -> list[Verdict]:
-        """Leaves of its operations those that are right and faster than their twins; see ``trial.choose``.
-
-        The twin of a whole is made of the parts that were taken.
-        """
-        twins, kernels = replace(TWINS, product=self.do.product), self.do
-        parts, verdicts = choose(samples.parts, twins, kernels, timer)
-        wholes = {
-            "attend": (parts.rope, *samples.attend),
-            "geglu_product": (parts.product, parts.geglu, *samples.geglu_product),
-        }
-        self.do, more = choose(wholes, parts, kernels, timer)
-        return verdicts + more
+        """Leaves of its operations those that are right and faster than their twins."""
+        self.do, verdicts = tried(self.do, samples, timer)
+        return verdicts
 
     def __call__(self, run: Run, norms: Sequence[Norm], cache: Sequence[tuple[Tensor, Tensor]]) -> None:
         """Runs ``run.x`` through the layers; keys and values go into ``cache``, the last norm into ``run.normed``.

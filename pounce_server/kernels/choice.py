@@ -72,27 +72,31 @@ class ChosenProduct:
     def __init__(self, choices: Choices, timer: Timer, switch: Switch) -> None:
         self._choices, self._timer, self._switch = choices, timer, switch
 
-    def __call__(self, x_MK: Tensor, weight_NK: Tensor, out_MN: Tensor) -> None:
+    def __call__(self, x_MK: Tensor, weight_NK: Tensor, out_MN: Tensor, bias_N: Tensor | None = None) -> None:
         (rows, inputs), outputs = x_MK.shape, len(weight_NK)
-        name = f"{str(x_MK.dtype).removeprefix('torch.')} {rows}x{inputs}x{outputs}"
+        bias = "" if bias_N is None else " + bias"
+        name = f"{str(x_MK.dtype).removeprefix('torch.')} {rows}x{inputs}x{outputs}{bias}"
         library = self._choices.get(name)
         if library is None:
-            library = self._fastest(x_MK, weight_NK, out_MN)
+            library = self._fastest(x_MK, weight_NK, out_MN, bias_N)
             self._choices.keep(name, library)
         with self._switch(library):
-            product(x_MK, weight_NK, out_MN)
+            product(x_MK, weight_NK, out_MN, bias_N)
 
-    def _fastest(self, x_MK: Tensor, weight_NK: Tensor, out_MN: Tensor) -> str:
+    def _fastest(self, x_MK: Tensor, weight_NK: Tensor, out_MN: Tensor, bias_N: Tensor | None) -> str:
         times = {}
         for library in LIBRARIES:
             with self._switch(library):
-                times[library] = self._timer(lambda: product(x_MK, weight_NK, out_MN))
+                times[library] = self._timer(lambda: product(x_MK, weight_NK, out_MN, bias_N))
         return min(LIBRARIES, key=times.__getitem__)
 
 
-def product(x_MK: Tensor, weight_NK: Tensor, out_MN: Tensor) -> None:
-    """Writes x W^T to ``out_MN``, with torch's preferred library."""
-    torch.mm(x_MK, weight_NK.T, out=out_MN)
+def product(x_MK: Tensor, weight_NK: Tensor, out_MN: Tensor, bias_N: Tensor | None = None) -> None:
+    """Writes x W^T, plus a bias, to ``out_MN``, with torch's preferred library."""
+    if bias_N is None:
+        torch.mm(x_MK, weight_NK.T, out=out_MN)
+    else:
+        torch.addmm(bias_N, x_MK, weight_NK.T, out=out_MN)
 
 
 @contextlib.contextmanager

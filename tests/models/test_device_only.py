@@ -31,7 +31,7 @@ from dual_system.models.groot.pounce import GrootPounce
 from dual_system.models.ponder.configs import qwen35_9b
 from dual_system.models.ponder.configs import tiny_cpu as tiny_ponder
 from dual_system.models.ponder.network import Ponder
-from dual_system.models.pounce.configs import pi05_base, tiny_cpu, tiny_groot
+from dual_system.models.pounce.configs import groot_n1_5, pi05_base, tiny_cpu, tiny_groot
 from dual_system.models.pounce.family import blank_model
 from dual_system.models.pounce.precision import cast_streams
 from ponder_server.captured import CapturedDecoder
@@ -40,8 +40,8 @@ from ponder_server.narrow import quantise
 from ponder_server.operations import KERNELS
 from ponder_server.slots import SlotMemory
 from pounce_server.fused import FusedPounce
-from pounce_server.fused_stream import KERNELS as POUNCE_KERNELS
-from pounce_server.fused_stream import TWINS
+from pounce_server.operations import KERNELS as POUNCE_KERNELS
+from pounce_server.operations import TWINS
 
 GPU = torch.device("cuda:1")
 """The second: whatever takes "the" GPU lands on the first."""
@@ -75,6 +75,7 @@ class Launches(TorchDispatchMode):
     def __init__(self) -> None:
         super().__init__()
         self.counts: Counter[str] = Counter()
+        self.in_place: Counter[str] = Counter()
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         result = func(*args, **(kwargs or {}))
@@ -82,8 +83,8 @@ class Launches(TorchDispatchMode):
         for tensor in tree_leaves((args, kwargs, result)):
             if isinstance(tensor, Tensor) and tensor.device != GPU:
                 raise AssertionError(f"{name} has a tensor on {tensor.device}; expected all of them on {GPU}")
-        if not name.startswith(NO_KERNEL) and result is not (args[0] if args else None):
-            self.counts[name] += 1
+        if not name.startswith(NO_KERNEL):
+            (self.in_place if args and result is args[0] else self.counts)[name] += 1
         return result
 
 
@@ -134,7 +135,7 @@ def ponder() -> Ponder:
     return Ponder.random(config, seed=0, device="meta", dtype=torch.bfloat16)
 
 
-@pytest.mark.parametrize(("length", "most"), [(1, 400), (70, 510)])
+@pytest.mark.parametrize(("length", "most"), [(1, 400), (70, 516)])
 def test_ponder_s_forward(ponder: Ponder, length: int, most: int) -> None:
     with FakeTensorMode():
         on_gpu(ponder)
@@ -304,3 +305,34 @@ def test_a_pi05_of_kernels(counter: LaunchCounter, monkeypatch: pytest.MonkeyPat
         with mode:
             seen_by_torch = launched(work)
         assert seen_by_torch + counter.count == most
+
+
+def test_a_groot_of_full_size(counter: LaunchCounter, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Launches beside the vision tower's, writes in place among them: eager, and of kernels."""
+
+    # One kernel on a GPU; a build of torch without CUDA takes it apart.
+    def attention(q: Tensor, *_: Tensor, **__: Any) -> Tensor:
+        return torch.sin(q)
+
+    monkeypatch.setattr(F, "scaled_dot_product_attention", attention)
+
+    def all_launched(work: Callable[[], object]) -> int:
+        counter.count = 0
+        with mode, torch.inference_mode(), Launches() as launches:
+            work()
+        return launches.counts.total() + launches.in_place.total() + counter.count
+
+    mode, config = FakeTensorMode(), groot_n1_5(num_carriers=8)
+    model: Any = cast_streams(blank_model(config).eval(), "bfloat16")
+    kept: list[Any] = []
+    with mode:
+        on_gpu(model)
+        inputs, x_BNA = inputs_of(model), torch.zeros(1, config.horizon, config.padded_action_dim, device=GPU)
+        style = model.step_table().styles[0]
+    seen = all_launched(lambda: model.groot.eagle.vision_features(inputs.images))
+    prefill = all_launched(lambda: kept.append(model.prefill(inputs))) - seen
+    step = all_launched(lambda: model.groot.velocity(x_BNA, style, *kept))
+    assert (seen, prefill, step) == (468, 723, 289)
+    _, prefill_work, step_work, *_ = works_of(config, POUNCE_KERNELS, mode)
+    assert all_launched(prefill_work) == 137
+    assert all_launched(step_work) == 140

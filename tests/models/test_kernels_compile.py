@@ -21,7 +21,7 @@ import triton.backends.nvidia as nvidia
 from dual_system.models.kernels import fp8, rms_norm
 from ponder_server.kernels import attention, conv_silu, delta, gated_norm, rotate_store, swiglu
 from pounce_server.kernels import attention as pounce_attention
-from pounce_server.kernels import euler, geglu, geglu_product, rope
+from pounce_server.kernels import euler, gate, gate_product, head_rope, rope
 
 def compile_for(capability, warps, kernel, pointers, integers=(), **constants):
     types = dict(pointers) | dict.fromkeys(integers, "i32") | dict.fromkeys(constants, "constexpr")
@@ -44,9 +44,9 @@ window = dict(slot_ptr=long, num_past_ptr=long, num_new_ptr=long)
 
 def pi05(capability):
     for width, is_styled in ((2048, False), (1024, True)):
-        compile_for(capability, 4, rms_norm._norm, norm, WIDTH=width, BLOCK=width, EPS=1e-6,
+        compile_for(capability, 4, rms_norm._norm, norm, WIDTH=width, BLOCK=width, EPS=1e-6, IS_CENTRED=False,
                     HAS_BRANCH=True, HAS_GATE=is_styled, HAS_SHIFT=is_styled, HAS_NARROW=False)
-    compile_for(capability, 4, geglu._geglu, dict(gate_up_ptr=half, out_ptr=half), WIDTH=4096, BLOCK=1024)
+    compile_for(capability, 4, gate._gate, dict(gate_up_ptr=half, out_ptr=half), WIDTH=4096, BLOCK=1024, IS_SILU=False)
     compile_for(capability, 4, rope._rope, turn, ("num_tokens", "num_slots", "first_slot"),
                 Q_HEADS=8, KV_HEADS=1, PAIRS=128, HEAD_BLOCK=16, PAIR_BLOCK=128)
     compile_for(capability, 4, euler._euler, dict(x_ptr=full, velocity_ptr=full, bias_ptr=full),
@@ -63,14 +63,25 @@ def pi05(capability):
                 ("num_rows",), WIDTH=256, BLOCK=256, SPLITS=16)
     for width, inputs, rows, columns, block, warps in ((16384, 2048, 128, 64, 64, 8), (4096, 1024, 64, 32, 128, 4),
                                                        (4096, 1024, 32, 32, 128, 4), (4096, 1024, 16, 32, 128, 4)):
-        compile_for(capability, warps, geglu_product._geglu_product, dict(x_ptr=half, weight_ptr=half, out_ptr=half),
+        compile_for(capability, warps, gate_product._gate_product, dict(x_ptr=half, weight_ptr=half, out_ptr=half),
                     ("num_rows",), WIDTH=width, INPUTS=inputs, BLOCK_ROWS=rows, BLOCK_COLUMNS=columns,
-                    BLOCK_INPUTS=block, PRECISION="tf32")
+                    BLOCK_INPUTS=block, IS_SILU=False, PRECISION="tf32")
+
+def groot_n1_5(capability):
+    compile_for(capability, 4, rms_norm._norm, norm, WIDTH=1536, BLOCK=2048, EPS=1e-5, IS_CENTRED=True,
+                HAS_BRANCH=True, HAS_GATE=False, HAS_SHIFT=True, HAS_NARROW=False)
+    compile_for(capability, 4, head_rope._head_rope,
+                dict(qkv_ptr=half, query_norm_ptr=full, key_norm_ptr=full, cos_ptr=full, sin_ptr=full), ("num_tokens",),
+                Q_HEADS=16, KV_HEADS=8, PAIRS=64, HEAD_BLOCK=32, PAIR_BLOCK=64, EPS=1e-6)
+    compile_for(capability, 4, gate._gate, dict(gate_up_ptr=half, out_ptr=half), WIDTH=6144, BLOCK=1024, IS_SILU=True)
+    compile_for(capability, 8, gate_product._gate_product, dict(x_ptr=half, weight_ptr=half, out_ptr=half),
+                ("num_rows",), WIDTH=6144, INPUTS=2048, BLOCK_ROWS=128, BLOCK_COLUMNS=64, BLOCK_INPUTS=64,
+                IS_SILU=True, PRECISION="tf32")
 
 def qwen35_9b(capability):
     for has_narrow in (False, True):
         pointers = norm | (dict(narrow_ptr=byte) if has_narrow else {})
-        compile_for(capability, 4, rms_norm._norm, pointers, WIDTH=4096, BLOCK=4096, EPS=1e-6,
+        compile_for(capability, 4, rms_norm._norm, pointers, WIDTH=4096, BLOCK=4096, EPS=1e-6, IS_CENTRED=False,
                     HAS_BRANCH=True, HAS_GATE=False, HAS_SHIFT=False, HAS_NARROW=has_narrow)
     compile_for(capability, 8, fp8._quantise, dict(x_ptr=half, narrow_ptr=byte, scale_ptr=full),
                 WIDTH=12288, BLOCK=16384)
@@ -78,11 +89,12 @@ def qwen35_9b(capability):
                 ("num_rows",), INPUTS=12288, OUTPUTS=4096, ROWS=16, BLOCK_O=16, BLOCK_I=256, PRECISION="tf32")
     compile_for(capability, 4, swiglu._swiglu, dict(gate_ptr=half, up_ptr=half, out_ptr=half), ("count",), BLOCK=1024)
     compile_for(capability, 4, conv_silu._conv_silu,
-                dict(x_ptr=half, weight_ptr=half, state_ptr=half, slot_ptr=long, num_new_ptr=long, out_ptr=half),
+                dict(x_ptr=half, weight_ptr=half, state_ptr=half, kept_ptr=half, slot_ptr=long, num_new_ptr=long,
+                     num_kept_ptr=long, out_ptr=half),
                 ("length", "slot_stride"), CHANNELS=8192, WIDTH=4, BLOCK_T=16, BLOCK_C=128)
     compile_for(capability, 1, delta._delta,
                 dict(mixed_ptr=half, speed_beta_ptr=half, a_log_ptr=full, dt_bias_ptr=half, state_ptr=full,
-                     slot_ptr=long, num_new_ptr=long, read_ptr=half),
+                     kept_ptr=full, slot_ptr=long, num_new_ptr=long, num_kept_ptr=long, read_ptr=half),
                 ("length", "slot_stride"), KEY_HEADS=16, HEADS=32, KEY_DIM=128, VALUE_DIM=128, BLOCK=8, SCALE=128**-0.5)
     compile_for(capability, 1, gated_norm._gated_norm,
                 dict(read_ptr=half, gate_ptr=half, weight_ptr=half, out_ptr=half), HEADS=32, SIZE=128, EPS=1e-6)
@@ -104,9 +116,10 @@ def qwen35_9b(capability):
 pi05(80)
 for capability in map(int, sys.argv[1:]):
     pi05(capability)
+    groot_n1_5(capability)
     qwen35_9b(capability)
 """
-NUM_PI05, NUM_PONDER = 12, 12
+NUM_PI05, NUM_GROOT, NUM_PONDER = 12, 4, 12
 SHARED_BYTES = 227 << 10
 """Most shared memory of a program on Hopper and on Blackwell."""
 
@@ -125,7 +138,7 @@ def test_every_kernel_compiles_and_keeps_its_registers(tmp_path: os.PathLike[str
     )
     assert done.returncode == 0, done.stderr[-2000:]
     built = [line.split() for line in done.stdout.splitlines()]
-    assert len(built) == 3 * NUM_PI05 + 2 * NUM_PONDER
+    assert len(built) == 3 * NUM_PI05 + 2 * (NUM_GROOT + NUM_PONDER)
     for capability, name, registers, stack, local, shared in built:
         told = (
             f"{name} for sm_{capability}: {registers} registers, {stack} bytes of stack, {local} local, {shared} shared"

@@ -20,8 +20,9 @@ from dual_system.models.pounce.precision import cast_streams
 from dual_system.models.siglip import VisionConfig
 from pounce_server.contract import DTypeName, example_request
 from pounce_server.engine import EagerEngine
-from pounce_server.fused import BUCKET_TOKENS, SLOT_MULTIPLE, Bucket, FusedPounce, fused_for
-from pounce_server.fused_stream import KERNELS, TWINS, Operations
+from pounce_server.fused import BUCKET_TOKENS, FusedPounce, fused_for
+from pounce_server.fused_pi05 import SLOT_MULTIPLE
+from pounce_server.operations import KERNELS, TWINS, Operations
 from pounce_server.serve import PounceServer
 from protocol.bus import LocalBus
 from protocol.heartbeat import Heartbeat
@@ -291,7 +292,8 @@ def test_a_kernel_that_is_wrong_broken_or_slow_is_not_taken_and_the_heartbeat_sa
 def test_the_kernels_themselves_are_right_by_the_server_s_own_measure() -> None:
     config = small(2)
     model = model_of(config)
-    bucket = Bucket(FusedPounce(model, KERNELS)._network, model.embed_prefix(with_tokens(config, 3)))
+    prefix = model.embed_prefix(with_tokens(config, 3))
+    bucket = FusedPounce(model, KERNELS)._network.bucket(prefix, prefix.num_tokens)
     tried = bucket.try_kernels(Timer(1.0, 2.0))
     assert all(verdict.is_taken for verdicts in tried.values() for verdict in verdicts), tried
 
@@ -328,10 +330,9 @@ def test_a_heartbeat_says_which_kernels_were_taken(monkeypatch: pytest.MonkeyPat
 
 
 def test_what_the_fused_path_cannot_do_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"for pi0.5 without --continuity; leave --path fused out"):
-        EagerEngine(random_bundle(tiny_groot(), 0), path="fused")
-    with pytest.raises(ValueError, match=r"for pi0.5 without --continuity; leave --path fused out"):
-        EagerEngine(random_bundle(tiny_cpu(), 0), path="fused", continuity="rtc")
+    for config in (tiny_cpu(), tiny_groot()):
+        with pytest.raises(ValueError, match=r"the path 'fused' knows no --continuity; leave one of them out"):
+            EagerEngine(random_bundle(config, 0), path="fused", continuity="rtc")
 
 
 def test_a_cpu_that_may_not_interpret_is_told_where_kernels_run(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,9 @@
 
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import pytest
 import torch
@@ -10,10 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from dual_system.models.groot.dit import styled_norm
+from dual_system.models.groot.qwen3 import PlainRmsNorm
 from dual_system.models.kernels import rms_norm
 from dual_system.models.kernels.launch import Tolerance, block_size, missing_for
 from dual_system.models.pi05.gemma import AdaRmsNorm, GeGlu, GemmaConfig, RmsNorm, Rotation
-from pounce_server.kernels import attention, choice, euler, geglu, geglu_product, rope
+from dual_system.models.siglip import Float32LayerNorm
+from pounce_server.kernels import attention, choice, euler, gate, gate_product, head_rope, rope
 
 LACK = missing_for(torch.device("cpu"))
 interpreted = pytest.mark.skipif(bool(LACK), reason=LACK)
@@ -61,6 +66,20 @@ class Arena:
                 torch.testing.assert_close(side, guard, rtol=0, atol=0, equal_nan=True)
 
 
+class Gates(NamedTuple):
+    """A gate by its twin, by its kernel, and as the end of a product."""
+
+    eager: gate.Gate
+    fused: gate.Gate
+    product: Callable[..., None]
+
+
+GATES = (
+    Gates(gate.geglu_eager, gate.geglu_fused, gate_product.geglu_product_fused),
+    Gates(gate.swiglu_eager, gate.swiglu_fused, gate_product.swiglu_product_fused),
+)
+
+
 def check(actual: Tensor, expected: Tensor, tolerances: dict[torch.dtype, Tolerance]) -> None:
     tolerance = tolerances[expected.dtype]
     torch.testing.assert_close(actual, expected, rtol=tolerance.rtol, atol=tolerance.atol)
@@ -68,12 +87,14 @@ def check(actual: Tensor, expected: Tensor, tolerances: dict[torch.dtype, Tolera
 
 @interpreted
 @few
-@given(counts, widths, dtypes, st.sampled_from(["no", "plain", "gated"]), st.booleans(), seeds)
-def test_norm(rows: int, width: int, dtype: torch.dtype, residual: str, has_shift: bool, seed: int) -> None:
+@given(counts, widths, dtypes, st.sampled_from(["no", "plain", "gated"]), st.booleans(), st.booleans(), seeds)
+def test_norm(
+    rows: int, width: int, dtype: torch.dtype, residual: str, has_shift: bool, is_centred: bool, seed: int
+) -> None:
     arena = Arena(seed, dtype)
     x, out = arena.drawn(rows, width), arena.poisoned(rows, width)
     scale, shift, gate = (arena.drawn(width, dtype=torch.float32) for _ in range(3))
-    style = rms_norm.Style(scale, shift if has_shift else None)
+    style = rms_norm.Style(scale, shift if has_shift else None, eps=1e-3, is_centred=is_centred)
     branch = rms_norm.Residual(arena.drawn(rows, width), gate if residual == "gated" else None)
     expected_x, expected_out = x.clone(), torch.empty_like(x)
     rms_norm.norm_eager(expected_x, expected_out, style, None if residual == "no" else branch)
@@ -87,26 +108,26 @@ def test_norm(rows: int, width: int, dtype: torch.dtype, residual: str, has_shif
 
 @interpreted
 @few
-@given(counts, widths, dtypes, st.floats(0.1, 60.0), seeds)
-def test_geglu(rows: int, width: int, dtype: torch.dtype, spread: float, seed: int) -> None:
+@given(counts, widths, dtypes, st.sampled_from(GATES), st.floats(0.1, 60.0), seeds)
+def test_gates(rows: int, width: int, dtype: torch.dtype, gates: Gates, spread: float, seed: int) -> None:
     arena = Arena(seed, dtype)
     gate_up, out = arena.drawn(rows, 2 * width), arena.poisoned(rows, width)
     gate_up[:, :width] *= spread
     expected = torch.empty_like(out)
-    geglu.geglu_eager(gate_up, expected)
-    geglu.geglu_fused(gate_up, out)
-    check(out, expected, geglu.TOLERANCE)
+    gates.eager(gate_up, expected)
+    gates.fused(gate_up, out)
+    check(out, expected, gate.TOLERANCE)
     arena.check_guards()
 
 
 @interpreted
-def test_geglu_splits_wide_rows_between_programs() -> None:
+def test_a_gate_splits_wide_rows_between_programs() -> None:
     arena = Arena(0, torch.float32)
-    width = 2 * geglu.MAX_BLOCK + 3
+    width = 2 * gate.MAX_BLOCK + 3
     gate_up, out, expected = arena.drawn(2, 2 * width), arena.poisoned(2, width), torch.empty(2, width)
-    geglu.geglu_eager(gate_up, expected)
-    geglu.geglu_fused(gate_up, out)
-    check(out, expected, geglu.TOLERANCE)
+    gate.geglu_eager(gate_up, expected)
+    gate.geglu_fused(gate_up, out)
+    check(out, expected, gate.TOLERANCE)
     arena.check_guards()
 
 
@@ -131,6 +152,28 @@ def test_rope(batch: int, tokens: int, share: int, kv_heads: int, pairs: int, dt
         results.append((queries, keys[:, :, here], values[:, :, here]))
     for expected, actual in zip(*results, strict=True):
         check(actual, expected, rope.TOLERANCE)
+    arena.check_guards()
+
+
+@interpreted
+@few
+@given(st.integers(1, 2), counts, st.integers(1, 3), st.integers(1, 3), st.integers(1, 9), dtypes, seeds)
+def test_head_norms_with_rotation(
+    batch: int, tokens: int, share: int, kv_heads: int, pairs: int, dtype: torch.dtype, seed: int
+) -> None:
+    """In place; the values are left as they are."""
+    arena = Arena(seed, dtype)
+    heads, size = share * kv_heads, 2 * pairs
+    qkv = arena.drawn(batch * tokens, (heads + 2 * kv_heads) * size)
+    scales = (arena.drawn(size, dtype=torch.float32) for _ in range(2))
+    norms = head_rope.HeadNorms(*scales, heads, kv_heads, 1e-6)
+    rotation = Rotation.at(torch.randint(0, 900, (1, tokens), generator=arena.generator), size)
+    expected = qkv.clone()
+    head_rope.head_rope_eager(expected, norms, rotation)
+    before = qkv.clone()
+    head_rope.head_rope_fused(qkv, norms, rotation)
+    check(qkv, expected, head_rope.TOLERANCE)
+    assert torch.equal(qkv[:, (heads + kv_heads) * size :], before[:, (heads + kv_heads) * size :])
     arena.check_guards()
 
 
@@ -216,15 +259,17 @@ def test_a_missing_camera_is_not_read() -> None:
 
 @interpreted
 @settings(max_examples=8)
-@given(st.integers(1, 140), st.integers(1, 70), st.integers(1, 70), dtypes, seeds)
-def test_the_product_that_ends_in_its_gate(rows: int, inputs: int, width: int, dtype: torch.dtype, seed: int) -> None:
+@given(st.integers(1, 140), st.integers(1, 70), st.integers(1, 70), dtypes, st.sampled_from(GATES), seeds)
+def test_the_product_that_ends_in_its_gate(
+    rows: int, inputs: int, width: int, dtype: torch.dtype, gates: Gates, seed: int
+) -> None:
     arena = Arena(seed, dtype)
     x, weight, out = arena.drawn(rows, inputs), arena.drawn(2 * width, inputs), arena.poisoned(rows, width)
     weight /= inputs**0.5
     expected = torch.empty_like(out)
-    geglu_product.geglu_product_eager(choice.product, geglu.geglu_eager, x, weight, expected)
-    geglu_product.geglu_product_fused(choice.product, geglu.geglu_fused, x, weight, out)
-    check(out, expected, geglu_product.TOLERANCE)
+    gate_product.gate_product_eager(choice.product, gates.eager, x, weight, expected)
+    gates.product(choice.product, gates.fused, x, weight, out)
+    check(out, expected, gate_product.TOLERANCE)
     arena.check_guards()
 
 
@@ -269,8 +314,32 @@ def test_twin_of_the_norm_is_the_model_s(dtype: torch.dtype) -> None:
 def test_twin_of_the_gate_is_the_model_s() -> None:
     mlp = GeGlu(GemmaConfig(width=6, depth=1, mlp_width=10))
     x, out = torch.randn(3, 6, generator=torch.Generator().manual_seed(0)), torch.empty(3, 10)
-    geglu.geglu_eager(torch.cat([mlp.gate_proj(x), mlp.up_proj(x)], dim=-1), out)
+    gate.geglu_eager(torch.cat([mlp.gate_proj(x), mlp.up_proj(x)], dim=-1), out)
     torch.testing.assert_close(mlp.down_proj(out), mlp(x))  # not bit for bit on every CPU: strides choose kernels
+
+
+@torch.no_grad()
+def test_twins_of_groot_s_norms_and_heads_are_the_model_s() -> None:
+    arena = Arena(2, torch.float32)
+    x, out = arena.drawn(4, 24), arena.poisoned(4, 24)
+    affine = Float32LayerNorm(24, 1e-5)
+    for parameter in (affine.weight, affine.bias):
+        parameter.copy_(torch.randn(24, generator=arena.generator))
+    rms_norm.norm_eager(x, out, rms_norm.Style(affine.weight, affine.bias, 1e-5, is_centred=True))
+    torch.testing.assert_close(out, affine(x), rtol=1e-6, atol=1e-6)
+    style_2B1W = torch.randn(2, 1, 1, 24, generator=arena.generator)
+    rms_norm.norm_eager(x, out, rms_norm.Style(*style_2B1W[:, 0, 0], 1e-5, is_centred=True))
+    torch.testing.assert_close(out, styled_norm(x[None], style_2B1W, 1e-5)[0], rtol=1e-6, atol=1e-6)
+
+    qkv, rotation = arena.drawn(3, 4 * 6), Rotation.at(torch.arange(3)[None], 6)
+    query_norm, key_norm = (PlainRmsNorm(6, 1e-6) for _ in range(2))
+    for norm in (query_norm, key_norm):
+        norm.weight.copy_(torch.randn(6, generator=arena.generator))
+    q_1hTD, k_1gTD = (heads[None].transpose(1, 2) for heads in qkv.view(3, 4, 6).split([2, 2], dim=1))
+    expected = rotation(query_norm(q_1hTD)), rotation(key_norm(k_1gTD[:, :1]))
+    head_rope.head_rope_eager(qkv, head_rope.HeadNorms(query_norm.weight, key_norm.weight, 2, 1, 1e-6), rotation)
+    for mine, theirs in zip((qkv[:, :12], qkv[:, 12:18]), expected, strict=True):
+        assert torch.equal(mine.view(3, -1, 6).transpose(0, 1), theirs[0])
 
 
 # -- what does not fit is refused before a pointer is followed
@@ -309,8 +378,8 @@ def test_twins_need_no_triton() -> None:
     script = (
         "import sys, torch; sys.modules['triton'] = None\n"
         "from dual_system.models.kernels import launch, rms_norm\n"
-        "from pounce_server.kernels import euler, geglu, rope\n"
-        "geglu.geglu_eager(torch.ones(2, 4), torch.empty(2, 2))\n"
+        "from pounce_server.kernels import euler, gate, rope\n"
+        "gate.geglu_eager(torch.ones(2, 4), torch.empty(2, 2))\n"
         "print(launch.missing_for(torch.device('cuda')))"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60)

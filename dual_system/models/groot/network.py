@@ -186,7 +186,7 @@ class Groot(nn.Module):
     def step_table(self, num_steps: int) -> GrootStepTable:
         device = self.future_tokens.weight.device
         buckets = groot_flow.euler_buckets(num_steps, self.config.num_time_buckets)
-        styles = tuple(self.style(torch.tensor([bucket], device=device)) for bucket in buckets)
+        styles = tuple(self.style(torch.full((1,), bucket, device=device)) for bucket in buckets)
         return GrootStepTable(num_steps=num_steps, styles=styles)
 
     def sample(self, noise_BNA: Tensor, cache: GrootCache, table: GrootStepTable) -> Iterator[EulerStep]:

@@ -1,4 +1,4 @@
-"""RMSNorm, plain or styled by time (adaRMS), together with the gated residual that precedes it.
+"""RMSNorm and LayerNorm, plain or styled by time (adaRMS, adaLN), together with the gated residual that precedes them.
 
 Between two GEMMs of a stream comes x <- x + gate * branch, then norm(x): six passes over memory as eager operations,
 one here. The norm may also be given in fp8, for products with fp8 weights.
@@ -31,6 +31,8 @@ class Style:
     """1 + w of a plain norm, 1 + scale of a styled one."""
     shift: Tensor | None = None
     eps: float = 1e-6  # Gemma's and Qwen's
+    is_centred: bool = False
+    """LayerNorm: the mean is subtracted first."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +55,10 @@ def norm_eager(
     if residual is not None:
         gated_RE = residual.branch if residual.gate is None else residual.gate.to(x_RE.dtype) * residual.branch
         x_RE += gated_RE
-    normed_RE = torch.nn.functional.rms_norm(x_RE.float(), x_RE.shape[-1:], None, style.eps) * style.scale
+    if style.is_centred:
+        normed_RE = torch.nn.functional.layer_norm(x_RE.float(), x_RE.shape[-1:], eps=style.eps) * style.scale
+    else:
+        normed_RE = torch.nn.functional.rms_norm(x_RE.float(), x_RE.shape[-1:], None, style.eps) * style.scale
     out_RE.copy_(normed_RE if style.shift is None else normed_RE + style.shift)
     if narrow is not None:
         for place, rows in zip(narrow, quantise_eager(out_RE), strict=True):
@@ -94,6 +99,7 @@ def norm_fused(
         WIDTH=width,
         BLOCK=block_size(width),
         EPS=style.eps,
+        IS_CENTRED=style.is_centred,
         HAS_BRANCH=residual is not None,
         HAS_GATE=has_gate,
         HAS_SHIFT=style.shift is not None,
@@ -114,6 +120,7 @@ def _norm(
     WIDTH: tl.constexpr,
     BLOCK: tl.constexpr,
     EPS: tl.constexpr,
+    IS_CENTRED: tl.constexpr,
     HAS_BRANCH: tl.constexpr,
     HAS_GATE: tl.constexpr,
     HAS_SHIFT: tl.constexpr,
@@ -131,6 +138,8 @@ def _norm(
         stored = (x + branch).to(x_ptr.dtype.element_ty)
         tl.store(x_ptr + at, stored, mask=is_inside)
         x = stored.to(tl.float32)
+    if IS_CENTRED:
+        x = tl.where(is_inside, x - tl.sum(x, axis=0) / WIDTH, 0.0)
     y = x * tl.rsqrt(tl.sum(x * x, axis=0) / WIDTH + EPS)
     y = y * tl.load(scale_ptr + column, mask=is_inside, other=0.0)
     if HAS_SHIFT:

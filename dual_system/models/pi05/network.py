@@ -59,6 +59,10 @@ class Prefix:
     is_isolated: bool = False
     """P and (images, text) do not attend to each other; the actions attend to both."""
 
+    @property
+    def num_tokens(self) -> int:
+        return self.is_real.shape[1]
+
     def positions(self) -> Tensor:
         """Returns (B, T) int64, counting real tokens only. P gets negative positions, so it does not shift the rest."""
         return self.is_real.long().cumsum(dim=1) - 1 - self.num_cognition
