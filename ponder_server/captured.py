@@ -32,10 +32,12 @@ from ponder_server.decoder import Place, decode
 from ponder_server.kernels.rotate_store import Projected, Window
 from ponder_server.operations import KERNELS, TWINS, Operations
 from ponder_server.rehearsal import rehearse
-from ponder_server.slots import SlotMemory
+from ponder_server.slots import Keep, SlotMemory
 from ponder_server.stack import AttentionLayer, Product, Stack
 
 log = logging.getLogger(__name__)
+
+_NUMBERS = ("slot", "num_past", "num_new", "num_wanted", "num_kept")
 
 LEAST_POSITIONS = 1024
 """Smallest bucket of positions: shorter ones would save no time on a GPU, and each is another graph."""
@@ -202,16 +204,16 @@ class Forward:
         self._embeds_BTH = weight.new_zeros(num_rows, length, len(weight))
         self._hidden_BWH = weight.new_zeros(num_rows, num_read, len(weight))
         # All numbers in one tensor, for one copy to the device.
-        self._numbers = torch.zeros((4 + 3 * length) * num_rows, dtype=torch.long, device=weight.device)
-        rows, positions = self._numbers.split([4 * num_rows, 3 * length * num_rows])
-        self._slot_B, self._num_past_B, self._num_new_B, self._num_wanted_B = rows.view(4, num_rows)
+        self._numbers = torch.zeros((5 + 3 * length) * num_rows, dtype=torch.long, device=weight.device)
+        rows, positions = self._numbers.split([5 * num_rows, 3 * length * num_rows])
+        (self._slot_B, self._num_past_B, self._num_new_B, self._num_wanted_B, self._num_kept_B) = rows.view(5, num_rows)
         self._positions_3BT = positions.view(3, num_rows, length)
         self.run: Work = self._captured(capture)
 
     def load(self, places: Sequence[Place], embeds_BTH: Tensor, positions_3BT: Tensor) -> None:
         """Fills the buffers; padding must be finite."""
         self._embeds_BTH.copy_(embeds_BTH)
-        rows = [[getattr(p, name) for p in places] for name in ("slot", "num_past", "num_new", "num_wanted")]
+        rows = [[getattr(p, name) for p in places] for name in _NUMBERS]
         send(torch.cat([torch.tensor(rows).flatten(), positions_3BT.cpu().flatten()]), self._numbers)
 
     def hidden(self, places: Sequence[Place]) -> list[Tensor]:
@@ -281,10 +283,14 @@ class Forward:
             else:
                 delta, states = layer.mixer, memory.recurrent[layer.index]
                 inputs_BTC = times(normed_BTH, delta.inputs, rows)
-                mixed = do.conv_silu(inputs_BTC, delta.conv_CW, states.conv, self._slot_B, self._num_new_B)
+                keep_conv, keep_state = (
+                    Keep(memory_NX, self._num_kept_B) for memory_NX in (states.kept_conv, states.kept_state)
+                )
+                mixed = do.conv_silu(inputs_BTC, delta.conv_CW, states.conv, self._slot_B, self._num_new_B, keep_conv)
                 speed_beta = delta.speed_beta(normed_BTH)
                 read_BTVE = do.delta(
-                    mixed, speed_beta, delta.a_log_V, delta.dt_bias_V, states.state, self._slot_B, self._num_new_B
+                    *(mixed, speed_beta, delta.a_log_V, delta.dt_bias_V),
+                    *(states.state, self._slot_B, self._num_new_B, keep_state),
                 )
                 gate_RX = times(normed_RH, delta.gate, rows)
                 read_RVE = read_BTVE.reshape(num_rows * length, *read_BTVE.shape[2:])

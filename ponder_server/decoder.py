@@ -16,9 +16,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from dual_system.models.ponder import mixers
-from dual_system.models.ponder.delta_rule import gated_delta_rule, gated_delta_step
+from dual_system.models.ponder.delta_rule import gated_delta_keeping
 from ponder_server.attention import attend
-from ponder_server.slots import AttentionMemory, RecurrentMemory, SlotMemory
+from ponder_server.slots import AttentionMemory, Keep, RecurrentMemory, SlotMemory
 from ponder_server.threads import ALONE, Threads
 
 LEAST_TOKENS = 4
@@ -36,6 +36,8 @@ class Place:
     """Valid tokens of the row; 0 is an idle row. The rest up to T is padding."""
     num_wanted: int
     """Number of new tokens, counted from the last, whose hidden states are wanted."""
+    num_kept: int = 0
+    """Number of new tokens after which the recurrent states are kept a second time; 0: they are not."""
 
 
 def decode(
@@ -54,6 +56,9 @@ def decode(
     assert len({place.slot for place in places}) == len(places), "two rows of one slot"
     num_new_B = torch.tensor([place.num_new for place in places], device=embeds_BTH.device)
     slot_B = torch.tensor([place.slot for place in places], device=embeds_BTH.device)
+    num_kept_B = None
+    if any(place.num_kept for place in places):
+        num_kept_B = torch.tensor([place.num_kept for place in places], device=embeds_BTH.device)
     cos_sin = text_model.rotary_emb(embeds_BTH, positions_3BT.to(embeds_BTH.device))
     hidden = embeds_BTH
     last = len(text_model.layers) - 1
@@ -66,7 +71,8 @@ def decode(
                 layer.self_attn, memory.attention[index], places, num_queries, normed_BTH, cos_sin, threads
             )
         else:
-            mixed_BTH = gated_delta(layer.linear_attn, memory.recurrent[index], slot_B, num_new_B, normed_BTH)
+            states = memory.recurrent[index]
+            mixed_BTH = gated_delta(layer.linear_attn, states, slot_B, num_new_B, num_kept_B, normed_BTH)
         hidden = hidden + mixed_BTH
         if index == last:
             wanted = [slice(place.num_new - place.num_wanted, place.num_new) for place in places]
@@ -110,29 +116,43 @@ def _attention(
     return mixers.attended(attention, seen, gate)
 
 
-def gated_delta(delta: Any, memory: RecurrentMemory, slot_B: Tensor, num_new_B: Tensor, hidden_BTH: Tensor) -> Tensor:
+def gated_delta(
+    delta: Any,
+    memory: RecurrentMemory,
+    slot_B: Tensor,
+    num_new_B: Tensor,
+    num_kept_B: Tensor | None,
+    hidden_BTH: Tensor,
+) -> Tensor:
     """Advances every row's states by its valid tokens; output (B, T, H), garbage in rows beyond the slots.
 
-    Slots and numbers of valid tokens are device tensors, so it can be captured (``captured``).
+    ``num_kept_B`` (B,): tokens after which a row keeps its states a second time, 0 for not; None if no row does.
     """
     batch, length = len(slot_B), hidden_BTH.shape[1]
     width = delta.conv_kernel_size
     new_BTC, decay, beta, gate = mixers.delta_inputs(delta, hidden_BTH, batch)
     inputs_BCT = torch.cat([memory.conv[slot_B], new_BTC.transpose(1, 2)], dim=-1)
-    # The last W inputs of each row end at its last valid token, not at its padding.
-    kept_BW = num_new_B[:, None] + torch.arange(width, device=hidden_BTH.device)
-    memory.conv[slot_B] = inputs_BCT.gather(2, kept_BW[:, None].expand(-1, inputs_BCT.shape[1], -1))
+
+    def last(num_B: Tensor) -> Tensor:
+        """The W inputs that end at a token: the last valid one, not the padding."""
+        place_BW = num_B[:, None] + torch.arange(width, device=hidden_BTH.device)
+        return inputs_BCT.gather(2, place_BW[:, None].expand(-1, inputs_BCT.shape[1], -1))
+
+    memory.conv[slot_B] = last(num_new_B)
     mixed_BCT = F.silu(F.conv1d(inputs_BCT, delta.conv1d.weight, delta.conv1d.bias, groups=inputs_BCT.shape[1]))
     # With beta 0 and decay exp(0), padding leaves the state unchanged to the last bit.
     is_valid_BT1 = (torch.arange(length, device=hidden_BTH.device) < num_new_B[:, None])[..., None]
-    rule = gated_delta_step if length == 1 else gated_delta_rule
-    read, state = rule(
+    read, state, kept = gated_delta_keeping(
         *mixers.heads(delta, mixed_BCT[..., -length:].transpose(1, 2)),
         g=decay * is_valid_BT1,
         beta=beta * is_valid_BT1,
         initial_state=memory.state[slot_B],
+        num_kept_B=num_kept_B,
     )
     memory.state[slot_B] = state
+    if num_kept_B is not None:
+        Keep(memory.kept_conv, num_kept_B).put(slot_B, last(num_kept_B))
+        Keep(memory.kept_state, num_kept_B).put(slot_B, kept)
     normed_BTX = mixers.normed(delta, read, gate)
     mixed_BTH: Tensor = delta.out_proj(F.pad(normed_BTX, (0, 0, 0, 0, 0, len(hidden_BTH) - batch)))
     return mixed_BTH

@@ -1,8 +1,8 @@
 """The engine that runs Qwen3.5: sessions, one-pass fires, greedy text.
 
 A fire appends observation *and carriers* in one forward and reads T_t at the last observation token. T_no, the
-usual case, is then complete, because T_no is never part of the context (appendix A.2). On T_yes the append is
-undone, the observation is appended again followed by T_yes (its vision tokens are reused), the text is decoded,
+usual case, is then complete, because T_no is never part of the context (appendix A.2). On T_yes the context goes back
+to the state that the forward kept after the observation, without the carriers; T_yes is appended, the text is decoded,
 and the carriers follow.
 
 The engine is deterministic: on one machine equal calls give equal bits, also after reopening a session.
@@ -278,20 +278,27 @@ class QwenEngine:
         try:
             texts: tuple[Text, ...] = ()
             is_transition = exactly is not None
+            unread_ids, unread_TH = query.ids[:num_observed], observation_TH
             at_once = Append(
-                session=context, ids=query.ids, embeds_TH=embeds_TH, num_wanted=1 + self._format.num_carriers
+                session=context,
+                ids=query.ids,
+                embeds_TH=embeds_TH,
+                num_wanted=1 + self._format.num_carriers,
+                num_kept=num_observed if self._format.speaks else 0,
             )
             if not is_transition:
                 hidden_NH = yield at_once
                 is_transition = self._format.speaks and self._writer.wants_to_write(hidden_NH[:1])
                 hidden_KH = hidden_NH[1:]
+                if is_transition:
+                    context.restore(context.kept)
+                    unread_ids, unread_TH = (), observation_TH[:0]
             if is_transition:
-                context.restore(before)
                 texts = yield from self._writer.write(
                     context,
                     before,
-                    query.ids[:num_observed],
-                    observation_TH,
+                    unread_ids,
+                    unread_TH,
                     with_reasoning=episode.owes_reasoning and exactly is None,
                     exactly=exactly,
                 )

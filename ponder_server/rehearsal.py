@@ -14,7 +14,7 @@ from dual_system.models.fp8 import Fp8Linear
 from dual_system.models.kernels.fp8 import FEW_ROWS, Quantised
 from dual_system.models.kernels.rms_norm import Residual
 from ponder_server.kernels.rotate_store import Projected, Window
-from ponder_server.slots import SlotMemory
+from ponder_server.slots import Keep, SlotMemory
 from ponder_server.stack import AttentionLayer, DeltaLayer, Stack
 
 
@@ -44,6 +44,8 @@ def rehearse(stack: Stack, memory: SlotMemory, *, num_rows: int, length: int) ->
     positions = torch.arange(length, device=device).expand(3, num_rows, -1)
     asking_BT = torch.arange(length, device=device).expand(num_rows, -1).contiguous()
     state_BVDE = drawn(num_rows, num_heads, key_dim, size, dtype=torch.float32)
+    conv_BCW = drawn(num_rows, num_channels, width)
+    kept = [Keep(torch.zeros_like(state), torch.full_like(rows, (length + 1) // 2)) for state in (conv_BCW, state_BVDE)]
     x_RH = x_BTH.flatten(0, 1)
     cos_sin = tuple(stack.rotary(x_BTH, positions))
     queries = drawn(num_rows, length, query_heads, head_size)
@@ -58,10 +60,10 @@ def rehearse(stack: Stack, memory: SlotMemory, *, num_rows: int, length: int) ->
     return {
         "norm": norm,
         "swiglu": (gate_BTM, first.up(x_BTH)),
-        "conv_silu": (inputs_BTC, delta.conv_CW, drawn(num_rows, num_channels, width), rows, window.num_new_B),
+        "conv_silu": (inputs_BTC, delta.conv_CW, conv_BCW, rows, window.num_new_B, kept[0]),
         "delta": (
             *(inputs_BTC, delta.speed_beta(x_BTH), delta.a_log_V, delta.dt_bias_V),
-            *(state_BVDE, rows, window.num_new_B),
+            *(state_BVDE, rows, window.num_new_B, kept[1]),
         ),
         "gated_norm": (*(drawn(num_rows * length, num_heads, size), gate_BTX.flatten(0, 1), delta.norm_E, delta.eps),),
         "rotate_store": (projected, attention.norms, cos_sin, keys, values, window),

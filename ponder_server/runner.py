@@ -29,7 +29,7 @@ from ponder_server.slots import SlotMemory
 from ponder_server.threads import ALONE, Threads
 
 NUM_SAVED_STATES = 2
-"""Saved states per slot, allocated with it: before a query, and before a draft."""
+"""Saved states per slot, allocated with it: before a query, and `Session.kept`."""
 
 BUCKETS = (1, 16, 160, 512, 2048)
 """Padded row lengths: a decoded token, a verified draft, a fire of two 256 px cameras, pieces of a demonstration."""
@@ -74,6 +74,8 @@ class Append:
     ids: Sequence[int]
     embeds_TH: Tensor
     num_wanted: int | None = None
+    num_kept: int = 0
+    """After so many of the tokens the state goes to ``session.kept``, from where a restore goes on; 0: it does not."""
 
 
 class Runner:
@@ -99,7 +101,13 @@ class Runner:
         )
         self._captured: CapturedDecoder | None = None
         self._free_slots = list(reversed(range(num_slots)))
-        self._saved = [tuple(self._blank_state(slot) for _ in range(NUM_SAVED_STATES)) for slot in range(num_slots)]
+        self._saved = [
+            (
+                _blank_state([torch.empty_like(tensor) for tensor in self.memory.states(slot)]),
+                _blank_state(self.memory.kept_states(slot)),
+            )
+            for slot in range(num_slots)
+        ]
 
     def capture(self, capture: Capture, *, num_read: int, timer: Timer | None = None) -> None:
         """Turns on capturing of forwards (``captured``), at their first use or by :meth:`prepare`.
@@ -162,12 +170,12 @@ class Runner:
             together = [row for row in active if self.bucket(row.num_left) == length]
             self._forward(together, length)
         for one, row in zip(appends, rows, strict=True):
+            if one.num_kept:
+                one.session.kept.num_ids = len(one.session.ids) + one.num_kept
+                one.session.kept.next_position = row.kept_position
             one.session.ids.extend(one.ids)
             one.session.next_position = row.next_position
         return [torch.cat(row.hidden) if row.hidden else row.embeds_TH[:0] for row in rows]
-
-    def _blank_state(self, slot: int) -> SavedState:
-        return SavedState(num_ids=0, next_position=0, tensors=[torch.empty_like(t) for t in self.memory.states(slot)])
 
     def _forward(self, rows: "Sequence[_Row]", length: int) -> None:
         num_rows = max(len(rows), -(-LEAST_TOKENS // length))
@@ -183,6 +191,7 @@ class Runner:
                 num_past=row.num_past + first,
                 num_new=end - first,
                 num_wanted=max(0, end - max(first, row.first_wanted)),
+                num_kept=row.num_kept - first if first < row.num_kept <= end else 0,
             )
             places.append(place)
             row.num_done = end
@@ -193,6 +202,10 @@ class Runner:
             hidden = decode(self._text_model, self.memory, places, embeds_BTH, positions, self._threads)
         for row, hidden_NH in zip(rows, hidden, strict=True):
             row.hidden.append(hidden_NH)
+
+
+def _blank_state(tensors: list[Tensor]) -> SavedState:
+    return SavedState(num_ids=0, next_position=0, tensors=tensors)
 
 
 class _Row:
@@ -208,6 +221,11 @@ class _Row:
             append.ids, first_index=session.num_tokens, first_position=session.next_position
         )
         self.positions_3T = positions_4T[1:]
+        self.num_kept = append.num_kept
+        if self.num_kept:
+            _, self.kept_position = ponder.format.positions(
+                append.ids[: self.num_kept], first_index=session.num_tokens, first_position=session.next_position
+            )
         self.hidden: list[Tensor] = []
 
     @property
@@ -218,9 +236,10 @@ class _Row:
 class Session:
     """One context in a slot of its runner, which opens and closes it."""
 
-    def __init__(self, runner: Runner, name: str, slot: int, before_fire: SavedState, before_draft: SavedState) -> None:
+    def __init__(self, runner: Runner, name: str, slot: int, before_fire: SavedState, kept: SavedState) -> None:
         self.before_fire = before_fire
-        self.before_draft = before_draft
+        self.kept = kept
+        """An append leaves it behind (`Append.num_kept`); once that is restored, a text saves its drafts' here."""
         self._runner = runner
         self._memory = runner.memory
         self.name = name
@@ -259,7 +278,7 @@ class Session:
         """Copies the state, into ``into`` if given (no allocation)."""
         tensors = self._memory.states(self.slot)
         if into is None:
-            into = SavedState(num_ids=0, next_position=0, tensors=[torch.empty_like(t) for t in tensors])
+            into = _blank_state([torch.empty_like(t) for t in tensors])
         for kept, tensor in zip(into.tensors, tensors, strict=True):
             kept.copy_(tensor)
         into.num_ids, into.next_position = len(self.ids), self.next_position

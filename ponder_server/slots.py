@@ -9,7 +9,7 @@ and cannot be restored.) The sessions keep the slots' lengths.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -61,6 +61,24 @@ class RecurrentMemory:
     """(N, C, W): the last W inputs of the convolution."""
     state: Tensor
     """(N, value heads, key dim, value dim) float32 whatever the model's dtype: it sums over thousands of tokens."""
+    kept_conv: Tensor
+    """A second state, as an append's first tokens leave it (`Keep`)."""
+    kept_state: Tensor
+
+
+class Keep(NamedTuple):
+    """Where rows leave a second state, and after how many of their tokens."""
+
+    memory: Tensor
+    """(N, ...), like the state itself."""
+    num_B: Tensor
+    """int64; 0: this row leaves none."""
+
+    def put(self, slot_B: Tensor, state: Tensor | None) -> None:
+        """Writes ``state`` (B, ...) to the slots of the rows that leave one."""
+        assert state is not None, "it was asked for"
+        is_kept = (self.num_B > 0).view(-1, *[1] * (state.dim() - 1))
+        self.memory[slot_B] = torch.where(is_kept, state, self.memory[slot_B])
 
 
 class SlotMemory:
@@ -84,17 +102,23 @@ class SlotMemory:
         num_recurrent = sum(kind != "full_attention" for kind in text_config.layer_types)
         self._conv = torch.zeros(num_slots, num_recurrent, *conv_shape, device=device, dtype=dtype)
         self._state = torch.zeros(num_slots, num_recurrent, *state_shape, device=device)
+        self._kept_conv, self._kept_state = torch.zeros_like(self._conv), torch.zeros_like(self._state)
         for index, kind in enumerate(text_config.layer_types):
             if kind == "full_attention":
                 keys, values = (torch.empty(kv_shape, device=device, dtype=dtype) for _ in range(2))
                 self.attention[index] = AttentionMemory(keys, values)
             else:
                 own = len(self.recurrent)
-                self.recurrent[index] = RecurrentMemory(self._conv[:, own], self._state[:, own])
+                states = (self._conv, self._state, self._kept_conv, self._kept_state)
+                self.recurrent[index] = RecurrentMemory(*(state[:, own] for state in states))
 
     def states(self, slot: int) -> list[Tensor]:
         """Views of all that an append overwrites in a slot: (layers, C, W) and (layers, V, key dim, value dim)."""
         return [self._conv[slot], self._state[slot]]
+
+    def kept_states(self, slot: int) -> list[Tensor]:
+        """Views of a slot's second state, as `states`."""
+        return [self._kept_conv[slot], self._kept_state[slot]]
 
     def keys_and_values(self, slot: int, num_tokens: int) -> list[Tensor]:
         """Views (G, num_tokens, D) of a slot's keys and values, which an append only extends."""

@@ -87,13 +87,15 @@ class TransitionWriter:
         self,
         context: Session,
         before: SavedState,
-        observation_ids: Sequence[int],
-        observation_TH: Tensor,
+        unread_ids: Sequence[int],
+        unread_TH: Tensor,
         *,
         with_reasoning: bool,
         exactly: int | None,
     ) -> Steps[tuple[Text, ...]]:
-        """Generates a transition into ``context``, which is at ``before``; DR first if ``with_reasoning``.
+        """Generates a transition into ``context``; DR first if ``with_reasoning``.
+
+        ``before`` is the state before the observation, of which ``unread_ids`` are not in the context yet: all or none.
 
         DR ends with the T_yes that opens S, or at its limit, and S follows in both cases; T_no after DR ends the
         transition without S. ``exactly`` forces one text of this many tokens. Returns no text if one reached its limit
@@ -103,8 +105,8 @@ class TransitionWriter:
         """
         num_carriers = self._ponder.format.num_carriers
         t_yes_TH = self._ponder.embed([self._t_yes])
-        opened = torch.cat([observation_TH, t_yes_TH])
-        hidden_NH = yield Append(session=context, ids=[*observation_ids, self._t_yes], embeds_TH=opened, num_wanted=1)
+        opened = torch.cat([unread_TH, t_yes_TH])
+        hidden_NH = yield Append(session=context, ids=[*unread_ids, self._t_yes], embeds_TH=opened, num_wanted=1)
         texts = []
         if with_reasoning and self._policy.reasoning == "owed":
             num_kept = 2 + num_carriers  # T_yes and one token of S
@@ -174,7 +176,7 @@ class TransitionWriter:
             pending.append(token)
             room = min(limit - len(ids), MAX_CHECKED_TOKENS - len(pending))
             draft = self._draft.propose(ids, room, torch.cat(hidden_before)) if room > 0 else ()
-            before_draft = context.save(context.before_draft) if draft else None
+            before_draft = context.save(context.kept) if draft else None
             hidden_NH = yield self._append(context, [*pending, *draft], num_wanted=1 + len(draft))
             predicted = self._greedy(hidden_NH, allowed_V)
             num_right = next((i for i, guess in enumerate(draft) if guess != predicted[i]), len(draft))

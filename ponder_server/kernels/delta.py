@@ -14,7 +14,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dual_system.models.kernels.launch import check_tensor, kernel, tl
-from dual_system.models.ponder.delta_rule import gated_delta_rule, gated_delta_step
+from dual_system.models.ponder.delta_rule import gated_delta_keeping
+from ponder_server.kernels.conv_silu import check_second
+from ponder_server.slots import Keep
 
 _BLOCK_E = 8
 
@@ -27,10 +29,12 @@ def delta_eager(
     state_NVDE: Tensor,
     slot_B: Tensor,
     num_new_B: Tensor,
+    keep: Keep,
 ) -> Tensor:
     """Advances every row's state by its valid tokens; what it reads, (B, T, V, E), is garbage for padding.
 
-    ``speed_beta_BT2V`` are the projections [a | b]; the state is float32 whatever the network's dtype.
+    ``speed_beta_BT2V`` are the projections [a | b]; the state is float32 whatever the network's dtype. ``keep``: a row
+    that keeps a second state leaves it as it is after so many tokens.
     """
     length = mixed_BTC.shape[1]
     key_dim, value_dim = state_NVDE.shape[2:]
@@ -39,16 +43,17 @@ def delta_eager(
     decay_BTV = -a_log_V.float().exp() * F.softplus(speed_BTV.float() + dt_bias_V)
     # With beta 0 and decay exp(0), padding leaves the state unchanged to the last bit.
     is_valid_BT1 = (torch.arange(length, device=mixed_BTC.device) < num_new_B[:, None])[..., None]
-    rule = gated_delta_step if length == 1 else gated_delta_rule
-    read, state = rule(
+    read, state, kept = gated_delta_keeping(
         queries.unflatten(-1, (-1, key_dim)),
         keys.unflatten(-1, (-1, key_dim)),
         values.unflatten(-1, (-1, value_dim)),
         g=decay_BTV * is_valid_BT1,
         beta=beta_BTV.sigmoid() * is_valid_BT1,
         initial_state=state_NVDE[slot_B],
+        num_kept_B=keep.num_B,
     )
     state_NVDE[slot_B] = state
+    keep.put(slot_B, kept)
     return read
 
 
@@ -60,6 +65,7 @@ def delta_fused(
     state_NVDE: Tensor,
     slot_B: Tensor,
     num_new_B: Tensor,
+    keep: Keep,
 ) -> Tensor:
     """`delta_eager` in one launch; padding reads zeros. The rows' slots must differ.
 
@@ -72,6 +78,7 @@ def delta_fused(
     check_tensor("mixed", mixed_BTC, (num_rows, length, num_channels), mixed_BTC.dtype)
     check_tensor("speed_beta", speed_beta_BT2V, (num_rows, length, 2 * num_heads), mixed_BTC.dtype)
     check_tensor("state of a slot", state_NVDE[0], (num_heads, key_dim, value_dim), torch.float32)
+    check_second("state", state_NVDE, keep)
     read_BTVE = mixed_BTC.new_empty(num_rows, length, num_heads, value_dim)
     block = min(_BLOCK_E, value_dim)
     _delta[(num_rows, num_heads, value_dim // block)](
@@ -80,8 +87,10 @@ def delta_fused(
         a_log_V,
         dt_bias_V,
         state_NVDE,
+        keep.memory,
         slot_B,
         num_new_B,
+        keep.num_B,
         read_BTVE,
         length,
         state_NVDE.stride(0),
@@ -110,8 +119,10 @@ def _delta(
     a_log_ptr: tl.tensor,
     dt_bias_ptr: tl.tensor,
     state_ptr: tl.tensor,
+    kept_ptr: tl.tensor,
     slot_ptr: tl.tensor,
     num_new_ptr: tl.tensor,
+    num_kept_ptr: tl.tensor,
     read_ptr: tl.tensor,
     length: tl.tensor,
     slot_stride: tl.tensor,
@@ -129,8 +140,9 @@ def _delta(
     key_head = head // (HEADS // KEY_HEADS)
     num_new = tl.load(num_new_ptr + row).to(tl.int32)
     slot = tl.load(slot_ptr + row).to(tl.int64)
-    state_at = state_ptr + slot * slot_stride + (head * KEY_DIM + d[:, None]) * VALUE_DIM + e[None, :]
-    state = tl.load(state_at)
+    num_kept = tl.load(num_kept_ptr + row).to(tl.int32)
+    in_slots = slot * slot_stride + (head * KEY_DIM + d[:, None]) * VALUE_DIM + e[None, :]
+    state = tl.load(state_ptr + in_slots)
     speed_of_head = -tl.exp(tl.load(a_log_ptr + head).to(tl.float32))
     bias = tl.load(dt_bias_ptr + head).to(tl.float32)
     for token in range(num_new):
@@ -150,7 +162,9 @@ def _delta(
         state += k[:, None] * written[None, :]
         read = tl.sum(state * q[:, None], axis=0)
         tl.store(read_ptr + (at * HEADS + head) * VALUE_DIM + e, read.to(read_ptr.dtype.element_ty))
-    tl.store(state_at, state)
+        if token + 1 == num_kept:
+            tl.store(kept_ptr + in_slots, state)
+    tl.store(state_ptr + in_slots, state)
     nothing = tl.zeros([BLOCK], read_ptr.dtype.element_ty)
     for token in range(num_new, length):
         tl.store(read_ptr + ((row * length + token) * HEADS + head) * VALUE_DIM + e, nothing)

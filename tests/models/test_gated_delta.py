@@ -14,7 +14,7 @@ from transformers.models.qwen3_5.modeling_qwen3_5 import (
 )
 
 from dual_system.models.ponder.configs import tiny_cpu
-from dual_system.models.ponder.delta_rule import gated_delta_rule, gated_delta_step
+from dual_system.models.ponder.delta_rule import gated_delta_keeping, gated_delta_rule, gated_delta_step
 from dual_system.models.ponder.network import Ponder
 
 
@@ -127,6 +127,32 @@ def test_many_steps_are_the_rule_over_many() -> None:
         read, state = gated_delta_step(**{name: v[:, token : token + 1] for name, v in x.items()}, initial_state=state)
         assert error(read, whole[:, token : token + 1]) < 1e-4
     assert error(state, last) < 1e-4
+
+
+@given(
+    seed=st.integers(0, 99), length=st.integers(1, 140), share=st.floats(0, 1), heads=st.sampled_from([(1, 1), (2, 4)])
+)
+@settings(max_examples=25, deadline=None)
+def test_the_state_after_the_first_tokens_is_theirs_alone(
+    seed: int, length: int, share: float, heads: tuple[int, int]
+) -> None:
+    """To the last bit where they fill as many chunks; each row has its own number."""
+    x = inputs(seed, length, heads, (16, 32))
+    x["g"] *= 30.0  # what is later must not overflow
+    num_kept = torch.tensor([int(share * length), length])
+    read, last, kept = gated_delta_keeping(**x, num_kept_B=num_kept)
+    assert kept is not None
+    plain = (gated_delta_rule if length > 1 else gated_delta_step)(**x)
+    assert torch.equal(read, plain[0])
+    assert torch.equal(last, plain[1])
+    assert torch.equal(kept[1], last[1])
+    later = torch.arange(length) >= num_kept[0]
+    if length > 1:
+        cut = x | {"beta": x["beta"].masked_fill(later[:, None], 0.0), "g": x["g"].masked_fill(later[:, None], 0.0)}
+        assert torch.equal(kept[0], gated_delta_rule(**cut)[1][0])
+        alone = {name: value if name == "initial_state" else value[:, ~later] for name, value in x.items()}
+        if num_kept[0] > 0:
+            torch.testing.assert_close(kept[0], gated_delta_rule(**alone)[1][0], rtol=0, atol=1e-5)
 
 
 def test_a_layer_calls_no_rule_of_transformers(monkeypatch: pytest.MonkeyPatch) -> None:

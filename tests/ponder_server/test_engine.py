@@ -155,12 +155,29 @@ def test_a_transition_has_forgotten_its_speculative_carriers_to_the_last_bit(eng
     form, ponder, context = engine._format, engine._ponder, engine._episode("b").context
     t_yes = VOCABULARY.t_yes
     with torch.inference_mode():
-        ids = [*form.observation(2).ids, t_yes]
+        ids = form.observation(2).ids
         context.append(ids, ponder.embed(ids, torch.from_numpy(np.stack(observation(1)))))
-        for token in (*REASONING, t_yes, *SUBGOAL):
+        for token in (t_yes, *REASONING, t_yes, *SUBGOAL):
             context.append([token], ponder.embed([token]))
         by_hand = context.append(form.carrier_ids, ponder.embed(form.carrier_ids))
     np.testing.assert_array_equal(by_engine.cognition, by_hand.numpy())
+
+
+def test_a_transition_appends_its_observation_once(ponder: Ponder, engine: QwenEngine) -> None:
+    """Each token of the row goes through the network once, and the carriers twice: they are read ahead of the text."""
+    lengths = []
+    append = engine._runner.append
+
+    def count(appends: Sequence[Append]) -> list[torch.Tensor]:
+        lengths.extend(len(one.ids) for one in appends)
+        return append(appends)
+
+    engine.open("a", WITH_DEMO)
+    engine.fire("a", observation(0))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(engine._runner, "append", count)
+        assert engine.fire("a", observation(1)).texts
+    assert lengths == [12 + 2, *[1] * (1 + len(REASONING) + 1 + len(SUBGOAL)), 2]
 
 
 def test_equal_sessions_give_equal_bits_also_interleaved_and_reopened(engine: QwenEngine) -> None:
@@ -263,7 +280,7 @@ def test_progress_is_heard_at_every_chunk_and_every_token(ponder: Ponder) -> Non
     engine.fire("a", observation(0), lambda: calls.append(1))
     assert calls.count(1) == HEARD + SEEN
     engine.fire("a", observation(1), lambda: calls.append(2))
-    # one-pass try, observation again, each token, T_yes between the texts, carriers
+    # one-pass try, T_yes, each token, T_yes between the texts, carriers
     assert calls.count(2) == (1 + 1 + len(REASONING) + 1 + len(SUBGOAL) + 1) * HEARD + SEEN
 
 

@@ -12,6 +12,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
+from torch.utils._pytree import tree_leaves
 
 from dual_system.models.graphs import directly
 from dual_system.models.kernels.launch import missing_for
@@ -25,7 +26,7 @@ from ponder_server.kernels.rotate_store import HeadNorms, Projected, Window
 from ponder_server.operations import KERNELS, TWINS
 from ponder_server.rehearsal import rehearse
 from ponder_server.runner import Append, Runner, Session
-from ponder_server.slots import SlotMemory
+from ponder_server.slots import Keep, SlotMemory
 from ponder_server.stack import Stack
 
 LACK = missing_for(torch.device("cpu"))
@@ -66,13 +67,16 @@ def test_convolution(num_rows: int, length: int, num_channels: int, dtype: torch
     layers = drawn(NUM_SLOTS, 3, num_channels, 4)  # a layer's states are strided: those of a slot lie side by side
     arguments = drawn(num_rows, length, num_channels), drawn(num_channels, 4)
     slots, num_new = drawn.slots(num_rows), torch.randint(1, length + 1, (num_rows,), generator=drawn.generator)
+    num_kept = (torch.rand(num_rows, generator=drawn.generator) * (num_new + 1)).long()
     after = [layers.clone() for _ in range(2)]
     outs = [
-        function(*arguments, memory[:, 1], slots, num_new)
+        function(*arguments, memory[:, 1], slots, num_new, Keep(memory[:, 2], num_kept))
         for function, memory in zip((KERNELS.conv_silu, TWINS.conv_silu), after, strict=True)
     ]
     check(*outs)
-    assert torch.equal(*after), "the state is copied, never computed; other slots and layers are not touched"
+    assert torch.equal(*after), "the states are copied, never computed; other slots and layers are not touched"
+    keeps_none = [slot for slot in range(NUM_SLOTS) if slot not in slots[num_kept > 0]]
+    assert torch.equal(after[0][keeps_none, 2], layers[keeps_none, 2])
 
 
 @interpreted
@@ -85,18 +89,32 @@ def test_recurrence(num_rows: int, length: int, heads: tuple[int, int], dtype: t
     mixed = drawn(num_rows, length, (2 * key_heads + num_heads) * size)
     speed_beta = drawn(num_rows, length, 2 * num_heads) * 4.0
     gates = drawn(num_heads, dtype=torch.float32), drawn(num_heads)
-    memory = drawn(NUM_SLOTS, 2, num_heads, size, size, dtype=torch.float32)
+    num_kept = (torch.rand(num_rows, generator=drawn.generator) * (num_new + 1)).long()
+    memory = drawn(NUM_SLOTS, 3, num_heads, size, size, dtype=torch.float32)
     slots, after = drawn.slots(num_rows), [memory.clone() for _ in range(2)]
     padding = torch.arange(length) >= num_new[:, None]
     reads = []
     for function, states, pad in ((KERNELS.delta, after[0], NAN), (TWINS.delta, after[1], 0.0)):
         padded = [x.masked_fill(padding[..., None], pad) for x in (mixed, speed_beta)]
-        reads.append(function(*padded, *gates, states[:, 1], slots, num_new))
+        reads.append(function(*padded, *gates, states[:, 1], slots, num_new, Keep(states[:, 2], num_kept)))
     assert torch.isfinite(reads[0]).all(), "padding reads zeros"
     check(*(read[~padding] for read in reads))
     torch.testing.assert_close(*after, rtol=1e-4, atol=1e-2 if dtype == torch.bfloat16 else 1e-5)
     untouched = [slot for slot in range(NUM_SLOTS) if slot not in slots]
     assert torch.equal(after[0][untouched], memory[untouched])
+    keeps_none = [slot for slot in range(NUM_SLOTS) if slot not in slots[num_kept > 0]]
+    assert torch.equal(after[0][keeps_none, 2], memory[keeps_none, 2])
+    for row in (num_kept > 0).nonzero().flatten():  # as if these were all
+        once = memory.clone()
+        TWINS.delta(
+            *(x[row, None] for x in (mixed, speed_beta)),
+            *gates,
+            once[:, 1],
+            slots[row, None],
+            num_kept[row, None],
+            Keep(once[:, 2], torch.zeros(1, dtype=torch.long)),
+        )
+        torch.testing.assert_close(after[1][slots[row], 2], once[slots[row], 1], rtol=0, atol=0)
 
 
 @interpreted
@@ -292,11 +310,13 @@ def test_the_kernels_themselves_are_right_by_the_server_s_own_measure(
     samples: dict[str, tuple[Any, ...]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("ponder_server.kernels.attention._PROGRAMS", 4)
-    before = {name: [x.clone() for x in sample if isinstance(x, Tensor)] for name, sample in samples.items()}
+    before = {
+        name: [x.clone() for x in tree_leaves(sample) if isinstance(x, Tensor)] for name, sample in samples.items()
+    }
     chosen, verdicts = choose(samples, TWINS, KERNELS, Timer(1.0, 2.0))
     assert chosen == replace(KERNELS, quantise=TWINS.quantise, few_rows=TWINS.few_rows), verdicts
     for name, sample in samples.items():
-        tensors = [x for x in sample if isinstance(x, Tensor)]
+        tensors = [x for x in tree_leaves(sample) if isinstance(x, Tensor)]
         assert all(map(torch.equal, tensors, before[name])), f"trying {name} changes nothing"
 
 

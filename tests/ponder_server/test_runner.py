@@ -9,6 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dual_system.models.graphs import directly
 from dual_system.models.ponder.configs import qwen35_9b, tiny_cpu
 from dual_system.models.ponder.context import Row, Transition
 from dual_system.models.ponder.network import Ponder
@@ -96,6 +97,33 @@ def test_a_state_can_be_restored_twice() -> None:
     session.restore(saved)
     second = feed(session, middle, T)
     assert torch.equal(first, second)
+
+
+@settings(deadline=None, max_examples=8)
+@given(st.sets(st.sampled_from(CUTS), min_size=3, max_size=3), st.booleans(), st.sampled_from([(1, 16, 512), (7,)]))
+def test_an_append_keeps_the_state_of_its_first_tokens_alone(
+    cuts: set[int], is_captured: bool, buckets: tuple[int, ...]
+) -> None:
+    """A neighbour that keeps none shares the forward; what comes after the kept tokens leaves no trace."""
+    first, middle, end = sorted(cuts)
+    runner = Runner(PONDER, num_slots=3, max_tokens=512, buckets=buckets)
+    if is_captured:
+        runner.capture(directly, num_read=16)
+    keeps, alone, neighbour = (runner.open(name) for name in ("keeps", "alone", "neighbour"))
+    for session in (keeps, alone):
+        feed(session, 0, first)
+    before = neighbour.save(neighbour.kept)
+    untouched = [tensor.clone() for tensor in before.tensors]
+    with torch.inference_mode():
+        whole = Append(session=keeps, ids=ROW.ids[first:end], embeds_TH=EMBEDS[first:end], num_kept=middle - first)
+        runner.append([whole, Append(session=neighbour, ids=ROW.ids[:end], embeds_TH=EMBEDS[:end])])
+    assert all(map(torch.equal, neighbour.kept.tensors, untouched))
+    keeps.restore(keeps.kept)
+    feed(alone, first, middle)
+    assert (keeps.ids, keeps.next_position) == (alone.ids, alone.next_position)
+    for kept, expected in zip(runner.memory.states(keeps.slot), runner.memory.states(alone.slot), strict=True):
+        torch.testing.assert_close(kept, expected, rtol=0, atol=1e-5)
+    torch.testing.assert_close(feed(keeps, middle, T), feed(alone, middle, T), rtol=0, atol=TOLERANCE)
 
 
 def test_forks_of_one_prefix_continue_alike_and_independently() -> None:

@@ -6,7 +6,8 @@ its cost grows with the square of the number of chunks. Here the chunks are unbo
 in the loop, and the outputs of all chunks are computed at once. The chunk's triangular system is solved by
 substitution: a product of its powers, (I + N)(I + N^2)..., would cancel large terms wherever keys repeat.
 
-# B rows, T tokens, K key heads, V value heads, G = V / K, N chunks, C tokens of a chunk, D key and E value dimensions
+# B rows, T tokens, K key heads, V value heads, G = V / K, X = B V, N chunks, C tokens of a chunk
+# D key and E value dimensions
 """
 
 from contextlib import AbstractContextManager, nullcontext
@@ -45,18 +46,58 @@ def gated_delta_rule(
     Returns:
         Outputs (B, T, V, E) in the dtype of ``query``, and the final state (B, V, D, E) float32.
     """
+    return _prepared(query, key, value, g, beta, initial_state, chunk_size, None)[:2]
+
+
+def gated_delta_keeping(
+    query: Tensor,
+    key: Tensor,
+    value: Tensor,
+    g: Tensor,
+    beta: Tensor,
+    initial_state: Tensor,
+    num_kept_B: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """The rule for T tokens or one, and the state after each row's first ``num_kept_B`` (B,) of them; None without it.
+
+    That state has the bits of the final one of these tokens alone, if they are padded to as many chunks.
+    """
+    if query.shape[1] == 1:
+        read, state = gated_delta_step(query, key, value, g, beta, initial_state)
+        return read, state, None if num_kept_B is None else state
+    return _prepared(query, key, value, g, beta, initial_state, None, num_kept_B)
+
+
+def _prepared(
+    query: Tensor,
+    key: Tensor,
+    value: Tensor,
+    g: Tensor,
+    beta: Tensor,
+    initial_state: Tensor | None,
+    chunk_size: int | None,
+    num_kept_B: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor | None]:
     if chunk_size is None:
         chunk_size = min(GPU_CHUNK, query.shape[1]) if query.is_cuda else CHUNK
     with _without_autocast(query.device):
-        read, state = _rule(
-            _of_length_1(query), _of_length_1(key), value.float(), g.float(), beta.float(), chunk_size, initial_state
+        read, state, kept = _rule(
+            *(_of_length_1(query), _of_length_1(key), value.float(), g.float(), beta.float()),
+            *(chunk_size, initial_state, num_kept_B),
         )
-    return read.to(query.dtype), state
+    return read.to(query.dtype), state, kept
 
 
 def _rule(
-    query: Tensor, key: Tensor, value: Tensor, g: Tensor, beta: Tensor, chunk: int, state: Tensor | None
-) -> tuple[Tensor, Tensor]:
+    query: Tensor,
+    key: Tensor,
+    value: Tensor,
+    g: Tensor,
+    beta: Tensor,
+    chunk: int,
+    state: Tensor | None,
+    num_kept_B: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor | None]:
     batch, length, key_heads, key_dim = key.shape
     value_heads, value_dim = value.shape[2:]
     padding = -length % chunk
@@ -94,10 +135,36 @@ def _rule(
         state = torch.baddbmm(state * keep, k, new)
     attention = ((queries @ keys.transpose(-1, -2)) * decay).flatten(1, 3)
     reading = (queries * since_start.exp()).flatten(1, 3)
-    read = reading @ torch.stack(states) + attention @ torch.stack(news)
+    states_NXDE, news_NXCE = torch.stack(states), torch.stack(news)
+    read = reading @ states_NXDE + attention @ news_NXCE
     read_BNCVE = read.view(num_chunks, batch, value_heads, chunk, value_dim).permute(1, 0, 3, 2, 4)
     read_BTVE = read_BNCVE.reshape(batch, num_chunks * chunk, value_heads, value_dim)[:, :length]
-    return read_BTVE, state.view(batch, value_heads, key_dim, value_dim)
+    kept_BVDE = None
+    if num_kept_B is not None:
+        chunk_B = (num_kept_B // chunk).clamp(max=num_chunks - 1)
+        at = chunk_B, torch.arange(batch, device=key.device)
+        start_BVDE, new_BVCE = (x.unflatten(1, (batch, value_heads))[at] for x in (states_NXDE, news_NXCE))
+        kept_BVDE = _as_if_ended(keys[at], since_start[at], start_BVDE, new_BVCE, num_kept_B - chunk_B * chunk)
+    return read_BTVE, state.view(batch, value_heads, key_dim, value_dim), kept_BVDE
+
+
+def _as_if_ended(
+    keys_BK1CD: Tensor, since_start_BKGC1: Tensor, start_BVDE: Tensor, new_BVCE: Tensor, count_B: Tensor
+) -> Tensor:
+    """The state (B, V, D, E) after a chunk's first ``count_B`` tokens, from the state at its start."""
+    count_B111 = count_B[:, None, None, None]
+    sums_BVC1 = since_start_BKGC1.flatten(1, 2)
+    last_BV11 = sums_BVC1.gather(2, (count_B111 - 1).clamp(min=0).expand(-1, sums_BVC1.shape[1], 1, 1))
+    is_later_B1C1 = torch.arange(sums_BVC1.shape[2], device=count_B.device)[:, None] >= count_B111
+    # Masked before exp: what is later could overflow.
+    weights_BVC1 = (last_BV11 - sums_BVC1).masked_fill(is_later_B1C1, float("-inf")).exp()
+    keys_BVCD = keys_BK1CD.expand(-1, -1, since_start_BKGC1.shape[2], -1, -1).flatten(1, 2)
+    kept_XDE = torch.baddbmm(
+        (start_BVDE * last_BV11.masked_fill(count_B111 == 0, 0.0).exp()).flatten(0, 1),
+        (keys_BVCD * weights_BVC1).flatten(0, 1).transpose(-1, -2),
+        new_BVCE.flatten(0, 1),
+    )
+    return kept_XDE.view(start_BVDE.shape)
 
 
 def gated_delta_step(
