@@ -72,11 +72,11 @@ class Samples(NamedTuple):
 
     parts: dict[str, tuple[Any, ...]]
     wholes: Callable[[Operations], dict[str, tuple[Any, ...]]] = lambda parts: {}
-    """Of operations that replace several, given those parts that were taken: their twins are made of them."""
+    """Those of operations that replace several, given the parts that were taken: their twins are made of them."""
 
 
 def tried(kernels: Operations, samples: Samples, timer: Timer) -> tuple[Operations, list[Verdict]]:
-    """Of ``kernels`` those that are right and faster than their twins, and twins for the others; see ``trial.choose``.
+    """The ``kernels`` that are right and faster than their twins, and twins for the others; see ``trial.choose``.
 
     Products are not tried: those of ``kernels`` are kept.
     """
