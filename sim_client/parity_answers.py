@@ -43,7 +43,7 @@ class AnswersOptions:
     seed: int = 0
     """Seed of an episode that is to be stored."""
     seconds: int = 8
-    """Length of an episode that is to be stored: an observation a second."""
+    """Length of an episode that is to be stored, if it does not end sooner: an observation a second."""
     ponder: Path
     """PONDER's folder; with --backend official the official folder."""
     pounce: Path
@@ -67,6 +67,7 @@ class AnswersOptions:
 def stored_episode(task: str, seed: int, seconds: int) -> Arrays:
     """The script's episode: instruction, demo (D, V, h, w, 3) at 1 Hz, frames (Q, V, h, w, 3), states (Q, 8)."""
     from clock.schedules import CONTROL_HZ
+    from dual_system.tasks.engine import Status
     from dual_system.tasks.environment import make_environment
     from sim_client.panda_robot import CAMERAS
 
@@ -82,7 +83,7 @@ def stored_episode(task: str, seed: int, seconds: int) -> Arrays:
             if is_seen:
                 frames.append(now.frames)
                 states.append(now.state)
-            if len(frames) == seconds:
+            if len(frames) == seconds or now.status is not Status.ONGOING:  # a script goes on after the success
                 break
         first = [np.stack([each[name] for name in CAMERAS]) for each in frames]
         shown = [np.stack([each[name] for name in CAMERAS]) for each in demo]

@@ -64,3 +64,10 @@ def test_an_episode_is_stored_as_the_script_plays_it() -> None:
     assert episode["frames"].shape == (1, 2, 256, 256, 3)
     assert (episode["states"].shape, episode["demo"].shape) == ((1, 8), (0, 2, 256, 256, 3))
     assert str(episode["instruction"])
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_an_episode_that_succeeds_sooner_than_asked_for_ends_there() -> None:
+    episode = stored_episode(OPTIONS.task, OPTIONS.seed, OPTIONS.seconds)
+    assert 1 < len(episode["frames"]) == len(episode["states"]) < OPTIONS.seconds
