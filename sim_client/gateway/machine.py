@@ -48,6 +48,8 @@ log = logging.getLogger("pp-gateway")
 _IDLE_NS = 20_000_000
 _SILENCE_NS = 5_000_000_000
 _STOPPED = "the gateway was stopped"
+_NO_PICTURE_PX = (1, 1)
+"""A robot without cameras has pictures of this height and width."""
 T = TypeVar("T")
 
 _NO_ID = re.compile(r"[^A-Za-z0-9_.-]+")
@@ -420,10 +422,9 @@ class Machine:
         if self._is_draining:
             self._end(m.TaskStatus.ONGOING, "another episode was begun")
             raise Refused("the gateway is draining: it leaves now, and another process takes its place")
-        camera, first = next(iter(frames.items()))
-        height, width, _ = first.shape
-        _check_size(frames, (height, width), f"as of the {camera} camera")
-        robot = self._plan.body.describe(step.state, (height, width))
+        camera, size_px = next(((name, frame.shape[:2]) for name, frame in frames.items()), ("", _NO_PICTURE_PX))
+        _check_size(frames, size_px, f"as of the {camera} camera")
+        robot = self._plan.body.describe(step.state, size_px)
         _check_state(step.state, robot)
         self._end(m.TaskStatus.ONGOING, "another episode was begun")
         seed, horizon = self._plan.seed + self._num_episodes, self._horizon(client)

@@ -12,10 +12,12 @@ import pytest
 
 from clock import schedules
 from clock.check import disagreements
+from clock.policies import policy_of
 from protocol import messages as m
 from protocol.errors import TransportError
 from protocol.mcap_log import read_log
 from protocol.topics import HEALTH, QUERY, TICK
+from sim_client.gateway.body import Body
 from sim_client.gateway.exchange import Busy, Finish, Observed, Refused, Step
 from sim_client.gateway.options import GatewayOptions, ScheduleOptions
 from sim_client.gateway.pictures import EncodedPicture
@@ -93,6 +95,22 @@ def test_the_log_of_an_episode_follows_from_itself(
     assert record.result is not None
     assert (record.result.status, record.result.is_success) == (m.TaskStatus.SUCCESS, True)
     assert len(record.invocations) == (3 if num_rows == 1 else 4)
+
+
+def test_a_robot_without_cameras_is_played(
+    bench_with: Callable[..., Any], step_of: StepOf, robot_with: Callable[..., m.Robot], tmp_path: Path
+) -> None:
+    body = Body(3, lambda state, px: robot_with(cameras=(), image_height=px[0], image_width=px[1]))
+    bench = bench_with(body=body, policy=policy_of("none"), out=tmp_path, patience_ns=20_000_000_000)
+    spec = replace(bench.rig.pounce_engine.spec, num_cameras=0, num_carriers=0)
+    bench.rig.pounce_engine.spec = bench.rig.pounce._node._spec = spec
+    for request in range(25):
+        bench.ask(step_of(request, begins=request == 0, frames={}))
+    bench.tell(Finish())
+    (path,) = tmp_path.rglob("*.mcap")
+    record = read_log(path)
+    assert {tick.level for tick in record.ticks} == {m.Level.PLAY}
+    assert next(disagreements(record), None) is None
 
 
 def test_held_the_first_six_steps_count_as_by_the_official_server(
