@@ -179,6 +179,7 @@ def check_solved(snapshot: Snapshot) -> None:
 def kept_environment(task: str, image_px: int, max_steps: int, *, texts_follow: bool = False) -> Environment:
     """Returns this process's environment, kept until another one is needed or the process ends."""
     environment = make_environment(task, image_px=image_px, max_steps=max_steps, texts_follow=texts_follow)
+    environment.open_cameras()
     atexit.unregister(kept_environment.cache_clear)
     atexit.register(
         kept_environment.cache_clear

@@ -268,7 +268,8 @@ class Environment:
         self._reorder()
         return self._snapshot(look=look)
 
-    def _open_cameras(self) -> None:
+    def open_cameras(self) -> None:
+        """Opens the renderer, as ``reset`` does; not twice. Raises RenderingError."""
         if self._image_px is not None and self._cameras is None:
             self._cameras = Cameras(self.physics, self._image_px)
 
@@ -287,7 +288,7 @@ class Environment:
         self.close()
 
     def _begin(self, difficulty: str, layout: Any) -> None:
-        self._open_cameras()
+        self.open_cameras()
         self.difficulty, self._layout = difficulty, layout
         self._subtasks = self.task.subtasks(layout)
         self._step, self._memory, self._caption, self._progress = 0, None, None, Progress()
