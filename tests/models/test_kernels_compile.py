@@ -134,7 +134,7 @@ def test_every_kernel_compiles_and_keeps_its_registers(tmp_path: os.PathLike[str
         capture_output=True,
         text=True,
         check=False,
-        timeout=240,
+        timeout=480,
     )
     assert done.returncode == 0, done.stderr[-2000:]
     built = [line.split() for line in done.stdout.splitlines()]
