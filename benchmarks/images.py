@@ -116,6 +116,8 @@ def running(name: str, arguments: Sequence[str], said: Path, volume: str = "") -
     container = buildah("from", _tag(name))
     entry = json.loads(buildah("inspect", container))["OCIv1"]["config"]["Entrypoint"]
     volumes = ["--volume", volume] if volume else []
+    if volume:  # else buildah mounts a volume of its own where the image declares one
+        buildah("config", "--volume", f"{volume.partition(':')[2]}-", container)
     words = ["buildah", "run", "--network", "host", *volumes, container, "--", *entry, *arguments]
     with said.open("wb") as file:
         process = subprocess.Popen(words, stdout=file, stderr=file, start_new_session=True)
