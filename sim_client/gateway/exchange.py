@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clock.timebase import NS_PER_S
 from protocol.messages import Floats, Level, Mode, Robot, RobotState, TaskStatus
 from protocol.peers.mapping import PolicyMapping
 
@@ -109,6 +110,20 @@ class Answer:
     levels: tuple[Level, ...]
     deadline_ns: int = 0
     behind: Behind = Behind()
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """What a client hears beside the rows: the first one's tick, and what is behind it. No subgoal yet: ""."""
+        return {
+            "tick": self.tick,
+            "subgoal": self.behind.subgoal,
+            "subgoal_age_s": self.behind.subgoal_age_ns / NS_PER_S,
+            "cognition_age_s": self.behind.cognition_age_ns / NS_PER_S,
+        }
+
+    @property
+    def level_names(self) -> list[str]:
+        return [level.name for level in self.levels]
 
 
 class ClientRequest(NamedTuple):

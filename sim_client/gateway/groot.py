@@ -63,7 +63,7 @@ class GrootDialect:
         arrays = answer_of(self._mapping, answer.rows_NA)
         if self.is_flat:
             return self._packed({f"action.{named(key)}": array for key, array in arrays.items()})
-        info = {"tick": answer.tick, "levels": [level.name for level in answer.levels]}
+        info = {"levels": answer.level_names, **answer.told}
         return self._packed([{named(key): array[None] for key, array in arrays.items()}, info])
 
     def refuse(self, sentence: str) -> bytes:

@@ -67,5 +67,5 @@ def metadata(terms: Terms) -> dict[str, Any]:
 
 
 def actions_of(answer: Answer) -> dict[str, Any]:
-    """The rows, and beside them where they come from: the tick of the first, and the ladder's rung of each."""
-    return {"actions": answer.rows_NA, "tick": answer.tick, "levels": [level.name for level in answer.levels]}
+    """The rows, and beside them where they come from: `Answer.told`, and the ladder's rung of each."""
+    return {"actions": answer.rows_NA, "levels": answer.level_names, **answer.told}

@@ -93,11 +93,11 @@ class PonderpounceDialect:
         return _message(
             "command",
             asked.seq,
-            tick=answer.tick,
             values=answer.rows_NA[0].tolist(),
             level=answer.levels[0].name,
             deadline_ns=answer.deadline_ns,
             expires_ns=answer.deadline_ns + EXPIRY_TICKS * NS_PER_S // self._terms.control_hz,
+            **answer.told,
         )
 
     def refuse(self, sentence: str) -> bytes:

@@ -62,11 +62,7 @@ class VlaEvalDialect:
         raise Refused(f"expected a message of vla-eval 0.8, came type {kind[:80]!r}")
 
     def answer(self, asked: ClientRequest, answer: Answer) -> bytes:
-        payload = {
-            "actions": answer.rows_NA[0],
-            "tick": answer.tick,
-            "level": answer.levels[0].name,
-        }
+        payload = {"actions": answer.rows_NA[0], "level": answer.levels[0].name, **answer.told}
         return _message("action", payload, asked.seq)
 
     def refuse(self, sentence: str) -> bytes:

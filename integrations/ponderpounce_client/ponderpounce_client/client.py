@@ -55,7 +55,8 @@ class Command:
 
     ``values``: (action_dim,) float32, within the robot's limits. ``level``: PLAY or STALE for a policy's row, HOLD,
     DECELERATE or STOPPED where there is none. ``deadline_ns``: the tick's. ``expires_ns``: when a robot that got no
-    newer command has to stop by itself.
+    newer command has to stop by itself. ``subgoal``: PONDER's newest, "" if it has none yet, with its age and that of
+    the cognition behind ``values``, in seconds of the schedule.
     """
 
     tick: int
@@ -63,6 +64,9 @@ class Command:
     level: str
     deadline_ns: int
     expires_ns: int
+    subgoal: str = ""
+    subgoal_age_s: float = 0.0
+    cognition_age_s: float = 0.0
 
     @property
     def is_playing(self) -> bool:
@@ -141,6 +145,9 @@ class Client:
             level=told["level"],
             deadline_ns=told["deadline_ns"] - self._offset_ns,
             expires_ns=told["expires_ns"] - self._offset_ns,
+            subgoal=told["subgoal"],
+            subgoal_age_s=told["subgoal_age_s"],
+            cognition_age_s=told["cognition_age_s"],
         )
 
     def end(self, success: bool | None = None, reason: str = "") -> None:
