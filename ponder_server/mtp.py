@@ -26,8 +26,8 @@ WINDOW = 64
 """Tokens of the text to which the head attends; they are recomputed for every proposal."""
 MAX_DRAFT_TOKENS = MAX_CHECKED_TOKENS - 1
 NUM_ROWS = 32_768
-"""Tokens that it guesses: the first of the vocabulary, which were learned first because they are frequent. To read the
-whole head for a guess would take a 9B network longer than the block itself."""
+"""Tokens that it guesses: the first of the vocabulary. Byte pair encoding numbers tokens as it finds them, and finds
+frequent ones early. To read the whole head for a guess would take a 9B network longer than the block itself."""
 _LENGTHS = (1, 16, WINDOW)
 
 

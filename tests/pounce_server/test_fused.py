@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dual_system.models.graphs import Capture, Work, directly
+from dual_system.models.graphs import directly
 from dual_system.models.kernels.launch import missing_for
 from dual_system.models.pi05.gemma import GemmaConfig
 from dual_system.models.pi05.pounce import Pounce, PounceConfig, PounceInputs
@@ -150,24 +150,6 @@ def test_packing_holds_no_weight_twice_and_changes_none() -> None:
 # -- buckets and graphs, without a GPU
 
 
-class Recorder:
-    """Runs work before the recording as a graph does, and lists what is captured (c) and replayed (r)."""
-
-    def __init__(self) -> None:
-        self.events = ""
-
-    def __call__(self, work: Work) -> Work:
-        self.events += "c"
-        work()
-        work()
-
-        def replay() -> None:
-            self.events += "r"
-            work()
-
-        return replay
-
-
 @pytest.fixture
 def config() -> PounceConfig:
     return tiny_cpu(num_carriers=1)
@@ -177,13 +159,12 @@ def with_tokens(config: PounceConfig, num_tokens: int) -> PounceInputs:
     return config.example_inputs(1, num_tokens=num_tokens, seed=num_tokens)
 
 
-def test_what_is_captured_once_is_replayed_over_new_inputs(config: PounceConfig) -> None:
+def test_what_is_captured_once_is_replayed_over_new_inputs(config: PounceConfig, recorder: Any) -> None:
     model = model_of(config)
     noise = noise_for(config, 1)
     num_free = -NUM_BESIDE_TEXT % BUCKET_TOKENS
     requests = [with_tokens(config, count) for count in (num_free, 1, num_free)]
     expected = [eager_actions(model, inputs, noise) for inputs in requests]
-    recorder = Recorder()
     fused = FusedPounce(model, TWINS, recorder)
     for inputs, actions in zip(requests, expected, strict=True):
         assert mean_error(fused_actions(fused, inputs, noise), actions) <= MAE["float32"]
@@ -192,13 +173,12 @@ def test_what_is_captured_once_is_replayed_over_new_inputs(config: PounceConfig)
     assert recorder.events == captured + ("r" + invocation) * 2, "vision, prefill and ten steps, captured once"
 
 
-def test_no_prompt_waits_for_a_capture(config: PounceConfig) -> None:
+def test_no_prompt_waits_for_a_capture(config: PounceConfig, recorder: Any) -> None:
     """The prompt spells the state in digits: its length changes while a robot moves."""
     model = model_of(config)
     noise = noise_for(config, 1)
     requests = [with_tokens(config, count) for count in (4, 1, 4 + BUCKET_TOKENS, config.max_prompt_tokens, 4)]
     expected = [eager_actions(model, inputs, noise) for inputs in requests]
-    recorder = Recorder()
     fused = FusedPounce(model, TWINS, recorder)
     for inputs, actions in zip(requests, expected, strict=True):
         assert mean_error(fused_actions(fused, inputs, noise), actions) <= MAE["float32"]
@@ -215,9 +195,9 @@ def test_the_keys_of_an_action_fill_whole_slots(config: PounceConfig) -> None:
     assert all(width % SLOT_MULTIPLE == 0 for width in widths)
 
 
-@pytest.mark.parametrize("capture", [directly, Recorder()], ids=["directly", "captured"])
-def test_a_sample_leaves_nothing_behind(config: PounceConfig, capture: Capture) -> None:
-    fused = FusedPounce(model_of(config), TWINS, capture)
+@pytest.mark.parametrize("is_captured", [False, True], ids=["directly", "captured"])
+def test_a_sample_leaves_nothing_behind(config: PounceConfig, recorder: Any, *, is_captured: bool) -> None:
+    fused = FusedPounce(model_of(config), TWINS, recorder if is_captured else directly)
     inputs, noise = with_tokens(config, 7), noise_for(config, 1)
     first = fused_actions(fused, inputs, noise)
     fused_actions(fused, with_tokens(config, 9), noise_for(config, 1, seed=1))
@@ -273,14 +253,14 @@ def test_a_kernel_that_is_wrong_broken_or_slow_is_not_taken_and_the_heartbeat_sa
     operations = replace(TWINS, geglu=wrong, rope=broken, euler=own, attend=whole)
     model, inputs, noise = model_of(config), with_tokens(config, 3), noise_for(config, 1)
     expected = eager_actions(model, inputs, noise)
-    fused = FusedPounce(model, operations, Recorder(), Timer(1e-3, 2e-3))
+    fused = FusedPounce(model, operations, directly, Timer(1e-3, 2e-3))
     assert fused.kernels == ""
     assert mean_error(fused_actions(fused, inputs, noise), expected) <= MAE["float32"]
     assert fused._network.expert.do == replace(TWINS, euler=own, attend=whole)
     assert fused.kernels.startswith("kernels: norm 2/2, rope 0/2 (prefill: it does not run: RuntimeError: no kernel")
     assert "geglu 0/2 (prefill: it differs from its twin by 1.0e-02" in fused.kernels
     assert fused.kernels.endswith("attend 2/2, geglu_product 2/2, euler 1/1")
-    slow = FusedPounce(model, operations, Recorder(), Timer(2e-3, 1e-3))
+    slow = FusedPounce(model, operations, directly, Timer(2e-3, 1e-3))
     fused_actions(slow, inputs, noise)
     assert slow._network.expert.do == slow._network.language.do == TWINS
     assert "norm 0/2 (prefill: 2 us, its twin 1; it differs by 0.0e+00)" in slow.kernels

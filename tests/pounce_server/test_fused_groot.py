@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dual_system.models.golden import read_golden
-from dual_system.models.graphs import Work
+from dual_system.models.graphs import directly
 from dual_system.models.groot.blocks import BlockConfig
 from dual_system.models.groot.pounce import GrootInputs, GrootPounce, GrootPounceConfig
 from dual_system.models.groot.qwen3 import Qwen3Config
@@ -145,26 +146,8 @@ def test_kernels_in_the_interpreter_act_as_the_eager_model(dtype: DTypeName, mon
     assert mean_error(actions, expected) <= max(MAE["float32"], rounding)
 
 
-class Recorder:
-    """Runs work before the recording as a graph does, and lists what is captured (c) and replayed (r)."""
-
-    def __init__(self) -> None:
-        self.events = ""
-
-    def __call__(self, work: Work) -> Work:
-        self.events += "c"
-        work()
-        work()
-
-        def replay() -> None:
-            self.events += "r"
-            work()
-
-        return replay
-
-
 @pytest.mark.parametrize("slot", ["features", "embeddings"])
-def test_no_prompt_waits_for_a_capture_and_padding_is_not_seen(slot: str) -> None:
+def test_no_prompt_waits_for_a_capture_and_padding_is_not_seen(slot: str, recorder: Any) -> None:
     """Neither the padding of a bucket nor what an earlier prompt left in it moves an action."""
     config = replace(tiny_groot(num_carriers=2), slot=slot)  # type: ignore[arg-type]
     model, noise = model_of(config), noise_for(config)
@@ -173,7 +156,6 @@ def test_no_prompt_waits_for_a_capture_and_padding_is_not_seen(slot: str) -> Non
         for count in (4, config.max_prompt_tokens, 1, 4 + BUCKET_TOKENS, 61, 4)
     ]
     expected = [eager_actions(model, inputs, noise) for inputs in requests]
-    recorder = Recorder()
     fused = FusedPounce(model, TWINS, recorder)
     actions = [fused_actions(fused, inputs, noise) for inputs in requests]
     for mine, theirs in zip(actions, expected, strict=True):
@@ -233,12 +215,12 @@ def test_a_kernel_that_is_wrong_or_slow_is_not_taken_and_the_server_says_so() ->
     model, inputs, noise = model_of(config), config.example_inputs(1), noise_for(config)
     expected = eager_actions(model, inputs, noise)
     operations = replace(TWINS, swiglu=wrong, euler=own)
-    fused = FusedPounce(model, operations, Recorder(), Timer(1.0, 2.0))
+    fused = FusedPounce(model, operations, directly, Timer(1.0, 2.0))
     assert mean_error(fused_actions(fused, inputs, noise), expected) <= MAE["float32"]
     assert fused._network.dit.do == replace(TWINS, euler=own)
     assert fused._network.language.do == TWINS
     assert fused.kernels.startswith("kernels: norm 3/3, head_rope 1/1, swiglu 0/1 (language: it differs from its twin")
-    slow = FusedPounce(model, operations, Recorder(), Timer(2.0, 1.0))
+    slow = FusedPounce(model, operations, directly, Timer(2.0, 1.0))
     fused_actions(slow, inputs, noise)
     assert slow._network.dit.do == slow._network.mixer.do == TWINS
 
