@@ -68,7 +68,7 @@ oldest: setup
 	test -d $(OLDEST)/httpx || $(BIN)/pip install --quiet --target $(OLDEST) 'huggingface-hub<2' httpx
 	PYTHONPATH=$(OLDEST) $(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile -m "not gpu" tests/models tests/ponder_server
 
-## make peers   unit under Python 3.12 and 3.13, LeRobot, rosbags and Foxglove's reader beside us; writes benchmarks/reports/peers.json (an hour)
+## make peers   unit under Python 3.12 and 3.13; LeRobot, rosbags, Foxglove's reader and Grafana's SDK beside us; writes benchmarks/reports/peers.json (an hour)
 LEROBOT := $(VENV)/peers/lerobot
 $(LEROBOT)/.ready:
 	python3.12 -m venv $(LEROBOT)
@@ -87,9 +87,13 @@ $(FOXGLOVE)/.ready:
 	mkdir -p $(FOXGLOVE)
 	if command -v npm; then npm install --silent --prefix $(FOXGLOVE) @mcap/core@2.2.2 @mcap/nodejs@1.0.2 @mcap/support@1.1.0; fi
 	touch $@
-peers: setup site $(LEROBOT)/.ready $(ROSBAGS)/.ready $(FOXGLOVE)/.ready
+GRAFANA := $(VENV)/peers/grafana
+$(GRAFANA)/.ready:
+	$(BIN)/pip install --quiet --no-deps --target $(GRAFANA) grafana-foundation-sdk
+	touch $@
+peers: setup site $(LEROBOT)/.ready $(ROSBAGS)/.ready $(FOXGLOVE)/.ready $(GRAFANA)/.ready
 	for version in 3.12 3.13; do $(MAKE) setup VENV=$(VENV)/peers/$$version PYTHON=python$$version || exit 1; done
-	$(BIN)/python -m benchmarks.peers --pythons $(BIN)/python $(VENV)/peers/3.12/bin/python $(VENV)/peers/3.13/bin/python \
+	PYTHONPATH=$(GRAFANA) $(BIN)/python -m benchmarks.peers --jobs $(JOBS) --pythons $(VENV)/peers/3.12/bin/python $(VENV)/peers/3.13/bin/python \
 		--lerobot $(LEROBOT)/bin/python --rosbags $(ROSBAGS)/bin/python \
 		$$(test -d $(FOXGLOVE)/node_modules && echo --foxglove $(FOXGLOVE)/node_modules)
 

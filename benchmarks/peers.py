@@ -26,7 +26,7 @@ class PeersOptions:
     """Runs the unit tests under several Pythons, and the tests beside LeRobot."""
 
     pythons: tuple[Path, ...]
-    """Interpreters with our packages; the first runs the tests beside other projects."""
+    """Interpreters with our packages, each of another version than the one that runs this and CI."""
     lerobot: Path | None = None
     """Interpreter with lerobot 0.6. None: those tests are skipped, and counted so."""
     rosbags: Path | None = None
@@ -62,7 +62,7 @@ def main() -> int:
         "FOXGLOVE_MODULES": options.foxglove,
     }
     beside = {name: str(python) for name, python in others.items() if python is not None}
-    rows.append(_stage("beside other projects, and public folders", options.pythons[0], ["-m", "peers"], beside))
+    rows.append(_stage("beside other projects, and public folders", Path(sys.executable), ["-m", "peers"], beside))
     report.add_table("By stage", rows)
     if options.lerobot is not None:
         told = (
