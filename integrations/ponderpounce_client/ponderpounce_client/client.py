@@ -80,7 +80,8 @@ class Client:
         url: of the gateway.
         api_key: the word in the gateway's --api-key-file.
         patience_s: longest wait for a connection, for servers to open an episode, and for its first command.
-        silence_s: longest wait for any further answer. The robot's own watchdog does not wait for it.
+        silence_s: longest wait for any further answer: a busy computer stands still for a second and is not dead. The
+            robot's own watchdog does not wait for it.
 
     Raises:
         Lost: nobody answers there.
@@ -88,7 +89,7 @@ class Client:
     """
 
     def __init__(
-        self, url: str = "ws://127.0.0.1:8000", api_key: str = "", patience_s: float = 150.0, silence_s: float = 0.5
+        self, url: str = "ws://127.0.0.1:8000", api_key: str = "", patience_s: float = 150.0, silence_s: float = 5.0
     ) -> None:
         self._url, self._patience_s, self._silence_s = url, patience_s, silence_s
         self._seq, self._has_command = 0, False

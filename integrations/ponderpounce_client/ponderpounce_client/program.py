@@ -133,10 +133,12 @@ class _Drive:
 
     def _obey(self) -> None:
         until_s = time.monotonic() + self._settings.max_s if self._settings.max_s is not None else None
+        say_at = 0
         while until_s is None or time.monotonic() < until_s:
             seen = self._seen()
             command = self._client.step(seen)
-            if command.tick % _SAY_TICKS == 0:
+            if command.tick >= say_at:
+                say_at = command.tick + _SAY_TICKS
                 self._say(f"tick {command.tick:6d}  {command.level:<10}  {_row(command.values)}")
             if self._trouble is not None:
                 self._interrupt(command, seen)
