@@ -75,7 +75,7 @@ $(LEROBOT)/.ready:
 	$(LEROBOT)/bin/pip install --quiet "$(TORCH)" torchvision
 	$(LEROBOT)/bin/pip install --quiet --no-deps lerobot==0.6.1  # its own pin of torch would fetch CUDA
 	$(LEROBOT)/bin/pip install --quiet 'datasets<5' 'pandas<3' 'av<16' 'draccus>=0.11.6,<0.12' 'huggingface-hub<2' jsonlines einops \
-		gymnasium opencv-python-headless msgpack websockets termcolor deepdiff requests 'setuptools<82'
+		safetensors gymnasium opencv-python-headless msgpack websockets termcolor deepdiff requests 'setuptools<82'
 	touch $@
 ROSBAGS := $(VENV)/peers/rosbags
 $(ROSBAGS)/.ready:

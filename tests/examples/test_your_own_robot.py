@@ -115,6 +115,7 @@ class Bench:
         before = self.history()["num_moves"]
 
         def has_moved() -> bool:
+            assert self.programs[-1].poll() is None, self.said("program")
             if self.has_stopped():
                 self.arm.call("reset")
                 self.engage()

@@ -124,6 +124,7 @@ class Bench:
 
         def has_moved() -> bool:
             nonlocal seen, at_s
+            assert self._processes[-1].poll() is None, self.said("program")
             now = len(self.sent())
             if now > seen:
                 seen, at_s = now, time.monotonic()
