@@ -129,6 +129,8 @@ class Fire:
     texts: tuple[Text, ...]
     context_tokens: int
     """Tokens in the session after this fire."""
+    gate_score: float | None = None
+    """Probability of T_yes against T_no, or what a foreign gate reports of itself; None if no gate decided."""
     trouble: str = ""
     """Why it says nothing new although it was asked, for the log; "" if nothing went wrong."""
 

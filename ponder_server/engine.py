@@ -277,7 +277,7 @@ class QwenEngine:
         is_answered = False
         try:
             texts: tuple[Text, ...] = ()
-            is_transition = exactly is not None
+            is_transition, gate_score = exactly is not None, None
             unread_ids, unread_TH = query.ids[:num_observed], observation_TH
             at_once = Append(
                 session=context,
@@ -288,7 +288,8 @@ class QwenEngine:
             )
             if not is_transition:
                 hidden_NH = yield at_once
-                is_transition = self._format.speaks and self._writer.wants_to_write(hidden_NH[:1])
+                if self._format.speaks:
+                    is_transition, gate_score = self._writer.gate(hidden_NH[:1])
                 hidden_KH = hidden_NH[1:]
                 if is_transition:
                     context.restore(context.kept)
@@ -307,7 +308,7 @@ class QwenEngine:
                 else:  # rolled back: the same forward as for a query without a transition, hence the same bits
                     context.restore(before)
                     hidden_KH = (yield at_once)[1:]
-            answer = self._answer(context, hidden_KH, texts)
+            answer = self._answer(context, hidden_KH, texts, gate_score)
             num_written = len(context.ids) - before.num_ids - len(query.ids)
             episode.spans += [
                 Span(SegmentKind.OBSERVATION, num_observed),
@@ -395,7 +396,7 @@ class QwenEngine:
         embeds_TH = self._embed(ids, [*self._see(self.example_frames(), "warm-up")])
         context.save(context.before_fire)
         hidden_NH = context.append(ids, embeds_TH, num_wanted=1 + self._format.num_carriers)
-        self._writer.wants_to_write(hidden_NH[:1])
+        self._writer.gate(hidden_NH[:1])
         return hidden_NH[1:].float()
 
     def _episode(self, session: str) -> Episode:
@@ -441,7 +442,7 @@ class QwenEngine:
         )
         episode.spans = [span for span, stay in zip(episode.spans, stays, strict=True) if stay]
 
-    def _answer(self, context: Session, hidden_KH: Tensor, texts: tuple[Text, ...]) -> Fire:
+    def _answer(self, context: Session, hidden_KH: Tensor, texts: tuple[Text, ...], gate_score: float | None) -> Fire:
         # A copy, because a view would keep the hidden states of the whole observation alive.
         cognition = hidden_KH.to("cpu", torch.float32, copy=True).numpy()
         if not np.isfinite(cognition).all():
@@ -449,5 +450,10 @@ class QwenEngine:
                 f"session {context.name!r}: cognition is not finite after {context.num_tokens} tokens; "
                 f"weights {self._spec.model_hash} in {self._spec.dtype} are broken or overflow."
             )
-        num_tokens = context.num_tokens
-        return Fire(cognition=cognition, is_transition=bool(texts), texts=texts, context_tokens=num_tokens)
+        return Fire(
+            cognition=cognition,
+            is_transition=bool(texts),
+            texts=texts,
+            context_tokens=context.num_tokens,
+            gate_score=gate_score,
+        )

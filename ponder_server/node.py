@@ -119,6 +119,7 @@ class PonderNode:
             is_fake=self._spec.is_random,
             text=self._subgoal if self._spec.gives_text else None,
             text_source_ns=self._subgoal_source_ns,
+            gate_score=fire.gate_score,
         )
         texts = [
             m.Subgoal(

@@ -128,6 +128,7 @@ class OfficialPonder:
             is_transition=answer.kind == "transition",
             texts=_texts(answer),
             context_tokens=self._num_tokens(session),
+            gate_score=None if answer.gate_score is None else float(answer.gate_score),
         )
 
     def close(self, session: str) -> None:

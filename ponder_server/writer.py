@@ -75,13 +75,15 @@ class TransitionWriter:
         self._ends = ends_of_text(ponder.format.vocabulary, self._policy)
         self._is_text_V, self._may_end_V = allowed_tokens(ponder, ends=False), allowed_tokens(ponder, ends=True)
 
-    def wants_to_write(self, hidden_1H: Tensor) -> bool:
-        """Whether T_yes is the most likely of all next tokens.
+    def gate(self, hidden_1H: Tensor) -> tuple[bool, float]:
+        """Whether T_yes is the most likely of all next tokens, and its probability against T_no alone.
 
-        Mostly T_no leads it, and two rows of the head decide; the whole head is the largest matrix of the network.
+        Mostly T_no leads it, and two rows of the head decide; the whole head is the largest matrix of the network. A
+        third token may lead both, so that a probability above 1/2 opens nothing.
         """
         yes, no = self._ponder.logits(hidden_1H, self._gate)[0].tolist()
-        return no - yes < CLEARLY and int(self._ponder.logits(hidden_1H)[0].argmax()) == self._t_yes
+        opens = no - yes < CLEARLY and int(self._ponder.logits(hidden_1H)[0].argmax()) == self._t_yes
+        return opens, float(torch.tensor(yes - no).sigmoid())
 
     def write(
         self,

@@ -202,6 +202,8 @@ def check_cognition(c: m.Cognition) -> None:
     _duration(c, "infer_ns")
     _carriers(c, "vector", may_be_empty=c.text is not None)
     _text(c, "model_hash", limit=MAX_ID)
+    if c.gate_score is not None:
+        _require(math.isfinite(c.gate_score), c, "gate_score", "a finite number, or none", c.gate_score)
     _spoken(c, "text_source_ns")
     written_ns = c.text_source_ns if c.text else c.source_ns
     _require(0 <= c.source_ns - written_ns <= MAX_INSTANT_NS, c, "text_source_ns", f"<= {c.source_ns}", written_ns)

@@ -255,6 +255,7 @@ class Cognition:
     is_fake: bool = False
     text: str | None = None
     text_source_ns: int = 0
+    gate_score: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

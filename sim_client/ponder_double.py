@@ -27,6 +27,7 @@ class Answer:
     """The subgoal in force."""
     text_age_ns: int = 0
     """Age of that subgoal at the query's observation."""
+    gate_score: float | None = None
 
 
 class PonderDouble(ABC):
@@ -85,6 +86,7 @@ class PonderDouble(ABC):
             is_fake=self.is_fake,
             text=answer.text,
             text_source_ns=query.source_ns - answer.text_age_ns if answer.text else 0,
+            gate_score=answer.gate_score,
         )
         self.link.publish(topics.COGNITION, cognition, at_ns=now_ns, clock_id=host_clock_id())
 

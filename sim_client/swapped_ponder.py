@@ -58,6 +58,7 @@ class SwappedPonder(PonderDouble):
             norm=given.norm,
             text=given.text or "",
             text_age_ns=given.source_ns - given.text_source_ns if given.text else 0,
+            gate_score=None if has_ended else given.gate_score,
         )
 
     def end(self) -> None:

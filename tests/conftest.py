@@ -80,6 +80,7 @@ class FakePonder:
     contexts: dict[str, Any] = field(default_factory=dict)
     num_tokens: dict[str, int] = field(default_factory=dict)
     texts: tuple[ponder.Text, ...] = ()
+    has_gate: bool = True
     on_fire: Callable[[], None] = lambda: None
     durations_ns: tuple[int, ...] = (78_000_000,) * 20
 
@@ -120,6 +121,7 @@ class FakePonder:
             is_transition=digest[0] % 4 == 0,
             texts=self.texts,
             context_tokens=self.num_tokens[session],
+            gate_score=digest[1] / 256 if self.has_gate else None,
         )
 
     def close(self, session: str) -> None:

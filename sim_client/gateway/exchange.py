@@ -88,12 +88,13 @@ class Finish:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Behind:
-    """What is behind a command, as far as it is known: the newest subgoal that has come from PONDER with its age, the
-    age of the cognition that the command's chunk was conditioned on, and how long both models took."""
+    """What is behind a command, as far as it is known: the newest subgoal that has come from PONDER with its age, age
+    and gate score of the cognition that the command's chunk was conditioned on, and how long both models took."""
 
     subgoal: str = ""
     subgoal_age_ns: int = 0
     cognition_age_ns: int = 0
+    gate_score: float | None = None
     ponder_ns: int = 0
     pounce_ns: int = 0
 
@@ -113,12 +114,16 @@ class Answer:
 
     @property
     def told(self) -> dict[str, Any]:
-        """What a client hears beside the rows: the first one's tick, and what is behind it. No subgoal yet: ""."""
+        """What a client hears beside the rows: the first one's tick, and what is behind it.
+
+        No subgoal yet: "". No gate, no cognition, or none that has come: no score (None).
+        """
         return {
             "tick": self.tick,
             "subgoal": self.behind.subgoal,
             "subgoal_age_s": self.behind.subgoal_age_ns / NS_PER_S,
             "cognition_age_s": self.behind.cognition_age_ns / NS_PER_S,
+            "gate_score": self.behind.gate_score,
         }
 
     @property

@@ -354,6 +354,7 @@ class Session:
                     "cognition_age": behind.cognition_age_ns / 1e9,
                 },
                 "tick": answer.tick,
+                "gate_score": behind.gate_score,
                 "levels": [Level(level).name for level in answer.levels],
             },
         )

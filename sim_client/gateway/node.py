@@ -48,7 +48,8 @@ class Commands:
     newest: m.Action | None = None
     _account: m.Tick | None = None
     _chunks: dict[int, m.ActionChunk] = field(default_factory=dict)
-    _cognition: m.Cognition | None = None
+    _ponder_ns: int = 0
+    _gate_scores: dict[int, float | None] = field(default_factory=dict)  # by query, from the one in use on
     _subgoal: m.Subgoal | None = None
 
     def __post_init__(self) -> None:
@@ -60,6 +61,9 @@ class Commands:
 
     def on_account(self, account: m.Tick) -> None:
         self._account = account
+        if account.ref_query is not None:
+            while self._gate_scores and (oldest := min(self._gate_scores)) < account.ref_query:
+                del self._gate_scores[oldest]
 
     def on_chunk(self, chunk: m.ActionChunk) -> None:
         self._chunks[chunk.invocation] = chunk
@@ -67,7 +71,8 @@ class Commands:
             del self._chunks[min(self._chunks)]
 
     def on_cognition(self, cognition: m.Cognition) -> None:
-        self._cognition = cognition
+        self._ponder_ns = cognition.infer_ns
+        self._gate_scores[cognition.query] = cognition.gate_score
 
     def on_subgoal(self, subgoal: m.Subgoal) -> None:
         """Keeps the newest one that PONDER has told; a blank one says that none is in force."""
@@ -95,7 +100,8 @@ class Commands:
             subgoal=subgoal.text.strip() if subgoal is not None else "",
             subgoal_age_ns=max(0, newest.tick - subgoal.tick) * NS_PER_S // self.control_hz if subgoal else 0,
             cognition_age_ns=account.age_ns if account is not None else 0,
-            ponder_ns=self._cognition.infer_ns if self._cognition is not None else 0,
+            gate_score=self._gate_scores.get(account.ref_query) if account and account.ref_query is not None else None,
+            ponder_ns=self._ponder_ns,
             pounce_ns=chunk.infer_ns if chunk is not None else 0,
         )
 

@@ -18,14 +18,15 @@ from protocol.messages import Image
 from protocol.options import LinkOptions
 from protocol.process import IDLE_WAIT_NS, StopFlag
 from protocol.sockets import endpoint
-from protocol.topics import EVENT, HEALTH, INFO, OBSERVATION, PHASE, SUBGOAL, TICK, alive_key
+from protocol.topics import COGNITION, EVENT, HEALTH, INFO, OBSERVATION, PHASE, SUBGOAL, TICK, alive_key
 from protocol.zenoh_bus import open_bus
 from sim_client.watch.page import served
 from sim_client.watch.view import View
 
 log = logging.getLogger("pp-replay watch")
 
-_TOPICS: tuple[Any, ...] = (INFO, OBSERVATION, TICK, SUBGOAL, EVENT, PHASE, HEALTH)  # an episode's terms come first
+# An episode's terms come first.
+_TOPICS: tuple[Any, ...] = (INFO, OBSERVATION, TICK, COGNITION, SUBGOAL, EVENT, PHASE, HEALTH)
 _KEEP = 512
 
 

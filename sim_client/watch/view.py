@@ -41,6 +41,7 @@ class View:
     _ticks: deque[m.Tick] = field(default_factory=lambda: deque(maxlen=NUM_TICKS))
     _tick_ns: int = 0
     _seen: m.Observation | None = None
+    _gate: tuple[int, float | None] | None = None  # query and score of PONDER's newest answer
     _subgoals: deque[m.Subgoal] = field(default_factory=lambda: deque(maxlen=_NUM_TEXTS))
     _events: deque[m.Event] = field(default_factory=lambda: deque(maxlen=_NUM_TEXTS))
 
@@ -67,6 +68,8 @@ class View:
                 for image in message.images:
                     last = self.cameras.get(image.camera)
                     self.cameras[image.camera] = _Camera(image, last.seq + 1 if last else 0, now_ns)
+            case m.Cognition() if message.header.episode == self._episode:
+                self._gate = message.query, message.gate_score
             case m.Subgoal():
                 self._subgoals.appendleft(message)
             case m.Event():
@@ -74,7 +77,7 @@ class View:
 
     def _enter(self, episode: str) -> None:
         if episode != self._episode:
-            self._episode, self._info, self._seen = episode, None, None
+            self._episode, self._info, self._seen, self._gate = episode, None, None, None
             self._ticks.clear()
             self._subgoals.clear()
             self.cameras.clear()
@@ -139,6 +142,7 @@ class View:
             "late_p99_ms": round(float(np.percentile(late, 99)) / NS_PER_MS, 3),
             "age_ms": round(tick.age_ns / NS_PER_MS),
             "query": tick.ref_query,
+            "gate": self._gate and {"query": self._gate[0], "score": self._gate[1]},
             "invocation": tick.invocation,
             "row": tick.row,
             "limits_hit": tick.limits_hit,

@@ -78,6 +78,7 @@ def test_a_query_is_one_fire_of_their_context(ponder: PonderEngine, release: Any
         kinds = ["demo_reasoning", "subgoal"] if answer.is_transition else []
         assert [text.kind for text in answer.texts] == kinds
         assert answer.context_tokens == twin._context_len
+        assert answer.gate_score == expected.gate_score
     ponder.close("a")
 
 

@@ -117,6 +117,7 @@ def test_serving_regenerates_the_training_row(ponder: Ponder, engine: QwenEngine
     assert context_of(engine, "a").ids == list(row.ids)
     assert context_of(engine, "a").next_position == ponder.format.positions(row.ids)[1]
     assert [a.is_transition for a in answers] == [False, True, False, True]
+    assert [round(a.gate_score or 0, 2) for a in answers] == [0, 1, 0, 1]
     assert [(t.kind, t.token_ids, t.truncated) for t in answers[1].texts] == [
         ("demo_reasoning", REASONING, False),
         ("subgoal", SUBGOAL, False),
@@ -139,7 +140,7 @@ def test_serving_regenerates_the_row_of_a_ponder_that_was_trained_without_texts(
     engine.open("a", WITH_DEMO)
     answers = [engine.fire("a", observation(query)) for query in range(len(silence))]
     assert context_of(engine, "a").ids == list(row.ids)
-    assert [(each.is_transition, each.texts) for each in answers] == [(False, ())] * len(silence)
+    assert [(each.is_transition, each.texts, each.gate_score) for each in answers] == [(False, (), None)] * len(silence)
     expected = encode(ponder, row)[torch.from_numpy(row.carrier_index)]
     for answer, C_t in zip(answers, expected, strict=True):
         assert np.abs(answer.cognition - C_t.numpy()).max() < TOLERANCE

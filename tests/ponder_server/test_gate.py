@@ -1,5 +1,6 @@
 """Whether a transition begins: two rows of the LM head mostly tell, and always what the whole head says."""
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -32,7 +33,11 @@ def test_the_answer_is_that_of_the_whole_head(
     ponder = PONDERS[dtype]
     hidden_1H = hidden_for(ponder, {other: strength, T_YES: yes, T_NO: yes + lead})
     expected = int(ponder.logits(hidden_1H)[0].argmax()) == T_YES
-    assert TransitionWriter(ponder, NoDraft(), max_text_tokens=4).wants_to_write(hidden_1H) == expected
+    opens, score = TransitionWriter(ponder, NoDraft(), max_text_tokens=4).gate(hidden_1H)
+    assert opens == expected
+    yes_no = ponder.logits(hidden_1H, (T_YES, T_NO))[0].double()
+    assert score == pytest.approx(float(yes_no.softmax(0)[0]), rel=1e-5)
+    assert score == np.float32(score)  # so that the wire rounds nothing
 
 
 @pytest.mark.parametrize(("lead", "times_read"), [(10 * CLEARLY, 0), (0.0, 1), (-10 * CLEARLY, 1)])
@@ -43,7 +48,7 @@ def test_the_whole_head_is_read_only_if_two_rows_do_not_tell(lead: float, times_
     read: list[object] = []
     hook = ponder.qwen.lm_head.register_forward_hook(lambda *_: read.append(None))
     try:
-        writer.wants_to_write(hidden_for(ponder, {T_YES: 3.0, T_NO: 3.0 + lead}))
+        writer.gate(hidden_for(ponder, {T_YES: 3.0, T_NO: 3.0 + lead}))
     finally:
         hook.remove()
     assert len(read) == times_read

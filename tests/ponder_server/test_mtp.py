@@ -254,7 +254,7 @@ def test_the_end_is_foreseen_and_not_guessed(monkeypatch: pytest.MonkeyPatch) ->
     with torch.no_grad():  # after that token, T_no is by far the most likely
         towards_H = rms(ponder.embed([last]), ponder.qwen.model.language_model.norm.weight)[0]
         ponder.qwen.lm_head.weight[VOCABULARY.t_no] = towards_H / towards_H.norm()
-    monkeypatch.setattr(TransitionWriter, "wants_to_write", lambda *_: True)
+    monkeypatch.setattr(TransitionWriter, "gate", lambda *_: (True, 1.0))
     (greedy,), _ = written_by(QwenEngine(ponder, CONFIG, NoDraft()), ["7"], exactly=None)
     (guessed,), num_forwards = written_by(
         QwenEngine(ponder, CONFIG, MtpDraft(ponder, num_tokens=9)), ["7"], exactly=None

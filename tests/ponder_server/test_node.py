@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from dual_system.models.small_pair.reading import CropReader
 from ponder_server.contract import EngineSpec, Fire, Text
 from ponder_server.node import KEEP_QUERIES, PonderNode, check_robot
-from protocol import images
+from protocol import codec, images
 from protocol import messages as m
 from protocol.errors import EpisodeRefused, MalformedMessage
 
@@ -193,6 +193,12 @@ def test_a_cognition_says_what_it_is_about_and_who_made_it(node: PonderNode) -> 
     assert (cognition.query, cognition.tick, cognition.source_ns) == (5, 3, 7)
     assert (cognition.ready_ns, cognition.infer_ns, cognition.context_tokens) == (9, 2, 12)
     assert (cognition.model_hash, cognition.is_fake, cognition.is_transition) == ("abc", True, True)
+
+
+@pytest.mark.parametrize("score", [0.0, 0.625, None])
+def test_a_cognition_has_the_gate_score_of_its_fire(node: PonderNode, score: float | None) -> None:
+    cognition, _ = answered(node, gate_score=score)
+    assert codec.decode(m.Cognition, codec.encode(cognition)).gate_score == score
 
 
 def test_a_cognition_carries_the_hidden_states_and_their_norm(node: PonderNode) -> None:

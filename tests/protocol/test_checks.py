@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 import numpy as np
@@ -108,6 +109,7 @@ BROKEN: list[tuple[type, dict[str, Any], str]] = [
     (m.Cognition, {"vector": np.zeros((0, 0), np.float32)}, r"Cognition\.vector: "),
     (m.Cognition, {"vector": NAN[None]}, r"Cognition\.vector: expected finite numbers"),
     (m.Cognition, {"text": "x" * 20_001}, r"Cognition\.text: expected at most 20000 characters"),
+    (m.Cognition, {"gate_score": math.nan}, r"Cognition\.gate_score: expected a finite number, or none, came nan"),
     (m.Cognition, {"text_source_ns": -5}, r"Cognition\.text_source_ns: expected 0 without a text"),
     (m.Cognition, {"text": "", "text_source_ns": -5}, r"Cognition\.text_source_ns: expected 0 without a text"),
     (m.Cognition, {"text": "go", "text_source_ns": 1}, r"Cognition\.text_source_ns: expected <= 0, came 1"),

@@ -89,6 +89,7 @@ def cognitions(draw: st.DrawFn) -> m.Cognition:
         is_fake=draw(st.booleans()),
         text=text,
         text_source_ns=text_source_ns if text else 0,
+        gate_score=draw(st.none() | NUMBER),
     )
 
 

@@ -58,9 +58,9 @@ def test_a_donor_s_vectors_come_query_by_query_and_its_last_one_stays(played: An
     changed = [
         m.Cognition(
             header=c.header, query=c.query, tick=c.tick, source_ns=c.source_ns, ready_ns=c.ready_ns, vector=vector,
-            is_transition=True, model_hash="seven",
+            is_transition=True, model_hash="seven", gate_score=0.125 * index,
         )
-        for c, vector in zip(donor, vectors, strict=True)
+        for index, (c, vector) in enumerate(zip(donor, vectors, strict=True))
     ]  # fmt: skip
     said = played(donor=changed)
     given = [np.asarray(invocation.cognition) for invocation in said[m.Invocation]]
@@ -68,6 +68,7 @@ def test_a_donor_s_vectors_come_query_by_query_and_its_last_one_stays(played: An
         np.testing.assert_array_equal(vector, vectors[min(index, 2)])
     assert [i.age_ns for i in said[m.Invocation]] == [300_000_000] * 5
     assert [c.is_transition for c in said[m.Cognition][:5]] == [True] * 3 + [False] * 2
+    assert [c.gate_score for c in said[m.Cognition][:5]] == [0.0, 0.125, 0.25, None, None]
     assert said[m.Cognition][0].model_hash == f"seven in {donor[0].header.episode}"
 
 

@@ -82,7 +82,7 @@ def test_training_and_serving_read_the_same(monkeypatch: pytest.MonkeyPatch, pon
 
     engine = engine_of(ponder)
     monkeypatch.setattr(Ponder, "embed", listened)
-    monkeypatch.setattr(TransitionWriter, "wants_to_write", lambda *_: False)  # the episode has no texts
+    monkeypatch.setattr(TransitionWriter, "gate", lambda *_: (False, 0.0))  # the episode has no texts
     engine.open("a", Opening(instruction=INSTRUCTION, demo_frames=tuple(demo)))
     for query, index_K in zip(schedule.queries, row.carrier_index, strict=True):
         fire = engine.fire("a", views[query.tick], proprio=state_T8[query.tick])

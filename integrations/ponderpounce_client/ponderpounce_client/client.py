@@ -56,7 +56,8 @@ class Command:
     ``values``: (action_dim,) float32, within the robot's limits. ``level``: PLAY or STALE for a policy's row, HOLD,
     DECELERATE or STOPPED where there is none. ``deadline_ns``: the tick's. ``expires_ns``: when a robot that got no
     newer command has to stop by itself. ``subgoal``: PONDER's newest, "" if it has none yet, with its age and that of
-    the cognition behind ``values``, in seconds of the schedule.
+    the cognition behind ``values``, in seconds of the schedule. ``gate_score``: the probability of a transition that
+    PONDER found with that cognition; None if it has no gate or there is no cognition yet.
     """
 
     tick: int
@@ -67,6 +68,7 @@ class Command:
     subgoal: str = ""
     subgoal_age_s: float = 0.0
     cognition_age_s: float = 0.0
+    gate_score: float | None = None
 
     @property
     def is_playing(self) -> bool:
@@ -149,6 +151,7 @@ class Client:
             subgoal=told["subgoal"],
             subgoal_age_s=told["subgoal_age_s"],
             cognition_age_s=told["cognition_age_s"],
+            gate_score=told.get("gate_score"),
         )
 
     def end(self, success: bool | None = None, reason: str = "") -> None:

@@ -134,7 +134,7 @@ class Query(_message.Message):
     def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ..., query: _Optional[int] = ..., tick: _Optional[int] = ..., source_ns: _Optional[int] = ...) -> None: ...
 
 class Cognition(_message.Message):
-    __slots__ = ("header", "query", "tick", "source_ns", "ready_ns", "vector", "is_transition", "context_tokens", "infer_ns", "norm", "model_hash", "is_fake", "text", "text_source_ns")
+    __slots__ = ("header", "query", "tick", "source_ns", "ready_ns", "vector", "is_transition", "context_tokens", "infer_ns", "norm", "model_hash", "is_fake", "text", "text_source_ns", "gate_score")
     HEADER_FIELD_NUMBER: _ClassVar[int]
     QUERY_FIELD_NUMBER: _ClassVar[int]
     TICK_FIELD_NUMBER: _ClassVar[int]
@@ -149,6 +149,7 @@ class Cognition(_message.Message):
     IS_FAKE_FIELD_NUMBER: _ClassVar[int]
     TEXT_FIELD_NUMBER: _ClassVar[int]
     TEXT_SOURCE_NS_FIELD_NUMBER: _ClassVar[int]
+    GATE_SCORE_FIELD_NUMBER: _ClassVar[int]
     header: _common_pb2.Header
     query: int
     tick: int
@@ -163,7 +164,8 @@ class Cognition(_message.Message):
     is_fake: bool
     text: str
     text_source_ns: int
-    def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ..., query: _Optional[int] = ..., tick: _Optional[int] = ..., source_ns: _Optional[int] = ..., ready_ns: _Optional[int] = ..., vector: _Optional[_Union[_common_pb2.Tensor, _Mapping]] = ..., is_transition: _Optional[bool] = ..., context_tokens: _Optional[int] = ..., infer_ns: _Optional[int] = ..., norm: _Optional[float] = ..., model_hash: _Optional[str] = ..., is_fake: _Optional[bool] = ..., text: _Optional[str] = ..., text_source_ns: _Optional[int] = ...) -> None: ...
+    gate_score: float
+    def __init__(self, header: _Optional[_Union[_common_pb2.Header, _Mapping]] = ..., query: _Optional[int] = ..., tick: _Optional[int] = ..., source_ns: _Optional[int] = ..., ready_ns: _Optional[int] = ..., vector: _Optional[_Union[_common_pb2.Tensor, _Mapping]] = ..., is_transition: _Optional[bool] = ..., context_tokens: _Optional[int] = ..., infer_ns: _Optional[int] = ..., norm: _Optional[float] = ..., model_hash: _Optional[str] = ..., is_fake: _Optional[bool] = ..., text: _Optional[str] = ..., text_source_ns: _Optional[int] = ..., gate_score: _Optional[float] = ...) -> None: ...
 
 class Stamp(_message.Message):
     __slots__ = ("header", "kind", "index", "source_ns", "ready_ns", "arrived_ns", "is_transition")

@@ -48,9 +48,12 @@ def understood(asked: ClientRequest) -> Step:
 @given(rows=st.lists(st.lists(FLOATS, min_size=3, max_size=3), min_size=1, max_size=20), tick=st.integers(0, 10**6))
 def test_an_answer_reaches_every_client_bit_for_bit(rows: list[list[float]], tick: int) -> None:
     values = np.array(rows, np.float32)
-    behind = Behind(subgoal="press the button", subgoal_age_ns=1_500_000_000, cognition_age_ns=250_000_000)
+    behind = Behind(
+        subgoal="press the button", subgoal_age_ns=1_500_000_000, cognition_age_ns=250_000_000, gate_score=0.125
+    )
     answer = Answer(rows_NA=values, tick=tick, levels=(m.Level.PLAY,) * len(rows), behind=behind)
     beside = {"tick": tick, "subgoal": "press the button", "subgoal_age_s": 1.5, "cognition_age_s": 0.25}
+    beside |= {"gate_score": 0.125}
     terms: Any = None
     for dialect in (openpi.OpenpiDialect(terms), challenge.ChallengeDialect(terms), mme_vla.MmeVlaDialect(terms)):
         told = unpack(dialect.answer(ClientRequest(None), answer))

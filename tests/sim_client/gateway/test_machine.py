@@ -16,7 +16,7 @@ from clock.policies import policy_of
 from protocol import messages as m
 from protocol.errors import TransportError
 from protocol.mcap_log import read_log
-from protocol.topics import HEALTH, QUERY, TICK
+from protocol.topics import COGNITION, HEALTH, QUERY, TICK
 from sim_client.gateway.body import Body
 from sim_client.gateway.exchange import Busy, Finish, Observed, Refused, Step
 from sim_client.gateway.options import GatewayOptions, ScheduleOptions
@@ -205,6 +205,34 @@ def test_the_video_reaches_ponder_once_a_second(bench: Any, step_of: StepOf) -> 
     assert opening.instruction == "put the cube in the bin"
     assert [int(views[0][0, 0, 0]) for views in opening.demo_frames] == [0, 20, 40]
     assert [len(views) for views in opening.demo_frames] == [2, 2, 2]
+
+
+@pytest.mark.parametrize("num_rows", [1, 5])
+def test_an_answer_has_the_gate_score_that_ponder_computed_with_the_cognition_behind_it(
+    bench_with: Callable[..., Any], step_of: StepOf, num_rows: int
+) -> None:
+    bench = bench_with(num_rows=num_rows)
+    engine, take = bench.rig.ponder_engine, bench.rig.listen(TICK)
+    computed, fire = [], engine.fire
+    engine.fire = lambda *given, **named: (computed.append(answer := fire(*given, **named)), answer)[1]
+    answers = play(bench, step_of, 85 // num_rows)
+    take()
+    behind = {tick.tick: tick.ref_query for tick in bench.rig.said[m.Tick]}
+    assert len({behind[answer.tick] for answer in answers}) >= 3
+    for answer in answers:
+        assert answer.told["gate_score"] == computed[behind[answer.tick]].gate_score
+    assert len({answer.told["gate_score"] for answer in answers}) >= 3
+
+
+def test_without_a_gate_or_a_cognition_there_is_no_score(bench_with: Callable[..., Any], step_of: StepOf) -> None:
+    null = replace(schedules.paper(), delivery=m.Delivery(kind=m.DeliveryKind.NULL))
+    for bench, has_gate in ((bench_with(), False), (bench_with(null), True)):
+        bench.rig.ponder_engine.has_gate = has_gate
+        take = bench.rig.listen(COGNITION)
+        answers = play(bench, step_of, 30)
+        take()
+        assert [c.gate_score is None for c in bench.rig.said[m.Cognition]] == [not has_gate] * 2
+        assert {answer.told["gate_score"] for answer in answers} == {None}
 
 
 def test_a_second_client_is_told_who_has_the_robot_until_that_one_finishes(bench: Any, step_of: StepOf) -> None:

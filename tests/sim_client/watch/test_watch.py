@@ -59,6 +59,18 @@ def test_pictures_have_ages_and_another_episode_begins_empty() -> None:
     assert view.status(6_000_000_000)["cameras"] == []
 
 
+def test_the_gate_is_that_of_the_episode_s_newest_answer() -> None:
+    view = View("r0")
+    values: dict[str, Any] = {"tick": 0, "source_ns": 0, "ready_ns": 0, "vector": np.zeros((1, 4), np.float32)}
+    view.on_message(tick(0), 0)
+    for query, score, episode in ((0, None, "ep-1"), (1, 0.75, "ep-1"), (2, 0.5, "ep-0")):
+        header = m.Header(episode=episode, proc="ponder")
+        view.on_message(m.Cognition(header=header, query=query, gate_score=score, **values), 0)
+    assert view.status(0)["now"]["gate"] == {"query": 1, "score": 0.75}
+    view.on_message(tick(0, header=m.Header(episode="ep-2", proc="clock")), 0)
+    assert view.status(0)["now"]["gate"] is None
+
+
 def test_who_left_is_still_named() -> None:
     view = View("r0")
     view.on_token("ponder", True)

@@ -97,7 +97,7 @@ class SoftS2SessionContext:
             subgoal_text="pick it up" if is_transition else "",
             cognition=torch.from_numpy(numbers).reshape(1, K, H),
             kind="transition" if is_transition else "nontransition",
-            gate_score=None,
+            gate_score=self._hash.digest()[1] / 256 if self._hash.digest()[1] % 4 else None,
             n_input_frames=len(obs_pils),
             reasoning_text="think" if is_transition else None,
         )
