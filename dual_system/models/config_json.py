@@ -53,12 +53,16 @@ def _value(hint: Any, value: Any, where: str) -> Any:
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType) and value is not None and len(set(args) - {types.NoneType}) == 1:
         return _value(next(arg for arg in args if arg is not types.NoneType), value, where)
-    if origin is tuple and dataclasses.is_dataclass(args[0]) and isinstance(value, list):
-        return tuple(_value(args[0], item, f"{where}[{index}]") for index, item in enumerate(value))
+    if origin is tuple and isinstance(value, list):
+        kinds = args[:1] * len(value) if args[1:] == (...,) else args
+        if len(kinds) != len(value):
+            raise ValueError(f"{where}: expected {len(kinds)} values, came {value!r}")
+        pairs = enumerate(zip(kinds, value, strict=True))
+        return tuple(_value(kind, item, f"{where}[{index}]") for index, (kind, item) in pairs)
     if not _fits(hint, value):
         expected = " or ".join(map(repr, args)) if origin is typing.Literal else getattr(hint, "__name__", hint)
         raise ValueError(f"{where}: expected {expected}, came {value!r}")
-    return tuple(value) if origin is tuple else value
+    return value
 
 
 def _fits(hint: Any, value: Any) -> bool:
@@ -67,8 +71,6 @@ def _fits(hint: Any, value: Any) -> bool:
         return value in args
     if origin in (typing.Union, types.UnionType):
         return any(_fits(arg, value) for arg in args)
-    if origin is tuple:
-        return isinstance(value, list) and all(_fits(args[0], item) for item in value)
     if hint in (int, float):
         return isinstance(value, (int, hint)) and not isinstance(value, bool)
-    return isinstance(value, hint)
+    return origin is None and isinstance(value, hint)

@@ -76,6 +76,11 @@ class Physics:
             self.park(name)
         self.refresh()
 
+    def pose_arm(self, joints_7: Array, opening_m: float) -> None:
+        """Puts the arm elsewhere, at rest: joints in rad, and how far each finger is open. Call `refresh` after it."""
+        self.data.qpos[self._arm_qpos] = joints_7
+        self.data.qpos[self._finger_qpos] = np.multiply(opening_m, np.sign(self.robot.open_fingers_m))
+
     def place(self, name: str, pose_7: Array) -> None:
         """Puts a prop at a pose (7,), at rest. Call `refresh` after the last one."""
         self._set_pose(name, pose_7)

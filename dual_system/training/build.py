@@ -13,9 +13,10 @@ import torch
 
 from dual_system.data.episode import CAMERAS
 from dual_system.models.groot.pounce import GrootPounceConfig
-from dual_system.models.pi05.pounce import PounceConfig, freeze
+from dual_system.models.pi05.pounce import Pounce, PounceConfig, freeze
 from dual_system.models.pi05.prompt import Tokenizer, tokenizer_of_instructions
 from dual_system.models.ponder.checkpoint import load_ponder, save_ponder
+from dual_system.models.ponder.coordinates import PLACE_WORDS
 from dual_system.models.ponder.network import Ponder
 from dual_system.models.ponder.observation import check_cameras
 from dual_system.models.ponder.vocabulary import Vocabulary
@@ -28,7 +29,7 @@ from dual_system.models.pounce.checkpoint import (
     save_bundle,
 )
 from dual_system.models.pounce.family import AnyPounceConfig
-from dual_system.models.pounce.initialise import open_gates
+from dual_system.models.pounce.initialise import open_gates, random_pounce
 from dual_system.models.pounce.precision import cast_streams
 from dual_system.training.data import TrainingSet
 from dual_system.training.joint import JointModel, Trains
@@ -74,6 +75,8 @@ def build(run: Recipe, data: TrainingSet, start: Start) -> tuple[JointModel, Pou
     if isinstance(pounce.config, PounceConfig) and isinstance(run.pounce, PounceConfig):
         pounce.config = replace(pounce.config, max_committed_rows=run.pounce.max_committed_rows)
     freeze(pounce, run.freeze)
+    if run.freezes_ponder_vision:
+        ponder.qwen.model.visual.requires_grad_(False)
     return JointModel(ponder, pounce, w1=run.w1, w2=run.w2, trains=run.trains), bundle
 
 
@@ -84,7 +87,9 @@ def _ponder(run: Recipe, data: TrainingSet, start: Start) -> Ponder:
         if ponder.is_random and run.trains != "pounce":
             ponder.draw_carriers(seed)
     else:
-        own = Vocabulary.trained_on(data.texts(), run.ponder.first_carrier_id) if run.has_own_tokenizers else None
+        own = None
+        if run.has_own_tokenizers:
+            own = Vocabulary.trained_on(data.texts(), run.ponder.first_carrier_id, words=PLACE_WORDS)
         ponder = Ponder.random(run.ponder, own, seed=seed, device=start.device, dtype=dtype)
     try:
         check_cameras([(data.image_px, data.image_px)] * len(CAMERAS), ponder.format.reader, ponder.image_px)
@@ -107,12 +112,26 @@ def _pounce(run: Recipe, data: TrainingSet, start: Start, ponder: Ponder) -> Pou
         open_gates(bundle.model)
         return bundle
     if declares_config(start.pounce):
-        return load_bundle(start.pounce, tokenizer=start.tokenizer)
+        return with_channel(run, load_bundle(start.pounce, tokenizer=start.tokenizer))
     # A public folder has no cognition prefix and declares no inputs, and its statistics are of other data.
     config = _for_this_pair(run, public_config(start.pounce), ponder)
     return load_bundle(
         start.pounce, config=config, statistics=measured(), tokenizer=start.tokenizer, prefix_seed=run.train.seed
     )
+
+
+def with_channel(run: Recipe, bundle: PounceBundle) -> PounceBundle:
+    """The bundle with the recipe's cognition prefix, freshly drawn, in place of subgoal texts, if it has none."""
+    model, wanted = bundle.model, run.pounce
+    if not isinstance(model, Pounce) or not isinstance(wanted, PounceConfig):
+        return bundle
+    if model.config.cognition.num_carriers or not wanted.cognition.num_carriers:
+        return bundle
+    config = replace(model.config, cognition=wanted.cognition, reads_subgoal=False)
+    told = random_pounce(config, run.train.seed)
+    own = {name: value for name, value in told.state_dict().items() if name.startswith("cognition_prefix.")}
+    told.load_state_dict(model.state_dict() | own)
+    return replace(bundle, model=told, has_fresh_prefix=True)
 
 
 def _for_this_pair(run: Recipe, found: AnyPounceConfig, ponder: Ponder) -> AnyPounceConfig:
@@ -134,7 +153,7 @@ def _own_tokenizer(run: Recipe, data: TrainingSet) -> Tokenizer | None:
     if not run.has_own_tokenizers or not isinstance(run.pounce, PounceConfig):
         return None
     prompts = data.instructions_with_subgoals() if run.pounce.reads_subgoal else data.instructions()
-    return tokenizer_of_instructions(prompts)
+    return tokenizer_of_instructions(prompts, run.pounce.vocab_size, words=PLACE_WORDS)
 
 
 def export(model: JointModel, bundle: PounceBundle, out: Path, *, trained: Trains = "both") -> None:

@@ -37,7 +37,12 @@ class _TrainingMoment:
     index: int
     """Index of the example in the batch."""
     example: Example
-    invocation: SampledInvocation
+    place: int
+    """The invocation's, among the example's."""
+
+    @property
+    def invocation(self) -> SampledInvocation:
+        return self.example.invocations[self.place]
 
     @property
     def instruction(self) -> str:
@@ -61,8 +66,7 @@ class _TrainingMoment:
 
     @property
     def subgoal(self) -> str:
-        query = self.invocation.reference.query
-        return "" if query is None else self.example.written[query]
+        return self.example.told[self.place]
 
 
 def collate_ponder(examples: Sequence[Example]) -> PonderBatch:
@@ -82,12 +86,17 @@ def collate_pounce(
         ValueError: a prompt is longer than ``max_prompt_tokens``, the tokenizer is another family's, or the examples
             have no invocation.
     """
-    moments = [_TrainingMoment(index=n, example=e, invocation=i) for n, e in enumerate(examples) for i in e.invocations]
+    moments = [
+        _TrainingMoment(index=index, example=example, place=place)
+        for index, example in enumerate(examples)
+        for place in range(len(example.invocations))
+    ]
     if not moments:
         raise ValueError(f"none of the {len(examples)} examples has an invocation to learn from")
     inputs: PounceInputs | GrootInputs
     if isinstance(config, PounceConfig) and isinstance(tokenizer, Tokenizer):
-        inputs = joined_pi05([pi05_inputs(moment, config, tokenizer, statistics, _CPU) for moment in moments])
+        seen = replace(config, windows=())  # the training set has looked through them
+        inputs = joined_pi05([pi05_inputs(moment, seen, tokenizer, statistics, _CPU) for moment in moments])
     elif isinstance(config, GrootPounceConfig) and isinstance(tokenizer, EagleTokenizer):
         read = [groot_inputs(moment, config, tokenizer, statistics, _CPU) for moment in moments]
         inputs = joined_groot(_padded_on_the_left(read, tokenizer))

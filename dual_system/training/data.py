@@ -17,10 +17,13 @@ from dual_system.data.video import FPS
 from dual_system.models.action_space import ActionSpace, actions_in, num_dims, states_in
 from dual_system.models.images import resized
 from dual_system.models.normalisation import Quantiles, RobotStatistics
+from dual_system.models.pi05.pounce import PounceConfig
 from dual_system.models.pi05.prompt import with_subgoal
 from dual_system.models.ponder.context import ContextFormat
 from dual_system.models.ponder.coordinates import normalised_text
 from dual_system.models.ponder.demo_sampling import DemoSampling
+from dual_system.models.pounce.family import AnyPounceConfig
+from dual_system.models.windows import Box, Windows
 from dual_system.training.chunks import chunk_ticks
 from dual_system.training.episode import Frame, TrainingEpisode
 from dual_system.training.picture_store import PictureStore, Views
@@ -40,17 +43,32 @@ class PictureSizes:
     """PONDER's format, whose reader makes its images from the views; None: PONDER is not run."""
     pounce_px: int | None = None
     """Side of POUNCE's pictures, resized as in serving; None: POUNCE reads none."""
+    windows: tuple[Box, ...] = ()
+    """POUNCE's, one a camera."""
 
     @property
     def key(self) -> str:
         """Identifies the sizes: equal keys give equal pictures of an episode."""
-        return f"{None if self.form is None else (self.form.reader, self.form.image_px)} {self.pounce_px}"
+        windows = f" {self.windows}" if self.windows else ""
+        return f"{None if self.form is None else (self.form.reader, self.form.image_px)} {self.pounce_px}{windows}"
 
     def of_ponder(self, views: tuple[Frame, ...]) -> tuple[Frame, ...]:
         return () if self.form is None else tuple(self.form.reader.images(views, self.form.image_px))
 
     def of_pounce(self, views: tuple[Frame, ...]) -> tuple[Frame, ...]:
-        return () if self.pounce_px is None else tuple(resized(view, self.pounce_px) for view in views)
+        if self.pounce_px is None:
+            return ()
+        if self.windows:
+            return tuple(Windows(self.windows).images(views, (self.pounce_px, self.pounce_px)))
+        return tuple(resized(view, self.pounce_px) for view in views)
+
+    @classmethod
+    def of(cls, form: ContextFormat | None, pounce: AnyPounceConfig | None) -> PictureSizes:
+        """What networks of these configurations read; None for one that is not run."""
+        if pounce is None or not pounce.num_cameras:
+            return cls(form=form)
+        windows = pounce.windows if isinstance(pounce, PounceConfig) else ()
+        return cls(form=form, pounce_px=pounce.image_px, windows=windows)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

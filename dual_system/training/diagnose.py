@@ -110,7 +110,7 @@ def diagnose(options: DiagnoseOptions) -> dict[str, Any]:
     if wanted != (ponder.format.num_carriers, ponder.hidden_size):
         given = (ponder.format.num_carriers, ponder.hidden_size)
         raise ValueError(f"{options.pounce} reads (K, H) = {wanted}, {options.ponder} gives {given}: not a pair")
-    sizes = PictureSizes(form=ponder.format, pounce_px=pounce.config.image_px if pounce.config.num_cameras else None)
+    sizes = PictureSizes.of(ponder.format, pounce.config)
     data = TrainingSet(options.data, tasks=options.tasks, sizes=sizes, demo_hz=ponder.format.demonstrations.hz)
     numbers = in_turns([task for task, _ in data.names], options.episodes)
     examples = [_example(data, number, ponder) for number in numbers]

@@ -6,16 +6,21 @@ rule (``clock.reference``); tests compare the two.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from clock.sampling import Clocks, SampledInvocation, SampledSchedule, sample_schedule
 from dual_system.models.ponder.context import ContextFormat, Row, Transition
 from dual_system.models.ponder.coordinates import normalised_text
 from dual_system.training.episode import TrainingEpisode
+from dual_system.training.told import Told
+
+_BRANCH_TICKS = 30
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,6 +32,10 @@ class ExampleConfig:
     """Largest number of POUNCE invocations drawn from an episode's schedule; they dominate the cost of a step."""
     is_grounded: bool = True
     """False: the row has no texts, as in RoboCasa-DC."""
+    told: Told | None = None
+    """Texts for POUNCE in place of PONDER's; None: PONDER's newest subgoal, if it reads subgoals."""
+    branch_weight: float = 1.0
+    """Weight of invocations in the 1.5 s after a transition, where the subgoal decides, against all others."""
     has_reasoning: bool = True
     """False: the text at the first transition after a demonstration is the subgoal alone (paper, Table 3)."""
 
@@ -44,6 +53,8 @@ class Example:
     """The invocations drawn from the schedule."""
     written: tuple[str, ...]
     """PONDER's newest subgoal at every query; empty texts without grounding."""
+    told: tuple[str, ...]
+    """What POUNCE is told at every invocation: the newest text written, unless `ExampleConfig.told` changes it."""
 
 
 def make_example(
@@ -56,16 +67,32 @@ def make_example(
     schedule = sample_schedule(rng, config.clocks, episode.num_ticks, transition_ticks=episode.transition_ticks)
     imitated = [each for each in schedule.invocations if each.tick >= episode.imitated_from]
     count = min(config.max_invocations, len(imitated))
-    chosen = np.sort(rng.choice(len(imitated), size=count, replace=False)) if count else np.empty(0, np.intp)
+    weights = None if config.branch_weight == 1 else _weights(episode, imitated, config.branch_weight)
+    chosen = np.sort(rng.choice(len(imitated), size=count, replace=False, p=weights)) if count else np.empty(0, np.intp)
+    invocations = tuple(imitated[index] for index in chosen)
     written = subgoals_by_query(episode, schedule) if config.is_grounded else ("",) * len(schedule.queries)
+    newest = ["" if each.reference.query is None else written[each.reference.query] for each in invocations]
     return Example(
         episode=episode,
         row=episode_row(episode, form, schedule, config),
         images=row_images(episode, schedule),
         schedule=schedule,
-        invocations=tuple(imitated[index] for index in chosen),
+        invocations=invocations,
         written=written,
+        told=tuple(told if config.told is None else config.told.draw(told, rng) for told in newest),
     )
+
+
+def _weights(
+    episode: TrainingEpisode, invocations: Sequence[SampledInvocation], branch_weight: float
+) -> NDArray[np.float64]:
+    """Chances of being drawn, by how long ago the newest transition was."""
+    changes = np.array(sorted(episode.transition_ticks | {0}))
+    ticks = np.array([each.tick for each in invocations])
+    since = ticks - changes[np.searchsorted(changes, ticks, side="right") - 1]
+    weights = np.where(since < _BRANCH_TICKS, branch_weight, 1.0)
+    chances: NDArray[np.float64] = weights / weights.sum()
+    return chances
 
 
 def episode_row(episode: TrainingEpisode, form: ContextFormat, schedule: SampledSchedule, config: ExampleConfig) -> Row:

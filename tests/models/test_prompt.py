@@ -13,8 +13,10 @@ from dual_system.models.pi05.prompt import (
     prompt_text,
     state_bins,
     tiny_tokenizer_for_random_weights,
+    tokenizer_of_instructions,
     with_subgoal,
 )
+from dual_system.models.ponder.coordinates import PLACE_WORDS
 
 
 @pytest.fixture(scope="module")
@@ -82,3 +84,12 @@ def test_tokenizer_survives_its_file(tokenizer: Tokenizer, tmp_path: Path) -> No
 def test_missing_tokenizer_names_the_way_out(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"paligemma_tokenizer\.model.*--tokenizer"):
         Tokenizer.from_file(tmp_path / "absent.model")
+
+
+def test_a_word_is_one_piece_and_the_text_stays_readable() -> None:
+    prompts = ["pick up the red cube at [438, 512]", "press the button"]
+    tokenizer = tokenizer_of_instructions(prompts, 1024, words=PLACE_WORDS)
+    ids = tokenizer.encode("press the button at [230, 438]")
+    pieces = [tokenizer._pieces.id_to_piece(each).replace("\N{LOWER ONE EIGHTH BLOCK}", " ") for each in ids]
+    assert pieces[-2:] == [" [230,", " 438]"]
+    assert tokenizer._pieces.decode(ids) == "press the button at [230, 438]"

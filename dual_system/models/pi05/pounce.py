@@ -13,6 +13,7 @@ from dual_system.models import flow
 from dual_system.models.interface import CognitionConfig, CognitionPrefix, check_channel
 from dual_system.models.pi05.committed import Committed, first_rows
 from dual_system.models.pi05.network import Pi05, Pi05Config, Prefix, PrefixCache, StepTable
+from dual_system.models.windows import Box
 
 Freeze = Literal["none", "vision", "vlm"]
 StateInput = Literal["prompt", "token"]
@@ -51,6 +52,8 @@ class PounceConfig:
     """The first dims of the padded action: 7 arm joints and the gripper."""
     num_cameras: int = 2
     """front, wrist. 0: it acts on state and cognition alone, whatever cameras the robot has."""
+    windows: tuple[Box, ...] = ()
+    """A window for each camera (`windows`); () for whole pictures, as in the public models."""
     num_steps: int = 10
     """Euler steps per chunk."""
     control_hz: int = 20

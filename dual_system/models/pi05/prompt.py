@@ -117,13 +117,22 @@ def tiny_tokenizer_for_random_weights() -> Tokenizer:
     return _trained(states, TINY_VOCAB_SIZE)
 
 
-def tokenizer_of_instructions(instructions: Sequence[str], vocab_size: int = TINY_VOCAB_SIZE) -> Tokenizer:
+def tokenizer_of_instructions(
+    instructions: Sequence[str], vocab_size: int = TINY_VOCAB_SIZE, *, words: Sequence[str] = ()
+) -> Tokenizer:
     """Trains a tokenizer on the instructions of a dataset, for a network trained from scratch.
 
-    Pieces may span words, so that recurring phrases become few tokens: every token costs time.
+    Pieces may span words, so that recurring phrases become few tokens: every token costs time. Each of ``words``
+    is one piece of its own.
     """
     prompts = [stateless_prompt_text(instruction) for instruction in instructions]
-    return _trained(prompts * _REPEATS, vocab_size, split_by_whitespace=False, max_sentencepiece_length=_MAX_PIECE)
+    return _trained(
+        prompts * _REPEATS,
+        vocab_size,
+        split_by_whitespace=False,
+        max_sentencepiece_length=_MAX_PIECE,
+        user_defined_symbols=[word.replace(" ", "\N{LOWER ONE EIGHTH BLOCK}") for word in words],  # its blank
+    )
 
 
 def _trained(sentences: Iterable[str], vocab_size: int, **options: Any) -> Tokenizer:

@@ -38,6 +38,7 @@ from dual_system.models.stored_tensors import (
     require_layers,
     require_shapes,
 )
+from dual_system.models.windows import Box, Windows
 from protocol.files import read_object
 
 CONFIG_NAME = "config.json"
@@ -60,6 +61,7 @@ class StoredPonder:
     first_carrier_id: int | None = None
     """None: the first row after the tokenizer's last id."""
     image_px: tuple[int, int] = (256, 256)
+    windows: tuple[Box, ...] = ()
     speaks: bool = True
     demonstrations: DemoSampling = PAPER_SAMPLING
     opening: OpeningForm = "chat"
@@ -132,10 +134,12 @@ def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_S
     directory.mkdir(parents=True, exist_ok=True)
     ponder.qwen.config.save_pretrained(directory)
     ponder.format.vocabulary.save(directory)
+    reader = ponder.format.reader
     stored = StoredPonder(
         num_carriers=ponder.format.num_carriers,
         first_carrier_id=ponder.format.first_carrier_id,
         image_px=ponder.image_px,
+        windows=reader.boxes if isinstance(reader, Windows) else (),
         speaks=ponder.format.speaks,
         demonstrations=ponder.format.demonstrations,
         opening=ponder.format.opening_form,
@@ -143,8 +147,8 @@ def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_S
         is_random=ponder.is_random,
     )
     values = asdict(stored)
-    if ponder.format.reader != WHOLE_VIEWS:
-        values[SMALL_PAIR] = asdict(cast(Any, ponder.format.reader))
+    if reader != WHOLE_VIEWS and not isinstance(reader, Windows):
+        values[SMALL_PAIR] = asdict(cast(Any, reader))
     (directory / OWN_NAME).write_text(json.dumps(values, indent=2) + "\n")
     shards: list[dict[str, Tensor]] = [{}]
     shard_bytes = 0
@@ -235,7 +239,7 @@ def _read_stored(directory: Path) -> tuple[StoredPonder, ObservationReader]:
     declared = values.pop(SMALL_PAIR, None)
     stored = from_json(StoredPonder, values, str(path))
     if declared is None:
-        return stored, WHOLE_VIEWS
+        return stored, Windows(stored.windows) if stored.windows else WHOLE_VIEWS
     from dual_system.models.small_pair.reading import CropReader  # lazy: only the demo's pair has it
 
     return stored, from_json(CropReader, declared, f"{path}: {SMALL_PAIR}")

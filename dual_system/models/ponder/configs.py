@@ -10,6 +10,7 @@ from typing import Any
 from transformers.models.qwen3_5 import Qwen3_5Config
 
 from dual_system.models.ponder.vocabulary import Vocabulary
+from dual_system.models.windows import LAPTOP_WINDOWS, Box
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,6 +34,8 @@ class PonderConfig:
     vision_hidden_size: int
     vision_ffn_size: int
     vision_num_heads: int
+    vision_patch_px: int = 16
+    """Side of a patch; an image token covers 2 x 2 of them."""
     vision_num_positions: int = 2304
     """Size of the learned position grid, a square number; it is interpolated to the image's grid."""
 
@@ -46,6 +49,8 @@ class PonderConfig:
     """First unused row of the embedding table; the K carriers start there."""
     image_px: tuple[int, int] = (256, 256)
     """Height and width of every input image, in pixels."""
+    windows: tuple[Box, ...] = ()
+    """A window for each camera (`windows`); () for whole pictures, as in the paper."""
 
     def __post_init__(self) -> None:
         if self.first_carrier_id + self.num_carriers > self.vocab_size:
@@ -98,7 +103,7 @@ class PonderConfig:
                 "num_heads": self.vision_num_heads,
                 "out_hidden_size": self.hidden_size,
                 "num_position_embeddings": self.vision_num_positions,
-                "patch_size": 16,
+                "patch_size": self.vision_patch_px,
             },
             **token_ids,
         )
@@ -125,6 +130,33 @@ def tiny_cpu() -> PonderConfig:
         vision_num_positions=256,
         mrope_section=(2, 1, 1),
         first_carrier_id=448,
+    )
+
+
+def laptop() -> PonderConfig:
+    """The pair that two CPU cores train: 64 px windows of both cameras, 16 tokens a picture."""
+    return PonderConfig(
+        hidden_size=160,
+        ffn_size=480,
+        num_layers=8,
+        num_query_heads=4,
+        num_kv_heads=2,
+        head_dim=32,
+        num_gdn_key_heads=2,
+        num_gdn_value_heads=4,
+        gdn_head_dim=32,
+        tied_embeddings=True,
+        vocab_size=2048,
+        vision_depth=4,
+        vision_hidden_size=128,
+        vision_ffn_size=256,
+        vision_num_heads=4,
+        vision_patch_px=8,
+        vision_num_positions=64,
+        mrope_section=(2, 1, 1),
+        first_carrier_id=2000,
+        image_px=(64, 64),
+        windows=LAPTOP_WINDOWS,
     )
 
 

@@ -11,6 +11,9 @@ YX_PX = re.compile(r"<\s*(\d+)\s*,\s*(\d+)\s*>")
 XY_1000 = re.compile(r"\[\s*(\d+)\s*,\s*(\d+)\s*\]")
 
 
+_PIXELS = range(257)  # of a 256 px image, its far edge included
+
+
 def _scaled(value: int, numerator: int, denominator: int) -> int:
     return (2 * value * numerator + denominator) // (2 * denominator)
 
@@ -47,5 +50,30 @@ def pixel_text(text: str, image_px: tuple[int, int] = (256, 256)) -> str:
     def rewrite(match: re.Match[str]) -> str:
         y, x = yx_px_from_xy_1000((int(match[1]), int(match[2])), image_px)
         return f"<{y}, {x}>"
+
+    return XY_1000.sub(rewrite, text)
+
+
+PLACE_WORDS = (
+    *(f" [{_scaled(px, 1000, 256)}," for px in _PIXELS),
+    *(f" {_scaled(px, 1000, 256)}]" for px in _PIXELS),
+)
+"""Both halves of every `` [x, y]`` that a 256 px image has. A tokenizer of a network from scratch has a token for each:
+spelled in digits, a place is a sum that a small network does not learn."""
+
+
+def without_places(text: str) -> str:
+    """The plain reading of a grounded text: every " at [x, y]" left out."""
+    return re.sub(r" at " + XY_1000.pattern, "", text)
+
+
+def moved_places(text: str, by_xy_px: tuple[int, int], image_px: tuple[int, int] = (256, 256)) -> str:
+    """The text with every ``[x, y]`` moved by pixels, kept within the image."""
+    height, width = image_px
+
+    def rewrite(match: re.Match[str]) -> str:
+        y, x = yx_px_from_xy_1000((int(match[1]), int(match[2])), image_px)
+        moved = min(max(y + by_xy_px[1], 0), height), min(max(x + by_xy_px[0], 0), width)
+        return "[{}, {}]".format(*xy_1000_from_yx_px(moved, image_px))
 
     return XY_1000.sub(rewrite, text)

@@ -26,9 +26,11 @@ from dual_system.models.gpu import generator_for
 from dual_system.models.ponder.configs import PonderConfig
 from dual_system.models.ponder.context import ContextFormat, Row
 from dual_system.models.ponder.gated_delta import GatedDelta
+from dual_system.models.ponder.observation import WHOLE_VIEWS
 from dual_system.models.ponder.patches import patchify
 from dual_system.models.ponder.vision import image_tokens
 from dual_system.models.ponder.vocabulary import Vocabulary
+from dual_system.models.windows import Windows
 
 FLOAT32_PARAMETERS = ("linear_attn.A_log", "linear_attn.norm.weight")
 """Name suffixes of parameters that stay float32 in every dtype, as in public Qwen3.5 checkpoints: A_log is the decay,
@@ -110,6 +112,7 @@ class Ponder(nn.Module):
             first_carrier_id=config.first_carrier_id,
             image_grid=image_grid(qwen_config, config.image_px),
             token_px=token_px(qwen_config),
+            reader=Windows(config.windows) if config.windows else WHOLE_VIEWS,
         )
         ponder = cls(qwen_config, context_format, image_px=config.image_px, device=device, dtype=dtype)
         fill_randomly(ponder.qwen, seed=seed)

@@ -49,6 +49,9 @@ _SPLIT = (  # Qwen3.5's pre-tokenizer; every digit is a token of its own, so coo
     r"| ?[^\s\p{L}\p{M}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+"
 )
 
+_PLACE = r" \[\d+,| \d+\]"
+_WORD_REPEATS = 20
+
 _TINY_CORPUS = (
     "pick up the red cube and place it on the target at <72, 104>",
     "press the button on the left, then the blue button in the middle",
@@ -109,13 +112,15 @@ class Vocabulary:
         return cls.trained_on(_TINY_CORPUS, num_tokens=_TINY_NUM_BPE_TOKENS + len(CONTROL_TOKENS))
 
     @classmethod
-    def trained_on(cls, texts: Iterable[str], num_tokens: int) -> Self:
+    def trained_on(cls, texts: Iterable[str], num_tokens: int, *, words: Sequence[str] = ()) -> Self:
         """A byte-level BPE of at most ``num_tokens``, control tokens included: any UTF-8 text round-trips.
+
+        Each of ``words``, coordinates of the form " [x," or " y]", is one token.
 
         Trained on the subgoals of its tasks, a small PONDER generates them in fewer tokens. Texts with few distinct
         pairs give fewer than ``num_tokens``. Deterministic in ``texts``.
 
-        Raises ValueError if ``num_tokens`` has no room for the 256 bytes and the control tokens.
+        Raises ValueError if ``num_tokens`` has no room for the 256 bytes, the control tokens and the words.
         """
         alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
         least = len(alphabet) + len(CONTROL_TOKENS)
@@ -125,7 +130,7 @@ class Vocabulary:
         tokenizer.normalizer = normalizers.NFC()
         tokenizer.pre_tokenizer = pre_tokenizers.Sequence(
             [
-                pre_tokenizers.Split(Regex(_SPLIT), behavior="isolated"),
+                pre_tokenizers.Split(Regex(_SPLIT if not words else f"{_PLACE}|{_SPLIT}"), behavior="isolated"),
                 pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False),
             ]
         )
@@ -135,9 +140,14 @@ class Vocabulary:
             initial_alphabet=alphabet,
             show_progress=False,
         )
-        tokenizer.train_from_iterator(texts, trainer)
+        tokenizer.train_from_iterator([*texts, *[each for each in words for _ in range(_WORD_REPEATS)]], trainer)
         tokenizer.add_special_tokens(list(CONTROL_TOKENS))
-        return cls(tokenizer)
+        vocabulary = cls(tokenizer)
+        if split := [word for word in words if len(vocabulary.encode(word)) != 1]:
+            raise ValueError(
+                f"num_tokens {num_tokens} has no room for {len(words)} words; {split[0]!r} is several tokens"
+            )
+        return vocabulary
 
     def extended(self, texts: Iterable[str], num_tokens: int) -> Self:
         """A copy with more pieces, ids up to ``num_tokens``, merged from the most frequent pairs in ``texts``.

@@ -14,6 +14,7 @@ from dual_system.models.pi05.gemma import GemmaConfig
 from dual_system.models.pi05.network import Pi05Config
 from dual_system.models.pi05.pounce import PounceConfig
 from dual_system.models.siglip import VisionConfig
+from dual_system.models.windows import LAPTOP_WINDOWS
 
 Config = TypeVar("Config", bound=PounceConfig | GrootPounceConfig)
 
@@ -55,6 +56,25 @@ def tiny_cpu(*, num_carriers: int = 1, cognition_size: int = 64, horizon: int = 
         ),
         cognition=CognitionConfig(num_carriers=num_carriers, cognition_size=cognition_size),
     )
+
+
+def laptop(*, num_carriers: int = 1, cognition_size: int = 160) -> PounceConfig:
+    """The pair that two CPU cores train: 64 px windows of both cameras, state as one token, tool deltas."""
+    network = PounceConfig(
+        pi05=Pi05Config(
+            vision=VisionConfig(width=128, depth=4, num_heads=4, mlp_width=256, image_px=64, patch_px=8),
+            language=GemmaConfig(width=128, depth=4, mlp_width=256, head_dim=32, num_heads=4),
+            expert=GemmaConfig(width=128, depth=4, mlp_width=256, head_dim=32, num_heads=4),
+            vocab_size=1024,
+            action_dim=8,
+            horizon=ROBOMME_HORIZON,
+        ),
+        cognition=CognitionConfig(num_carriers=num_carriers, cognition_size=cognition_size),
+        windows=LAPTOP_WINDOWS,
+        max_prompt_tokens=64,
+        state_input="token",
+    )
+    return in_space(network, "ee_delta")
 
 
 def groot_n1_5(*, num_carriers: int = 1, cognition_size: int = 4096, horizon: int = GROOT_HORIZON) -> GrootPounceConfig:

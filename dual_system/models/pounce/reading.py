@@ -20,6 +20,7 @@ from dual_system.models.pi05 import prompt as prompt
 from dual_system.models.pi05.pounce import PounceConfig, PounceInputs
 from dual_system.models.pi05.prompt import Tokenizer
 from dual_system.models.resize import resized_views
+from dual_system.models.windows import through
 
 
 class Moment(Protocol):
@@ -58,7 +59,8 @@ def pi05_inputs(
     Raises:
         ValueError: the prompt is too long.
     """
-    images, has_view = _views(moment.frames, config.image_px, device)
+    frames = through(config.windows, moment.frames, (config.image_px, config.image_px))
+    images, has_view = _views(frames, config.image_px, device)
     state = statistics.normalise_states(moment.proprio)
     has_token = config.state_input == "token"
     text = _STATELESS[config.stateless_prompt] if has_token else partial(prompt.prompt_text, state=state)
