@@ -11,7 +11,7 @@ export MUJOCO_GL ?= egl
 export OMP_NUM_THREADS ?= 1
 
 # `make help` lists the rest.
-.PHONY: help setup demo test unit oldest peers wheels accept soak images site lint types proto bench clean
+.PHONY: help setup demo test unit oldest peers wheels accept soak images policy site lint types proto bench clean
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
 
@@ -112,6 +112,12 @@ soak: setup
 ## make images  builds the four container images and plays an episode with them (root, buildah)
 images: setup
 	$(BIN)/python -m benchmarks.images
+
+## make policy  trains the laptop pair, a slice of MINUTES at a time; keeps data and checkpoints in POLICY_DIR, outside of here
+MINUTES ?= 150
+POLICY_DIR ?= $(HOME)/ponderpounce-policy
+policy: setup
+	$(BIN)/python -m dual_system.policy --folder "$(POLICY_DIR)" --minutes $(MINUTES)
 
 ## make site    the documents as a site, links checked, in out/site/html
 SITE := $(VENV)/site

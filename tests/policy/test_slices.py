@@ -1,0 +1,130 @@
+"""``make policy``: stages in their order, slices that end in time, and an account that adds up."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dual_system.data.collect import CollectOptions
+from dual_system.policy import __main__ as policy
+from dual_system.policy.__main__ import DONE, FAILED, UNFINISHED, Stage, account, stages
+from dual_system.policy.towers import TowersOptions
+from dual_system.training.train import TrainOptions
+from protocol.command_line import parse
+
+OPTIONS: dict[str, Any] = {
+    "dual_system.data.collect": CollectOptions,
+    "dual_system.policy.towers": TowersOptions,
+    "dual_system.training.train": TrainOptions,
+}
+
+
+def test_every_command_of_every_stage_is_one_that_its_program_takes(tmp_path: Path) -> None:
+    found = set()
+    for stage in stages(tmp_path):
+        for module, *arguments in stage.commands:
+            options = parse(OPTIONS[module], arguments, prog=module)
+            found.add(module)
+            assert str(options.out).startswith(str(tmp_path))
+            assert hasattr(importlib.import_module(module), "main")
+    assert found == OPTIONS.keys()
+
+
+def test_a_stage_reads_only_what_an_earlier_one_leaves(tmp_path: Path) -> None:
+    made: set[Path] = set()
+    for stage in stages(tmp_path):
+        for _, *arguments in stage.commands:
+            out = Path(arguments[arguments.index("--out") + 1])
+            read = {Path(each) for each in arguments if each.startswith(str(tmp_path))} - {out, tmp_path / "pictures"}
+            assert all(
+                any(path == each or each in path.parents or path in each.parents for each in made) for path in read
+            )
+        made |= set(stage.leaves)
+
+
+PROGRAM = """
+    import sys, time
+    from pathlib import Path
+
+    def main(file, count):
+        done = int(file.read_text()) if file.exists() else 0
+        try:
+            while done < count:
+                time.sleep(0.05)
+                done += 1
+                file.write_text(str(done))
+        except KeyboardInterrupt:
+            return 130
+        file.with_suffix(".done").touch()
+        return 0
+
+    if __name__ == "__main__":
+        sys.exit(main(Path(sys.argv[1]), int(sys.argv[2])))
+"""
+
+
+@pytest.fixture
+def programs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a module that counts, saves its count and resumes."""
+    (tmp_path / "counting.py").write_text(textwrap.dedent(PROGRAM))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    return tmp_path
+
+
+def plan(folder: Path, monkeypatch: pytest.MonkeyPatch, *counts: int) -> None:
+    def planned(_: Path) -> tuple[Stage, ...]:
+        return tuple(
+            Stage(
+                name=f"part {number}",
+                commands=(("counting", f"{folder / f'{number}.txt'}", f"{count}"),),
+                leaves=(folder / f"{number}.done",),
+            )
+            for number, count in enumerate(counts)
+        )
+
+    monkeypatch.setattr(policy, "stages", planned)
+
+
+def entries(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / "hours.jsonl").read_text().splitlines()]
+
+
+def test_what_is_done_is_not_done_again(programs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan(programs, monkeypatch, 2, 3)
+    (programs / "0.done").touch()
+    assert policy.main(["--folder", str(programs)]) == DONE
+    assert [entry["stage"] for entry in entries(programs)] == ["part 1"]
+    assert policy.main(["--folder", str(programs)]) == DONE
+    assert len(entries(programs)) == 1
+
+
+def test_a_slice_that_is_over_is_gone_on_with(programs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan(programs, monkeypatch, 1_000_000)
+    assert policy.main(["--folder", str(programs), "--minutes", "0.02"]) == UNFINISHED
+    reached = int((programs / "0.txt").read_text())
+    assert reached > 0
+    plan(programs, monkeypatch, reached + 1)
+    assert policy.main(["--folder", str(programs)]) == DONE
+    assert int((programs / "0.txt").read_text()) == reached + 1
+    assert [entry["stage"] for entry in entries(programs)] == ["part 0", "part 0"]
+
+
+def test_a_command_that_fails_ends_the_slice(
+    programs: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    failing = Stage(name="broken", commands=(("counting", "no", "number"),), leaves=(programs / "never",))
+    monkeypatch.setattr(policy, "stages", lambda _: (failing,))
+    assert policy.main(["--folder", str(programs)]) == FAILED
+    assert "broken ended with [1]" in capfd.readouterr().err
+
+
+def test_the_account_is_the_sum_of_its_slices(tmp_path: Path) -> None:
+    lines = [{"stage": name, "wall_s": 1800.0, "core_s": 3600.0} for name in ("towers", "joint", "towers")]
+    (tmp_path / "hours.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in account(tmp_path).splitlines()]
+    assert rows[2:] == [["towers", "2", "1.00", "2.00"], ["joint", "1", "0.50", "1.00"], ["all", "3", "1.50", "3.00"]]
