@@ -31,6 +31,8 @@ CLIENT_PYTHON = os.environ.get("PONDERPOUNCE_CLIENT_PYTHON", sys.executable)
 """An older Python with numpy, msgpack and websockets may run the robot's program."""
 EXAMPLE = ROOT / "examples" / "06_your_own_robot.py"
 PATIENCE_S = 150.0
+NUM_TRIES = 5
+"""A busy machine may end an episode in the middle of what a test is about."""
 STEP_RAD = 2.61 / 20 + 1e-4
 PATHS = (ROOT / "integrations" / "ponderpounce_client", ROOT)
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, PATHS)), "OMP_NUM_THREADS": "1"}
@@ -100,6 +102,7 @@ class Bench:
 
     def program(self, *arguments: str, **options: Any) -> subprocess.Popen[bytes]:
         self.arm.call("reset")
+        self._arguments, self.found_at = arguments, self.arm.call("read")["state"][:7]
         begin = ["--url", f"ws://{self.port}", "--instruction", "pick the highlighted cube", *arguments]
         self.programs.append(self._start("program", str(EXAMPLE), *begin, **options))
         return self.programs[-1]
@@ -110,18 +113,25 @@ class Bench:
     def has_stopped(self) -> bool:
         return bool(self.arm.call("read")["says"] == "protective_stop")
 
-    def moving(self, more: int = 10) -> None:
-        """Waits for more movements. The watchdog of a busy machine may stop the arm: a person releases and engages."""
+    def moving(self, more: int = 10) -> subprocess.Popen[bytes]:
+        """Waits for more movements; returns the program that makes them.
+
+        On a busy machine the watchdog may stop the arm: a person releases it and engages. Or the gateway ends the
+        episode, as it has no command for half a second: the program begins another one.
+        """
         before = self.history()["num_moves"]
 
         def has_moved() -> bool:
-            assert self.programs[-1].poll() is None, self.said("program")
-            if self.has_stopped():
+            if self.programs[-1].poll() is not None:
+                assert "no command for" in self.said("program"), self.said("program")
+                self.program(*self._arguments)
+            elif self.has_stopped():
                 self.arm.call("reset")
                 self.engage()
             return bool(self.history()["num_moves"] >= before + more)
 
         eventually(has_moved, lambda: f"no motion: {self.said('program')}")
+        return self.programs[-1]
 
     def stops(self, then_ns: int) -> int:
         """Waits until the watchdog has stopped the arm; returns how often it was moved.
@@ -135,9 +145,13 @@ class Bench:
         return int(told["num_moves"])
 
     def says_more(self, what: str, times: int = 2) -> None:
-        """Waits until the program has gone on for so many further lines."""
-        before = self.said("program").count(what)
-        eventually(lambda: self.said("program").count(what) >= before + times, lambda: self.said("program"))
+        """Waits until the program has gone on for so many further lines, or has ended."""
+        before, program = self.said("program").count(what), self.programs[-1]
+
+        def has_said() -> bool:
+            return program.poll() is not None or self.said("program").count(what) >= before + times
+
+        eventually(has_said, lambda: self.said("program"))
 
     def engage(self) -> None:
         """A person's ``pp-engage``; refused as long as nothing is stopped."""
@@ -195,17 +209,17 @@ def test_nothing_is_sent_before_a_person_confirms_the_first_row(bench: Bench) ->
 
 
 def test_stop_displace_release_engage_and_the_arm_goes_on_from_there(bench: Bench) -> None:
-    program = bench.program("--yes", "--max-s", "3600")
-    bench.moving()
+    bench.program("--yes", "--max-s", "3600")
+    program = bench.moving()
     bench.arm.call("stop", says="user_stop", text="a person")
     before = bench.history()["num_moves"]
-    eventually(lambda: "stopped: user_stop a person" in bench.said("program"), lambda: bench.said("program"))
+    bench.says_more("  STOPPED  ", 1)
     bench.arm.call("displace", by=0.5)
     bench.arm.call("reset")
     bench.says_more("  STOPPED  ")
     assert bench.history()["num_moves"] == before
     bench.engage()
-    bench.moving()
+    program = bench.moving()
     assert max(move for _, move in bench.history()["moves"]) <= STEP_RAD
     program.send_signal(signal.SIGINT)
     assert program.wait(PATIENCE_S) == 0
@@ -213,8 +227,8 @@ def test_stop_displace_release_engage_and_the_arm_goes_on_from_there(bench: Benc
 
 @pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGKILL])
 def test_the_watchdog_stops_the_arm_of_a_program_that_died_or_froze(bench: Bench, number: int) -> None:
-    program = bench.program("--yes")
-    bench.moving()
+    bench.program("--yes")
+    program = bench.moving()
     then_ns = time.monotonic_ns()
     program.send_signal(number)
     num_moves = bench.stops(then_ns)
@@ -230,34 +244,39 @@ def test_the_watchdog_stops_the_arm_of_a_program_that_died_or_froze(bench: Bench
 
 def test_a_gateway_that_stands_still_stops_the_arm_and_ends_nothing(bench: Bench) -> None:
     """What a busy machine does. A person releases the arm and engages, and the same program goes on."""
-    program = bench.program("--yes")
-    bench.moving()
-    then_ns = time.monotonic_ns()
-    bench.gateway.send_signal(signal.SIGSTOP)
-    num_moves = bench.stops(then_ns)
-    bench.gateway.send_signal(signal.SIGCONT)
-    bench.arm.call("reset")
-    bench.says_more("  STOPPED  ")
-    assert bench.history()["num_moves"] == num_moves
-    bench.engage()
-    bench.moving()
+    bench.program("--yes")
+    for _ in range(NUM_TRIES):
+        program = bench.moving()
+        then_ns = time.monotonic_ns()
+        bench.gateway.send_signal(signal.SIGSTOP)
+        num_moves = bench.stops(then_ns)
+        bench.gateway.send_signal(signal.SIGCONT)
+        bench.arm.call("reset")
+        bench.says_more("  STOPPED  ")
+        assert bench.history()["num_moves"] == num_moves
+        bench.engage()
+        if bench.moving() is program:
+            break
+    else:
+        pytest.fail(bench.said("program"))
     program.send_signal(signal.SIGINT)
     assert program.wait(PATIENCE_S) == 0, bench.said("program")
 
 
 def test_parking_goes_back_in_steps(bench: Bench) -> None:
-    """An arm that its watchdog stopped is not parked; on a busy machine another try may be."""
-    for _ in range(5):
-        program = bench.program("--yes", "--at-exit", "park", "--speed", "0.5")
-        start = bench.arm.call("read")["state"][:7]
-        bench.moving(30)
+    """An arm that its watchdog stopped is not parked."""
+    for _ in range(NUM_TRIES):
+        bench.program("--yes", "--at-exit", "park", "--speed", "0.5")
+        program = bench.moving(30)
         program.send_signal(signal.SIGINT)
-        assert program.wait(PATIENCE_S) == 0, bench.said("program")
+        program.wait(PATIENCE_S)
         told = bench.history()
-        if not bench.has_stopped():
+        if program.returncode == 0 and not bench.has_stopped():
             break
         assert told["moves"][-1][0] < told["stopped_ns"]
-    assert bench.arm.call("read")["state"][:7] == pytest.approx(start, abs=1e-3)
+    else:
+        pytest.fail(bench.said("program"))
+    assert bench.arm.call("read")["state"][:7] == pytest.approx(bench.found_at, abs=1e-3)
     assert max(move for _, move in told["moves"][-20:]) <= STEP_RAD / 2 + 1e-4
 
 
@@ -271,8 +290,8 @@ def test_every_log_agrees_with_the_schedule(bench: Bench) -> None:
 @pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGKILL])
 def test_the_watchdog_stops_the_arm_when_our_gateway_dies_or_freezes(bench: Bench, number: int) -> None:
     """The last tests: the gateway is gone then."""
-    program, over = bench.program("--yes", "--at-exit", "park"), bench.said("gateway").count(" over ")
-    bench.moving()
+    bench.program("--yes", "--at-exit", "park")
+    program, over = bench.moving(), bench.said("gateway").count(" over ")
     then_ns = time.monotonic_ns()
     bench.gateway.send_signal(number)
     num_moves = bench.stops(then_ns)
