@@ -12,7 +12,6 @@ from __future__ import annotations
 import json
 import os
 import resource
-import signal
 import subprocess
 import sys
 import time
@@ -146,11 +145,11 @@ def _run(stage: Stage, folder: Path, ends_s: float) -> int:
 
 
 def _ended(process: subprocess.Popen[bytes], ends_s: float) -> int:
-    """Waits for a command; at the end of the slice it is interrupted, and saves what it has."""
+    """Waits for a command; at the end of the slice it is told to (by SIGTERM: nohup shields from Ctrl-C) and saves."""
     try:
         return process.wait(max(0.0, ends_s - time.monotonic()))
     except subprocess.TimeoutExpired:
-        process.send_signal(signal.SIGINT)
+        process.terminate()
     try:
         return process.wait(_ENDING_S)
     except subprocess.TimeoutExpired:

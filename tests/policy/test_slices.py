@@ -48,10 +48,14 @@ def test_a_stage_reads_only_what_an_earlier_one_leaves(tmp_path: Path) -> None:
 
 
 PROGRAM = """
-    import sys, time
+    import signal, sys, time
     from pathlib import Path
 
+    def interrupted(number, frame):
+        raise KeyboardInterrupt
+
     def main(file, count):
+        signal.signal(signal.SIGTERM, interrupted)
         done = int(file.read_text()) if file.exists() else 0
         try:
             while done < count:
