@@ -162,8 +162,8 @@ def test_the_gateway_answers_a_control_message_and_an_observation(deployment: De
     assert told == golden
     assert {type(seconds) for seconds in ours.pop("server_durations").values()} == {float}
     theirs.pop("server_durations")
-    assert {name: ours[name] for name in theirs} == theirs  # and two of ours that LeRobot leaves alone
-    assert ours.keys() - theirs.keys() == {"tick", "levels"}
+    assert {name: ours[name] for name in theirs} == theirs  # and three of ours that LeRobot leaves alone
+    assert ours.keys() - theirs.keys() == {"tick", "levels", "gate_score"}
 
 
 class Server:
