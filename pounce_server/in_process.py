@@ -15,7 +15,6 @@ from pounce_server.config import PathName, PounceOptions, RemoteOptions, SpeedOp
 from pounce_server.contract import EngineSpec, Episodic, PounceEngine, Request, check_robot
 from pounce_server.node import PounceNode
 from pounce_server.serve import PounceServer
-from pounce_server.subgoal_text import Source
 from protocol.bus import Bus
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
@@ -28,19 +27,18 @@ def build(
     bus: Bus,
     robot: str,
     checkpoint: Path | None,
-    subgoals: Source | None = None,
     *,
     path: PathName = "eager",
     **options: Any,
 ) -> Callable[[], bool]:
     """Returns the step function of a warm server.
 
-    ``subgoals``: see `subgoal_text`; ``path``: see `SpeedOptions`; ``options``: further ones of `PounceOptions`.
+    ``path``: see `SpeedOptions`; ``options``: further ones of `PounceOptions`.
     """
     link = Link(bus, robot=robot, proc="pounce")
     heartbeat = Heartbeat(link, version(), host_clock_id())
     engine = build_engine(PounceOptions(checkpoint=checkpoint, speed=SpeedOptions(path=path), **options))
-    server = PounceServer(link, engine, heartbeat, version(), subgoals)
+    server = PounceServer(link, engine, heartbeat, version())
     server.warm_up()
     server.ready()
     return server.step

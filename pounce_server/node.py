@@ -15,7 +15,6 @@ from clock.playback import tick_at
 from model_server.rendezvous import Rendezvous
 from pounce_server.contract import EngineSpec, Request, Window
 from pounce_server.past import Past
-from pounce_server.subgoal_text import OracleText
 from protocol import images
 from protocol import messages as m
 from protocol.errors import MalformedMessage
@@ -33,10 +32,9 @@ class Work:
 
 
 class PounceNode:
-    def __init__(self, spec: EngineSpec, oracle: OracleText | None = None) -> None:
+    def __init__(self, spec: EngineSpec) -> None:
         self._spec = spec
         self._past: Past | None = None
-        self._oracle = oracle
         self._rendezvous: Rendezvous[m.Invocation] = Rendezvous(keep_requests=KEEP_INVOCATIONS)
         self._info: m.EpisodeInfo | None = None
         self._next_asked = 0
@@ -51,8 +49,6 @@ class PounceNode:
         self._past = None if self._spec.window is None else Past(self._spec.window)
         self._info = info
         self._next_asked = 0
-        if self._oracle is not None:
-            self._oracle.clear()
 
     def on_observation(self, observation: m.Observation) -> None:
         """Keeps an observation for invocations; without pictures it is ignored, as none names it (`will_look`).
@@ -73,10 +69,6 @@ class PounceNode:
             self._past.on_observation(observation)
         if not is_blind:
             self._rendezvous.on_observation(observation)
-
-    def on_subgoal(self, subgoal: m.Subgoal) -> None:
-        if self._oracle is not None:
-            self._oracle.on_subgoal(subgoal)
 
     def on_invocation(self, invocation: m.Invocation) -> None:
         """Keeps an invocation until its observation is there; one that was taken before is ignored."""
@@ -122,13 +114,10 @@ class PounceNode:
             previous_rows=previous_rows.reshape(-1, self._spec.action_dim) if previous_rows.size else None,
             previous_row0=max(0, late_ticks),
             committed_rows=invocation.committed_rows,
-            subgoal=self._subgoal(invocation) if self._spec.reads_subgoal else "",
+            subgoal=(invocation.text or "") if self._spec.reads_subgoal else "",
             window=None if self._past is None else self._past.window_at(observation.tick),
         )
         return Work(invocation=invocation, request=request)
-
-    def _subgoal(self, invocation: m.Invocation) -> str:
-        return (invocation.text or "") if self._oracle is None else self._oracle.at(invocation)
 
     def answer(self, work: Work, rows_NA: m.Floats, *, infer_ns: int) -> m.ActionChunk:
         """The chunk message for rows (horizon, action_dim); row 0 belongs to the tick of its observation."""

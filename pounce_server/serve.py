@@ -9,7 +9,6 @@ from clock.feasibility import delay_ticks
 from model_server.shell import KEEP_OBSERVATIONS, ModelShell
 from pounce_server.contract import Episodic, PounceEngine, check_robot
 from pounce_server.node import PounceNode, Work
-from pounce_server.subgoal_text import OracleText, Source
 from protocol import codec, images, topics
 from protocol import messages as m
 from protocol.drops import DropReason
@@ -22,19 +21,13 @@ from protocol.process import host_clock_id
 class PounceServer(ModelShell):
     """POUNCE on a bus."""
 
-    def __init__(
-        self, link: Link, engine: PounceEngine, heartbeat: Heartbeat, version: str, subgoals: Source | None = None
-    ) -> None:
-        """``subgoals``: source of the texts for an engine that must read them. None, "ponder": the invocation's."""
+    def __init__(self, link: Link, engine: PounceEngine, heartbeat: Heartbeat, version: str) -> None:
         reach_ticks = 0 if engine.spec.window is None else engine.spec.window.reach_ticks
         super().__init__(link, engine, heartbeat, version, keep_observations=KEEP_OBSERVATIONS + reach_ticks)
         self._engine = engine
-        self._has_subgoals = subgoals is not None
-        oracle = OracleText() if subgoals == "oracle" else None
-        self._node = PounceNode(engine.spec, oracle)
+        self._node = PounceNode(engine.spec)
         self._invocations = link.subscribe(topics.INVOCATION)
         self._last: m.ActionChunk | None = None
-        self._subgoals = None if oracle is None else link.subscribe(topics.SUBGOAL)
 
     @property
     def num_superseded(self) -> int:
@@ -57,9 +50,6 @@ class PounceServer(ModelShell):
         self._heartbeat.beat()
         worked = self._take_calls()
         self._take_observations()
-        for subgoal in self._subgoals.drain() if self._subgoals is not None else ():
-            if self._link.is_member(subgoal.header):
-                self._link.survive("subgoal", self._node.on_subgoal, subgoal)
         for invocation in self._invocations.drain():
             if invocation.header.episode != self._link.episode:
                 worked |= self.rejoin()
@@ -149,8 +139,7 @@ class PounceServer(ModelShell):
 
     def _channels(self) -> tuple[m.ChannelSpec, ...]:
         spec = self._engine.spec
-        reads_ponder_s = spec.reads_subgoal and self._subgoals is None
-        return (*([PREFIX] if spec.num_carriers else []), *([PROMPT] if reads_ponder_s else []))
+        return (*([PREFIX] if spec.num_carriers else []), *([PROMPT] if spec.reads_subgoal else []))
 
     def _infer_p99_ns(self) -> int:
         return self._heartbeat.health.infer_p99_ns
@@ -158,12 +147,6 @@ class PounceServer(ModelShell):
     def _open(self, request: m.OpenRequest) -> m.Contract:
         spec = self._engine.spec
         check_robot(request.info.robot, spec)
-        if self._has_subgoals and not spec.reads_subgoal:
-            raise EpisodeRefused(
-                m.Refusal.MODELS,
-                "this checkpoint reads cognition and no subgoals: it was not trained with reads_subgoal; leave "
-                "--subgoal-text out",
-            )
         self._check_committed(request.info.schedule)
         if isinstance(self._engine, Episodic):
             self._engine.begin(request.info)

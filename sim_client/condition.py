@@ -32,8 +32,9 @@ class ConditionOptions:
     another episode of the task."""
     donors: Path | None = None
     """Folder (--out) of a recorded evaluation of the same scenes with real cognition, for --cognition other-episode."""
-    subgoal_text: Literal["ponder", "oracle"] | None = None
-    """Subgoal texts for a POUNCE that reads them in place of cognition: PONDER's, or the task's. Others refuse it."""
+    subgoal_text: Literal["ponder", "grounded", "simple"] = "ponder"
+    """Source of the subgoals for a POUNCE that reads text: PONDER, or the task itself, with places (grounded) or without
+    (simple). The task's come as late as PONDER's."""
     deliver: Literal["every", "held-transition"] = "every"
     """Delivery of cognition. held-transition: only the first, then those at predicted transitions (paper, 5.2)."""
     reported_age_ms: int = 0
@@ -120,9 +121,9 @@ class EvalOptions:
             raise EvaluationError("--cognition other-episode and --donors go together: record the real one first")
         if condition.cognition == "other-episode" and (servers, self.policy) != ("in-process", "servers"):
             raise EvaluationError("--cognition other-episode replaces PONDER: use --servers in-process")
-        if condition.subgoal_text is not None and (servers, condition.cognition) != ("in-process", "real"):
+        if condition.subgoal_text != "ponder" and (servers, condition.cognition) != ("in-process", "real"):
             raise EvaluationError(
-                "--subgoal-text is for --servers in-process, and POUNCE then reads no cognition: leave --cognition out"
+                "--subgoal-text replaces PONDER: use --servers in-process, and leave --cognition out, as it gives none"
             )
         on_gpu = self.models.device == "cuda"
         if workers.gpus_per_worker and not on_gpu:
@@ -199,7 +200,7 @@ class EvalOptions:
         del known["task"], known["list_tasks"]
         known |= {"tasks": list(self.task_names()), "runs": self.runs, "cognition": self.condition.cognition}
         known["donors"] = None if self.condition.donors is None else str(self.condition.donors)
-        if self.condition.subgoal_text is not None:
+        if self.condition.subgoal_text != "ponder":
             known["subgoal_text"] = self.condition.subgoal_text
         return known
 

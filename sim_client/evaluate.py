@@ -24,6 +24,7 @@ import dual_system.tasks.headless  # noqa: F401 - before anything that imports m
 
 from dual_system.data.workers import LocalWorkers, RayWorkers, Workers, worker_index
 from dual_system.tasks.environment import Environment, make_environment
+from protocol import messages as m
 from protocol.bus import Bus
 from protocol.command_line import command, parse
 from protocol.link import Link
@@ -36,6 +37,7 @@ from sim_client.ledger import Ledger, write_json
 from sim_client.null_ponder import NullPonder, cognition_shape
 from sim_client.suite import Suite
 from sim_client.swapped_ponder import SwappedPonder
+from sim_client.telling_ponder import TellingPonder
 
 DONE, REFUSED, INTERRUPTED = 0, 2, 130
 Line = dict[str, Any]  # one episode's entry in results.json
@@ -122,7 +124,7 @@ class EvaluationHarness:
         self._donor: SwappedPonder | None = None
         self._open = contextlib.ExitStack()
         daemons = self._open.enter_context(Daemons(options.out / "servers" / str(os.getpid())))
-        harness = open_harness(sim, daemons, self._replacement(), options.condition.subgoal_text)
+        harness = open_harness(sim, daemons, self._replacement())
         self._open.callback(harness.bus.close)
         self._suite = Suite(sim, harness.link, harness.clock, daemons.dead)
         self._task = ""
@@ -160,6 +162,9 @@ class EvaluationHarness:
         options = self._options
         if options.condition.cognition == "other-episode":
             return self._build_donor
+        if (told := options.condition.subgoal_text) != "ponder":
+            kind = m.SubgoalKind.TASK_GROUNDED if told == "grounded" else m.SubgoalKind.TASK_SIMPLE
+            return lambda bus, robot, _: TellingPonder(Link(bus, robot=robot, proc="ponder"), kind).step
         is_null = options.condition.cognition == "null"
         is_unheard = is_null and options.workers.servers == "in-process" and not options.log.record
         if is_unheard and options.pounce_checkpoint is not None:

@@ -32,21 +32,18 @@ class Harness:
     clock: ClockService | None
 
 
-def open_harness(
-    options: SimOptions, daemons: Daemons, ponder: BuildServer | None = None, subgoals: str | None = None
-) -> Harness:
+def open_harness(options: SimOptions, daemons: Daemons, ponder: BuildServer | None = None) -> Harness:
     """Starts the servers that the options ask for.
 
     Args:
         daemons: stops those that are started as processes.
         ponder: in process, a server in place of ``ponder-serve``'s.
-        subgoals: in process, the source of texts for a POUNCE that reads subgoals, "ponder" or "oracle".
 
     Raises:
         TransportError: a bus that cannot be opened, or options that contradict each other.
     """
     options.check()
-    bus, add_participant = _bus(options, daemons, ponder, subgoals)
+    bus, add_participant = _bus(options, daemons, ponder)
     try:
         clock = None
         if not options.runs_clock_daemon and options.policy == "servers":
@@ -59,9 +56,7 @@ def open_harness(
         raise
 
 
-def _bus(
-    options: SimOptions, daemons: Daemons, ponder: BuildServer | None, subgoals: str | None
-) -> tuple[Bus, Callable[[ServerStep], None]]:
+def _bus(options: SimOptions, daemons: Daemons, ponder: BuildServer | None) -> tuple[Bus, Callable[[ServerStep], None]]:
     """Returns the bus, and how to add one more server to it if all share this thread."""
     link = options.link
     if options.policy == "oracle":
@@ -74,8 +69,7 @@ def _bus(
         if has_ponder(options.played_by):
             build_ponder = ponder or partial(_builder("ponder_server.in_process"), **models.of_ponder())
             bus.add_participant(build_ponder(bus, link.robot, options.ponder_checkpoint))
-        reads = {} if subgoals is None else {"subgoals": subgoals}
-        pounce = partial(_builder("pounce_server.in_process"), **models.of_pounce(), **reads)
+        pounce = partial(_builder("pounce_server.in_process"), **models.of_pounce())
         bus.add_participant(pounce(bus, link.robot, options.pounce_checkpoint))
         return bus, bus.add_participant
     if options.local:

@@ -33,6 +33,9 @@ class Answer:
 class PonderDouble(ABC):
     """Joins episodes and answers queries as ``ponder-serve`` does; subclasses decide with what."""
 
+    payloads: tuple[m.PayloadKind, ...] = (m.PayloadKind.VECTORS, m.PayloadKind.TEXT)
+    """What it gives."""
+
     def __init__(self, link: Link) -> None:
         self.link = link
         self._heartbeat = Heartbeat(link, version(), host_clock_id())
@@ -102,5 +105,5 @@ class PonderDouble(ABC):
             model_hash=self.model_hash,
             is_fake=self.is_fake,
             version=version(),
-            channels=tuple(m.ChannelSpec(payload=kind) for kind in (m.PayloadKind.VECTORS, m.PayloadKind.TEXT)),
+            channels=tuple(m.ChannelSpec(payload=kind) for kind in self.payloads),
         )

@@ -148,6 +148,13 @@ _GIVEN = {
     "other-episode": "another episode's cognition",
 }
 
+_TOLD = {
+    "ponder": "PONDER's subgoal text",
+    "grounded": "the task's grounded subgoal",
+    "simple": "the task's subgoal without places",
+    "oracle": "the task's grounded subgoal of the same tick",  # of earlier releases
+}
+
 
 def _condition(results: Results) -> tuple[str, str, str, str]:
     """POUNCE's cognition, PONDER's query period, its delay and K, as far as the file has them."""
@@ -155,8 +162,9 @@ def _condition(results: Results) -> tuple[str, str, str, str]:
     if config.get("policy") == "oracle":
         return "nothing: the oracle played", "", "", ""
     gets = _GIVEN.get(_cognition(config), "C_t")
-    if config.get("subgoal_text") is not None:
-        gets = {"ponder": "PONDER's subgoal text", "oracle": "the oracle's subgoal text"}[config["subgoal_text"]]
+    told = config.get("subgoal_text", "ponder" if results.num_carriers == 0 else None)
+    if told is not None:
+        gets = _TOLD[told]
     if config.get("deliver") == "held-transition":
         reported_ms = config.get("held_age_ms", 0)
         gets += f" held at transitions, with {f'age {reported_ms} ms' if reported_ms else 'its true age'}"

@@ -100,7 +100,8 @@ def test_of_all_sixteen_tasks_the_paper_s_interventions_stand_below(tmp_path: Pa
         ({"deliver": "held-transition"}, "C_t held at transitions, with its true age"),
         ({"cognition": "other-episode"}, "another episode's cognition"),
         ({"policy": "oracle"}, "nothing: the oracle played"),
-        ({"subgoal_text": "oracle"}, "the oracle's subgoal text"),
+        ({"subgoal_text": "ponder"}, "PONDER's subgoal text"),
+        ({"subgoal_text": "simple"}, "the task's subgoal without places"),
     ],
 )
 def test_a_condition_says_what_pounce_got(tmp_path: Path, config: dict[str, Any], told: str) -> None:

@@ -142,8 +142,8 @@ def test_one_folder_holds_one_condition(tmp_path: Path) -> None:
         ({"cognition": "other-episode"}, "--donors"),
         ({"donors": Path("x")}, "--donors"),
         ({"cognition": "other-episode", "donors": Path("x"), "servers": "local"}, "in-process"),
-        ({"subgoal_text": "oracle", "servers": "local"}, "in-process"),
-        ({"subgoal_text": "oracle", "cognition": "null"}, "reads no cognition"),
+        ({"subgoal_text": "grounded", "servers": "local"}, "in-process"),
+        ({"subgoal_text": "simple", "cognition": "null"}, "it gives none"),
         ({"gpus_per_worker": 0.5}, "use it with --device cuda"),
         ({"gpus_per_worker": 0.5, "device": "cuda:1"}, "use it with --device cuda"),
         ({"ray": "local", "device": "cuda"}, "add --gpus-per-worker"),
@@ -283,15 +283,15 @@ def test_subgoal_text_reaches_a_pounce_that_reads_it_and_is_refused_by_another(t
     save_bundle(random_bundle(dataclasses.replace(silent, reads_subgoal=True), seed=0), tmp_path / "pounce")
     shared: dict[str, Any] = {"tasks": ("StopCube",), "runs": 1, "policy": "servers", "max_steps": 10}
     streams = {}
-    for source in ("ponder", "oracle"):
+    for source in ("ponder", "grounded", "simple"):
         chosen = options(tmp_path / source, subgoal_text=source, pounce_checkpoint=tmp_path / "pounce", **shared)
         with contextlib.closing(EvaluationHarness(chosen)) as harness:
             streams[source] = harness.play(chosen.jobs()[0])["stream_sha256"]
-    assert streams["ponder"] != streams["oracle"]
-    other = options(tmp_path / "other", subgoal_text="oracle", **shared)
+    assert len(set(streams.values())) == 3
+    other = options(tmp_path / "other", subgoal_text="grounded", **shared)
     with (
         contextlib.closing(EvaluationHarness(other)) as harness,
-        pytest.raises(EvaluationError, match="reads cognition and no subgoals"),
+        pytest.raises(EvaluationError, match=r"POUNCE reads vectors .*, PONDER gives text"),
     ):
         harness.play(other.jobs()[0])
 
