@@ -33,7 +33,7 @@ class ConditionOptions:
     donors: Path | None = None
     """Folder (--out) of a recorded evaluation of the same scenes with real cognition, for --cognition other-episode."""
     subgoal_text: Literal["ponder", "grounded", "simple"] = "ponder"
-    """Source of the subgoals for a POUNCE that reads text: PONDER, or the task itself, with places (grounded) or without
+    """Source of the subgoals for a POUNCE that reads text: PONDER, or the task, with places (grounded) or without
     (simple). The task's come as late as PONDER's."""
     deliver: Literal["every", "held-transition"] = "every"
     """Delivery of cognition. held-transition: only the first, then those at predicted transitions (paper, 5.2)."""

@@ -183,3 +183,7 @@ def _workers(options: EvalOptions) -> Workers[Job, Line]:
     if chosen.ray is not None:
         return RayWorkers(chosen.ray, play, num_gpus=chosen.gpus_per_worker)
     return LocalWorkers(chosen.workers, play)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -49,7 +49,7 @@ class CorrectOptions:
     """Makes a dataset of recorded episodes that the oracle takes over. The same command gives the same dataset."""
 
     files: tyro.conf.Positional[tuple[Path, ...]]
-    """MCAP logs of lockstep episodes, made by sim-client or pp-eval; they need no pictures."""
+    """MCAP logs of lockstep episodes, made by sim-client or pp-eval, or folders of them; they need no pictures."""
     out: Path
     """Folder of the new dataset."""
     per_episode: int = 2
@@ -68,6 +68,16 @@ class CorrectOptions:
     def __post_init__(self) -> None:
         if self.per_episode < 1 or self.workers < 1:
             raise ValueError(f"per_episode and workers must be at least 1, came {self.per_episode} and {self.workers}")
+
+    def logs(self) -> list[Path]:
+        """The logs, those of a folder in alphabetical order. Raises DatasetError if a folder has none."""
+        found = []
+        for path in self.files:
+            inside = sorted(path.rglob("*.mcap")) if path.is_dir() else [path]
+            if not inside:
+                raise DatasetError(f"{path} holds no .mcap log; record with pp-eval --record")
+            found += inside
+        return found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,8 +107,9 @@ class Outcome:
 def main(argv: list[str] | None = None, prog: str = "pp-collect correct") -> int:
     options = parse(CorrectOptions, argv, prog=prog)
     reasons = correct(options, LocalWorkers(options.workers, work_out))
-    num_jobs = len(options.files) * options.per_episode
-    sys.stdout.write(f"{num_jobs - len(reasons)} episodes of {len(options.files)} logs in {options.out}\n")
+    num_logs = len(options.logs())
+    num_kept = num_logs * options.per_episode - len(reasons)
+    sys.stdout.write(f"{num_kept} episodes of {num_logs} logs in {options.out}\n")
     for reason in sorted(set(reasons)):
         sys.stdout.write(f"  {reasons.count(reason)} not kept: {reason}\n")
     return DONE
@@ -114,7 +125,9 @@ def correct(options: CorrectOptions, workers: Workers[Job, Outcome]) -> list[str
     """
     if (options.out / INFO_PATH).exists():
         raise DatasetError(f"{options.out} holds a dataset already; use another --out")
-    jobs = [Job(path=path, part=part, options=options) for path in options.files for part in range(options.per_episode)]
+    jobs = [
+        Job(path=path, part=part, options=options) for path in options.logs() for part in range(options.per_episode)
+    ]
     bar = tqdm(total=len(jobs), unit="episode", disable=not options.progress)
     writer = DatasetWriter(files.folder(options.out))
     reasons = []

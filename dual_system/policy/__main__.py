@@ -2,9 +2,9 @@
 
     python -m dual_system.policy --folder POLICY_DIR --minutes 150
 
-A stage is a set of commands that run side by side, each of which resumes by itself, and the files that it leaves. The
-first stage that lacks one of its files is run, until the slice is over or there is none left. What each stage has cost
-is added to ``hours.jsonl``, of which a table is printed at the end.
+A stage is a set of commands that run side by side, each of which resumes by itself; when all have ended well, it is
+marked as done. Stages are run in their order until the slice is over. What each has cost is added to ``hours.jsonl``,
+of which a table is printed at the end.
 """
 
 from __future__ import annotations
@@ -21,11 +21,13 @@ from pathlib import Path
 
 from dual_system.analysis.markdown import markdown
 from dual_system.training.recipes import laptop as laptop_joint
-from dual_system.training.recipes import laptop_grounding, laptop_hand
+from dual_system.training.recipes import laptop_grounding, laptop_hand, laptop_hand_corrected
 from protocol.command_line import command, parse
 
 TASKS = ("VideoUnmask", "PickHighlight", "MoveCube", "PickXtimes")
 EPISODES, STILLS, TOWER_MINUTES = 300, 12_000, 60
+PLAYS, PLAYS_SEED = 40, 1_000_000
+"""Episodes a task that the hand plays under the task's own text, to be corrected."""
 _ENDING_S = 120.0
 """What a command is given to save its state when a slice ends."""
 DONE, UNFINISHED, FAILED = 0, 3, 1
@@ -39,56 +41,52 @@ class PolicyOptions:
     """Where data, checkpoints and the account of hours are kept: tens of gigabytes, outside of the checkout."""
     minutes: float = 150.0
     """Length of this slice."""
-    only: tuple[str, ...] = ()
-    """Stages to run, by name; () for all."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stage:
-    """Commands that run side by side, and what is there when they are done."""
+    """Commands, each a module and its arguments, that run side by side."""
 
     name: str
     commands: tuple[tuple[str, ...], ...]
-    leaves: tuple[Path, ...]
-
-    @property
-    def is_done(self) -> bool:
-        return all(path.exists() for path in self.leaves)
 
 
 def stages(folder: Path) -> tuple[Stage, ...]:
-    """The stages in their order; each starts from what those before it left."""
+    """The stages in their order; each reads what those before it wrote."""
     sets = {task: folder / "data" / task for task in TASKS}
     data = tuple(map(str, sets.values()))
-    towers, hand, grounded, joint = (folder / name for name in ("towers", "hand", "grounding", "joint"))
+    names = ("towers", "hand", "plays", "corrections", "hand_corrected", "grounding", "joint")
+    towers, hand, plays, corrections, corrected, grounded, joint = (folder / name for name in names)
     locating = ("dual_system.policy.towers", "--out", f"{towers}", "--stills", f"{STILLS}")
-    training = ("dual_system.training.train", "--picture-store", f"{folder / 'pictures'}", "--data", *data)
+    training = ("dual_system.training.train", "--picture-store", f"{folder / 'pictures'}")
     obeying = ("--recipe", laptop_hand.__name__, *_from(towers, towers), "--out", f"{hand}")
     wording = ("--recipe", laptop_grounding.__name__, *_from(towers, towers), "--out", f"{grounded}")
-    together = ("--recipe", laptop_joint.__name__, *_from(grounded, hand), "--out", f"{joint}")
-    systems = ("ponder", "pounce")
+    again = ("--recipe", laptop_hand_corrected.__name__, *_from(towers, hand), "--out", f"{corrected}")
+    together = ("--recipe", laptop_joint.__name__, *_from(grounded, corrected), "--out", f"{joint}")
+    scenes = ("--tasks", *TASKS, "--episodes", f"{PLAYS}", "--runs", "1", "--seed", f"{PLAYS_SEED}")
+    asked = ("--pounce-checkpoint", f"{hand / 'pounce'}", "--subgoal-text", "grounded", "--max-steps", "700")
+    correcting = ("--out", f"{corrections}", "--image-px", "128", "--record-hz", "10")
     return (
-        *(
-            Stage(name=f"data {task}", commands=(_collect(task, out),), leaves=(out / "meta",))
-            for task, out in sets.items()
-        ),
-        Stage(name="album", commands=((*locating, "--minutes", "0"),), leaves=(towers / "album.npz",)),
+        *(Stage(name=f"data {task}", commands=(_collect(task, out),)) for task, out in sets.items()),
+        Stage(name="album", commands=((*locating, "--minutes", "0"),)),
         Stage(
             name="towers",
-            commands=tuple((*locating, "--minutes", f"{TOWER_MINUTES}", "--trains", system) for system in systems),
-            leaves=tuple(towers / f"{system}.done" for system in systems),
+            commands=tuple(
+                (*locating, "--minutes", f"{TOWER_MINUTES}", "--trains", system) for system in ("ponder", "pounce")
+            ),
         ),
-        Stage(
-            name="pretrained",
-            commands=((*locating, "--minutes", "0", "--data", *data),),
-            leaves=tuple(towers / system for system in systems),
-        ),
+        Stage(name="pretrained", commands=((*locating, "--minutes", "0", "--data", *data),)),
         Stage(
             name="hand and words",
-            commands=((*training, *obeying), (*training, *wording)),
-            leaves=(hand / "pounce", grounded / "ponder"),
+            commands=((*training, "--data", *data, *obeying), (*training, "--data", *data, *wording)),
         ),
-        Stage(name="joint", commands=((*training, *together),), leaves=tuple(joint / system for system in systems)),
+        Stage(
+            name="plays",
+            commands=(("sim_client.evaluate", "--out", f"{plays}", *scenes, *asked, "--record", "--record-hz", "1"),),
+        ),
+        Stage(name="corrections", commands=(("dual_system.data.correct", f"{plays}", *correcting),)),
+        Stage(name="hand corrected", commands=((*training, "--data", *data, f"{corrections}", *again),)),
+        Stage(name="joint", commands=((*training, "--data", *data, *together),)),
     )
 
 
@@ -109,19 +107,22 @@ def main(argv: list[str] | None = None) -> int:
     folder = options.folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
     ends_s = time.monotonic() + 60 * options.minutes
+    code = DONE
     for stage in stages(folder):
-        if stage.is_done or (options.only and stage.name.split()[0] not in options.only):
-            continue
-        code = _run(stage, folder, ends_s)
-        if code or time.monotonic() >= ends_s:
-            sys.stdout.write(account(folder))
-            return code or (DONE if all(each.is_done for each in stages(folder)) else UNFINISHED)
+        if code == DONE and not _mark(stage, folder).exists():
+            code = _run(stage, folder, ends_s)
     sys.stdout.write(account(folder))
-    return DONE
+    return code
+
+
+def _mark(stage: Stage, folder: Path) -> Path:
+    return folder / "done" / stage.name.replace(" ", "_")
 
 
 def _run(stage: Stage, folder: Path, ends_s: float) -> int:
     """Runs a stage until it is done or the slice is over; adds its cost to the account."""
+    if time.monotonic() >= ends_s:
+        return UNFINISHED
     sys.stdout.write(f"--- {stage.name}\n")
     sys.stdout.flush()
     before, began_s = _core_s(), time.monotonic()
@@ -137,11 +138,14 @@ def _run(stage: Stage, folder: Path, ends_s: float) -> int:
     entry = {"stage": stage.name, "wall_s": time.monotonic() - began_s, "core_s": _core_s() - before}
     with (folder / "hours.jsonl").open("a") as file:
         file.write(json.dumps(entry) + "\n")
-    is_over = time.monotonic() >= ends_s
-    if any(codes) and not is_over:
-        sys.stderr.write(f"policy: {stage.name} ended with {codes}; what it printed says why\n")
-        return FAILED
-    return DONE
+    if not any(codes):
+        _mark(stage, folder).parent.mkdir(exist_ok=True)
+        _mark(stage, folder).touch()
+        return DONE
+    if time.monotonic() >= ends_s:
+        return UNFINISHED
+    sys.stderr.write(f"policy: {stage.name} ended with {codes}; what it printed says why\n")
+    return FAILED
 
 
 def _ended(process: subprocess.Popen[bytes], ends_s: float) -> int:

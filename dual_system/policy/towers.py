@@ -195,8 +195,6 @@ def _trained(tower: _Tower, pictures: dict[str, Album], options: TowersOptions) 
             told = "; ".join(f"{camera}: {each}" for camera, each in found.items())
             yield f"{tower.name} {run.spent_s / 60:.1f} min, step {run.step}, loss {loss.item():.3f}; {told}"
             since_s = time.process_time()
-    if run.step:
-        run.file.with_suffix(".done").touch()
 
 
 def _found(tower: _Tower, head: nn.Module, album: Album) -> Located:

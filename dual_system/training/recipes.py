@@ -219,6 +219,11 @@ def laptop_hand() -> Recipe:
     )
 
 
+def laptop_hand_corrected() -> Recipe:
+    """Stage B, its end: the hand goes on with the oracle's corrections of its own play among the data (DAgger)."""
+    return replace(laptop_hand(), name="laptop_hand_corrected", num_steps=8_000)
+
+
 def laptop_grounding() -> Recipe:
     """Stage A2 of the laptop pair: PONDER learns the tasks' words, as the paper's did before joint training."""
     return Recipe(
@@ -279,6 +284,7 @@ RECIPES: dict[str, Callable[[], Recipe]] = {
         tiny_groot,
         tiny_subgoal_text,
         laptop_hand,
+        laptop_hand_corrected,
         laptop_grounding,
         laptop,
     )

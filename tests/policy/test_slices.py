@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import json
 import textwrap
 from pathlib import Path
@@ -11,14 +12,18 @@ from typing import Any
 import pytest
 
 from dual_system.data.collect import CollectOptions
+from dual_system.data.correct import CorrectOptions
 from dual_system.policy import __main__ as policy
 from dual_system.policy.__main__ import DONE, FAILED, UNFINISHED, Stage, account, stages
 from dual_system.policy.towers import TowersOptions
 from dual_system.training.train import TrainOptions
 from protocol.command_line import parse
+from sim_client.condition import EvalOptions
 
 OPTIONS: dict[str, Any] = {
     "dual_system.data.collect": CollectOptions,
+    "dual_system.data.correct": CorrectOptions,
+    "sim_client.evaluate": EvalOptions,
     "dual_system.policy.towers": TowersOptions,
     "dual_system.training.train": TrainOptions,
 }
@@ -31,20 +36,20 @@ def test_every_command_of_every_stage_is_one_that_its_program_takes(tmp_path: Pa
             options = parse(OPTIONS[module], arguments, prog=module)
             found.add(module)
             assert str(options.out).startswith(str(tmp_path))
-            assert hasattr(importlib.import_module(module), "main")
+            assert all(str(path).startswith(str(tmp_path)) for path in getattr(options, "files", ()))
+            source = inspect.getsource(importlib.import_module(module))
+            assert "\nif __name__ == " in source, f"-m {module} does nothing"
     assert found == OPTIONS.keys()
 
 
-def test_a_stage_reads_only_what_an_earlier_one_leaves(tmp_path: Path) -> None:
-    made: set[Path] = set()
+def test_a_stage_reads_only_what_an_earlier_one_writes(tmp_path: Path) -> None:
+    written = {tmp_path / "pictures"}
     for stage in stages(tmp_path):
+        outs = {Path(arguments[arguments.index("--out") + 1]) for _, *arguments in stage.commands}
         for _, *arguments in stage.commands:
-            out = Path(arguments[arguments.index("--out") + 1])
-            read = {Path(each) for each in arguments if each.startswith(str(tmp_path))} - {out, tmp_path / "pictures"}
-            assert all(
-                any(path == each or each in path.parents or path in each.parents for each in made) for path in read
-            )
-        made |= set(stage.leaves)
+            read = {Path(each) for each in arguments if each.startswith(str(tmp_path))} - outs
+            assert all(path in written or written & set(path.parents) for path in read)
+        written |= outs
 
 
 PROGRAM = """
@@ -64,7 +69,6 @@ PROGRAM = """
                 file.write_text(str(done))
         except KeyboardInterrupt:
             return 130
-        file.with_suffix(".done").touch()
         return 0
 
     if __name__ == "__main__":
@@ -86,7 +90,6 @@ def plan(folder: Path, monkeypatch: pytest.MonkeyPatch, *counts: int) -> None:
             Stage(
                 name=f"part {number}",
                 commands=(("counting", f"{folder / f'{number}.txt'}", f"{count}"),),
-                leaves=(folder / f"{number}.done",),
             )
             for number, count in enumerate(counts)
         )
@@ -100,11 +103,10 @@ def entries(folder: Path) -> list[dict[str, Any]]:
 
 def test_what_is_done_is_not_done_again(programs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plan(programs, monkeypatch, 2, 3)
-    (programs / "0.done").touch()
     assert policy.main(["--folder", str(programs)]) == DONE
-    assert [entry["stage"] for entry in entries(programs)] == ["part 1"]
+    assert [entry["stage"] for entry in entries(programs)] == ["part 0", "part 1"]
     assert policy.main(["--folder", str(programs)]) == DONE
-    assert len(entries(programs)) == 1
+    assert len(entries(programs)) == 2
 
 
 def test_a_slice_that_is_over_is_gone_on_with(programs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -121,7 +123,7 @@ def test_a_slice_that_is_over_is_gone_on_with(programs: Path, monkeypatch: pytes
 def test_a_command_that_fails_ends_the_slice(
     programs: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    failing = Stage(name="broken", commands=(("counting", "no", "number"),), leaves=(programs / "never",))
+    failing = Stage(name="broken", commands=(("counting", "no", "number"),))
     monkeypatch.setattr(policy, "stages", lambda _: (failing,))
     assert policy.main(["--folder", str(programs)]) == FAILED
     assert "broken ended with [1]" in capfd.readouterr().err
