@@ -80,6 +80,7 @@ class Conductor:
         committed_ticks: number of ticks that will be played whatever a new chunk contains; POUNCE receives it.
         residual: head that corrects every row with the newest joints; None: no correction.
         picture_ticks: offsets of the pictures that POUNCE looks at, against an invocation's tick.
+        picture_stride_ticks: POUNCE also remembers the pictures of every n-th tick; 0: it does not.
         start_ns: deadline of tick 0, once known.
     """
 
@@ -87,6 +88,7 @@ class Conductor:
     committed_ticks: int = 0
     residual: ResidualHead | None = None
     picture_ticks: tuple[int, ...] = (0,)
+    picture_stride_ticks: int = 0
     stage: Stage = Stage.WAIT_OBSERVATION
     start_ns: int = 0
     tick: int = 0
@@ -230,7 +232,8 @@ class Conductor:
 
         In lockstep the schedule alone decides, so the robot need not render pictures that no model will read.
         """
-        if not self._is_lockstep or self.stage != Stage.RUNNING:
+        is_remembered = self.picture_stride_ticks > 0 and tick % self.picture_stride_ticks == 0
+        if is_remembered or not self._is_lockstep or self.stage != Stage.RUNNING:
             return True
         if tick >= self._invoke_due_tick or (self._has_ponder and self.deadline_ns(tick) >= self._query_due_ns):
             return True

@@ -94,6 +94,8 @@ class _Episode:
     newest_payload: bytes = b""
     recent: deque[bytes] = field(default_factory=lambda: deque(maxlen=0))
     """Lockstep: the observations before the newest in POUNCE's window, for one that restarts."""
+    remembered: list[bytes] = field(default_factory=list)
+    """Lockstep: those that POUNCE's memory has pictures of, in order, for one that restarts."""
     invoked: m.Invocation | None = None
     """The newest invocation, for a POUNCE that restarts before it has answered."""
     phase: str = ""
@@ -272,6 +274,9 @@ class ClockService:
             if episode.newest_payload:
                 episode.recent.append(episode.newest_payload)
             episode.newest_payload = payload
+            stride = episode.conductor.picture_stride_ticks if episode.is_lockstep else 0
+            if stride and observation.tick % stride == 0:
+                episode.remembered.append(payload)
         return True
 
     def _out_of_time(self, episode: _Episode, observation: m.Observation) -> str:
@@ -417,7 +422,11 @@ class ClockService:
         head = self._config.residual if procs else None
         window = contracts[-1].window or m.ObservationWindow() if contracts else m.ObservationWindow()
         conductor = Conductor(
-            request.info, committed_ticks=committed_ticks, residual=head, picture_ticks=window.video_ticks
+            request.info,
+            committed_ticks=committed_ticks,
+            residual=head,
+            picture_ticks=window.video_ticks,
+            picture_stride_ticks=window.stride_ticks,
         )
         self._episode = _Episode(request, conductor, contracts=dict(zip(procs, contracts, strict=True)))
         if self._episode.is_lockstep:  # in real time a restarted POUNCE has seen its window before it is warm
@@ -470,8 +479,9 @@ class ClockService:
         if why_not := self._admit(request.header):
             return m.ActiveReply(error=why_not)
         conductor, invoked, opened = self._episode.conductor, self._episode.invoked, self._episode.request
-        if request.header.proc == "pounce-shadow":
-            opened = replace(opened, demo=())  # megabytes that a POUNCE does not read, while rows are played
+        if request.header.proc == "pounce-shadow" and not conductor.picture_stride_ticks:
+            opened = replace(opened, demo=())  # megabytes that this POUNCE does not read, while rows are played
+        past = [*self._episode.remembered, *self._episode.recent]
         is_owed = invoked is not None and invoked.invocation == conductor.owed_invocation
         return m.ActiveReply(
             open=replace(opened, members=self._servers.members()),
@@ -479,7 +489,7 @@ class ClockService:
             owed_query=conductor.owed_query,
             owed_invocation=codec.encode(invoked) if is_owed else b"",
             observation=self._episode.newest_payload,
-            recent=_within(self._episode.recent, MAX_RECENT_BYTES) if request.header.proc != "ponder" else (),
+            recent=_within(past, MAX_RECENT_BYTES) if request.header.proc != "ponder" else (),
         )
 
     def _plays_without(self, proc: str) -> bool:

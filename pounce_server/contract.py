@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from dual_system.models.action_space import ActionSpace
 from dual_system.models.arm import JOINT_HIGH_RAD, JOINT_LOW_RAD, NUM_ARM_JOINTS
+from dual_system.models.frame_sampling import FrameSampling, PastFrame
 from protocol.errors import EpisodeRefused
 from protocol.messages import EpisodeInfo, ObservationWindow, Refusal, Robot
 
@@ -68,6 +69,8 @@ class EngineSpec:
     """True if the engine reads PONDER's newest subgoal in place of cognition (then K = 0)."""
     window: ObservationWindow | None = None
     """The ticks at which it looks; None: the present alone, and requests have no ``window``."""
+    past: FrameSampling | None = None
+    """The past front pictures that it reads as a memory; None: requests have no ``past``."""
     kernels: str = ""
     """Which kernels of the fused path it runs and why not others, known after the warm-up; "" if it tried none."""
 
@@ -114,6 +117,8 @@ class Request:
     """PONDER's newest subgoal, for engines that read it; empty before there is one."""
     window: Window | None = None
     """What was seen at the ticks of ``EngineSpec.window``; None if it has none."""
+    past: tuple[PastFrame, ...] = ()
+    """The pictures that ``EngineSpec.past`` chooses, oldest first; () means the learned null."""
 
 
 def no_progress() -> None:
@@ -208,7 +213,18 @@ def check_request(request: Request, spec: EngineSpec) -> None:
         raise ValueError(f"this engine takes no cognition (K = 0), came {request.cognition.shape}")
     else:
         _check_floats("cognition", request.cognition, (spec.num_carriers, spec.cognition_size))
+    _check_past(request, spec)
     _check_previous(request, spec)
+
+
+def _check_past(request: Request, spec: EngineSpec) -> None:
+    most = 0 if spec.past is None else spec.past.num_frames
+    if len(request.past) > most:
+        raise ValueError(f"this engine reads at most {most} pictures of the past, came {len(request.past)}")
+    for each in request.past:
+        if each.frame.dtype != np.uint8 or each.frame.ndim != 3 or each.frame.shape[2] != 3 or not each.frame.size:
+            came = f"{each.frame.shape} {each.frame.dtype}"
+            raise ValueError(f"picture of step {each.step}: expected (h, w, 3) uint8, came {came}")
 
 
 def _check_previous(request: Request, spec: EngineSpec) -> None:
@@ -246,4 +262,13 @@ def example_request(spec: EngineSpec, *, frame_px: int = 256, seed: int = 0) -> 
         seed=seed,
         previous_rows=np.zeros((spec.horizon // 2, spec.action_dim), dtype=np.float32),
         committed_rows=min(1, spec.horizon // 2),
+        past=() if spec.past is None else _example_past(spec.past, generator, shape),
     )
+
+
+def _example_past(
+    sampling: FrameSampling, generator: np.random.Generator, shape: tuple[int, int, int]
+) -> tuple[PastFrame, ...]:
+    """As many pictures of noise as the memory has slots."""
+    frames = [generator.integers(0, 256, shape, dtype=np.uint8) for _ in range(sampling.num_frames)]
+    return sampling.read(dict(enumerate(frames)), len(frames))

@@ -1,12 +1,14 @@
 """Selects the invocation that POUNCE answers, and builds the answer. Pure: messages in, work and messages out.
 
 POUNCE is stateless: each invocation contains its cognition and names its observation, so a restarted POUNCE continues
-as if it had never stopped. Only an engine with a window looks at the ticks before as well (`past`).
+as if it had never stopped. Only an engine with a window looks at the ticks before as well (`past`), and one with a
+frame memory at the whole episode (`history`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import compress
 
 import numpy as np
@@ -14,6 +16,7 @@ import numpy as np
 from clock.playback import tick_at
 from model_server.rendezvous import Rendezvous
 from pounce_server.contract import EngineSpec, Request, Window
+from pounce_server.history import History
 from pounce_server.past import Past
 from protocol import images
 from protocol import messages as m
@@ -29,12 +32,15 @@ class Work:
 
     invocation: m.Invocation
     request: Request
+    num_missing: int = 0
+    """Pictures of the past that the engine should read and that never came."""
 
 
 class PounceNode:
     def __init__(self, spec: EngineSpec) -> None:
         self._spec = spec
         self._past: Past | None = None
+        self._history: History | None = None
         self._rendezvous: Rendezvous[m.Invocation] = Rendezvous(keep_requests=KEEP_INVOCATIONS)
         self._info: m.EpisodeInfo | None = None
         self._next_asked = 0
@@ -43,8 +49,13 @@ class PounceNode:
     def num_superseded(self) -> int:
         return self._rendezvous.num_superseded
 
-    def open(self, info: m.EpisodeInfo | None) -> None:
-        """Starts an episode; None ends it."""
+    def open(self, info: m.EpisodeInfo | None, demo: Sequence[m.DemoFrame] = ()) -> None:
+        """Starts an episode, after its demonstration; None ends it.
+
+        Raises:
+            MalformedMessage: the engine has a frame memory, and the demonstration lacks a picture.
+        """
+        self._history = None if self._spec.past is None or info is None else History(self._spec.past, demo)
         self._rendezvous.clear()
         self._past = None if self._spec.window is None else Past(self._spec.window)
         self._info = info
@@ -67,6 +78,8 @@ class PounceNode:
                 raise MalformedMessage("Observation", field, f"{expected} of them", f"{came}")
         if self._past is not None:
             self._past.on_observation(observation)
+        if self._history is not None:
+            self._history.on_observation(observation)
         if not is_blind:
             self._rendezvous.on_observation(observation)
 
@@ -117,7 +130,11 @@ class PounceNode:
             subgoal=(invocation.text or "") if self._spec.reads_subgoal else "",
             window=None if self._past is None else self._past.window_at(observation.tick),
         )
-        return Work(invocation=invocation, request=request)
+        if self._history is None or self._info.schedule.delivery.kind == m.DeliveryKind.NULL:
+            return Work(invocation=invocation, request=request)
+        remembered = replace(request, past=self._history.at(observation.tick))
+        num_missing = self._history.num_missing(observation.tick)
+        return Work(invocation=invocation, request=remembered, num_missing=num_missing)
 
     def answer(self, work: Work, rows_NA: m.Floats, *, infer_ns: int) -> m.ActionChunk:
         """The chunk message for rows (horizon, action_dim); row 0 belongs to the tick of its observation."""

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
-from clock.channels import PREFIX, PROMPT
+from clock.channels import MODULATION, PREFIX, PROMPT
 from clock.feasibility import delay_ticks
+from dual_system.models.ponder.demo_sampling import DemoSampling
 from model_server.shell import KEEP_OBSERVATIONS, ModelShell
 from pounce_server.contract import Episodic, PounceEngine, check_robot
 from pounce_server.node import PounceNode, Work
@@ -23,6 +25,8 @@ class PounceServer(ModelShell):
 
     def __init__(self, link: Link, engine: PounceEngine, heartbeat: Heartbeat, version: str) -> None:
         reach_ticks = 0 if engine.spec.window is None else engine.spec.window.reach_ticks
+        if engine.spec.past is not None:  # no tick of its grid may be pushed out while a chunk is computed
+            reach_ticks = max(reach_ticks, 2 * engine.spec.horizon)
         super().__init__(link, engine, heartbeat, version, keep_observations=KEEP_OBSERVATIONS + reach_ticks)
         self._engine = engine
         self._node = PounceNode(engine.spec)
@@ -59,10 +63,14 @@ class PounceServer(ModelShell):
             text = f"invocation {invocation.invocation}: tick {invocation.tick} never came"
             self._tell(m.Severity.ERROR, "observation_missed", text)
         try:
-            return worked, self._node.next_work()
+            work = self._node.next_work()
         except MalformedMessage as error:
             self._link.drop("invocation", DropReason.WRONG_REQUEST, str(error))
             return True, None
+        if work is not None and work.num_missing:
+            text = f"invocation {work.invocation.invocation}: {work.num_missing} pictures of the past never came"
+            self._tell(m.Severity.WARNING, "past_missing", text)
+        return worked, work
 
     def _on_observation(self, observation: m.Observation) -> None:
         self._node.on_observation(observation)
@@ -134,12 +142,20 @@ class PounceServer(ModelShell):
             version=self._version,
             channels=self._channels(),
             control_hz=spec.control_hz,
-            window=spec.window,
+            window=self._window(),
+            demonstrations=None if spec.past is None else _as_message(spec.past.demonstrations),
         )
+
+    def _window(self) -> m.ObservationWindow | None:
+        spec = self._engine.spec
+        if spec.past is None:
+            return spec.window
+        return replace(spec.window or m.ObservationWindow(), stride_ticks=spec.past.stride_ticks)
 
     def _channels(self) -> tuple[m.ChannelSpec, ...]:
         spec = self._engine.spec
-        return (*([PREFIX] if spec.num_carriers else []), *([PROMPT] if spec.reads_subgoal else []))
+        own = [MODULATION] if spec.past is not None else []
+        return (*([PREFIX] if spec.num_carriers else []), *([PROMPT] if spec.reads_subgoal else []), *own)
 
     def _infer_p99_ns(self) -> int:
         return self._heartbeat.health.infer_p99_ns
@@ -150,7 +166,7 @@ class PounceServer(ModelShell):
         self._check_committed(request.info.schedule)
         if isinstance(self._engine, Episodic):
             self._engine.begin(request.info)
-        self._node.open(request.info)
+        self._node.open(request.info, request.demo)
         return self._contract()
 
     def _check_committed(self, schedule: m.Schedule) -> None:
@@ -169,3 +185,7 @@ class PounceServer(ModelShell):
     def _close(self) -> None:
         self._node.open(None)
         self._last = None
+
+
+def _as_message(sampling: DemoSampling) -> m.DemoSampling:
+    return m.DemoSampling(hz=sampling.hz, to_its_end=sampling.to_its_end)

@@ -140,12 +140,14 @@ class PayloadKind(IntEnum):
     UNSPECIFIED = 0
     VECTORS = 1
     TEXT = 2
+    FRAMES = 3
 
 
 class ConsumerKind(IntEnum):
     UNSPECIFIED = 0
     PREFIX = 1
     PROMPT = 2
+    MODULATION = 3
 
 
 class NullKind(IntEnum):
@@ -537,6 +539,7 @@ class ChannelSpec:
 class ObservationWindow:
     video_ticks: tuple[int, ...] = (0,)
     state_ticks: tuple[int, ...] = (0,)
+    stride_ticks: int = 0
 
     @property
     def reach_ticks(self) -> int:

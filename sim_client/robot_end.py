@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from typing import TypeVar
 
 from clock.obeyed import Obeyed
+from clock.policies import has_ponder, servers_of
 from clock.report import statistics, stream_sha256
 from clock.schedules import HORIZON
 from clock.service import ClockService
@@ -83,16 +84,21 @@ class RobotEnd:
         """Answers those who ask for this host's clock; returns whether there were any."""
         return self._timing.answer(_time) > 0
 
-    def demo_sampling(self) -> DemoSampling:
-        """Asks PONDER which frames of a demonstration it reads.
+    def demo_sampling(self, policy: str = "servers") -> DemoSampling | None:
+        """Asks PONDER, or a POUNCE that plays alone, which frames of a demonstration it reads; None: nobody reads any.
 
         Raises:
-            EpisodeRefused: PONDER refuses the call.
+            EpisodeRefused: it refuses the call.
             TransportError: it is not ready within the patience.
         """
-        reply = self._patiently(lambda: self._ask_contract("ponder"))
+        players = servers_of(policy)
+        if not players:
+            return None
+        reply = self._patiently(lambda: self._ask_contract(players[0]))
         wanted = reply.contract.demonstrations if reply.contract is not None else None
-        return PAPER_SAMPLING if wanted is None else DemoSampling(hz=wanted.hz, to_its_end=wanted.to_its_end)
+        if wanted is None:
+            return PAPER_SAMPLING if has_ponder(policy) else None
+        return DemoSampling(hz=wanted.hz, to_its_end=wanted.to_its_end)
 
     def horizon(self) -> int:
         """Asks POUNCE how many rows its chunks have.

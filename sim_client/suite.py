@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from clock.policies import has_ponder
 from clock.schedules import HORIZON
 from clock.service import ClockService
+from dual_system.models.ponder.demo_sampling import DemoSampling
 from dual_system.tasks.environment import Environment, Snapshot, make_environment
 from dual_system.tasks.physics import CONTROL_HZ
 from protocol import disk, files, images
@@ -106,8 +106,8 @@ class Suite:
         first = environment.reset(seed, self._options.difficulty)
         self._num_played += 1
         self._link.enter_episode(self._session, f"{task}-{seed}-{secrets.token_hex(3)}", self._num_played)
-        horizon, why_not = self._horizon()
-        info = self._info(environment, first, task, seed, run, horizon)
+        horizon, sampling, why_not = self._terms(environment)
+        info = self._info(environment, first, task, seed, run, horizon, has_demo=sampling is not None)
         path = self._log_path(info) if self._options.log.record else None
         side = RobotSide(
             self._link, self._actions, environment, self._recorder, self._end.take_turn, self._patience_ns, self._looks
@@ -120,7 +120,7 @@ class Suite:
             outcome = Outcome(status=m.TaskStatus.ABORTED, reason=why_not, num_ticks=0)
         else:
             try:
-                opened = self._end.open(m.OpenRequest(info=info, demo=self._demonstration(environment)))
+                opened = self._end.open(m.OpenRequest(info=info, demo=self._demonstration(environment, sampling)))
                 outcome = side.run(info, first, on_tick)
             except (TransportError, EpisodeRefused) as error:
                 outcome = Outcome(status=m.TaskStatus.ABORTED, reason=str(error), num_ticks=0)
@@ -143,17 +143,28 @@ class Suite:
             "schedule": result.statistics,
         }
 
-    def _horizon(self) -> tuple[int, str]:
-        """Rows of POUNCE's chunks, and why there is nobody to ask, or ""."""
+    def _terms(self, environment: Environment) -> tuple[int, DemoSampling | None, str]:
+        """Rows of POUNCE's chunks, the sampling of the demonstration if one is shown, and why nobody says so, or ""."""
+        sampling = None
         if self._options.policy == "servers":
             try:
-                return self._end.horizon(), ""
+                if environment.has_demonstration:
+                    sampling = self._end.demo_sampling(self._options.played_by)
+                return self._end.horizon(), sampling, ""
             except (TransportError, EpisodeRefused) as error:
-                return HORIZON, str(error)
-        return HORIZON, ""
+                return HORIZON, sampling, str(error)
+        return HORIZON, None, ""
 
     def _info(
-        self, environment: Environment, first: Snapshot, task: str, seed: int, run: int, horizon: int
+        self,
+        environment: Environment,
+        first: Snapshot,
+        task: str,
+        seed: int,
+        run: int,
+        horizon: int,
+        *,
+        has_demo: bool,
     ) -> m.EpisodeInfo:
         return m.EpisodeInfo(
             header=self._link.header("info", 0),
@@ -167,18 +178,13 @@ class Suite:
             t0_unix_ns=time.time_ns(),
             versions=versions(),
             policy=self._options.played_by,
-            has_demo=self._shows_demonstration(environment),
+            has_demo=has_demo,
         )
 
-    def _demonstration(self, environment: Environment) -> tuple[m.DemoFrame, ...]:
-        """The demonstration's frames. Raises TransportError or EpisodeRefused if PONDER's contract is not available."""
-        if not self._shows_demonstration(environment):
+    def _demonstration(self, environment: Environment, sampling: DemoSampling | None) -> tuple[m.DemoFrame, ...]:
+        if sampling is None:
             return ()
-        return demonstration(environment, images.wire_codec(self._link.bus.is_local), self._end.demo_sampling())
-
-    def _shows_demonstration(self, environment: Environment) -> bool:
-        """Whether there is one, and a PONDER to see it."""
-        return environment.has_demonstration and has_ponder(self._options.played_by)
+        return demonstration(environment, images.wire_codec(self._link.bus.is_local), sampling)
 
     def _looks(self, tick: int) -> bool:
         """Whether a tick's pictures are needed, by the log or, according to the schedule, by the models."""

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from dual_system.models.stored_tensors import Shape, require_shapes
 
 COGNITION = "pounce_prefix."
+FRAME_MEMORY = "pounce_frame_memory."
 
 
 def write_tensors(tensors: Mapping[str, Tensor], path: Path) -> None:
@@ -35,17 +36,16 @@ def renamed(name: str, table: Iterable[tuple[str, str]]) -> str:
 def require_fit(model: nn.Module, found: Mapping[str, Shape], public_name: Callable[[str], str], source: str) -> bool:
     """Compares the shapes of tensors with public names with a model's; returns whether a cognition prefix is there.
 
-    A public file has none: the model then keeps its own prefix parameters.
+    A public file has none, and no frame memory: the model then keeps its own parameters of these.
 
     Raises:
         WeightsError: a tensor is missing, unknown or of another shape.
     """
     expected = {public_name(name): tuple(parameter.shape) for name, parameter in model.state_dict().items()}
-    has_prefix = any(name.startswith(COGNITION) for name in found)
-    if not has_prefix:
-        expected = {public: shape for public, shape in expected.items() if not public.startswith(COGNITION)}
+    absent = tuple(own for own in (COGNITION, FRAME_MEMORY) if not any(name.startswith(own) for name in found))
+    expected = {public: shape for public, shape in expected.items() if not public.startswith(absent)}
     require_shapes(expected, found, source)
-    return has_prefix
+    return COGNITION not in absent
 
 
 def assign(model: nn.Module, found: Mapping[str, Tensor], public_name: Callable[[str], str], source: str) -> bool:

@@ -32,7 +32,7 @@ from dual_system.models.pounce.family import AnyPounceConfig
 from dual_system.models.pounce.initialise import open_gates, random_pounce
 from dual_system.models.pounce.precision import cast_streams
 from dual_system.training.data import TrainingSet
-from dual_system.training.joint import JointModel, Trains
+from dual_system.training.joint import JointModel, Trains, runs_ponder
 from dual_system.training.recipe import Recipe
 from protocol import disk
 
@@ -61,7 +61,8 @@ def build(run: Recipe, data: TrainingSet, start: Start) -> tuple[JointModel, Pou
             learns are missing.
         FileNotFoundError: a given folder holds no checkpoint.
     """
-    if not run.from_scratch and (start.ponder is None or start.pounce is None):
+    needs_ponder = runs_ponder(run.trains, run.pounce.cognition.num_carriers)
+    if not run.from_scratch and (start.pounce is None or (needs_ponder and start.ponder is None)):
         raise ValueError(
             f"recipe {run.name} starts from pretrained weights; give their folders with --ponder, --pounce"
         )
@@ -91,6 +92,8 @@ def _ponder(run: Recipe, data: TrainingSet, start: Start) -> Ponder:
         if run.has_own_tokenizers:
             own = Vocabulary.trained_on(data.texts(), run.ponder.first_carrier_id, words=PLACE_WORDS)
         ponder = Ponder.random(run.ponder, own, seed=seed, device=start.device, dtype=dtype)
+    if not runs_ponder(run.trains, run.pounce.cognition.num_carriers):
+        return ponder
     try:
         check_cameras([(data.image_px, data.image_px)] * len(CAMERAS), ponder.format.reader, ponder.image_px)
     except ValueError as error:

@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 
 from clock.sampling import SampledInvocation
+from dual_system.models.frame_sampling import FrameSampling, PastFrame
 from dual_system.models.groot.pounce import GrootInputs, GrootPounceConfig
 from dual_system.models.groot.prompt import EagleTokenizer
 from dual_system.models.normalisation import Floats, RobotStatistics
@@ -19,7 +20,7 @@ from dual_system.models.pi05.pounce import PounceConfig, PounceInputs
 from dual_system.models.pi05.prompt import Tokenizer
 from dual_system.models.pounce.batching import joined_groot, joined_pi05
 from dual_system.models.pounce.checkpoint import AnyTokenizer
-from dual_system.models.pounce.family import AnyPounceConfig
+from dual_system.models.pounce.family import AnyPounceConfig, sampling_of
 from dual_system.models.pounce.reading import groot_inputs, pi05_inputs
 from dual_system.training.chunks import chunk_ticks
 from dual_system.training.episode import Frame
@@ -39,6 +40,8 @@ class _TrainingMoment:
     example: Example
     place: int
     """The invocation's, among the example's."""
+    sampling: FrameSampling | None
+    """Of POUNCE's frame memory, if it has one."""
 
     @property
     def invocation(self) -> SampledInvocation:
@@ -65,6 +68,14 @@ class _TrainingMoment:
         return self.invocation.reference.age_ns
 
     @property
+    def past(self) -> tuple[PastFrame, ...]:
+        episode = self.example.episode
+        if self.sampling is None:
+            return ()
+        num_seen = self.sampling.num_seen(episode.num_demo_history, self.invocation.tick)
+        return self.sampling.read(dict(enumerate(episode.history)), num_seen)
+
+    @property
     def subgoal(self) -> str:
         return self.example.told[self.place]
 
@@ -86,8 +97,9 @@ def collate_pounce(
         ValueError: a prompt is longer than ``max_prompt_tokens``, the tokenizer is another family's, or the examples
             have no invocation.
     """
+    sampling = sampling_of(config)
     moments = [
-        _TrainingMoment(index=index, example=example, place=place)
+        _TrainingMoment(index=index, example=example, place=place, sampling=sampling)
         for index, example in enumerate(examples)
         for place in range(len(example.invocations))
     ]

@@ -15,6 +15,7 @@ from dual_system.data.dataset import Dataset, Entry
 from dual_system.data.episode import CAMERAS, Rows
 from dual_system.data.video import FPS
 from dual_system.models.action_space import ActionSpace, actions_in, num_dims, states_in
+from dual_system.models.frame_sampling import FrameSampling
 from dual_system.models.images import resized
 from dual_system.models.normalisation import Quantiles, RobotStatistics
 from dual_system.models.pi05.pounce import PounceConfig
@@ -22,7 +23,7 @@ from dual_system.models.pi05.prompt import with_subgoal
 from dual_system.models.ponder.context import ContextFormat
 from dual_system.models.ponder.coordinates import normalised_text
 from dual_system.models.ponder.demo_sampling import DemoSampling
-from dual_system.models.pounce.family import AnyPounceConfig
+from dual_system.models.pounce.family import AnyPounceConfig, sampling_of
 from dual_system.models.windows import Box, Windows
 from dual_system.training.chunks import chunk_ticks
 from dual_system.training.episode import Frame, TrainingEpisode
@@ -45,6 +46,8 @@ class PictureSizes:
     """Side of POUNCE's pictures, resized as in serving; None: POUNCE reads none."""
     windows: tuple[Box, ...] = ()
     """POUNCE's, one a camera."""
+    past: FrameSampling | None = None
+    """The past pictures of a POUNCE with a frame memory, which needs ``pounce_px``."""
 
     @property
     def key(self) -> str:
@@ -68,7 +71,7 @@ class PictureSizes:
         if pounce is None or not pounce.num_cameras:
             return cls(form=form)
         windows = pounce.windows if isinstance(pounce, PounceConfig) else ()
-        return cls(form=form, pounce_px=pounce.image_px, windows=windows)
+        return cls(form=form, pounce_px=pounce.image_px, windows=windows, past=sampling_of(pounce))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -228,6 +231,7 @@ class TrainingSet:
             )
         rendered = np.maximum.accumulate(np.where(rows.is_rendered, np.arange(len(rows.is_rendered)), 0))
         views, images = self._pictures(source, rendered[[*demo, *range(start, entry.num_rows)]].tolist())
+        history, num_demo_history = self._history(source, views, len(demo))
         episode = TrainingEpisode(
             instruction=entry.instruction,
             demo=tuple(images[: len(demo)]),
@@ -239,8 +243,34 @@ class TrainingSet:
             is_transition_T=rows.is_transition[start:],
             reasoning=rows.demonstration_reasoning[start],
             imitated_from=entry.corrected_from,
+            history=history,
+            num_demo_history=num_demo_history,
         )
         return episode if self._sizes.form is None else episode.as_seen((rendered[start:] - start).clip(min=0))
+
+    def _history(self, source: _Source, views: Views, num_demo: int) -> tuple[tuple[Frame, ...], int]:
+        """The front pictures on the grid of POUNCE's frame memory, and how many are the demonstration's.
+
+        Raises ValueError if the grid is not the demonstration's, or a picture on it was not rendered.
+        """
+        past = self._sizes.past
+        if past is None:
+            return (), 0
+        start, stride = source.entry.num_demonstration_rows, past.stride_ticks
+        if past.demonstrations.hz != self._demo_hz:
+            raise ValueError(
+                f"a frame memory with stride_ticks {stride} reads demonstrations at {past.demonstrations.hz} Hz, the "
+                f"recipe's demo_hz is {self._demo_hz}"
+            )
+        is_rendered = source.rows().is_rendered[start::stride]
+        if not is_rendered.all():
+            raise ValueError(
+                f"{source.dataset.root}: POUNCE's memory reads every {stride}th picture of {source.entry.task} "
+                f"{source.entry.seed}, and {(~is_rendered).sum()} of these {len(is_rendered)} were not rendered; "
+                "collect with --frames all"
+            )
+        shown = views[: len(past.demonstrations.indices(start, FPS))]
+        return tuple(each[0] for each in (*shown, *views[num_demo::stride])), len(shown)
 
     def _pictures(self, source: _Source, rows: Sequence[int]) -> tuple[Views, Views]:
         """POUNCE's views and PONDER's images at ``rows``, which may repeat."""

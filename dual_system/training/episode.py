@@ -40,6 +40,10 @@ class TrainingEpisode:
     """PONDER's target text at the first transition after a demonstration; empty without one."""
     imitated_from: int = 0
     """The tick from which POUNCE imitates; before it a policy acted (`pp-collect correct`, DAgger)."""
+    history: Sequence[Frame] = ()
+    """POUNCE's front pictures on the grid of its frame memory, the demonstration's first (`FrameSampling`)."""
+    num_demo_history: int = 0
+    """How many of these are the demonstration's."""
     seen_at_T: NDArray[np.intp] | None = None
     """For each tick, the tick at which its picture was taken (`as_seen`); None: the same tick."""
 

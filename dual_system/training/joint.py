@@ -4,8 +4,8 @@ PONDER reads every episode as one causal row, all queries in one pass. Every POU
 cognition that the schedule assigns to it, so many invocations share one; their action loss reaches PONDER only through
 it, scaled (A.3). The LM head runs at supervised tokens only.
 
-One system can be trained alone: PONDER on its texts; POUNCE on the cognition of a frozen PONDER or, if it reads
-subgoals as text (K = 0), without PONDER.
+One system can be trained alone: PONDER on its texts; POUNCE on the cognition of a frozen PONDER or, without cognition
+(K = 0), without PONDER. Dropout takes a frame memory away as it does cognition.
 """
 
 # B episodes, T tokens, H hidden, Q queries, I invocations of all episodes, K carriers, N horizon, A padded action dim
@@ -211,7 +211,7 @@ class JointModel(nn.Module):
         super().__init__()
         wanted = (pounce.config.cognition.num_carriers, pounce.config.cognition.cognition_size)
         given = (ponder.format.num_carriers, ponder.hidden_size)
-        if wanted != given and not pounce.config.reads_subgoal:
+        if wanted != given and wanted[0]:
             raise ValueError(f"POUNCE reads (K, H) = {wanted}, PONDER gives {given}; build them for each other")
         self.ponder = ponder
         self.pounce = pounce
@@ -252,6 +252,8 @@ class JointModel(nn.Module):
             if cognition_QKH is not None and first_query is not None:
                 index_I = first_query[invocations.episode_I] + invocations.query_I.clamp(min=0)
                 inputs = replace(inputs, cognition=cognition_QKH[index_I], is_null=_is_null(invocations, draws))
+            if isinstance(inputs, PounceInputs):
+                inputs = inputs.forgetting(draws.is_dropped_I)
             matching = action_loss(
                 self.pounce, inputs, invocations.actions_INA, draws.noise_SNA, draws.time_S, draws.num_committed_S
             )

@@ -12,6 +12,7 @@ from difflib import get_close_matches
 
 from clock import sampling
 from clock.timebase import NS_PER_S
+from dual_system.models.frame_sampling import FrameMemoryConfig, FrameSampling
 from dual_system.models.ponder import configs as ponder_configs
 from dual_system.models.pounce import configs as pounce_configs
 from dual_system.training.example import ExampleConfig
@@ -144,6 +145,27 @@ def robocasa_dc() -> Recipe:
     )
 
 
+def robomme_framesamp() -> Recipe:
+    """FrameSamp+Modul: 32 of POUNCE's own past pictures modulate its expert, and there is no PONDER.
+
+    As in RoboMME's row the language model learns as well. The pictures lie on a grid of 2 Hz; RoboMME keeps every step.
+    """
+    pounce = pounce_configs.pi05_base(num_carriers=0)
+    return Recipe(
+        name="robomme_framesamp",
+        ponder=ponder_configs.tiny_cpu(),  # not run
+        pounce=replace(pounce, frame_memory=FrameMemoryConfig(sampling=FrameSampling(stride_ticks=10))),
+        freeze="vision",
+        example=ExampleConfig(clocks=sampling.ROBOMME, is_grounded=False),
+        train=_PAPER,
+        num_steps=4320,
+        batch_episodes=32,
+        w2=0.0,
+        trains="pounce",
+        demo_hz=2,
+    )
+
+
 def tiny() -> Recipe:
     """Both architectures at the smallest size, from scratch: exercises every part on one CPU core, learns little."""
     return Recipe(
@@ -188,6 +210,24 @@ def tiny_subgoal_text() -> Recipe:
         num_steps=200,
         batch_episodes=2,
         w2=0.3,
+        from_scratch=True,
+    )
+
+
+def tiny_framesamp() -> Recipe:
+    """``robomme_framesamp`` at the size of ``tiny``: 8 pictures, one a second."""
+    pounce = pounce_configs.tiny_cpu(num_carriers=0, cognition_size=_TINY_H)
+    return Recipe(
+        name="tiny_framesamp",
+        ponder=ponder_configs.tiny_cpu(),  # not run
+        pounce=replace(pounce, frame_memory=pounce_configs.tiny_frame_memory()),
+        freeze="none",
+        example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=8, is_grounded=False),
+        train=_TINY,
+        num_steps=200,
+        batch_episodes=2,
+        w2=0.0,
+        trains="pounce",
         from_scratch=True,
     )
 
@@ -279,10 +319,12 @@ RECIPES: dict[str, Callable[[], Recipe]] = {
         robomme_refresh_2s,
         robomme_refresh_4s,
         robomme_0p8b,
+        robomme_framesamp,
         robocasa_dc,
         tiny,
         tiny_groot,
         tiny_subgoal_text,
+        tiny_framesamp,
         laptop_hand,
         laptop_hand_corrected,
         laptop_grounding,

@@ -112,8 +112,8 @@ class TrainOptions:
     """Trains PONDER and POUNCE together. The same command again resumes a run that was killed."""
 
     recipe: str
-    """Name of a recipe: robomme and robocasa_dc are the paper's runs, robomme_* its ablations; tiny, tiny_groot and
-    tiny_subgoal_text are small ones for a CPU."""
+    """Name of a recipe: robomme and robocasa_dc are the paper's runs, robomme_* its ablations; tiny, tiny_groot,
+    tiny_subgoal_text and tiny_framesamp are small ones for a CPU."""
     data: tuple[Path, ...]
     """Folders that pp-collect or pp-export made."""
     out: Path

@@ -191,7 +191,7 @@ def _window(given: Mapping[str, Any]) -> dict[str, Any]:
             raise ValueError(f"[window] {modality} = {why_not}")
         ticks[f"{modality}_ticks"] = offsets
     pads = {name: _key(given[name], f"[window] {name}") for name in ("video_pad", "state_pad") if name in given}
-    return {"window": ObservationWindow(**ticks), **pads}
+    return {"window": ObservationWindow(video_ticks=ticks["video_ticks"], state_ticks=ticks["state_ticks"]), **pads}
 
 
 def _prompt(given: Mapping[str, Any]) -> Prompt:

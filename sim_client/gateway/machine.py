@@ -22,9 +22,10 @@ from typing import Literal, TypeVar
 import numpy as np
 
 from clock.limits import out_of_range, slowed
-from clock.policies import has_ponder, servers_of
+from clock.policies import servers_of
 from clock.service import ClockService
 from clock.timebase import MonotonicClock
+from dual_system.models.ponder.demo_sampling import DemoSampling
 from protocol import images
 from protocol import messages as m
 from protocol.drops import DropReason
@@ -427,7 +428,7 @@ class Machine:
         robot = self._plan.body.describe(step.state, size_px)
         _check_state(step.state, robot)
         self._end(m.TaskStatus.ONGOING, "another episode was begun")
-        seed, horizon = self._plan.seed + self._num_episodes, self._horizon(client)
+        seed, (horizon, sampling) = self._plan.seed + self._num_episodes, self._terms(client, has_video=bool(step.demo))
         schedule = self._plan.schedule(seed, horizon)
         if schedule.mode == m.Mode.LOCKSTEP and self._plan.num_rows > 1:
             # A client may not say what it saw between its requests: the last state is repeated, and has no lead.
@@ -451,14 +452,14 @@ class Machine:
             t0_unix_ns=time.time_ns(),
             versions=versions(),
             policy=self._plan.policy,
-            has_demo=bool(step.demo) and has_ponder(self._plan.policy),
+            has_demo=sampling is not None,
         )
         path = self._log_path(info)
         self._recorder.begin(info, path)
         episode = _Episode(client, info, self._node(info))
         self._episode = episode
         try:
-            demo = self._demonstration(step.demo if info.has_demo else (), info.schedule.control_hz)
+            demo = self._demonstration(step.demo, info.schedule.control_hz, sampling)
             opened = self._robot_end.open(m.OpenRequest(info=info, demo=demo))
         except (Refused, TransportError, ProtocolError) as error:  # Refused: a picture of the video is none
             self._end(m.TaskStatus.ABORTED, str(error))
@@ -480,23 +481,25 @@ class Machine:
             log.warning("episode=%s %s", info.header.episode, warning)
         return episode
 
-    def _horizon(self, client: str) -> int:
-        """Rows of POUNCE's chunks. Raises Refused, TransportError, EpisodeRefused: they cannot be served."""
+    def _terms(self, client: str, *, has_video: bool) -> tuple[int, DemoSampling | None]:
+        """Rows of POUNCE's chunks, and the sampling of a video that is read. Raises Refused, TransportError,
+        EpisodeRefused: they cannot be served."""
         try:
             horizon, rows = self._robot_end.horizon(), self._plan.num_rows
             if rows > horizon:
                 raise Refused(f"--rows {rows}: POUNCE's chunks have {horizon} rows, expected 1 to {horizon}")
+            return horizon, self._robot_end.demo_sampling(self._plan.policy) if has_video else None
         except (Refused, TransportError, ProtocolError):
             with self._lock:
                 self._lease.release(client)
             raise
-        return horizon
 
-    def _demonstration(self, video: Sequence[Frames], control_hz: int) -> tuple[m.DemoFrame, ...]:
-        """PONDER's frames of a video. Raises TransportError or EpisodeRefused if PONDER's contract is not available."""
-        if not video:
+    def _demonstration(
+        self, video: Sequence[Frames], control_hz: int, sampling: DemoSampling | None
+    ) -> tuple[m.DemoFrame, ...]:
+        if sampling is None:
             return ()
-        frames = sampled(video, control_hz, self._robot_end.demo_sampling())
+        frames = sampled(video, control_hz, sampling)
         return tuple(m.DemoFrame(images=self._packed(resized(each, self._plan.image_px))) for each in frames)
 
     def _packed(self, frames: Frames) -> tuple[m.Image, ...]:

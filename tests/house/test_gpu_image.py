@@ -9,8 +9,8 @@ import pytest
 
 LACKING = ("tyro", "zenoh", "simplejpeg", "mcap", "av", "mujoco")
 NEED_THEM = (
-    "__main__", "config", "fleet", "in_process", "node", "past", "serve", "parity", "export_hf", "import_folder",
-    "inspect_folder",
+    "__main__", "config", "fleet", "in_process", "history", "node", "past", "serve", "parity", "export_hf",
+    "import_folder", "inspect_folder",
 )  # fmt: skip
 """Command lines and daemons: the last part of their modules' names."""
 NETWORKED = ("ponder_server.chat", "pounce_server.remote")

@@ -20,6 +20,7 @@ from dual_system.models import flow
 from dual_system.models.pi05 import committed as committed
 from dual_system.models.pi05.committed import Committed, pinned, row_styles
 from dual_system.models.pi05.gemma import ActionExpert, GemmaConfig, LanguageModel, Rotation, attend
+from dual_system.models.pi05.modulation import MemoryCache
 from dual_system.models.siglip import VisionConfig, VisionTower
 from dual_system.models.sinusoid import sinusoid
 
@@ -91,6 +92,8 @@ class PrefixCache:
     """(B, T) bool: prefix tokens that the actions may attend to."""
     next_position: Tensor
     """(B,) int64: position of the first action token."""
+    memory: MemoryCache | None = None
+    """What modulates the action stream's FFNs; None: nothing does."""
 
     def repeated(self, times: int) -> "PrefixCache":
         """The batch repeated ``times``: several action streams against one prefix."""
@@ -101,6 +104,7 @@ class PrefixCache:
             values=tuple(value.repeat(times, 1, 1, 1) for value in self.values),
             visible=self.visible.repeat(times, 1),
             next_position=self.next_position.repeat(times),
+            memory=None if self.memory is None else self.memory.repeated(times),
         )
 
 
@@ -254,13 +258,15 @@ class Pi05(nn.Module):
         visible = torch.cat([cache.visible, is_action_BN], dim=1)[:, None, None, :]
         x_BNE = self.action_in_proj(x_BNA).to(self.stream_dtype)
         styles = iter(styles_M3B1E)
-        for layer, prefix_key, prefix_value in zip(self.expert.layers, cache.keys, cache.values, strict=True):
+        stack = zip(self.expert.layers, cache.keys, cache.values, strict=True)
+        for index, (layer, prefix_key, prefix_value) in enumerate(stack):
             normed_BNE, gate = layer.input_layernorm(x_BNE, next(styles))
             q_BhND, k_BgND, v_BgND = layer.self_attn.qkv(normed_BNE, rotation)
             keys = torch.cat([prefix_key, k_BgND], dim=2)
             values = torch.cat([prefix_value, v_BgND], dim=2)
             x_BNE = x_BNE + gate * layer.self_attn.o_proj(attend(q_BhND, keys, values, visible))
-            normed_BNE, gate = layer.post_attention_layernorm(x_BNE, next(styles))
+            branch_BNE = x_BNE if cache.memory is None else cache.memory.modulated(index, x_BNE)
+            normed_BNE, gate = layer.post_attention_layernorm(branch_BNE, next(styles))
             x_BNE = x_BNE + gate * layer.mlp(normed_BNE)
         final_BNE, _ = self.expert.norm(x_BNE, next(styles))  # the last norm has no residual to gate
         velocity_BNA: Tensor = self.action_out_proj(final_BNE.float())

@@ -1,18 +1,21 @@
 """POUNCE, System 1: pi0.5 with the cognition prefix in front of images and text (paper 3.1)."""
 
-# B batch, V views, T text tokens, K carriers, H carrier size, N horizon, A padded action dim
+# B batch, V views, T text tokens, K carriers, H carrier size, N horizon, A padded action dim, F past frames
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
 import torch
 from torch import Tensor, nn
 
 from dual_system.models import flow
+from dual_system.models.frame_sampling import FrameMemoryConfig
 from dual_system.models.interface import CognitionConfig, CognitionPrefix, check_channel
 from dual_system.models.pi05.committed import Committed, first_rows
+from dual_system.models.pi05.modulation import NO_FRAME, FrameMemory, pooled
 from dual_system.models.pi05.network import Pi05, Pi05Config, Prefix, PrefixCache, StepTable
+from dual_system.models.ponder.demo_sampling import FASTEST_HZ
 from dual_system.models.windows import Box
 
 Freeze = Literal["none", "vision", "vlm"]
@@ -40,6 +43,16 @@ class PounceInputs:
     """(B,) bool; samples of ``cognition`` to replace by the learned null"""
     state: Tensor | None = None
     """(B, S) float32, normalised; required if the config's ``state_input`` is "token"."""
+    past: Tensor | None = None
+    """(B, F, 3, px, px) uint8: front pictures of the past for ``frame_memory``; None: none for any sample."""
+    past_step: Tensor | None = None
+    """(B, F) int64: the step of each (`PastFrame`), or `NO_FRAME` for an empty slot."""
+
+    def forgetting(self, is_null_B: Tensor) -> "PounceInputs":
+        """Inputs whose marked samples have no past pictures: the memory's learned null."""
+        if self.past_step is None:
+            return self
+        return replace(self, past_step=self.past_step.masked_fill(is_null_B[:, None], NO_FRAME))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,9 +85,18 @@ class PounceConfig:
     """Largest number of committed rows in training (`committed`); 0 if it was not trained with any."""
     reads_subgoal: bool = False
     """Put the newest subgoal's text into the prompt in place of cognition: the paper's subgoal-text reference (3.1)."""
+    frame_memory: FrameMemoryConfig | None = None
+    """A memory of POUNCE's own past front pictures that modulates the expert (FrameSamp+Modul); None: there is none."""
 
     def __post_init__(self) -> None:
         check_channel(self.cognition, self.reads_subgoal)
+        if self.frame_memory is not None:
+            self.frame_memory.grid_side(self.pi05.vision.num_patches)
+            if self.control_hz != FASTEST_HZ or not self.num_cameras:
+                raise ValueError(
+                    f"frame_memory needs a front camera and control_hz {FASTEST_HZ}, that of demonstrations; came "
+                    f"{self.num_cameras} cameras and {self.control_hz}"
+                )
         if not 0 <= self.max_committed_rows < self.pi05.horizon:
             raise ValueError(f"max_committed_rows must be 0..{self.pi05.horizon - 1}, came {self.max_committed_rows}")
         if not 0 < self.robot_action_dim <= self.pi05.action_dim:
@@ -115,7 +137,16 @@ class PounceConfig:
             age_ns=torch.full((batch_size,), 300_000_000),
             cognition=cognition_BKH if cognition.num_carriers else None,
             state=torch.rand(batch_size, self.robot_state_dim, generator=generator) * 2 - 1 if has_token else None,
+            **({} if self.frame_memory is None else self._example_past(batch_size, self.frame_memory, generator)),
         )
+
+    def _example_past(
+        self, batch_size: int, memory: FrameMemoryConfig, generator: torch.Generator
+    ) -> dict[str, Tensor]:
+        num_frames, px = memory.sampling.num_frames, self.image_px
+        past = torch.randint(256, (batch_size, num_frames, 3, px, px), generator=generator, dtype=torch.uint8)
+        steps_F = torch.arange(num_frames) * memory.sampling.stride_ticks
+        return {"past": past, "past_step": steps_F.repeat(batch_size, 1)}
 
     def example_actions(self, batch_size: int, *, seed: int = 0) -> Tensor:
         """Makes normalised training targets, (B, N, A) float32, zero beyond the robot's dims."""
@@ -155,6 +186,12 @@ class Pounce(nn.Module):
         self.cognition_prefix = CognitionPrefix(config.cognition, width) if has_prefix else None
         has_token = config.state_input == "token"
         self.state_projector = nn.Linear(config.robot_state_dim, width) if has_token else None
+        self.frame_memory = None
+        if config.frame_memory is not None:
+            num_patches, expert = config.pi05.vision.num_patches, config.pi05.expert
+            self.frame_memory = FrameMemory(
+                config.frame_memory, num_patches=num_patches, feature_width=width, expert=expert
+            )
 
     @property
     def backbone(self) -> Backbone:
@@ -189,8 +226,25 @@ class Pounce(nn.Module):
         )
 
     def prefill(self, inputs: PounceInputs) -> PrefixCache:
-        """Embeds [P][images][text][state] and runs it through the language layers once."""
-        return self.pi05.prefill(self.embed_prefix(inputs))
+        """Embeds [P][images][text][state] and runs it through the language layers once; encodes the frame memory."""
+        cache = self.pi05.prefill(self.embed_prefix(inputs))
+        if self.frame_memory is None:
+            return cache
+        return replace(cache, memory=self.frame_memory(*self._past_features(inputs, self.frame_memory.config)))
+
+    def _past_features(self, inputs: PounceInputs, memory: FrameMemoryConfig) -> tuple[Tensor, Tensor]:
+        """The past pictures' features (B, F, C, W) and steps (B, F). No gradient reaches the vision tower here."""
+        device, width = inputs.age_ns.device, self.config.pi05.language.width
+        shape = (len(inputs.age_ns), memory.sampling.num_frames)
+        features_BFCW = torch.zeros(*shape, memory.tokens_per_frame, width, device=device)
+        if inputs.past is None or inputs.past_step is None:
+            return features_BFCW, torch.full(shape, NO_FRAME, device=device)
+        is_frame_BF = inputs.past_step != NO_FRAME
+        if is_frame_BF.any():
+            with torch.no_grad():
+                pictures_M13PP = inputs.past[is_frame_BF][:, None].float() / 127.5 - 1.0
+                features_BFCW[is_frame_BF] = pooled(self.pi05.embed_images(pictures_M13PP), memory.pooled_side)
+        return features_BFCW, inputs.past_step
 
     def loss(
         self,

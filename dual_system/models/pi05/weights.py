@@ -16,7 +16,7 @@ from torch import Tensor
 
 from dual_system.models.pi05.network import Pi05Config
 from dual_system.models.pi05.pounce import Pounce
-from dual_system.models.public_layout import COGNITION, assign, renamed, require_fit, write_tensors
+from dual_system.models.public_layout import COGNITION, FRAME_MEMORY, assign, renamed, require_fit, write_tensors
 from dual_system.models.stored_tensors import StoredTensors, WeightsError
 
 _ROOT = "paligemma_with_expert."
@@ -39,6 +39,7 @@ _PREFIXES = (
     ("pi05.", ""),  # action_in_proj, action_out_proj, time_mlp_in, time_mlp_out
     ("cognition_prefix.", COGNITION),
     ("state_projector.", "state_proj."),  # pi0's name for it
+    ("frame_memory.", FRAME_MEMORY),
 )
 
 

@@ -19,6 +19,7 @@ def joined_pi05(inputs: Sequence[PounceInputs]) -> PounceInputs:
     num_tokens = max(one.token_ids.shape[1] for one in inputs)
     cognition, is_null = _joined_cognition([one.cognition for one in inputs])
     states = [one.state for one in inputs]
+    past, past_step = _joined_past(inputs)
     return PounceInputs(
         images=torch.cat([one.images for one in inputs]),
         has_view=torch.cat([one.has_view for one in inputs]),
@@ -28,6 +29,8 @@ def joined_pi05(inputs: Sequence[PounceInputs]) -> PounceInputs:
         cognition=cognition,
         is_null=is_null,
         state=None if None in states else torch.cat([state for state in states if state is not None]),
+        past=past,
+        past_step=past_step,
     )
 
 
@@ -57,6 +60,15 @@ def of_equal_length(inputs: Sequence[GrootInputs]) -> list[list[int]]:
 def _padded(values_1T: Tensor, num_tokens: int) -> Tensor:
     """Pads on the right with `PADDING_ID`, which is False in a mask."""
     return torch.nn.functional.pad(values_1T, (0, num_tokens - values_1T.shape[1]), value=PADDING_ID)
+
+
+def _joined_past(inputs: Sequence[PounceInputs]) -> tuple[Tensor | None, Tensor | None]:
+    """Past pictures (B, F, ...) and steps (B, F): of all samples or, without a frame memory, of none."""
+    pasts = [(one.past, one.past_step) for one in inputs]
+    given = [(past, step) for past, step in pasts if past is not None and step is not None]
+    if not given:
+        return None, None
+    return torch.cat([past for past, _ in given]), torch.cat([step for _, step in given])
 
 
 def _joined_cognition(cognitions: Sequence[Tensor | None]) -> tuple[Tensor | None, Tensor | None]:

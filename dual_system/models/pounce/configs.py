@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import TypeVar
 
 from dual_system.models.action_space import ActionSpace, num_dims
+from dual_system.models.frame_sampling import FrameMemoryConfig, FrameSampling
 from dual_system.models.groot.blocks import BlockConfig
 from dual_system.models.groot.eagle import EagleConfig
 from dual_system.models.groot.network import GrootConfig
@@ -119,6 +120,12 @@ def tiny_groot(*, num_carriers: int = 1, cognition_size: int = 64, horizon: int 
         ),
         embodiment=1,
     )
+
+
+def tiny_frame_memory() -> FrameMemoryConfig:
+    """`FrameMemoryConfig` at the size of `tiny_cpu`: eight pictures, one a second."""
+    sampling = FrameSampling(num_frames=8, stride_ticks=20)
+    return FrameMemoryConfig(sampling=sampling, position_size=48, head_dim=16)
 
 
 def in_space(config: Config, space: ActionSpace) -> Config:

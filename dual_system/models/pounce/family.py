@@ -7,6 +7,7 @@ from typing import Literal, TypeAlias
 import torch
 
 from dual_system.models import flow
+from dual_system.models.frame_sampling import FrameSampling
 from dual_system.models.groot import flow as groot_flow
 from dual_system.models.groot import weights as groot_weights
 from dual_system.models.groot.pounce import GrootInputs, GrootPounce, GrootPounceConfig
@@ -67,6 +68,12 @@ def sample_times(model: AnyPounce, count: int, generator: torch.Generator) -> to
 def max_committed_rows(config: AnyPounceConfig) -> int:
     """Largest number of committed rows, in training and with ``--continuity trained``; 0 for GR00T."""
     return config.max_committed_rows if isinstance(config, PounceConfig) else 0
+
+
+def sampling_of(config: AnyPounceConfig) -> FrameSampling | None:
+    """The past pictures that a model with a frame memory reads; None for all others, and for GR00T."""
+    memory = config.frame_memory if isinstance(config, PounceConfig) else None
+    return None if memory is None else memory.sampling
 
 
 def load_weights(model: AnyPounce, path: Path) -> bool:

@@ -28,6 +28,8 @@ def random_pounce(config: PounceConfig, seed: int, device: torch.device | str = 
     initialise_prefix(model, generator)
     if model.state_projector is not None:
         _draw(model.state_projector, generator)
+    if model.frame_memory is not None:
+        model.frame_memory.initialise(generator)
     return model
 
 
@@ -68,6 +70,14 @@ def initialise_prefix(model: Pounce | GrootPounce, generator: torch.Generator) -
     text_rms = embedding.float().square().mean().sqrt().item() * scale
     model.cognition_prefix.to_empty(device=embedding.device)
     model.cognition_prefix.initialise(text_rms, generator)
+
+
+def initialise_missing_memory(model: Pounce, generator: torch.Generator) -> None:
+    """Draws a frame memory that a loaded file did not hold: it changes nothing until it is trained."""
+    memory = model.frame_memory
+    if memory is not None and any(parameter.is_meta for parameter in memory.parameters()):
+        memory.to_empty(device=model.pi05.language.embed_tokens.weight.device)
+        memory.initialise(generator)
 
 
 def initialise_pi05(pi05: Pi05, generator: torch.Generator) -> None:

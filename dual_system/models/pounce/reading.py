@@ -4,23 +4,25 @@
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from dual_system.models.frame_sampling import PastFrame
 from dual_system.models.groot import prompt as groot_prompt
 from dual_system.models.groot.pounce import GrootInputs, GrootPounceConfig
 from dual_system.models.groot.prompt import EagleTokenizer
-from dual_system.models.images import camera_batch
+from dual_system.models.images import camera_batch, resize_with_pad
 from dual_system.models.normalisation import Floats, RobotStatistics
 from dual_system.models.pi05 import prompt as prompt
+from dual_system.models.pi05.modulation import NO_FRAME
 from dual_system.models.pi05.pounce import PounceConfig, PounceInputs
 from dual_system.models.pi05.prompt import Tokenizer
 from dual_system.models.resize import resized_views
-from dual_system.models.windows import through
+from dual_system.models.windows import seen_through, through
 
 
 class Moment(Protocol):
@@ -50,6 +52,11 @@ class Moment(Protocol):
         """PONDER's newest subgoal; empty before the first. Models with ``reads_subgoal`` read it."""
         ...
 
+    @property
+    def past(self) -> Sequence[PastFrame]:
+        """Front pictures of the past, oldest first, as `FrameSampling` chooses them; for models with a frame memory."""
+        ...
+
 
 def pi05_inputs(
     moment: Moment, config: PounceConfig, tokenizer: Tokenizer, statistics: RobotStatistics, device: torch.device
@@ -74,6 +81,7 @@ def pi05_inputs(
         age_ns=torch.tensor([moment.age_ns], device=device),
         cognition=_cognition(moment, device),
         state=torch.from_numpy(state)[None].to(device) if has_token else None,
+        **_past(moment, config, device),
     )
 
 
@@ -113,6 +121,20 @@ def groot_inputs(
         age_ns=torch.tensor([moment.age_ns], device=device),
         cognition=_cognition(moment, device),
     )
+
+
+def _past(moment: Moment, config: PounceConfig, device: torch.device) -> dict[str, Any]:
+    """Past pictures as they are resized for the present one, in as many slots as the memory has, empty ones last."""
+    if config.frame_memory is None:
+        return {}
+    num_frames, size_px = config.frame_memory.sampling.num_frames, config.image_px
+    past = torch.zeros(1, num_frames, 3, size_px, size_px, dtype=torch.uint8)
+    steps = [each.step for each in moment.past]
+    for slot, frame in enumerate(each.frame for each in moment.past):
+        seen = seen_through(config.windows[0], frame, (size_px, size_px)) if config.windows else frame
+        past[0, slot] = ((resize_with_pad(seen, size_px) + 1.0) * 127.5).round()
+    steps += [NO_FRAME] * (num_frames - len(steps))
+    return {"past": past.to(device), "past_step": torch.tensor([steps], device=device)}
 
 
 def _views(frames: Sequence[NDArray[np.uint8] | None], size_px: int, device: torch.device) -> tuple[Tensor, Tensor]:

@@ -69,12 +69,14 @@ class PayloadKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     PAYLOAD_KIND_UNSPECIFIED: _ClassVar[PayloadKind]
     PAYLOAD_KIND_VECTORS: _ClassVar[PayloadKind]
     PAYLOAD_KIND_TEXT: _ClassVar[PayloadKind]
+    PAYLOAD_KIND_FRAMES: _ClassVar[PayloadKind]
 
 class ConsumerKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     CONSUMER_KIND_UNSPECIFIED: _ClassVar[ConsumerKind]
     CONSUMER_KIND_PREFIX: _ClassVar[ConsumerKind]
     CONSUMER_KIND_PROMPT: _ClassVar[ConsumerKind]
+    CONSUMER_KIND_MODULATION: _ClassVar[ConsumerKind]
 
 class NullKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -127,9 +129,11 @@ AT_EXIT_RELEASE: AtExit
 PAYLOAD_KIND_UNSPECIFIED: PayloadKind
 PAYLOAD_KIND_VECTORS: PayloadKind
 PAYLOAD_KIND_TEXT: PayloadKind
+PAYLOAD_KIND_FRAMES: PayloadKind
 CONSUMER_KIND_UNSPECIFIED: ConsumerKind
 CONSUMER_KIND_PREFIX: ConsumerKind
 CONSUMER_KIND_PROMPT: ConsumerKind
+CONSUMER_KIND_MODULATION: ConsumerKind
 NULL_KIND_UNSPECIFIED: NullKind
 NULL_KIND_LEARNED: NullKind
 NULL_KIND_ABSENT: NullKind
@@ -371,12 +375,14 @@ class ChannelSpec(_message.Message):
     def __init__(self, payload: _Optional[_Union[PayloadKind, str]] = ..., consumer: _Optional[_Union[ConsumerKind, str]] = ..., reads_age: _Optional[bool] = ..., null: _Optional[_Union[NullKind, str]] = ...) -> None: ...
 
 class ObservationWindow(_message.Message):
-    __slots__ = ("video_ticks", "state_ticks")
+    __slots__ = ("video_ticks", "state_ticks", "stride_ticks")
     VIDEO_TICKS_FIELD_NUMBER: _ClassVar[int]
     STATE_TICKS_FIELD_NUMBER: _ClassVar[int]
+    STRIDE_TICKS_FIELD_NUMBER: _ClassVar[int]
     video_ticks: _containers.RepeatedScalarFieldContainer[int]
     state_ticks: _containers.RepeatedScalarFieldContainer[int]
-    def __init__(self, video_ticks: _Optional[_Iterable[int]] = ..., state_ticks: _Optional[_Iterable[int]] = ...) -> None: ...
+    stride_ticks: int
+    def __init__(self, video_ticks: _Optional[_Iterable[int]] = ..., state_ticks: _Optional[_Iterable[int]] = ..., stride_ticks: _Optional[int] = ...) -> None: ...
 
 class Contract(_message.Message):
     __slots__ = ("proc", "num_carriers", "hidden_size", "horizon", "action_dim", "preferred_codec", "infer_p50_ns", "infer_p99_ns", "model_hash", "is_fake", "version", "context_tokens", "max_context_tokens", "demonstrations", "boot_id", "channels", "control_hz", "window")
