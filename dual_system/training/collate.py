@@ -41,7 +41,7 @@ class _TrainingMoment:
     place: int
     """The invocation's, among the example's."""
     sampling: FrameSampling | None
-    """Of POUNCE's frame memory, if it has one."""
+    """The sampling of POUNCE's frame memory; None without one."""
 
     @property
     def invocation(self) -> SampledInvocation:
