@@ -145,7 +145,7 @@ def laptop() -> PonderConfig:
         num_gdn_key_heads=2,
         num_gdn_value_heads=4,
         gdn_head_dim=32,
-        tied_embeddings=True,
+        tied_embeddings=False,
         vocab_size=2048,
         vision_depth=4,
         vision_hidden_size=128,
