@@ -11,6 +11,7 @@ import dual_system.tasks.headless  # noqa: F401 - before anything that imports m
 
 # isort: split
 
+from dual_system.tasks.seeds import require_open
 from dual_system.tasks.task import make_task, task_names
 from protocol import files
 from protocol.command_line import command, parse
@@ -30,6 +31,8 @@ def main(argv: list[str] | None = None) -> int:
         return 0
     try:
         make_task(options.task)  # a mistyped name before anything is started
+        for seed in range(options.seed, options.seed + options.episodes):
+            require_open(seed, "pp-eval --split test plays them, and its results say so")
         with Daemons(files.folder(options.out)) as daemons:
             results, unwritten = _run(options, daemons)
     except KeyboardInterrupt:

@@ -8,8 +8,8 @@ from typing import Any, Literal
 
 import tyro
 
-from dual_system.data.seeds import TRAIN_SEED
 from dual_system.tasks.difficulty import Difficulty
+from dual_system.tasks.seeds import scenes, split_of
 from dual_system.tasks.task import chosen_tasks
 from protocol.command_line import flat
 from protocol.errors import CommandError
@@ -92,8 +92,10 @@ class EvalOptions:
     """Number of scenes per task (paper: 50)."""
     runs: int = 3
     """Number of times that every scene is played, each with other flow noise (paper: 3)."""
-    seed: int = 0
-    """Seed of the first scene; all must lie below 2,000,000, where the training seeds begin."""
+    split: Literal["demo", "development", "test", "rollouts"] | None = None
+    """Split of the scenes (docs/evaluation.md). None: that of --seed; test scenes are played only if named."""
+    seed: int | None = None
+    """Seed of the first scene. None: the first of the split, without one 0."""
     difficulty: Difficulty | None = None
     """Difficulty of every scene. None: by seed, as the benchmark does."""
     policy: Literal["servers", "oracle"] = "servers"
@@ -106,13 +108,9 @@ class EvalOptions:
 
     def __post_init__(self) -> None:
         condition, workers, servers = self.condition, self.workers, self.workers.servers
-        if min(self.episodes, self.runs, workers.workers) < 1 or self.seed < 0:
-            raise EvaluationError("--episodes, --runs and --workers must be at least 1, and --seed at least 0")
-        if self.seed + self.episodes > TRAIN_SEED:
-            raise EvaluationError(
-                f"--seed {self.seed} with {self.episodes} episodes reaches into the training seeds, which begin at "
-                f"{TRAIN_SEED}; evaluate on seeds below"
-            )
+        if min(self.episodes, self.runs, workers.workers) < 1:
+            raise EvaluationError("--episodes, --runs and --workers must be at least 1")
+        _ = self.seeds
         if condition.reported_age_ms and condition.deliver != "held-transition":
             raise EvaluationError("--reported-age-ms is for --deliver held-transition; otherwise ages are true")
         if condition.cognition == "null" and condition.deliver != "every":
@@ -141,6 +139,11 @@ class EvalOptions:
                 "leave --workers, --ray, the checkpoints, --device, --dtype and --path out"
             )
 
+    @property
+    def seeds(self) -> range:
+        """The scenes' seeds. Raises SeedError if they are not of one split, or of one that is not evaluated on."""
+        return scenes(self.episodes, split=self.split, seed=self.seed)
+
     def task_names(self) -> tuple[str, ...]:
         """The tasks in alphabetical order, each once. Raises TaskError for an unknown one."""
         return chosen_tasks(self.tasks)
@@ -152,12 +155,7 @@ class EvalOptions:
             TaskError: an unknown task.
             DonorError: an episode has no donor.
         """
-        keys = [
-            (task, run, seed)
-            for task in self.task_names()
-            for run in range(self.runs)
-            for seed in range(self.seed, self.seed + self.episodes)
-        ]
+        keys = [(task, run, seed) for task in self.task_names() for run in range(self.runs) for seed in self.seeds]
         folder = self.condition.donors
         donors = {} if folder is None else donors_in(folder, keys)
         return [
@@ -173,7 +171,7 @@ class EvalOptions:
         return SimOptions(
             task="evaluation",
             episodes=self.episodes,
-            seed=self.seed,
+            seed=self.seeds[0],
             difficulty=self.difficulty,
             policy=self.policy,
             out=self.out,
@@ -199,6 +197,7 @@ class EvalOptions:
         known = flat(self.sim())
         del known["task"], known["list_tasks"]
         known |= {"tasks": list(self.task_names()), "runs": self.runs, "cognition": self.condition.cognition}
+        known["split"] = split_of(self.seeds[0])
         known["donors"] = None if self.condition.donors is None else str(self.condition.donors)
         if self.condition.subgoal_text != "ponder":
             known["subgoal_text"] = self.condition.subgoal_text

@@ -59,6 +59,8 @@ class RobotSide:
     let_others: Others
     patience_ns: int
     looks: Callable[[int], bool] = always
+    first_done_tick: int | None = None
+    """The first tick whose observation shows the first subtask done."""
     _tick: int = 0
     _start_ns: int = 0
     _control_hz: int = 1
@@ -145,6 +147,8 @@ class RobotSide:
                 subgoal = m.Subgoal(kind=kind, text=text, tick=self._tick)
                 self.link.publish(SUBGOAL, subgoal, at_ns=source_ns)
         self._texts, self._subgoal_index = texts, snapshot.subgoal_index
+        if self.first_done_tick is None and snapshot.subtask_index > 0:
+            self.first_done_tick = self._tick
 
     def _hold(self) -> None:
         for ticks in range(round(HOLD_S * self._control_hz)):

@@ -14,6 +14,7 @@ import numpy as np
 from clock.schedules import HORIZON
 from clock.service import ClockService
 from dual_system.models.ponder.demo_sampling import DemoSampling
+from dual_system.analysis.ceiling import ceiling_in
 from dual_system.tasks.environment import Environment, Snapshot, make_environment
 from dual_system.tasks.physics import CONTROL_HZ
 from protocol import disk, files, images
@@ -112,6 +113,7 @@ class Suite:
         side = RobotSide(
             self._link, self._actions, environment, self._recorder, self._end.take_turn, self._patience_ns, self._looks
         )
+        ceiling = ceiling_in(task, environment.layout)
         opened = m.OpenReply()
         self._recorder.begin(info, path)
         if info.policy == "oracle":
@@ -136,6 +138,8 @@ class Suite:
             "status": result.status.name,
             "reason": result.reason,
             "steps": result.num_ticks,
+            "first_done_tick": side.first_done_tick,
+            "ceiling_without_memory": None if ceiling is None else [*ceiling.as_integer_ratio()],
             "stream_sha256": result.stream_sha256,
             "mcap": str(path.relative_to(self._options.out)) if path else None,
             "models": {contract.proc: _model(contract) for contract in opened.contracts},

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dual_system.analysis import paper
+from dual_system.analysis.ceiling import ceiling_of
 from protocol import files
 from protocol.errors import CommandError
 
@@ -32,6 +34,9 @@ class Results:
         config: the evaluation's options.
         outcomes: per task, in the paper's order, (R, E): 1 where the episode succeeded.
         scenes: per task, the E scenes in ascending order.
+        ceilings: per task, of the E scenes: the ceiling without memory as recorded, else its mean over the difficulty's
+            scenes; None if none is known.
+        first_done: per task, (R, E): the tick at which the first subtask was done; -1 if never, or not recorded.
         num_carriers, is_untrained: PONDER's K, and whether either model is random; None and False if unknown.
     """
 
@@ -39,6 +44,8 @@ class Results:
     config: Mapping[str, Any]
     outcomes: Mapping[str, NDArray[np.int64]]
     scenes: Mapping[str, tuple[Scene, ...]]
+    ceilings: Mapping[str, tuple[Fraction | None, ...]]
+    first_done: Mapping[str, NDArray[np.int64]]
     num_carriers: int | None = None
     is_untrained: bool = False
 
@@ -69,7 +76,14 @@ def read_results(path: Path) -> Results:
     with files.reading(file, kind):
         episodes, config = list(found["episodes"]), dict(found["config"])
         cells = Counter((e["task"], e.get("run", 0), (e["seed"], e["difficulty"])) for e in episodes)
-        successes = {(e["task"], e.get("run", 0), (e["seed"], e["difficulty"])): bool(e["success"]) for e in episodes}
+        by_cell = {(e["task"], e.get("run", 0), (e["seed"], e["difficulty"])): e for e in episodes}
+        successes = {cell: bool(e["success"]) for cell, e in by_cell.items()}
+        done = {cell: -1 if (at := e.get("first_done_tick")) is None else int(at) for cell, e in by_cell.items()}
+        recorded = {(e["task"], e["seed"], e["difficulty"]): e.get("ceiling_without_memory") for e in episodes}
+        ceilings = {
+            (task, (seed, difficulty)): ceiling_of(task, difficulty) if ceiling is None else Fraction(*map(int, ceiling))
+            for (task, seed, difficulty), ceiling in recorded.items()
+        }
         models = [(proc, dict(model)) for episode in episodes for proc, model in episode.get("models", {}).items()]
         num_carriers = next((int(model["num_carriers"]) for proc, model in models if proc == "ponder"), None)
         is_untrained = any(model["is_untrained"] for _, model in models)
@@ -99,6 +113,11 @@ def read_results(path: Path) -> Results:
             for task, of_task in scenes.items()
         },
         scenes=scenes,
+        ceilings={task: tuple(ceilings[task, scene] for scene in of_task) for task, of_task in scenes.items()},
+        first_done={
+            task: np.array([[done[task, run, scene] for scene in of_task] for run in runs])
+            for task, of_task in scenes.items()
+        },
         num_carriers=num_carriers,
         is_untrained=is_untrained,
     )

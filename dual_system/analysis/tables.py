@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import tyro
 
 from dual_system.analysis import paper
-from dual_system.analysis.ceiling import ceiling_of
+from dual_system.analysis.ceiling_tables import ceilings
 from dual_system.analysis.counterfactual import COUNTERFACTUAL, read_counterfactual
 from dual_system.analysis.diagnosis import DIAGNOSIS, read_diagnosis
 from dual_system.analysis.diagnosis_tables import counterfactual_table, diagnosis_tables
@@ -73,7 +73,7 @@ def tables(results: Sequence[Results]) -> str:
     """Returns all tables as markdown. Raises ResultsError if conditions were run on different scenes."""
     parts = ["# Evaluation", NOTE, "\n".join(_about(each) for each in results)]
     parts += ["## By family (form of the paper's Table 1)", by_family(results)]
-    parts += ["## By task (form of the paper's Table 7)", by_task(results), *_ceilings(results)]
+    parts += ["## By task (form of the paper's Table 7)", by_task(results), *ceilings(results)]
     if len(results) > 1:
         parts += ["## Between conditions (form of the paper's Tables 3 and 4)", between_conditions(results)]
     return "\n\n".join(parts) + "\n"
@@ -95,21 +95,6 @@ def by_task(results: Sequence[Results]) -> str:
         ours = [wilson(float(each.outcomes[task].mean()), len(each.scenes[task])) for each in results]
         rows.append([task, *map(percent, ours), *_papers((task,))])
     return markdown(["task", *_columns(results)], rows)
-
-
-def _ceilings(results: Sequence[Results]) -> list[str]:
-    """A sentence for each task with a known ceiling without memory, over each condition's scenes."""
-    sentences = []
-    for task in results[0].tasks:
-        exact = [ceiling_of(task, (difficulty for _, difficulty in each.scenes[task])) for each in results]
-        shares = [f"{100 * float(share):.2f} over the scenes of `{each.label}`"
-                  for share, each in zip(exact, results, strict=True) if share is not None]  # fmt: skip
-        if shares:
-            sentences.append(
-                f"{task} without memory and with perfect motion, exactly: {', '.join(shares)}. Without cognition no "
-                "more than that is to be expected."
-            )
-    return sentences
 
 
 def between_conditions(results: Sequence[Results]) -> str:
@@ -178,7 +163,8 @@ def _cognition(config: Any) -> str:
 
 def _about(results: Results) -> str:
     scenes = sum(len(of_task) for of_task in results.scenes.values())
-    size = [_count(len(results.tasks), "task"), _count(scenes, "scene"), _count(results.num_runs, "run")]
+    split = f"{results.config['split']} scene" if "split" in results.config else "scene"
+    size = [_count(len(results.tasks), "task"), _count(scenes, split), _count(results.num_runs, "run")]
     mode, steps = results.config.get("mode", "unknown mode"), results.config.get("max_steps", "?")
     untrained = " **Untrained weights: motion, not skill.**" if results.is_untrained else ""
     return f"- `{results.label}`: {', '.join(size)}; {mode}, at most {steps} steps.{untrained}"

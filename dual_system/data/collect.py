@@ -27,11 +27,11 @@ from dual_system.data.jobs import DIFFICULTY_CYCLE, RECOVERY_SHARE, Job, Look, j
 from dual_system.data.lerobot_files import INFO_PATH
 from dual_system.data.lerobot_v3 import COLLECTION_PATH, DatasetWriter
 from dual_system.data.rollout import UNSOLVED, work_out
-from dual_system.data.seeds import TRAIN_SEED
 from dual_system.data.shove import SHOVES
 from dual_system.data.store import Store
 from dual_system.data.workers import LocalWorkers, RayWorkers, Workers
 from dual_system.tasks.difficulty import Difficulty
+from dual_system.tasks.seeds import FIRST_COLLECTION_SEED
 from dual_system.tasks.task import chosen_tasks
 from protocol import files
 from protocol.command_line import command, parse
@@ -155,7 +155,7 @@ class CollectOptions:
         """Returns what all episodes of a dataset have in common; their number and the workers are no part of it."""
         versions = {name: metadata.version(name) for name in (DISTRIBUTION, "mujoco", "numpy", "av", "pyarrow")}
         settings = {
-            "first_seed": TRAIN_SEED,
+            "first_seed": FIRST_COLLECTION_SEED,
             "image_px": self.pictures.image_px,
             "max_steps": self.content.max_steps,
             "look": asdict(self.pictures.look),

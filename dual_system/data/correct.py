@@ -26,7 +26,7 @@ from tqdm import tqdm
 import dual_system.tasks.headless  # noqa: F401 - before mujoco is imported
 from dual_system.data.episode import About, EpisodeWriter, Package, unpack
 from dual_system.data.errors import DatasetError
-from dual_system.data.export import texts_by_tick
+from dual_system.data.export import refuse_split, texts_by_tick
 from dual_system.data.jobs import Look
 from dual_system.data.lerobot_files import INFO_PATH
 from dual_system.data.lerobot_v3 import DatasetWriter
@@ -36,6 +36,7 @@ from dual_system.tasks.engine import Status
 from dual_system.tasks.environment import Environment, Snapshot
 from dual_system.tasks.kinematics import UnreachableError
 from dual_system.tasks.oracle import Motions
+from dual_system.tasks.seeds import UNTRAINED
 from protocol import files
 from protocol.command_line import command, parse
 from protocol.mcap_log import EpisodeRecord, read_log
@@ -119,7 +120,8 @@ def correct(options: CorrectOptions, workers: Workers[Job, Outcome]) -> list[str
     """Writes the dataset, log by log; returns why each episode that is not in it was not kept.
 
     Raises:
-        DatasetError: there is a dataset already, nothing is left to write, or a log cannot be acted out.
+        DatasetError: there is a dataset already, nothing is left to write, or a log cannot be acted out or is of a
+            scene that nothing is trained on.
         OSError, ProtocolError: a log cannot be read.
         TaskError: a log of a task that does not exist here.
     """
@@ -162,6 +164,7 @@ def _in_order(jobs: Sequence[Job], workers: Workers[Job, Outcome]) -> Iterator[O
 def work_out(job: Job) -> Outcome:
     """Makes one episode. Raises as `correct` does."""
     record = read_log(job.path)
+    refuse_split(job.path, record.info, UNTRAINED)
     actions = _actions(job.path, record)
     options = job.options
     environment = kept_environment(  # the policy may have pushed objects: coordinates follow them

@@ -64,6 +64,10 @@ class Rejection:
     noise_rad: float = 0.0  # as in `About`
 
 
+IMPORTED = "import"
+"""Origin of episodes that others recorded; their task and seed are theirs."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class About:
     """The description of a whole episode."""
@@ -72,7 +76,7 @@ class About:
     instruction: str
     seed: int
     difficulty: str
-    origin: str  # "oracle", or the policy that was recorded
+    origin: str  # "oracle", the policy that was recorded, or IMPORTED
     is_success: bool
     image_px: int
     recovery: Recovery = "none"  # where a grasp was made to fail before the right one

@@ -27,6 +27,7 @@ from dual_system.data.recording import RecordingWriter
 from dual_system.data.rollout import Narrator
 from dual_system.data.video import FPS, Frame
 from dual_system.tasks.environment import Environment, Snapshot, make_environment
+from dual_system.tasks.seeds import HELD_OUT, Split, split_of
 from dual_system.tasks.task import task_names
 from protocol import files, images
 from protocol import messages as m
@@ -80,7 +81,7 @@ def export(options: ExportOptions) -> tuple[int, list[str]]:
     """Writes the dataset; returns the number of its episodes, and why logs were left out.
 
     Raises:
-        DatasetError: there is a dataset already, nothing is left to write, or a log is unfit.
+        DatasetError: there is a dataset already, nothing is left to write, or a log is unfit or of a test scene.
         OSError, ProtocolError: a log cannot be read.
         TaskError: a log of a task that does not exist here.
     """
@@ -95,6 +96,7 @@ def export(options: ExportOptions) -> tuple[int, list[str]]:
             record = read_log(path)
             if options.only_success and not (record.result and record.result.is_success):
                 continue
+            refuse_split(path, record.info, HELD_OUT)
             if why := why_unfit(path, record):
                 raise DatasetError(f"{path}: {why}")
             with files.writing(options.out):
@@ -138,9 +140,22 @@ class _Recorded:
 
 def _is_for_training(options: ExportOptions) -> bool:
     if options.rows == "auto":
-        info = read_log(options.files[0]).info
-        return info.suite == SUITE and info.task in task_names()
+        return _is_ours(read_log(options.files[0]).info)
     return options.rows == "training"
+
+
+def refuse_split(path: Path, info: m.EpisodeInfo, refused: frozenset[Split]) -> None:
+    """Raises DatasetError for an episode of a scene that was drawn here from a seed of one of these splits."""
+    if _is_ours(info) and (split := split_of(info.seed)) in refused:
+        raise DatasetError(
+            f"{path}: seed {info.seed} of {info.task} is of the {split} split, which no training data may hold; play "
+            "episodes for training with pp-eval --split rollouts"
+        )
+
+
+def _is_ours(info: m.EpisodeInfo) -> bool:
+    """Whether the episode's scene was drawn here: elsewhere the same seed is another scene."""
+    return info.suite == SUITE and info.task in task_names()
 
 
 def read_episode(

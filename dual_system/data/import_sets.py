@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
 
-from dual_system.data.episode import About, Episode, EpisodeWriter, Row, unpack
+from dual_system.data.episode import IMPORTED, About, Episode, EpisodeWriter, Row, unpack
 from dual_system.data.errors import DatasetError
 from dual_system.data.lerobot_files import INFO_PATH
 from dual_system.data.lerobot_v3 import DatasetWriter
@@ -28,8 +28,6 @@ from dual_system.models.arm import tool_poses
 from dual_system.tasks.geometry import pose_of
 from protocol import files
 from protocol.command_line import command, parse
-
-ORIGIN = "import"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -148,7 +146,7 @@ def as_ours(source: SourceEpisode, image_px: int) -> Episode:
         instruction=source.instruction,
         seed=source.number,
         difficulty=source.difficulty,
-        origin=ORIGIN,
+        origin=IMPORTED,
         is_success=source.is_success,
         image_px=image_px,
     )

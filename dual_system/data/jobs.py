@@ -15,10 +15,10 @@ import numpy as np
 import dual_system.tasks.headless  # noqa: F401 - before mujoco is imported
 from dual_system.data.dart import NoiseKind
 from dual_system.data.episode import Recovery
-from dual_system.data.seeds import TRAIN_SEED
 from dual_system.data.video import FPS
 from dual_system.tasks.difficulty import Difficulty
 from dual_system.tasks.oracle import FailedGrasp
+from dual_system.tasks.seeds import FIRST_COLLECTION_SEED
 
 ATTEMPTS = 100
 DIFFICULTY_CYCLE: tuple[Difficulty, ...] = ("easy", "easy", "medium", "hard")
@@ -68,7 +68,7 @@ class Job:
 
     def seed(self, attempt: int) -> int:
         """Returns the scene's seed of an attempt from 0 to 99; no two jobs of a task share a seed."""
-        return TRAIN_SEED + ATTEMPTS * self.slot + attempt
+        return FIRST_COLLECTION_SEED + ATTEMPTS * self.slot + attempt
 
 
 def jobs_of(

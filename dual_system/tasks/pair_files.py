@@ -18,7 +18,6 @@ where a branch is ``own`` or ``twin``. `dual_system.analysis.counterfactual` sco
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import json
 import sys
 from collections.abc import Generator, Iterator
@@ -32,6 +31,7 @@ from tqdm import tqdm
 
 from dual_system.tasks.environment import IMAGE_PX, make_environment
 from dual_system.tasks.pairs import Pair, Telling, find_pair
+from dual_system.tasks.seeds import scenes, seeds_from
 from dual_system.tasks.task import make_task, task_names
 from protocol import files
 from protocol.command_line import command, parse
@@ -56,8 +56,10 @@ class PairsOptions:
     """Number of pairs."""
     tasks: tuple[str, ...] = ()
     """Names of tasks of the family. Empty: all that can be forked."""
-    seed: int = 0
-    """Seed of the first scene of every task."""
+    split: Literal["demo", "development", "rollouts"] | None = None
+    """Split of the scenes (docs/evaluation.md). None: that of --seed."""
+    seed: int | None = None
+    """Seed of the first scene of every task. None: the first of the split, without one 0."""
     image_px: int = IMAGE_PX
     """Side of the pictures in pixels (paper and benchmark: 256)."""
     demo_hz: Literal[1, 2, 4, 5, 10, 20] = 1
@@ -66,6 +68,14 @@ class PairsOptions:
     """Take the video's last frame as well."""
     max_seeds: int = 300
     """Number of seeds in a row without a pair after which a task is left out, and named."""
+
+    @property
+    def seeds(self) -> range:
+        """Seeds to try, to the end of their split's range. Raises SeedError if they are of a split for measurements."""
+        return seeds_from(scenes(1, split=self.split, seed=self.seed)[0])
+
+    def __post_init__(self) -> None:
+        _ = self.seeds
 
 
 def write_pair(pair: Pair, folder: Path) -> dict[str, Any]:
@@ -152,13 +162,13 @@ def _pictures(part: str, arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[n
 
 
 def _pairs_of(task: str, options: PairsOptions) -> Generator[Pair]:
-    """Yields the pairs of one task, seed by seed, until ``max_seeds`` in a row have none."""
+    """Yields the pairs of one task, seed by seed, until ``max_seeds`` in a row have none or the split's range ends."""
     with (
         make_environment(task, image_px=options.image_px) as own,
         make_environment(task, render=False) as other,
     ):
         num_barren = 0
-        for seed in itertools.count(options.seed):
+        for seed in options.seeds:
             pair = find_pair(own, other, task, seed, demo_hz=options.demo_hz, demo_to_its_end=options.demo_to_its_end)
             num_barren = 0 if pair else num_barren + 1
             if pair:
@@ -192,7 +202,9 @@ def main(argv: list[str] | None = None, prog: str = "pp-collect pairs") -> int:
                 pair = next(sources[task], None)
                 if pair is None:
                     del sources[task]
-                    sys.stderr.write(f"{prog}: {task} has no pair in {options.max_seeds} seeds; left out\n")
+                    sys.stderr.write(
+                        f"{prog}: {task} has no pair in the next {options.max_seeds} seeds of the split; left out\n"
+                    )
                     continue
                 entries.append(write_pair(pair, options.out))
                 bar.update()

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dual_system.data.dataset import Dataset, Entry
-from dual_system.data.episode import CAMERAS, Rows
+from dual_system.data.episode import CAMERAS, IMPORTED, Rows
 from dual_system.data.video import FPS
 from dual_system.models.action_space import ActionSpace, actions_in, num_dims, states_in
 from dual_system.models.frame_sampling import FrameSampling
@@ -25,6 +25,7 @@ from dual_system.models.ponder.coordinates import normalised_text
 from dual_system.models.ponder.demo_sampling import DemoSampling
 from dual_system.models.pounce.family import AnyPounceConfig, sampling_of
 from dual_system.models.windows import Box, Windows
+from dual_system.tasks.seeds import UNTRAINED, split_of
 from dual_system.training.chunks import chunk_ticks
 from dual_system.training.episode import Frame, TrainingEpisode
 from dual_system.training.picture_store import PictureStore, Views
@@ -196,6 +197,21 @@ class TrainingSet:
                 "or take a recipe with w2 = 0 (robomme_without_grounding, robocasa_dc)"
             )
 
+    def require_trainable(self) -> None:
+        """Raises ValueError if an episode's scene was drawn here from a seed that nothing is trained on."""
+        found = [
+            (source, split)
+            for source in self._sources
+            if (split := split_of(source.entry.seed)) in UNTRAINED and _is_drawn_here(source.entry)
+        ]
+        if found:
+            source, split = found[0]
+            raise ValueError(
+                f"{len(found)} of {len(self)} episodes are of scenes that nothing is trained on (first "
+                f"{source.entry.task} {source.entry.seed} of {source.dataset.root}: {split} split); leave these "
+                "folders out, and train on pp-collect's, or on rollouts of pp-eval --split rollouts"
+            )
+
     def texts(self) -> list[str]:
         """Distinct texts that PONDER reads or writes in these episodes, sorted."""
         found = set()
@@ -324,6 +340,13 @@ def _sources(dataset: Dataset, tasks: Sequence[str]) -> list[_Source]:
         wanted = ", ".join(tasks) or "any task"
         raise ValueError(f"{dataset.root} has no successful episode of {wanted}; it has {there}")
     return [_Source(dataset=dataset, entry=entry) for entry in entries]
+
+
+def _is_drawn_here(entry: Entry) -> bool:
+    """Whether the scene is of this simulator: elsewhere the same seed is another scene."""
+    from dual_system.tasks.task import task_names  # needs MuJoCo, which most trainings never come to need
+
+    return entry.origin != IMPORTED and entry.task in task_names()
 
 
 def _reach(moves_MND: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -213,6 +213,7 @@ def train(options: TrainOptions) -> None:
     if machine.tf32 and machine.device == "cpu":
         raise ValueError("--tf32 is for GPUs; on a CPU leave it out")
     data = TrainingSet(*options.data, tasks=options.tasks, demo_hz=run.demo_hz)
+    data.require_trainable()
     with joined(machine.device) as world:
         share = run.batch_episodes // world.size  # every process has this many
         if min(machine.accumulate, machine.length_groups) < 1 or machine.accumulate * machine.length_groups > share:

@@ -186,3 +186,34 @@ def test_families_are_those_of_the_tasks() -> None:
     for family, tasks in paper.FAMILIES.items():
         assert {make_task(task).family for task in tasks} == {family}
     assert set(paper.TASKS) <= set(task_names())
+
+
+def test_ceilings_are_of_the_scenes_that_were_played_and_of_those_that_need_memory(tmp_path: Path) -> None:
+    """As recorded; of an older file, or another simulator's scenes, what the difficulty gives."""
+    folder = write(tmp_path / "a", {"PickXtimes": ["0101"]})
+    assert f"exactly: {100 * 151 / 324:.2f} over the scenes of `{folder}`. Without" in tables([read_results(folder)])
+    found = json.loads((folder / "results.json").read_text())
+    for episode, ceiling in zip(found["episodes"], ([1, 1], [1, 4], [4, 27], [1, 1]), strict=True):
+        episode["ceiling_without_memory"] = ceiling
+    (folder / "results.json").write_text(json.dumps(found))
+    mean, hard = (2 + 1 / 4 + 4 / 27) / 4, (1 / 4 + 4 / 27) / 2
+    text = tables([read_results(folder)])
+    assert (
+        f"{100 * mean:.2f} over the scenes of `{folder}` ({100 * hard:.2f} over the 2 that need memory). Without"
+        in text
+    )
+
+
+def test_who_could_choose_in_sight_of_the_discs_is_listed_apart(tmp_path: Path) -> None:
+    folder = write(tmp_path / "a", {"PickHighlight": ["11010"]})
+    assert "was pressed" not in tables([read_results(folder)])
+    found = json.loads((folder / "results.json").read_text())
+    for episode, tick, difficulty in zip(
+        found["episodes"], (95, 100, 101, 130, None), ("easy", "medium", "easy", "hard", "easy"), strict=True
+    ):
+        episode |= {"first_done_tick": tick, "difficulty": difficulty}
+    (folder / "results.json").write_text(json.dumps(found))
+    assert (
+        f"Of the episodes of `{folder}` the button was pressed by step 100, with the discs still in sight, in 2 "
+        "(2 solved, ceiling 66.67 %); later in 2 (1 solved, ceiling 19.17 %); never in 1 (0 solved)."
+    ) in tables([read_results(folder)])

@@ -157,3 +157,13 @@ def test_a_log_that_goes_on_for_longer_than_an_episode_may_is_none(
 def test_nothing_is_overwritten(log: Path, corrected: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(log), "--out", str(corrected.root), "--no-progress"]) == module.REFUSED
     assert "another --out" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("seed", [500_000, 799_999, 800_000, 810_000])
+def test_a_scene_that_nothing_is_trained_on_is_refused(
+    log: Path, record: EpisodeRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
+    info = dataclasses.replace(record.info, seed=seed)
+    monkeypatch.setattr(module, "read_log", lambda path: dataclasses.replace(record, info=info))
+    with pytest.raises(DatasetError, match=rf"{log}: seed {seed} of PickXtimes .*--split rollouts"):
+        correct(options(log, tmp_path / "out"), HereAndNow())

@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from dual_system.data import export as module
 from dual_system.data.dataset import Dataset
 from dual_system.data.episode import CAMERAS, Row
 from dual_system.data.errors import DatasetError
@@ -139,3 +141,23 @@ def test_a_log_of_another_scene_is_refused(log: Path, record: EpisodeRecord) -> 
 def test_nothing_is_overwritten(log: Path, exported: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(log), "--out", str(exported.root), "--no-progress"]) == 2
     assert "another --out" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("rows", ["training", "recorded"])
+@pytest.mark.parametrize("seed", [800_000, 800_099, 810_000, 820_099])
+def test_an_episode_of_a_test_scene_is_refused(
+    log: Path, record: EpisodeRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rows: Any, seed: int
+) -> None:
+    info = dataclasses.replace(record.info, seed=seed)
+    monkeypatch.setattr(module, "read_log", lambda path: dataclasses.replace(record, info=info))
+    with pytest.raises(DatasetError, match=rf"{log}: seed {seed} of {TASK} .*--split rollouts"):
+        export(ExportOptions(files=(log,), out=tmp_path / "out", rows=rows, progress=False))
+
+
+@pytest.mark.parametrize("change", [{"suite": "openpi"}, {"task": "WipeTheTable"}])
+def test_the_same_number_elsewhere_is_another_scene(
+    log: Path, record: EpisodeRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, str]
+) -> None:
+    info = dataclasses.replace(record.info, seed=800_000, **change)
+    monkeypatch.setattr(module, "read_log", lambda path: dataclasses.replace(record, info=info))
+    assert export(ExportOptions(files=(log,), out=tmp_path / "out", progress=False)) == (1, [])

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dual_system.data.jobs import ATTEMPTS, Look, failed_grasp, jobs_of
-from dual_system.data.seeds import TRAIN_SEED
+from dual_system.tasks.seeds import FIRST_COLLECTION_SEED, split_of
 
 JOBS = list(jobs_of(("A", "B"), 900, image_px=256, max_steps=1300, look=Look()))
 
@@ -17,7 +17,8 @@ JOBS = list(jobs_of(("A", "B"), 900, image_px=256, max_steps=1300, look=Look()))
 def test_no_two_attempts_of_a_task_share_a_seed() -> None:
     seeds = [job.seed(attempt) for job in JOBS if job.task == "A" for attempt in range(ATTEMPTS)]
     assert len(set(seeds)) == len(seeds)
-    assert min(seeds) == TRAIN_SEED
+    assert {split_of(seed) for seed in seeds} == {"collection"}
+    assert min(seeds) == FIRST_COLLECTION_SEED
 
 
 @given(st.integers(0, 900), st.integers(1, 900))

@@ -37,5 +37,5 @@ def test_from_nothing_to_tables(tmp_path: Path) -> None:
     assert lines[0]["stream_sha256"] != lines[1]["stream_sha256"]
     text = (tmp_path / "tables" / "tables.md").read_text()
     assert all(f"| {folder} |" in text for folder in folders)
-    assert "PickHighlight without memory and with perfect motion, exactly: 33.33 over the scenes" in text
+    assert "exactly, if the button is pressed first: 33.33 over the scenes" in text
     assert (tmp_path / "tables" / "staleness.png").exists()

@@ -21,12 +21,13 @@ from dual_system.analysis import tables
 from dual_system.analysis.results import read_results
 from dual_system.data.dataset import Dataset
 from dual_system.data.export import ExportOptions, export
-from dual_system.data.seeds import TRAIN_SEED
 from dual_system.models.ponder.configs import tiny_cpu as tiny_ponder
 from dual_system.models.pounce.checkpoint import random_bundle, save_bundle
 from dual_system.models.pounce.configs import tiny_cpu
+from dual_system.tasks.seeds import SeedError
 from protocol import messages as m
 from protocol.mcap_log import read_log
+from sim_client import __main__ as sim_client
 from sim_client import evaluate as module
 from sim_client.condition import ConditionOptions, EvalOptions, EvaluationError, Job, LogOptions, WorkersOptions
 from sim_client.config import ModelsOptions
@@ -134,8 +135,6 @@ def test_one_folder_holds_one_condition(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"seed": TRAIN_SEED - 1}, "training seeds"),
-        ({"seed": TRAIN_SEED + 5}, "training seeds"),
         ({"episodes": 0}, "at least 1"),
         ({"reported_age_ms": 300}, "held-transition"),
         ({"cognition": "null", "deliver": "held-transition"}, "nothing is held"),
@@ -157,8 +156,49 @@ def test_options_that_contradict_each_other_are_refused(tmp_path: Path, changes:
         options(tmp_path, **changes)
 
 
-def test_the_last_evaluation_seed_is_below_the_training_seeds(tmp_path: Path) -> None:
-    assert options(tmp_path, seed=TRAIN_SEED - EPISODES).jobs()[-1].seed == TRAIN_SEED - 1
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"seed": 2_000_000}, "the training data's"),
+        ({"seed": 1_999_999}, "leave the rollouts split"),
+        ({"seed": 800_000}, "--split test"),
+        ({"seed": 810_000}, "kept for later"),
+        ({"split": "test", "episodes": 101}, "at most 100 scenes"),
+    ],
+)
+def test_scenes_of_another_split_are_refused(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(SeedError, match=words):
+        options(tmp_path, **changes)
+
+
+def test_sim_client_leaves_test_scenes_to_this(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--policy", "oracle", "--seed", "799999", "--episodes", "2", "--out", str(tmp_path)]
+    assert sim_client.main(arguments) == 2
+    assert "seed 800000 is of the test split" in capsys.readouterr().err
+    assert not (tmp_path / "results.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "split", "first"),
+    [
+        ({}, "demo", 0),
+        ({"split": "development"}, "development", 500_000),
+        ({"seed": 600_000}, "development", 600_000),
+        ({"split": "test"}, "test", 800_000),
+        ({"split": "rollouts", "seed": 1_000_500}, "rollouts", 1_000_500),
+    ],
+)
+def test_results_name_the_split_of_their_scenes(
+    tmp_path: Path, changes: dict[str, Any], split: str, first: int
+) -> None:
+    """That test scenes are used is on disk before the first of them is played."""
+    with pytest.raises(Killed):
+        evaluate(options(tmp_path, **changes), InOrder(pretended, dies_after=0))
+    assert json.loads((tmp_path / "settings.json").read_text())["split"] == split
+    found = evaluate(options(tmp_path, **changes), InOrder(pretended))
+    assert found["config"]["split"] == split
+    assert sorted({episode["seed"] for episode in found["episodes"]}) == [first, first + 1]
+    assert f"{split} scenes" in tables.tables([read_results(tmp_path)])
 
 
 def test_the_defaults_are_the_paper_s_protocol(tmp_path: Path) -> None:
@@ -208,7 +248,7 @@ def test_interventions_are_deliveries(tmp_path: Path, changes: Any, kind: m.Deli
     assert (delivery.kind, delivery.reported_age_ns) == (kind, age_ns)
 
 
-@given(st.integers(0, TRAIN_SEED), st.integers(1, 5))
+@given(st.integers(0, 2_000_000), st.integers(1, 5))
 def test_runs_of_a_scene_have_other_noise(seed: int, run: int) -> None:
     assert run_seed(seed, 0) == seed
     assert len({run_seed(seed, each) for each in range(run + 1)}) == run + 1

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dual_system.tasks.seeds import SeedError
 from dual_system.tasks.task import TaskError, task_names
 
 pytest.importorskip("vla_eval", reason="pip install vla-eval==0.8.0")
@@ -113,3 +114,8 @@ def test_vla_eval_scores_a_model_server_of_its_own(tmp_path: Path) -> None:
     for task in result["tasks"]:
         (episode,) = task["episodes"]
         assert (episode["steps"], episode["metrics"]["status"]) == (6, "timeout")
+
+
+def test_a_test_scene_is_refused(benchmark_of: Callable[..., TableBenchmark]) -> None:
+    with pytest.raises(SeedError, match="seed 800001 is of the test split"):
+        benchmark_of(seed=800_000).reset({"name": HAS_NONE, "episode_idx": 1})

@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from dual_system.analysis.counterfactual import p_own
-from dual_system.tasks.pair_files import INDEX, demo_sampling_of, main, read_pairs, write_index, write_pair
+from dual_system.tasks.pair_files import (
+    INDEX,
+    PairsOptions,
+    demo_sampling_of,
+    main,
+    read_pairs,
+    write_index,
+    write_pair,
+)
 from dual_system.tasks.pairs import Pair, Telling
 from dual_system.tasks.task import Task
 
@@ -97,3 +106,27 @@ def test_a_family_without_forks_says_so(
     monkeypatch.setattr(Task, "can_be_forked", classmethod(lambda cls: False))
     assert main(["--family", "imitation", "--out", str(tmp_path)]) == 2
     assert "no task of the imitation family can be forked" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        (["--seed", "800000"], "only if it is named"),
+        (["--seed", "2000000"], "the training data's"),
+        (["--split", "development", "--seed", "7"], "of the demo split, not of development"),
+    ],
+)
+def test_pairs_of_scenes_that_are_for_measurements_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], asked: list[str], words: str
+) -> None:
+    assert main(["--family", "reference", "--out", str(tmp_path), *asked]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_pairs_are_looked_for_to_the_end_of_their_split(tmp_path: Path) -> None:
+    def seeds(**asked: Any) -> range:
+        return PairsOptions(family="reference", out=tmp_path, **asked).seeds
+
+    assert seeds() == range(500_000)
+    assert seeds(split="development") == range(500_000, 800_000)
+    assert seeds(seed=799_999) == range(799_999, 800_000)

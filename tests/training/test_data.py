@@ -6,6 +6,7 @@ import errno
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -272,3 +273,21 @@ def test_rows_normalised_by_row_have_one_spread_and_come_back(
     np.testing.assert_allclose(tail, chunks[3, 2:], atol=1e-5)
     with pytest.raises(ValueError, match="chunks of 6 rows, came 7"):
         statistics.normalise_targets(rows.action[:7], steady[0])
+
+
+@pytest.mark.parametrize("seed", [500_000, 800_000, 820_099])
+def test_scenes_for_measurements_are_not_trained_on(
+    tmp_path: Path, package_of_noise: MakePackage, write_dataset: WriteDataset, seed: int
+) -> None:
+    data = TrainingSet(write_dataset(tmp_path / "set", [package_of_noise(0), package_of_noise(seed)]))
+    with pytest.raises(ValueError, match=rf"1 of 2 episodes .*PickHighlight {seed} .*--split rollouts"):
+        data.require_trainable()
+
+
+@pytest.mark.parametrize("change", [{"origin": "import"}, {"task": "WipeTheTable"}, {"seed": 1_000_000}, {"seed": 7}])
+def test_others_episodes_and_other_splits_are_trained_on(
+    tmp_path: Path, package_of_noise: MakePackage, write_dataset: WriteDataset, change: dict[str, Any]
+) -> None:
+    data = TrainingSet(write_dataset(tmp_path / "set", [package_of_noise(800_000)]))
+    data._sources = [replace(source, entry=replace(source.entry, **change)) for source in data._sources]
+    data.require_trainable()

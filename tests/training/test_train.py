@@ -272,3 +272,14 @@ def test_a_trained_ponder_says_how_demonstrations_were_sampled(
     packages = [package_of_noise(seed, num_demo) for seed, num_demo in ((1, 42), (2, 46))]
     train.train(options(write_dataset(tmp_path / "set", packages), tmp_path / "out"))
     assert load_ponder(tmp_path / "out" / "ponder").format.demonstrations == DemoSampling(hz=1, to_its_end=True)
+
+
+def test_a_test_scene_is_not_trained_on(
+    tmp_path: Path,
+    package_of_noise: Callable[..., Package],
+    write_dataset: Callable[..., Path],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    data = write_dataset(tmp_path / "set", [package_of_noise(800_000)])
+    assert train.main(["--recipe", "tiny", "--data", str(data), "--out", str(tmp_path / "run")]) == train.REFUSED
+    assert "PickHighlight 800000" in capsys.readouterr().err

@@ -145,7 +145,7 @@ def _wander(rng: np.random.Generator, side: int, start: int, end: int) -> tuple[
     """A random way to a button: depth first, neighbours in random order, no button tried twice."""
     way, seen = [start], {start}
     while way[-1] != end:
-        fresh = [button for button in _neighbours(side, way[-1]) if button not in seen]
+        fresh = [button for button in neighbours(side, way[-1]) if button not in seen]
         if fresh:
             way.append(int(rng.choice(fresh)))
             seen.add(way[-1])
@@ -168,7 +168,8 @@ def _turned_away(side: int, pattern: tuple[int, ...], shared: int) -> list[tuple
     return found
 
 
-def _neighbours(side: int, button: int) -> list[int]:
+def neighbours(side: int, button: int) -> list[int]:
+    """Returns the buttons next to one, diagonally too, in ascending order."""
     row, column = divmod(button, side)
     rows, columns = (range(max(at - 1, 0), min(at + 2, side)) for at in (row, column))
     return [r * side + c for r in rows for c in columns if (r, c) != (row, column)]
