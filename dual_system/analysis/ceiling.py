@@ -77,9 +77,9 @@ PATTERN_LOCK = MappingProxyType({3: Fraction(121, 1000), 4: Fraction(39, 1000), 
 """PatternLock, by buttons in a row: where a pattern goes from its first button, estimated and no exact figure.
 
 The stick walks from button to button, the first wrong one ends the episode, and success comes with the last right one.
-So a walk succeeds in the patterns that it begins with. Of 25,000 drawn patterns of each size, turned and mirrored, the
-best walk from each button was taken and played against 25,000 others: 12.1, 3.8 and 0.9 %, with standard errors of 0.2,
-0.1 and 0.06. The rule in `memoryless` needs no such table and comes to 12.0, 4.0 and 0.6 % of 20,000.
+So a walk succeeds in the patterns that it begins with. The best walk from each button of 25,000 drawn patterns of each
+size, turned and mirrored, came to 12.1, 3.8 and 0.9 % of 25,000 others, with standard errors of 0.2, 0.1 and 0.06. The
+rule in `memoryless` needs no such table and comes to 12.0, 4.0 and 0.6 % of 20,000.
 """
 
 _OF_LAYOUT: Mapping[str, Callable[[Any], Fraction]] = MappingProxyType(

@@ -81,8 +81,8 @@ def read_results(path: Path) -> Results:
         done = {cell: -1 if (at := e.get("first_done_tick")) is None else int(at) for cell, e in by_cell.items()}
         recorded = {(e["task"], e["seed"], e["difficulty"]): e.get("ceiling_without_memory") for e in episodes}
         ceilings = {
-            (task, (seed, difficulty)): ceiling_of(task, difficulty) if ceiling is None else Fraction(*map(int, ceiling))
-            for (task, seed, difficulty), ceiling in recorded.items()
+            (task, (seed, difficulty)): Fraction(*map(int, ratio)) if ratio else ceiling_of(task, difficulty)
+            for (task, seed, difficulty), ratio in recorded.items()
         }
         models = [(proc, dict(model)) for episode in episodes for proc, model in episode.get("models", {}).items()]
         num_carriers = next((int(model["num_carriers"]) for proc, model in models if proc == "ponder"), None)
