@@ -13,8 +13,8 @@ import numpy as np
 
 from clock.schedules import HORIZON
 from clock.service import ClockService
-from dual_system.models.ponder.demo_sampling import DemoSampling
 from dual_system.analysis.ceiling import ceiling_in
+from dual_system.models.ponder.demo_sampling import DemoSampling
 from dual_system.tasks.environment import Environment, Snapshot, make_environment
 from dual_system.tasks.physics import CONTROL_HZ
 from protocol import disk, files, images
