@@ -45,8 +45,8 @@ def build(
 
 
 Floats = NDArray[np.float32]
-Act = Callable[[str, Sequence[NDArray[np.uint8]], Floats, Floats | None, int, int], Floats]
-"""(instruction, frames, proprioception, cognition (None: null), its age [ns], noise seed) -> chunk."""
+Act = Callable[..., Floats]
+"""(instruction, frames, proprioception, cognition (None: null), its age [ns], noise seed, subgoal="") -> chunk."""
 
 
 def build_actor(checkpoint: Path | None, *, path: PathName = "eager", **options: Any) -> tuple[Act, EngineSpec]:
@@ -63,6 +63,7 @@ def build_actor(checkpoint: Path | None, *, path: PathName = "eager", **options:
         cognition: Floats | None,
         age_ns: int,
         seed: int,
+        subgoal: str = "",
     ) -> Floats:
         return engine.invoke(
             Request(
@@ -72,6 +73,7 @@ def build_actor(checkpoint: Path | None, *, path: PathName = "eager", **options:
                 cognition=cognition,
                 age_ns=age_ns,
                 seed=seed,
+                subgoal=subgoal,
             )
         )
 

@@ -3,6 +3,8 @@
 For each pair of ``pp-collect pairs`` PONDER reads either past and the common present, and POUNCE acts on the cognition:
 twice on the same pictures, joints and noise. `dual_system.analysis.counterfactual` compares the actions with the
 script's in either branch. PONDER generates its own texts on the way, as in an episode.
+
+Without PONDER, a POUNCE that reads text is told what comes next in either branch: does it heed what it is told?
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import tyro
@@ -24,7 +26,8 @@ import dual_system.tasks.headless  # noqa: F401 - before anything that imports m
 # isort: split
 
 from clock.timebase import NS_PER_MS
-from dual_system.analysis.counterfactual import COUNTERFACTUAL, SCHEMA, follows_own_past
+from dual_system.analysis.counterfactual import COUNTERFACTUAL, SCHEMA, follows_own_past, heed
+from dual_system.models.ponder.coordinates import normalised_text, without_places
 from dual_system.models.ponder.demo_sampling import DemoSampling
 from dual_system.tasks.pair_files import demo_sampling_of, read_pairs
 from dual_system.tasks.pairs import Pair, Telling
@@ -38,7 +41,7 @@ Views = tuple[NDArray[np.uint8], ...]
 Floats = NDArray[np.float32]
 Read = Callable[[str, Sequence[Views], Sequence[Views], NDArray[np.float32]], Floats]
 """`ponder_server.in_process.build_reader`'s."""
-Act = Callable[[str, Views, Floats, Floats | None, int, int], Floats]
+Act = Callable[..., Floats]
 """`pounce_server.in_process.build_actor`'s."""
 _MIN_SCALE = 1e-3  # of a dimension that no script moves
 
@@ -47,14 +50,16 @@ _MIN_SCALE = 1e-3  # of a dimension that no script moves
 class CounterfactualOptions:
     """Scores how often a trained pair's action follows its own past, on pairs that look the same now."""
 
-    ponder: Path
-    """PONDER's checkpoint."""
     pounce: Path
     """POUNCE's checkpoint, trained with that PONDER."""
     pairs: Path
     """Folder of pp-collect pairs, with pictures and demonstrations as PONDER was trained on."""
     out: Path
     """Folder for counterfactual.json."""
+    ponder: Path | None = None
+    """PONDER's checkpoint. None: POUNCE is told the subgoal of each branch (--subgoal-text)."""
+    subgoal_text: Literal["grounded", "simple"] = "grounded"
+    """Text that POUNCE is told without --ponder: with places, or without."""
     draws: int = 4
     """Number of draws of flow noise per pair; each is used in both branches."""
     age_ms: int = 300
@@ -69,18 +74,19 @@ def main(argv: list[str] | None = None, prog: str = "pp-diagnose counterfactual"
     options = parse(CounterfactualOptions, argv, prog=prog)
     files.folder(options.out)
     pairs = read_pairs(options.pairs)
-    read, ponder = importlib.import_module("ponder_server.in_process").build_reader(
-        options.ponder, **options.models.of_ponder()
-    )
-    _require_as_in_training(options.pairs, ponder.demonstrations)
-    act, pounce = importlib.import_module("pounce_server.in_process").build_actor(
+    read, specs = None, {}
+    if options.ponder is not None:
+        read, specs["ponder"] = importlib.import_module("ponder_server.in_process").build_reader(
+            options.ponder, **options.models.of_ponder()
+        )
+        _require_as_in_training(options.pairs, specs["ponder"].demonstrations)
+    act, specs["pounce"] = importlib.import_module("pounce_server.in_process").build_actor(
         options.pounce, **options.models.of_pounce()
     )
+    if options.ponder is None and not specs["pounce"].reads_subgoal:
+        raise ValueError(f"{options.pounce} reads cognition and no text; give its PONDER with --ponder")
     entries = scored(tqdm(pairs, unit="pair", disable=not options.progress), read, act, options)
-    models = {
-        name: {"model_hash": spec.model_hash, "is_untrained": spec.is_fake}
-        for name, spec in (("ponder", ponder), ("pounce", pounce))
-    }
+    models = {name: {"model_hash": spec.model_hash, "is_untrained": spec.is_fake} for name, spec in specs.items()}
     write_json(
         options.out / COUNTERFACTUAL, {"schema": SCHEMA, "config": flat(options), "models": models, "pairs": entries}
     )
@@ -103,8 +109,8 @@ def _in_words(sampling: DemoSampling) -> str:
     return f"{sampling.hz} times a second" + (" and at their end" if sampling.to_its_end else "")
 
 
-def scored(pairs: Iterable[Pair], read: Read, act: Act, options: CounterfactualOptions) -> list[dict[str, Any]]:
-    """Returns one entry per pair: which it is, and its mean score over draws and branches, in [0, 1].
+def scored(pairs: Iterable[Pair], read: Read | None, act: Act, options: CounterfactualOptions) -> list[dict[str, Any]]:
+    """Returns one entry per pair: which it is, its mean score over draws and branches, in [0, 1], and its mean heed.
 
     Differences of joints and gripper are weighed by their standard deviation over all pairs' scripts.
 
@@ -123,21 +129,27 @@ def scored(pairs: Iterable[Pair], read: Read, act: Act, options: CounterfactualO
     for entry, answers_D2HA, script_2HA in zip(found, answers, scripts, strict=True):
         script = np.broadcast_to(script_2HA, answers_D2HA.shape)
         entry["score"] = float(follows_own_past(answers_D2HA, script, scale=scale).mean())
+        mean_heed = float(heed(answers_D2HA, script, scale=scale).mean())
+        entry["heed"] = None if np.isnan(mean_heed) else mean_heed
     return found
 
 
 def _answers(
-    pair: Pair, telling: Telling, read: Read, act: Act, options: CounterfactualOptions, index: int
+    pair: Pair, telling: Telling, read: Read | None, act: Act, options: CounterfactualOptions, index: int
 ) -> NDArray[np.float32]:
     """Returns POUNCE's actions after this past, (draws, H, A)."""
+    now = tuple(pair.frames[camera] for camera in CAMERAS)
+    seeds = range(index * options.draws, (index + 1) * options.draws)
+    if read is None:
+        told = normalised_text(telling.subgoal)
+        told = told if options.subgoal_text == "grounded" else without_places(told)
+        return np.stack([act(pair.instruction, now, pair.state, None, 0, seed, told) for seed in seeds])
     past = [tuple(telling.frames[camera][row] for camera in CAMERAS) for row in range(len(telling.steps))]
     demo = [views for views, is_shown in zip(past, telling.is_demonstration, strict=True) if is_shown]
     seen = [views for views, is_shown in zip(past, telling.is_demonstration, strict=True) if not is_shown]
-    now = tuple(pair.frames[camera] for camera in CAMERAS)
     states = [*telling.states[~telling.is_demonstration], pair.state]
     cognition = read(pair.instruction, demo, [*seen, now], np.stack(states))
     age_ns = options.age_ms * NS_PER_MS
-    seeds = range(index * options.draws, (index + 1) * options.draws)
     return np.stack([act(pair.instruction, now, pair.state, cognition, age_ns, seed) for seed in seeds])
 
 

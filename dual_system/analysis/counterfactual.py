@@ -3,6 +3,9 @@
 The policy predicts twice per pair, once with each past, and each prediction is compared with the script's next actions
 in both branches. P(own) is how often it is closer to the branch whose past was given. A policy that ignores the past
 predicts the same twice, so it is right once and wrong once, or tied: it scores exactly 1/2.
+
+Heed: how far the end of the policy's chunk moves when the other branch's past is given, over how far the script's does,
+along the same direction. 0 is a policy that ignores it, 1 one that goes all the way; a low loss shows neither.
 """
 
 from __future__ import annotations
@@ -26,6 +29,8 @@ class Counterfactual:
 
     label: str
     by_task: Mapping[str, NDArray[np.float64]]
+    heed_by_task: Mapping[str, NDArray[np.float64]]
+    """(P,), NaN where the scripts end alike, or for all pairs of a file of an earlier release."""
     is_untrained: bool
 
     @property
@@ -44,12 +49,16 @@ def read_counterfactual(path: Path) -> Counterfactual:
                 f"schema {found['schema']!r} with {len(found['pairs'])} pairs, expected some of {SCHEMA!r}"
             )
         scores: dict[str, list[float]] = {}
+        heeds: dict[str, list[float]] = {}
         for pair in found["pairs"]:
             scores.setdefault(pair["task"], []).append(float(pair["score"]))
+            heed = pair.get("heed")
+            heeds.setdefault(pair["task"], []).append(float("nan") if heed is None else float(heed))
         is_untrained = any(model["is_untrained"] for model in found["models"].values())
     label = str(path.parent if path.name == COUNTERFACTUAL else path)
     by_task = {task: np.array(of_task) for task, of_task in sorted(scores.items())}
-    return Counterfactual(label=label, by_task=by_task, is_untrained=is_untrained)
+    heed_by_task = {task: np.array(of_task) for task, of_task in sorted(heeds.items())}
+    return Counterfactual(label=label, by_task=by_task, heed_by_task=heed_by_task, is_untrained=is_untrained)
 
 
 def follows_own_past(predicted: ArrayLike, script: ArrayLike, *, scale: ArrayLike | None = None) -> NDArray[np.float64]:
@@ -64,6 +73,28 @@ def follows_own_past(predicted: ArrayLike, script: ArrayLike, *, scale: ArrayLik
     Raises:
         ValueError: shapes differ or are not (P, 2, H, A), values are not finite, or a scale is not positive.
     """
+    answers, scripts = _scaled(predicted, script, scale)
+    own = np.sum((answers - scripts) ** 2, axis=(2, 3))
+    other = np.sum((answers - scripts[:, ::-1]) ** 2, axis=(2, 3))
+    return np.where(own < other, 1.0, np.where(own > other, 0.0, 0.5))
+
+
+def heed(predicted: ArrayLike, script: ArrayLike, *, scale: ArrayLike | None = None) -> NDArray[np.float64]:
+    """Returns how far each pair's last rows are apart, (P,), in units of the script's; NaN where the script's are not.
+
+    The arguments and errors are those of `follows_own_past`.
+    """
+    answers, scripts = _scaled(predicted, script, scale)
+    moved, wanted = (each[:, 1, -1] - each[:, 0, -1] for each in (answers, scripts))
+    length = np.sum(wanted**2, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share: NDArray[np.float64] = np.sum(moved * wanted, axis=1) / length
+    return np.where(length > 0, share, np.nan)
+
+
+def _scaled(
+    predicted: ArrayLike, script: ArrayLike, scale: ArrayLike | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     answers, scripts = np.asarray(predicted, dtype=np.float64), np.asarray(script, dtype=np.float64)
     if answers.shape != scripts.shape or answers.ndim != 4 or answers.shape[1] != 2:
         raise ValueError(f"expected (P, 2, H, A) twice; got predicted {answers.shape} and script {scripts.shape}")
@@ -72,9 +103,7 @@ def follows_own_past(predicted: ArrayLike, script: ArrayLike, *, scale: ArrayLik
         raise ValueError(f"expected {answers.shape[3]} positive scales; got {divisors.tolist()}")
     if not (np.isfinite(answers).all() and np.isfinite(scripts).all()):
         raise ValueError("predicted and script must be finite")
-    own = np.sum(((answers - scripts) / divisors) ** 2, axis=(2, 3))
-    other = np.sum(((answers - scripts[:, ::-1]) / divisors) ** 2, axis=(2, 3))
-    return np.where(own < other, 1.0, np.where(own > other, 0.0, 0.5))
+    return answers / divisors, scripts / divisors
 
 
 def p_own(predicted: ArrayLike, script: ArrayLike, *, scale: ArrayLike | None = None) -> float:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dual_system.analysis import paper
 from dual_system.analysis.counterfactual import Counterfactual
 from dual_system.analysis.diagnosis import CONDITIONS, FRESH_AGE_S, Diagnosis, absolute, ratio
@@ -16,7 +19,8 @@ condition; 95 % intervals in brackets by a bootstrap of episodes within tasks. N
 "{paper.MARK}" are reported in the paper's 5.2: another dataset and other models."""
 COUNTERFACTUAL_NOTE = """\
 Pairs of episodes with equal presents and different pasts: how often the action is closer to that of its own past. A
-policy that ignores the past scores exactly 50. 95 % intervals by a bootstrap of pairs."""
+policy that ignores the past scores exactly 50. 95 % intervals by a bootstrap of pairs. Heed: how far the end of the
+chunk moves with the other past, over how far the script's does; the median over pairs, and how many reach half."""
 
 
 def diagnosis_tables(diagnoses: Sequence[Diagnosis]) -> str:
@@ -69,11 +73,19 @@ def counterfactual_table(found: Sequence[Counterfactual]) -> str:
     """Returns a row for each file, task by task and over all pairs."""
     rows = []
     for each in found:
-        for task, scores_P in [*each.by_task.items(), ("all", each.scores_P)]:
-            row = [each.label, task, str(len(scores_P)), percent(bootstrap_mean(scores_P))]
+        heeds = [*each.heed_by_task.values(), np.concatenate(list(each.heed_by_task.values()))]
+        for (task, scores_P), heed_P in zip([*each.by_task.items(), ("all", each.scores_P)], heeds, strict=True):
+            row = [each.label, task, str(len(scores_P)), percent(bootstrap_mean(scores_P)), *_heed(heed_P)]
             rows.append([*row, "**untrained weights**" if each.is_untrained else ""])
-    table = markdown(["checkpoint", "task", "pairs", "P(own past)", ""], rows)
+    table = markdown(["checkpoint", "task", "pairs", "P(own past)", "heed", "heed of 0.5 or more", ""], rows)
     return "\n\n".join(["# Counterfactual history", COUNTERFACTUAL_NOTE, table])
+
+
+def _heed(heed_P: NDArray[np.float64]) -> tuple[str, str]:
+    known = heed_P[~np.isnan(heed_P)]
+    if not len(known):
+        return "", ""
+    return f"{np.median(known):.2f}", f"{np.sum(known >= 0.5)} of {len(known)}"
 
 
 def _loss(interval: Interval) -> str:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from dual_system.analysis.counterfactual import follows_own_past, p_own
+from dual_system.analysis.counterfactual import follows_own_past, heed, p_own
 
 shapes = st.tuples(st.integers(1, 4), st.just(2), st.integers(1, 3), st.integers(1, 3))
 numbers = st.floats(-3, 3, width=32)
@@ -75,3 +75,30 @@ def test_what_cannot_be_scored_is_refused(
 ) -> None:
     with pytest.raises(ValueError, match=complaint):
         p_own(predicted, script, scale=scale)
+
+
+@given(twice, st.floats(-2, 2))
+def test_heed_is_how_far_the_end_moves_in_units_of_the_script_s(
+    both: tuple[np.ndarray, np.ndarray], share: float
+) -> None:
+    start, script = (each.astype(np.float64) for each in both)
+    answers = start.copy()
+    answers[:, 1, -1] = start[:, 0, -1] + share * (script[:, 1, -1] - script[:, 0, -1])
+    found = heed(answers, script)
+    is_apart = np.sum((script[:, 1, -1] - script[:, 0, -1]) ** 2, axis=1) > 1e-6
+    np.testing.assert_allclose(found[is_apart], share, atol=1e-6)
+    is_alike = np.all(script[:, 1, -1] == script[:, 0, -1], axis=1)
+    assert np.isnan(found[is_alike]).all()
+
+
+@given(twice)
+def test_who_ignores_the_past_heeds_nothing(both: tuple[np.ndarray, np.ndarray]) -> None:
+    answers, script = both
+    found = heed(np.repeat(answers[:, :1], 2, axis=1), script)
+    assert np.all((found == 0) | np.isnan(found))
+
+
+def test_a_move_sideways_is_no_heed() -> None:
+    script = np.array([[[[0.0, 0.0]], [[2.0, 0.0]]]])
+    answers = np.array([[[[5.0, 5.0]], [[6.0, 9.0]]]])
+    assert heed(answers, script).tolist() == [0.5]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -71,6 +72,7 @@ def test_the_score_is_how_often_the_own_past_is_followed(memory: Any, score: flo
     found = scored([pair(0), pair(1)], read, goes_there, OPTIONS)
     assert [entry["score"] for entry in found] == [score, score]
     assert [entry["seed"] for entry in found] == [0, 1]
+    assert [entry["heed"] for entry in found] == pytest.approx([2 * score - 1] * 2)
 
 
 def test_both_branches_get_the_same_noise_and_every_pair_its_own() -> None:
@@ -82,6 +84,24 @@ def test_both_branches_get_the_same_noise_and_every_pair_its_own() -> None:
 
     scored([pair(0), pair(1)], remembers, act, OPTIONS)
     assert seeds == [0, 1, 2, 0, 1, 2, 3, 4, 5, 3, 4, 5]
+
+
+@pytest.mark.parametrize(("kind", "texts"), [("grounded", ["at [78, 39]", "at [20, 20]"]), ("simple", ["", ""])])
+def test_without_ponder_pounce_is_told_what_comes_next_in_either_branch(kind: Any, texts: list[str]) -> None:
+    told: list[str] = []
+
+    def act(instruction: str, now: Any, state: Any, cognition: Any, age_ns: int, seed: int, text: str) -> np.ndarray:
+        assert cognition is None
+        told.append(text)
+        goal = 200 if text.endswith("[20, 20]") else 10
+        return np.full((20, 8), goal, np.float32)
+
+    pasts = pair(0)
+    own, twin = (replace(each, subgoal=f"pick {place}") for each, place in
+                 ((pasts.own, "at <10, 20>"), (pasts.twin, "at <5, 5>")))  # fmt: skip
+    (entry,) = scored([replace(pasts, own=own, twin=twin)], None, act, replace(OPTIONS, subgoal_text=kind))
+    assert told == [f"pick {text}".strip() for text in texts for _ in range(OPTIONS.draws)]
+    assert (entry["score"], entry["heed"]) == ((1.0, 1.0) if kind == "grounded" else (0.5, 0.0))
 
 
 def test_without_pairs_there_is_no_score() -> None:
