@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dual_system.models.ponder.demo_sampling import DemoSampling
 from pounce_server.__main__ import build_engine, build_remote
 from pounce_server.config import PathName, PounceOptions, RemoteOptions, SpeedOptions
 from pounce_server.contract import EngineSpec, Episodic, PounceEngine, Request, check_robot
@@ -18,7 +19,7 @@ from pounce_server.serve import PounceServer
 from protocol.bus import Bus
 from protocol.heartbeat import Heartbeat
 from protocol.link import Link
-from protocol.messages import ActionChunk, EpisodeInfo, Invocation, Observation
+from protocol.messages import ActionChunk, DemoFrame, EpisodeInfo, Invocation, Observation
 from protocol.process import host_clock_id
 from protocol.version import version
 
@@ -106,10 +107,17 @@ class Answerer:
         return self._node.answer(work, self._engine.invoke(work.request), infer_ns=0)
 
 
-def build_answerer(info: EpisodeInfo, checkpoint: Path | None, remote: RemoteOptions, **options: Any) -> Answerer:
+def build_answerer(
+    info: EpisodeInfo,
+    checkpoint: Path | None,
+    remote: RemoteOptions,
+    demonstration: Callable[[DemoSampling], Sequence[DemoFrame]],
+    **options: Any,
+) -> Answerer:
     """Raises OSError, ValueError: there is no such checkpoint or policy server, or it is for another robot.
 
-    ``options``: further ones of `PounceOptions`.
+    ``demonstration`` gives the episode's, for an engine whose memory reads it; ``options``: further ones of
+    `PounceOptions`.
     """
     chosen = PounceOptions(checkpoint=checkpoint, remote=remote, **options)
     engine = build_engine(chosen) if chosen.backend == "own" else build_remote(chosen)
@@ -117,5 +125,6 @@ def build_answerer(info: EpisodeInfo, checkpoint: Path | None, remote: RemoteOpt
     if isinstance(engine, Episodic):
         engine.begin(info)
     node = PounceNode(engine.spec)
-    node.open(info)
+    past = engine.spec.past
+    node.open(info, demonstration(past.demonstrations) if past is not None and info.has_demo else ())
     return Answerer(engine.spec, engine, node)

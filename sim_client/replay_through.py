@@ -16,12 +16,14 @@ import zlib
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import tyro
 
+from dual_system.models.ponder.demo_sampling import DemoSampling
 from protocol import files
 from protocol import messages as m
 from protocol.command_line import command, parse
@@ -164,7 +166,13 @@ def _through(record: EpisodeRecord, config: ThroughConfig) -> Compared:
     server = importlib.import_module("pounce_server.in_process")
     remote = server.RemoteOptions(url=config.url, mapping=config.mapping, key_file=config.key_file)
     other = server.build_answerer(
-        record.info, config.pounce, remote, backend=config.backend, device=config.device, dtype=config.dtype
+        record.info,
+        config.pounce,
+        remote,
+        partial(_demonstration, record.info),
+        backend=config.backend,
+        device=config.device,
+        dtype=config.dtype,
     )
     invocations = {each.invocation: each for each in record.invocations}
     seen = _Observations(record, config.file if other.spec.num_cameras else None)
@@ -183,6 +191,20 @@ def _through(record: EpisodeRecord, config: ThroughConfig) -> Compared:
         others.append(answer)
     pixels = seen.pixels if other.spec.num_cameras else ""
     return _compared(chunks, others, refused, other.spec.model_hash, pixels)
+
+
+def _demonstration(info: m.EpisodeInfo, sampling: DemoSampling) -> Sequence[m.DemoFrame]:
+    """The episode's demonstration, which no log holds: rendered again, from the seed of its scene.
+
+    Raises ValueError if there is no such scene here.
+    """
+    if not info.robot.is_simulated:
+        raise ValueError("its memory reads the demonstration, which a log of a real robot does not hold")
+    tasks, robot = importlib.import_module("dual_system.tasks.environment"), importlib.import_module("sim_client.robot")
+    with tasks.make_environment(info.task, render=True) as environment:
+        environment.reset(info.seed, info.difficulty)
+        frames: Sequence[m.DemoFrame] = robot.demonstration(environment, m.ImageCodec.RAW, sampling)
+    return frames
 
 
 def _shadow(record: EpisodeRecord, path: Path) -> Compared:

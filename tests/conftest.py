@@ -153,6 +153,8 @@ class FakePounce:
         if (seen := request.window) is not None:
             for array in (*(frame for frames in seen.frames for frame in frames), seen.states_TP):
                 digest.update(array.tobytes())
+        for each in request.past:
+            digest.update(f"{each.step}".encode() + each.frame.tobytes())
         shape = (self.spec.horizon, self.spec.action_dim)
         return (request.proprio + np.cumsum(0.01 * floats_of(digest.digest(), shape), axis=0)).astype(np.float32)
 
