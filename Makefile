@@ -101,7 +101,7 @@ peers: setup site $(LEROBOT)/.ready $(ROSBAGS)/.ready $(FOXGLOVE)/.ready $(GRAFA
 wheels: setup
 	$(BIN)/python -m benchmarks.wheels
 
-## make accept  a hundred oracle episodes of every task (about ten minutes)
+## make accept  a hundred oracle episodes of every task, and what repeats laws of make test at more sizes (about ten minutes)
 accept: setup
 	$(BIN)/python -m pytest -q -m acceptance
 

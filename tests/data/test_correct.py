@@ -135,9 +135,13 @@ def test_a_log_with_a_gap_is_refused(log: Path, record: EpisodeRecord, monkeypat
 
 
 def test_what_is_not_kept_is_counted(
-    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    log: Path,
+    outcomes: list[Outcome],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(module, "LocalWorkers", lambda num_workers, work_out: HereAndNow(0))
+    monkeypatch.setattr(module, "LocalWorkers", lambda num_workers, work_out: HereAndNow(0, outcomes=outcomes))
     assert main([str(log), "--out", str(tmp_path / "a"), "--per-episode", "2", "--no-progress"]) == module.DONE
     said = capsys.readouterr().out
     assert "1 episodes of 1 logs" in said
@@ -148,7 +152,7 @@ def test_a_log_that_goes_on_for_longer_than_an_episode_may_is_none(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(module, "LocalWorkers", lambda num_workers, work_out: HereAndNow())
-    arguments = [str(log), "--out", str(tmp_path / "a"), "--max-steps", "60", "--per-episode", "2", "--no-progress"]
+    arguments = [str(log), "--out", str(tmp_path / "a"), "--max-steps", "60", "--per-episode", "1", "--no-progress"]
     assert main(arguments) == module.REFUSED
     assert "no episode was left to write: the log goes on beyond --max-steps" in capsys.readouterr().err
     assert not (tmp_path / "a" / "meta").exists()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 import tomllib
 from collections.abc import Callable
@@ -94,17 +95,25 @@ def test_everything_copied_exists_and_reaches_the_builder(name: str) -> None:
     assert [source for source in copied(name) if not (ROOT / source).exists()] == []
 
 
+@functools.cache
+def imported_by(room: str) -> set[str]:
+    """Rooms that a room's files import."""
+    found = set()
+    for path in (ROOT / room).rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            modules = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            modules += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            found |= {m.partition(".")[0] for m in modules} & set(ROOMS)
+    return found
+
+
 @pytest.mark.parametrize("name", ROLES)
 def test_an_image_holds_every_room_that_its_own_room_needs_and_no_other(name: str) -> None:
     needed, todo = set(), {ROLES[name].room}
     while todo:
         room = todo.pop()
         needed.add(room)
-        for path in (ROOT / room).rglob("*.py"):
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                modules = [a.name for a in node.names] if isinstance(node, ast.Import) else []
-                modules += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
-                todo |= {m.partition(".")[0] for m in modules} & set(ROOMS) - needed
+        todo |= imported_by(room) - needed
     assert copied(name) & set(ROOMS) == needed
 
 

@@ -80,7 +80,7 @@ def test_convolution(num_rows: int, length: int, num_channels: int, dtype: torch
 
 
 @interpreted
-@few
+@settings(max_examples=3)
 @given(st.integers(1, 3), st.sampled_from([1, 7, 20]), st.sampled_from([(1, 1), (2, 6)]), dtypes, seeds)
 def test_recurrence(num_rows: int, length: int, heads: tuple[int, int], dtype: torch.dtype, seed: int) -> None:
     key_heads, num_heads, size = *heads, 16
@@ -156,7 +156,7 @@ def test_head_norms_rotation_and_stores(
 
 
 @interpreted
-@few
+@settings(max_examples=3)
 @given(st.integers(1, 2), st.sampled_from([1, 5, 19]), st.integers(0, 150), st.sampled_from([(1, 1), (6, 2)]), seeds)
 def test_attention(num_rows: int, length: int, most_past: int, heads: tuple[int, int], seed: int) -> None:
     """In float32: the interpreter multiplies bfloat16 wrongly."""
@@ -223,7 +223,7 @@ def test_a_forward_of_kernels_is_the_network_s(ponder: Ponder, monkeypatch: pyte
     eager, fused = (sessions_of(ponder, has_kernels=has_kernels) for has_kernels in (False, True))
     for tensor in fused[0]._memory.keys_and_values(slice(None), 90):  # type: ignore[arg-type]
         tensor.fill_(NAN)
-    for seed, sizes in enumerate(((6, 3), (1, 0), (0, 4), (1, 1))):
+    for seed, sizes in enumerate(((6, 3), (0, 4), (1, 1))):
         come, expected = (append(ponder, sessions, sizes, seed) for sessions in (fused, eager))
         for one, other in zip(come, expected, strict=True):
             torch.testing.assert_close(one, other, rtol=0, atol=2e-4)

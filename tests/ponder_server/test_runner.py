@@ -99,7 +99,7 @@ def test_a_state_can_be_restored_twice() -> None:
     assert torch.equal(first, second)
 
 
-@settings(deadline=None, max_examples=8)
+@settings(deadline=None, max_examples=4)
 @given(st.sets(st.sampled_from(CUTS), min_size=3, max_size=3), st.booleans(), st.sampled_from([(1, 16, 512), (7,)]))
 def test_an_append_keeps_the_state_of_its_first_tokens_alone(
     cuts: set[int], is_captured: bool, buckets: tuple[int, ...]

@@ -212,7 +212,7 @@ def attended(
 
 
 @interpreted
-@settings(max_examples=6)
+@settings(max_examples=4)
 @given(
     st.integers(1, 2),
     st.integers(1, 19),

@@ -338,7 +338,7 @@ def test_every_message_class_has_a_strategy() -> None:
 
 @pytest.mark.parametrize("cls", CLASSES, ids=lambda c: c.__name__)
 @given(data=st.data())
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_decoding_inverts_encoding(cls: type, data: st.DataObject) -> None:
     message = data.draw(MESSAGES[cls])
     assert bits_of(codec.decode(cls, codec.encode(message))) == bits_of(message)
@@ -408,7 +408,7 @@ def test_any_bytes_decode_or_are_refused(cls: type, payload: bytes) -> None:
 
 @pytest.mark.parametrize("cls", CLASSES, ids=lambda c: c.__name__)
 @given(data=st.data())
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=12, deadline=None)
 def test_a_flipped_bit_decodes_or_is_refused(cls: type, data: st.DataObject) -> None:
     payload = bytearray(codec.encode(data.draw(MESSAGES[cls])))
     if payload:

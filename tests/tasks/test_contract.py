@@ -36,10 +36,12 @@ HOME = np.append(panda.HOME_QPOS, 1.0)
 SEED = 7
 
 every_task = pytest.mark.parametrize("name", task_names())
-every_difficulty = pytest.mark.parametrize("difficulty", DIFFICULTIES)
+every_difficulty = pytest.mark.parametrize(
+    "difficulty", [pytest.param(each, marks=[pytest.mark.acceptance] * (each == "medium")) for each in DIFFICULTIES]
+)
 
 
-_KEPT = {(SEED, "easy"), (SEED, "medium"), (SEED, "hard"), (SEED + 1, "easy"), (SEED, None)}
+_KEPT = {(SEED, "easy"), (SEED, "medium"), (SEED, "hard"), (SEED + 1, "easy")}
 
 
 class Remembering(Environment):
@@ -232,7 +234,7 @@ def test_another_seed_gives_another_scene(environment: EnvironmentOf, name: str,
 @every_task
 def test_a_restored_episode_continues_bit_exactly(walk: WalkOf, environment: EnvironmentOf, name: str) -> None:
     env, episode = environment(name), walk(name, "hard")
-    forks = [min(step, len(episode) - 2) for step in (5, 60, 190)]  # some episodes are short
+    forks = [min(step, len(episode) - 2) for step in (5, 130)]  # some episodes are short
     env.reset(SEED, "hard")
     saved = {}
     for moment in episode[1 : forks[-1] + 1]:
@@ -242,7 +244,7 @@ def test_a_restored_episode_continues_bit_exactly(walk: WalkOf, environment: Env
     for step, state in saved.items():
         env.reset(SEED + 1, "easy")  # another episode in between
         assert facts(env.restore(state)) == facts(episode[step].snapshot)
-        for moment in episode[step + 1 : step + 61]:
+        for moment in episode[step + 1 : step + 41]:
             assert facts(env.step(moment.action)) == facts(moment.snapshot)
 
 
@@ -277,7 +279,7 @@ def test_snapshots_share_no_memory(environment: EnvironmentOf, name: str) -> Non
 @pytest.mark.sim
 def test_frames_have_the_promised_shape_and_own_their_memory(name: str) -> None:
     with make_environment(name) as env:
-        a, b = env.reset(SEED), env.step(HOME)
+        a, b = env.reset(SEED, "easy"), env.step(HOME)
         assert tuple(a.frames) == tuple(b.frames) == CAMERAS
         for camera in CAMERAS:
             assert a.frames[camera].shape == (IMAGE_PX, IMAGE_PX, 3)
@@ -309,7 +311,7 @@ def test_a_bad_action_is_refused_and_changes_nothing(
     environment: EnvironmentOf, name: str, action: np.ndarray, complaint: str
 ) -> None:
     env = environment(name)
-    env.reset(SEED)
+    env.reset(SEED, "easy")
     before = env.physics.data.qpos.copy()
     with pytest.raises(ValueError, match=complaint):
         env.step(action)
@@ -348,7 +350,7 @@ def test_a_video_can_be_watched_at_any_time_and_changes_nothing(
 @every_task
 def test_frames_of_a_video_are_well_formed(environment: EnvironmentOf, name: str) -> None:
     env = environment(name)
-    env.reset(SEED)
+    env.reset(SEED, "easy")
     for step, frame in enumerate(env.demonstration()):
         assert frame.is_demonstration
         assert frame.step == step
@@ -362,7 +364,7 @@ def test_frames_of_a_video_are_well_formed(environment: EnvironmentOf, name: str
 @every_task
 @pytest.mark.parametrize("rate_hz", [0, -1, 3, 40])
 def test_a_video_has_no_frames_between_its_frames(environment: EnvironmentOf, name: str, rate_hz: int) -> None:
-    environment(name).reset(SEED)
+    environment(name).reset(SEED, "easy")
     with pytest.raises(ValueError, match=f"20 Hz cannot be shown at {rate_hz} Hz; use 1, 2, 4, 5, 10 or 20"):
         environment(name).demonstration(rate_hz)
 
@@ -374,7 +376,7 @@ import hashlib, sys
 from dual_system.tasks.environment import make_environment
 for name in sys.argv[1:]:
     env = make_environment(name, render=False)
-    snapshot, digest, actions = env.reset({SEED}, "hard"), hashlib.sha256(), env.oracle()
+    snapshot, digest, actions = env.reset({SEED}, "easy"), hashlib.sha256(), env.oracle()
     while snapshot.step < 100 and snapshot.status.value == "ongoing":
         snapshot = env.step(next(actions))
         digest.update(snapshot.state.tobytes() + snapshot.tcp_pose.tobytes())
@@ -384,7 +386,7 @@ for name in sys.argv[1:]:
     here = []
     for name in task_names():
         digest = hashlib.sha256()
-        for moment in walk(name, "hard")[1:101]:
+        for moment in walk(name, "easy")[1:101]:
             digest.update(moment.snapshot.state.tobytes() + moment.snapshot.tcp_pose.tobytes())
         here.append(f"{name} {digest.hexdigest()}")
     there = subprocess.run([sys.executable, "-c", script, *task_names()], capture_output=True, text=True, check=True)

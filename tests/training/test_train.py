@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -38,11 +39,13 @@ def shrunk(run: Recipe) -> Recipe:
     return replace(run, ponder=ponder, example=replace(run.example, max_invocations=2), batch_episodes=2)
 
 
-@pytest.fixture(autouse=True)
-def small_recipes(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("tiny", "tiny_groot", "tiny_subgoal_text"):
-        small = shrunk(recipes.recipe(name))
-        monkeypatch.setitem(recipes.RECIPES, name, lambda small=small: small)
+@pytest.fixture(autouse=True, scope="module")
+def small_recipes() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("tiny", "tiny_groot", "tiny_subgoal_text"):
+            small = shrunk(recipes.recipe(name))
+            patch.setitem(recipes.RECIPES, name, lambda small=small: small)
+        yield
 
 
 def options(folder: Path, out: Path, recipe: str = "tiny", **changes: Any) -> TrainOptions:
@@ -51,6 +54,14 @@ def options(folder: Path, out: Path, recipe: str = "tiny", **changes: Any) -> Tr
         log=LogOptions(save_every=1, progress=False),
     )  # fmt: skip
     return replace(given, **changes)
+
+
+@pytest.fixture(scope="module")
+def finished(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The two steps of ``options``, run once for all tests; who changes it makes a copy."""
+    out = tmp_path_factory.mktemp("finished") / "run"
+    train.train(options(folder, out))
+    return out
 
 
 def trainer_of(folder: Path, tmp_path: Path) -> Trainer:
@@ -68,25 +79,26 @@ def test_under_a_fixed_seed_the_losses_are_known(folder: Path, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("name", ["tiny", "tiny_groot", "tiny_subgoal_text"])
-def test_a_run_leaves_folders_that_the_servers_load(folder: Path, tmp_path: Path, name: str) -> None:
-    train.train(options(folder, tmp_path / "run", name))
-    steps = [json.loads(line)["step"] for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+def test_a_run_leaves_folders_that_the_servers_load(folder: Path, finished: Path, tmp_path: Path, name: str) -> None:
+    run = finished if name == "tiny" else tmp_path / "run"
+    if run != finished:
+        train.train(options(folder, run, name))
+    steps = [json.loads(line)["step"] for line in (run / "log.jsonl").read_text().splitlines()]
     assert steps == [0, 1]
-    samples = [json.loads(line) for line in (tmp_path / "run" / "samples.jsonl").read_text().splitlines()]
+    samples = [json.loads(line) for line in (run / "samples.jsonl").read_text().splitlines()]
     assert {sample["step"] for sample in samples} == (set() if name == "tiny_groot" else {0})  # actions only: no texts
-    ponder = load_ponder(tmp_path / "run" / "ponder")
+    ponder = load_ponder(run / "ponder")
     assert not ponder.is_random
     assert ponder.format.speaks == (name != "tiny_groot")
-    bundle = load_bundle(tmp_path / "run" / "pounce")
+    bundle = load_bundle(run / "pounce")
     assert not bundle.is_random
     assert not bundle.has_fresh_prefix
     assert bundle.statistics == TrainingSet(folder).statistics(bundle.model.config.horizon)
 
 
 def test_a_run_that_was_killed_ends_as_one_that_was_not(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    train.train(options(folder, tmp_path / "whole"))
     update, done = train.Trainer._update, []
 
     def dies_at_the_second(self: Trainer) -> train.StepReport:
@@ -101,7 +113,7 @@ def test_a_run_that_was_killed_ends_as_one_that_was_not(
             train.train(options(folder, tmp_path / "cut"))
     train.train(options(folder, tmp_path / "cut"))
     for name in ("log.jsonl", "ponder/model.safetensors", "pounce/model.safetensors"):
-        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "cut" / name).read_bytes()
+        assert (finished / name).read_bytes() == (tmp_path / "cut" / name).read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -158,9 +170,11 @@ def test_a_finished_run_is_not_overwritten(folder: Path, tmp_path: Path) -> None
         train.train(options(folder, tmp_path / "run"))
 
 
-def test_a_finished_run_is_prolonged_to_what_a_longer_one_would_have_been(folder: Path, tmp_path: Path) -> None:
+def test_a_finished_run_is_prolonged_to_what_a_longer_one_would_have_been(
+    folder: Path, finished: Path, tmp_path: Path
+) -> None:
     longer = InsteadOptions(steps=3)
-    train.train(options(folder, tmp_path / "run"))
+    shutil.copytree(finished, tmp_path / "run")
     with pytest.raises(train.CheckpointError, match="finished run of 2 steps; --steps with a larger number"):
         train.train(options(folder, tmp_path / "run"))
     train.train(options(folder, tmp_path / "run", instead=longer))
@@ -204,10 +218,10 @@ def test_the_processes_share_one_batch_and_rows_of_like_length(folder: Path, tmp
     assert seen == set(range(len(lengths)))
 
 
-def test_who_makes_the_batches_changes_nothing(folder: Path, tmp_path: Path) -> None:
-    for name, loaders in (("alone", 0), ("helped", 2)):
-        train.train(options(folder, tmp_path / name, machine=MachineOptions(loaders=loaders)))
-    alone, helped = (load_file(tmp_path / name / "ponder" / "model.safetensors") for name in ("alone", "helped"))
+def test_who_makes_the_batches_changes_nothing(folder: Path, finished: Path, tmp_path: Path) -> None:
+    assert MachineOptions().loaders == 0
+    train.train(options(folder, tmp_path, machine=MachineOptions(loaders=2)))
+    alone, helped = (load_file(run / "ponder" / "model.safetensors") for run in (finished, tmp_path))
     assert all(torch.equal(alone[name], helped[name]) for name in alone)
 
 
@@ -249,21 +263,19 @@ def test_a_pounce_that_learned_to_continue_rows_is_served_so(folder: Path, tmp_p
     np.testing.assert_array_equal(engine.invoke(request)[:2], rows)
 
 
-def test_a_trained_pair_goes_on_with_another_recipe(folder: Path, tmp_path: Path) -> None:
+def test_a_trained_pair_goes_on_with_another_recipe(folder: Path, finished: Path, tmp_path: Path) -> None:
     """Folders of ours keep their statistics, tokenizers and the way demonstrations are shown to PONDER."""
-    train.train(options(folder, tmp_path / "first"))
-    first = {system: tmp_path / "first" / system for system in ("ponder", "pounce")}
-    train.train(options(folder, tmp_path / "second", "tiny", **first))
-    before, after = (load_bundle(tmp_path / name / "pounce") for name in ("first", "second"))
+    first = {system: finished / system for system in ("ponder", "pounce")}
+    train.train(options(folder, tmp_path, "tiny", **first))
+    before, after = (load_bundle(run / "pounce") for run in (finished, tmp_path))
     assert before.statistics == after.statistics
     assert before.tokenizer.model_bytes == after.tokenizer.model_bytes
     assert before.digest() != after.digest()
 
 
-def test_the_other_family_is_refused(folder: Path, tmp_path: Path) -> None:
-    train.train(options(folder, tmp_path / "first"))
+def test_the_other_family_is_refused(folder: Path, finished: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="recipe tiny_groot is of another action model than"):
-        train.train(options(folder, tmp_path / "second", "tiny_groot", pounce=tmp_path / "first" / "pounce"))
+        train.train(options(folder, tmp_path / "second", "tiny_groot", pounce=finished / "pounce"))
 
 
 def test_a_trained_ponder_says_how_demonstrations_were_sampled(

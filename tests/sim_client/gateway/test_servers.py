@@ -128,9 +128,11 @@ def test_of_two_clients_one_drives_and_the_other_is_told(openpi_port: int, pictu
 
 
 def test_a_flood_is_read_no_faster_than_it_is_answered(
-    picture_of: PictureOf, terms_with: Callable[..., Terms], listening: Callable[..., Any]
-) -> None:
+    picture_of: PictureOf, terms_with: Callable[..., Terms], listening: Callable[..., Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
     """Live, and nothing is ever answered: what lies in memory has an end, and another client is heard."""
+    monkeypatch.setattr("sim_client.gateway.websocket._PING_S", 0.2)  # pings find that a client that is not read left
     asked: list[str] = []
 
     class Silent:
