@@ -122,6 +122,11 @@ def slowed(robot: Robot, speed: float) -> Robot:
     return replace(robot, command_low=low, command_high=high, max_step=(robot.max_step * share).astype(np.float32))
 
 
+def without_lead(robot: Robot) -> Robot:
+    """The robot whose commands may be as far from what was measured as they come."""
+    return replace(robot, max_lead=np.zeros(robot.action_dim, np.float32))
+
+
 def is_in_range(state: Floats, robot: Robot) -> bool:
     """Whether every measured value is one that this robot can have."""
     if not len(robot.state_low):

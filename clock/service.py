@@ -10,18 +10,18 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import accumulate
+from dataclasses import dataclass, replace
 from typing import Any
 
 from clock.agreement import agree
 from clock.channels import null_of
 from clock.conductor import Conductor, Stage
+from clock.episode import Episode
 from clock.policies import SERVERS, has_ponder, servers_of
 from clock.report import ADMITTED_EVENT
 from clock.residual import RESIDUAL_EVENT, ResidualHead
 from clock.servers import Servers
-from clock.timebase import NS_PER_S, MonotonicClock, VirtualClock
+from clock.timebase import MonotonicClock, VirtualClock
 from clock.watch import HEARTBEAT_TIMEOUT_NS, Watch
 from protocol import codec
 from protocol import messages as m
@@ -57,7 +57,6 @@ log = logging.getLogger(__name__)
 
 ROBOT = "sim"
 ROBOT_SILENCE_NS = 1_000_000_000
-MAX_RECENT_BYTES = 32 << 20  # half of what a message may be
 MAX_SHADOW_QUERIES = 4  # for later ones it would fetch a journal from this thread, while rows are played
 _TOPIC_OF: dict[type, Topic[object]] = {
     t.cls: t  # type: ignore[misc]
@@ -84,39 +83,6 @@ class ServiceConfig:
     """False if all participants share one thread, so that none can die alone."""
 
 
-@dataclass(slots=True)
-class _Episode:
-    request: m.OpenRequest
-    conductor: Conductor
-    clock: MonotonicClock | VirtualClock | None = None  # starts with the first observation: episode time 0
-    journal: list[m.JournalEntry] = field(default_factory=list)
-    journal_bytes: int = 0
-    newest_payload: bytes = b""
-    recent: deque[bytes] = field(default_factory=lambda: deque(maxlen=0))
-    """Lockstep: the observations before the newest in POUNCE's window, for one that restarts."""
-    remembered: list[bytes] = field(default_factory=list)
-    """Lockstep: those that POUNCE's memory has pictures of, in order, for one that restarts."""
-    invoked: m.Invocation | None = None
-    """The newest invocation, for a POUNCE that restarts before it has answered."""
-    phase: str = ""
-    contracts: dict[str, m.Contract] = field(default_factory=dict)
-    """Terms of both servers by process; empty if nobody but the oracle plays."""
-    others: set[int] = field(default_factory=set)
-    """Boot ids of processes that answered with other models."""
-
-    @property
-    def now_ns(self) -> int:
-        return self.clock.now_ns() if self.clock is not None else 0
-
-    @property
-    def servers(self) -> tuple[str, ...]:
-        return servers_of(self.request.info.policy)
-
-    @property
-    def is_lockstep(self) -> bool:
-        return self.request.info.schedule.mode == m.Mode.LOCKSTEP
-
-
 class ClockService:
     """One robot's clock. ``step`` does due work and returns whether there was any; ``wait_ns`` is the time to wait.
 
@@ -139,7 +105,7 @@ class ClockService:
             watches=config.watches,
             max_clock_bound_ns=config.max_clock_bound_ns,
         )
-        self._episode: _Episode | None = None
+        self._episode: Episode | None = None
         self._last_epoch: dict[str, int] = {}
         self._is_stepping = False
         self._is_draining = False
@@ -215,7 +181,7 @@ class ClockService:
             self._finish(None)
         return worked
 
-    def _on_cognition(self, episode: _Episode, cognition: m.Cognition) -> bool:
+    def _on_cognition(self, episode: Episode, cognition: m.Cognition) -> bool:
         contract = episode.contracts.get("ponder")
         if contract is None or not self._is_agreed(episode, "ponder", cognition):
             return False
@@ -227,13 +193,13 @@ class ClockService:
         taken = episode.conductor.on_cognition(cognition, episode.now_ns)
         return taken or self._unasked("cognition", cognition.query, cognition.header)
 
-    def _on_chunk(self, episode: _Episode, chunk: m.ActionChunk) -> bool:
+    def _on_chunk(self, episode: Episode, chunk: m.ActionChunk) -> bool:
         if not self._is_agreed(episode, "pounce", chunk):
             return False
         taken = episode.conductor.on_chunk(chunk, episode.now_ns)
         return taken or self._unasked("chunk", chunk.invocation, chunk.header)
 
-    def _is_agreed(self, episode: _Episode, proc: str, answer: m.Cognition | m.ActionChunk) -> bool:
+    def _is_agreed(self, episode: Episode, proc: str, answer: m.Cognition | m.ActionChunk) -> bool:
         """Whether an answer is from the model that the episode was opened with; another one is never played."""
         contract = episode.contracts.get(proc)
         if contract is None:
@@ -249,7 +215,7 @@ class ClockService:
             self._event(m.Severity.ERROR, "other_model", text)
         return False
 
-    def _on_observation(self, episode: _Episode, observation: m.Observation, payload: bytes) -> bool:
+    def _on_observation(self, episode: Episode, observation: m.Observation, payload: bytes) -> bool:
         if len(observation.proprio) != episode.request.info.robot.num_proprio:
             expected = episode.request.info.robot.num_proprio
             detail = f"expected {expected} joints, came {len(observation.proprio)}"
@@ -264,38 +230,15 @@ class ClockService:
             captured_ns = tuple(offset.to_ours(at_ns) - zero_ns for at_ns in observation.captured_ns)
             source_ns = offset.to_ours(observation.source_ns) - zero_ns
             observation = replace(observation, source_ns=source_ns, captured_ns=captured_ns)
-        if why_not := self._out_of_time(episode, observation):
+        if why_not := episode.out_of_time(observation):
             self._link.drop(source_of(observation.header), DropReason.WRONG_INSTANT, why_not)
             return False
         self._robot_heard_ns = self._host.now_ns()
         if episode.clock is None:
             episode.clock = VirtualClock() if episode.is_lockstep else MonotonicClock()
         if episode.conductor.on_observation(observation):
-            if episode.newest_payload:
-                episode.recent.append(episode.newest_payload)
-            episode.newest_payload = payload
-            stride = episode.conductor.picture_stride_ticks if episode.is_lockstep else 0
-            if stride and observation.tick % stride == 0:
-                episode.remembered.append(payload)
+            episode.show(observation.tick, payload)
         return True
-
-    def _out_of_time(self, episode: _Episode, observation: m.Observation) -> str:
-        """Why an observation cannot be of this episode's present; "" if it can.
-
-        A robot shows the next tick, whose instant may lie one period ahead, and never an earlier instant than before.
-        """
-        conductor, schedule = episode.conductor, episode.request.info.schedule
-        may_count = conductor.stage != Stage.RUNNING and not episode.is_lockstep  # before tick 0 a robot may stream
-        early = schedule.control_hz if may_count else 0
-        if observation.tick > conductor.tick + early:
-            return f"tick {observation.tick} before tick {conductor.tick} was commanded"
-        ahead_ns = max((observation.source_ns, *observation.captured_ns)) - episode.now_ns
-        if ahead_ns > 2 * NS_PER_S // schedule.control_hz:
-            return f"tick {observation.tick} is dated {ahead_ns / 1e6:.0f} ms ahead of the episode's clock"
-        oldest_ns = conductor.newest_source_ns if conductor.newest_source_ns is not None else -NS_PER_S
-        if observation.tick >= conductor.newest_tick and observation.source_ns < oldest_ns:
-            return f"tick {observation.tick} is dated {observation.source_ns} ns, before {oldest_ns} ns"
-        return ""
 
     def _unasked(self, what: str, index: int, header: m.Header) -> bool:
         self._link.drop(source_of(header), DropReason.UNASKED, f"{what} {index}")
@@ -337,7 +280,7 @@ class ClockService:
             return True
         for effect in effects:
             if isinstance(effect, m.Query):
-                self._keep(episode, effect)
+                episode.keep(effect)
             sent = self._link.publish(_TOPIC_OF[type(effect)], effect, at_ns=now_ns)
             if isinstance(sent, m.Invocation):
                 episode.invoked = sent
@@ -349,15 +292,7 @@ class ClockService:
                 return True
         return bool(effects)
 
-    def _keep(self, episode: _Episode, query: m.Query) -> None:
-        episode.journal.append(
-            m.JournalEntry(
-                query=query.query, tick=query.tick, source_ns=query.source_ns, observation=episode.newest_payload
-            )
-        )
-        episode.journal_bytes += len(episode.newest_payload)
-
-    def _show_phase(self, episode: _Episode, now_ns: int) -> None:
+    def _show_phase(self, episode: Episode, now_ns: int) -> None:
         stage = episode.conductor.stage
         state = episode.conductor.ladder.level.name.lower() if stage == Stage.RUNNING else stage.value
         if state != episode.phase:
@@ -428,7 +363,7 @@ class ClockService:
             picture_ticks=window.video_ticks,
             picture_stride_ticks=window.stride_ticks,
         )
-        self._episode = _Episode(request, conductor, contracts=dict(zip(procs, contracts, strict=True)))
+        self._episode = Episode(request, conductor, contracts=dict(zip(procs, contracts, strict=True)))
         if self._episode.is_lockstep:  # in real time a restarted POUNCE has seen its window before it is warm
             self._episode.recent = deque(maxlen=window.reach_ticks)
         self._robot_heard_ns = self._host.now_ns()
@@ -481,7 +416,6 @@ class ClockService:
         conductor, invoked, opened = self._episode.conductor, self._episode.invoked, self._episode.request
         if request.header.proc == "pounce-shadow" and not conductor.picture_stride_ticks:
             opened = replace(opened, demo=())  # megabytes that this POUNCE does not read, while rows are played
-        past = [*self._episode.remembered, *self._episode.recent]
         is_owed = invoked is not None and invoked.invocation == conductor.owed_invocation
         return m.ActiveReply(
             open=replace(opened, members=self._servers.members()),
@@ -489,7 +423,7 @@ class ClockService:
             owed_query=conductor.owed_query,
             owed_invocation=codec.encode(invoked) if is_owed else b"",
             observation=self._episode.newest_payload,
-            recent=_within(past, MAX_RECENT_BYTES) if request.header.proc != "ponder" else (),
+            recent=self._episode.past() if request.header.proc != "ponder" else (),
         )
 
     def _plays_without(self, proc: str) -> bool:
@@ -548,13 +482,6 @@ class ClockService:
             return m.EngageReply(error=why_not)
         self._event(m.Severity.WARNING, "engaged", f"motion may start again, says {request.operator}")
         return m.EngageReply(level=self._episode.conductor.ladder.level.name)
-
-
-def _within(payloads: Sequence[bytes], limit_bytes: int) -> tuple[bytes, ...]:
-    """The newest payloads, in order, that are no longer than ``limit_bytes`` together."""
-    sums = accumulate(len(payload) for payload in reversed(payloads))
-    num = sum(total <= limit_bytes for total in sums)
-    return tuple(payloads)[len(payloads) - num :]
 
 
 def _named(model_hash: str, is_fake: bool) -> str:

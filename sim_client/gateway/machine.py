@@ -19,27 +19,24 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, TypeVar
 
-import numpy as np
-
-from clock.limits import out_of_range, slowed
-from clock.policies import servers_of
+from clock.limits import out_of_range, slowed, without_lead
 from clock.service import ClockService
 from clock.timebase import MonotonicClock
 from dual_system.models.ponder.demo_sampling import DemoSampling
 from protocol import images
 from protocol import messages as m
-from protocol.drops import DropReason
 from protocol.errors import EpisodeRefused, ProtocolError, TransportError
 from protocol.link import Link, Stream
 from protocol.process import host_clock_id
-from protocol.topics import ACTION, CHUNK, COGNITION, EVENT, HEALTH, OBSERVATION, SHADOW_OF, SUBGOAL, TICK
+from protocol.topics import ACTION, CHUNK, COGNITION, EVENT, OBSERVATION, SUBGOAL, TICK
 from protocol.version import versions
 from sim_client.gateway.body import Body
 from sim_client.gateway.exchange import Answer, Finish, Frames, Observed, Refused, Step, Trial
 from sim_client.gateway.lease import Lease
 from sim_client.gateway.node import LiveNode, LockstepNode, Measurement, Node
-from sim_client.gateway.pictures import resized
+from sim_client.gateway.pictures import check_size, resized
 from sim_client.gateway.rule import sampled
+from sim_client.gateway.servers import Servers
 from sim_client.recorder import Recorder
 from sim_client.robot_end import RobotEnd, is_sound
 from sim_client.silence import CLOCK_SILENCE_NS, Silence
@@ -47,7 +44,6 @@ from sim_client.silence import CLOCK_SILENCE_NS, Silence
 log = logging.getLogger("pp-gateway")
 
 _IDLE_NS = 20_000_000
-_SILENCE_NS = 5_000_000_000
 _STOPPED = "the gateway was stopped"
 _NO_PICTURE_PX = (1, 1)
 """A robot without cameras has pictures of this height and width."""
@@ -122,9 +118,7 @@ class Machine:
         self._chunks = link.subscribe(CHUNK)
         self._cognitions = link.subscribe(COGNITION)
         self._subgoals = link.subscribe(SUBGOAL)
-        self._healths = link.subscribe(HEALTH)
-        self._heard: dict[str, tuple[m.Health, int]] = {}  # by process: the newest, and when it came
-        self._misshapen: dict[str, int] = {}  # by server: observations it had dropped for their shape at the start
+        self._servers = Servers(link, plan.policy)
         self._session = f"{_id_of(plan.suite)}-{secrets.token_hex(4)}"
         self._num_episodes = 0
         self._state: m.Floats | None = None  # the newest
@@ -159,22 +153,12 @@ class Machine:
 
     def unready(self) -> str:
         """Why no episode could begin: a sentence; "" if the model servers say that they are ready."""
-        if self._is_closed:
-            return _STOPPED
-        now_ns, heard = time.monotonic_ns(), dict(self._heard)
-        for proc in servers_of(self._plan.policy):
-            health, heard_ns = heard.get(proc, (None, 0))
-            if health is None or now_ns - heard_ns > _SILENCE_NS:
-                return f"{proc} is not there"
-            if health.state != m.ServingState.READY:
-                return f"{proc} is {health.state.name.lower()} ({health.progress:.0%}) {health.detail}".strip()
-        return ""
+        return _STOPPED if self._is_closed else self._servers.unready()
 
     @property
     def models(self) -> tuple[str, ...]:
         """The hashes of the models that were heard of last."""
-        heard = dict(self._heard)
-        return tuple(heard[proc][0].model_hash for proc in servers_of(self._plan.policy) if proc in heard)
+        return self._servers.models
 
     def submit(self, client: str, request: Step | Finish) -> Future[Answer | None]:
         """Hands in a request; the future holds its answer (None if it asks for no rows), or raises Refused.
@@ -202,25 +186,11 @@ class Machine:
         Raises:
             TransportError: a server that we started is dead, or they are not ready within the patience.
         """
-        states: dict[str, str] = {}
-        deadline_ns = time.monotonic_ns() + self._plan.patience_ns
-        procs = servers_of(self._plan.policy)
-        while any(states.get(proc) != "ready" for proc in procs):
-            for health in self._health():
-                state = (
-                    f"{health.state.name.lower()} ({health.progress:.0%})"
-                    if health.state != m.ServingState.READY
-                    else "ready"
-                )
-                if states.get(health.header.proc) != state:
-                    log.info("robot=%s server=%s state=%s %s", self.robot, health.header.proc, state, health.detail)
-                states[health.header.proc] = state
-            if (why := self._dead_server()) or should_stop():
-                raise TransportError(why or _STOPPED)
-            if time.monotonic_ns() > deadline_ns:
-                missing = ", ".join(f"{proc} is {states.get(proc, 'not there')}" for proc in procs)
-                raise TransportError(f"not ready within {self._plan.patience_ns / 1e9:.0f} s (--patience-s): {missing}")
-            self._turn(_IDLE_NS)
+        self._servers.await_ready(
+            self._plan.patience_ns,
+            lambda: self._turn(_IDLE_NS),
+            lambda: self._dead_server() or (_STOPPED if should_stop() else ""),
+        )
 
     def tell_time(self) -> bool:
         """Answers those who ask for this host's clock; returns whether there were any."""
@@ -255,12 +225,7 @@ class Machine:
         if is_live:
             self._look_after_live()
         if self._episode is None:
-            self._health()  # who is ready, for those who ask before an episode
-
-    def _health(self) -> list[m.Health]:
-        news, now_ns = self._healths.drain(), time.monotonic_ns()
-        self._heard |= {health.header.proc: (health, now_ns) for health in news}
-        return news
+            self._servers.hear()  # who is ready, for those who ask before an episode
 
     def _work(self, job: _Job) -> None:
         try:
@@ -297,7 +262,7 @@ class Machine:
         size = (episode.info.robot.image_height, episode.info.robot.image_width)
         since = [Observed(resized(seen.frames, self._plan.image_px), seen.state) for seen in step.since]
         for pictures in (*(seen.frames for seen in since), frames):
-            _check_size(pictures, size, "as at first")
+            check_size(pictures, size, "as at first")
         if step.trial is not None:
             job.future.set_result(None)
             return
@@ -334,7 +299,7 @@ class Machine:
                 return answer
             if time.monotonic_ns() - asked_ns > self._plan.patience_ns:
                 self._give_up(episode, f"no command within {self._plan.patience_ns / 1e9:.0f} s")
-            if why := self._dead_server() or self._objection():
+            if why := self._dead_server() or self._servers.objection():
                 self._give_up(episode, why)
             if self._should_stop():
                 raise Refused(_STOPPED)
@@ -358,7 +323,7 @@ class Machine:
         if away_ns := episode.silence.look(time.monotonic_ns()):
             log.warning("this process stood still for %.0f ms", away_ns / 1e6)
         limit_ns = self._plan.patience_ns if node.commands.newest is None else CLOCK_SILENCE_NS
-        why = episode.node.over() or self._objection()
+        why = episode.node.over() or self._servers.objection()
         if not why and episode.silence.total_ns > limit_ns:
             why = f"no command for {episode.silence.total_ns / 1e6:.0f} ms"
         waiting, self._waiting = self._waiting, []
@@ -370,19 +335,6 @@ class Machine:
         if why:
             episode.over = why
             self._end(m.TaskStatus.ABORTED, why, keep=episode)
-
-    def _objection(self) -> str:
-        """A sentence if an episode cannot go on: a server was built for other pictures or joints, or has a double."""
-        if self._link.second_sender:
-            return self._link.second_sender
-        for health in self._health():
-            is_member = self._link.members.get(health.header.proc) == health.header.boot_id
-            if not is_member or health.header.proc in SHADOW_OF:
-                continue
-            if health.dropped.get(DropReason.WRONG_SHAPE, 0) > self._misshapen.get(health.header.proc, 0):
-                proc = health.header.proc
-                return f"{proc} was built for other pictures, and says in its log for which. See --image-px"
-        return ""
 
     def _take_background(self, node: Node) -> None:
         """Reads the sources of forecast rows, and what is behind them."""
@@ -424,7 +376,7 @@ class Machine:
             self._end(m.TaskStatus.ONGOING, "another episode was begun")
             raise Refused("the gateway is draining: it leaves now, and another process takes its place")
         camera, size_px = next(((name, frame.shape[:2]) for name, frame in frames.items()), ("", _NO_PICTURE_PX))
-        _check_size(frames, size_px, f"as of the {camera} camera")
+        check_size(frames, size_px, f"as of the {camera} camera")
         robot = self._plan.body.describe(step.state, size_px)
         _check_state(step.state, robot)
         self._end(m.TaskStatus.ONGOING, "another episode was begun")
@@ -432,10 +384,10 @@ class Machine:
         schedule = self._plan.schedule(seed, horizon)
         if schedule.mode == m.Mode.LOCKSTEP and self._plan.num_rows > 1:
             # A client may not say what it saw between its requests: the last state is repeated, and has no lead.
-            robot = _without_lead(robot)
+            robot = without_lead(robot)
         trial = step.trial or Trial()
         if trial.is_dry:  # nothing moves, so commands lead the arm
-            robot = _without_lead(robot)
+            robot = without_lead(robot)
         robot = slowed(robot, trial.speed)
         self._num_episodes += 1
         task = _id_of(step.task) or self._plan.task
@@ -470,8 +422,7 @@ class Machine:
             raise
         for stale in (self._actions, self._accounts, self._chunks, self._cognitions, self._subgoals):
             stale.drain()
-        for health in self._health():
-            self._misshapen[health.header.proc] = health.dropped.get(DropReason.WRONG_SHAPE, 0)
+        self._servers.begin()
         if trial.is_dry:
             self._tell("dry_run", "a dry run: the robot is sent nothing")
         log.info(
@@ -533,18 +484,6 @@ class Machine:
 def _refuse(future: Future[Answer | None], sentence: str) -> None:
     if not future.done():  # what failed may have come after the answer
         future.set_exception(Refused(sentence))
-
-
-def _without_lead(robot: m.Robot) -> m.Robot:
-    return replace(robot, max_lead=np.zeros(robot.action_dim, np.float32))
-
-
-def _check_size(frames: Frames, size: tuple[int, int], reason: str) -> None:
-    """Raises Refused: a picture is not of ``size``, height and width in px."""
-    for camera, frame in frames.items():
-        if frame.shape[:2] != size:
-            expected, came = (f"{height} x {width}" for height, width in (size, frame.shape[:2]))
-            raise Refused(f"{camera}: expected {expected} px {reason}, came {came}. See --image-px.")
 
 
 def _check_state(state: m.Floats, robot: m.Robot) -> None:

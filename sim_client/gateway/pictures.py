@@ -1,4 +1,4 @@
-"""Pictures from clients: decoded lazily, checked against their announced size, and resized on request.
+"""Pictures from clients: decoded lazily, checked against their announced size and each other, resized on request.
 
 PONDER reads one frame in twenty of a video at 20 Hz; the others are never decoded.
 """
@@ -56,3 +56,11 @@ def _resized(frame: NDArray[np.uint8], side_px: int) -> NDArray[np.uint8]:
     if frame.shape[:2] == (side_px, side_px):
         return frame
     return np.asarray(Image.fromarray(frame).resize((side_px, side_px), Image.Resampling.BILINEAR))
+
+
+def check_size(frames: Frames, size: tuple[int, int], reason: str) -> None:
+    """Raises Refused: a picture is not of ``size``, height and width in px."""
+    for camera, frame in frames.items():
+        if frame.shape[:2] != size:
+            expected, came = (f"{height} x {width}" for height, width in (size, frame.shape[:2]))
+            raise Refused(f"{camera}: expected {expected} px {reason}, came {came}. See --image-px.")

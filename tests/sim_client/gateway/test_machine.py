@@ -457,6 +457,6 @@ def test_a_gateway_waits_for_its_servers_and_tells_how_far_they_are(
 
 def test_a_gateway_whose_servers_are_never_ready_says_what_is_missing(bench_with: Callable[..., Any]) -> None:
     machine = bench_with(patience_ns=0).machine
-    machine._healths.drain()
+    machine._servers.hear()
     with pytest.raises(TransportError, match=r"--patience-s\): ponder is not there, pounce is not there"):
         machine.await_servers(lambda: False)
