@@ -20,14 +20,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dual_system.analysis.markdown import markdown
-from dual_system.training.recipes import laptop as laptop_joint
-from dual_system.training.recipes import laptop_grounding, laptop_hand, laptop_hand_corrected
+from dual_system.policy.plan import Stage, stages
 from protocol.command_line import command, parse
 
-TASKS = ("VideoUnmask", "PickHighlight", "MoveCube", "PickXtimes")
-EPISODES, STILLS, TOWER_MINUTES = 300, 12_000, 60
-PLAYS, PLAYS_SEED = 40, 1_000_000
-"""Episodes a task that the hand plays under the task's own text, to be corrected."""
 _ENDING_S = 120.0
 """What a command is given to save its state when a slice ends."""
 DONE, UNFINISHED, FAILED = 0, 3, 1
@@ -41,64 +36,6 @@ class PolicyOptions:
     """Where data, checkpoints and the account of hours are kept: tens of gigabytes, outside of the checkout."""
     minutes: float = 150.0
     """Length of this slice."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Stage:
-    """Commands, each a module and its arguments, that run side by side."""
-
-    name: str
-    commands: tuple[tuple[str, ...], ...]
-
-
-def stages(folder: Path) -> tuple[Stage, ...]:
-    """The stages in their order; each reads what those before it wrote."""
-    sets = {task: folder / "data" / task for task in TASKS}
-    data = tuple(map(str, sets.values()))
-    names = ("towers", "hand", "plays", "corrections", "hand_corrected", "grounding", "joint")
-    towers, hand, plays, corrections, corrected, grounded, joint = (folder / name for name in names)
-    locating = ("dual_system.policy.towers", "--out", f"{towers}", "--stills", f"{STILLS}")
-    training = ("dual_system.training.train", "--picture-store", f"{folder / 'pictures'}")
-    obeying = ("--recipe", laptop_hand.__name__, *_from(towers, towers), "--out", f"{hand}")
-    wording = ("--recipe", laptop_grounding.__name__, *_from(towers, towers), "--out", f"{grounded}")
-    again = ("--recipe", laptop_hand_corrected.__name__, *_from(towers, hand), "--out", f"{corrected}")
-    together = ("--recipe", laptop_joint.__name__, *_from(grounded, corrected), "--out", f"{joint}")
-    scenes = ("--tasks", *TASKS, "--episodes", f"{PLAYS}", "--runs", "1", "--seed", f"{PLAYS_SEED}")
-    asked = ("--pounce-checkpoint", f"{hand / 'pounce'}", "--subgoal-text", "grounded", "--max-steps", "700")
-    correcting = ("--out", f"{corrections}", "--image-px", "128", "--record-hz", "10")
-    return (
-        *(Stage(name=f"data {task}", commands=(_collect(task, out),)) for task, out in sets.items()),
-        Stage(name="album", commands=((*locating, "--minutes", "0"),)),
-        Stage(
-            name="towers",
-            commands=tuple(
-                (*locating, "--minutes", f"{TOWER_MINUTES}", "--trains", system) for system in ("ponder", "pounce")
-            ),
-        ),
-        Stage(name="pretrained", commands=((*locating, "--minutes", "0", "--data", *data),)),
-        Stage(
-            name="hand and words",
-            commands=((*training, "--data", *data, *obeying), (*training, "--data", *data, *wording)),
-        ),
-        Stage(
-            name="plays",
-            commands=(("sim_client.evaluate", "--out", f"{plays}", *scenes, *asked, "--record", "--record-hz", "1"),),
-        ),
-        Stage(name="corrections", commands=(("dual_system.data.correct", f"{plays}", *correcting),)),
-        Stage(name="hand corrected", commands=((*training, "--data", *data, f"{corrections}", *again),)),
-        Stage(name="joint", commands=((*training, "--data", *data, *together),)),
-    )
-
-
-def _from(ponder: Path, pounce: Path) -> tuple[str, ...]:
-    return "--ponder", f"{ponder / 'ponder'}", "--pounce", f"{pounce / 'pounce'}"
-
-
-def _collect(task: str, out: Path) -> tuple[str, ...]:
-    pictures = ("--image-px", "128", "--frames", "training", "--invocation-hz", "10", "--demonstration-hz", "2")
-    content = ("--noise", "dart", "--texts", "follow", "--shove-share", "0.4", "--recovery-share", "0.15")
-    amount = ("--tasks", task, "--episodes", f"{EPISODES}", "--difficulties", "easy", "medium", "hard")
-    return "dual_system.data.collect", "--out", f"{out}", *amount, *pictures, *content, "--no-progress"
 
 
 @command("policy")

@@ -32,7 +32,7 @@ from dual_system.policy.studio import WINDOWS
 from dual_system.training.build import Start, build, export
 from dual_system.training.data import TrainingSet
 from dual_system.training.joint import JointModel
-from dual_system.training.recipes import laptop_hand
+from dual_system.training.laptop_recipes import laptop_hand
 from protocol.command_line import command, parse
 
 _BATCH, _HELD_OUT = 32, 400

@@ -124,17 +124,21 @@ def _pounce(run: Recipe, data: TrainingSet, start: Start, ponder: Ponder) -> Pou
 
 
 def with_channel(run: Recipe, bundle: PounceBundle) -> PounceBundle:
-    """The bundle with the recipe's cognition prefix, freshly drawn, in place of subgoal texts, if it has none."""
+    """The bundle with the recipe's channels, freshly drawn, if it is a hand: a pi0.5 that reads no cognition yet."""
     model, wanted = bundle.model, run.pounce
-    if not isinstance(model, Pounce) or not isinstance(wanted, PounceConfig):
+    if not isinstance(model, Pounce) or not isinstance(wanted, PounceConfig) or model.config.cognition.num_carriers:
         return bundle
-    if model.config.cognition.num_carriers or not wanted.cognition.num_carriers:
+    config = replace(
+        model.config,
+        cognition=wanted.cognition,
+        reads_subgoal=wanted.reads_subgoal,
+        frame_memory=wanted.frame_memory or model.config.frame_memory,
+    )
+    if config == model.config:
         return bundle
-    config = replace(model.config, cognition=wanted.cognition, reads_subgoal=False)
-    told = random_pounce(config, run.train.seed)
-    own = {name: value for name, value in told.state_dict().items() if name.startswith("cognition_prefix.")}
-    told.load_state_dict(model.state_dict() | own)
-    return replace(bundle, model=told, has_fresh_prefix=True)
+    given = random_pounce(config, run.train.seed)
+    given.load_state_dict(given.state_dict() | model.state_dict())
+    return replace(bundle, model=given, has_fresh_prefix=config.cognition.num_carriers > 0)
 
 
 def _for_this_pair(run: Recipe, found: AnyPounceConfig, ponder: Ponder) -> AnyPounceConfig:

@@ -15,15 +15,14 @@ from clock.timebase import NS_PER_S
 from dual_system.models.frame_sampling import FrameMemoryConfig, FrameSampling
 from dual_system.models.ponder import configs as ponder_configs
 from dual_system.models.pounce import configs as pounce_configs
+from dual_system.training import laptop_recipes
 from dual_system.training.example import ExampleConfig
 from dual_system.training.optim import OptimConfig
 from dual_system.training.recipe import Recipe
-from dual_system.training.told import Told
 from dual_system.training.trainer import TrainConfig
 
 _PAPER = TrainConfig(seed=42, dropout=0.0, optim=OptimConfig())
 _TINY = TrainConfig(seed=0, dropout=0.15, optim=OptimConfig(learning_rate=3e-4, warmup_steps=50, ema_decay=0.99))
-_LAPTOP = TrainConfig(seed=0, optim=OptimConfig(learning_rate=1e-3, warmup_steps=200, ema_decay=0.999))
 _TINY_H = ponder_configs.tiny_cpu().hidden_size
 
 
@@ -232,79 +231,6 @@ def tiny_framesamp() -> Recipe:
     )
 
 
-def laptop_hand() -> Recipe:
-    """Stage B of the laptop pair: one hand for all rows, a third of them told places, a third plain texts.
-
-    It stands in for a pretrained pi0.5. Its vision tower comes trained and frozen (`policy.towers`).
-    """
-    return Recipe(
-        name="laptop_hand",
-        ponder=ponder_configs.laptop(),
-        pounce=replace(pounce_configs.laptop(num_carriers=0), reads_subgoal=True),
-        freeze="vision",
-        example=ExampleConfig(
-            clocks=sampling.ROBOMME,
-            max_invocations=8,
-            told=Told(grounded=1 / 3, simple=1 / 3, jitter_px=3.2, far_share=0.25, far_px=12.0),
-            branch_weight=3.0,
-        ),
-        train=_LAPTOP,
-        num_steps=20_000,
-        batch_episodes=8,
-        trains="pounce",
-        demo_hz=2,
-        space="ee_delta",
-        statistics_by_row=True,
-        has_own_tokenizers=True,
-    )
-
-
-def laptop_hand_corrected() -> Recipe:
-    """Stage B, its end: the hand goes on with the oracle's corrections of its own play among the data (DAgger)."""
-    return replace(laptop_hand(), name="laptop_hand_corrected", num_steps=8_000)
-
-
-def laptop_grounding() -> Recipe:
-    """Stage A2 of the laptop pair: PONDER learns the tasks' words, as the paper's did before joint training."""
-    return Recipe(
-        name="laptop_grounding",
-        ponder=ponder_configs.laptop(),
-        pounce=pounce_configs.laptop(),
-        freeze="vision",
-        freezes_ponder_vision=True,
-        example=ExampleConfig(clocks=sampling.ROBOMME),
-        train=_LAPTOP,
-        num_steps=6_000,
-        batch_episodes=8,
-        w2=1.0,
-        trains="ponder",
-        demo_hz=2,
-        space="ee_delta",
-        statistics_by_row=True,
-        has_own_tokenizers=True,
-    )
-
-
-def laptop() -> Recipe:
-    """Stage C of the laptop pair: both systems together, POUNCE told the task alone and given the cognition."""
-    return Recipe(
-        name="laptop",
-        ponder=ponder_configs.laptop(),
-        pounce=pounce_configs.laptop(),
-        freeze="vision",
-        freezes_ponder_vision=True,
-        example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=8, branch_weight=3.0),
-        train=_LAPTOP,
-        num_steps=4_000,
-        batch_episodes=8,
-        w2=0.3,  # the paper's 0.1 is for a pretrained LM head
-        demo_hz=2,
-        space="ee_delta",
-        statistics_by_row=True,
-        has_own_tokenizers=True,
-    )
-
-
 def _refreshed_every(period_s: int) -> sampling.Clocks:
     return replace(sampling.ROBOMME, query=replace(sampling.ROBOMME.query, mean_ns=period_s * NS_PER_S))
 
@@ -325,10 +251,7 @@ RECIPES: dict[str, Callable[[], Recipe]] = {
         tiny_groot,
         tiny_subgoal_text,
         tiny_framesamp,
-        laptop_hand,
-        laptop_hand_corrected,
-        laptop_grounding,
-        laptop,
+        *laptop_recipes.ALL,
     )
 }
 

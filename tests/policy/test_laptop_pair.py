@@ -19,7 +19,7 @@ from dual_system.models.pounce.reading import pi05_inputs
 from dual_system.models.windows import LAPTOP_WINDOWS, Windows
 from dual_system.training.build import with_channel
 from dual_system.training.data import PictureSizes
-from dual_system.training.recipes import laptop, laptop_hand
+from dual_system.training.laptop_recipes import laptop, laptop_hand
 from pounce_server.engine import Request
 
 CPU = torch.device("cpu")

@@ -10,6 +10,7 @@ import pytest
 
 from clock.timebase import NS_PER_S
 from dual_system.models.ponder import configs as ponder_configs
+from dual_system.training.joint import runs_ponder
 from dual_system.training.recipe import Recipe
 from dual_system.training.recipes import RECIPES, recipe
 from dual_system.training.train import InsteadOptions, _adjusted
@@ -60,7 +61,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
 
 
 def test_every_ablation_of_robomme_is_known() -> None:
-    assert {name for name in RECIPES if name.startswith("robomme_")} == set(ABLATIONS)
+    assert {name for name in RECIPES if name.startswith("robomme_")} == {*ABLATIONS, "robomme_framesamp"}
 
 
 @pytest.mark.parametrize("name", ABLATIONS)
@@ -109,8 +110,24 @@ def test_a_recipe_is_one_complete_value(name: str) -> None:
 @pytest.mark.parametrize("name", RECIPES)
 def test_both_systems_of_a_recipe_fit(name: str) -> None:
     run = recipe(name)
-    assert run.pounce.cognition.cognition_size == run.ponder.hidden_size
-    assert run.pounce.cognition.num_carriers == (0 if run.pounce.reads_subgoal else run.ponder.num_carriers)
+    num_carriers = run.pounce.cognition.num_carriers
+    if runs_ponder(run.trains, num_carriers):
+        assert run.pounce.cognition.cognition_size == run.ponder.hidden_size
+        assert num_carriers == (0 if run.pounce.reads_subgoal else run.ponder.num_carriers)
+    else:
+        assert num_carriers == 0
+
+
+@pytest.mark.parametrize("name", [name for name in RECIPES if name.startswith("laptop")])
+def test_every_row_of_the_laptop_table_has_the_same_chances(name: str) -> None:
+    """Same data, steps, batches, rates and branch points as the pair; only the channel differs."""
+    row, pair, hand = recipe(name), recipe("laptop"), recipe("laptop_hand_corrected")
+    assert (row.train, row.batch_episodes, row.space) == (pair.train, pair.batch_episodes, pair.space)
+    assert row.pounce.pi05 == pair.pounce.pi05 == hand.pounce.pi05
+    if name not in ("laptop_hand", "laptop_hand_corrected", "laptop_grounding"):
+        assert row.num_steps == pair.num_steps
+        for field in ("clocks", "max_invocations", "branch_weight"):
+            assert getattr(row.example, field) == getattr(pair.example, field)
 
 
 def test_a_mistyped_name_is_answered_with_the_nearest() -> None:

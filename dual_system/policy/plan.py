@@ -1,0 +1,103 @@
+"""What is run for the laptop pair and its baselines, in which order, on which data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from dual_system.training import laptop_recipes as recipes
+
+TASKS = ("VideoUnmask", "PickHighlight", "MoveCube", "PickXtimes")
+EPISODES, STILLS, TOWER_MINUTES = 300, 12_000, 60
+PLAYS, PLAYS_SEED = 40, 1_000_000
+"""Episodes a task that the hand plays under the task's own text, to be corrected."""
+
+ROWS = (
+    (recipes.laptop, 0),
+    (recipes.laptop, 1),
+    (recipes.laptop_observation, 0),
+    (recipes.laptop_observation, 1),
+    (recipes.laptop_framesamp, 0),
+    (recipes.laptop_framesamp, 1),
+    (recipes.laptop_without_grounding, 0),
+    (recipes.laptop_window, 0),
+    (recipes.laptop_text, 0),
+)
+"""The rows of the table that are trained: recipe and seed, two at a time, one on each core."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stage:
+    """Commands, each a module and its arguments, that run side by side."""
+
+    name: str
+    commands: tuple[tuple[str, ...], ...]
+
+
+def stages(folder: Path) -> tuple[Stage, ...]:
+    """The stages in their order; each reads what those before it wrote."""
+    names = ("towers", "words", "hand", "plays", "corrections", "corrected")
+    towers, words, hand, plays, corrections, corrected = (folder / name for name in names)
+    sets = [folder / "data" / task for task in TASKS]
+    data = ("--data", *map(str, sets))
+    locating = ("dual_system.policy.towers", "--out", f"{towers}", "--stills", f"{STILLS}")
+    training = ("dual_system.training.train", "--picture-store", f"{folder / 'pictures'}")
+    scenes = ("--tasks", *TASKS, "--episodes", f"{PLAYS}", "--runs", "1", "--seed", f"{PLAYS_SEED}")
+    asked = ("--pounce-checkpoint", f"{hand / 'pounce'}", "--subgoal-text", "grounded", "--max-steps", "700")
+    playing = ("sim_client.evaluate", "--out", f"{plays}", *scenes, *asked, "--record", "--record-hz", "1")
+    correcting = ("dual_system.data.correct", f"{plays}", "--out", f"{corrections}")
+    rows = [(*training, *data, *_row(folder, recipe.__name__, seed)) for recipe, seed in ROWS]
+    return (
+        *(Stage(name=f"data {out.name}", commands=(_collect(out),)) for out in sets),
+        Stage(name="album", commands=((*locating, "--minutes", "0"),)),
+        Stage(
+            name="towers",
+            commands=tuple(
+                (*locating, "--minutes", f"{TOWER_MINUTES}", "--trains", system) for system in ("ponder", "pounce")
+            ),
+        ),
+        Stage(name="pretrained", commands=((*locating, "--minutes", "0", *data),)),
+        Stage(
+            name="hand and words",
+            commands=(
+                (*training, *data, *_run(recipes.laptop_hand.__name__, towers, towers, hand)),
+                (*training, *data, *_run(recipes.laptop_grounding.__name__, towers, towers, words)),
+            ),
+        ),
+        Stage(name="plays", commands=(playing,)),
+        Stage(name="corrections", commands=((*correcting, "--image-px", "128", "--record-hz", "10"),)),
+        Stage(
+            name="hand corrected",
+            commands=(
+                (
+                    *training,
+                    *data,
+                    f"{corrections}",
+                    *_run(recipes.laptop_hand_corrected.__name__, towers, hand, corrected),
+                ),
+            ),
+        ),
+        *(
+            Stage(name=f"rows {first // 2 + 1}", commands=tuple(rows[first : first + 2]))
+            for first in range(0, len(rows), 2)
+        ),
+    )
+
+
+def _row(folder: Path, recipe: str, seed: int) -> Sequence[str]:
+    """A row's options; without grounding PONDER has not learned the tasks' words before either."""
+    ponder = folder / ("towers" if recipe == recipes.laptop_without_grounding.__name__ else "words")
+    run = _run(recipe, ponder, folder / "corrected", folder / "rows" / f"{recipe}_{seed}")
+    return *run, "--seed", f"{seed}"
+
+
+def _run(recipe: str, ponder: Path, pounce: Path, out: Path) -> Sequence[str]:
+    return "--recipe", recipe, "--ponder", f"{ponder / 'ponder'}", "--pounce", f"{pounce / 'pounce'}", "--out", f"{out}"
+
+
+def _collect(out: Path) -> tuple[str, ...]:
+    pictures = ("--image-px", "128", "--frames", "training", "--invocation-hz", "10", "--demonstration-hz", "2")
+    content = ("--noise", "dart", "--texts", "follow", "--shove-share", "0.4", "--recovery-share", "0.15")
+    amount = ("--tasks", out.name, "--episodes", f"{EPISODES}", "--difficulties", "easy", "medium", "hard")
+    return "dual_system.data.collect", "--out", f"{out}", *amount, *pictures, *content, "--no-progress"

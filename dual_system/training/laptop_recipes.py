@@ -1,0 +1,152 @@
+"""Recipes of the pair that two CPU cores train: its stages, and the baselines that share its hand, data and steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from clock import sampling
+from dual_system.models.frame_sampling import FrameMemoryConfig, FrameSampling
+from dual_system.models.pi05.pounce import PounceConfig
+from dual_system.models.ponder import configs as ponder_configs
+from dual_system.models.pounce import configs as pounce_configs
+from dual_system.training.example import ExampleConfig
+from dual_system.training.optim import OptimConfig
+from dual_system.training.recipe import Recipe
+from dual_system.training.told import Told
+from dual_system.training.trainer import TrainConfig
+
+_LAPTOP = TrainConfig(seed=0, optim=OptimConfig(learning_rate=1e-3, warmup_steps=200, ema_decay=0.999))
+_ROW_STEPS = 4_000
+"""Steps that every row of the table goes on with, whatever its channel."""
+
+
+def laptop_hand() -> Recipe:
+    """Stage B of the laptop pair: one hand for all rows, a third of them told places, a third plain texts.
+
+    It stands in for a pretrained pi0.5. Its vision tower comes trained and frozen (`policy.towers`).
+    """
+    return Recipe(
+        name="laptop_hand",
+        ponder=ponder_configs.laptop(),
+        pounce=replace(pounce_configs.laptop(num_carriers=0), reads_subgoal=True),
+        freeze="vision",
+        example=ExampleConfig(
+            clocks=sampling.ROBOMME,
+            max_invocations=8,
+            told=Told(grounded=1 / 3, simple=1 / 3, jitter_px=3.2, far_share=0.25, far_px=12.0),
+            branch_weight=3.0,
+        ),
+        train=_LAPTOP,
+        num_steps=20_000,
+        batch_episodes=8,
+        trains="pounce",
+        demo_hz=2,
+        space="ee_delta",
+        statistics_by_row=True,
+        has_own_tokenizers=True,
+    )
+
+
+def laptop_hand_corrected() -> Recipe:
+    """Stage B, its end: the hand goes on with the oracle's corrections of its own play among the data (DAgger)."""
+    return replace(laptop_hand(), name="laptop_hand_corrected", num_steps=8_000)
+
+
+def laptop_grounding() -> Recipe:
+    """Stage A2 of the laptop pair: PONDER learns the tasks' words, as the paper's did before joint training."""
+    return Recipe(
+        name="laptop_grounding",
+        ponder=ponder_configs.laptop(),
+        pounce=pounce_configs.laptop(),
+        freeze="vision",
+        freezes_ponder_vision=True,
+        example=ExampleConfig(clocks=sampling.ROBOMME),
+        train=_LAPTOP,
+        num_steps=6_000,
+        batch_episodes=8,
+        w2=1.0,
+        trains="ponder",
+        demo_hz=2,
+        space="ee_delta",
+        statistics_by_row=True,
+        has_own_tokenizers=True,
+    )
+
+
+def laptop() -> Recipe:
+    """Stage C of the laptop pair: both systems together, POUNCE told the task alone and given the cognition."""
+    return Recipe(
+        name="laptop",
+        ponder=ponder_configs.laptop(),
+        pounce=pounce_configs.laptop(),
+        freeze="vision",
+        freezes_ponder_vision=True,
+        example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=8, branch_weight=3.0),
+        train=_LAPTOP,
+        num_steps=_ROW_STEPS,
+        batch_episodes=8,
+        w2=0.3,  # the paper's 0.1 is for a pretrained LM head
+        demo_hz=2,
+        space="ee_delta",
+        statistics_by_row=True,
+        has_own_tokenizers=True,
+    )
+
+
+def laptop_without_grounding() -> Recipe:
+    """Row: w2 = 0, from a PONDER that knows pictures and no words of the tasks."""
+    run = laptop()
+    return replace(
+        run,
+        name="laptop_without_grounding",
+        example=replace(run.example, is_grounded=False, has_reasoning=False),
+        w2=0.0,
+    )
+
+
+def laptop_observation() -> Recipe:
+    """Row: the current observation and the task alone, trained so."""
+    return _of_the_hand("laptop_observation", pounce_configs.laptop(num_carriers=0), _NOTHING)
+
+
+def laptop_text() -> Recipe:
+    """Row: subgoal texts, with places twice as often as without; the oracle's and PONDER's are read by one hand."""
+    pounce = replace(pounce_configs.laptop(num_carriers=0), reads_subgoal=True)
+    return _of_the_hand("laptop_text", pounce, Told(grounded=2 / 3, simple=1 / 3))
+
+
+def laptop_framesamp() -> Recipe:
+    """Row: FrameSamp+Modul, 16 pictures spread evenly over all that was seen."""
+    return _of_the_hand("laptop_framesamp", _with_frames(FrameSampling(num_frames=16, stride_ticks=10)), _NOTHING)
+
+
+def laptop_window() -> Recipe:
+    """Row: FrameSamp's consumer on the last six pictures, one a second."""
+    newest = FrameSampling(num_frames=6, rule="newest", stride_ticks=20)
+    return replace(_of_the_hand("laptop_window", _with_frames(newest), _NOTHING), demo_hz=1)
+
+
+def _with_frames(sampling: FrameSampling) -> PounceConfig:
+    memory = FrameMemoryConfig(sampling=sampling, position_size=96, num_heads=4, head_dim=32)
+    return replace(pounce_configs.laptop(num_carriers=0), frame_memory=memory)
+
+
+def _of_the_hand(name: str, pounce: PounceConfig, told: Told) -> Recipe:
+    run = laptop_hand()
+    return replace(run, name=name, pounce=pounce, example=replace(run.example, told=told), num_steps=_ROW_STEPS)
+
+
+_NOTHING = Told(grounded=0.0, simple=0.0)
+
+ALL: tuple[Callable[[], Recipe], ...] = (
+    laptop_hand,
+    laptop_hand_corrected,
+    laptop_grounding,
+    laptop,
+    laptop_without_grounding,
+    laptop_observation,
+    laptop_text,
+    laptop_framesamp,
+    laptop_window,
+)
