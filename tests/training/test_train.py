@@ -228,7 +228,14 @@ def test_who_makes_the_batches_changes_nothing(folder: Path, finished: Path, tmp
 def test_both_tokenizers_can_be_trained_on_the_data(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    own = replace(recipes.recipe("tiny"), has_own_tokenizers=True)
+    tiny = recipes.recipe("tiny")
+    assert isinstance(tiny.pounce, PounceConfig)
+    own = replace(  # with room for a token for every place
+        tiny,
+        ponder=replace(tiny.ponder, vocab_size=2048, first_carrier_id=2000),
+        pounce=replace(tiny.pounce, pi05=replace(tiny.pounce.pi05, vocab_size=1024)),
+        has_own_tokenizers=True,
+    )
     monkeypatch.setitem(recipes.RECIPES, "own", lambda: own)
     lengths = {}
     for name in ("tiny", "own"):
