@@ -39,7 +39,11 @@ def local_folder(path: Path, kind: Literal["model", "dataset"] = "model") -> Pat
         ) from None
     try:
         found = hub.snapshot_download(
-            named["repo"], repo_type=kind, revision=named["revision"], allow_patterns=_FILES[kind]
+            named["repo"],
+            repo_type=kind,
+            revision=named["revision"],
+            allow_patterns=_FILES[kind],
+            local_files_only=hub.constants.HF_HUB_OFFLINE,  # huggingface-hub 1.33 asks for a commit's list of files
         )
     except (OSError, ValueError, RuntimeError) as error:  # its errors are these: no network, no such id, no access
         told = " ".join(str(error).split())[:300]
