@@ -10,6 +10,7 @@ Without PONDER, a POUNCE that reads text is told what comes next in either branc
 from __future__ import annotations
 
 import importlib
+import shlex
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -90,7 +91,8 @@ def main(argv: list[str] | None = None, prog: str = "pp-diagnose counterfactual"
     write_json(
         options.out / COUNTERFACTUAL, {"schema": SCHEMA, "config": flat(options), "models": models, "pairs": entries}
     )
-    sys.stdout.write(f"{options.out / COUNTERFACTUAL}; tables: pp-tables {options.out} --out {options.out}\n")
+    folder = shlex.quote(str(options.out))
+    sys.stdout.write(f"{options.out / COUNTERFACTUAL}; tables: pp-tables {folder} --out {folder}\n")
     return 0
 
 

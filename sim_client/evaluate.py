@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shlex
 import sys
 from collections.abc import Iterable
 from functools import cache
@@ -58,7 +59,8 @@ def main(argv: list[str] | None = None) -> int:
     for task in sorted({episode["task"] for episode in episodes}):
         successes = [episode["success"] for episode in episodes if episode["task"] == task]
         sys.stdout.write(f"{task}: {sum(successes)} of {len(successes)}\n")
-    sys.stdout.write(f"{options.out / 'results.json'}; tables: pp-tables {options.out} --out {options.out}\n")
+    folder = shlex.quote(str(options.out))
+    sys.stdout.write(f"{options.out / 'results.json'}; tables: pp-tables {folder} --out {folder}\n")
     return DONE
 
 

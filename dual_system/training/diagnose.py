@@ -15,6 +15,7 @@ PONDER's row has the recorded texts, as in training. ``pp-tables`` makes tables 
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -92,7 +93,8 @@ def main(argv: list[str] | None = None) -> int:
     found = diagnose(options)
     with files.writing(options.out / DIAGNOSIS):
         (options.out / DIAGNOSIS).write_text(json.dumps(found, indent=1) + "\n")
-    sys.stdout.write(f"{options.out / DIAGNOSIS}; tables: pp-tables {options.out} --out {options.out}\n")
+    folder = shlex.quote(str(options.out))
+    sys.stdout.write(f"{options.out / DIAGNOSIS}; tables: pp-tables {folder} --out {folder}\n")
     return 0
 
 
@@ -113,15 +115,16 @@ def diagnose(options: DiagnoseOptions) -> dict[str, Any]:
     sizes = PictureSizes.of(ponder.format, pounce.config)
     data = TrainingSet(options.data, tasks=options.tasks, sizes=sizes, demo_hz=ponder.format.demonstrations.hz)
     numbers = in_turns([task for task, _ in data.names], options.episodes)
+    tasks = [data.names[number][0] for number in numbers]
+    others = [next_alike(tasks, place) for place in range(len(tasks))]
     examples = [_example(data, number, ponder) for number in numbers]
     shown = tqdm(examples, desc="PONDER", unit="episode", disable=not options.progress)
     cognitions = [_cognition(ponder, example) for example in shown]
-    tasks = [data.names[number][0] for number in numbers]
     episodes = []
     places = tqdm(range(len(examples)), desc="POUNCE", unit="episode", disable=not options.progress)
     for place in places:
         task, seed = data.names[numbers[place]]
-        other = cognitions[next_alike(tasks, place)]
+        other = cognitions[others[place]]
         generator = torch.Generator().manual_seed(options.seed * 1_000_003 + place)
         measured = measure(bundle, examples[place], cognitions[place], other, options.draws, generator)
         episodes.append({"task": task, "seed": seed} | measured)

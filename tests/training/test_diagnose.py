@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -171,13 +172,16 @@ def test_one_command_measures_and_another_draws(tmp_path: Path, capsys: pytest.C
     save_ponder(PONDER, tmp_path / "ponder")
     save_bundle(BUNDLE, tmp_path / "pounce")
     arguments = ["--ponder", str(tmp_path / "ponder"), "--pounce", str(tmp_path / "pounce"), "--draws", "1"]
-    arguments += ["--data", str(dataset(tmp_path / "data", 2)), "--out", str(tmp_path / "out"), "--no-progress"]
+    out = tmp_path / "täglich 測試 'x'"
+    arguments += ["--data", str(dataset(tmp_path / "data", 2)), "--out", str(out), "--no-progress"]
     assert diagnose.main(arguments) == 0
-    found = read_diagnosis(tmp_path / "out")
+    found = read_diagnosis(out)
     assert found.is_untrained
     assert [found.parts[part].total_ticks for part in ("staleness", "all", "branch")] == [2 * 3, 2 * 7, 2 * 2]
-    assert tables.main([str(tmp_path / "out"), "--out", str(tmp_path)]) == 0
-    assert (tmp_path / "staleness.png").exists()
+    advice = shlex.split(capsys.readouterr().out.partition("tables: ")[2])  # as a person pastes it
+    assert advice == ["pp-tables", str(out), "--out", str(out)]
+    assert tables.main(advice[1:]) == 0
+    assert (out / "staleness.png").exists()
     assert diagnose.main([*arguments, "--episodes", "1"]) == 2
     assert "at least two" in capsys.readouterr().err
 

@@ -11,6 +11,7 @@ Facts and their grades: docs/official.md.
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 import sys
 from collections.abc import Sequence
@@ -231,10 +232,11 @@ def main(argv: list[str] | None = None, prog: str = "pp-parity import-official")
         sys.stdout.write(f"note      {note}\n")
     for what, how in facts["assumptions"].items():
         sys.stdout.write(f"assumed   {what}: {how}\n")
+    ponder_folder, pounce_folder = (shlex.quote(str(options.out / name)) for name in ("ponder", "pounce"))
     sys.stdout.write(
         f"imported  {facts['num_tensors']} tensors, {facts['num_parameters']:,} numbers -> {options.out}\n"
-        f"serve     ponder-serve --checkpoint {options.out}/ponder\n"
-        f"          pounce-serve --checkpoint {options.out}/pounce\n"
+        f"serve     ponder-serve --checkpoint {ponder_folder}\n"
+        f"          pounce-serve --checkpoint {pounce_folder}\n"
         "before    a robot moves: compare with the official code, `pp-parity answers`; see docs/official.md\n"
     )
     return 0
