@@ -96,6 +96,7 @@ peers: setup site $(LEROBOT)/.ready $(ROSBAGS)/.ready $(FOXGLOVE)/.ready $(GRAFA
 	PYTHONPATH=$(GRAFANA) $(BIN)/python -m benchmarks.peers --jobs $(JOBS) --pythons $(VENV)/peers/3.12/bin/python $(VENV)/peers/3.13/bin/python \
 		--lerobot $(LEROBOT)/bin/python --rosbags $(ROSBAGS)/bin/python \
 		$$(test -d $(FOXGLOVE)/node_modules && echo --foxglove $(FOXGLOVE)/node_modules)
+	$(BIN)/python -m benchmarks.render
 
 ## make wheels  every extra from the built wheel in an environment of its own (python3.11 to 3.13; an hour)
 wheels: setup

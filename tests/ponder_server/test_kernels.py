@@ -114,7 +114,8 @@ def test_recurrence(num_rows: int, length: int, heads: tuple[int, int], dtype: t
             num_kept[row, None],
             Keep(once[:, 2], torch.zeros(1, dtype=torch.long)),
         )
-        torch.testing.assert_close(after[1][slots[row], 2], once[slots[row], 1], rtol=0, atol=0)
+        # Not bit for bit: the twin's products of one row and of several may add up in another order.
+        torch.testing.assert_close(after[1][slots[row], 2], once[slots[row], 1], rtol=1e-4, atol=1e-6)
 
 
 @interpreted
