@@ -61,6 +61,9 @@ class RobotSide:
     looks: Callable[[int], bool] = always
     first_done_tick: int | None = None
     """The first tick whose observation shows the first subtask done."""
+    first_choice: bool | None = None
+    """Whether the episode's first choice was right; None if it made none."""
+    first_choice_tick: int | None = None
     _tick: int = 0
     _start_ns: int = 0
     _control_hz: int = 1
@@ -149,6 +152,8 @@ class RobotSide:
         self._texts, self._subgoal_index = texts, snapshot.subgoal_index
         if self.first_done_tick is None and snapshot.subtask_index > 0:
             self.first_done_tick = self._tick
+        if self.first_choice is None and snapshot.first_choice is not None:
+            self.first_choice, self.first_choice_tick = snapshot.first_choice, self._tick
 
     def _hold(self) -> None:
         for ticks in range(round(HOLD_S * self._control_hz)):

@@ -13,7 +13,7 @@ import numpy as np
 
 from clock.schedules import HORIZON
 from clock.service import ClockService
-from dual_system.analysis.ceiling import ceiling_in
+from dual_system.analysis.ceiling import ceiling_in, first_choice_in
 from dual_system.models.ponder.demo_sampling import DemoSampling
 from dual_system.tasks.environment import Environment, Snapshot, make_environment
 from dual_system.tasks.physics import CONTROL_HZ
@@ -113,7 +113,7 @@ class Suite:
         side = RobotSide(
             self._link, self._actions, environment, self._recorder, self._end.take_turn, self._patience_ns, self._looks
         )
-        ceiling = ceiling_in(task, environment.layout)
+        ceiling, chance = ceiling_in(task, environment.layout), first_choice_in(task, environment.layout)
         opened = m.OpenReply()
         self._recorder.begin(info, path)
         if info.policy == "oracle":
@@ -140,6 +140,9 @@ class Suite:
             "steps": result.num_ticks,
             "first_done_tick": side.first_done_tick,
             "ceiling_without_memory": None if ceiling is None else [*ceiling.as_integer_ratio()],
+            "first_choice": None if side.first_choice is None else "right" if side.first_choice else "wrong",
+            "first_choice_tick": side.first_choice_tick,
+            "first_choice_chance": None if chance is None else [*chance.as_integer_ratio()],
             "stream_sha256": result.stream_sha256,
             "mcap": str(path.relative_to(self._options.out)) if path else None,
             "models": {contract.proc: _model(contract) for contract in opened.contracts},

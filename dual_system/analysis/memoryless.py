@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from dual_system.tasks.engine import Status
-from dual_system.tasks.environment import Environment
+from dual_system.tasks.environment import Environment, Snapshot
 from dual_system.tasks.imitation.move_cube import MANNERS
 from dual_system.tasks.imitation.pattern_lock import neighbours
 from dual_system.tasks.kinematics import UnreachableError
@@ -31,6 +31,8 @@ class Play:
     """One episode of the player."""
 
     is_success: bool
+    first_choice: bool | None
+    """Whether the first choice was right; None if there was none."""
     began: tuple[int, ...]
     """The steps at which its motions began."""
     layout: Any
@@ -54,10 +56,15 @@ def play(environment: Environment, seed: int, difficulty: str | None = None, *, 
             for action in act.motion(motions):
                 snapshot = environment.step(action, look=False)
                 if snapshot.status is not Status.ONGOING:
-                    return Play(is_success=snapshot.status is Status.SUCCESS, began=tuple(began), layout=layout)
+                    return _played(snapshot, began, layout)
         except UnreachableError:
             break
-    return Play(is_success=False, began=tuple(began), layout=layout)
+    return _played(snapshot, began, layout)
+
+
+def _played(last: Snapshot, began: list[int], layout: Any) -> Play:
+    is_success = last.status is Status.SUCCESS
+    return Play(is_success=is_success, first_choice=last.first_choice, began=tuple(began), layout=layout)
 
 
 def _unmask(task: Task[Any, Any], layout: Any, rng: np.random.Generator) -> Iterable[Subtask]:

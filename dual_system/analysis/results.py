@@ -19,6 +19,7 @@ from protocol.errors import CommandError
 
 Scene = tuple[int, str]  # seed and difficulty, which determine a task's scene
 RESULTS = "results.json"
+_CHOICES = {"right": 1, "wrong": 0, None: -1}
 
 
 class ResultsError(CommandError):
@@ -37,6 +38,10 @@ class Results:
         ceilings: per task, of the E scenes: the ceiling without memory as recorded, else its mean over the difficulty's
             scenes; None if none is known.
         first_done: per task, (R, E): the tick at which the first subtask was done; -1 if never, or not recorded.
+        first_choices: per task, (R, E): 1 where the first choice was right, 0 where it was wrong, -1 where there was
+            none or it was not recorded.
+        chose: per task, (R, E): the tick of the first choice; -1 where there was none.
+        chances: per task, of the E scenes: the recorded chance of a right first choice without memory; None if none is.
         num_carriers, is_untrained: PONDER's K, and whether either model is random; None and False if unknown.
     """
 
@@ -46,6 +51,9 @@ class Results:
     scenes: Mapping[str, tuple[Scene, ...]]
     ceilings: Mapping[str, tuple[Fraction | None, ...]]
     first_done: Mapping[str, NDArray[np.int64]]
+    first_choices: Mapping[str, NDArray[np.int64]]
+    chose: Mapping[str, NDArray[np.int64]]
+    chances: Mapping[str, tuple[Fraction | None, ...]]
     num_carriers: int | None = None
     is_untrained: bool = False
 
@@ -78,7 +86,11 @@ def read_results(path: Path) -> Results:
         cells = Counter((e["task"], e.get("run", 0), (e["seed"], e["difficulty"])) for e in episodes)
         by_cell = {(e["task"], e.get("run", 0), (e["seed"], e["difficulty"])): e for e in episodes}
         successes = {cell: bool(e["success"]) for cell, e in by_cell.items()}
-        done = {cell: -1 if (at := e.get("first_done_tick")) is None else int(at) for cell, e in by_cell.items()}
+        done = {cell: _tick(e, "first_done_tick") for cell, e in by_cell.items()}
+        chose = {cell: _tick(e, "first_choice_tick") for cell, e in by_cell.items()}
+        choices = {cell: _CHOICES[e.get("first_choice")] for cell, e in by_cell.items()}
+        of_chance = {(e["task"], (e["seed"], e["difficulty"])): e.get("first_choice_chance") for e in episodes}
+        chances = {scene: Fraction(*map(int, ratio)) if ratio else None for scene, ratio in of_chance.items()}
         recorded = {(e["task"], e["seed"], e["difficulty"]): e.get("ceiling_without_memory") for e in episodes}
         ceilings = {
             (task, (seed, difficulty)): Fraction(*map(int, ratio)) if ratio else ceiling_of(task, difficulty)
@@ -105,22 +117,30 @@ def read_results(path: Path) -> Results:
             f"{file}: {len(missing)} episodes are missing, the first is {task} seed {seed} of run {run}; start the "
             "same pp-eval again, it goes on where it was"
         )
+
+    def of_cells(values: Mapping[tuple[str, int, Scene], int]) -> dict[str, NDArray[np.int64]]:
+        return {
+            task: np.array([[int(values[task, run, scene]) for scene in of_task] for run in runs])
+            for task, of_task in scenes.items()
+        }
+
     return Results(
         label=str(path.parent if path.name == RESULTS else path),
         config=config,
-        outcomes={
-            task: np.array([[int(successes[task, run, scene]) for scene in of_task] for run in runs])
-            for task, of_task in scenes.items()
-        },
+        outcomes=of_cells(successes),
         scenes=scenes,
         ceilings={task: tuple(ceilings[task, scene] for scene in of_task) for task, of_task in scenes.items()},
-        first_done={
-            task: np.array([[done[task, run, scene] for scene in of_task] for run in runs])
-            for task, of_task in scenes.items()
-        },
+        first_done=of_cells(done),
+        first_choices=of_cells(choices),
+        chose=of_cells(chose),
+        chances={task: tuple(chances[task, scene] for scene in of_task) for task, of_task in scenes.items()},
         num_carriers=num_carriers,
         is_untrained=is_untrained,
     )
+
+
+def _tick(episode: Mapping[str, Any], name: str) -> int:
+    return -1 if (at := episode.get(name)) is None else int(at)
 
 
 def read_comparable(paths: Sequence[Path]) -> list[Results]:

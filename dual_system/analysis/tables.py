@@ -18,6 +18,7 @@ from dual_system.analysis.ceiling_tables import ceilings
 from dual_system.analysis.counterfactual import COUNTERFACTUAL, read_counterfactual
 from dual_system.analysis.diagnosis import DIAGNOSIS, read_diagnosis
 from dual_system.analysis.diagnosis_tables import counterfactual_table, diagnosis_tables
+from dual_system.analysis.first_choices import ABOUT_FIRST_CHOICES, first_choices
 from dual_system.analysis.markdown import markdown, percent
 from dual_system.analysis.results import Results, ResultsError, read_comparable
 from dual_system.analysis.statistics import bootstrap, paired, wilson
@@ -74,6 +75,8 @@ def tables(results: Sequence[Results]) -> str:
     parts = ["# Evaluation", NOTE, "\n".join(_about(each) for each in results)]
     parts += ["## By family (form of the paper's Table 1)", by_family(results)]
     parts += ["## By task (form of the paper's Table 7)", by_task(results), *ceilings(results)]
+    if first := first_choices(results):
+        parts += ["## First choice", ABOUT_FIRST_CHOICES, first]
     if len(results) > 1:
         parts += ["## Between conditions (form of the paper's Tables 3 and 4)", between_conditions(results)]
     return "\n\n".join(parts) + "\n"

@@ -31,6 +31,7 @@ class Progress:
     index: int = 0
     status: Status = Status.ONGOING
     reason: str = ""
+    first_choice: bool | None = None  # whether the first one was right, see `Task.first_choice`; it decides nothing
 
 
 def judge(

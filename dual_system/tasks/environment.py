@@ -45,6 +45,7 @@ class Snapshot:
     subtask_index: int  # the engine's; the texts follow it one step later, as upstream delivers them
     subgoal_index: int  # the subtask that the texts describe; two in a row may have the same text
     is_demonstration: bool = False  # a frame of the conditioning video; outcome and subtask are then those of a start
+    first_choice: bool | None = None  # whether the episode's first choice was right; None before it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -309,8 +310,11 @@ class Environment:
         before, self._memory = self._memory, self.task.remember(self._memory, self.physics, self._layout)
         if self._memory != before:
             self._reorder()
+        chosen = self._progress.first_choice
+        if chosen is None:
+            chosen = self.task.first_choice(self.physics, self._memory, self._layout, self._progress.index)
         self._progress = engine.judge(
-            self._progress,
+            replace(self._progress, first_choice=chosen),
             self._subtasks,
             self.physics,
             self._memory,
@@ -318,7 +322,7 @@ class Environment:
         )
         if self._progress.status is Status.ONGOING and self._step >= self._max_steps:
             reason = f"not done after {self._max_steps} steps"
-            self._progress = Progress(index=self._progress.index, status=Status.TIMEOUT, reason=reason)
+            self._progress = replace(self._progress, status=Status.TIMEOUT, reason=reason)
         if self._progress.index == described and (again := self._to_pick_up_again()) is not None:
             described = again
         subtask = self._subtasks[described]
@@ -414,6 +418,7 @@ class Environment:
             subtask_index=progress.index,
             subgoal_index=caption.index,
             is_demonstration=is_demonstration,
+            first_choice=progress.first_choice,
         )
 
     def _require_episode(self) -> None:

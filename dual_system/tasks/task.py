@@ -154,6 +154,17 @@ class Task(ABC, Generic[LayoutT, MemoryT]):
         """
         return
 
+    def first_choice(self, physics: Physics, memory: MemoryT, layout: LayoutT, index: int) -> bool | None:
+        """Returns whether what this observation commits to is right; None if it commits to nothing.
+
+        It asks for the one thing, manner or count that only the past tells, and for little skill: the first answer of
+        an episode that is not None is its first choice. It decides no outcome.
+
+        Args:
+            index: of the subtask that was current before this observation.
+        """
+        return None
+
     def is_accomplished(self, memory: MemoryT, layout: LayoutT) -> bool:
         """Returns whether the whole task is done regardless of the list. The default leaves it to the list."""
         return False

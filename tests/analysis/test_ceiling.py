@@ -12,8 +12,16 @@ from math import comb
 import numpy as np
 import pytest
 
-from dual_system.analysis.ceiling import LAST_DISC_STEP, ceiling_in, ceiling_of, highlight, rounds, unmask
-from dual_system.analysis.memoryless import PLAYERS, Play, play
+from dual_system.analysis.ceiling import (
+    LAST_DISC_STEP,
+    ceiling_in,
+    ceiling_of,
+    first_choice_in,
+    highlight,
+    rounds,
+    unmask,
+)
+from dual_system.analysis.memoryless import PLAYERS, play
 from dual_system.tasks.difficulty import DIFFICULTIES
 from dual_system.tasks.environment import Environment, make_environment
 from dual_system.tasks.reference.pick_highlight import HIGHLIGHT_STEPS
@@ -88,6 +96,7 @@ def test_the_discs_are_seen_until_then() -> None:
 def test_of_other_tasks_none_is_claimed() -> None:
     assert ceiling_of("StopCube", "easy") is None
     assert ceiling_in("StopCube", object()) is None
+    assert first_choice_in("StopCube", object()) is None
 
 
 @pytest.fixture(scope="module")
@@ -104,11 +113,11 @@ def odds_of_so_few(num_hits: int, chances: list[float]) -> tuple[float, float]:
     return float(exactly[: num_hits + 1].sum()), float(exactly[num_hits:].sum())
 
 
-def agree(plays: list[Play], chances: list[Fraction | None]) -> None:
-    """The player's successes lie within the central 99 % of what the ceilings' scenes would give."""
+def agree(hits: list[bool], chances: list[Fraction | None]) -> None:
+    """The player's hits lie within the central 99 % of what the scenes' chances would give."""
     known = [float(chance) for chance in chances if chance is not None]
-    assert len(known) == len(plays)
-    assert min(odds_of_so_few(sum(each.is_success for each in plays), known)) > 0.005
+    assert len(known) == len(hits)
+    assert min(odds_of_so_few(sum(hits), known)) > 0.005
 
 
 def check_player(environment: Environment, num_scenes: int) -> None:
@@ -117,7 +126,12 @@ def check_player(environment: Environment, num_scenes: int) -> None:
     plays = [play(environment, seed, difficulty) for seed in range(FIRST_SEED, FIRST_SEED + num_scenes)]
     assert any(each.is_success for each in plays)
     assert not all(each.is_success for each in plays)
-    agree(plays, [ceiling_in(environment.task.name, each.layout) for each in plays])
+    agree([each.is_success for each in plays], [ceiling_in(environment.task.name, each.layout) for each in plays])
+    chose = [each for each in plays if each.first_choice is not None]
+    assert len(chose) >= 0.9 * len(plays)
+    chances = [first_choice_in(environment.task.name, each.layout) for each in chose]
+    agree([bool(each.first_choice) for each in chose], chances)
+    assert not any(each.is_success and not each.first_choice for each in plays), "success begins with a right choice"
 
 
 @pytest.mark.parametrize("task", PLAYERS)
@@ -135,7 +149,8 @@ def test_who_chose_in_sight_of_the_discs_succeeds_more_often(environment_of: Env
     seeds = range(FIRST_SEED, FIRST_SEED + 12)
     plays = [play(environment_of("PickHighlight"), seed, saw_one=True) for seed in seeds]
     counts = [(len(each.layout.cubes), len(each.layout.targets)) for each in plays]
-    agree(plays, [highlight(*each, saw_one=True) for each in counts])
+    agree([each.is_success for each in plays], [highlight(*each, saw_one=True) for each in counts])
+    assert all(each.first_choice for each in plays)
     assert all(each.is_success for each, (_, num_targets) in zip(plays, counts, strict=True) if num_targets == 1)
 
 

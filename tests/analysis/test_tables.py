@@ -68,6 +68,25 @@ CONDITIONS = """\
 | null | the null cognition | 1000 ms | 300 ms |  | 0.00 [0.0, 0.0] | 100.00 [100.0, 100.0] | 33.33 [33.3, 33.3] | -33.33 [-33.3, -33.3] | 0, 4 | 0.12 |"""  # noqa: E501
 
 
+CHOSEN = {
+    "PickHighlight": [("right", 140, 90, [1, 3]), ("wrong", 200, 120, [1, 2]), ("wrong", 80, None, [1, 3]),
+                      ("right", 80, 99, [1, 3]), *[(None, None, None, [1, n]) for n in (3, 2, 3, 3)]],
+    "MoveCube": [("right", 50, None, [1, 3]), ("wrong", 50, None, [1, 3]), (None, None, None, [1, 3]),
+                 ("right", 50, None, [1, 3]), ("right", 50, None, [1, 3]), *[(None, None, None, [1, 3])] * 3],
+    "PickXtimes": [(None, None, 30, [1, 4])] * 4,
+}  # fmt: skip
+"""Of each episode: choice, its tick, the tick of the button, and the chance."""
+
+FIRST_CHOICES = """\
+| task | condition | committed | right | right, % | chance, % |
+| --- | --: | --: | --: | --: | --: |
+| PickXtimes | FOLDER | 0 of 4 | 0 |  |  |
+| PickHighlight, button pressed first | FOLDER | 1 of 8 | 0 | 0.00 [0.0, 79.3] | 50.00 |
+| PickHighlight, button pressed by step 100, discs in sight | FOLDER | 1 of 8 | 1 | 100.00 [20.7, 100.0] | 100.00 |
+| PickHighlight, chosen before the button | FOLDER | 2 of 8 | 1 | 50.00 [9.5, 90.5] |  |
+| MoveCube | FOLDER | 4 of 8 | 3 | 75.00 [25.6, 96.3] | 33.33 |"""
+
+
 def test_the_tables_of_a_made_up_evaluation(conditions: tuple[Path, Path]) -> None:
     results = read_comparable(conditions)
     assert by_family(results) == BY_FAMILY
@@ -202,6 +221,22 @@ def test_ceilings_are_of_the_scenes_that_were_played_and_of_those_that_need_memo
         f"{100 * mean:.2f} over the scenes of `{folder}` ({100 * hard:.2f} over the 2 that need memory). Without"
         in text
     )
+
+
+def test_first_choices_are_of_the_episodes_that_committed(tmp_path: Path) -> None:
+    """With the chance of the same episodes; PickHighlight's apart by what the player could see."""
+    folder = write(
+        tmp_path / "a", {"PickHighlight": ["1000", "0000"], "MoveCube": ["1100", "0000"], "PickXtimes": ["00", "00"]}
+    )
+    assert "First choice" not in tables([read_results(folder)]), "of an earlier release"
+    found = json.loads((folder / "results.json").read_text())
+    of_task = {task: iter(cells) for task, cells in CHOSEN.items()}
+    for episode in found["episodes"]:
+        choice, tick, pressed, chance = next(of_task[episode["task"]])
+        episode |= {"first_choice": choice, "first_choice_tick": tick, "first_done_tick": pressed}
+        episode["first_choice_chance"] = chance
+    (folder / "results.json").write_text(json.dumps(found))
+    assert FIRST_CHOICES.replace("FOLDER", str(folder)) in tables([read_results(folder)])
 
 
 def test_who_could_choose_in_sight_of_the_discs_is_listed_apart(tmp_path: Path) -> None:

@@ -111,6 +111,13 @@ class PickXtimes(Task[Layout, None]):
     def remember(self, memory: None, physics: Physics, layout: Layout) -> None:
         return None
 
+    def first_choice(self, physics: Physics, memory: None, layout: Layout, index: int) -> bool | None:
+        """The button is pressed after exactly so many rounds, not earlier, and the cube is not picked once more."""
+        are_done = index == 2 * layout.repeats
+        if predicates.is_pressed(physics, _BUTTON):
+            return are_done
+        return False if are_done and predicates.is_picked(physics, _CUBES[layout.asked]) else None
+
 
 def _draw(rng: np.random.Generator, difficulty: str) -> Layout:
     button = draw_button(rng)

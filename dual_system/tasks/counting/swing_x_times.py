@@ -175,6 +175,12 @@ class SwingXtimes(Task[Layout, Memory]):
             right=_follow(before.right, physics, cube, "right"), left=_follow(before.left, physics, cube, "left")
         )
 
+    def first_choice(self, physics: Physics, memory: Memory, layout: Layout, index: int) -> bool | None:
+        """The button is pressed after exactly so many rounds, put down or not, and the cube swings to no other side."""
+        if memory.right.num_arrivals + memory.left.num_arrivals > 2 * layout.repeats:
+            return False
+        return index > 2 * layout.repeats if predicates.is_pressed(physics, _BUTTON) else None
+
 
 def _draw(rng: np.random.Generator, difficulty: str) -> Layout:
     button = draw_button(rng)

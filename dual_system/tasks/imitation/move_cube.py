@@ -39,6 +39,7 @@ _CUBE_AREA_HALF_M, _CUBE_FROM_TARGET_M, _CUBE_JITTER_HALF_M = 0.1, 0.1, 0.05
 _PEG_HALF_LENGTH_M, _PEG_RGBA = 0.1, (236 / 255, 115 / 255, 87 / 255, 1.0)
 _PEG_Y_M, _PEG_JITTER_M, _PEG_YAW_RAD = 0.2, 0.05, np.pi / 4
 _GAP_M, _CUBE_REACH_M, _HAND_BEHIND_M = 0.01, 0.03, 0.08
+_PUSHED_M = 0.05  # half of the shortest way to the target: a cube that slips out of the fingers is not pushed
 _CUBE, _TARGET, _PEG = "cube", "target", "peg"
 _TAIL, _HEAD = f"{_PEG}/tail", f"{_PEG}/head"
 
@@ -116,6 +117,24 @@ class MoveCube(Task[Layout, None]):
 
     def remember(self, memory: None, physics: Physics, layout: Layout) -> None:
         return None
+
+    def first_choice(self, physics: Physics, memory: None, layout: Layout, index: int) -> bool | None:
+        """The first manner that is begun is the shown one.
+
+        It begins when the peg or the cube is picked, or when the cube is on the target or 5 cm away from where it lay
+        while the gripper is not open.
+        """
+        start, at_m = layout.asked.cube, physics.position_m(_CUBE)
+        moved_m = float(np.hypot(at_m[0] - start.x_m, at_m[1] - start.y_m))
+        if picked := predicates.first_picked(physics, (_TAIL, _HEAD, _CUBE)):
+            begun = "place" if picked == _CUBE else "hook"
+        elif (moved_m > _PUSHED_M and not predicates.is_gripper_open(physics)) or predicates.is_pushed_onto(
+            physics, _CUBE, _TARGET
+        ):
+            begun = "push"
+        else:
+            return None
+        return begun == layout.manner
 
 
 def _draw(rng: np.random.Generator, area_half_m: float) -> Scene:

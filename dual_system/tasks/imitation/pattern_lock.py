@@ -140,6 +140,12 @@ class PatternLock(Task[Layout, Touches]):
     def remember(self, memory: Touches | None, physics: Physics, layout: Layout) -> Touches:
         return traces.followed(memory, [_is_touched(physics, button) for button in layout.pattern])
 
+    def first_choice(self, physics: Physics, memory: Touches, layout: Layout, index: int) -> bool | None:
+        """The first button that is touched after the pattern's first one is its second."""
+        start, right = layout.pattern[:2]
+        others = [button for button in range(layout.side**2) if button != start and _is_touched(physics, button)]
+        return others == [right] if others else None
+
 
 def _wander(rng: np.random.Generator, side: int, start: int, end: int) -> tuple[int, ...]:
     """A random way to a button: depth first, neighbours in random order, no button tried twice."""

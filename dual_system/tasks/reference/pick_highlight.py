@@ -138,6 +138,11 @@ class PickHighlight(Task[Layout, Memory]):
         now = frozenset(name for name in _CUBES[: len(layout.cubes)] if predicates.is_picked(physics, name))
         return Memory(ever_picked=now | (memory.ever_picked if memory else frozenset()), picked_now=now)
 
+    def first_choice(self, physics: Physics, memory: Memory, layout: Layout, index: int) -> bool | None:
+        """The first cube that is picked was lit, whether the button was pressed before or not."""
+        lit = {_CUBES[target] for target in layout.targets}
+        return memory.picked_now <= lit if memory.picked_now else None
+
     def is_accomplished(self, memory: Memory, layout: Layout) -> bool:
         return all(_CUBES[target] in memory.ever_picked for target in layout.targets)
 

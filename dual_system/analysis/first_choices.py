@@ -1,0 +1,60 @@
+"""What `pp-tables` says of first choices: of the episodes that committed to something, how many chose rightly."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dual_system.analysis.ceiling import LAST_DISC_STEP
+from dual_system.analysis.markdown import markdown, percent
+from dual_system.analysis.results import Results
+from dual_system.analysis.statistics import wilson
+
+ABOUT_FIRST_CHOICES = """\
+Of the episodes that committed to a container, cube, manner, count or direction, how many chose rightly, with Wilson's
+interval over their scenes, and how many the best player without memory would choose rightly in the same scenes."""
+
+_Part = tuple[str, NDArray[np.bool_], bool | None]  # a name, its episodes (R, E), and whether the discs were in sight
+
+
+def first_choices(results: Sequence[Results]) -> str:
+    """Returns a row for each task and condition; "" if no first choice was recorded."""
+    rows = []
+    for task in results[0].tasks:
+        for each in results:
+            is_made = each.first_choices[task] >= 0
+            made = [(name, is_made & part, saw) for name, part, saw in _parts(each, task)]
+            found = [
+                [task + name, each.label, *_row(each, task, chosen, saw)] for name, chosen, saw in made if chosen.any()
+            ]
+            if not found and any(each.chances[task]):
+                found.append([task, each.label, f"0 of {is_made.size}", "0", "", ""])
+            rows += found
+    return markdown(["task", "condition", "committed", "right", "right, %", "chance, %"], rows) if rows else ""
+
+
+def _parts(results: Results, task: str) -> Iterator[_Part]:
+    """PickHighlight's episodes by what the player could see: it may choose before the button, or beside the discs."""
+    pressed, chose = results.first_done[task], results.chose[task]
+    if task != "PickHighlight":
+        yield "", np.full(chose.shape, True), False
+        return
+    is_after = (pressed >= 0) & (pressed <= chose)
+    yield ", button pressed first", is_after & (pressed > LAST_DISC_STEP), False
+    yield f", button pressed by step {LAST_DISC_STEP}, discs in sight", is_after & (pressed <= LAST_DISC_STEP), True
+    yield ", chosen before the button", ~is_after, None
+
+
+def _row(results: Results, task: str, chosen_RE: NDArray[np.bool_], saw_discs: bool | None) -> list[str]:
+    num_chosen, num_right = int(chosen_RE.sum()), int(results.first_choices[task][chosen_RE].sum())
+    right = percent(wilson(num_right / num_chosen, int(chosen_RE.any(axis=0).sum())))
+    scenes = np.nonzero(chosen_RE)[1]
+    known = [each for scene in scenes if (each := results.chances[task][scene]) is not None]
+    if saw_discs:
+        known = [Fraction(1)] * num_chosen
+    is_known = saw_discs is not None and len(known) == num_chosen
+    chance = f"{100 * float(sum(known, Fraction(0)) / num_chosen):.2f}" if is_known else ""
+    return [f"{num_chosen} of {chosen_RE.size}", str(num_right), right, chance]
