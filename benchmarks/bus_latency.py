@@ -53,6 +53,7 @@ from protocol.zenoh_bus import Endpoints, ZenohBus
 from sim_client.launch import free_ports
 
 _PATIENCE_S = 20.0
+_AGAIN_S = 1.0
 
 Pictures = dict[str, NDArray[np.uint8]]
 Pipe = Connection
@@ -162,6 +163,14 @@ class OverLink:
             self._open()
 
     def __call__(self, pictures: Pictures, state: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Asks again after a second: on a busy host a picture may be dropped before it leaves, as in an episode."""
+        deadline_s = time.monotonic() + _PATIENCE_S
+        while time.monotonic() < deadline_s:
+            if (rows := self._asked(pictures, state)) is not None:
+                return rows
+        raise TimeoutError(f"no chunk for tick {self._tick} within {_PATIENCE_S:.0f} s")
+
+    def _asked(self, pictures: Pictures, state: NDArray[np.float32]) -> NDArray[np.float32] | None:
         self._tick += 1
         tick, now_ns = self._tick, self._tick * 50_000_000
         packed = images.pack(pictures, self._codec)
@@ -172,13 +181,13 @@ class OverLink:
                 invocation=tick, tick=tick, now_ns=now_ns, ref_query=None, age_ns=0, cognition=_NO_COGNITION
             )
             self._clock.publish(topics.INVOCATION, invocation, at_ns=now_ns)
-        deadline_s = time.monotonic() + _PATIENCE_S
-        while time.monotonic() < deadline_s:
+        again_s = time.monotonic() + _AGAIN_S
+        while time.monotonic() < again_s:
             for chunk in self._chunks.drain():
                 if chunk.invocation == tick:
                     return chunk.rows_NA
             self._bus.wait(20_000_000)
-        raise TimeoutError(f"no chunk for tick {tick} within {_PATIENCE_S:.0f} s")
+        return None
 
     def _open(self) -> None:
         members = tuple(m.Member(proc=link.proc, boot_id=link.boot_id) for link in (self._link, self._clock))
@@ -249,6 +258,7 @@ class Contestant:
             "messages": self.way.messages,
             **timing,
             "p50_vs_openpi": ratio,
+            "asked_again": sum(took_ms > 1e3 * _AGAIN_S for took_ms in self.took_ms),
             "client_cpu_ms": round(self.client_cpu_s * 1e3 / len(self.took_ms), 2),
             "server_cpu_ms": round(self.server_cpu_s * 1e3 / len(self.took_ms), 2),
         }
