@@ -82,6 +82,8 @@ class EngineSpec:
     """What an episode's log is to say of the model, besides its hash."""
     gives_text: bool = True
     """False if it never writes a subgoal, so that POUNCE's prompt cannot come from it."""
+    remembers: bool = True
+    """False if every query is answered from the instruction and its own observation alone."""
     weights: WeightsName = "float"
     cognition_error: float = 0.0
     """Relative L2 change of C by narrow ``weights``, measured in the warm-up's short context."""

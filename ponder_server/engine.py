@@ -3,7 +3,7 @@
 A fire appends observation *and carriers* in one forward and reads T_t at the last observation token. T_no, the
 usual case, is then complete, because T_no is never part of the context (appendix A.2). On T_yes the context goes back
 to the state that the forward kept after the observation, without the carriers; T_yes is appended, the text is decoded,
-and the carriers follow.
+and the carriers follow. Without memory (`ContextFormat.remembers`) it goes back to the opening after each answer.
 
 The engine is deterministic: on one machine equal calls give equal bits, also after reopening a session.
 
@@ -119,6 +119,7 @@ class QwenEngine:
             dtype=str(ponder.dtype).removeprefix("torch."),
             session_bytes=session_bytes,
             gives_text=self._format.speaks,
+            remembers=self._format.remembers,
         )
         draft = draft or NoDraft()
         self._parts = [*(layer.mlp for layer in ponder.layers), *draft.parts]
@@ -166,7 +167,8 @@ class QwenEngine:
         if not opening.instruction.strip():
             raise ValueError(f"session {session!r}: the instruction is empty; PONDER needs the task's text")
         views = self._format.demonstrations.num_views
-        opening = replace(opening, demo_frames=tuple(cameras[:views] for cameras in opening.demo_frames))
+        demo_frames = opening.demo_frames if self._format.remembers else ()
+        opening = replace(opening, demo_frames=tuple(cameras[:views] for cameras in demo_frames))
         for instant, cameras in enumerate(opening.demo_frames):
             if not cameras:
                 raise ValueError(f"demo instant {instant} has no view")
@@ -238,7 +240,8 @@ class QwenEngine:
         ids = self._query_ids(proprio)
         if force_text_tokens is not None and force_text_tokens < 1:
             raise ValueError(f"force_text_tokens is {force_text_tokens}; at least 1, or None")
-        self._make_room(episode)
+        if self._format.remembers:
+            self._make_room(episode)
         context.check_room(len(ids))
         self._begun[session] = Query(
             episode=episode,
@@ -268,13 +271,13 @@ class QwenEngine:
             return self._batch.step(progress)
 
     def _think(self, query: Query, embeds_TH: Tensor) -> Steps[Fire]:
-        """Runs one query through the network; if it ends early, the context is restored."""
+        """Runs one query through the network; if it ends early, or without memory, the context is restored."""
         episode, exactly = query.episode, query.force_text_tokens
         context = episode.context
         num_observed = len(query.ids) - self._format.num_carriers
         observation_TH, carriers_KH = embeds_TH[:num_observed], embeds_TH[num_observed:]
         before = context.save(context.before_fire)
-        is_answered = False
+        is_kept = False
         try:
             texts: tuple[Text, ...] = ()
             is_transition, gate_score = exactly is not None, None
@@ -310,16 +313,17 @@ class QwenEngine:
                     hidden_KH = (yield at_once)[1:]
             answer = self._answer(context, hidden_KH, texts, gate_score)
             num_written = len(context.ids) - before.num_ids - len(query.ids)
-            episode.spans += [
-                Span(SegmentKind.OBSERVATION, num_observed),
-                Span(SegmentKind.TEXT, num_written),
-                Span(SegmentKind.CARRIERS, self._format.num_carriers),
-            ]
-            episode.owes_reasoning &= not texts
-            is_answered = True
+            if self._format.remembers:
+                episode.spans += [
+                    Span(SegmentKind.OBSERVATION, num_observed),
+                    Span(SegmentKind.TEXT, num_written),
+                    Span(SegmentKind.CARRIERS, self._format.num_carriers),
+                ]
+                episode.owes_reasoning &= not texts
+                is_kept = True
             return answer
         finally:
-            if not is_answered:
+            if not is_kept:
                 context.restore(before)
 
     @torch.inference_mode()
@@ -363,7 +367,8 @@ class QwenEngine:
         self.open(WARM_UP_SESSION, WARM_UP_OPENING)
         try:
             context = self._episode(WARM_UP_SESSION).context
-            context.fill(max(context.num_tokens, context.max_tokens - self._num_query_ids))
+            if self._format.remembers:  # otherwise no context is ever fuller than after one query
+                context.fill(max(context.num_tokens, context.max_tokens - self._num_query_ids))
             filled = context.save()
             durations_ns = []
             for _ in range(1 + NUM_FULL_FIRES):

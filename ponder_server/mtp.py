@@ -16,11 +16,12 @@ from torch.nn import functional as F
 from dual_system.models.graphs import Capture
 from dual_system.models.ponder.mtp import MtpHead
 from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.text_tokens import allowed_tokens, ends_of_text
 from ponder_server.captured import CapturedDecoder
 from ponder_server.decoder import Place, decode
 from ponder_server.draft import Draft
 from ponder_server.slots import SlotMemory
-from ponder_server.writer import MAX_CHECKED_TOKENS, allowed_tokens, ends_of_text
+from ponder_server.writer import MAX_CHECKED_TOKENS
 
 WINDOW = 64
 """Tokens of the text to which the head attends; they are recomputed for every proposal."""

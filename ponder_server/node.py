@@ -94,7 +94,12 @@ class PonderNode:
         return list(self._rendezvous.give_up())
 
     def keep(self, query: m.Query, fire: Fire) -> None:
-        """Takes the subgoal that a fire wrote: it is in force until the next one, and goes with every answer."""
+        """Takes the subgoal that a fire wrote: it is in force until the next one, and goes with every answer.
+
+        A PONDER without memory writes anew at every query, and nothing older stays in force.
+        """
+        if not self._spec.remembers:
+            self._subgoal, self._subgoal_source_ns = "", 0
         for text in fire.texts:
             if text.kind == "subgoal":
                 self._subgoal, self._subgoal_source_ns = text.text, query.source_ns if text.text else 0
@@ -103,7 +108,9 @@ class PonderNode:
         """Messages to publish: the cognition, and PONDER's generated texts."""
         query = work.query
         self.next_query = query.query + 1
+        earlier = self._subgoal
         self.keep(query, fire)
+        is_new = self._spec.remembers or self._subgoal != earlier  # without memory it writes the same text again
         vector = np.ascontiguousarray(fire.cognition, np.float32)
         cognition = m.Cognition(
             query=query.query,
@@ -111,7 +118,7 @@ class PonderNode:
             source_ns=query.source_ns,
             ready_ns=ready_ns,
             vector=vector,
-            is_transition=fire.is_transition,
+            is_transition=fire.is_transition and is_new,
             context_tokens=fire.context_tokens,
             infer_ns=infer_ns,
             norm=float(np.linalg.norm(vector)),

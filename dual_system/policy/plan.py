@@ -10,6 +10,8 @@ from dual_system.training import laptop_recipes as recipes
 
 TASKS = ("VideoUnmask", "PickHighlight", "MoveCube", "PickXtimes")
 EPISODES, STILLS, TOWER_MINUTES = 300, 12_000, 60
+CURRENT_WORDS = "words_current"
+"""Folder of the PONDER without memory."""
 PLAYS, PLAYS_SEED = 40, 1_000_000
 """Episodes a task that the hand plays under the task's own text, to be corrected."""
 
@@ -23,6 +25,7 @@ ROWS = (
     (recipes.laptop_without_grounding, 0),
     (recipes.laptop_window, 0),
     (recipes.laptop_text, 0),
+    (recipes.laptop_current, 0),
 )
 """The rows of the table that are trained: recipe and seed, two at a time, one on each core."""
 
@@ -37,8 +40,8 @@ class Stage:
 
 def stages(folder: Path) -> tuple[Stage, ...]:
     """The stages in their order; each reads what those before it wrote."""
-    names = ("towers", "words", "hand", "plays", "corrections", "corrected")
-    towers, words, hand, plays, corrections, corrected = (folder / name for name in names)
+    names = ("towers", "words", CURRENT_WORDS, "hand", "plays", "corrections", "corrected")
+    towers, words, current_words, hand, plays, corrections, corrected = (folder / name for name in names)
     sets = [folder / "data" / task for task in TASKS]
     data = ("--data", *map(str, sets))
     locating = ("dual_system.policy.towers", "--out", f"{towers}", "--stills", f"{STILLS}")
@@ -76,6 +79,7 @@ def stages(folder: Path) -> tuple[Stage, ...]:
                     f"{corrections}",
                     *_run(recipes.laptop_hand_corrected.__name__, towers, hand, corrected),
                 ),
+                (*training, *data, *_run(recipes.laptop_current_grounding.__name__, towers, towers, current_words)),
             ),
         ),
         *(
@@ -86,8 +90,10 @@ def stages(folder: Path) -> tuple[Stage, ...]:
 
 
 def _row(folder: Path, recipe: str, seed: int) -> Sequence[str]:
-    """A row's options; without grounding PONDER has not learned the tasks' words before either."""
-    ponder = folder / ("towers" if recipe == recipes.laptop_without_grounding.__name__ else "words")
+    """A row's options. Without grounding PONDER has not learned the tasks' words before either; without memory it has
+    learned them without."""
+    own = {recipes.laptop_without_grounding.__name__: "towers", recipes.laptop_current.__name__: CURRENT_WORDS}
+    ponder = folder / own.get(recipe, "words")
     run = _run(recipe, ponder, folder / "corrected", folder / "rows" / f"{recipe}_{seed}")
     return *run, "--seed", f"{seed}"
 

@@ -103,7 +103,9 @@ def _ponder(run: Recipe, data: TrainingSet, start: Start) -> Ponder:
     if run.trains != "pounce":
         declared = ponder.format.demonstrations
         demonstrations = replace(data.demo_sampling() or declared, num_views=declared.num_views)
-        ponder.format = replace(ponder.format, speaks=run.w2 > 0, demonstrations=demonstrations)
+        ponder.format = replace(
+            ponder.format, speaks=run.w2 > 0, demonstrations=demonstrations, remembers=run.remembers
+        )
     return ponder
 
 

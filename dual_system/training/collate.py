@@ -82,7 +82,11 @@ class _TrainingMoment:
 
 def collate_ponder(examples: Sequence[Example]) -> PonderBatch:
     """PONDER's side: rows and images."""
-    return PonderBatch(rows=tuple(each.row for each in examples), frames=tuple(each.images for each in examples))
+    return PonderBatch(
+        rows=tuple(row for each in examples for row in each.rows),
+        frames=tuple(frames for each in examples for frames in each.frames),
+        rows_per_episode=tuple(len(each.rows) for each in examples),
+    )
 
 
 def collate_pounce(

@@ -7,7 +7,8 @@ There are two comparisons; ticks, targets, pictures and flow draws are the same 
   over all ticks, and over branch points: the first invocation after each start of a subgoal, where the motion does not
   yet show which way to go. Neither mean predicts success.
 
-PONDER's row has the recorded texts, as in training. ``pp-tables`` makes tables and a plot of the result.
+PONDER's row has the recorded texts, as in training (without memory its own). ``pp-tables`` makes tables and a plot of
+the result.
 """
 
 # Q queries of an episode, I its invocations, K carriers, H hidden, N horizon, A padded action dim
@@ -40,7 +41,7 @@ from dual_system.training.build import DTYPES, DTypeName
 from dual_system.training.collate import collate_ponder, collate_pounce
 from dual_system.training.data import PictureSizes, TrainingSet
 from dual_system.training.example import Example, ExampleConfig, make_example
-from dual_system.training.joint import NO_QUERY, PounceBatch, encode_rows, gather_cognition
+from dual_system.training.joint import NO_QUERY, PounceBatch, read_cognition
 from protocol import files
 from protocol.command_line import command, flat, parse
 
@@ -233,9 +234,7 @@ def _example(data: TrainingSet, number: int, ponder: Ponder) -> Example:
 
 @torch.inference_mode()
 def _cognition(ponder: Ponder, example: Example) -> Tensor:
-    row = collate_ponder([example]).to(ponder.device)
-    cognition_QKH, _ = gather_cognition(row.rows, encode_rows(ponder, row))
-    return cognition_QKH.float()
+    return read_cognition(ponder, collate_ponder([example]).to(ponder.device)).float()
 
 
 def _losses(model: AnyPounce, batch: PounceBatch, given: Given, noise_DINA: Tensor, time_DI: Tensor) -> Tensor:

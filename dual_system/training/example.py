@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from clock.sampling import Clocks, SampledInvocation, SampledSchedule, sample_schedule
+from clock.sampling import Clocks, SampledInvocation, SampledQuery, SampledSchedule, sample_schedule
 from dual_system.models.ponder.context import ContextFormat, Row, Transition
 from dual_system.models.ponder.coordinates import normalised_text
 from dual_system.training.episode import TrainingEpisode
@@ -45,9 +45,10 @@ class Example:
     """An episode under a schedule."""
 
     episode: TrainingEpisode
-    row: Row
+    rows: tuple[Row, ...]
+    """One of the whole episode; for a PONDER without memory one of every query."""
     images: Tensor | None
-    """PONDER's images in the order of the row, (N, height, width, 3) uint8; None if PONDER is not run."""
+    """PONDER's images in the order of the rows, (N, height, width, 3) uint8; None if PONDER is not run."""
     schedule: SampledSchedule
     invocations: tuple[SampledInvocation, ...]
     """The invocations drawn from the schedule."""
@@ -56,11 +57,26 @@ class Example:
     told: tuple[str, ...]
     """What POUNCE is told at every invocation: the newest text written, unless `ExampleConfig.told` changes it."""
 
+    @property
+    def row(self) -> Row:
+        """The episode's only row."""
+        (row,) = self.rows
+        return row
+
+    @property
+    def frames(self) -> tuple[Tensor | None, ...]:
+        """The images of each row."""
+        if self.images is None:
+            return (None,) * len(self.rows)
+        return self.images.split([row.num_images for row in self.rows])
+
 
 def make_example(
     episode: TrainingEpisode, form: ContextFormat, config: ExampleConfig, rng: np.random.Generator
 ) -> Example:
     """Samples a schedule and builds the example under it, with the demonstration's views that the format reads."""
+    if not form.remembers:
+        episode = replace(episode, demo=())
     if (num_views := form.demonstrations.num_views) is not None:
         num_images = form.reader.num_images(num_views)
         episode = replace(episode, demo=tuple(images[:num_images] for images in episode.demo))
@@ -70,11 +86,11 @@ def make_example(
     weights = None if config.branch_weight == 1 else _weights(episode, imitated, config.branch_weight)
     chosen = np.sort(rng.choice(len(imitated), size=count, replace=False, p=weights)) if count else np.empty(0, np.intp)
     invocations = tuple(imitated[index] for index in chosen)
-    written = subgoals_by_query(episode, schedule) if config.is_grounded else ("",) * len(schedule.queries)
+    written = subgoals_by_query(episode, form, schedule) if config.is_grounded else ("",) * len(schedule.queries)
     newest = ["" if each.reference.query is None else written[each.reference.query] for each in invocations]
     return Example(
         episode=episode,
-        row=episode_row(episode, form, schedule, config),
+        rows=rows_of(episode, form, schedule, config),
         images=row_images(episode, schedule),
         schedule=schedule,
         invocations=invocations,
@@ -95,6 +111,27 @@ def _weights(
     return chances
 
 
+def rows_of(
+    episode: TrainingEpisode, form: ContextFormat, schedule: SampledSchedule, config: ExampleConfig
+) -> tuple[Row, ...]:
+    """The episode's row, or those of its queries: then each has the text of its own tick."""
+    if form.remembers:
+        return (episode_row(episode, form, schedule, config),)
+    opening, num_views = form.opening(episode.instruction), len(episode.images[0])
+    rows = []
+    for query in schedule.queries:
+        text = _new_text(episode, form, query) if config.is_grounded else ""
+        transition = Transition(subgoal=form.vocabulary.encode(text)) if text else None
+        rows.append(form.row([*opening, *form.query(num_views, transition, episode.ponder_state(query.tick))]))
+    return tuple(rows)
+
+
+def _new_text(episode: TrainingEpisode, form: ContextFormat, query: SampledQuery) -> str:
+    """The subgoal that PONDER is to write at a query; "" for none. Without memory it cannot know whether it is new."""
+    is_new = query.stamp.is_transition or not form.remembers
+    return normalised_text(episode.subgoals[query.tick]) if is_new else ""
+
+
 def episode_row(episode: TrainingEpisode, form: ContextFormat, schedule: SampledSchedule, config: ExampleConfig) -> Row:
     """The tokens of the episode. The first transition after a demonstration begins with its reasoning."""
     encode = form.vocabulary.encode
@@ -102,21 +139,20 @@ def episode_row(episode: TrainingEpisode, form: ContextFormat, schedule: Sampled
     segments = list(form.opening(episode.instruction, [len(images) for images in episode.demo]))
     reasoning = encode(normalised_text(episode.reasoning)) if config.has_reasoning and episode.reasoning else None
     for query in schedule.queries:
-        transition, text = None, episode.subgoals[query.tick]
-        if config.is_grounded and query.stamp.is_transition and text:
-            transition = Transition(subgoal=encode(normalised_text(text)), reasoning=reasoning)
+        transition = None
+        if config.is_grounded and (text := _new_text(episode, form, query)):
+            transition = Transition(subgoal=encode(text), reasoning=reasoning)
             reasoning = None
         segments += form.query(num_views, transition, episode.ponder_state(query.tick))
     return form.row(segments)
 
 
-def subgoals_by_query(episode: TrainingEpisode, schedule: SampledSchedule) -> tuple[str, ...]:
-    """The newest subgoal at every query, as PONDER generates it: it changes at predicted transitions only."""
+def subgoals_by_query(episode: TrainingEpisode, form: ContextFormat, schedule: SampledSchedule) -> tuple[str, ...]:
+    """The newest subgoal at every query, as PONDER generates it: with memory it changes at transitions only."""
     texts: list[str] = []
     for query in schedule.queries:
-        text = episode.subgoals[query.tick]
-        is_new = query.stamp.is_transition and bool(text)
-        texts.append(normalised_text(text) if is_new else (texts[-1] if texts else ""))
+        text = _new_text(episode, form, query)
+        texts.append(text or (texts[-1] if texts and form.remembers else ""))
     return tuple(texts)
 
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from itertools import accumulate
 from typing import Any, Literal, NamedTuple
 
@@ -31,6 +32,7 @@ from dual_system.models.pi05.pounce import PounceInputs
 from dual_system.models.ponder.context import Row
 from dual_system.models.ponder.network import Ponder
 from dual_system.models.pounce.family import AnyPounce, action_loss
+from dual_system.training.own_text import Read, with_own_texts
 
 Trains = Literal["both", "ponder", "pounce"]
 """The systems to train; the other's weights do not change."""
@@ -47,17 +49,41 @@ class PonderBatch:
     """PONDER's inputs for B episodes."""
 
     rows: tuple[Row, ...] = ()
-    """() if PONDER is not run."""
+    """() if PONDER is not run. Episode by episode; a PONDER without memory has a row for every query, in order."""
     frames: tuple[Tensor | None, ...] = ()
     """Per row, (num_images, height, width, 3) uint8 in the order of its image positions; None without images."""
+    rows_per_episode: tuple[int, ...] = ()
+    """Number of rows of each episode; () for one row each."""
 
     def __post_init__(self) -> None:
         if len(self.rows) != len(self.frames):
             raise ValueError(f"{len(self.rows)} rows, frames for {len(self.frames)}")
+        if self.rows_per_episode and sum(self.rows_per_episode) != len(self.rows):
+            raise ValueError(f"{len(self.rows)} rows, the episodes have {sum(self.rows_per_episode)}")
+
+    @property
+    def num_episodes(self) -> int:
+        return len(self.rows_per_episode or self.rows)
+
+    @property
+    def first_row(self) -> list[int]:
+        """Index of each episode's first row, and the number of rows."""
+        return [0, *accumulate(self.rows_per_episode or (1,) * len(self.rows))]
+
+    @property
+    def first_query_B(self) -> Tensor:
+        """int64: index of each episode's first query among the queries of all rows (`gather_cognition`)."""
+        first_query = [0, *accumulate(len(row.carrier_index) for row in self.rows)]
+        return torch.tensor([first_query[row] for row in self.first_row[:-1]])
 
     def part(self, begin: int, end: int) -> PonderBatch:
         """Episodes ``begin`` to ``end`` - 1."""
-        return PonderBatch(rows=self.rows[begin:end], frames=self.frames[begin:end])
+        if not self.rows:
+            return self
+        rows = slice(self.first_row[begin], self.first_row[end])
+        return PonderBatch(
+            rows=self.rows[rows], frames=self.frames[rows], rows_per_episode=self.rows_per_episode[begin:end]
+        )
 
     def to(self, device: torch.device | str) -> PonderBatch:
         frames = iter(_moved([each for each in self.frames if each is not None], device))
@@ -80,9 +106,9 @@ class PounceBatch:
     actions_INA: Tensor
     """Normalised targets, zero beyond the robot's dims."""
     episode_I: Tensor
-    """int64: row index in the PonderBatch."""
+    """int64: index of the episode in the PonderBatch."""
     query_I: Tensor
-    """int64: query index in that row, or NO_QUERY."""
+    """int64: query index in that episode, or NO_QUERY."""
 
     @property
     def num_episodes(self) -> int:
@@ -240,18 +266,22 @@ class JointModel(nn.Module):
         zero = torch.zeros((), device=invocations.actions_INA.device)
         matching, grounding = zero, zero
         predicted_N = torch.zeros(0, dtype=torch.int64)
-        cognition_QKH, first_query = None, None
+        cognition_IKH = None
         if self.runs_ponder:
+            read = partial(_read, self.ponder, together=self.reads_together, num_groups=self.num_groups)
             with torch.set_grad_enabled(self.trains != "pounce"):
-                hidden = encode_rows(self.ponder, episodes, together=self.reads_together, num_groups=self.num_groups)
-                cognition_QKH, first_query = gather_cognition(episodes.rows, hidden)
+                embeds = embed_rows(self.ponder, episodes)
+                hidden = read([row.ids for row in episodes.rows], embeds)
+                if self.trains != "ponder":
+                    first_I = episodes.first_query_B.to(zero.device)[invocations.episode_I]
+                    index_I = first_I + invocations.query_I.clamp(min=0)
+                    cognition_IKH = cognition_of(self.ponder, episodes.rows, embeds, hidden, index_I, read)
             if self.trains != "pounce":
                 grounding, predicted_N = self._grounding(episodes, hidden)
         if self.trains != "ponder":
             inputs = invocations.inputs
-            if cognition_QKH is not None and first_query is not None:
-                index_I = first_query[invocations.episode_I] + invocations.query_I.clamp(min=0)
-                inputs = replace(inputs, cognition=cognition_QKH[index_I], is_null=_is_null(invocations, draws))
+            if cognition_IKH is not None:
+                inputs = replace(inputs, cognition=cognition_IKH, is_null=_is_null(invocations, draws))
             if isinstance(inputs, PounceInputs):
                 inputs = inputs.forgetting(draws.is_dropped_I)
             matching = action_loss(
@@ -304,12 +334,25 @@ def encode_rows(ponder: Ponder, episodes: PonderBatch, *, together: bool = True,
     activations alive at once (`benchmarks.training_throughput`). ``num_groups`` is the middle way: batches of rows of
     similar length (at most one per row), with less padding and more calls.
     """
+    ids = [row.ids for row in episodes.rows]
+    return _read(ponder, ids, embed_rows(ponder, episodes), together=together, num_groups=num_groups)
+
+
+def embed_rows(ponder: Ponder, episodes: PonderBatch) -> list[Tensor]:
+    """Input embeddings (T, H) of each row."""
     frames = [each for each in episodes.frames if each is not None]
     ids = np.concatenate([row.ids for row in episodes.rows])
-    lengths = [len(row.ids) for row in episodes.rows]
-    embeds = ponder.embed(ids, torch.cat(frames) if frames else None).split(lengths)
-    positions = [ponder.format.positions(row.ids)[0] for row in episodes.rows]
-    if not together:
+    embeds = ponder.embed(ids, torch.cat(frames) if frames else None)
+    return list(embeds.split([len(row.ids) for row in episodes.rows]))
+
+
+def _read(
+    ponder: Ponder, ids: Sequence[Sequence[int]], embeds: Sequence[Tensor], *, together: bool, num_groups: int
+) -> list[Tensor]:
+    """`encode_rows` of rows that are embedded already."""
+    lengths = [len(each) for each in ids]
+    positions = [ponder.format.positions(each)[0] for each in ids]
+    if not together and ponder.format.remembers:  # a query's rows are short and alike: padding is cheaper than calls
         return [
             ponder(embed[None], torch.from_numpy(each)[:, None].to(ponder.device))[0]
             for embed, each in zip(embeds, positions, strict=True)
@@ -330,11 +373,35 @@ def encode_rows(ponder: Ponder, episodes: PonderBatch, *, together: bool = True,
     return [found[row] for row in range(len(lengths))]
 
 
-def gather_cognition(rows: Sequence[Row], hidden: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """Cognition of all queries of all rows, (Q, K, H), and the index of each row's first query, (B,) int64."""
+def gather_cognition(rows: Sequence[Row], hidden: Sequence[Tensor]) -> Tensor:
+    """Cognition of all queries of all rows, (Q, K, H)."""
     index = [row.carrier_index for row in rows]
-    counts = [len(each) for each in index]
-    if 0 in counts:
+    if 0 in [len(each) for each in index]:
         raise ValueError("a row without a query gives no cognition; leave such an episode out")
-    cognition_QKH = _taken(hidden, index).unflatten(0, (-1, index[0].shape[1]))
-    return cognition_QKH, torch.tensor([0, *accumulate(counts)][:-1], device=hidden[0].device)
+    return _taken(hidden, index).unflatten(0, (-1, index[0].shape[1]))
+
+
+def cognition_of(
+    ponder: Ponder, rows: Sequence[Row], embeds: Sequence[Tensor], hidden: Sequence[Tensor], index_I: Tensor, read: Read
+) -> Tensor:
+    """Cognition (I, K, H) of the given queries of all rows, as PONDER is trained on it.
+
+    A PONDER that remembers reads the recorded texts before its carriers (teacher forcing). One without memory reads
+    what it writes itself, because a recorded text may tell what only the past showed (`own_text`).
+    """
+    if ponder.format.remembers or not ponder.format.speaks:
+        return gather_cognition(rows, hidden)[index_I]
+    places, place_I = index_I.unique(return_inverse=True)  # a row has one query: their indices are the same
+    asked = places.tolist()
+    chosen, chosen_embeds, chosen_hidden = ([each[place] for place in asked] for each in (rows, embeds, hidden))
+    own, own_embeds = with_own_texts(ponder, chosen, chosen_embeds, chosen_hidden, read)
+    return gather_cognition(own, read([row.ids for row in own], own_embeds))[place_I]
+
+
+def read_cognition(ponder: Ponder, episodes: PonderBatch) -> Tensor:
+    """Cognition (Q, K, H) of all queries of all rows, as in training."""
+    read = partial(_read, ponder, together=True, num_groups=1)
+    embeds = embed_rows(ponder, episodes)
+    hidden = read([row.ids for row in episodes.rows], embeds)
+    every = torch.arange(sum(len(row.carrier_index) for row in episodes.rows), device=ponder.device)
+    return cognition_of(ponder, episodes.rows, embeds, hidden, every, read)

@@ -94,6 +94,16 @@ def laptop() -> Recipe:
     )
 
 
+def laptop_current_grounding() -> Recipe:
+    """Stage A2 of the row whose PONDER sees the current observation only: its own words, a row for every query."""
+    return replace(laptop_grounding(), name="laptop_current_grounding", remembers=False)
+
+
+def laptop_current() -> Recipe:
+    """Row: PONDER sees the instruction and the newest pictures only, and reads the text that it writes itself."""
+    return replace(laptop(), name="laptop_current", remembers=False)
+
+
 def laptop_without_grounding() -> Recipe:
     """Row: w2 = 0, from a PONDER that knows pictures and no words of the tasks."""
     run = laptop()
@@ -143,7 +153,9 @@ ALL: tuple[Callable[[], Recipe], ...] = (
     laptop_hand,
     laptop_hand_corrected,
     laptop_grounding,
+    laptop_current_grounding,
     laptop,
+    laptop_current,
     laptop_without_grounding,
     laptop_observation,
     laptop_text,

@@ -35,6 +35,8 @@ class Recipe:
     """The systems to train."""
     freezes_ponder_vision: bool = False
     """Leave PONDER's vision tower as it came."""
+    remembers: bool = True
+    """False: PONDER is trained and served without memory (`ContextFormat.remembers`)."""
     demo_hz: int = 1
     """Frames per second of demonstrations (paper: 1); stored in PONDER's checkpoint and contract."""
     space: ActionSpace = "joint_delta"
@@ -49,5 +51,10 @@ class Recipe:
     def __post_init__(self) -> None:
         if self.trains != "pounce" and self.example.is_grounded != (self.w2 > 0):
             raise ValueError(f"recipe {self.name}: is_grounded is {self.example.is_grounded}, but w2 is {self.w2}")
+        if not self.remembers and self.pounce.reads_subgoal:
+            raise ValueError(
+                f"recipe {self.name}: POUNCE would learn from recorded subgoals and be given those of a PONDER without "
+                "memory; expected cognition as its channel"
+            )
         if self.demo_hz < 1 or FPS % self.demo_hz:
             raise ValueError(f"recipe {self.name}: demo_hz must divide {FPS}, came {self.demo_hz}")

@@ -231,6 +231,11 @@ def tiny_framesamp() -> Recipe:
     )
 
 
+def tiny_current() -> Recipe:
+    """``tiny`` with a PONDER that sees the current observation only, as ``laptop_current``'s."""
+    return replace(tiny(), name="tiny_current", remembers=False)
+
+
 def _refreshed_every(period_s: int) -> sampling.Clocks:
     return replace(sampling.ROBOMME, query=replace(sampling.ROBOMME.query, mean_ns=period_s * NS_PER_S))
 
@@ -251,6 +256,7 @@ RECIPES: dict[str, Callable[[], Recipe]] = {
         tiny_groot,
         tiny_subgoal_text,
         tiny_framesamp,
+        tiny_current,
         *laptop_recipes.ALL,
     )
 }

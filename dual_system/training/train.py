@@ -113,7 +113,7 @@ class TrainOptions:
 
     recipe: str
     """Name of a recipe: robomme and robocasa_dc are the paper's runs, robomme_* its ablations; tiny, tiny_groot,
-    tiny_subgoal_text and tiny_framesamp are small ones for a CPU."""
+    tiny_subgoal_text, tiny_framesamp and tiny_current are small ones for a CPU."""
     data: tuple[Path, ...]
     """Folders that pp-collect or pp-export made."""
     out: Path
@@ -226,6 +226,11 @@ def train(options: TrainOptions) -> None:
         if world.is_first:
             sys.stderr.write(f"pp-train: {run.name} needs {sentence(needed, world.size)}\n")
         require_room(needed, world.size, torch.device(machine.device))
+        if world.size > 1 and machine.weights == "sharded" and not model.ponder.format.remembers:
+            raise ValueError(
+                f"recipe {run.name}: a PONDER without memory decodes its own texts, which takes each process another "
+                "number of passes, and sharded weights need the same of all; take --weights whole"
+            )
         _prepare(model, machine, world)
         data = TrainingSet(
             *options.data,
@@ -250,8 +255,9 @@ def _update(
         if options.machine.loaders:
             prefetcher = Prefetcher(batches.on_cpu, world.device, options.machine.loaders)
             stack.callback(prefetcher.close)
-        # The number of steps is left out: a run may go on for longer.
-        made_with = {name: value for name, value in asdict(run).items() if name != "num_steps"}
+        # A run may go on for longer; and a checkpoint of before `remembers` is of a PONDER that does.
+        left_out = {"num_steps", *(["remembers"] if run.remembers else [])}
+        made_with = {name: value for name, value in asdict(run).items() if name not in left_out}
         trainer = Trainer(
             model,
             prefetcher or batches,

@@ -161,7 +161,7 @@ class Trainer:
         if self._num_parts == 1:
             yield episodes, invocations, self._draws(invocations)
             return
-        num_episodes = max(len(episodes.rows), invocations.num_episodes)
+        num_episodes = max(episodes.num_episodes, invocations.num_episodes)
         for numbers in np.array_split(np.arange(num_episodes), self._num_parts):
             begin, end = int(numbers[0]), int(numbers[-1]) + 1
             part = invocations.part(begin, end)

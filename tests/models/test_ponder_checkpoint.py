@@ -97,7 +97,12 @@ def test_a_checkpoint_remembers_whether_it_was_trained(tmp_path: Path, is_random
 # -- ponder.json: what PONDER adds
 
 CROP = CropReader(camera=1, box=(0.25, 0, 0.75, 0.5), first_state_id=460, num_finger_bins=4, num_height_bins=8)
-ADDED: dict[str, Any] = {"speaks": False, "demonstrations": DemoSampling(hz=2, to_its_end=True), "reader": CROP}
+ADDED: dict[str, Any] = {
+    "speaks": False,
+    "remembers": False,
+    "demonstrations": DemoSampling(hz=2, to_its_end=True),
+    "reader": CROP,
+}
 
 
 def stored_in(folder: Path) -> dict[str, Any]:

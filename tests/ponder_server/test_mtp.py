@@ -23,6 +23,7 @@ from dual_system.models.ponder.checkpoint import load_ponder, mtp_shapes, save_p
 from dual_system.models.ponder.configs import tiny_cpu
 from dual_system.models.ponder.mtp import MtpHead
 from dual_system.models.ponder.network import Ponder
+from dual_system.models.ponder.text_tokens import allowed_tokens
 from dual_system.models.ponder.vocabulary import Vocabulary
 from ponder_server import mtp
 from ponder_server.__main__ import build_engine
@@ -32,7 +33,7 @@ from ponder_server.draft import Draft, FirstOf, NoDraft, TrieDraft
 from ponder_server.engine import QwenEngine
 from ponder_server.engine_config import EngineConfig
 from ponder_server.mtp import MAX_DRAFT_TOKENS, WINDOW, MtpDraft
-from ponder_server.writer import TransitionWriter, allowed_tokens
+from ponder_server.writer import TransitionWriter
 
 VOCABULARY = Vocabulary.tiny()
 MODEL = replace(tiny_cpu(), num_layers=4, hidden_size=48, ffn_size=96, image_px=(64, 64))

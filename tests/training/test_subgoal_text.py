@@ -56,7 +56,7 @@ def example(*, is_grounded: bool = True) -> Example:
 def test_the_subgoal_is_what_ponder_wrote_at_the_last_transition() -> None:
     """At one query a second: the text of tick 60 is another text of the old subgoal, which PONDER does not write."""
     schedule = sample_schedule(np.random.default_rng(0), EVALUATION, NUM_TICKS, transition_ticks=frozenset(CHANGES))
-    said = subgoals_by_query(episode(), schedule)
+    said = subgoals_by_query(episode(), PONDER.format, schedule)
     written = {query.tick: text for query, text in zip(schedule.queries, said, strict=True)}
     first, second = "press at [20, 20]", "pick at [78, 39]"
     assert [text for _, text in sorted(written.items())] == [first, first, second, second, second]

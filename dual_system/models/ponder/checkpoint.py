@@ -66,6 +66,7 @@ class StoredPonder:
     demonstrations: DemoSampling = PAPER_SAMPLING
     opening: OpeningForm = "chat"
     texts: TextPolicy = OWN_TEXTS
+    remembers: bool = True
     is_random: bool = True
     """True if the carriers were never trained."""
 
@@ -109,6 +110,7 @@ def load_ponder(directory: Path, *, device: torch.device | str = "cpu", dtype: t
         demonstrations=stored.demonstrations,
         opening_form=stored.opening,
         texts=stored.texts,
+        remembers=stored.remembers,
     )
     if qwen_config.image_token_id != vocabulary.image_pad:
         raise CheckpointError(
@@ -144,6 +146,7 @@ def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_S
         demonstrations=ponder.format.demonstrations,
         opening=ponder.format.opening_form,
         texts=ponder.format.texts,
+        remembers=ponder.format.remembers,
         is_random=ponder.is_random,
     )
     values = asdict(stored)

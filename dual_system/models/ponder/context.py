@@ -7,7 +7,8 @@ both get them from here (the official chat template rewrites earlier turns, so i
     O_t  [ T_yes S_t | T_yes DR T_yes S_t ]  K carriers                               per query t
 
 where a frame is ``<|vision_start|> <|image_pad|> * n <|vision_end|>`` (n = 64 at 256 px), one per image that the
-`observation` reader returns. **T_no is never in the row.** It is only the LM *target* at the first carrier position
+`observation` reader returns. Without memory (`ContextFormat.remembers`) every query is such a row of its own, after Ins
+and without a demonstration. **T_no is never in the row.** It is only the LM *target* at the first carrier position
 (paper, appendix A.2), so T_t is always decided by the logits of the preceding token: the last one of O_t, or the last
 one of the text. Carriers are rows of the embedding table that no real token uses; their ids are ordinary ids.
 
@@ -103,6 +104,8 @@ class ContextFormat:
     """How demonstrations were sampled in training; serving must sample them alike."""
     opening_form: OpeningForm = "chat"
     texts: TextPolicy = OWN_TEXTS
+    remembers: bool = True
+    """False: a query's context is instruction, observation and its own text; no demonstration, nothing earlier."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.num_carriers <= 16:
