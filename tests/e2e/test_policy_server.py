@@ -72,7 +72,10 @@ def test_its_rows_are_played_and_without_it_the_robot_holds_slows_down_and_stops
     policy.kill()
     episode = player.wait_for_end()
     assert next(disagreements(episode.record), None) is None
-    levels = [level.name for level, _ in groupby(tick.level for tick in episode.record.ticks)]
+    kept = [
+        tick.level for tick in episode.record.ticks if tick.level != m.Level.SKIPPED
+    ]  # a busy machine leaves some out
+    levels = [level.name for level, _ in groupby(kept)]
     assert levels[:2] == ["PLAY", "HOLD"]
     assert levels[-4:] == ["PLAY", "HOLD", "DECELERATE", "STOPPED"]
     assert "stopped by the ladder" in episode.result["reason"]
