@@ -118,7 +118,7 @@ images: setup
 MINUTES ?= 150
 POLICY_DIR ?= $(HOME)/ponderpounce-policy
 policy: setup
-	$(BIN)/python -m dual_system.policy --folder "$(POLICY_DIR)" --minutes $(MINUTES)
+	$(BIN)/python -m benchmarks.policy --folder "$(POLICY_DIR)" --minutes $(MINUTES)
 
 ## make site    the documents as a site, links checked, in out/site/html
 SITE := $(VENV)/site

@@ -55,23 +55,7 @@ def laptop_hand_corrected() -> Recipe:
 
 def laptop_grounding() -> Recipe:
     """Stage A2 of the laptop pair: PONDER learns the tasks' words, as the paper's did before joint training."""
-    return Recipe(
-        name="laptop_grounding",
-        ponder=ponder_configs.laptop(),
-        pounce=pounce_configs.laptop(),
-        freeze="vision",
-        freezes_ponder_vision=True,
-        example=ExampleConfig(clocks=sampling.ROBOMME),
-        train=_LAPTOP,
-        num_steps=6_000,
-        batch_episodes=8,
-        w2=1.0,
-        trains="ponder",
-        demo_hz=2,
-        space="ee_delta",
-        statistics_by_row=True,
-        has_own_tokenizers=True,
-    )
+    return replace(laptop(), name="laptop_grounding", num_steps=6_000, w2=1.0, trains="ponder")
 
 
 def laptop() -> Recipe:
@@ -117,7 +101,7 @@ def laptop_without_grounding() -> Recipe:
 
 def laptop_observation() -> Recipe:
     """Row: the current observation and the task alone, trained so."""
-    return _of_the_hand("laptop_observation", pounce_configs.laptop(num_carriers=0), _NOTHING)
+    return _of_the_hand("laptop_observation", pounce_configs.laptop(num_carriers=0))
 
 
 def laptop_text() -> Recipe:
@@ -128,13 +112,13 @@ def laptop_text() -> Recipe:
 
 def laptop_framesamp() -> Recipe:
     """Row: FrameSamp+Modul, 16 pictures spread evenly over all that was seen."""
-    return _of_the_hand("laptop_framesamp", _with_frames(FrameSampling(num_frames=16, stride_ticks=10)), _NOTHING)
+    return _of_the_hand("laptop_framesamp", _with_frames(FrameSampling(num_frames=16, stride_ticks=10)))
 
 
 def laptop_window() -> Recipe:
     """Row: FrameSamp's consumer on the last six pictures, one a second."""
     newest = FrameSampling(num_frames=6, rule="newest", stride_ticks=20)
-    return replace(_of_the_hand("laptop_window", _with_frames(newest), _NOTHING), demo_hz=1)
+    return replace(_of_the_hand("laptop_window", _with_frames(newest)), demo_hz=1)
 
 
 def _with_frames(sampling: FrameSampling) -> PounceConfig:
@@ -142,12 +126,10 @@ def _with_frames(sampling: FrameSampling) -> PounceConfig:
     return replace(pounce_configs.laptop(num_carriers=0), frame_memory=memory)
 
 
-def _of_the_hand(name: str, pounce: PounceConfig, told: Told) -> Recipe:
+def _of_the_hand(name: str, pounce: PounceConfig, told: Told | None = None) -> Recipe:
     run = laptop_hand()
     return replace(run, name=name, pounce=pounce, example=replace(run.example, told=told), num_steps=_ROW_STEPS)
 
-
-_NOTHING = Told(grounded=0.0, simple=0.0)
 
 ALL: tuple[Callable[[], Recipe], ...] = (
     laptop_hand,

@@ -1,6 +1,6 @@
 """``make policy``: trains the laptop pair from nothing, in slices of some minutes; a killed or ended slice is resumed.
 
-    python -m dual_system.policy --folder POLICY_DIR --minutes 150
+    python -m benchmarks.policy --folder POLICY_DIR --minutes 150
 
 A stage is a set of commands that run side by side, each of which resumes by itself; when all have ended well, it is
 marked as done. Stages are run in their order until the slice is over. What each has cost is added to ``hours.jsonl``,
@@ -19,8 +19,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks.policy_plan import Stage, stages
 from dual_system.analysis.markdown import markdown
-from dual_system.policy.plan import Stage, stages
 from protocol.command_line import command, parse
 
 _ENDING_S = 120.0
@@ -40,7 +40,7 @@ class PolicyOptions:
 
 @command("policy")
 def main(argv: list[str] | None = None) -> int:
-    options = parse(PolicyOptions, argv, prog="python -m dual_system.policy")
+    options = parse(PolicyOptions, argv, prog="policy")
     folder = options.folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
     ends_s = time.monotonic() + 60 * options.minutes

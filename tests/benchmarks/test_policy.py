@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 
+from benchmarks import policy
+from benchmarks.policy import DONE, FAILED, UNFINISHED, account
+from benchmarks.policy_plan import Stage, stages
 from dual_system.data.collect import CollectOptions
 from dual_system.data.correct import CorrectOptions
-from dual_system.policy import __main__ as policy
-from dual_system.policy.__main__ import DONE, FAILED, UNFINISHED, account
-from dual_system.policy.plan import Stage, stages
 from dual_system.policy.towers import TowersOptions
 from dual_system.training.train import TrainOptions
 from protocol.command_line import parse
