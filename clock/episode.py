@@ -26,8 +26,9 @@ class Episode:
     newest_payload: bytes = b""
     recent: deque[bytes] = field(default_factory=lambda: deque(maxlen=0))
     """Lockstep: the observations before the newest in POUNCE's window, for one that restarts."""
-    remembered: list[bytes] = field(default_factory=list)
-    """Lockstep: those that POUNCE's memory has pictures of, in order, for one that restarts."""
+    remembered: deque[bytes] = field(default_factory=deque)
+    """Lockstep: the newest that POUNCE's memory has pictures of, in order, for one that restarts."""
+    remembered_bytes: int = 0
     invoked: m.Invocation | None = None
     """The newest invocation, for a POUNCE that restarts before it has answered."""
     phase: str = ""
@@ -74,6 +75,9 @@ class Episode:
         stride = self.conductor.picture_stride_ticks if self.is_lockstep else 0
         if stride and tick % stride == 0:
             self.remembered.append(payload)
+            self.remembered_bytes += len(payload)
+        while self.remembered_bytes > MAX_RECENT_BYTES:  # older ones would not fit into the answer
+            self.remembered_bytes -= len(self.remembered.popleft())
 
     def keep(self, query: m.Query) -> None:
         """Enters a query about the newest observation in the journal."""
