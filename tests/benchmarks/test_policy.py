@@ -67,9 +67,10 @@ PROGRAM = """
             while done < count:
                 time.sleep(0.05)
                 done += 1
-                file.write_text(str(done))
         except KeyboardInterrupt:
             return 130
+        finally:
+            file.write_text(str(done))
         return 0
 
     if __name__ == "__main__":
@@ -98,6 +99,11 @@ def plan(folder: Path, monkeypatch: pytest.MonkeyPatch, *counts: int) -> None:
     monkeypatch.setattr(policy, "stages", planned)
 
 
+def counted(folder: Path) -> int:
+    file = folder / "0.txt"
+    return int(file.read_text()) if file.exists() else 0
+
+
 def entries(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (folder / "hours.jsonl").read_text().splitlines()]
 
@@ -112,13 +118,13 @@ def test_what_is_done_is_not_done_again(programs: Path, monkeypatch: pytest.Monk
 
 def test_a_slice_that_is_over_is_gone_on_with(programs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plan(programs, monkeypatch, 1_000_000)
-    assert policy.main(["--folder", str(programs), "--minutes", "0.02"]) == UNFINISHED
-    reached = int((programs / "0.txt").read_text())
-    assert reached > 0
+    while (reached := counted(programs)) == 0:  # on a busy machine a slice may end before Python has started
+        assert policy.main(["--folder", str(programs), "--minutes", "0.02"]) == UNFINISHED
+    slices = len(entries(programs))
     plan(programs, monkeypatch, reached + 1)
     assert policy.main(["--folder", str(programs)]) == DONE
-    assert int((programs / "0.txt").read_text()) == reached + 1
-    assert [entry["stage"] for entry in entries(programs)] == ["part 0", "part 0"]
+    assert counted(programs) == reached + 1
+    assert len(entries(programs)) == slices + 1
 
 
 def test_a_command_that_fails_ends_the_slice(
