@@ -17,7 +17,7 @@ from dual_system.training.told import Told
 from dual_system.training.trainer import TrainConfig
 
 _LAPTOP = TrainConfig(seed=0, optim=OptimConfig(learning_rate=1e-3, warmup_steps=200, ema_decay=0.999))
-_ROW_STEPS = 4_000
+_ROW_STEPS = 1_500
 """Steps that every row of the table goes on with, whatever its channel."""
 
 
@@ -38,7 +38,7 @@ def laptop_hand() -> Recipe:
             branch_weight=3.0,
         ),
         train=_LAPTOP,
-        num_steps=20_000,
+        num_steps=7_000,
         batch_episodes=8,
         trains="pounce",
         demo_hz=2,
@@ -50,12 +50,12 @@ def laptop_hand() -> Recipe:
 
 def laptop_hand_corrected() -> Recipe:
     """Stage B, its end: the hand goes on with the oracle's corrections of its own play among the data (DAgger)."""
-    return replace(laptop_hand(), name="laptop_hand_corrected", num_steps=8_000)
+    return replace(laptop_hand(), name="laptop_hand_corrected", num_steps=2_000)
 
 
 def laptop_grounding() -> Recipe:
     """Stage A2 of the laptop pair: PONDER learns the tasks' words, as the paper's did before joint training."""
-    return replace(laptop(), name="laptop_grounding", num_steps=6_000, w2=1.0, trains="ponder")
+    return replace(laptop(), name="laptop_grounding", num_steps=4_000, w2=1.0, trains="ponder")
 
 
 def laptop() -> Recipe:
@@ -66,10 +66,10 @@ def laptop() -> Recipe:
         pounce=pounce_configs.laptop(),
         freeze="vision",
         freezes_ponder_vision=True,
-        example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=8, branch_weight=3.0),
+        example=ExampleConfig(clocks=sampling.ROBOMME, max_invocations=16, branch_weight=3.0),
         train=_LAPTOP,
         num_steps=_ROW_STEPS,
-        batch_episodes=8,
+        batch_episodes=4,  # 16 invocations of each: PONDER's films are what a step costs
         w2=0.3,  # the paper's 0.1 is for a pretrained LM head
         demo_hz=2,
         space="ee_delta",
@@ -127,8 +127,15 @@ def _with_frames(sampling: FrameSampling) -> PounceConfig:
 
 
 def _of_the_hand(name: str, pounce: PounceConfig, told: Told | None = None) -> Recipe:
-    run = laptop_hand()
-    return replace(run, name=name, pounce=pounce, example=replace(run.example, told=told), num_steps=_ROW_STEPS)
+    hand, pair = laptop_hand(), laptop()
+    return replace(
+        hand,
+        name=name,
+        pounce=pounce,
+        example=replace(hand.example, told=told, max_invocations=pair.example.max_invocations),
+        num_steps=pair.num_steps,
+        batch_episodes=pair.batch_episodes,
+    )
 
 
 ALL: tuple[Callable[[], Recipe], ...] = (
