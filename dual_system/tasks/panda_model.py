@@ -65,7 +65,7 @@ def panda_spec(robot: Robot = PANDA_WRISTCAM) -> mujoco.MjSpec:
 
 def _source_spec(robot: Robot) -> mujoco.MjSpec:
     """Robosuite's robot and hand joined, corrected and given our gains, with the full visual meshes."""
-    assets = _assets()
+    assets = robosuite_assets()
     spec = mujoco.MjSpec.from_file(str(assets / "robots/panda/robot.xml"))
     gripper = mujoco.MjSpec.from_file(str(assets / "grippers/panda_gripper.xml"))
     hand = spec.body("right_hand")
@@ -142,11 +142,12 @@ def _replace_fingers_by_stick(spec: mujoco.MjSpec) -> None:
     )
 
 
-def _assets() -> Path:
+def robosuite_assets() -> Path:
+    """Returns the folder of robosuite's asset files. Raises FileNotFoundError if they are not installed."""
     found = importlib.util.find_spec("robosuite")
     if found is None or not found.submodule_search_locations:
         raise FileNotFoundError(
-            "the arm's meshes come with robosuite, which is not installed. "
+            "the robots' meshes and the textures come with robosuite, which is not installed. "
             "Install its files with: pip install --no-deps robosuite==1.5.2"
         )
     return Path(found.submodule_search_locations[0]) / "models" / "assets"
