@@ -32,9 +32,12 @@ class ConditionOptions:
     another episode of the task."""
     donors: Path | None = None
     """Folder (--out) of a recorded evaluation of the same scenes with real cognition, for --cognition other-episode."""
-    subgoal_text: Literal["ponder", "grounded", "simple"] = "ponder"
-    """Source of the subgoals for a POUNCE that reads text: PONDER, or the task, with places (grounded) or without
-    (simple). The task's come as late as PONDER's."""
+    subgoal_text: Literal["ponder", "grounded", "simple", "displaced"] = "ponder"
+    """Source of the subgoals for a POUNCE that reads text: PONDER, or the task, with places (grounded), without
+    (simple), or with places that are 12 px off (displaced). The task's come as late as PONDER's."""
+    pictures: Literal["own", "other-scene", "without-cue"] = "own"
+    """What the models are shown: the scene; another one, in which the arm moves alike; or the scene without what only
+    memory could tell later (PickHighlight's discs, the cubes of the unmasking tasks)."""
     deliver: Literal["every", "held-transition"] = "every"
     """Delivery of cognition. held-transition: only the first, then those at predicted transitions (paper, 5.2)."""
     reported_age_ms: int = 0
@@ -199,8 +202,12 @@ class EvalOptions:
         known |= {"tasks": list(self.task_names()), "runs": self.runs, "cognition": self.condition.cognition}
         known["split"] = split_of(self.seeds[0])
         known["donors"] = None if self.condition.donors is None else str(self.condition.donors)
-        if self.condition.subgoal_text != "ponder":
-            known["subgoal_text"] = self.condition.subgoal_text
+        usual = ConditionOptions()
+        known |= {
+            name: getattr(self.condition, name)
+            for name in ("subgoal_text", "pictures")
+            if getattr(self.condition, name) != getattr(usual, name)
+        }
         return known
 
 

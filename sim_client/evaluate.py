@@ -24,7 +24,8 @@ import dual_system.tasks.headless  # noqa: F401 - before anything that imports m
 # isort: split
 
 from dual_system.data.workers import LocalWorkers, RayWorkers, Workers, worker_index
-from dual_system.tasks.environment import Environment, make_environment
+from dual_system.tasks.disguises import disguised
+from dual_system.tasks.environment import Environment
 from protocol import messages as m
 from protocol.bus import Bus
 from protocol.command_line import command, parse
@@ -38,7 +39,7 @@ from sim_client.ledger import Ledger, write_json
 from sim_client.null_ponder import NullPonder, cognition_shape
 from sim_client.suite import Suite
 from sim_client.swapped_ponder import SwappedPonder
-from sim_client.telling_ponder import TellingPonder
+from sim_client.telling_ponder import FAR_PX, TellingPonder
 
 DONE, REFUSED, INTERRUPTED = 0, 2, 130
 Line = dict[str, Any]  # one episode's entry in results.json
@@ -155,7 +156,8 @@ class EvaluationHarness:
             if self._environment is not None:
                 self._environment.close()
             needs_frames = self._options.policy == "servers" or self._options.log.record  # the oracle alone needs none
-            self._environment = make_environment(task, max_steps=self._options.condition.max_steps, render=needs_frames)
+            condition = self._options.condition
+            self._environment = disguised(task, condition.pictures, max_steps=condition.max_steps, render=needs_frames)
             self._task = task
         return self._environment
 
@@ -165,8 +167,9 @@ class EvaluationHarness:
         if options.condition.cognition == "other-episode":
             return self._build_donor
         if (told := options.condition.subgoal_text) != "ponder":
-            kind = m.SubgoalKind.TASK_GROUNDED if told == "grounded" else m.SubgoalKind.TASK_SIMPLE
-            return lambda bus, robot, _: TellingPonder(Link(bus, robot=robot, proc="ponder"), kind).step
+            kind = m.SubgoalKind.TASK_SIMPLE if told == "simple" else m.SubgoalKind.TASK_GROUNDED
+            off_px = FAR_PX if told == "displaced" else 0.0
+            return lambda bus, robot, _: TellingPonder(Link(bus, robot=robot, proc="ponder"), kind, off_px).step
         is_null = options.condition.cognition == "null"
         is_unheard = is_null and options.workers.servers == "in-process" and not options.log.record
         if is_unheard and options.pounce_checkpoint is not None:

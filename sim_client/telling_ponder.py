@@ -7,13 +7,18 @@ with PONDER's delay and age (`--delay-ms 0` comes near to theirs).
 
 from __future__ import annotations
 
+import zlib
+
 import numpy as np
 
-from dual_system.models.ponder.coordinates import normalised_text
+from dual_system.models.ponder.coordinates import moved_places, normalised_text
 from protocol import messages as m
 from protocol import topics
 from protocol.link import Link
 from sim_client.ponder_double import Answer, PonderDouble
+
+FAR_PX = 12.0
+"""How far a displaced text's places are off, in pixels of a 256 px picture: about three centimetres of the table."""
 
 _NO_VECTOR = np.zeros((0, 0), np.float32)
 
@@ -23,8 +28,9 @@ class TellingPonder(PonderDouble):
 
     payloads = (m.PayloadKind.TEXT,)
 
-    def __init__(self, link: Link, kind: m.SubgoalKind) -> None:
-        self._kind = kind
+    def __init__(self, link: Link, kind: m.SubgoalKind, off_px: float = 0.0) -> None:
+        """``off_px``: the distance by which every place is off, in a direction that the tick and the place decide."""
+        self._kind, self._off_px = kind, off_px
         self._said: list[m.Subgoal] = []
         self._subgoals = link.subscribe(topics.SUBGOAL)
         self._told: m.Subgoal | None = None
@@ -52,7 +58,7 @@ class TellingPonder(PonderDouble):
             vector=_NO_VECTOR,
             is_transition=is_new,
             norm=0.0,
-            text="" if newest is None else normalised_text(newest.text),
+            text="" if newest is None else self._told_as(newest),
             text_age_ns=query.source_ns - self._since_ns,
         )
 
@@ -60,3 +66,9 @@ class TellingPonder(PonderDouble):
         self._subgoals.drain()
         self._said.clear()
         self._told = None
+
+    def _told_as(self, subgoal: m.Subgoal) -> str:
+        text = normalised_text(subgoal.text)
+        angle_rad = zlib.crc32(f"{subgoal.tick} {text}".encode()) / 2**32 * 2 * np.pi
+        x_px, y_px = (round(self._off_px * float(part(angle_rad))) for part in (np.cos, np.sin))
+        return moved_places(text, (x_px, y_px))

@@ -138,10 +138,13 @@ _GIVEN = {
 
 _TOLD = {
     "ponder": "PONDER's subgoal text",
+    "displaced": "the task's grounded subgoal, 12 px off",
     "grounded": "the task's grounded subgoal",
     "simple": "the task's subgoal without places",
     "oracle": "the task's grounded subgoal of the same tick",  # of earlier releases
 }
+
+_SHOWN = {"other-scene": "the pictures of another scene", "without-cue": "pictures without the cue"}
 
 
 def _condition(results: Results) -> tuple[str, str, str, str]:
@@ -156,6 +159,8 @@ def _condition(results: Results) -> tuple[str, str, str, str]:
     if config.get("deliver") == "held-transition":
         reported_ms = config.get("held_age_ms", 0)
         gets += f" held at transitions, with {f'age {reported_ms} ms' if reported_ms else 'its true age'}"
+    if (shown := config.get("pictures")) is not None:
+        gets += f", {_SHOWN[shown]}"
     carriers = "" if results.num_carriers is None else str(results.num_carriers)
     return gets, _ms(config.get("query_period_ms")), _ms(config.get("delay_ms")), carriers
 

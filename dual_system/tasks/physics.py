@@ -105,6 +105,10 @@ class Physics:
         """Colours a geom until the next `reset`."""
         self.model.geom(geom).rgba[:] = rgba
 
+    def hide(self, body: str) -> None:
+        """Makes a body invisible until the next `reset`; it is touched as before."""
+        self.model.geom_rgba[self.model.geom_bodyid == self.model.body(body).id, 3] = 0.0
+
     def refresh(self) -> None:
         """Recomputes poses and contacts from the current state. No time passes."""
         mujoco.mj_forward(self.model, self.data)

@@ -137,6 +137,10 @@ class Task(ABC, Generic[LayoutT, MemoryT]):
         """
         return ()
 
+    def cues(self, layout: LayoutT) -> tuple[str, ...]:
+        """Returns the bodies that are seen only for a while, and then decide. The default is none."""
+        return ()
+
     @classmethod
     def can_be_forked(cls) -> bool:
         """Returns whether other pasts may lead to the same present."""

@@ -323,11 +323,19 @@ def test_subgoal_text_reaches_a_pounce_that_reads_it_and_is_refused_by_another(t
     save_bundle(random_bundle(dataclasses.replace(silent, reads_subgoal=True), seed=0), tmp_path / "pounce")
     shared: dict[str, Any] = {"tasks": ("StopCube",), "runs": 1, "policy": "servers", "max_steps": 10}
     streams = {}
-    for source in ("ponder", "grounded", "simple"):
-        chosen = options(tmp_path / source, subgoal_text=source, pounce_checkpoint=tmp_path / "pounce", **shared)
+    changes: dict[str, Any]
+    for source, changes in {
+        "ponder": {},
+        "grounded": {"subgoal_text": "grounded"},
+        "simple": {"subgoal_text": "simple"},
+        "displaced": {"subgoal_text": "displaced"},
+        "other": {"subgoal_text": "grounded", "pictures": "other-scene"},
+    }.items():
+        chosen = options(tmp_path / source, pounce_checkpoint=tmp_path / "pounce", **changes, **shared)
         with contextlib.closing(EvaluationHarness(chosen)) as harness:
             streams[source] = harness.play(chosen.jobs()[0])["stream_sha256"]
-    assert len(set(streams.values())) == 3
+        assert changes.items() <= chosen.config().items()
+    assert len(set(streams.values())) == 5
     other = options(tmp_path / "other", subgoal_text="grounded", **shared)
     with (
         contextlib.closing(EvaluationHarness(other)) as harness,

@@ -6,8 +6,10 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 
+from dual_system.models.ponder.coordinates import YX_PX, pixel_text
 from protocol import messages as m
 from protocol.link import Link
 from protocol.topics import COGNITION, INVOCATION, SUBGOAL
@@ -24,10 +26,10 @@ def played(
 ) -> Callable[[m.SubgoalKind], Any]:
     fake_pounce.spec = dataclasses.replace(fake_pounce.spec, num_carriers=0, reads_subgoal=True)
 
-    def play(kind: m.SubgoalKind, epochs: int = 1) -> Any:
+    def play(kind: m.SubgoalKind, epochs: int = 1, off_px: float = 0.0) -> Any:
         class Told(new_rig):  # type: ignore[misc, valid-type]
             def start_ponder(self, link: Link, engine: Any) -> Any:
-                return TellingPonder(link, kind)
+                return TellingPonder(link, kind, off_px)
 
         rig = Told(pounce_engine=fake_pounce)
         take = rig.listen(COGNITION, INVOCATION)
@@ -84,3 +86,13 @@ def test_an_episode_knows_nothing_of_the_one_before(played: Any) -> None:
     requests = [request.subgoal for request in rig.pounce_engine.requests]
     assert len(requests) == 10
     assert requests[:5] == requests[5:]
+
+
+def test_displaced_places_are_as_far_off_as_asked_and_stay_there(played: Any) -> None:
+    told = {each.text for each in played(GROUNDED, off_px=12.0).said[m.Cognition]} - {""}
+    assert len(told) == 2
+    for text in told:
+        (place,) = YX_PX.findall(pixel_text(text))
+        (meant,) = YX_PX.findall(TEXTS[0 if text.startswith("press") else 30][0])
+        off_px = np.hypot(*(int(a) - int(b) for a, b in zip(place, meant, strict=True)))
+        assert off_px == pytest.approx(12.0, abs=1.0)

@@ -116,6 +116,9 @@ class Unmask(Task[Layout, Pressed]):
             for shift in range(1, len(places))
         )
 
+    def cues(self, layout: Layout) -> tuple[str, ...]:
+        return tuple(cube_name(cube.container) for cube in layout.hidden)
+
     def remember(self, memory: Pressed | None, physics: Physics, layout: Layout) -> Pressed:
         now = (button for button in button_names(self.num_buttons) if predicates.is_pressed(physics, button))
         return (memory or frozenset()).union(now)

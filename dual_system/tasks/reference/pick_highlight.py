@@ -134,6 +134,9 @@ class PickHighlight(Task[Layout, Memory]):
         others = [index for index in range(len(layout.cubes)) if index not in layout.targets]
         return tuple(replace(layout, targets=lit) for lit in combinations(others, len(layout.targets)))
 
+    def cues(self, layout: Layout) -> tuple[str, ...]:
+        return _DISCS[: len(layout.targets)]
+
     def remember(self, memory: Memory | None, physics: Physics, layout: Layout) -> Memory:
         now = frozenset(name for name in _CUBES[: len(layout.cubes)] if predicates.is_picked(physics, name))
         return Memory(ever_picked=now | (memory.ever_picked if memory else frozenset()), picked_now=now)
