@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks.policy_gates import gates
 from benchmarks.policy_plan import Stage, stages
 from dual_system.analysis.markdown import markdown
 from protocol.command_line import command, parse
@@ -48,7 +49,7 @@ def main(argv: list[str] | None = None) -> int:
     for stage in stages(folder):
         if code == DONE and not _mark(stage, folder).exists():
             code = _run(stage, folder, ends_s)
-    sys.stdout.write(account(folder))
+    sys.stdout.write(gates(folder / "gates") + account(folder))
     return code
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +14,24 @@ CURRENT_WORDS = "words_current"
 """Folder of the PONDER without memory."""
 PLAYS, PLAYS_SEED = 40, 1_000_000
 """Episodes a task that the hand plays under the task's own text, to be corrected."""
+
+GATE_SCENES = 15
+"""Development scenes a task of every gate before joint training (`policy_gates`)."""
+GATES = {
+    "grounded": ("--subgoal-text", "grounded"),
+    "simple": ("--subgoal-text", "simple"),
+    "displaced": ("--subgoal-text", "displaced"),
+    "other_scene": ("--subgoal-text", "grounded", "--pictures", "other-scene"),
+    "alone": ("--cognition", "null"),
+}
+"""What each gate's plays are given, by the name of their folder."""
+HEED, HEED_PAIRS = "heed_", 40
+FAMILIES = {
+    "VideoUnmask": "permanence",
+    "PickHighlight": "reference",
+    "MoveCube": "imitation",
+    "PickXtimes": "counting",
+}
 
 ROWS = (
     (recipes.laptop, 0),
@@ -82,11 +100,30 @@ def stages(folder: Path) -> tuple[Stage, ...]:
                 (*training, *data, *_run(recipes.laptop_current_grounding.__name__, towers, towers, current_words)),
             ),
         ),
+        Stage(name="pairs", commands=tuple(_pairs(folder, task) for task in TASKS)),
+        Stage(name="gates", commands=tuple(_gates(folder, corrected / "pounce"))),
         *(
             Stage(name=f"rows {first // 2 + 1}", commands=tuple(rows[first : first + 2]))
             for first in range(0, len(rows), 2)
         ),
     )
+
+
+def _pairs(folder: Path, task: str) -> tuple[str, ...]:
+    scenes = ("--tasks", task, "--pairs", f"{HEED_PAIRS}", "--split", "development")
+    out = folder / "pairs" / task
+    return "dual_system.tasks.pair_files", "--family", FAMILIES[task], *scenes, "--demo-hz", "2", "--out", f"{out}"
+
+
+def _gates(folder: Path, hand: Path) -> Iterator[tuple[str, ...]]:
+    """Plays and heed of the hand that all rows share."""
+    scenes = ("--tasks", *TASKS, "--episodes", f"{GATE_SCENES}", "--runs", "1", "--split", "development")
+    for name, told in GATES.items():
+        given = ("--pounce-checkpoint", f"{hand}", "--max-steps", "700", *told)
+        yield "sim_client.evaluate", "--out", f"{folder / 'gates' / name}", *scenes, *given
+    for task in TASKS:
+        asked = ("--pounce", f"{hand}", "--pairs", f"{folder / 'pairs' / task}")
+        yield "sim_client.counterfactual", *asked, "--out", f"{folder / 'gates' / (HEED + task)}"
 
 
 def _row(folder: Path, recipe: str, seed: int) -> Sequence[str]:

@@ -17,15 +17,19 @@ from benchmarks.policy_plan import Stage, stages
 from dual_system.data.collect import CollectOptions
 from dual_system.data.correct import CorrectOptions
 from dual_system.policy.towers import TowersOptions
+from dual_system.tasks.pair_files import PairsOptions
 from dual_system.training.train import TrainOptions
 from protocol.command_line import parse
 from sim_client.condition import EvalOptions
+from sim_client.counterfactual import CounterfactualOptions
 
 OPTIONS: dict[str, Any] = {
     "dual_system.data.collect": CollectOptions,
     "dual_system.data.correct": CorrectOptions,
     "sim_client.evaluate": EvalOptions,
     "dual_system.policy.towers": TowersOptions,
+    "dual_system.tasks.pair_files": PairsOptions,
+    "sim_client.counterfactual": CounterfactualOptions,
     "dual_system.training.train": TrainOptions,
 }
 
