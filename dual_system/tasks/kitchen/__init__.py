@@ -1,0 +1,1 @@
+"""RoboCasa-DC's twenty-four kitchen tasks in a kitchen of our own, generated per seed."""
