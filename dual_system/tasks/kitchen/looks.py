@@ -17,7 +17,7 @@ PAINT = "paint"
 WALLS = ("cream-plaster", "white-plaster", "gray-plaster", "light-gray-plaster")
 FLOORS = ("light-gray-floor-tile", "wood-tiles", "gray-woodgrain")
 TOPS = ("ceramic", "light-gray-plaster", "white-plaster", "light-wood")
-WOODS = ("dark-wood", "light-wood", "gray-woodgrain", "blue-wood", "green-wood", "wood-varnished-panels")
+WOODS = ("dark-wood", "light-wood", "gray-woodgrain", "blue-wood", "green-wood")
 
 COLORS: dict[str, tuple[int, int, int]] = {
     "white": (245, 245, 242),

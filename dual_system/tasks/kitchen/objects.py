@@ -56,7 +56,7 @@ KINDS: dict[str, Kind] = {
     # ball: half axes x, y, z
     "apple": _kind("ball", ((33, 33, 33), (30, 30, 30), (32, 32, 32), (31, 31, 31), (33, 33, 33), (29, 29, 29)),
                    (("red",), ("lime",), ("dark red",), ("yellow",), ("green",), ("red",)), is_washable=True),
-    "orange": _kind("ball", ((32, 32, 32), (30, 30, 30), (33, 33, 33), (31, 31, 31), (29, 29, 29), (32, 32, 32)),
+    "orange": _kind("ball", ((32, 32, 32), (30, 30, 30), (33, 33, 33), (31, 31, 31), (29, 29, 29), (28, 28, 28)),
                     (("orange",),) * _EACH, is_washable=True),
     "tomato": _kind("ball", ((30, 30, 25), (32, 32, 27), (28, 28, 24), (31, 31, 24), (29, 29, 26), (33, 33, 28)),
                     (("red",), ("red",), ("orange",), ("dark red",), ("red",), ("lime",)), is_washable=True),
@@ -107,6 +107,9 @@ KINDS: dict[str, Kind] = {
                   ("green", "brown"), ("yellow", "brown"), ("purple", "brown")), is_food=False),
 }  # fmt: skip
 FOODS = tuple(name for name, kind in KINDS.items() if kind.is_food)
+_VESSEL_ROOM_MM = 65
+DISHES = tuple(name for name in FOODS if max(each.size_mm[0] for each in KINDS[name].instances) <= _VESSEL_ROOM_MM)
+"""Food that lies within a plate or a pan."""
 WASHABLES = tuple(name for name, kind in KINDS.items() if kind.is_washable)
 GRASPABLES = tuple(name for name, kind in KINDS.items() if kind.shape in ("ball", "block", "post"))
 

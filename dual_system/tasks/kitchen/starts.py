@@ -5,13 +5,13 @@ Source: RoboCasa's kitchen tasks at v0.2, rules restated.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from dual_system.tasks.kitchen import objects
+from dual_system.tasks.kitchen.drafts import Draft, Span, draft
 from dual_system.tasks.kitchen.fixtures import cabinet, coffee_machine, counter, drawer, microwave, sink, stove
-from dual_system.tasks.kitchen.layouts import Draft, Span, draft
 from dual_system.tasks.kitchen.plan import COUNTER_TOP_M, FixtureKind, Instances, Target
 
 AJAR_FRACTION = (0.90, 1.0)  # of a door or drawer that starts open
@@ -20,11 +20,11 @@ _BACK_Y_M: Span = (-0.22, -0.08)  # where distractors stand
 _ASIDE_Y_M: Span = (-0.50, -0.10)  # both, beside a fixture
 _UNDER_CABINET_X_M = 0.28
 _DRAWER_ASIDE_M = counter.DRAWER_HALF_M + 0.3
-_DRAWER_BACK_M = 0.23
+DRAWER_BACK_M = 0.23
 _PAN_YAW_RAD = (np.deg2rad(22.5), np.deg2rad(45.0))  # of the handle, to either side of the robot's direction
 _MUG_YAW_RAD, _SERVED_YAW_RAD = np.deg2rad((45.0, 90.0)), np.deg2rad((22.5, 45.0))
 _WATER_ON_RAD, _KNOB_ON_RAD = (0.40, 0.50), (0.50, np.pi / 2)
-_SPOUT_START_RAD = 0.25
+SPOUT_START_RAD = 0.25
 OBJ, CONTAINER = "obj", "container"
 
 
@@ -74,7 +74,7 @@ def open_doors(drawn: Draft, kind: FixtureKind, joints: list[str]) -> None:
 def drawers(rng: np.random.Generator, instances: Instances, *, is_open: bool) -> Start:
     """A drawer to the left or right of the robot, with an object in it."""
     side = int(rng.choice([-1, 1]))
-    drawn = draft(rng, instances, ["drawer"], offsets_m=[side * _DRAWER_ASIDE_M], back_m=_DRAWER_BACK_M)
+    drawn = draft(rng, instances, ["drawer"], offsets_m=[side * _DRAWER_ASIDE_M], back_m=DRAWER_BACK_M)
     out_m = 0.0
     if is_open:
         drawn.joints["drawer/slide"] = open_joint("drawer", "", float(rng.uniform(*AJAR_FRACTION)))
@@ -107,7 +107,7 @@ def faucet(rng: np.random.Generator, instances: Instances, *, is_on: bool) -> St
 def spout(rng: np.random.Generator, instances: Instances) -> Start:
     """A sink whose spout points about ahead; side and water are drawn."""
     start = faucet(rng, instances, is_on=bool(rng.integers(2)))
-    start.draft.joints["sink/spout"] = float(rng.uniform(-_SPOUT_START_RAD, _SPOUT_START_RAD))
+    start.draft.joints["sink/spout"] = float(rng.uniform(-SPOUT_START_RAD, SPOUT_START_RAD))
     side = ("left", "right")[int(rng.integers(2))]
     return Start(draft=start.draft, target=Target(fixture="sink", part=side), words={"side": side})
 
@@ -151,7 +151,7 @@ def microwave_buttons(rng: np.random.Generator, instances: Instances, *, is_on: 
 
 def coffee_button(rng: np.random.Generator, instances: Instances) -> Start:
     """A coffee machine with a mug under its dispenser."""
-    return coffee_serve(rng, instances)
+    return replace(coffee_serve(rng, instances), target=Target(fixture="coffee_machine"))
 
 
 def coffee_serve(rng: np.random.Generator, instances: Instances) -> Start:
@@ -194,7 +194,8 @@ def cabinet_pnp(rng: np.random.Generator, instances: Instances, *, is_in_cabinet
         drawn.put_somewhere(OBJ, word, inside_x, (-0.30, -0.26), z_m=floor)
     else:
         drawn.put_somewhere(OBJ, word, under_x, _FRONT_Y_M)
-        drawn.put_somewhere("behind", drawn.draw_kind(objects.GRASPABLES), inside_x, (-0.10, -0.09), z_m=floor)
+        behind = drawn.draw_kind(objects.GRASPABLES)
+        drawn.put_somewhere("behind", behind, inside_x, (-0.10, -0.09), z_m=floor, yaw_rad=0.0)
     drawn.distract(1, [under_x], _BACK_Y_M)
     return Start(draft=drawn, target=Target(fixture="cabinet", obj=OBJ), words={"obj": word})
 
@@ -223,7 +224,7 @@ def microwave_pnp(rng: np.random.Generator, instances: Instances, *, is_in_micro
     tray = (drawn.x_m + tray_x, microwave.CENTER_Y_M + tray_y, tray_z)
     right = drawn.x_m + microwave.HALF_WIDTH_M
     beside_x, beside_y = (right + 0.115, right + 0.16), (-0.52, -0.42)  # the door is in the way on the left
-    word = drawn.draw_kind(objects.FOODS)
+    word = drawn.draw_kind(objects.DISHES)
     words = {"obj": word}
     if is_in_microwave:
         drawn.put("plate", "plate", tray, yaw_rad=0.0)
@@ -244,7 +245,7 @@ def stove_pnp(rng: np.random.Generator, instances: Instances, *, is_in_pan: bool
     put_pan(drawn, burner)
     near, far = _sides(drawn, counter.STOVE_HALF_M)
     beside_x = far if ("left" in burner) == (near[0] > drawn.x_m) else near  # on the pan's side
-    word = drawn.draw_kind(objects.FOODS)
+    word = drawn.draw_kind(objects.DISHES)
     words = {"obj": word, "pan": "pan"}
     if is_in_pan:
         put_on(drawn, OBJ, word, "pan")

@@ -136,10 +136,10 @@ def draft(
     kinds: Sequence[FixtureKind],
     *,
     names: Sequence[str] = (),
-    offsets_m: Sequence[float] = (0.0,),
+    offsets_m: Sequence[float] | None = None,
     back_m: float = 0.0,
 ) -> Draft:
-    """Draws a bay with reference fixtures at offsets from the robot, and one or two others beside them."""
+    """Draws a bay with reference fixtures at offsets from the robot, by default 0, and up to two others beside them."""
     length = float(rng.uniform(*_LENGTH_M))
     x = float(rng.uniform(-_REFERENCE_X_M, _REFERENCE_X_M))
     finish = Finish(
@@ -150,7 +150,7 @@ def draft(
     )
     fixtures = [
         FixturePlan(kind=kind, name=name, x_m=x + offset, opens_right=bool(rng.integers(2)))
-        for kind, name, offset in zip(kinds, names or kinds, offsets_m, strict=True)
+        for kind, name, offset in zip(kinds, names or kinds, offsets_m or [0.0] * len(kinds), strict=True)
     ]
     drawn = Draft(rng=rng, instances=instances, length_m=length, x_m=x, finish=finish, fixtures=fixtures, back_m=back_m)
     _add_neighbours(drawn)
