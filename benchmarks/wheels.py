@@ -56,7 +56,7 @@ class Case:
 
 ABSENT = "! pounce-serve --backend {} --start-s 2 --mapping examples/policies/{} --url {}"
 IN_PROCESS = "sim-client --in-process --max-steps 20 --no-progress --out {out}"
-COLLECT = "pp-collect --tasks PickHighlight --episodes 1 --difficulties easy --image-px 64 --out {out}/set"
+COLLECT = "pp-collect --tasks PickHighlight --episodes 1 --difficulties easy --out {out}/set"
 GYM = (
     'python -c "import gymnasium, dual_system.tasks.gymnasium_env; '
     "e = gymnasium.make('ponderpounce/PickHighlight-v0'); e.reset(seed=0); e.step(e.action_space.sample()); e.close()\""
