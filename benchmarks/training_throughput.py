@@ -136,8 +136,8 @@ def _batch(
             demo=(images,) * options.demo,
             images=[images] * ticks,
             views=[views] * ticks,
-            state_T8=rng.uniform(-0.2, 0.2, (ticks, 8)).astype(np.float32),
-            action_T8=rng.uniform(-0.2, 0.2, (ticks, 8)).astype(np.float32),
+            state_TS=rng.uniform(-0.2, 0.2, (ticks, 8)).astype(np.float32),
+            action_TA=rng.uniform(-0.2, 0.2, (ticks, 8)).astype(np.float32),
             subgoals=[f"pick cube {1 + tick // 50} at <{50 + tick // 50}, 120>" for tick in range(ticks)],
             is_transition_T=np.arange(ticks) % 50 == 0,
         )

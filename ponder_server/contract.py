@@ -82,6 +82,8 @@ class EngineSpec:
     """What an episode's log is to say of the model, besides its hash."""
     gives_text: bool = True
     """False if it never writes a subgoal, so that POUNCE's prompt cannot come from it."""
+    cameras: tuple[str, ...] = ()
+    """Names of the cameras in training, in order; () if they are not known."""
     remembers: bool = True
     """False if every query is answered from the instruction and its own observation alone."""
     weights: WeightsName = "float"

@@ -87,7 +87,8 @@ class QwenEngine:
         self._episodes: dict[str, Episode] = {}
         reader = self._format.reader
         self._frame_px = reader.readable_sizes(ponder.image_px)[0]
-        check_cameras([self._frame_px] * config.num_cameras, reader, ponder.image_px)
+        self._num_cameras = config.num_cameras or self._format.num_cameras
+        check_cameras([self._frame_px] * self._num_cameras, reader, ponder.image_px)
         settle(ponder.device)
         ponder.served_hash = ponder.served_hash or weights_hash(ponder)
         size = slot_size(ponder.qwen.config.text_config, ponder.dtype)
@@ -110,7 +111,8 @@ class QwenEngine:
             num_carriers=self._format.num_carriers,
             hidden_size=ponder.hidden_size,
             image_px=ponder.image_px,
-            num_cameras=config.num_cameras,
+            num_cameras=self._num_cameras,
+            cameras=self._format.cameras,
             reader=reader,
             demonstrations=self._format.demonstrations,
             max_context_tokens=config.max_context_tokens,
@@ -234,8 +236,8 @@ class QwenEngine:
         context = episode.context
         if session in (*self._begun, *self._batch.sessions):
             raise SessionError(f"session {session!r} is thinking about a query already; one at a time.")
-        if len(frames) != self._config.num_cameras:
-            raise ValueError(f"fire got {len(frames)} frames, this engine has num_cameras {self._config.num_cameras}")
+        if len(frames) != self._num_cameras:
+            raise ValueError(f"fire got {len(frames)} frames, this engine has num_cameras {self._num_cameras}")
         pictures = self._see(frames, "observation")
         ids = self._query_ids(proprio)
         if force_text_tokens is not None and force_text_tokens < 1:
@@ -384,7 +386,7 @@ class QwenEngine:
         """Noise frames for one query, for measurements."""
         noise = np.random.default_rng(0)
         shape = (*self._frame_px, 3)
-        return tuple(noise.integers(0, 256, shape, dtype=np.uint8) for _ in range(self._config.num_cameras))
+        return tuple(noise.integers(0, 256, shape, dtype=np.uint8) for _ in range(self._num_cameras))
 
     @torch.inference_mode()
     def _example_cognition(self) -> Tensor:
@@ -412,7 +414,7 @@ class QwenEngine:
 
     def _query_ids(self, proprio: Proprio | None) -> tuple[int, ...]:
         """Tokens of O_t and the carriers, a fixed number."""
-        observed = self._format.observation(self._config.num_cameras, proprio)
+        observed = self._format.observation(self._num_cameras, proprio)
         return (*observed.ids, *self._format.carrier_ids)
 
     def _see(self, frames: tuple[Frame, ...], where: str) -> Pictures:

@@ -12,8 +12,8 @@ from ponder_server.runner import BUCKETS
 class EngineConfig:
     """Options of an engine; the network is in its ``Ponder``."""
 
-    num_cameras: int = 2
-    """Frames per fire, always the same cameras in the same order."""
+    num_cameras: int | None = None
+    """Frames per fire, always the same cameras in the same order. None: as many as the checkpoint says."""
     max_context_tokens: int = 16_384
     """Limit per session (paper, section 3.4: 16K holds more than 100 fires of two cameras)."""
     max_sessions: int = 4

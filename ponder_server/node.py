@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dual_system.models.action_space import ROBOT_DIM
+from model_server import cameras
 from model_server.rendezvous import Rendezvous
 from ponder_server.contract import EngineSpec, Fire, Frame, Proprio
 from protocol import images
@@ -155,6 +156,7 @@ def check_robot(robot: m.Robot, spec: EngineSpec) -> None:
             f"robot {robot.name!r} has {len(robot.cameras)} cameras {list(robot.cameras)}; PONDER expects "
             f"{spec.num_cameras}",
         )
+    cameras.check_names("PONDER", spec.cameras, robot)
     if spec.reader.state_rows and robot.num_proprio != ROBOT_DIM:
         raise EpisodeRefused(
             m.Refusal.ROBOT,

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from dual_system.models.action_space import ActionSpace
 from dual_system.models.arm import JOINT_HIGH_RAD, JOINT_LOW_RAD, NUM_ARM_JOINTS
 from dual_system.models.frame_sampling import FrameSampling, PastFrame
+from model_server import cameras
 from protocol.errors import EpisodeRefused
 from protocol.messages import EpisodeInfo, ObservationWindow, Refusal, Robot
 
@@ -37,7 +38,7 @@ class EngineSpec:
     horizon: int
     """Rows per chunk."""
     action_dim: int
-    """Dims of a row in robot units: 7 joint targets (rad) and the gripper, -1 closed to 1 open."""
+    """Dims of a row in robot units. The Panda's: 7 joint targets (rad) and the gripper, -1 closed to 1 open."""
     proprio_dim: int
     num_carriers: int
     """K; 0 means the engine takes no cognition."""
@@ -56,7 +57,9 @@ class EngineSpec:
     """True if the cognition prefix is untrained: cognition affects the actions, but not meaningfully."""
     dtype: DTypeName
     space: ActionSpace = "joint_delta"
-    """The network's action space. Rows are absolute joint targets in any case; see `check_robot`."""
+    """The network's action space. Rows are in the robot's units in any case; see `check_robot`."""
+    cameras: tuple[str, ...] = ()
+    """Names of the cameras in training, in order; () if they are not known."""
     continuity: Continuity = "none"
     max_committed_rows: int = 0
     """Largest number of committed rows in the network's training; for continuity "trained" only."""
@@ -98,9 +101,9 @@ class Request:
 
     instruction: str
     frames: tuple[NDArray[np.uint8] | None, ...]
-    """(h, w, 3) uint8 per camera, front then wrist; None for a missing camera."""
+    """(h, w, 3) uint8 per camera, in the robot's order; None for a missing camera."""
     proprio: NDArray[np.float32]
-    """(8,) float32: 7 joint positions (rad), finger opening (m)."""
+    """(proprio_dim,) float32. The Panda's: 7 joint positions (rad), finger opening (m)."""
     cognition: NDArray[np.float32] | None
     """(K, H) float32; None means the learned null."""
     age_ns: int
@@ -175,7 +178,8 @@ def check_robot(robot: Robot, spec: EngineSpec) -> None:
             Refusal.CAMERAS,
             f"POUNCE reads {spec.num_cameras} cameras, the robot has {len(robot.cameras)}: {names}",
         )
-    if spec.space == "joint_delta":
+    cameras.check_names("POUNCE", spec.cameras, robot)
+    if spec.space != "ee_delta":
         return
     low, high = robot.command_low[:NUM_ARM_JOINTS], robot.command_high[:NUM_ARM_JOINTS]
     is_panda = len(low) == NUM_ARM_JOINTS and (low >= JOINT_LOW_RAD - _LIMIT_SLACK_RAD).all()
@@ -193,7 +197,7 @@ def check_request(request: Request, spec: EngineSpec) -> None:
     if not request.instruction.strip():
         raise ValueError("instruction is empty; POUNCE needs the task's text")
     if len(request.frames) != spec.num_cameras:
-        raise ValueError(f"expected {spec.num_cameras} frames (front, wrist order), came {len(request.frames)}")
+        raise ValueError(f"expected {spec.num_cameras} frames, one for each camera, came {len(request.frames)}")
     if spec.num_cameras and all(frame is None for frame in request.frames):
         raise ValueError(f"all {spec.num_cameras} cameras are missing; POUNCE does not act blind")
     for index, frame in enumerate(request.frames):

@@ -1,4 +1,4 @@
-"""POUNCE of either family as an action engine: for each request a chunk of absolute joint targets."""
+"""POUNCE of either family as an action engine: for each request a chunk of rows in the robot's units."""
 
 # B requests, N horizon, A padded action dim, D dims of the action space
 
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dual_system.models import flow
-from dual_system.models.action_space import ROBOT_DIM
 from dual_system.models.flow import EulerStep
 from dual_system.models.gpu import current, settle
 from dual_system.models.groot.pounce import GrootInputs, GrootPounce
@@ -86,6 +85,8 @@ class EagerEngine:
             )
         if rolls_forward and continuity == "trained":
             raise ValueError("--roll-forward plans after the committed rows, --continuity trained with them: take one")
+        if rolls_forward and bundle.statistics.space == "native":
+            raise ValueError("--roll-forward predicts the Panda's joints; this checkpoint commands another robot")
         self._rolls_forward = rolls_forward
         config = bundle.model.config
         self._statistics = bundle.statistics
@@ -95,14 +96,15 @@ class EagerEngine:
         self.spec = EngineSpec(
             horizon=config.horizon,
             control_hz=0 if bundle.is_random else config.control_hz,
-            action_dim=ROBOT_DIM,
-            proprio_dim=ROBOT_DIM,
+            action_dim=bundle.statistics.robot_command_dim,
+            proprio_dim=bundle.statistics.robot_state_dim,
             space=bundle.statistics.space,
             num_carriers=config.cognition.num_carriers,
             cognition_size=config.cognition.cognition_size,
             image_px=config.image_px,
             num_steps=config.num_steps,
             num_cameras=config.num_cameras,
+            cameras=config.cameras,
             model_hash=bundle.digest(),
             is_random=bundle.is_random,
             has_fresh_prefix=bundle.has_fresh_prefix,

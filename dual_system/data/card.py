@@ -62,10 +62,11 @@ def card(dataset: Dataset) -> str:
         "",
         f"# {len(entries)} episodes of {len(_by_task(entries))} memory tasks",
         "",
-        f"{num_rows} rows at {FPS} Hz ({num_rows / FPS / 3600:.2f} hours), two cameras of {dataset.image_px} px, "
-        f"{_num_bytes(dataset.root) / 1e6:.1f} MB. LeRobot dataset {dataset.described['codebase_version']}, simulated "
-        "in MuJoCo. Row k holds what was seen before action k; a demonstration's rows come first and carry "
-        "`is_demonstration`. Each picture below is the front camera's, the demonstration's framed in yellow.",
+        f"{num_rows} rows at {FPS} Hz ({num_rows / FPS / 3600:.2f} hours), {len(dataset.cameras)} cameras of "
+        f"{dataset.image_px} px, {_num_bytes(dataset.root) / 1e6:.1f} MB. LeRobot dataset "
+        f"{dataset.described['codebase_version']}, simulated in MuJoCo. Row k holds what was seen before action k; a "
+        "demonstration's rows come first and carry `is_demonstration`. Each picture below is the "
+        f"{dataset.cameras[0]} camera's, the demonstration's framed in yellow.",
         "",
         f"![contact sheet]({SHEET})",
         "",
@@ -77,7 +78,7 @@ def card(dataset: Dataset) -> str:
 
 
 def contact_sheet(dataset: Dataset) -> Image.Image:
-    """Returns one line of front-camera pictures per task, evenly spread over its first episode."""
+    """Returns one line of the first camera's pictures per task, evenly spread over its first episode."""
     tasks = _by_task(dataset.episodes)
     height_px = PICTURE_PX + LABEL_PX
     sheet = Image.new("RGB", (PICTURES_PER_TASK * PICTURE_PX, len(tasks) * height_px), "white")
@@ -87,7 +88,7 @@ def contact_sheet(dataset: Dataset) -> Image.Image:
         shown = np.linspace(0, first.num_rows - 1, PICTURES_PER_TASK).round().astype(int).tolist()
         draw.text((2, line * height_px), f"{task}, seed {first.seed}: {first.instruction}", fill="black")
         rows = sorted(set(shown))
-        pictures = dict(zip(rows, dataset.frames(first.index, "front", rows), strict=True))
+        pictures = {row: views[0] for row, views in zip(rows, dataset.views(first, rows), strict=True)}
         for column, row in enumerate(shown):
             corner = (column * PICTURE_PX, line * height_px + LABEL_PX)
             sheet.paste(Image.fromarray(pictures[row]).resize((PICTURE_PX, PICTURE_PX)), corner)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from bisect import bisect_left
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from dual_system.data import lerobot_files as layout
 from dual_system.data import lerobot_v3 as v3
-from dual_system.data.episode import CAMERAS, OPTIONAL, Rows, from_table
+from dual_system.data.episode import DEMO_CAMERA, EXECUTED, OPTIONAL, TCP_POSE, Rows, from_table
 from dual_system.data.errors import DatasetError
 from dual_system.data.lerobot_folder import LeRobotFolder
 from dual_system.data.video import FPS
@@ -43,6 +44,11 @@ class Dataset:
 
     Episodes are known by their ``episode_index``, which need not count from 0.
 
+    Attributes:
+        cameras: names of the robot's cameras, in the order that models read them.
+        demo_cameras: those of demonstrations; another body's has one of its own (`DEMO_CAMERA`).
+        state_dim, action_dim: how many numbers a row has of each.
+
     Raises:
         DatasetError: the folder holds no such dataset, or a broken one (`LeRobotFolder`).
     """
@@ -59,8 +65,14 @@ class Dataset:
             )
         if self._folder.fps != FPS:
             raise DatasetError(f"{root} has {self._folder.fps} rows a second; datasets here have {FPS}")
-        shapes = {camera: self._folder.features.get(layout.video_key(camera), {}).get("shape") for camera in CAMERAS}
-        self.image_px = _side_px(root, shapes)
+        videos = [name.removeprefix(_VIDEO) for name in self._folder.cameras if name.startswith(_VIDEO)]
+        self.cameras = tuple(camera for camera in videos if camera != DEMO_CAMERA)
+        self.demo_cameras = (DEMO_CAMERA,) if DEMO_CAMERA in videos else self.cameras
+        if not self.cameras:
+            raise DatasetError(f"{root / layout.INFO_PATH}: no camera's videos; expected features {_VIDEO}NAME")
+        features = self._folder.features
+        self.image_px = _side_px(root, {camera: features[layout.video_key(camera)].get("shape") for camera in videos})
+        self.state_dim, self.action_dim = (_size(root, features, name) for name in ("observation.state", "action"))
         self.episodes = tuple(_entry(root, listed) for listed in self._folder.listed)
 
     def rows(self, episode: int) -> Rows:
@@ -73,7 +85,10 @@ class Dataset:
         wanted = [each.name for each in fields(Rows) if each.name not in OPTIONAL or each.name in self._folder.features]
         table = self._folder.rows(episode, [theirs.get(name, name) for name in wanted]).rename_columns(wanted)
         try:
-            rows = from_table(table)
+            rows = from_table(
+                table,
+                {"state": self.state_dim, "action": self.action_dim, EXECUTED: self.action_dim, TCP_POSE: 7},
+            )
         except ValueError as error:
             raise DatasetError(f"{self.root}: episode {episode}: {error}") from None
         return rows
@@ -87,7 +102,18 @@ class Dataset:
         """
         return self._folder.frames(episode, layout.video_key(camera), rows)
 
+    def views(self, entry: Entry, rows: Sequence[int]) -> Iterator[tuple[NDArray[np.uint8], ...]]:
+        """Yields the pictures of each of some rows, which ascend: the robot's cameras', a demonstration's its own.
 
+        Raises: as `frames`.
+        """
+        split = bisect_left(rows, entry.num_demonstration_rows)
+        for cameras, part in ((self.demo_cameras, rows[:split]), (self.cameras, rows[split:])):
+            if part:
+                yield from zip(*(self.frames(entry.index, camera, part) for camera in cameras), strict=True)
+
+
+_VIDEO = layout.video_key("")
 _SAME = ("task", "seed", "difficulty", "origin", "is_success", "recovery", "num_rejected", "num_demonstration_rows")
 _LISTED = {
     "tasks": list,
@@ -97,6 +123,14 @@ _LISTED = {
     "num_demonstration_rows": int,
 } | dict.fromkeys(("task", "difficulty", "origin", "recovery"), str)
 """Our columns of ``meta/episodes`` that every dataset of ours has, and the type of their values."""
+
+
+def _size(root: Path, features: Mapping[str, Any], column: str) -> int:
+    """How many numbers a row of a column has. Raises DatasetError unless its shape says so."""
+    shape = features.get(column, {}).get("shape")
+    if not isinstance(shape, list) or len(shape) != 1 or type(shape[0]) is not int or shape[0] < 1:
+        raise DatasetError(f"{root / layout.INFO_PATH}: {column} has the shape {shape}; expected one number, its size")
+    return shape[0]
 
 
 def _side_px(root: Path, shapes: Mapping[str, Any]) -> int:

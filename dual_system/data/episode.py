@@ -22,37 +22,60 @@ from dual_system.data.statistics import PixelHistogram
 from dual_system.data.video import FPS, Frame, VideoWriter
 
 CAMERAS = ("front", "wrist")
+DEMO_CAMERA = "demonstration"
+"""Camera of demonstrations by another body: a dataset that has it shows them with it alone."""
 ROWS, ABOUT = "rows.parquet", "episode.json"
-EXECUTED = "executed_action"
-OPTIONAL = (EXECUTED,)
-"""Columns that only some datasets have: those collected under noise."""
+EXECUTED, TCP_POSE = "executed_action", "tcp_pose"
+OPTIONAL = (TCP_POSE, EXECUTED)
+"""Columns that only some datasets have: those of our arm, and those collected under noise."""
 
-_TYPES = {
-    **{
-        name: pa.list_(pa.float32(), size)
-        for name, size in (("state", 8), ("action", 8), ("tcp_pose", 7), (EXECUTED, 8))
-    },
-    **dict.fromkeys(("is_demonstration", "is_transition", "is_rendered"), pa.bool_()),
-}
-"""Arrow types of the columns; the others are texts."""
+_VECTORS = ("state", "action", *OPTIONAL)
+_TRUTHS = ("is_demonstration", "is_transition", "is_rendered")
 
 Package = dict[str, bytes]  # file name -> content
 Recovery = Literal["none", "z", "xy"]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RobotColumns:
+    """The robot whose episodes a dataset holds: names of its numbers, and its cameras in the models' order."""
+
+    robot_type: str
+    state: tuple[str, ...]
+    action: tuple[str, ...]
+    cameras: tuple[str, ...]
+    has_demo_camera: bool = False
+    """Demonstrations are by another body, in `DEMO_CAMERA` alone."""
+
+    @property
+    def videos(self) -> tuple[str, ...]:
+        return (*self.cameras, DEMO_CAMERA) if self.has_demo_camera else self.cameras
+
+    def shown_in(self, is_demonstration: bool) -> tuple[str, ...]:
+        """The cameras whose pictures a row of its own has."""
+        return (DEMO_CAMERA,) if is_demonstration and self.has_demo_camera else self.cameras
+
+
+_JOINTS = tuple(f"joint_{number}" for number in range(1, 8))
+PANDA = RobotColumns(
+    robot_type="panda", state=(*_JOINTS, "finger_opening"), action=(*_JOINTS, "gripper"), cameras=CAMERAS
+)
+"""The arm of the sixteen tasks: seven joints [rad] and one finger's opening [m]; joint targets, gripper in [-1, 1]."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Row:
-    """One instant of an episode and what was done then."""
+    """One instant of an episode and what was done then. S and A are the robot's (`RobotColumns`)."""
 
-    state: NDArray[np.float32]  # (8,): seven joints [rad], one finger's opening [m]
-    action: NDArray[np.float32]  # (8,): seven joint targets [rad], gripper in [-1, 1]
-    tcp_pose: NDArray[np.float32]  # (7,): xyz [m], quaternion wxyz, of the joints in `state`
+    state: NDArray[np.float32]  # (S,)
+    action: NDArray[np.float32]  # (A,)
+    tcp_pose: NDArray[np.float32] | None = None  # (7,): xyz [m], quaternion wxyz, of the joints in `state`
     subgoal: str
     grounded_subgoal: str
     is_demonstration: bool = False
     is_transition: bool = False  # the first row of a new subgoal that the robot itself is to reach
     demonstration_reasoning: str = ""  # only in the first row after a demonstration
-    executed_action: NDArray[np.float32] | None = None  # (8,): executed in place of `action`, under noise
+    executed_action: NDArray[np.float32] | None = None  # (A,): executed in place of `action`, under noise
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,16 +112,16 @@ class About:
 class Rows:
     """The rows of an episode as columns."""
 
-    state: NDArray[np.float32]  # (N, 8)
-    action: NDArray[np.float32]  # (N, 8)
-    tcp_pose: NDArray[np.float32]  # (N, 7)
+    state: NDArray[np.float32]  # (N, S)
+    action: NDArray[np.float32]  # (N, A)
     is_demonstration: NDArray[np.bool_]  # (N,)
     is_transition: NDArray[np.bool_]  # (N,)
     is_rendered: NDArray[np.bool_]  # (N,): the pictures are this row's own, not repeats of an earlier row's
     subgoal: tuple[str, ...]
     grounded_subgoal: tuple[str, ...]
     demonstration_reasoning: tuple[str, ...]
-    executed_action: NDArray[np.float32] | None = None  # (N, 8); None: every action was executed as it is
+    tcp_pose: NDArray[np.float32] | None = None  # (N, 7); None: not recorded
+    executed_action: NDArray[np.float32] | None = None  # (N, A); None: every action was executed as it is
 
     def __len__(self) -> int:
         return len(self.state)
@@ -107,19 +130,36 @@ class Rows:
 class EpisodeWriter:
     """Takes an episode row by row and encodes its pictures as they come; it needs some megabytes of memory."""
 
-    def __init__(self, image_px: int) -> None:
+    def __init__(self, image_px: int, robot: RobotColumns = PANDA) -> None:
+        self._robot = robot
         self._rows: list[Row] = []
         self._is_rendered: list[bool] = []
-        self._videos = {camera: VideoWriter(image_px) for camera in CAMERAS}
-        self._pixels = {camera: PixelHistogram() for camera in CAMERAS}
+        self._videos = {camera: VideoWriter(image_px) for camera in robot.videos}
+        self._pixels = {camera: PixelHistogram() for camera in robot.videos}
         self._counted_row = -FPS
+        if robot.has_demo_camera:  # no row has a picture of every camera: what comes before a camera's first is black
+            self._before: Frame | None = np.zeros((image_px, image_px, 3), np.uint8)
+        else:
+            self._before = None
 
     def add(self, row: Row, frames: Mapping[str, Frame]) -> None:
-        """Appends a row with the pictures of both cameras, or none: then the videos repeat the last ones."""
+        """Appends a row with its cameras' pictures (`RobotColumns.shown_in`), or none: the videos repeat the last ones.
+
+        Raises:
+            ValueError: the numbers are not the robot's, or the pictures are of other cameras.
+        """
+        robot, shown = self._robot, self._robot.shown_in(row.is_demonstration)
+        if (len(row.state), len(row.action)) != (len(robot.state), len(robot.action)):
+            raise ValueError(
+                f"{robot.robot_type}: expected {len(robot.state)} numbers of state and {len(robot.action)} of action, "
+                f"came {len(row.state)} and {len(row.action)}"
+            )
+        if frames and {*frames} != {*shown}:
+            raise ValueError(f"a row's pictures are of {', '.join(shown)}, came {', '.join(frames)}")
         counts = bool(frames) and len(self._rows) - self._counted_row >= FPS  # one a second is enough for statistics
-        for camera in CAMERAS:
-            self._videos[camera].add(frames.get(camera))
-            if counts:
+        for camera in robot.videos:
+            self._videos[camera].add(frames.get(camera, None if self._rows else self._before))
+            if counts and camera in frames:
                 self._pixels[camera].add(frames[camera])
         self._counted_row = len(self._rows) if counts else self._counted_row
         self._rows.append(row)
@@ -129,7 +169,9 @@ class EpisodeWriter:
         """Returns the files of the finished episode."""
         rows = self._rows
         columns = Rows(
-            **{name: np.stack([getattr(row, name) for row in rows]) for name in ("state", "action", "tcp_pose")},
+            state=np.stack([row.state for row in rows]),
+            action=np.stack([row.action for row in rows]),
+            tcp_pose=_poses(rows),
             is_demonstration=np.array([row.is_demonstration for row in rows]),
             is_transition=np.array([row.is_transition for row in rows]),
             is_rendered=np.array(self._is_rendered),
@@ -170,7 +212,7 @@ def unpack(package: Package) -> Episode:
         about=About(**values),
         rows=from_table(pq.read_table(io.BytesIO(package[ROWS]))),
         pixels=pixels,
-        videos={camera: package[f"{camera}.mp4"] for camera in CAMERAS},
+        videos={camera: package[f"{camera}.mp4"] for camera in pixels},
     )
 
 
@@ -180,15 +222,26 @@ def to_table(rows: Rows) -> pa.Table:
     return pa.table({name: _to_arrow(column) for name, column in columns.items() if column is not None})
 
 
-def from_table(table: pa.Table) -> Rows:
+def from_table(table: pa.Table, sizes: Mapping[str, int] | None = None) -> Rows:
     """Returns the rows of an Arrow table; unknown columns are ignored, and optional ones may be missing.
+
+    ``sizes``: how many numbers a row of each column of vectors has; None: as many as `to_table` wrote.
 
     Raises:
         ValueError: a column cannot be of its type in `Rows`, or a value is null. Other widths are cast: pandas, with
             which LeRobot's tools rewrite rows, has its own.
     """
-    names = [each.name for each in fields(Rows) if each.name not in OPTIONAL or each.name in table.column_names]
-    return Rows(**{name: _from_arrow(name, table.column(name).combine_chunks()) for name in names})
+    required = [each.name for each in fields(Rows) if each.name not in OPTIONAL]
+    names = [*required, *(name for name in OPTIONAL if name in table.column_names)]
+    return Rows(**{name: _from_arrow(name, table.column(name).combine_chunks(), sizes) for name in names})
+
+
+def _poses(rows: list[Row]) -> NDArray[np.float32] | None:
+    """Returns the tool's poses (N, 7); None if no row has one."""
+    found = [row.tcp_pose for row in rows if row.tcp_pose is not None]
+    if found and len(found) < len(rows):
+        raise ValueError(f"{len(found)} of {len(rows)} rows have a tcp_pose; expected all or none")
+    return np.stack(found) if found else None
 
 
 def _executed(rows: list[Row]) -> NDArray[np.float32] | None:
@@ -206,8 +259,11 @@ def _to_arrow(column: Any) -> Any:
     return pa.FixedSizeListArray.from_arrays(pa.array(column.reshape(-1)), column.shape[1])
 
 
-def _from_arrow(name: str, column: Any) -> Any:
-    kind = _TYPES.get(name, pa.string())
+def _from_arrow(name: str, column: Any, sizes: Mapping[str, int] | None) -> Any:
+    if name in _VECTORS:
+        kind = pa.list_(pa.float32(), column.type.list_size if sizes is None else sizes[name])
+    else:
+        kind = pa.bool_() if name in _TRUTHS else pa.string()
     try:
         column = column.cast(kind)
     except pa.ArrowException as error:

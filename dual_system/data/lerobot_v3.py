@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from dual_system.data import lerobot_files as layout
-from dual_system.data.episode import CAMERAS, EXECUTED, OPTIONAL, Episode, to_table
+from dual_system.data.episode import EXECUTED, OPTIONAL, PANDA, TCP_POSE, Episode, RobotColumns, to_table
 from dual_system.data.language import EVENTS, FEATURE, PERSISTENT, language_columns, spoken_in
 from dual_system.data.lerobot_files import (
     DATA_FILE_MB,
@@ -28,13 +29,9 @@ from dual_system.data.video import FPS
 COLLECTION_PATH = "meta/collection.json"
 """Ours: how `pp-collect` made the folder."""
 
-_JOINTS = [f"joint_{number}" for number in range(1, 8)]
-_POSE = ["x", "y", "z", "qw", "qx", "qy", "qz"]
+_POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 OUR_NAMES = {"observation.state": "state"}  # of LeRobot's columns; the others are called the same
 _COLUMNS: dict[str, dict[str, Any]] = {
-    "observation.state": {"dtype": "float32", "shape": [8], "names": [*_JOINTS, "finger_opening"]},
-    "action": {"dtype": "float32", "shape": [8], "names": [*_JOINTS, "gripper"]},
-    "tcp_pose": {"dtype": "float32", "shape": [7], "names": _POSE},
     "is_demonstration": {"dtype": "bool", "shape": [1], "names": None},
     "is_transition": {"dtype": "bool", "shape": [1], "names": None},
     "is_rendered": {"dtype": "bool", "shape": [1], "names": None},
@@ -43,21 +40,26 @@ _COLUMNS: dict[str, dict[str, Any]] = {
     "demonstration_reasoning": {"dtype": "string", "shape": [1], "names": None},
     **layout.NUMBERING,
 }
-_OPTIONAL_COLUMNS = {EXECUTED: _COLUMNS["action"]}
-"""Columns that only some datasets have (`episode.OPTIONAL`)."""
-_POLICY = ("observation.state", "action", "tcp_pose", EXECUTED)
+_POLICY = ("observation.state", "action", TCP_POSE, EXECUTED)
 """Columns whose statistics leave demonstrations out: they normalise the policy."""
 
 
 class DatasetWriter:
     """Appends episodes to a new v3 folder; `finish` writes its tables, without which it is no dataset yet."""
 
-    def __init__(self, root: Path, *, data_file_mb: int = DATA_FILE_MB, video_file_mb: int = VIDEO_FILE_MB) -> None:
-        self._root = root
+    def __init__(
+        self,
+        root: Path,
+        robot: RobotColumns = PANDA,
+        *,
+        data_file_mb: int = DATA_FILE_MB,
+        video_file_mb: int = VIDEO_FILE_MB,
+    ) -> None:
+        self._root, self._robot = root, robot
         self._limits_mb = (data_file_mb, video_file_mb)
         self._data = RowFiles(root, data_file_mb)
-        self._videos = {camera: VideoFiles(root, video_key(camera), video_file_mb, FPS) for camera in CAMERAS}
-        self._pixels = {camera: PixelHistogram() for camera in CAMERAS}
+        self._videos = {camera: VideoFiles(root, video_key(camera), video_file_mb, FPS) for camera in robot.videos}
+        self._pixels = {camera: PixelHistogram() for camera in robot.videos}
         self._instructions: dict[str, int] = {}
         self._episodes: list[dict[str, Any]] = []
         self._image_px = 0
@@ -133,12 +135,16 @@ class DatasetWriter:
         return pa.table(columns | language_columns(spoken_in(episode.rows), num_rows))
 
     def _columns(self) -> dict[str, dict[str, Any]]:
-        return _COLUMNS | {name: _OPTIONAL_COLUMNS[name] for name in self._optional or ()}
+        robot, optional = self._robot, self._optional or ()
+        vectors = {"observation.state": robot.state, "action": robot.action}
+        vectors |= {TCP_POSE: _POSE} if TCP_POSE in optional else {}
+        found = {name: _vectors(names) for name, names in vectors.items()} | _COLUMNS
+        return found | ({EXECUTED: _vectors(robot.action)} if EXECUTED in optional else {})
 
     def _described(self) -> dict[str, Any]:
         video = layout.video_feature(self._image_px, self._image_px, FPS)
         return layout.described(
-            robot_type="panda",
+            robot_type=self._robot.robot_type,
             fps=FPS,
             num_episodes=len(self._episodes),
             num_rows=self._num_rows,
@@ -148,6 +154,11 @@ class DatasetWriter:
                 **self._columns(),
                 PERSISTENT: FEATURE,
                 EVENTS: FEATURE,
-                **{video_key(camera): video for camera in CAMERAS},
+                **{video_key(camera): video for camera in self._robot.videos},
             },
         )
+
+
+def _vectors(names: Sequence[str]) -> dict[str, Any]:
+    """LeRobot's description of a column whose rows have one number for each name."""
+    return {"dtype": "float32", "shape": [len(names)], "names": list(names)}

@@ -94,6 +94,12 @@ def check_channel(cognition: CognitionConfig, reads_subgoal: bool) -> None:
         )
 
 
+def check_camera_names(names: tuple[str, ...], num_cameras: int) -> None:
+    """Raises ValueError unless there is a name for each camera, or none at all."""
+    if names and len(names) != num_cameras:
+        raise ValueError(f"expected the names of {num_cameras} cameras or none, came {', '.join(names)}")
+
+
 class CognitionPrefix(nn.Module):
     """Projects cognition and age into the language stream. Needs K >= 1."""
 

@@ -1,13 +1,13 @@
 """Robot units to the network's [-1, 1] and back: an `action_space` and the quantiles of its dims."""
 
-# N horizon, 8 = 7 arm joints (rad) + gripper, D numbers of the space
+# N horizon, 8 = 7 arm joints (rad) + gripper (in space "native": as many as the robot has), D numbers of the space
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dual_system.models.action_space import ActionSpace, actions_in, num_dims, states_in, targets_from
+from dual_system.models.action_space import ROBOT_DIM, ActionSpace, actions_in, num_dims, states_in, targets_from
 
 Floats = NDArray[np.float32]
 
@@ -67,13 +67,25 @@ class RobotStatistics:
     def __post_init__(self) -> None:
         expected = num_dims(self.space)
         for name, table in (("state", self.state), ("action", self.action)):
-            if table.num_dims != expected:
+            if expected is not None and table.num_dims != expected:
                 raise ValueError(
                     f"statistics in space {self.space!r} need {expected} {name} dims, came {table.num_dims}; "
                     "collect them in that space (TrainingSet.statistics)"
                 )
         if any(each <= 0 for each in self.reach):
             raise ValueError(f"a row's reach must be above 0, came {self.reach}")
+        if self.reach and self.space == "native":
+            raise ValueError("a row's reach is a share of moves from the chunk's first state; native commands are none")
+
+    @property
+    def robot_state_dim(self) -> int:
+        """Dims of the robot's state, before `action_space.states_in`."""
+        return self.state.num_dims if self.space == "native" else ROBOT_DIM
+
+    @property
+    def robot_command_dim(self) -> int:
+        """Dims of a row in the robot's units."""
+        return self.action.num_dims if self.space == "native" else ROBOT_DIM
 
     def normalise_states(self, states_8: ArrayLike) -> Floats:
         """The robot's states (..., 8) -> (..., D) as the network reads them."""
@@ -96,7 +108,7 @@ class RobotStatistics:
         return self.action.normalise(actions_MND)
 
     def absolute_targets(self, actions_ND: ArrayLike, state_8: ArrayLike) -> Floats:
-        """The network's actions (N, D) -> absolute joint targets (rad) and gripper, clipped to [-1, 1]: (N, 8)."""
+        """The network's actions (N, D) -> rows in the robot's units, (N, 8) (`targets_from`)."""
         actions = self.action.denormalise(actions_ND)
         actions[:, :-1] *= self._reach(len(actions), 0)
         return targets_from(self.space, actions, state_8).astype(np.float32)

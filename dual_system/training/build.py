@@ -11,7 +11,7 @@ from typing import Literal
 
 import torch
 
-from dual_system.data.episode import CAMERAS
+from dual_system.models.action_space import ActionSpace
 from dual_system.models.groot.pounce import GrootPounceConfig
 from dual_system.models.pi05.pounce import Pounce, PounceConfig, freeze
 from dual_system.models.pi05.prompt import Tokenizer, tokenizer_of_instructions
@@ -28,10 +28,11 @@ from dual_system.models.pounce.checkpoint import (
     random_bundle,
     save_bundle,
 )
+from dual_system.models.pounce.configs import Config
 from dual_system.models.pounce.family import AnyPounceConfig
 from dual_system.models.pounce.initialise import open_gates, random_pounce
 from dual_system.models.pounce.precision import cast_streams
-from dual_system.training.data import TrainingSet
+from dual_system.training.data import RobotShape, TrainingSet
 from dual_system.training.joint import JointModel, Trains, runs_ponder
 from dual_system.training.recipe import Recipe
 from protocol import disk
@@ -57,10 +58,11 @@ def build(run: Recipe, data: TrainingSet, start: Start) -> tuple[JointModel, Pou
     """Both systems, initialised or loaded, frozen as the recipe says, with the data's own statistics.
 
     Raises:
-        ValueError: pretrained weights are missing, PONDER cannot read the pictures' size, or texts that the recipe
-            learns are missing.
+        ValueError: pretrained weights are missing or of another robot than the data, PONDER cannot read the pictures'
+            size, or texts that the recipe learns are missing.
         FileNotFoundError: a given folder holds no checkpoint.
     """
+    run = replace(run, pounce=for_robot(run.pounce, run.space, data.robot))
     needs_ponder = runs_ponder(run.trains, run.pounce.cognition.num_carriers)
     if not run.from_scratch and (start.pounce is None or (needs_ponder and start.ponder is None)):
         raise ValueError(
@@ -85,8 +87,12 @@ def _ponder(run: Recipe, data: TrainingSet, start: Start) -> Ponder:
     seed, dtype = run.train.seed, DTYPES[start.dtype]
     if start.ponder is not None:
         ponder = load_ponder(start.ponder, device=start.device, dtype=dtype)
+        if ponder.format.cameras not in ((), data.robot.cameras):
+            names = ", ".join(ponder.format.cameras)
+            raise ValueError(f"{start.ponder} was trained on the cameras {names}; the data have {data.robot}")
         if ponder.is_random and run.trains != "pounce":
             ponder.draw_carriers(seed)
+            ponder.look_at(run.ponder.image_px)
     else:
         own = None
         if run.has_own_tokenizers:
@@ -95,16 +101,21 @@ def _ponder(run: Recipe, data: TrainingSet, start: Start) -> Ponder:
     if not runs_ponder(run.trains, run.pounce.cognition.num_carriers):
         return ponder
     try:
-        check_cameras([(data.image_px, data.image_px)] * len(CAMERAS), ponder.format.reader, ponder.image_px)
+        sizes = [(data.image_px, data.image_px)] * len(data.robot.cameras)
+        check_cameras(sizes, ponder.format.reader, ponder.image_px)
     except ValueError as error:
         wanted_px = ponder.format.reader.readable_sizes(ponder.image_px)[0][0]
         folders = ", ".join(map(str, data.roots))
         raise ValueError(f"{folders}: {error}; collect with --image-px {wanted_px}") from None
     if run.trains != "pounce":
         declared = ponder.format.demonstrations
-        demonstrations = replace(data.demo_sampling() or declared, num_views=declared.num_views)
+        found = data.demo_sampling() or declared
         ponder.format = replace(
-            ponder.format, speaks=run.w2 > 0, demonstrations=demonstrations, remembers=run.remembers
+            ponder.format,
+            speaks=run.w2 > 0,
+            demonstrations=replace(found, num_views=declared.num_views or found.num_views),
+            remembers=run.remembers,
+            cameras=data.robot.cameras,
         )
     return ponder
 
@@ -117,12 +128,39 @@ def _pounce(run: Recipe, data: TrainingSet, start: Start, ponder: Ponder) -> Pou
         open_gates(bundle.model)
         return bundle
     if declares_config(start.pounce):
-        return with_channel(run, load_bundle(start.pounce, tokenizer=start.tokenizer))
+        found = load_bundle(start.pounce, tokenizer=start.tokenizer)
+        _require_same_robot(found, data, start.pounce)
+        return with_channel(run, found)
     # A public folder has no cognition prefix and declares no inputs, and its statistics are of other data.
     config = _for_this_pair(run, public_config(start.pounce), ponder)
     return load_bundle(
         start.pounce, config=config, statistics=measured(), tokenizer=start.tokenizer, prefix_seed=run.train.seed
     )
+
+
+def for_robot(config: Config, space: ActionSpace, robot: RobotShape) -> Config:
+    """The configuration with the cameras and dims of the data's robot. Raises ValueError if it has no room for them."""
+    state_dim, action_dim = robot.dims_in(space)
+    is_blind = config.num_cameras == 0
+    return replace(
+        config,
+        robot_state_dim=state_dim,
+        robot_action_dim=action_dim,
+        num_cameras=0 if is_blind else len(robot.cameras),
+        cameras=() if is_blind else robot.cameras,
+    )
+
+
+def _require_same_robot(bundle: PounceBundle, data: TrainingSet, folder: Path) -> None:
+    """Raises ValueError if a checkpoint of ours is of another robot than the data."""
+    config, statistics, robot = bundle.model.config, bundle.statistics, data.robot
+    has_cameras = config.num_cameras in (0, len(robot.cameras)) and config.cameras in ((), robot.cameras)
+    dims = (statistics.robot_state_dim, statistics.robot_command_dim)
+    if not has_cameras or dims != (robot.state_dim, robot.action_dim):
+        raise ValueError(
+            f"{folder} is of another robot than the data: it has {config.num_cameras} cameras "
+            f"{', '.join(config.cameras)}, state {dims[0]}, action {dims[1]}; the data have {robot}"
+        )
 
 
 def with_channel(run: Recipe, bundle: PounceBundle) -> PounceBundle:

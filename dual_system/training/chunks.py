@@ -9,8 +9,8 @@ from dual_system.training.episode import TrainingEpisode
 
 
 def target_rows(episode: TrainingEpisode, tick: int, horizon: int) -> NDArray[np.float32]:
-    """Commands (horizon, 8) from ``tick`` on; after the end the last one repeats, as on the robot."""
-    return episode.action_T8[chunk_ticks(np.array([tick]), horizon, episode.num_ticks)[0]]
+    """Commands (horizon, A) from ``tick`` on; after the end the last one repeats, as on the robot."""
+    return episode.action_TA[chunk_ticks(np.array([tick]), horizon, episode.num_ticks)[0]]
 
 
 def chunk_ticks(first_M: NDArray[np.integer], horizon: int, num_ticks: int) -> NDArray[np.intp]:

@@ -57,7 +57,7 @@ class _TrainingMoment:
 
     @property
     def proprio(self) -> Floats:
-        return self.example.episode.state_T8[self.invocation.tick]
+        return self.example.episode.state_TS[self.invocation.tick]
 
     @property
     def cognition(self) -> None:
@@ -124,7 +124,7 @@ def collate_pounce(
         ticks = np.array([invocation.tick for invocation in example.invocations], dtype=np.intp)
         episode = example.episode
         rows = chunk_ticks(ticks, config.horizon, episode.num_ticks)
-        wanted = statistics.normalise_chunks(episode.action_T8, episode.state_T8[ticks], rows)
+        wanted = statistics.normalise_chunks(episode.action_TA, episode.state_TS[ticks], rows)
         actions_INA[first : first + len(ticks), :, : config.robot_action_dim] = torch.from_numpy(wanted)
         first += len(ticks)
     queries = [moment.invocation.reference.query for moment in moments]

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dual_system.data.dataset import Dataset, Entry
-from dual_system.data.episode import CAMERAS, IMPORTED, Rows
+from dual_system.data.episode import IMPORTED, Rows
 from dual_system.data.video import FPS
-from dual_system.models.action_space import ActionSpace, actions_in, num_dims, states_in
+from dual_system.models.action_space import ROBOT_DIM, ActionSpace, actions_in, num_dims, states_in
 from dual_system.models.frame_sampling import FrameSampling
 from dual_system.models.images import resized
 from dual_system.models.normalisation import Quantiles, RobotStatistics
@@ -87,7 +87,7 @@ class _Source:
 
     def frames(self, rows: Sequence[int]) -> Iterator[tuple[Frame, ...]]:
         """Yields every camera's picture at each of these rows."""
-        return zip(*(self.dataset.frames(self.entry.index, camera, rows) for camera in CAMERAS), strict=True)
+        return self.dataset.views(self.entry, rows)
 
     @property
     def key(self) -> bytes:
@@ -95,6 +95,42 @@ class _Source:
         rows = self.rows()
         scene = f"{self.entry.task} {self.entry.seed} {self.entry.difficulty} {self.dataset.image_px}"
         return b" ".join((scene.encode(), rows.state.tobytes(), rows.action.tobytes(), rows.is_rendered.tobytes()))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RobotShape:
+    """What a dataset says of its robot, and POUNCE's configuration has to fit."""
+
+    cameras: tuple[str, ...]
+    demo_cameras: tuple[str, ...]
+    state_dim: int
+    action_dim: int
+
+    @classmethod
+    def of(cls, dataset: Dataset) -> RobotShape:
+        return cls(
+            cameras=dataset.cameras,
+            demo_cameras=dataset.demo_cameras,
+            state_dim=dataset.state_dim,
+            action_dim=dataset.action_dim,
+        )
+
+    def __str__(self) -> str:
+        shown = "" if self.demo_cameras == self.cameras else f", demonstrations in {', '.join(self.demo_cameras)}"
+        return f"cameras {', '.join(self.cameras)}, state {self.state_dim}, action {self.action_dim}{shown}"
+
+    def dims_in(self, space: ActionSpace) -> tuple[int, int]:
+        """Dims of the network's state and actions in a space. Raises ValueError if it is another robot's."""
+        dims = num_dims(space)
+        if dims is None:
+            return self.state_dim, self.action_dim
+        if (self.state_dim, self.action_dim) != (ROBOT_DIM, ROBOT_DIM):
+            raise ValueError(
+                f"space {space!r} is the Panda's, with {ROBOT_DIM} numbers of state and of action; the data have "
+                f"{self.state_dim} and {self.action_dim}. Take a recipe whose space is native (robocasa_dc, "
+                "tiny_robocasa_dc)"
+            )
+        return dims, dims
 
 
 class TrainingSet:
@@ -126,17 +162,21 @@ class TrainingSet:
 
         Raises:
             DatasetError: a folder holds no dataset of ours.
-            ValueError: a folder has no episode of these tasks, or the folders' pictures differ in size.
+            ValueError: a folder has no episode of these tasks, or the folders' robots or pictures' sizes differ.
         """
         self.roots = roots
         self._sizes, self._demo_hz = sizes or PictureSizes(), demo_hz
         self._store = None if store is None else PictureStore(store, self._sizes.key)
         self._sources = [source for root in roots for source in _sources(Dataset(root), tasks)]
         found_px = {source.dataset.image_px for source in self._sources}
+        folders = ", ".join(map(str, roots))
         if len(found_px) > 1:
-            folders = ", ".join(map(str, roots))
             raise ValueError(f"pictures of {sorted(found_px)} px in {folders}; collect all at one --image-px")
         (self.image_px,) = found_px
+        robots = {RobotShape.of(source.dataset) for source in self._sources}
+        if len(robots) > 1:
+            raise ValueError(f"{folders} are of different robots: {'; '.join(sorted(map(str, robots)))}")
+        (self.robot,) = robots
         self._cache: OrderedDict[int, TrainingEpisode] = OrderedDict()
         self._cache_bytes = cache_mb * 1_000_000
         self._cached_bytes = 0
@@ -166,12 +206,15 @@ class TrainingSet:
     def demo_sampling(self) -> DemoSampling | None:
         """Sampling of these demonstrations; None if there are none.
 
-        ``to_its_end`` is set if most of those that end between two samples have their last frame rendered.
+        ``num_views`` is set if they have cameras of their own, ``to_its_end`` if most of those that end between two
+        samples have their last frame rendered.
         """
         begins = [source.entry.num_demonstration_rows for source in self._sources]
         shown = [(source, begin - 1) for source, begin in zip(self._sources, begins, strict=True) if begin]
         ends = [bool(source.rows().is_rendered[last]) for source, last in shown if last % (FPS // self._demo_hz)]
-        return DemoSampling(hz=self._demo_hz, to_its_end=2 * sum(ends) > len(ends)) if shown else None
+        num_views = None if self.robot.demo_cameras == self.robot.cameras else len(self.robot.demo_cameras)
+        sampling = DemoSampling(hz=self._demo_hz, to_its_end=2 * sum(ends) > len(ends), num_views=num_views)
+        return sampling if shown else None
 
     def instructions(self) -> list[str]:
         """Distinct instructions, sorted."""
@@ -253,8 +296,8 @@ class TrainingSet:
             demo=tuple(images[: len(demo)]),
             images=images[len(demo) :],
             views=views[len(demo) :],
-            state_T8=rows.state[start:],
-            action_T8=rows.action[start:],
+            state_TS=rows.state[start:],
+            action_TA=rows.action[start:],
             subgoals=rows.grounded_subgoal[start:],
             is_transition_T=rows.is_transition[start:],
             reasoning=rows.demonstration_reasoning[start],
@@ -312,7 +355,11 @@ class TrainingSet:
 
         All rows of a chunk are pooled, as in the released RoboMME statistics; ``by_row`` first scales every row to
         the same spread (`RobotStatistics.reach`).
+
+        Raises:
+            ValueError: the space is another robot's.
         """
+        _, num_actions = self.robot.dims_in(space)
         states, actions = [], []
         for source in self._sources:
             rows = source.rows()
@@ -327,7 +374,7 @@ class TrainingSet:
         actions_MND[..., :-1] /= reach_N[:, None]
         return RobotStatistics(
             state=_quantiles(np.concatenate(states)),
-            action=_quantiles(actions_MND.reshape(-1, num_dims(space))),
+            action=_quantiles(actions_MND.reshape(-1, num_actions)),
             space=space,
             reach=tuple(reach_N.tolist()) if by_row else (),
         )

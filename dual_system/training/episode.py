@@ -1,6 +1,6 @@
 """A recorded episode as training data."""
 
-# T ticks
+# T ticks, S numbers of a state, A of an action
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class TrainingEpisode:
     """PONDER's images (`ObservationReader.images`), per tick; empty tuples if PONDER is not run."""
     views: Sequence[tuple[Frame, ...]]
     """POUNCE's views in the order of the robot's cameras, per tick; empty tuples if POUNCE reads none."""
-    state_T8: NDArray[np.float32]
-    action_T8: NDArray[np.float32]
-    """Absolute joint targets and the gripper's command."""
+    state_TS: NDArray[np.float32]
+    action_TA: NDArray[np.float32]
+    """What was commanded, in the robot's units; the Panda's are absolute joint targets and the gripper's command."""
     subgoals: Sequence[str]
     """T grounded texts; empty texts for data without annotations."""
     is_transition_T: NDArray[np.bool_]
@@ -48,7 +48,7 @@ class TrainingEpisode:
     """For each tick, the tick at which its picture was taken (`as_seen`); None: the same tick."""
 
     def __post_init__(self) -> None:
-        columns = (self.images, self.views, self.state_T8, self.action_T8, self.subgoals, self.is_transition_T)
+        columns = (self.images, self.views, self.state_TS, self.action_TA, self.subgoals, self.is_transition_T)
         sizes = {len(column) for column in columns}
         if len(sizes) != 1 or 0 in sizes:
             raise ValueError(
@@ -82,6 +82,6 @@ class TrainingEpisode:
         )
 
     def ponder_state(self, tick: int) -> NDArray[np.float32]:
-        """The robot's state (8,) when the picture of this tick was taken."""
-        state_8: NDArray[np.float32] = self.state_T8[tick if self.seen_at_T is None else self.seen_at_T[tick]]
-        return state_8
+        """The robot's state (S,) when the picture of this tick was taken."""
+        state_S: NDArray[np.float32] = self.state_TS[tick if self.seen_at_T is None else self.seen_at_T[tick]]
+        return state_S

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from dual_system.training.episode import Frame
 
 Views = list[tuple[Frame, ...]]
-"""Per instant, one picture per view; empty tuples if no view is read."""
+"""Per instant, one picture per view; empty tuples if no view is read. A demonstration's instants come first, and may
+have fewer views than the robot's."""
 
 
 class PictureStore:
@@ -57,14 +58,21 @@ def _name(key: bytes) -> str:
 
 
 def _arrays(views: dict[str, Views]) -> dict[str, NDArray[np.uint8]]:
-    """``name/number``: (instants, height, width, 3) of each view."""
+    """``name/number``: (instants, height, width, 3) of each view, for the last instants, those that have it."""
     return {
-        f"{name}/{number}": np.stack(pictures)
+        f"{name}/{number}": np.stack([pictures[number] for pictures in instants if number < len(pictures)])
         for name, instants in views.items()
-        for number, pictures in enumerate(zip(*instants, strict=True))
+        for number in range(max(map(len, instants), default=0))
     }
 
 
 def _instants(arrays: dict[str, NDArray[np.uint8]], name: str, num_instants: int) -> Views:
     mine = [array for key, array in arrays.items() if key.rpartition("/")[0] == name]
-    return list(zip(*mine, strict=True)) if mine else [()] * num_instants
+    if not mine:
+        return [()] * num_instants
+    count = len(mine[0])
+    late = [count - len(array) for array in mine]  # the first instant with each view
+    return [
+        tuple(array[instant - first] for array, first in zip(mine, late, strict=True) if instant >= first)
+        for instant in range(count)
+    ]

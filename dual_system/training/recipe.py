@@ -40,7 +40,7 @@ class Recipe:
     demo_hz: int = 1
     """Frames per second of demonstrations (paper: 1); stored in PONDER's checkpoint and contract."""
     space: ActionSpace = "joint_delta"
-    """POUNCE's action space."""
+    """POUNCE's action space. native: the data's numbers, of any robot."""
     statistics_by_row: bool = False
     """Normalise every row of a chunk by its own spread (`RobotStatistics.reach`)."""
     has_own_tokenizers: bool = False

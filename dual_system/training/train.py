@@ -113,7 +113,7 @@ class TrainOptions:
 
     recipe: str
     """Name of a recipe: robomme and robocasa_dc are the paper's runs, robomme_* its ablations; tiny, tiny_groot,
-    tiny_subgoal_text, tiny_framesamp and tiny_current are small ones for a CPU."""
+    tiny_robocasa_dc, tiny_subgoal_text, tiny_framesamp and tiny_current are small ones for a CPU."""
     data: tuple[Path, ...]
     """Folders that pp-collect or pp-export made."""
     out: Path

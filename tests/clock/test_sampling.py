@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from clock import sampling
@@ -35,6 +35,8 @@ def drawn(seed: int, clocks: Clocks, num_ticks: int, **options: object) -> Sampl
     delay_ms=st.integers(1, 3_000),
     num_ticks=st.integers(1, 90),
 )
+@example(query_ms=4_000, invoke_ticks=16, delay_ms=300, num_ticks=200)  # RoboCasa-DC: chunks of 16 rows, played in full
+@example(query_ms=60_000, invoke_ticks=16, delay_ms=300, num_ticks=200)  # and one cognition an episode
 def test_without_spread_the_sampled_schedule_is_the_served_one(
     timing: Callable[..., m.Schedule],
     lockstep: Callable[..., Any],

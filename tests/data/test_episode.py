@@ -7,7 +7,7 @@ from dataclasses import fields
 
 import numpy as np
 
-from dual_system.data.episode import OPTIONAL, Package, Rejection, Rows, from_table, to_table, unpack
+from dual_system.data.episode import EXECUTED, Package, Rejection, Rows, from_table, to_table, unpack
 
 
 def test_what_is_packed_is_unpacked(package: Callable[..., Package]) -> None:
@@ -35,4 +35,4 @@ def test_every_column_has_a_value_for_every_row(package: Callable[..., Package])
     read = from_table(to_table(rows))
     np.testing.assert_array_equal(read.executed_action, rows.executed_action)
     missing = {each.name for each in fields(Rows) if getattr(unpack(package(4)).rows, each.name) is None}
-    assert missing == set(OPTIONAL)
+    assert missing == {EXECUTED}

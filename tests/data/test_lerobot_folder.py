@@ -217,7 +217,7 @@ def test_rows_that_are_not_the_listed_ones_are_refused(
         ({"codebase_version": "v2.1"}, r"version v2\.1, and v3\.0 is read\. LeRobot converts"),
         ({"codebase_version": None}, "expected 'codebase_version' of type str, came nothing"),
         ({"features": None}, "expected 'features' of type dict"),
-        ({"features": {}}, "observation.images.front has the shape None"),
+        ({"features": {}}, "no camera's videos; expected features"),
         ({"fps": None}, "expected 'fps'"),
         ({"fps": 30}, r"5 rows, and 7\.5 frames"),
         ({"data_path": "../{episode}"}, "expected 'data/chunk-"),

@@ -119,7 +119,7 @@ def test_a_robot_without_a_gripper_is_the_same_arm() -> None:
 
 
 def test_another_space_or_its_dims_are_refused() -> None:
-    with pytest.raises(ValueError, match="expected an action space of joint_delta, ee_delta, came 'ee_pose'"):
+    with pytest.raises(ValueError, match="expected an action space of joint_delta, ee_delta, native, came 'ee_pose'"):
         RobotStatistics(state=ROBOMME.state, action=ROBOMME.action, space="ee_pose")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="statistics in space 'ee_delta' need 7 state dims, came 8"):
         RobotStatistics(state=ROBOMME.state, action=ROBOMME.action, space="ee_delta")

@@ -209,7 +209,9 @@ def test_an_unknown_action_space_is_refused_by_name(folder: Path) -> None:
     stored = json.loads((folder / "config.json").read_text())
     stored["statistics"]["space"] = "ee_pose"
     (folder / "config.json").write_text(json.dumps(stored))
-    with pytest.raises(ValueError, match=r"statistics\.space: expected 'joint_delta' or 'ee_delta', came 'ee_pose'"):
+    with pytest.raises(
+        ValueError, match=r"statistics\.space: expected 'joint_delta' or 'ee_delta' or 'native', came 'ee_pose'"
+    ):
         load_bundle(folder)
 
 

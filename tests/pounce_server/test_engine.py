@@ -113,7 +113,7 @@ def test_warm_up_measures_at_least_twenty(engine: EagerEngine) -> None:
 
 FRAME = np.zeros((8, 8, 3), np.uint8)
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
-    "one frame": ({"frames": (FRAME,)}, "expected 2 frames .* came 1"),
+    "one frame": ({"frames": (FRAME,)}, "expected 2 frames, .* came 1"),
     "blind": ({"frames": (None, None)}, "all 2 cameras are missing"),
     "float frame": (
         {"frames": (FRAME, FRAME.astype(np.float32))},

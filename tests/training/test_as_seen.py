@@ -40,14 +40,14 @@ def newest(is_taken_T: NDArray[np.bool_]) -> NDArray[np.intp]:
 def moving(num_ticks: int, changes: frozenset[int]) -> TrainingEpisode:
     """Every tick has a state, a picture and a place of its own."""
     stint = np.cumsum([tick in changes or tick == 0 for tick in range(num_ticks)])
-    state_T8 = np.linspace(-0.5, 0.5, num_ticks, dtype=np.float32)[:, None].repeat(8, axis=1)
+    state_TS = np.linspace(-0.5, 0.5, num_ticks, dtype=np.float32)[:, None].repeat(8, axis=1)
     return TrainingEpisode(
         instruction="pick them",
         demo=(),
         images=[(np.full((32, 32, 3), tick, np.uint8),) for tick in range(num_ticks)],
         views=[()] * num_ticks,
-        state_T8=state_T8,
-        action_T8=state_T8 + 1,
+        state_TS=state_TS,
+        action_TA=state_TS + 1,
         subgoals=[f"pick cube {stint[tick]} at <{tick}, 20>" for tick in range(num_ticks)],
         is_transition_T=np.diff(stint, prepend=0) > 0,
     )
@@ -59,11 +59,11 @@ def test_text_and_state_of_a_tick_are_of_its_picture(is_taken_T: NDArray[np.bool
     seen = episode.as_seen(seen_at_T)
     for tick, at in enumerate(seen_at_T.tolist()):
         assert seen.subgoals[tick] == episode.subgoals[at]
-        assert np.array_equal(seen.ponder_state(tick), episode.state_T8[at])
+        assert np.array_equal(seen.ponder_state(tick), episode.state_TS[at])
         since = int(seen_at_T[tick - 1]) if tick else -1
         assert seen.is_transition_T[tick] == any(episode.is_transition_T[since + 1 : at + 1])
-    assert np.array_equal(seen.state_T8, episode.state_T8)
-    assert seen.action_T8 is episode.action_T8
+    assert np.array_equal(seen.state_TS, episode.state_TS)
+    assert seen.action_TA is episode.action_TA
 
 
 @given(num_ticks=st.integers(1, 60), changes=st.frozensets(st.integers(1, 59)))
@@ -81,7 +81,7 @@ def test_a_row_is_that_of_a_world_that_stood_still_between_pictures(
 ) -> None:
     episode, seen_at_T = moving(len(is_taken_T), changes), newest(is_taken_T)
     seen = episode.as_seen(seen_at_T)
-    frozen = replace(seen, state_T8=episode.state_T8[seen_at_T], seen_at_T=None)
+    frozen = replace(seen, state_TS=episode.state_TS[seen_at_T], seen_at_T=None)
     schedule = sample_schedule(
         np.random.default_rng(seed), ROBOMME, episode.num_ticks, transition_ticks=seen.transition_ticks
     )
@@ -127,7 +127,7 @@ def test_a_dataset_with_few_pictures_is_read_so(sparse: Path) -> None:
         row = (float(episode.images[tick][0].mean()) - 20) / 3  # H.264 rounds
         assert episode.subgoals[tick] == f"pick it at <{round(row)}, 7>"
         assert episode.ponder_state(tick)[0] * 100 == pytest.approx(row, abs=0.7)
-        assert episode.state_T8[tick, 0] * 100 == pytest.approx(NUM_DEMO_ROWS + tick)
+        assert episode.state_TS[tick, 0] * 100 == pytest.approx(NUM_DEMO_ROWS + tick)
     assert episode.transition_ticks == {0, 42 - NUM_DEMO_ROWS}  # the first picture that was taken after row 40
 
 

@@ -62,8 +62,8 @@ def test_an_episode_is_read_as_it_was_written(folder: Path, package_of_noise: Ma
     episode = TrainingSet(folder, sizes=WHOLE)[1]
     written = unpack(package_of_noise(1, NUM_DEMO_ROWS)).rows
     assert episode.num_ticks == 45
-    np.testing.assert_array_equal(episode.state_T8, written.state[NUM_DEMO_ROWS:])
-    np.testing.assert_array_equal(episode.action_T8, written.action[NUM_DEMO_ROWS:])
+    np.testing.assert_array_equal(episode.state_TS, written.state[NUM_DEMO_ROWS:])
+    np.testing.assert_array_equal(episode.action_TA, written.action[NUM_DEMO_ROWS:])
     assert episode.reasoning == "Demo selected <3, 4>."
     assert episode.transition_ticks == {0, 60 - NUM_DEMO_ROWS}
     first_and_last = [20 + NUM_DEMO_ROWS, 64 + NUM_DEMO_ROWS]
@@ -236,7 +236,7 @@ def chunks_of(data: TrainingSet, statistics: RobotStatistics, horizon: int) -> n
     for number in range(len(data)):
         episode = data[number]
         ticks = chunk_ticks(np.arange(episode.num_ticks), horizon, episode.num_ticks)
-        chunks.append(statistics.normalise_chunks(episode.action_T8, episode.state_T8, ticks))
+        chunks.append(statistics.normalise_chunks(episode.action_TA, episode.state_TS, ticks))
     return np.concatenate(chunks)
 
 
@@ -244,7 +244,7 @@ def chunks_of(data: TrainingSet, statistics: RobotStatistics, horizon: int) -> n
 def test_statistics_put_the_data_into_the_networks_range(folder: Path, space: ActionSpace) -> None:
     data = TrainingSet(folder)
     statistics = data.statistics(horizon=4, space=space)
-    states = np.concatenate([statistics.normalise_states(data[number].state_T8) for number in range(len(data))])
+    states = np.concatenate([statistics.normalise_states(data[number].state_TS) for number in range(len(data))])
     chunks = chunks_of(data, statistics, 4)
     assert chunks.shape == (len(states), 4, num_dims(space))
     for numbers in (states, chunks):

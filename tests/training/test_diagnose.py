@@ -51,8 +51,8 @@ def example() -> Example:
         demo=(),
         images=views,
         views=views,
-        state_T8=rng.uniform(-0.2, 0.2, (NUM_TICKS, 8)).astype(np.float32),
-        action_T8=rng.uniform(-0.2, 0.2, (NUM_TICKS, 8)).astype(np.float32),
+        state_TS=rng.uniform(-0.2, 0.2, (NUM_TICKS, 8)).astype(np.float32),
+        action_TA=rng.uniform(-0.2, 0.2, (NUM_TICKS, 8)).astype(np.float32),
         subgoals=["pick"] * NUM_TICKS,
         is_transition_T=np.isin(np.arange(NUM_TICKS), CHANGES),
     )

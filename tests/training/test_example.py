@@ -48,7 +48,7 @@ def written(example: Example) -> str:
 def served(episode: TrainingEpisode, tick: int, age_ns: int) -> Request:
     return Request(
         frames=episode.views[tick],
-        proprio=episode.state_T8[tick],
+        proprio=episode.state_TS[tick],
         instruction=episode.instruction,
         cognition=np.zeros((1, 64), np.float32),
         age_ns=age_ns,
@@ -101,14 +101,14 @@ def test_targets_turn_back_into_the_commands(episode_of_noise: MakeEpisode) -> N
     example = example_of(recorded)
     batch = collate_pounce([example], POUNCE, TOKENIZER, STATISTICS)
     for place, asked in enumerate(example.invocations):
-        rows = STATISTICS.absolute_targets(batch.actions_INA[place, :, :8].numpy(), recorded.state_T8[asked.tick])
+        rows = STATISTICS.absolute_targets(batch.actions_INA[place, :, :8].numpy(), recorded.state_TS[asked.tick])
         np.testing.assert_allclose(rows, target_rows(recorded, asked.tick, 6), atol=1e-5)
         assert not batch.actions_INA[place, :, 8:].any()
 
 
 def test_after_the_end_the_last_command_stays_in_force(episode_of_noise: MakeEpisode) -> None:
     recorded = episode_of_noise(5)
-    assert np.array_equal(target_rows(recorded, 3, 4), recorded.action_T8[[3, 4, 4, 4]])
+    assert np.array_equal(target_rows(recorded, 3, 4), recorded.action_TA[[3, 4, 4, 4]])
 
 
 def test_the_row_writes_what_the_annotations_say(episode_of_noise: MakeEpisode) -> None:
@@ -236,7 +236,7 @@ def test_the_tokenizer_of_the_other_family_is_refused(episode_of_noise: MakeEpis
 def test_an_episode_with_missing_rows_is_refused(episode_of_noise: MakeEpisode) -> None:
     whole = episode_of_noise(5)
     with pytest.raises(ValueError, match="per tick; it has 5, 5, 4, 5, 5, 5"):
-        replace(whole, state_T8=whole.state_T8[:4])
+        replace(whole, state_TS=whole.state_TS[:4])
 
 
 def test_a_prompt_that_is_too_long_is_refused(episode_of_noise: MakeEpisode) -> None:

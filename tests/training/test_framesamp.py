@@ -75,7 +75,7 @@ def test_training_and_serving_read_the_same_pictures(
     for tick in range(len(shown) - NUM_DEMO_ROWS):
         is_seen = tick % STRIDE == 0 or tick in asked
         seen = packed(shown[NUM_DEMO_ROWS + tick]) if is_seen else ()
-        node.on_observation(m.Observation(tick=tick, source_ns=0, proprio=data[0].state_T8[tick], images=seen))
+        node.on_observation(m.Observation(tick=tick, source_ns=0, proprio=data[0].state_TS[tick], images=seen))
         if tick not in asked:
             continue
         place, nothing = asked[tick], np.zeros((0, 0), np.float32)

@@ -42,9 +42,11 @@ def test_robomme_is_the_papers() -> None:
 def test_robocasa_dc_is_the_papers() -> None:
     run = recipe("robocasa_dc")
     assert (run.num_steps, run.batch_episodes, run.train.dropout, run.w2) == (4000, 32, 0.15, 0.0)
-    assert (run.train.optim.learning_rate, run.pounce.horizon) == (1e-5, 16)
+    assert (run.train.optim.learning_rate, run.pounce.horizon, run.space) == (1e-5, 16, "native")
+    assert run.ponder.image_px == (128, 128)
     assert run.pounce.cognition.projector_std == 1e-3
-    assert (run.example.clocks.query.mean_ns, run.example.clocks.invoke.mean_ns) == (4 * 10**9, 2 * 10**9)
+    clocks = run.example.clocks
+    assert [each.mean_ns for each in (clocks.query, clocks.invoke, clocks.delay)] == [4 * 10**9, 2 * 10**9, 3 * 10**8]
 
 
 ABLATIONS: dict[str, dict[str, Any]] = {
@@ -83,6 +85,11 @@ def test_table_5_trains_qwen_of_0p8_billion() -> None:
     [
         ("tiny", "robomme", ("example.is_grounded", "example.has_reasoning", "w1", "trains", "space", "demo_hz")),
         ("tiny_groot", "robocasa_dc", ("w2", "example.is_grounded", "train.dropout")),
+        (
+            "tiny_robocasa_dc",
+            "robocasa_dc",
+            ("w2", "example.is_grounded", "train.dropout", "space", "ponder.image_px", "pounce.groot.horizon"),
+        ),
         ("tiny_subgoal_text", "robomme_subgoal_text", ("pounce.reads_subgoal", "pounce.cognition.num_carriers")),
     ],
 )

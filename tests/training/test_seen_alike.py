@@ -53,14 +53,14 @@ def engine_of(ponder: Ponder, **changes: int) -> QwenEngine:
 @pytest.mark.parametrize(("ponder", "view_px"), [(PAPERS, 32), (CROPS, 64), (CROPS, 128)])
 def test_training_and_serving_read_the_same(monkeypatch: pytest.MonkeyPatch, ponder: Ponder, view_px: int) -> None:
     form = ponder.format
-    demo, views, state_T8 = recorded(view_px)
+    demo, views, state_TS = recorded(view_px)
     episode = TrainingEpisode(
         instruction=INSTRUCTION,
         demo=tuple(tuple(form.reader.images(each, form.image_px)) for each in demo),
         images=[tuple(form.reader.images(each, form.image_px)) for each in views],
         views=[()] * NUM_TICKS,
-        state_T8=state_T8,
-        action_T8=np.zeros((NUM_TICKS, 8), np.float32),
+        state_TS=state_TS,
+        action_TA=np.zeros((NUM_TICKS, 8), np.float32),
         subgoals=[""] * NUM_TICKS,
         is_transition_T=np.zeros(NUM_TICKS, np.bool_),
     )
@@ -85,7 +85,7 @@ def test_training_and_serving_read_the_same(monkeypatch: pytest.MonkeyPatch, pon
     monkeypatch.setattr(TransitionWriter, "gate", lambda *_: (False, 0.0))  # the episode has no texts
     engine.open("a", Opening(instruction=INSTRUCTION, demo_frames=tuple(demo)))
     for query, index_K in zip(schedule.queries, row.carrier_index, strict=True):
-        fire = engine.fire("a", views[query.tick], proprio=state_T8[query.tick])
+        fire = engine.fire("a", views[query.tick], proprio=state_TS[query.tick])
         np.testing.assert_allclose(fire.cognition, hidden[index_K].numpy(), atol=1e-4)
     assert tuple(ids) == row.ids
     assert torch.equal(torch.stack(pictures), images)
@@ -101,13 +101,13 @@ def test_the_engine_announces_its_reader_and_warms_up_on_pictures_that_it_can_re
 
 
 def test_a_query_without_the_state_that_is_read_leaves_no_trace() -> None:
-    _, views, state_T8 = recorded(64)
+    _, views, state_TS = recorded(64)
     engine, fresh = engine_of(CROPS), engine_of(CROPS)
     for each in (engine, fresh):
         each.open("a", Opening(instruction=INSTRUCTION))
     with pytest.raises(ValueError, match="none came"):
         engine.fire("a", views[0])
-    answered, alike = (each.fire("a", views[0], proprio=state_T8[0]) for each in (engine, fresh))
+    answered, alike = (each.fire("a", views[0], proprio=state_TS[0]) for each in (engine, fresh))
     assert alike.context_tokens == answered.context_tokens
     assert np.array_equal(alike.cognition, answered.cognition)
 
@@ -125,13 +125,13 @@ def test_an_engine_without_the_camera_that_its_ponder_reads_is_refused() -> None
     ],
 )
 def test_a_frame_of_another_size_leaves_no_trace(ponder: Ponder, view_px: int, said: str) -> None:
-    _, views, state_T8 = recorded(view_px)
+    _, views, state_TS = recorded(view_px)
     front, wrist = views[0]
     engine = engine_of(ponder)
     engine.open("a", Opening(instruction=INSTRUCTION))
     with pytest.raises(ValueError, match=said):
-        engine.fire("a", (front, wrist[:24, :24]), proprio=state_T8[0])
-    assert engine.fire("a", (front, wrist), proprio=state_T8[0]).cognition.shape == (2, ponder.hidden_size)
+        engine.fire("a", (front, wrist[:24, :24]), proprio=state_TS[0])
+    assert engine.fire("a", (front, wrist), proprio=state_TS[0]).cognition.shape == (2, ponder.hidden_size)
 
 
 def test_a_demonstration_without_the_camera_that_is_read_is_refused() -> None:

@@ -41,8 +41,8 @@ def episode() -> TrainingEpisode:
         demo=(),
         images=views,
         views=views,
-        state_T8=rng.uniform(-0.2, 0.2, (NUM_TICKS, 8)).astype(np.float32),
-        action_T8=rng.uniform(-0.2, 0.2, (NUM_TICKS, 8)).astype(np.float32),
+        state_TS=rng.uniform(-0.2, 0.2, (NUM_TICKS, 8)).astype(np.float32),
+        action_TA=rng.uniform(-0.2, 0.2, (NUM_TICKS, 8)).astype(np.float32),
         subgoals=["press at <5, 5>"] * 30 + ["pick at <10, 20>"] * 30 + ["pick at <30, 40>"] * 30,
         is_transition_T=np.isin(np.arange(NUM_TICKS), CHANGES),
     )
@@ -69,7 +69,7 @@ def test_training_reads_the_subgoal_of_the_query_it_refers_to() -> None:
         assert asked.reference.query is not None
         request = Request(
             frames=seen.episode.views[asked.tick],
-            proprio=seen.episode.state_T8[asked.tick],
+            proprio=seen.episode.state_TS[asked.tick],
             instruction=seen.episode.instruction,
             cognition=None,
             age_ns=0,

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from dual_system.models.flow import EulerStep
 from dual_system.models.groot import flow as groot_flow
 from dual_system.models.groot.network import Groot, GrootCache, GrootConfig, GrootStepTable
-from dual_system.models.interface import CognitionConfig, CognitionPrefix, check_channel
+from dual_system.models.interface import CognitionConfig, CognitionPrefix, check_camera_names, check_channel
 from dual_system.models.pi05.pounce import Backbone
 
 PrefixSlot = Literal["features", "embeddings"]
@@ -61,6 +61,8 @@ class GrootPounceConfig:
     robot_state_dim: int = 8
     num_cameras: int = 2
     """front, wrist"""
+    cameras: tuple[str, ...] = ()
+    """Their names in training, in order; () if they are not known."""
     num_steps: int = 4
     """Euler steps per chunk."""
     control_hz: int = 20
@@ -72,6 +74,7 @@ class GrootPounceConfig:
 
     def __post_init__(self) -> None:
         check_channel(self.cognition, self.reads_subgoal)
+        check_camera_names(self.cameras, self.num_cameras)
         if self.cognition.place != "before_images":
             raise ValueError(f"GR00T reads P before the images only, came place {self.cognition.place!r}")
         groot = self.groot

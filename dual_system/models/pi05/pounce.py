@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from dual_system.models import flow
 from dual_system.models.frame_sampling import FrameMemoryConfig
-from dual_system.models.interface import CognitionConfig, CognitionPrefix, check_channel
+from dual_system.models.interface import CognitionConfig, CognitionPrefix, check_camera_names, check_channel
 from dual_system.models.pi05.committed import Committed, first_rows
 from dual_system.models.pi05.modulation import NO_FRAME, FrameMemory, pooled
 from dual_system.models.pi05.network import Pi05, Pi05Config, Prefix, PrefixCache, StepTable
@@ -65,6 +65,8 @@ class PounceConfig:
     """The first dims of the padded action: 7 arm joints and the gripper."""
     num_cameras: int = 2
     """front, wrist. 0: it acts on state and cognition alone, whatever cameras the robot has."""
+    cameras: tuple[str, ...] = ()
+    """Their names in training, in order; () if they are not known."""
     windows: tuple[Box, ...] = ()
     """A window for each camera (`windows`); () for whole pictures, as in the public models."""
     num_steps: int = 10
@@ -90,6 +92,7 @@ class PounceConfig:
 
     def __post_init__(self) -> None:
         check_channel(self.cognition, self.reads_subgoal)
+        check_camera_names(self.cameras, self.num_cameras)
         if self.frame_memory is not None:
             self.frame_memory.grid_side(self.pi05.vision.num_patches)
             if self.control_hz != FASTEST_HZ or not self.num_cameras:

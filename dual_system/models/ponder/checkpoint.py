@@ -62,6 +62,7 @@ class StoredPonder:
     """None: the first row after the tokenizer's last id."""
     image_px: tuple[int, int] = (256, 256)
     windows: tuple[Box, ...] = ()
+    cameras: tuple[str, ...] = ()
     speaks: bool = True
     demonstrations: DemoSampling = PAPER_SAMPLING
     opening: OpeningForm = "chat"
@@ -106,6 +107,7 @@ def load_ponder(directory: Path, *, device: torch.device | str = "cpu", dtype: t
         image_grid=grid,
         token_px=side_px,
         reader=reader,
+        cameras=stored.cameras,
         speaks=stored.speaks,
         demonstrations=stored.demonstrations,
         opening_form=stored.opening,
@@ -142,6 +144,7 @@ def save_ponder(ponder: Ponder, directory: Path, *, max_shard_bytes: int = MAX_S
         first_carrier_id=ponder.format.first_carrier_id,
         image_px=ponder.image_px,
         windows=reader.boxes if isinstance(reader, Windows) else (),
+        cameras=ponder.format.cameras,
         speaks=ponder.format.speaks,
         demonstrations=ponder.format.demonstrations,
         opening=ponder.format.opening_form,

@@ -35,6 +35,8 @@ from dual_system.models.ponder.vocabulary import Vocabulary
 OpeningForm: TypeAlias = Literal["chat", "bare"]
 """chat: the user's turn is closed and the assistant's opened. bare: observations follow the demonstration directly."""
 
+PAPER_CAMERAS = 2
+"""front, wrist"""
 IGNORE = -100
 """Target of a position that is not supervised (the ignore index of torch's cross-entropy)."""
 
@@ -104,6 +106,8 @@ class ContextFormat:
     """How demonstrations were sampled in training; serving must sample them alike."""
     opening_form: OpeningForm = "chat"
     texts: TextPolicy = OWN_TEXTS
+    cameras: tuple[str, ...] = ()
+    """Names of the robot's cameras in training, in order; () if they are not known."""
     remembers: bool = True
     """False: a query's context is instruction, observation and its own text; no demonstration, nothing earlier."""
 
@@ -118,6 +122,11 @@ class ContextFormat:
                 )
         if clash := sorted({*self.carrier_ids} & {*self.reader.state_rows}):
             raise ValueError(f"rows {clash} are carriers and the state's tokens at once; move first_carrier_id.")
+
+    @property
+    def num_cameras(self) -> int:
+        """Views of an observation; the paper's two if the checkpoint names none."""
+        return len(self.cameras) or PAPER_CAMERAS
 
     @property
     def carrier_ids(self) -> tuple[int, ...]:

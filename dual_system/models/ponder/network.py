@@ -9,6 +9,7 @@ the same modules over a few tokens at a time (``ponder_server/decoder.py``).
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Self
 
 import numpy as np
@@ -87,6 +88,11 @@ class Ponder(nn.Module):
         qwen.model.language_model.rotary_emb = Qwen3_5TextRotaryEmbedding(text).to(device)
         qwen.model.visual.rotary_pos_emb = Qwen3_5VisionRotaryEmbedding(vision).to(device)
         self.qwen: Any = qwen.eval()
+
+    def look_at(self, image_px: tuple[int, int]) -> None:
+        """Reads images of another size: positions are interpolated to any. Raises ValueError as the constructor."""
+        grid = image_grid(self.qwen.config, image_px)
+        self.format, self.image_px = replace(self.format, image_grid=grid), image_px
 
     @classmethod
     def random(

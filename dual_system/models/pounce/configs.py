@@ -129,5 +129,8 @@ def tiny_frame_memory() -> FrameMemoryConfig:
 
 
 def in_space(config: Config, space: ActionSpace) -> Config:
-    """Returns the configuration for another action space; the shapes of the weights do not change."""
-    return replace(config, robot_action_dim=num_dims(space), robot_state_dim=num_dims(space))
+    """Returns the configuration for another of the Panda's action spaces; the shapes of the weights do not change."""
+    dims = num_dims(space)
+    if dims is None:
+        raise ValueError(f"the data decide the dims in space {space!r}: see `training.build`")
+    return replace(config, robot_action_dim=dims, robot_state_dim=dims)
