@@ -20,7 +20,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.policy_gates import gates
-from benchmarks.policy_plan import Stage, stages
+from benchmarks.policy_plan import Stage, stages, trained
+from benchmarks.policy_weights import require_committed
 from dual_system.analysis.markdown import markdown
 from protocol.command_line import command, parse
 
@@ -48,6 +49,8 @@ def main(argv: list[str] | None = None) -> int:
     code = DONE
     for stage in stages(folder):
         if code == DONE and not _mark(stage, folder).exists():
+            if stage.is_test:
+                require_committed(trained(folder), folder)
             code = _run(stage, folder, ends_s)
     sys.stdout.write(gates(folder / "gates") + account(folder))
     return code

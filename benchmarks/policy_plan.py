@@ -35,17 +35,21 @@ FAMILIES = {
 
 ROWS = (
     (recipes.laptop, 0),
-    (recipes.laptop, 1),
-    (recipes.laptop_observation, 0),
-    (recipes.laptop_observation, 1),
     (recipes.laptop_framesamp, 0),
-    (recipes.laptop_framesamp, 1),
-    (recipes.laptop_without_grounding, 0),
-    (recipes.laptop_window, 0),
+    (recipes.laptop_observation, 0),
     (recipes.laptop_text, 0),
+    (recipes.laptop, 1),
+    (recipes.laptop_without_grounding, 0),
+    (recipes.laptop_framesamp, 1),
     (recipes.laptop_current, 0),
+    (recipes.laptop_observation, 1),
+    (recipes.laptop_window, 0),
 )
-"""The rows of the table that are trained: recipe and seed, two at a time, one on each core."""
+"""The rows of the table that are trained: recipe and seed, two that cost alike at a time, one on each core."""
+WITH_PONDER = (recipes.laptop, recipes.laptop_without_grounding, recipes.laptop_current)
+"""Those whose POUNCE reads cognition."""
+TEST_SCENES, FEW_TEST_SCENES = 100, 50
+"""Test scenes a task of the rows of both contrasts and their controls, and of the others."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,6 +58,8 @@ class Stage:
 
     name: str
     commands: tuple[tuple[str, ...], ...]
+    is_test: bool = False
+    """Whether it plays test scenes, which no run of training may follow."""
 
 
 def stages(folder: Path) -> tuple[Stage, ...]:
@@ -106,7 +112,16 @@ def stages(folder: Path) -> tuple[Stage, ...]:
             Stage(name=f"rows {first // 2 + 1}", commands=tuple(rows[first : first + 2]))
             for first in range(0, len(rows), 2)
         ),
+        *(
+            Stage(name=f"test {number}", commands=commands, is_test=True)
+            for number, commands in enumerate(_tests(folder), 1)
+        ),
     )
+
+
+def trained(folder: Path) -> list[Path]:
+    """The checkpoints that test scenes are played with."""
+    return [folder / "words" / "ponder", *(_folder(folder, recipe.__name__, seed) for recipe, seed in ROWS)]
 
 
 def _pairs(folder: Path, task: str) -> tuple[str, ...]:
@@ -131,8 +146,63 @@ def _row(folder: Path, recipe: str, seed: int) -> Sequence[str]:
     learned them without."""
     own = {recipes.laptop_without_grounding.__name__: "towers", recipes.laptop_current.__name__: CURRENT_WORDS}
     ponder = folder / own.get(recipe, "words")
-    run = _run(recipe, ponder, folder / "corrected", folder / "rows" / f"{recipe}_{seed}")
+    run = _run(recipe, ponder, folder / "corrected", _folder(folder, recipe, seed))
     return *run, "--seed", f"{seed}"
+
+
+def _tests(folder: Path) -> Iterator[tuple[tuple[str, ...], ...]]:
+    """Every condition of every row, once; those side by side that need nothing of each other."""
+    donors = [(f"laptop_{seed}", seed) for seed in (0, 1)]
+    record = ("--record", "--record-hz", "1")
+    yield tuple(_test(folder, name, "laptop", seed, *record) for name, seed in donors)
+    given = {
+        "null": ("--cognition", "null"),
+        "held": ("--deliver", "held-transition"),
+    }
+    for kind, options in given.items():
+        yield tuple(_test(folder, f"{name}_{kind}", "laptop", seed, *options) for name, seed in donors)
+    other = ("--cognition", "other-episode", "--donors")
+    yield tuple(
+        _test(folder, f"{name}_other_episode", "laptop", seed, *other, f"{folder / 'test' / name}")
+        for name, seed in donors
+    )
+    for recipe in ("laptop_observation", "laptop_framesamp"):
+        yield tuple(_test(folder, f"{recipe}_{seed}", recipe, seed) for seed in (0, 1))
+    words = ("--ponder-checkpoint", f"{folder / 'words' / 'ponder'}")
+    few = {
+        "laptop_text_grounded": ("laptop_text", "--subgoal-text", "grounded"),
+        "laptop_text_simple": ("laptop_text", "--subgoal-text", "simple"),
+        "laptop_text_predicted": ("laptop_text", *words),
+        "laptop_window_0": ("laptop_window",),
+        "laptop_without_grounding_0": ("laptop_without_grounding",),
+    }
+    yield (
+        _test(folder, "laptop_current_0", "laptop_current", 0),
+        *(_test(folder, name, *how[:1], 0, *how[1:], scenes=FEW_TEST_SCENES) for name, how in few.items()),
+    )
+    cued = ("--pictures", "without-cue")
+    yield (_test(folder, "laptop_0_without_cue", "laptop", 0, *cued, tasks=("VideoUnmask", "PickHighlight")),)
+
+
+def _test(
+    folder: Path,
+    name: str,
+    recipe: str,
+    seed: int,
+    *given: str,
+    tasks: Sequence[str] = TASKS,
+    scenes: int = TEST_SCENES,
+) -> tuple[str, ...]:
+    row = _folder(folder, recipe, seed)
+    has_ponder = recipe in (each.__name__ for each in WITH_PONDER)
+    models = ("--ponder-checkpoint", f"{row / 'ponder'}") if has_ponder else ()
+    played = ("--tasks", *tasks, "--episodes", f"{scenes}", "--runs", "1", "--split", "test", "--max-steps", "700")
+    models += ("--pounce-checkpoint", f"{row / 'pounce'}")
+    return "sim_client.evaluate", "--out", f"{folder / 'test' / name}", *played, *models, *given
+
+
+def _folder(folder: Path, recipe: str, seed: int) -> Path:
+    return folder / "rows" / f"{recipe}_{seed}"
 
 
 def _run(recipe: str, ponder: Path, pounce: Path, out: Path) -> Sequence[str]:
