@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from typing import Any
 
 from dual_system.data.video import FPS
 from dual_system.models.action_space import ActionSpace
@@ -58,3 +59,18 @@ class Recipe:
             )
         if self.demo_hz < 1 or FPS % self.demo_hz:
             raise ValueError(f"recipe {self.name}: demo_hz must divide {FPS}, came {self.demo_hz}")
+
+
+def defaults(config: Any) -> dict[str, Any]:
+    """A configuration's values where nothing was chosen, nested as `dataclasses.asdict` nests; fields without a default
+    are left out."""
+    found: dict[str, Any] = {}
+    for field in fields(config):
+        value = getattr(config, field.name)
+        if is_dataclass(value):
+            found[field.name] = defaults(value)
+        elif field.default is not MISSING:
+            found[field.name] = field.default
+        elif field.default_factory is not MISSING:
+            found[field.name] = field.default_factory()
+    return found

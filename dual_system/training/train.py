@@ -38,7 +38,7 @@ from dual_system.training.joint import JointModel, PonderBatch, PounceBatch
 from dual_system.training.memory import memory_of, require_room, sentence
 from dual_system.training.parallel import World, gather, joined, require_alike, shard
 from dual_system.training.prefetch import Prefetcher
-from dual_system.training.recipe import Recipe
+from dual_system.training.recipe import Recipe, defaults
 from dual_system.training.recipes import recipe
 from dual_system.training.trainer import CheckpointError, Trainer, num_steps_in
 from dual_system.training.watch import Watch
@@ -255,15 +255,15 @@ def _update(
         if options.machine.loaders:
             prefetcher = Prefetcher(batches.on_cpu, world.device, options.machine.loaders)
             stack.callback(prefetcher.close)
-        # A run may go on for longer; and a checkpoint of before `remembers` is of a PONDER that does.
-        left_out = {"num_steps", *(["remembers"] if run.remembers else [])}
-        made_with = {name: value for name, value in asdict(run).items() if name not in left_out}
+        made_with = asdict(run)
+        del made_with["num_steps"]  # a run may go on for longer
         trainer = Trainer(
             model,
             prefetcher or batches,
             run.train,
             data_hash=data_hash,
             recipe=made_with,
+            recipe_defaults=defaults(run),
             world=world,
             num_parts=options.machine.accumulate,
         )

@@ -78,12 +78,14 @@ class Trainer:
         *,
         data_hash: str = "",
         recipe: Mapping[str, Any] | None = None,
+        recipe_defaults: Mapping[str, Any] | None = None,
         world: World | None = None,
         num_parts: int = 1,
     ) -> None:
         """``num_parts``: the parts of a batch that are computed one after the other; their gradients add up.
 
         A checkpoint made with another ``config``, ``data_hash`` or ``recipe`` (what else fixes the run) is refused.
+        What it does not name, because it is of before that existed, it was made with as in ``recipe_defaults``.
 
         With several processes, ``model`` must be sharded already, or equal on all of them.
         """
@@ -93,6 +95,7 @@ class Trainer:
         self._batches = batches
         made_with = {"train": asdict(config), "data": data_hash, **(recipe or {})}
         self._made_with: dict[str, Any] = json.loads(json.dumps(made_with))  # as a checkpoint's facts come back
+        self._unnamed: dict[str, Any] = json.loads(json.dumps(recipe_defaults or {}))
         self._world, self._num_parts = world or World(), num_parts
         self._optimiser = Optimiser(model, config.optim)
         self._latest: tuple[PonderBatch, Tensor] | None = None
@@ -236,7 +239,7 @@ class Trainer:
         then, now = (each.get("name") for each in (made_with, self._made_with))
         if then != now:
             raise CheckpointError(f"{folder}: made with recipe {then}, this run is of recipe {now}. Use another --out.")
-        if differs := list(_differences(made_with, self._made_with)):
+        if differs := list(_differences(made_with, self._made_with, self._unnamed)):
             raise CheckpointError(
                 f"{folder}: made with {'; '.join(differs[:5])}. Use another folder, or the same data and recipe."
             )
@@ -271,11 +274,13 @@ def _weights(model: JointModel) -> dict[str, Tensor]:
     return {name: parameter.detach() for name, parameter in model.named_parameters()}
 
 
-def _differences(then: Any, now: Any, name: str = "") -> Iterator[str]:
-    """Dotted names of the values that differ, with both values."""
+def _differences(then: Any, now: Any, unnamed: Any, name: str = "") -> Iterator[str]:
+    """Dotted names of the values that differ, with both values; ``unnamed`` has those that ``then`` may lack."""
     if isinstance(then, dict) and isinstance(now, dict):
+        usual = unnamed if isinstance(unnamed, dict) else {}
         for key in sorted(then.keys() | now.keys()):
-            yield from _differences(then.get(key), now.get(key), f"{name}.{key}".lstrip("."))
+            was = then.get(key, usual.get(key))
+            yield from _differences(was, now.get(key), usual.get(key), f"{name}.{key}".lstrip("."))
     elif then != now:
         yield f"{name} {then}, this run has {now}"
 

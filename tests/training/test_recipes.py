@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
+from dataclasses import FrozenInstanceError, asdict, fields, is_dataclass, replace
 from typing import Any
 
 import pytest
@@ -11,7 +11,7 @@ import pytest
 from clock.timebase import NS_PER_S
 from dual_system.models.ponder import configs as ponder_configs
 from dual_system.training.joint import runs_ponder
-from dual_system.training.recipe import Recipe
+from dual_system.training.recipe import Recipe, defaults
 from dual_system.training.recipes import RECIPES, recipe
 from dual_system.training.train import InsteadOptions, _adjusted
 
@@ -183,3 +183,12 @@ def test_every_value_that_can_be_replaced_is_tested_above() -> None:
 def test_groot_continues_no_rows() -> None:
     with pytest.raises(ValueError, match=r"--max-committed-rows is pi0\.5's, recipe robocasa_dc trains GR00T"):
         _adjusted(recipe("robocasa_dc"), InsteadOptions(max_committed_rows=2))
+
+
+def test_defaults_are_a_configuration_s_where_nothing_was_chosen() -> None:
+    run = recipe("laptop")
+    usual = defaults(run)
+    assert (usual["w2"], usual["remembers"], usual["example"]["branch_weight"]) == (0.1, True, 1.0)
+    assert "name" not in usual
+    for name in RECIPES:
+        assert defaults(recipe(name)).keys() <= asdict(recipe(name)).keys()

@@ -119,6 +119,20 @@ def test_a_checkpoint_of_another_run_is_refused(
         other.resume(tmp_path / "checkpoint")
 
 
+@pytest.mark.parametrize(("now", "is_fit"), [("short", True), ("long", False)])
+def test_what_a_checkpoint_does_not_name_yet_it_was_made_with_by_default(
+    tmp_path: Path, now: str, is_fit: bool
+) -> None:
+    usual = {"pounce": {"memory": "short"}}
+    Trainer(joint(), batch, TRAIN, recipe={"pounce": {"width": 1}}).save(tmp_path / "checkpoint")
+    later = Trainer(joint(), batch, TRAIN, recipe={"pounce": {"width": 1, "memory": now}}, recipe_defaults=usual)
+    if is_fit:
+        assert later.resume(tmp_path / "checkpoint")
+    else:
+        with pytest.raises(CheckpointError, match=r"made with pounce.memory short, this run has long"):
+            later.resume(tmp_path / "checkpoint")
+
+
 def test_a_loss_that_is_not_finite_stops_before_any_weight_moves() -> None:
     def broken(step: int) -> tuple[PonderBatch, PounceBatch]:
         episodes, invocations = batch(step)
