@@ -10,6 +10,7 @@ import numpy as np
 from dual_system.tasks.kitchen import looks, objects
 from dual_system.tasks.kitchen.fixtures import cabinet, coffee_machine, counter, drawer, microwave, sink, stove
 from dual_system.tasks.kitchen.handles import Bay, FixtureHandle
+from dual_system.tasks.kitchen.omron import AIR
 from dual_system.tasks.kitchen.parts import Workshop
 from dual_system.tasks.kitchen.plan import BayPlan, FixturePlan
 from dual_system.tasks.scene import PHYSICS_STEP_S
@@ -81,6 +82,7 @@ def _set_options(spec: mujoco.MjSpec) -> None:
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0
+    spec.option.density, spec.option.viscosity = AIR
     spec.visual.quality.offsamples = 0
     spec.visual.quality.shadowsize = 0
     spec.visual.map.znear, spec.visual.map.zfar = 0.01, 50.0
