@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.policy_gates import gates
+from benchmarks.policy_losses import losses
 from benchmarks.policy_plan import Stage, stages, trained
 from benchmarks.policy_weights import require_committed
 from dual_system.analysis.markdown import markdown
@@ -52,7 +53,7 @@ def main(argv: list[str] | None = None) -> int:
             if stage.is_test:
                 require_committed(trained(folder), folder)
             code = _run(stage, folder, ends_s)
-    sys.stdout.write(gates(folder / "gates") + account(folder))
+    sys.stdout.write(gates(folder / "gates") + losses(folder / "rows") + account(folder))
     return code
 
 
