@@ -25,6 +25,8 @@ BASE_MOTORS = tuple(joint.replace("joint", "actuator", 1) for joint in BASE_JOIN
 TORSO_MOTOR = "actuator_torso_height"
 GRIP_SITE = "grip_site"  # between the finger pads
 HAND_BODY = "right_hand"
+FINGER_BODIES = ("leftfinger", "rightfinger")
+ROOT_BODY = "mobile_base"
 BASE_SITE = "center"  # where the arm stands on the base; the base's pose in the state
 ARM_SITE = "right_center"  # the same point; the frame of the arm's commands
 
@@ -55,7 +57,7 @@ def panda_omron_spec() -> mujoco.MjSpec:
     """
     base, arm, gripper = (_light(part) for part in ("base", "arm", "gripper"))
     base.modelname = NAME
-    base.body("base").name = "mobile_base"
+    base.body("base").name = ROOT_BODY
     arm.body("base").name = "arm_base"
     for joint, armature in zip(ARM_JOINTS, 5.0 / np.arange(1, 8), strict=True):
         arm.joint(joint).armature = armature  # robosuite sets these where it loads the file
