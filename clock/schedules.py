@@ -10,6 +10,7 @@ from protocol.messages import Delay, DelayKind, Mode, Schedule, WaitKind
 CONTROL_HZ = 20
 """Rate of the paper's robot and of our tasks'."""
 HORIZON = 20
+A_DAY_NS = 86_400 * NS_PER_S
 MAX_S = 65  # RoboMME's limit of 1300 steps, as the paper uses it (B.1)
 
 MEASURED = Delay(kind=DelayKind.MEASURED)
@@ -49,3 +50,8 @@ def realtime(control_hz: int = CONTROL_HZ, horizon: int = HORIZON) -> Schedule:
         query_delay=MEASURED,
         invoke_delay=MEASURED,
     )
+
+
+def once_an_episode(schedule: Schedule) -> Schedule:
+    """PONDER is queried on the first observation alone, as by RoboCasa-DC's server; its cognition never is too old."""
+    return replace(schedule, query_period_ns=A_DAY_NS, max_age_ns=A_DAY_NS, stale_limit_ns=A_DAY_NS)

@@ -43,7 +43,7 @@ class ConditionOptions:
     reported_age_ms: int = 0
     """Age in ms given to POUNCE with --deliver held-transition; 0 is the true age. The paper fixes it at 300."""
     query_period_ms: int = 1000
-    """Period of PONDER's queries in ms (paper: 1 Hz)."""
+    """Period of PONDER's queries in ms (paper: 1 Hz). 0: one query an episode, whose cognition is never too old."""
     delay_ms: int = 300
     """PONDER's delay in ms (paper: fixed 300 ms)."""
     max_steps: int = 1300

@@ -26,7 +26,7 @@ class ScheduleOptions:
     """When models are asked, and what the robot does with their answers."""
 
     query_period_ms: int = 1000
-    """Period of PONDER's queries in ms (paper: 1 Hz)."""
+    """Period of PONDER's queries in ms (paper: 1 Hz). 0: one query an episode, whose cognition is never too old."""
     invoke_every_ticks: int | None = None
     """Period of POUNCE's invocations in 50 ms ticks. None: as many as its chunks have rows in lockstep (20 rows: the
     paper's 1 Hz), half of that in real time."""
@@ -55,7 +55,7 @@ class ScheduleOptions:
         """Returns the schedule of the episode with this seed, for chunks of ``horizon`` rows."""
         named = schedules.realtime if mode == "realtime" else schedules.paper
         base = named(horizon=horizon)
-        return replace(
+        schedule = replace(
             base,
             query_period_ns=self.query_period_ms * NS_PER_MS,
             invoke_period_ticks=self.invoke_every_ticks or base.invoke_period_ticks,
@@ -68,6 +68,7 @@ class ScheduleOptions:
             max_ticks=self.max_steps,
             seed=seed,
         )
+        return schedule if self.query_period_ms else schedules.once_an_episode(schedule)
 
     def _delay(self, default: Delay) -> Delay:
         mean_ns = self.delay_ms * NS_PER_MS

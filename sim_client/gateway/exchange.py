@@ -51,8 +51,9 @@ class Step:
     """A request for actions, with the current observation of the client's robot.
 
     ``begins``: start a new episode in any case. ``may_begin``: start one if none is open, for protocols without
-    episodes. ``demo`` is the conditioning video at the control rate, used only at the start of an episode. ``since``:
-    the observations between the last request and this one, for protocols that send them.
+    episodes. ``demo`` is the conditioning video, used only at the start of an episode; ``demo_hz``, its frames a second
+    (0: the control rate). ``since``: the observations between the last request and this one, for protocols that send
+    them.
 
     A robot's own program says more: ``taken_ns``, the instant of ``state`` (this host's monotonic clock; None: now);
     ``captured_ns``, those of its pictures by camera (one without is as old as the state);
@@ -66,6 +67,7 @@ class Step:
     begins: bool
     may_begin: bool = False
     demo: Sequence[Frames] = ()
+    demo_hz: int = 0
     since: Sequence[Observed] = ()
     task: str = ""
     taken_ns: int | None = None

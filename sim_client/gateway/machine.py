@@ -411,7 +411,7 @@ class Machine:
         episode = _Episode(client, info, self._node(info))
         self._episode = episode
         try:
-            demo = self._demonstration(step.demo, info.schedule.control_hz, sampling)
+            demo = self._demonstration(step.demo, step.demo_hz or info.schedule.control_hz, sampling)
             opened = self._robot_end.open(m.OpenRequest(info=info, demo=demo))
         except (Refused, TransportError, ProtocolError) as error:  # Refused: a picture of the video is none
             self._end(m.TaskStatus.ABORTED, str(error))
@@ -446,11 +446,11 @@ class Machine:
             raise
 
     def _demonstration(
-        self, video: Sequence[Frames], control_hz: int, sampling: DemoSampling | None
+        self, video: Sequence[Frames], video_hz: int, sampling: DemoSampling | None
     ) -> tuple[m.DemoFrame, ...]:
         if sampling is None:
             return ()
-        frames = sampled(video, control_hz, sampling)
+        frames = sampled(video, video_hz, sampling)
         return tuple(m.DemoFrame(images=self._packed(resized(each, self._plan.image_px))) for each in frames)
 
     def _packed(self, frames: Frames) -> tuple[m.Image, ...]:

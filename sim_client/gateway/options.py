@@ -57,7 +57,7 @@ class ScheduleOptions:
     """When models are asked, and what the robot does with their answers."""
 
     query_period_ms: int = 1000
-    """Period of PONDER's queries in ms (paper: 1 Hz)."""
+    """Period of PONDER's queries in ms (paper: 1 Hz). 0: one query an episode, whose cognition is never too old."""
     invoke_every_ticks: int | None = None
     """Period of POUNCE's invocations in ticks of the robot. None: --rows in lockstep if several; else as many as its
     chunks have rows in lockstep, half of that in real time."""
@@ -289,7 +289,7 @@ class GatewayOptions:
         rows = self.rows or _SPOKEN[self.dialect][3] or self._mapped_rows()
         every_ticks = rows if not self.is_realtime and rows > 1 else base.invoke_period_ticks
         fixed = Delay(kind=DelayKind.FIXED, mean_ns=self.timing.delay_ms * NS_PER_MS)
-        return replace(
+        schedule = replace(
             base,
             query_period_ns=self.timing.query_period_ms * NS_PER_MS,
             invoke_period_ticks=self.timing.invoke_every_ticks or every_ticks,
@@ -300,6 +300,7 @@ class GatewayOptions:
             stale_limit_ns=self.timing.stale_limit_ms * NS_PER_MS,
             seed=seed,
         )
+        return schedule if self.timing.query_period_ms else schedules.once_an_episode(schedule)
 
     def body(self) -> body.Body:
         """The robot that clients drive. Raises OSError or FileError if its file does not describe one."""

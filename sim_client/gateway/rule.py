@@ -14,9 +14,9 @@ from protocol.messages import Action, ActionChunk, Floats, Level, Robot
 from sim_client.gateway.exchange import Frames
 
 
-def sampled(video: Sequence[Frames], control_hz: int, sampling: DemoSampling) -> Sequence[Frames]:
-    """The frames of a video at the control rate that PONDER reads."""
-    return [video[index] for index in sampling.indices(len(video), control_hz)]
+def sampled(video: Sequence[Frames], video_hz: int, sampling: DemoSampling) -> Sequence[Frames]:
+    """The frames of a video that PONDER reads."""
+    return [video[index] for index in sampling.indices(len(video), video_hz)]
 
 
 def ahead(command: Action, chunk: ActionChunk | None, robot: Robot, num_rows: int) -> tuple[Floats, tuple[Level, ...]]:

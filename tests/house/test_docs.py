@@ -67,7 +67,8 @@ def _options() -> set[str]:
     client = ROOT / "integrations" / "ponderpounce_client" / "ponderpounce_client"
     program = (client / "program.py").read_text(encoding="utf-8")
     strategy = ROOT / "integrations" / "lerobot_strategy_ponderpounce" / "lerobot_strategy_ponderpounce"
-    program += (strategy / "__main__.py").read_text(encoding="utf-8")
+    robocasa = ROOT / "integrations" / "ponderpounce_robocasa" / "ponderpounce_robocasa"
+    program += "".join((folder / "__main__.py").read_text(encoding="utf-8") for folder in (strategy, robocasa))
     return found | set(re.findall(r'"(--[a-z-]+)"', program))
 
 

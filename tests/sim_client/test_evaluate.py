@@ -234,6 +234,13 @@ def test_models_options_reach_the_servers_that_are_started(tmp_path: Path) -> No
     assert ModelsOptions().of_pounce() == {}
 
 
+def test_a_period_of_nothing_is_one_cognition_an_episode(tmp_path: Path) -> None:
+    once = options(tmp_path, query_period_ms=0).sim().schedule.of_episode("lockstep", seed=0, horizon=16)
+    longest_ns = once.max_ticks * 10**9 // once.control_hz
+    assert min(once.query_period_ns, once.max_age_ns, once.stale_limit_ns) > longest_ns
+    assert (once.invoke_period_ticks, once.horizon) == (16, 16)
+
+
 @pytest.mark.parametrize(
     ("changes", "kind", "age_ns"),
     [

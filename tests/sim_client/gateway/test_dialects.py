@@ -110,6 +110,21 @@ def test_openpi_keys_may_name_entries_of_maps_within(terms_with: TermsWith, pict
     assert int(step.frames["front"][0, 0, 0]) == 5
 
 
+@pytest.mark.parametrize("rate", [{}, {"demonstration_hz": 5}])
+def test_openpi_an_observation_may_bring_a_demonstration(
+    speak_openpi: openpi.OpenpiDialect, picture_of: PictureOf, rate: dict[str, int]
+) -> None:
+    video = [picture_of(shade) for shade in (7, 8, 9)]
+    step = understood(speak_openpi.read(openpi_packet(picture_of, demonstration=video, **rate)))
+    assert step.demo_hz == rate.get("demonstration_hz", 0)
+    assert [[int(frames[name][0, 0, 0]) for name in ("front", "wrist")] for frames in step.demo] == [
+        [7] * 2,
+        [8] * 2,
+        [9] * 2,
+    ]
+    assert not len(understood(speak_openpi.read(openpi_packet(picture_of))).demo)
+
+
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
@@ -125,6 +140,9 @@ def test_openpi_keys_may_name_entries_of_maps_within(terms_with: TermsWith, pict
         ({"observation/state": [1.0, 2.0, float("nan")]}, "expected finite numbers"),
         ({"observation/state": "joints"}, "expected 3 numbers"),
         ({"observation/state": [1.0, 2.0, 1e300]}, "expected finite numbers"),
+        ({"demonstration": 3}, "expected a list of frames per camera"),
+        ({"demonstration_hz": 0.5}, "demonstration_hz: expected frames per second, 1 to 120"),
+        ({"demonstration_hz": -1}, "demonstration_hz: expected frames per second"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:overflow encountered in cast:RuntimeWarning")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from dual_system.tasks.panda import HOME_QPOS
+from protocol.checks import check_schedule
 from protocol.errors import FileError, TransportError
 from protocol.messages import DelayKind, Mode
 from sim_client.gateway.body import PANDA, ROBOMME, Body, read_body
@@ -75,6 +76,17 @@ def test_by_default_pounce_is_asked_as_in_the_paper(dialect: Any, rows: int, eve
     schedule = options.schedule(7)
     assert (options.terms().rows, schedule.invoke_period_ticks, schedule.seed) == (rows, every_ticks, 7)
     assert (schedule.mode, schedule.query_delay.mean_ns) == (Mode.LOCKSTEP, 300_000_000)
+
+
+@pytest.mark.parametrize("horizon", [16, 20])
+def test_a_period_of_nothing_is_one_cognition_an_episode(horizon: int) -> None:
+    once = GatewayOptions(dialect="openpi", rows=horizon, timing=ScheduleOptions(query_period_ms=0)).schedule(
+        0, horizon
+    )
+    check_schedule(once)
+    longest_ns = once.max_ticks * 10**9 // once.control_hz
+    assert min(once.query_period_ns, once.max_age_ns, once.stale_limit_ns) > longest_ns
+    assert (once.invoke_period_ticks, once.horizon) == (horizon, horizon)
 
 
 def test_a_client_that_plays_fewer_rows_gets_chunks_as_often() -> None:

@@ -1,0 +1,1 @@
+"""Plays the real RoboCasa-DC against PonderPounce, from RoboCasa's own environment."""
