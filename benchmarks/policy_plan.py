@@ -46,6 +46,8 @@ ROWS = (
     (recipes.laptop_window, 0),
 )
 """The rows of the table that are trained: recipe and seed, two that cost alike at a time, one on each core."""
+RETOLD = ("VideoUnmask", "PickHighlight", "MoveCube")
+"""Tasks whose present can have another past."""
 WITH_PONDER = (recipes.laptop, recipes.laptop_without_grounding, recipes.laptop_current)
 """Those whose POUNCE reads cognition."""
 TEST_SCENES, FEW_TEST_SCENES = 100, 50
@@ -168,6 +170,9 @@ def _tests(folder: Path) -> Iterator[tuple[tuple[str, ...], ...]]:
     )
     for recipe in ("laptop_observation", "laptop_framesamp"):
         yield tuple(_test(folder, f"{recipe}_{seed}", recipe, seed) for seed in (0, 1))
+    retold = ("--pictures", "retold")
+    for pair in (("laptop", "laptop_framesamp"), ("laptop_observation", "laptop_current")):
+        yield tuple(_test(folder, f"{recipe}_0_retold", recipe, 0, *retold, tasks=RETOLD) for recipe in pair)
     words = ("--ponder-checkpoint", f"{folder / 'words' / 'ponder'}")
     few = {
         "laptop_text_grounded": ("laptop_text", "--subgoal-text", "grounded"),

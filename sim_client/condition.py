@@ -35,9 +35,10 @@ class ConditionOptions:
     subgoal_text: Literal["ponder", "grounded", "simple", "displaced"] = "ponder"
     """Source of the subgoals for a POUNCE that reads text: PONDER, or the task, with places (grounded), without
     (simple), or with places that are 12 px off (displaced). The task's come as late as PONDER's."""
-    pictures: Literal["own", "other-scene", "without-cue"] = "own"
-    """What the models are shown: the scene; another one, in which the arm moves alike; or the scene without what only
-    memory could tell later (PickHighlight's discs, the cubes of the unmasking tasks)."""
+    pictures: Literal["own", "other-scene", "without-cue", "retold"] = "own"
+    """What the models are shown: the scene; another one, in which the arm moves alike; the scene without what only
+    memory could tell later (PickHighlight's discs, the cubes of the unmasking tasks); or retold: after another past,
+    by which the episode is judged. pp-tables sets it beside the same scenes after their own."""
     deliver: Literal["every", "held-transition"] = "every"
     """Delivery of cognition. held-transition: only the first, then those at predicted transitions (paper, 5.2)."""
     reported_age_ms: int = 0

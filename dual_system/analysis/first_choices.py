@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,14 @@ from dual_system.analysis.statistics import wilson
 ABOUT_FIRST_CHOICES = """\
 Of the episodes that committed to a container, cube, manner, count or direction, how many chose rightly, with Wilson's
 interval over their scenes, and how many the best player without memory would choose rightly in the same scenes."""
+
+ABOUT_RETOLD = """\
+Scenes that were played twice, after their own past and after another that leads to the same present (`--pictures
+retold`). Of those with a first choice in both plays, in how many it was right in both, in one, in neither. A policy
+that ignores the past chooses alike twice and is right in one at most."""
+
+_OF_PLAY = ("out", "pictures")
+"""Options that may differ between two plays of one condition."""
 
 _Part = tuple[str, NDArray[np.bool_], bool | None]  # a name, its episodes (R, E), and whether the discs were in sight
 
@@ -58,3 +67,31 @@ def _row(results: Results, task: str, chosen_RE: NDArray[np.bool_], saw_discs: b
     is_known = saw_discs is not None and len(known) == num_chosen
     chance = f"{100 * float(sum(known, Fraction(0)) / num_chosen):.2f}" if is_known else ""
     return [f"{num_chosen} of {chosen_RE.size}", str(num_right), right, chance]
+
+
+def retold(results: Sequence[Results]) -> str:
+    """Returns a row for each task and condition that was played after both pasts; "" if none was."""
+    rows = []
+    for own, other in _pairs(results):
+        for task in own.tasks:
+            ours, theirs = own.first_choices[task], other.first_choices[task]
+            is_made = (ours >= 0) & (theirs >= 0)
+            num_right = (ours + theirs)[is_made]
+            if is_made.any():
+                counts = [int((num_right == count).sum()) for count in (2, 1, 0)]
+                both = percent(wilson(counts[0] / int(is_made.sum()), int(is_made.any(axis=0).sum())))
+                rows.append([task, own.label, f"{is_made.sum()} of {is_made.size}", *map(str, counts), both])
+    return markdown(["task", "condition", "chose twice", "both right", "one", "none", "both, %"], rows) if rows else ""
+
+
+def _pairs(results: Sequence[Results]) -> Iterator[tuple[Results, Results]]:
+    """Every condition after its own past, with the same one after another: same models, options and scenes."""
+    for other in results:
+        if other.config.get("pictures") == "retold":
+            for own in results:
+                if "pictures" not in own.config and _settings(own) == _settings(other) and own.scenes == other.scenes:
+                    yield own, other
+
+
+def _settings(results: Results) -> dict[str, Any]:
+    return {name: value for name, value in results.config.items() if name not in _OF_PLAY}

@@ -18,7 +18,7 @@ from dual_system.analysis.ceiling_tables import ceilings
 from dual_system.analysis.counterfactual import COUNTERFACTUAL, read_counterfactual
 from dual_system.analysis.diagnosis import DIAGNOSIS, read_diagnosis
 from dual_system.analysis.diagnosis_tables import counterfactual_table, diagnosis_tables
-from dual_system.analysis.first_choices import ABOUT_FIRST_CHOICES, first_choices
+from dual_system.analysis.first_choices import ABOUT_FIRST_CHOICES, ABOUT_RETOLD, first_choices, retold
 from dual_system.analysis.markdown import markdown, percent
 from dual_system.analysis.results import Results, ResultsError, read_comparable
 from dual_system.analysis.statistics import bootstrap, paired, wilson
@@ -77,6 +77,8 @@ def tables(results: Sequence[Results]) -> str:
     parts += ["## By task (form of the paper's Table 7)", by_task(results), *ceilings(results)]
     if first := first_choices(results):
         parts += ["## First choice", ABOUT_FIRST_CHOICES, first]
+    if twins := retold(results):
+        parts += ["## The same present after another past", ABOUT_RETOLD, twins]
     if len(results) > 1:
         parts += ["## Between conditions (form of the paper's Tables 3 and 4)", between_conditions(results)]
     return "\n\n".join(parts) + "\n"
@@ -144,7 +146,11 @@ _TOLD = {
     "oracle": "the task's grounded subgoal of the same tick",  # of earlier releases
 }
 
-_SHOWN = {"other-scene": "the pictures of another scene", "without-cue": "pictures without the cue"}
+_SHOWN = {
+    "other-scene": "the pictures of another scene",
+    "without-cue": "pictures without the cue",
+    "retold": "another past",
+}
 
 
 def _condition(results: Results) -> tuple[str, str, str, str]:

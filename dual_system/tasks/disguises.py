@@ -1,6 +1,6 @@
 """Environments that show their pictures otherwise, to ask what a policy reads from them: controls of an evaluation.
 
-Physics, instruction and judgement are the episode's own.
+Physics and instruction are the episode's own, and so is the judgement, unless the past is retold.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from dual_system.tasks.difficulty import DIFFICULTIES
 from dual_system.tasks.engine import Status
 from dual_system.tasks.environment import IMAGE_PX, MAX_STEPS, Environment, Snapshot
 from dual_system.tasks.physics import CONTROL_HZ
-from dual_system.tasks.task import make_task
+from dual_system.tasks.task import TaskError, make_task
 
-Pictures = Literal["own", "other-scene", "without-cue"]
+Pictures = Literal["own", "other-scene", "without-cue", "retold"]
 
 _NEVER = 10**9
 
 
 def disguised(name: str, pictures: Pictures, *, render: bool = True, max_steps: int = MAX_STEPS) -> Environment:
     """Returns an environment of a task that shows the given pictures. Raises TaskError for an unknown name."""
-    kinds = {"own": Environment, "other-scene": OtherScene, "without-cue": WithoutCue}
+    kinds = {"own": Environment, "other-scene": OtherScene, "without-cue": WithoutCue, "retold": Retold}
     return kinds[pictures](make_task(name), image_px=IMAGE_PX, render=render, max_steps=max_steps)
 
 
@@ -70,6 +70,19 @@ class WithoutCue(Environment):
         super()._begin(difficulty, layout)
         for body in self.task.cues(layout):
             self.physics.hide(body)
+
+
+class Retold(Environment):
+    """Shows the scene after another past, which decides what is right (`Task.retold`). A layout is taken as it is."""
+
+    def reset(self, seed: int, difficulty: str | None = None, *, layout: Any = None) -> Snapshot:
+        """As everywhere; and raises TaskError for a task whose past cannot be retold."""
+        if layout is None:
+            super().reset(seed, difficulty)
+            layout = next(iter(self.task.retold(self.layout)), None)
+        if layout is None:
+            raise TaskError(f"{self.task.name} has one past only in the scene of seed {seed}; leave this task out")
+        return super().reset(seed, difficulty, layout=layout)
 
 
 def another_seed(seed: int) -> int:

@@ -239,6 +239,26 @@ def test_first_choices_are_of_the_episodes_that_committed(tmp_path: Path) -> Non
     assert FIRST_CHOICES.replace("FOLDER", str(folder)) in tables([read_results(folder)])
 
 
+def write_choices(folder: Path, choices: list[str | None], **config: Any) -> Path:
+    """Results of MoveCube in which these were the first choices."""
+    write(folder, {"MoveCube": ["0" * len(choices)]}, **config)
+    found = json.loads((folder / "results.json").read_text())
+    for episode, choice in zip(found["episodes"], choices, strict=True):
+        episode |= {"first_choice": choice, "first_choice_tick": 5}
+    (folder / "results.json").write_text(json.dumps(found))
+    return folder
+
+
+def test_two_pasts_of_one_present_are_counted_scene_by_scene(tmp_path: Path) -> None:
+    own = write_choices(tmp_path / "own", ["right", "right", "wrong", "wrong", None])
+    other = write_choices(tmp_path / "other", ["right", "wrong", "right", "wrong", "right"], pictures="retold")
+    late = write_choices(tmp_path / "late", ["right"] * 5, pictures="retold", delay_ms=1000)
+    text = tables(read_comparable([own, other, late]))
+    assert f"| MoveCube | {own} | 4 of 5 | 1 | 2 | 1 | 25.00 [4.6, 69.9] |" in text
+    assert f"| MoveCube | {other} |" not in text.split("another past")[1]
+    assert "another past" not in tables(read_comparable([own]))
+
+
 def test_who_could_choose_in_sight_of_the_discs_is_listed_apart(tmp_path: Path) -> None:
     folder = write(tmp_path / "a", {"PickHighlight": ["11010"]})
     assert "was pressed" not in tables([read_results(folder)])

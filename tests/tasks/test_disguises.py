@@ -9,6 +9,7 @@ from dual_system.tasks.disguises import Pictures, another_seed, disguised
 from dual_system.tasks.engine import Status
 from dual_system.tasks.environment import Environment, Snapshot, make_environment
 from dual_system.tasks.seeds import split_of
+from dual_system.tasks.task import TaskError
 
 SEED = 500_001
 
@@ -65,6 +66,21 @@ def test_without_its_cue_a_scene_and_its_retellings_look_alike(task: str, step: 
 
     assert not np.array_equal(pictures("own", None), pictures("own", 0))
     np.testing.assert_array_equal(pictures("without-cue", None), pictures("without-cue", 0))
+
+
+@pytest.mark.parametrize("task", ["PickHighlight", "VideoUnmask", "MoveCube"])
+def test_a_retold_scene_has_the_same_present_and_another_answer(task: str) -> None:
+    with disguised(task, "retold", render=False) as odd, make_environment(task, render=False) as plain:
+        ours, own = odd.reset(SEED), plain.reset(SEED)
+        assert odd.instruction == plain.instruction
+        assert odd.layout in plain.task.retold(plain.layout)
+        assert odd.layout != plain.layout
+        np.testing.assert_allclose(ours.state, own.state, atol=0.02)
+
+
+def test_a_task_without_another_past_is_refused() -> None:
+    with disguised("StopCube", "retold", render=False) as odd, pytest.raises(TaskError, match="one past only"):
+        odd.reset(SEED)
 
 
 def test_the_other_scene_is_another_one_and_never_held_out() -> None:
