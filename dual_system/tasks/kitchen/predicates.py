@@ -112,7 +112,7 @@ def holds(view: View, memory: Memory, check: Check) -> bool:
 
 def _doors(view: View, memory: Memory, check: Check) -> list[float]:
     """Fraction of 90 degrees by which a door (a joint) or each of a fixture's doors is open."""
-    return [_fraction(view, door) for door in _hinges(view.bay, check.of)]
+    return [_fraction(view, door) for door in hinges(view.bay, check.of)]
 
 
 def _drawer(view: View, memory: Memory, check: Check) -> list[float]:
@@ -210,7 +210,7 @@ def region_of(bay: Bay, name: str) -> Region:
             raise TypeError(f"{name!r} is a {type(fixture).__name__}, which has no inside")
 
 
-def _hinges(bay: Bay, name: str) -> tuple[Hinge, ...]:
+def hinges(bay: Bay, name: str) -> tuple[Hinge, ...]:
     """The doors of a fixture, or the one whose joint has this name."""
     fixture = bay.fixtures[name.split("/")[0]]
     match fixture:
