@@ -19,6 +19,9 @@ from ponderpounce_robocasa.fake import REACHED_M, FakeKitchen, make
 from ponderpounce_robocasa.play import Outcome, play
 from ponderpounce_robocasa.scenes import Scene, SceneError, read_scene, restore, seeds_of
 
+from dual_system.data.paired import HELD_OUT, PANDA_OMRON
+from dual_system.tasks.kitchen import catalogue
+from dual_system.tasks.kitchen import layout as kitchen
 from sim_client.robot_file import read_robot
 
 ROOT = Path(__file__).parents[2]
@@ -109,6 +112,15 @@ def test_the_action_is_the_robot_file_s() -> None:
     assert robot.cameras == tuple(layout.CAMERAS)
     assert robot.control_hz == layout.CONTROL_HZ
     assert sum(size for _, size in layout.BODY_PARTS) + 1 == len(layout.ACTION_NAMES) == 12
+
+
+def test_our_own_kitchen_has_the_same_numbers_cameras_tasks_and_splits() -> None:
+    assert [(name.removeprefix("robot0_"), size) for name, size in layout.STATE] == list(kitchen.STATE_PARTS)
+    assert layout.ACTION_NAMES == kitchen.ACTION_NAMES
+    assert tuple(layout.CAMERAS) == PANDA_OMRON.cameras
+    assert set(layout.TASKS) == set(catalogue.TASKS)
+    assert set(layout.CATEGORY_BALANCED) == set(HELD_OUT["category_balanced"])
+    assert set(layout.PRECISION_SENSITIVE) == set(HELD_OUT["precision_sensitive"])
 
 
 def test_an_action_that_begins_with_the_base_is_refused() -> None:

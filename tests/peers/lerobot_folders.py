@@ -3,6 +3,7 @@
 python lerobot_folders.py write ROOT     ten frames a second, two cameras; also merged, cut, and without videos
 python lerobot_folders.py read FOLDER    JSON on stdout
 python lerobot_folders.py rows FOLDER    the same, of any robot's: every row
+python lerobot_folders.py pairs FOLDER   the same, of pairs: the episodes that a split has seen
 """
 
 import json
@@ -90,6 +91,27 @@ def rows(root: Path) -> dict:
     }
 
 
+def pairs(root: Path) -> dict:
+    seen = json.loads((root / "meta" / "splits.json").read_text())["category_balanced"]["seen"]["episodes"]
+    data = LeRobotDataset("test/pairs", root=root, episodes=seen, video_backend="pyav")
+    first, last = data[0], data[len(data) - 1]
+    return {
+        "fps": data.fps,
+        "robot": data.meta.robot_type,
+        "frames": len(data),
+        "names": [data.features[name]["names"] for name in ("observation.state", "action")],
+        "cameras": sorted(data.meta.camera_keys),
+        "state": [item["observation.state"].tolist() for item in (first, last)],
+        "action": [item["action"].tolist() for item in (first, last)],
+        "is_demonstration": [bool(item["is_demonstration"]) for item in (first, last)],
+        "task": [item["task"] for item in (first, last)],
+        "shades": [
+            {key: round(float(255 * item[key].mean())) for key in data.meta.camera_keys} for item in (first, last)
+        ],
+        "statistics": [len(data.meta.stats[name]["q01"]) for name in ("observation.state", "action")],
+    }
+
+
 if __name__ == "__main__":
     verb, place = sys.argv[1], Path(sys.argv[2])
     if verb == "write":
@@ -98,5 +120,5 @@ if __name__ == "__main__":
         delete_episodes(videos, [1], output_dir=place / "cut", repo_id="test/cut")
         merge_datasets([videos, others], output_repo_id="test/merged", output_dir=place / "merged")
     else:
-        told = {"read": read, "rows": rows}[verb](place)
+        told = {"read": read, "rows": rows, "pairs": pairs}[verb](place)
         sys.stdout.write(json.dumps(told, default=str) + "\n")

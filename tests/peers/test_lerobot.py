@@ -16,6 +16,9 @@ import pytest
 
 from dual_system.commands import collect
 from dual_system.data.dataset import Dataset
+from dual_system.data.episode import About, unpack
+from dual_system.data.lerobot_v3 import DatasetWriter
+from dual_system.data.paired import PANDA_OMRON, Instant, pack_pair, write_splits
 from dual_system.models.ponder.checkpoint import load_ponder
 from dual_system.training import train
 
@@ -90,3 +93,35 @@ def test_lerobot_reads_what_we_write(theirs: Path, tmp_path: Path) -> None:
     said = [(row["role"], row["style"], row["content"], row["timestamp"]) for row in found["persistent"]]
     assert said == [("assistant", "subtask", "reach it", 0.0), ("assistant", "subtask", "lift it", 1.5)]
     assert found["events"] == []
+
+
+def test_lerobot_reads_pairs_of_two_bodies_and_a_split_of_them(tmp_path: Path) -> None:
+    tasks = ("OpenDrawer", "CloseDrawer", "TurnOffStove")  # the second is held out
+    writer, rng = DatasetWriter(tmp_path, PANDA_OMRON), np.random.default_rng(0)
+    demo = [np.full((128, 128, 3), shade, np.uint8) for shade in (30, 60)]
+    views = {name: np.full((128, 128, 3), 100 + 40 * place, np.uint8) for place, name in enumerate(PANDA_OMRON.cameras)}
+    done = [
+        Instant(state=rng.uniform(-1, 1, 53).astype(np.float32), action=rng.uniform(-1, 1, 12).astype(np.float32),
+                frames=views)
+        for _ in range(10)
+    ]  # fmt: skip
+    for seed, task in enumerate(tasks):
+        about = About(task=task, instruction=f"do {task}", seed=seed, difficulty="", origin="script", is_success=True,
+                      image_px=128)  # fmt: skip
+        writer.add(unpack(pack_pair(demo, done, about)))
+    writer.finish()
+    write_splits(tmp_path, tasks)
+    found: dict[str, Any] = json.loads(lerobot("pairs", str(tmp_path)).splitlines()[-1])
+    assert (found["fps"], found["robot"], found["frames"]) == (20, "panda_omron", 2 * (21 + 10))
+    assert found["names"] == [list(PANDA_OMRON.state), list(PANDA_OMRON.action)]
+    assert found["statistics"] == [53, 12]
+    assert found["cameras"] == sorted(f"observation.images.{name}" for name in PANDA_OMRON.videos)
+    assert found["task"] == ["do OpenDrawer", "do TurnOffStove"]
+    assert found["is_demonstration"] == [True, False]
+    np.testing.assert_allclose(found["state"], [done[0].state, done[-1].state], atol=1e-6)
+    np.testing.assert_allclose(found["action"], [done[0].action, done[-1].action], atol=1e-6)
+    shown, acted = found["shades"]
+    assert abs(shown["observation.images.demonstration"] - 30) <= 3
+    for place, name in enumerate(PANDA_OMRON.cameras):
+        assert shown[f"observation.images.{name}"] <= 3  # black while another body shows it
+        assert abs(acted[f"observation.images.{name}"] - (100 + 40 * place)) <= 3
