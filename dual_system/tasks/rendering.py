@@ -1,17 +1,18 @@
-"""Pictures of the world: both cameras through one renderer."""
+"""Pictures of a world: all its cameras through one renderer."""
 
 from __future__ import annotations
 
 import os
 import sys
 import traceback
+from collections.abc import Sequence
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from dual_system.tasks import headless
-from dual_system.tasks.physics import Physics
 from dual_system.tasks.scene import CAMERAS
 from protocol.errors import CommandError
 
@@ -23,8 +24,20 @@ class RenderingError(CommandError):
     """There is no GL context as the environment's variables want it, or none in this process."""
 
 
+class Drawn(Protocol):
+    """A world that can be drawn."""
+
+    @property
+    def model(self) -> Any:
+        """Its compiled model."""
+
+    @property
+    def data(self) -> Any:
+        """Its state."""
+
+
 class Cameras:
-    """Renders one physics at one size. Needs a GL context (MUJOCO_GL=egl without a display); close it after use.
+    """Renders one world at one size. Needs a GL context (MUJOCO_GL=egl without a display); close it after use.
 
     Raises RenderingError if there is none.
 
@@ -35,7 +48,7 @@ class Cameras:
     _drawing_process = 0
     """The process that drew first. Its forks inherit a GL library in use, where a new context waits for ever."""
 
-    def __init__(self, physics: Physics, image_px: int) -> None:
+    def __init__(self, physics: Drawn, image_px: int, names: Sequence[str] = CAMERAS) -> None:
         Cameras._drawing_process = Cameras._drawing_process or os.getpid()
         if Cameras._drawing_process != os.getpid():
             raise RenderingError(
@@ -43,6 +56,7 @@ class Cameras:
                 'processes with "spawn" (AsyncVectorEnv: context="spawn"), or before the first reset'
             )
         self._physics = physics
+        self._names = tuple(names)
         self._renderer = _renderer(physics.model, image_px)
         self._options = mujoco.MjvOption()
         for group in _UNSEEN_GROUPS:
@@ -57,7 +71,7 @@ class Cameras:
 
     def frames(self) -> dict[str, NDArray[np.uint8]]:
         """Returns a new (image_px, image_px, 3) RGB picture per camera name."""
-        return {camera: self._render(camera) for camera in CAMERAS}
+        return {camera: self._render(camera) for camera in self._names}
 
     def segmentation(self, camera: str) -> NDArray[np.int32]:
         """Returns the id of the geom seen in each pixel (image_px, image_px), -1 where there is none."""

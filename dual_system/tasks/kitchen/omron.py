@@ -47,7 +47,7 @@ _FILES = {
     "arm": "robots/panda/robot.xml",
     "gripper": "grippers/panda_gripper.xml",
 }
-_CELL_M = {"base": 0.04, "arm": 0.02, "gripper": 0.008}
+_CELL_M = {"base": 0.07, "arm": 0.03, "gripper": 0.012}
 
 
 def panda_omron_spec() -> mujoco.MjSpec:

@@ -23,6 +23,7 @@ SEEN_GROUP, FELT_GROUP = 1, 0
 _DARK = 0.35  # mean of the colour below which a part counts as dark
 _BLACKEST = 0.12  # a black part still shows its edges
 _MAX_HULL_POINTS = 40
+_FEWEST_FACES = 12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,7 +99,11 @@ def _merged(model: Any, name: str, body: str, geoms: Sequence[int], cell_m: floa
         num_vertices += len(vertices[-1])
     largest = geoms[int(np.argmax([len(each) for each in faces]))]
     rgba = (*(max(_BLACKEST, float(c)) for c in _rgba(model, largest)[:3]), 1.0)
-    light, corners = cluster(np.concatenate(vertices), np.concatenate(faces).astype(np.int32), cell_m=cell_m)
+    corners_full = np.concatenate(faces).astype(np.int32)
+    light, corners = cluster(np.concatenate(vertices), corners_full, cell_m=cell_m)
+    while len(corners) < _FEWEST_FACES:  # a part no larger than a cell
+        cell_m /= 2
+        light, corners = cluster(np.concatenate(vertices), corners_full, cell_m=cell_m)
     return Skin(name=name, body=body, vertices=light, faces=corners, rgba=rgba, collides=False)
 
 

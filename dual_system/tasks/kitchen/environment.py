@@ -1,0 +1,283 @@
+"""The order of calls for a kitchen task: draw and build a scene, act for 50 ms, judge, render. As `tasks.environment`.
+
+A scene is generated per seed, so that every reset compiles a model; the robot is a PandaOmron with three views. Seeds
+of held-out scenes show held-out instances of the objects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dual_system.tasks.engine import Status
+from dual_system.tasks.environment import Snapshot
+from dual_system.tasks.geometry import Array, pose_of
+from dual_system.tasks.kinematics import UnreachableError
+from dual_system.tasks.kitchen import predicates, puppet
+from dual_system.tasks.kitchen.catalogue import PAPER_HORIZON, TASKS, draw_scene
+from dual_system.tasks.kitchen.control import CONTROL_HZ
+from dual_system.tasks.kitchen.goals import GOAL_SETS, draw_goal_scene
+from dual_system.tasks.kitchen.layout import NUM_ACTION
+from dual_system.tasks.kitchen.omron import VIEWS
+from dual_system.tasks.kitchen.performing import perform
+from dual_system.tasks.kitchen.plan import Instances, Scene
+from dual_system.tasks.kitchen.scripts import script
+from dual_system.tasks.kitchen.steps import here
+from dual_system.tasks.kitchen.world import World, WorldState
+from dual_system.tasks.rendering import Cameras
+from dual_system.tasks.seeds import UNTRAINED, split_of
+from dual_system.tasks.task import TaskError
+
+IMAGE_PX = 128
+_WAITING = np.zeros(NUM_ACTION)
+_WAITING[-1] = -1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeState:
+    """A saved episode: restoring it, in any environment, continues it exactly."""
+
+    scene: Scene
+    step: int
+    world: WorldState
+    memory: predicates.Memory
+    status: Status
+    reason: str
+    action: Array  # (12,) the last one
+
+
+class KitchenEnvironment:
+    """One kitchen task or goal set, stepped at 20 Hz. Use it as a context manager or close it.
+
+    Args:
+        name: of one of the twenty-four tasks, or of a goal set.
+        image_px: side of the pictures.
+        render: without it, snapshots have no pictures and no GL is needed.
+        max_steps: after which an episode ends; the paper's 1000 for every task.
+
+    Raises:
+        TaskError: there is no such task.
+    """
+
+    def __init__(
+        self, name: str, *, image_px: int = IMAGE_PX, render: bool = True, max_steps: int = PAPER_HORIZON
+    ) -> None:
+        if name not in TASKS and name not in GOAL_SETS:
+            raise TaskError(f"unknown kitchen task {name!r}; expected one of {', '.join([*TASKS, *GOAL_SETS])}")
+        self.name = name
+        self._image_px = image_px if render else None
+        self._max_steps = max_steps
+        self._world: World | None = None
+        self._cameras: Cameras | None = None
+        self._memory = predicates.Memory()
+        self._step, self._status, self._reason = 0, Status.ONGOING, ""
+        self._action: Array = _WAITING
+        self._start: WorldState | None = None
+
+    @property
+    def scene(self) -> Scene:
+        """Bay and goals of this episode."""
+        return self.world.scene
+
+    @property
+    def world(self) -> World:
+        """The simulated scene. Raises RuntimeError before the first reset."""
+        if self._world is None:
+            raise RuntimeError("no episode has begun; call reset first")
+        return self._world
+
+    @property
+    def instruction(self) -> str:
+        """The instruction of this episode."""
+        return self.scene.instruction
+
+    def reset(self, seed: int, *, goal: int | None = None) -> Snapshot:
+        """Begins the episode of a seed and returns its first snapshot.
+
+        With a goal set, ``goal`` asks for another of its goals from the very same start. Raises ValueError for a task,
+        which has one goal.
+        """
+        instances = instances_of(seed)
+        if self.name in GOAL_SETS:
+            scene = draw_goal_scene(self.name, seed, goal, instances)
+        elif goal is None:
+            scene = draw_scene(self.name, seed, instances)
+        else:
+            raise ValueError(f"{self.name} has one goal; goal={goal} is for a goal set: {', '.join(GOAL_SETS)}")
+        self._begin(scene)
+        self._start = self.world.save()
+        return self._observe()
+
+    def step(self, action: ArrayLike, *, look: bool = True) -> Snapshot:
+        """Applies an action (12,) for exactly 50 ms and returns the snapshot after it; without ``look``, no pictures.
+
+        Numbers beyond [-1, 1] are clipped. Raises ValueError if it has another shape or is not finite, and RuntimeError
+        if the episode is over or never began.
+        """
+        world = self.world
+        if self._status is not Status.ONGOING:
+            raise RuntimeError(
+                f"the episode ended with {self._status.value} at step {self._step} ({self._reason}); "
+                "call reset before stepping on"
+            )
+        self._action = _checked(action)
+        world.advance(self._action)
+        self._step += 1
+        return self._observe(look=look)
+
+    def oracle(self) -> Iterator[NDArray[np.float32]]:
+        """Yields the actions (12,) of the script, each computed from the state in which it is requested.
+
+        It ends early where the arm cannot do the next thing.
+        """
+        goal = self.scene.goals[self.scene.goal]
+        try:
+            for action in perform(self.world, script(goal, self.world.view)):
+                yield action.astype(np.float32)
+            while True:  # what was let go may still have to come to rest
+                yield _WAITING.astype(np.float32)
+        except UnreachableError:
+            return
+
+    has_demonstration = True
+
+    def demonstration(self, rate_hz: int = CONTROL_HZ, *, look_hz: int | None = None) -> Iterator[Snapshot]:
+        """Yields GR-1's demonstration from this episode's start at ``rate_hz``, its pictures of one camera.
+
+        With ``look_hz`` only snapshots at that rate have pictures, and the last one. The episode does not change.
+        Raises ValueError unless the rates divide 20 Hz, and UnreachableError if the script does not reach the goal.
+        """
+        every, look_every = (_steps_between(rate) for rate in (rate_hz, look_hz or rate_hz))
+        scene, stage = self.scene, World(self.scene)
+        assert self._start is not None
+        stage.load(self._start)
+        moments = puppet.record(stage, _until_done(stage), scene.horizon)
+        body = puppet.Puppet(scene, TASKS[scene.goals[scene.goal].task].family)
+        poses = body.poses(moments)
+        shown = range(0, len(poses), every)
+        looked_at = {*(step for step in shown if step % look_every == 0), *shown[-1:]}
+        cameras = None if self._image_px is None else Cameras(body, self._image_px, (puppet.CAMERA,))
+        try:
+            for step in shown:
+                body.pose(poses[step])
+                frames = cameras.frames() if cameras is not None and step in looked_at else {}
+                yield replace(
+                    self._snapshot(look=False), step=step, frames=frames, status=Status.ONGOING, reason="",
+                    is_demonstration=True,
+                )  # fmt: skip
+        finally:
+            if cameras is not None:
+                cameras.close()
+
+    def save(self) -> EpisodeState:
+        """Returns a copy of the current state of the whole episode."""
+        return EpisodeState(
+            scene=self.scene,
+            step=self._step,
+            world=self.world.save(),
+            memory=self._memory,
+            status=self._status,
+            reason=self._reason,
+            action=self._action,
+        )
+
+    def restore(self, state: EpisodeState, *, look: bool = True) -> Snapshot:
+        """Continues a saved episode and returns its snapshot. Raises TaskError if it is another task's."""
+        if state.scene.task != self.name:
+            raise TaskError(f"the saved episode is of {state.scene.task!r}; this environment runs {self.name!r}")
+        if self._world is None or self._world.scene != state.scene:
+            self._begin(state.scene)
+            self._start = self.world.save()
+        self.world.load(state.world)
+        self._step, self._memory, self._action = state.step, state.memory, state.action
+        self._status, self._reason = state.status, state.reason
+        return self._snapshot(look=look)
+
+    def close(self) -> None:
+        """Frees the renderer. May be called twice."""
+        if self._cameras is not None:
+            self._cameras.close()
+            self._cameras = None
+
+    def __enter__(self) -> KitchenEnvironment:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _begin(self, scene: Scene) -> None:
+        self.close()
+        self._world = World(scene)
+        if self._image_px is not None:
+            self._cameras = Cameras(self._world, self._image_px, VIEWS)
+        self._memory = predicates.remember(self._world.view, None)
+        self._step, self._status, self._reason, self._action = 0, Status.ONGOING, "", _WAITING
+
+    def _observe(self, *, look: bool = True) -> Snapshot:
+        world, scene = self.world, self.scene
+        if self._step:
+            self._memory = predicates.remember(world.view, self._memory)
+        done = predicates.fired(world.view, self._memory, scene.goals)
+        if done == scene.goal:
+            self._status, self._reason = Status.SUCCESS, "goal reached"
+        elif done is not None:
+            self._status, self._reason = Status.FAIL, f"another goal was reached: {scene.goals[done].instruction}"
+        elif self._step >= self._max_steps:
+            self._status, self._reason = Status.TIMEOUT, f"not done after {self._max_steps} steps"
+        return self._snapshot(look=look)
+
+    def _snapshot(self, *, look: bool) -> Snapshot:
+        world = self.world
+        is_decided = self._status in (Status.SUCCESS, Status.FAIL) and len(self.scene.goals) > 1
+        return Snapshot(
+            step=self._step,
+            frames=self._cameras.frames() if look and self._cameras is not None else {},
+            state=world.state().astype(np.float32),
+            command=self._action.astype(np.float32),
+            tcp_pose=pose_of(here(world.view)),
+            status=self._status,
+            reason=self._reason,
+            simple_subgoal=self.instruction,
+            grounded_subgoal=self.instruction,
+            subtask_index=int(self._status is Status.SUCCESS),
+            subgoal_index=0,
+            first_choice=self._status is Status.SUCCESS if is_decided else None,
+        )
+
+
+def instances_of(seed: int) -> Instances:
+    """Returns the split of objects that a seed's scene shows: B, held out, in scenes that nothing trains on."""
+    return "B" if split_of(seed) in UNTRAINED else "A"
+
+
+def _until_done(world: World) -> Iterator[Array]:
+    """Yields the script's actions up to the goal. Raises UnreachableError if it is missed."""
+    scene = world.scene
+    memory = predicates.remember(world.view, None)
+    for action in perform(world, script(scene.goals[scene.goal], world.view)):
+        yield action
+        memory = predicates.remember(world.view, memory)
+        if predicates.fired(world.view, memory, scene.goals) == scene.goal:
+            return
+    raise UnreachableError(f"{scene.task}, seed {scene.seed}: the script misses its goal; there is no demonstration")
+
+
+def _steps_between(rate_hz: int) -> int:
+    if rate_hz < 1 or CONTROL_HZ % rate_hz:
+        raise ValueError(f"a video of {CONTROL_HZ} Hz cannot be shown at {rate_hz} Hz; use 1, 2, 4, 5, 10 or 20")
+    return CONTROL_HZ // rate_hz
+
+
+def _checked(action: ArrayLike) -> Array:
+    values = np.asarray(action, dtype=np.float64)
+    if values.shape != (NUM_ACTION,):
+        raise ValueError(f"action has shape {values.shape}; expected ({NUM_ACTION},), see kitchen.layout.ACTION_PARTS")
+    if not np.isfinite(values).all():
+        raise ValueError(f"action {values.tolist()} is not finite")
+    return np.clip(values, -1.0, 1.0)
