@@ -5,8 +5,10 @@ The robot is RoboCasa-DC's: 53 numbers of state, 12 of action, three 128 px view
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +19,17 @@ import torch
 from dual_system.data.dataset import Dataset
 from dual_system.data.episode import DEMO_CAMERA, About, EpisodeWriter, Package, RobotColumns, Row, unpack
 from dual_system.data.lerobot_v3 import DatasetWriter
+from dual_system.models.groot.folder import nvidia_config
 from dual_system.models.groot.pounce import GrootInputs
-from dual_system.models.pounce.checkpoint import load_bundle
+from dual_system.models.pi05.pounce import PounceInputs
+from dual_system.models.ponder.checkpoint import save_ponder
+from dual_system.models.ponder.configs import tiny_cpu
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.pounce.checkpoint import load_bundle, random_bundle, save_bundle
+from dual_system.models.pounce.configs import TINY_IMAGE_TOKEN_ID, tiny_groot
 from dual_system.models.pounce.reading import groot_inputs
 from dual_system.training import recipes, train
-from dual_system.training.build import Start, build
+from dual_system.training.build import Start, build, for_robot
 from dual_system.training.collate import collate_ponder, collate_pounce
 from dual_system.training.data import PictureSizes, TrainingSet
 from dual_system.training.example import Example, make_example
@@ -190,6 +198,27 @@ def test_cognition_is_computed_in_training_as_in_serving(built: Any) -> None:
         np.testing.assert_allclose(fire.cognition, expected, atol=1e-4)
 
 
+@pytest.mark.parametrize("state_input", ["prompt", "token"])
+def test_pi05_reads_as_many_cameras_and_numbers(folder: Path, state_input: Any) -> None:
+    """Its prompt spells up to some forty numbers; more are read as one token."""
+    tiny = recipes.recipe("tiny_robocasa_dc")
+    recipe = replace(tiny, pounce=replace(recipes.recipe("tiny").pounce, state_input=state_input))  # type: ignore[arg-type]
+    model, bundle = build(recipe, TrainingSet(folder), Start())
+    data = TrainingSet(folder, sizes=PictureSizes.of(model.ponder.format, model.pounce.config))
+    collate = partial(collate_pounce, [example_of(data, model)], bundle.model.config, bundle.tokenizer)
+    if state_input == "prompt":
+        with pytest.raises(ValueError, match=r"prompt has 2\d\d tokens.* read its 53 numbers of state as one token"):
+            collate(bundle.statistics)
+        return
+    batch = collate(bundle.statistics)
+    assert isinstance(batch.inputs, PounceInputs)
+    assert batch.inputs.images.shape[1] == len(CAMERAS)
+    assert batch.inputs.state is not None
+    assert batch.inputs.state.shape[1] == NUM_STATE
+    spec = EagerEngine(bundle).spec
+    assert (spec.proprio_dim, spec.action_dim, spec.cameras) == (NUM_STATE, NUM_ACTION, CAMERAS)
+
+
 # -- the way from a folder of data to servers
 
 
@@ -233,6 +262,41 @@ def test_a_run_that_was_killed_ends_as_one_that_was_not(
     train.train(options(folder, tmp_path / "cut"))
     for name in ("log.jsonl", "ponder/model.safetensors", "pounce/model.safetensors"):
         assert (run / name).read_bytes() == (tmp_path / "cut" / name).read_bytes()
+
+
+def test_the_papers_recipe_builds_a_public_pair_for_the_datas_robot(folder: Path, tmp_path: Path) -> None:
+    """Under ``robocasa_dc``: public folders of tiny width, which know neither this robot nor its pictures' size."""
+    tiny = tiny_groot(num_carriers=0)
+    eagle = replace(
+        tiny.groot.eagle,
+        vision=replace(tiny.groot.eagle.vision, width=64, num_heads=16),  # SigLIP's published number
+        language=replace(tiny.groot.eagle.language, vocab_size=TINY_IMAGE_TOKEN_ID + 1),
+    )
+    groot = replace(tiny.groot, eagle=eagle, num_embodiments=32)
+    public = replace(tiny, groot=groot)
+    save_bundle(random_bundle(public, seed=0), tmp_path / "groot")
+    (tmp_path / "groot" / "config.json").write_text(json.dumps(nvidia_config(groot, public.num_steps)))
+    save_ponder(Ponder.random(tiny_cpu(), seed=0), tmp_path / "qwen")
+    (tmp_path / "qwen" / "ponder.json").unlink()
+    run = recipes.recipe("robocasa_dc")
+    model, bundle = build(run, TrainingSet(folder), Start(ponder=tmp_path / "qwen", pounce=tmp_path / "groot"))
+    config = bundle.model.config
+    assert (config.robot_state_dim, config.robot_action_dim, config.cameras) == (NUM_STATE, NUM_ACTION, CAMERAS)
+    assert (config.horizon, config.num_steps, bundle.statistics.space) == (HORIZON, 4, "native")
+    assert config.cognition.cognition_size == model.ponder.hidden_size
+    assert (model.ponder.image_px, model.ponder.format.cameras) == ((PX, PX), CAMERAS)
+    data = TrainingSet(folder, sizes=PictureSizes.of(model.ponder.format, config))
+    example = example_of(data, model)
+    with torch.inference_mode():
+        assert read_cognition(model.ponder, collate_ponder([example])).isfinite().all()
+    batch = collate_pounce([example], config, bundle.tokenizer, bundle.statistics)
+    assert batch.inputs.images.shape[1] == len(CAMERAS)
+
+
+def test_a_robot_that_groot_has_no_room_for_is_refused(folder: Path) -> None:
+    shape = replace(TrainingSet(folder).robot, state_dim=65)
+    with pytest.raises(ValueError, match=r"robot_state_dim must be 1\.\.64, came 65"):
+        for_robot(recipes.recipe("robocasa_dc").pounce, "native", shape)
 
 
 def test_the_picture_store_keeps_a_demonstration_of_other_cameras(

@@ -72,7 +72,7 @@ def pi05_inputs(
     has_token = config.state_input == "token"
     text = _STATELESS[config.stateless_prompt] if has_token else partial(prompt.prompt_text, state=state)
     token_ids = tokenizer.encode(text(_instruction(moment, config.reads_subgoal)))
-    _check_length(len(token_ids), config.max_prompt_tokens, moment.instruction)
+    _check_length(len(token_ids), config.max_prompt_tokens, moment.instruction, 0 if has_token else len(state))
     return PounceInputs(
         images=images,
         has_view=has_view,
@@ -160,9 +160,11 @@ def _cognition(moment: Moment, device: torch.device) -> Tensor | None:
     return torch.tensor(moment.cognition, device=device)[None]
 
 
-def _check_length(num_tokens: int, max_tokens: int, instruction: str) -> None:
+def _check_length(num_tokens: int, max_tokens: int, instruction: str, num_state: int = 0) -> None:
+    """Raises ValueError for a prompt that is too long. ``num_state``: how many numbers of the state it spells."""
     if num_tokens > max_tokens:
+        also = f", or read its {num_state} numbers of state as one token (state_input)" if num_state else ""
         raise ValueError(
             f"prompt has {num_tokens} tokens, expected at most {max_tokens} "
-            f"(max_prompt_tokens); shorten the instruction {instruction[:60]!r}"
+            f"(max_prompt_tokens); shorten the instruction {instruction[:60]!r}{also}"
         )
