@@ -12,7 +12,6 @@ import dual_system.tasks.headless  # noqa: F401 - before anything that imports m
 # isort: split
 
 from dual_system.tasks.seeds import require_open
-from dual_system.tasks.task import make_task, task_names
 from protocol import files
 from protocol.command_line import command, parse
 from protocol.logs import set_up_logging
@@ -20,6 +19,7 @@ from sim_client.config import SimOptions
 from sim_client.harness import open_harness
 from sim_client.launch import Daemons
 from sim_client.suite import Suite
+from sim_client.worlds import names, require
 
 
 @command("sim-client")
@@ -27,10 +27,10 @@ def main(argv: list[str] | None = None) -> int:
     options = parse(SimOptions, argv, prog="sim-client")
     set_up_logging("WARNING")
     if options.list_tasks:
-        print("\n".join(task_names()))
+        print("\n".join(names()))
         return 0
     try:
-        make_task(options.task)  # a mistyped name before anything is started
+        require(options.task)  # a mistyped name before anything is started
         for seed in range(options.seed, options.seed + options.episodes):
             require_open(seed, "pp-eval --split test plays them, and its results say so")
         with Daemons(files.folder(options.out)) as daemons:

@@ -15,7 +15,7 @@ from clock.playback import deadline_ns
 from clock.report import CLOCK_LOST_EVENT
 from clock.timebase import NS_PER_MS
 from dual_system.tasks.engine import Status
-from dual_system.tasks.environment import Environment, Snapshot
+from dual_system.tasks.environment import Snapshot
 from protocol import images
 from protocol import messages as m
 from protocol.drops import DropReason
@@ -25,6 +25,7 @@ from sim_client.recorder import Recorder
 from sim_client.robot import observation, status_of
 from sim_client.robot_end import STOPPED_S, is_sound
 from sim_client.silence import CLOCK_SILENCE_NS, STALL_NS, Silence
+from sim_client.worlds import World
 
 HOLD_S = 0.5
 """Time for which the robot then holds before it ends the episode."""
@@ -54,7 +55,7 @@ class RobotSide:
     link: Link
     actions: Stream[m.Action]
     """The link's subscription, one for all episodes: each is a thread of the bus."""
-    environment: Environment
+    environment: World
     recorder: Recorder
     let_others: Others
     patience_ns: int
@@ -195,5 +196,5 @@ def play_oracle(
     return Outcome(status=status_of(snapshot), reason=snapshot.reason, num_ticks=len(ticks)), ticks
 
 
-def _script(environment: Environment) -> Iterator[m.Floats]:
+def _script(environment: World) -> Iterator[m.Floats]:
     return iter(environment.oracle())

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dual_system.models.ponder.demo_sampling import DemoSampling
 from dual_system.tasks.engine import Status
-from dual_system.tasks.environment import Environment, Snapshot
+from dual_system.tasks.environment import Snapshot
 from protocol import images
 from protocol.messages import DemoFrame, Image, ImageCodec, Observation, TaskStatus
-from sim_client.panda_robot import CAMERAS, CONTROL_HZ
+from sim_client.panda_robot import CONTROL_HZ
+from sim_client.worlds import World
 
 _STATUS = {
     Status.ONGOING: TaskStatus.ONGOING,
@@ -17,7 +18,7 @@ _STATUS = {
 }
 
 
-def demonstration(environment: Environment, codec: ImageCodec, sampling: DemoSampling) -> tuple[DemoFrame, ...]:
+def demonstration(environment: World, codec: ImageCodec, sampling: DemoSampling) -> tuple[DemoFrame, ...]:
     """The conditioning video as PONDER reads it, before the first query; () for tasks without one."""
     rate_hz = CONTROL_HZ if sampling.to_its_end else sampling.hz
     video = environment.demonstration(rate_hz, look_hz=sampling.hz)
@@ -37,7 +38,7 @@ def observation(snapshot: Snapshot, tick: int, source_ns: int, codec: ImageCodec
 
 
 def _pictures(snapshot: Snapshot, codec: ImageCodec) -> tuple[Image, ...]:
-    return images.pack({name: snapshot.frames[name] for name in CAMERAS if name in snapshot.frames}, codec)
+    return images.pack(dict(snapshot.frames), codec)
 
 
 def status_of(snapshot: Snapshot) -> TaskStatus:

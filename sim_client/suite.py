@@ -15,7 +15,8 @@ from clock.schedules import HORIZON
 from clock.service import ClockService
 from dual_system.analysis.ceiling import ceiling_in, first_choice_in
 from dual_system.models.ponder.demo_sampling import DemoSampling
-from dual_system.tasks.environment import Environment, Snapshot, make_environment
+from dual_system.tasks.environment import Snapshot
+from dual_system.tasks.kinematics import UnreachableError
 from dual_system.tasks.physics import CONTROL_HZ
 from protocol import disk, files, images
 from protocol import messages as m
@@ -27,10 +28,10 @@ from protocol.version import versions
 from sim_client.config import SimOptions
 from sim_client.episode import Outcome, RobotSide, play_oracle
 from sim_client.ledger import write_json
-from sim_client.panda_robot import simulated_robot
 from sim_client.recorder import Recorder
 from sim_client.robot import demonstration
 from sim_client.robot_end import RobotEnd
+from sim_client.worlds import World, open_world, robot_of, suite_of
 
 OnTick = Callable[[int, int], None]
 """Called with (episode index, ticks played) during an episode."""
@@ -74,7 +75,7 @@ class Suite:
         }
         has_eyes = self._options.policy == "servers" or self._options.log.record  # the oracle alone needs none
         task, max_steps = self._options.task, self._options.schedule.max_steps
-        with make_environment(task, max_steps=max_steps, render=has_eyes) as environment:
+        with open_world(task, max_steps=max_steps, render=has_eyes) as environment:
             for index in range(self._options.episodes):
                 episode = self.play(environment, task, self._options.seed + index, on_tick=partial(on_tick, index))
                 results["episodes"].append(episode)
@@ -89,7 +90,7 @@ class Suite:
 
     def play(
         self,
-        environment: Environment,
+        environment: World,
         task: str,
         seed: int,
         *,
@@ -124,7 +125,7 @@ class Suite:
             try:
                 opened = self._end.open(m.OpenRequest(info=info, demo=self._demonstration(environment, sampling)))
                 outcome = side.run(info, first, on_tick)
-            except (TransportError, EpisodeRefused) as error:
+            except (TransportError, EpisodeRefused, UnreachableError) as error:
                 outcome = Outcome(status=m.TaskStatus.ABORTED, reason=str(error), num_ticks=0)
         result, missing = self._end.end(
             outcome.status, outcome.reason, outcome.num_ticks, with_servers=info.policy != "oracle"
@@ -150,7 +151,7 @@ class Suite:
             "schedule": result.statistics,
         }
 
-    def _terms(self, environment: Environment) -> tuple[int, DemoSampling | None, str]:
+    def _terms(self, environment: World) -> tuple[int, DemoSampling | None, str]:
         """Rows of POUNCE's chunks, the sampling of the demonstration if one is shown, and why nobody says so, or ""."""
         sampling = None
         if self._options.policy == "servers":
@@ -164,7 +165,7 @@ class Suite:
 
     def _info(
         self,
-        environment: Environment,
+        environment: World,
         first: Snapshot,
         task: str,
         seed: int,
@@ -176,19 +177,19 @@ class Suite:
         return m.EpisodeInfo(
             header=self._link.header("info", 0),
             task=task,
-            suite="RoboMME",
+            suite=suite_of(environment),
             seed=seed,
             difficulty=environment.difficulty,
             instruction=environment.instruction,
             schedule=self._options.schedule.of_episode(self._options.mode, run_seed(seed, run), horizon),
-            robot=simulated_robot(environment.physics.robot, first.state),
+            robot=robot_of(environment, first),
             t0_unix_ns=time.time_ns(),
             versions=versions(),
             policy=self._options.played_by,
             has_demo=has_demo,
         )
 
-    def _demonstration(self, environment: Environment, sampling: DemoSampling | None) -> tuple[m.DemoFrame, ...]:
+    def _demonstration(self, environment: World, sampling: DemoSampling | None) -> tuple[m.DemoFrame, ...]:
         if sampling is None:
             return ()
         return demonstration(environment, images.wire_codec(self._link.bus.is_local), sampling)

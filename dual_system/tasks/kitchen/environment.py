@@ -95,12 +95,19 @@ class KitchenEnvironment:
         """The instruction of this episode."""
         return self.scene.instruction
 
-    def reset(self, seed: int, *, goal: int | None = None) -> Snapshot:
+    @property
+    def layout(self) -> Scene:
+        """Scene and goal of this episode, by the name that the sixteen's environment has for it."""
+        return self.scene
+
+    def reset(self, seed: int, difficulty: str | None = None, *, goal: int | None = None) -> Snapshot:
         """Begins the episode of a seed and returns its first snapshot.
 
         With a goal set, ``goal`` asks for another of its goals from the very same start. Raises ValueError for a task,
-        which has one goal.
+        which has one goal, and TaskError for a difficulty: a kitchen has none.
         """
+        if difficulty is not None:
+            raise TaskError(f"{self.name} has no difficulties, so {difficulty!r} cannot be chosen; leave it out")
         instances = instances_of(seed)
         if self.name in GOAL_SETS:
             scene = draw_goal_scene(self.name, seed, goal, instances)
@@ -144,6 +151,7 @@ class KitchenEnvironment:
             return
 
     has_demonstration = True
+    difficulty = ""
 
     def demonstration(self, rate_hz: int = CONTROL_HZ, *, look_hz: int | None = None) -> Iterator[Snapshot]:
         """Yields GR-1's demonstration from this episode's start at ``rate_hz``, its pictures of one camera.

@@ -106,7 +106,7 @@ class Puppet:
 
     def _stand(self, offset_m: Array) -> None:
         """Puts the feet beside their place: along the wall, and back from it."""
-        self.model.body_pos[self._root] = [*self._stand_m, *offset_m, 0.0]
+        self.model.body_pos[self._root] = self._stand_m + np.array([*offset_m, 0.0])
         self.data.qpos[self._qpos] = self._rest
         mujoco.mj_kinematics(self.model, self.data)
 
