@@ -48,28 +48,36 @@ class Reach:
         ahead_m, left_m = self._view.data.qpos[self._base]
         return float(ahead_m), float(left_m)
 
-    def worth(self, poses: Sequence[Array], base: Base, *, joint: str = "", values: Sequence[float] = ()) -> float:
-        """Returns how well poses (4, 4) are reached one after the other; `UNREACHABLE` or less if one is not.
+    def worth(
+        self,
+        poses: Sequence[Array],
+        base: Base,
+        *,
+        joint: str = "",
+        values: Sequence[float] = (),
+        start: Array = omron.START_QPOS,
+    ) -> tuple[float, Array]:
+        """Returns how well poses (4, 4) are reached one after the other, and the arm's joints (7,) at the last one.
 
-        A ``joint`` of the bay has one of ``values`` at each pose.
+        A pose that is not reached makes it `UNREACHABLE` or less. A ``joint`` of the bay has one of ``values`` at each.
         """
         scratch, model = self._scratch, self._view.model
         scratch.qpos[:] = self._view.data.qpos
         scratch.qpos[self._base] = base
-        worst, qpos = np.inf, omron.START_QPOS
+        worst, qpos = np.inf, start
         for i, pose in enumerate(poses):
             if joint:
                 scratch.qpos[model.joint(joint).qposadr[0]] = values[i]
             qpos, miss = self._solve(pose, qpos)
             if miss > _NEAR:
-                return UNREACHABLE - miss
+                return UNREACHABLE - miss, qpos
             A = self._jacobian[:, self._dof]
             manipulability = np.sqrt(max(float(np.linalg.det(A @ A.T)), 0.0))
             margin = float(np.minimum(qpos - self._low, self._high - qpos).min())
             worst = min(worst, margin, _MANIPULABILITY * manipulability)
             mujoco.mj_collision(model, scratch)
             worst -= self._depth_m() * 20.0
-        return float(worst)
+        return float(worst), qpos
 
     def _solve(self, pose: Array, start: Array) -> tuple[Array, float]:
         """Joint angles near a start, drawn towards the arm's usual posture, and by how much they miss the pose."""

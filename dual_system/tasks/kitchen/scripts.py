@@ -7,7 +7,7 @@ far from what it has touched.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -16,18 +16,22 @@ import numpy as np
 
 from dual_system.tasks.geometry import Array
 from dual_system.tasks.kinematics import UnreachableError
-from dual_system.tasks.kitchen import steps
+from dual_system.tasks.kitchen import omron, steps
 from dual_system.tasks.kitchen.handles import Button, CoffeeMachine, Drawer, Hinge, Microwave, Sink, Stove
 from dual_system.tasks.kitchen.plan import COUNTER_TOP_M, Goal, Target
 from dual_system.tasks.kitchen.predicates import View, hinges, region_of
 from dual_system.tasks.kitchen.reach import UNREACHABLE, Base, Reach
 from dual_system.tasks.kitchen.steps import AHEAD, SHUT, UP, Step, Steps
 
-_HERE: Base = (0.0, 0.0)
+_BASES: tuple[Base, ...] = ((0.0, 0.0), (0.0, 0.2), (0.0, -0.2), (-0.15, 0.0), (-0.15, 0.2), (-0.15, -0.2))
+_STEEP_RAD = 0.8
+_NUM_GRIPS = 4  # ways to hold an object that are followed to where it goes
 _LEVER_OUT_M, _FINGER_M = 0.13, 0.016  # where a lever is pushed; from its middle to that of closed fingers
 _WATER_RAD, _NO_WATER_RAD = 0.50, 0.25
 _SPOUT_RAD, _KNOB_RAD = 0.72, 0.75
-_HALF_SHUT = 0.45  # of a door: where the hand takes it anew to shut it
+_LOW_M, _WIDE_RAD, _HALF_SHUT_RAD = 1.3, 0.8, 0.7  # doors: a low bar, wide open, where to take it anew to shut it
+_AROUND_M = -0.17 * AHEAD  # around the edge of an open leaf
+_EASY = 0.1  # worth of a way that needs no second go
 _TILTS = tuple(np.deg2rad((0.0, 20.0, 40.0)))
 _FORWARD_TILTS = tuple(np.deg2rad((50.0, 65.0)))  # into cabinets and microwaves
 _MUG_TILTS = tuple(np.deg2rad((65.0, 80.0)))
@@ -52,28 +56,35 @@ class Arm:
         self._reach = Reach(view)
         self._home, self._home_base = steps.here(view), self._reach.base()
 
-    def best(self, ways: Iterable[Way]) -> Way:
-        """Returns the way that is reached best. Raises UnreachableError if none is."""
+    def rate(self, ways: Sequence[Way], start: Array = omron.START_QPOS) -> tuple[float, int, Array]:
+        """Returns how well the best of some ways is reached, which it is, and the joints (7,) at its end."""
         rated = [
-            (self._reach.worth(way.poses, way.base, joint=way.joint, values=way.values), i, way)
-            for i, way in enumerate(ways)
+            self._reach.worth(way.poses, way.base, joint=way.joint, values=way.values, start=start) for way in ways
         ]
-        worth, _, way = max(rated, key=lambda each: each[:2])
+        best = int(np.argmax([worth for worth, _ in rated]))
+        return rated[best][0], best, rated[best][1]
+
+    def best(self, ways: Sequence[Way]) -> Way:
+        """Returns the way that is reached best. Raises UnreachableError if none is."""
+        worth, best, _ = self.rate(ways)
         if worth <= UNREACHABLE:
-            raise UnreachableError(f"none of {len(rated)} ways is within the arm's reach; draw another scene")
-        return way
+            raise UnreachableError(f"none of {len(ways)} ways is within the arm's reach; draw another scene")
+        return ways[best]
 
     def go_home(self) -> Steps:
         """Brings the hand back to where it was at first, seen from the base."""
         (ahead, left), (ahead_0, left_0) = self._reach.base(), self._home_base
-        yield Step(pose=steps.moved(self._home, [left_0 - left, ahead - ahead_0, 0.0]))
+        home = steps.moved(self._home, [left_0 - left, ahead - ahead_0, 0.0])
+        nearer_m = min(0.0, float(steps.here(self.view)[1, 3] - home[1, 3]))  # to the robot: open doors are ahead
+        yield Step(pose=steps.moved(home, nearer_m * AHEAD))
+        yield Step(pose=home)
 
-    def drive(self, base: Base) -> Steps:
+    def drive(self, base: Base, *, holds: str = "") -> Steps:
         """Moves the base to a place if it is not there; the hand rides along."""
         now = self._reach.base()
         if max(abs(a - b) for a, b in zip(now, base, strict=True)) > 0.02:
             shift = np.array([now[1] - base[1], base[0] - now[0], 0.0])
-            yield Step(pose=steps.moved(steps.here(self.view), shift), base_m=base, opening=SHUT)
+            yield Step(pose=steps.moved(steps.here(self.view), shift), base_m=base, opening=SHUT, holds=holds)
 
 
 Script = Callable[[Arm, Target], Steps]
@@ -88,42 +99,70 @@ def _doors(arm: Arm, target: Target, *, fraction: float) -> Steps:
     for i, door in enumerate(hinges(arm.view.bay, target.fixture)):
         if i:
             yield from arm.go_home()
-        if fraction < _HALF_SHUT:
-            yield from _lead_door(arm, door, _HALF_SHUT * door.open_rad)
-            yield from arm.go_home()
         yield from _lead_door(arm, door, fraction * door.open_rad)
 
 
 def _lead_door(arm: Arm, door: Hinge, to_rad: float) -> Steps:
-    """Takes a door by its bar and leads it along its arc; the base makes room."""
-    now, side = arm.view.angle(door.joint), -float(np.sign(door.open_rad))
-    is_low = door.grip_m[2] < 1.3  # a microwave's, whose door is wide as well
-    backs, tilts = ((-0.3, -0.4, -0.55), (35.0, 50.0)) if is_low else ((-0.05, -0.2, -0.35), (60.0, 75.0))
-    lefts = (-0.1, 0.1) if is_low else (0.0, 0.2 * side)
-    around_m = -0.17 * AHEAD if abs(now) > abs(to_rad) else 0.0 * AHEAD  # an open leaf is between hand and bar
-    span = np.linspace(now, to_rad, 4)
+    """Takes a door by its bar and leads it along its arc, in two goes if need be; the base makes room."""
+    grasps = _door_grasps(door)
+    now = arm.view.angle(door.joint)
+    is_shutting = abs(now) > abs(to_rad)
 
-    def frame(at_rad: float, tilt: float, follow: float, *, is_flipped: bool) -> Array:
-        grip, bar, _ = door.at(at_rad)
-        toward = steps.about(UP, follow * at_rad) @ AHEAD
-        T = steps.tool(grip, steps.tilted(toward, np.deg2rad(tilt)), np.cross(bar, toward))
-        return steps.flipped(T) if is_flipped else T
+    def way(grasp: _DoorGrasp, start_rad: float, end_rad: float) -> Way:
+        span = np.linspace(start_rad, end_rad, 4).tolist()
+        poses = tuple(grasp.at(door, angle) for angle in span)
+        before = steps.backed(poses[0], 0.1)
+        if abs(start_rad) > _WIDE_RAD and is_shutting:  # the open leaf is between the hand and its bar
+            before = steps.moved(before, _AROUND_M)
+        return Way(base=grasp.base, poses=(before, *poses), joint=door.joint, values=(start_rad, *span))
 
-    kinds = list(product(backs, lefts, tilts, (0.4, 0.7), (False, True)))
-    ways = []
-    for back, left, tilt, follow, flip in kinds:
-        arc = [frame(a, tilt, follow, is_flipped=flip) for a in span]
-        via = steps.moved(steps.backed(arc[0], 0.1), around_m)
-        way = Way(base=(back, left), poses=(via, *arc), joint=door.joint, values=(now, *span.tolist()))
-        ways.append(way)
-    way = arm.best(ways)
-    follow = next(kind[3] for kind, each in zip(kinds, ways, strict=True) if each is way)
-    yield from arm.drive(way.base)
-    yield Step(pose=way.poses[0])
-    yield from steps.grasp(way.poses[1], door.joint)
-    yield from steps.swing(door, now, to_rad, way.poses[1], follow=follow)
-    yield from steps.release(steps.here(arm.view))
-    yield from steps.retreat(arm.view, back_m=0.15)
+    worth, best, _ = arm.rate([way(grasp, now, to_rad) for grasp in grasps])
+    ends = [to_rad] if worth > _EASY or not is_shutting else [_HALF_SHUT_RAD * np.sign(now), to_rad]
+    for i, end in enumerate(ends):
+        if i:
+            yield from arm.go_home()
+            now = arm.view.angle(door.joint)
+        _, best, _ = arm.rate([way(grasp, now, end) for grasp in grasps])
+        grasp = grasps[best]
+        yield from arm.drive(grasp.base)
+        now = arm.view.angle(door.joint)  # the arm may have touched it
+        before, frame, *_ = way(grasp, now, end).poses
+        yield Step(pose=before)
+        yield from steps.grasp(frame, door.joint)
+        yield from steps.swing(door, now, end, frame, follow=grasp.follow)
+        yield from steps.release(steps.here(arm.view))
+        yield from steps.retreat(arm.view, back_m=0.1)
+        if abs(end) > _WIDE_RAD:
+            yield Step(pose=steps.moved(steps.here(arm.view), _AROUND_M))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _DoorGrasp:
+    """How a door's bar is held: where the base stands, and how the hand turns with the leaf."""
+
+    base: Base
+    tilt_rad: float
+    follow: float
+    is_flipped: bool
+
+    def at(self, door: Hinge, angle_rad: float) -> Array:
+        """Returns the tool's pose (4, 4) at an angle of the door."""
+        grip, bar, _ = door.at(angle_rad)
+        toward = steps.about(UP, self.follow * angle_rad) @ AHEAD
+        T = steps.tool(grip, steps.tilted(toward, self.tilt_rad), np.cross(bar, toward))
+        return steps.flipped(T) if self.is_flipped else T
+
+
+def _door_grasps(door: Hinge) -> list[_DoorGrasp]:
+    side = -float(np.sign(door.open_rad))
+    if door.grip_m[2] < _LOW_M:  # a microwave's, whose door is wide as well
+        backs, lefts, tilts, follows = (-0.3, -0.4), (-0.1, 0.05), (35.0, 50.0), (0.15, 0.5)
+    else:
+        backs, lefts, tilts, follows = (-0.15, -0.25), (-0.1, 0.05, 0.2, 0.35), (60.0, 75.0), (0.0, 0.2)
+    return [
+        _DoorGrasp(base=(back, left * side), tilt_rad=float(np.deg2rad(tilt)), follow=follow, is_flipped=flip)
+        for back, left, tilt, follow, flip in product(backs, lefts, tilts, follows, (False, True))
+    ]
 
 
 def _drawer(arm: Arm, target: Target, *, fraction: float) -> Steps:
@@ -273,7 +312,7 @@ def _pick_and_place(
     tilts: tuple[float, ...],
     leave: Array,
     enter: Array,
-    bases: tuple[Base, ...] = (_HERE,),
+    bases: tuple[Base, ...] = _BASES,
 ) -> Steps:
     """Grasps the object, draws it out along ``leave``, carries it to the end of ``enter`` and lets go of it there.
 
@@ -285,13 +324,11 @@ def _pick_and_place(
     """
     view, thing = arm.view, arm.view.bay.objects[target.obj]
     goal, now = place(arm, target), view.position_m(target.obj)
-    grips = [
-        (T, tilt)
-        for tilt in tilts
-        for grip in (steps.grip_on(view, thing, tilt), steps.grip_on(view, thing, -tilt))
-        for T in (grip, steps.flipped(grip))
-    ]
-    yaws = np.linspace(-np.pi, np.pi, 8, endpoint=False)
+    grips = []
+    for tilt in tilts:
+        ways_round = (tilt, -tilt) if tilt < _STEEP_RAD else (tilt,)  # a flat hand comes from the robot's side
+        grips += [steps.grip_on(view, thing, each) for each in ways_round]
+    grips += [steps.flipped(T) for T in grips]
 
     def placed(T: Array, yaw: float) -> Array:
         turned = steps.about(UP, yaw)
@@ -299,24 +336,36 @@ def _pick_and_place(
         there[:3, :3], there[:3, 3] = turned @ T[:3, :3], goal + turned @ (T[:3, 3] - now)
         return there
 
-    ways = [
-        Way(base=base, poses=(T, steps.moved(T, leave), steps.moved(placed(T, yaw), enter), placed(T, yaw)))
-        for base in bases
-        for T, _ in grips
-        for yaw in yaws
+    picks = [
+        [
+            Way(base=base, poses=(steps.moved(T, leave), steps.backed(T, 0.1), T, steps.moved(T, leave)))
+            for base in bases
+        ]
+        for T in grips
     ]
-    way = arm.best(ways)
-    grip, out, before, there = way.poses
-    yield from arm.drive(way.base)
+    rated = sorted(((*arm.rate(ways), i) for i, ways in enumerate(picks)), key=lambda each: -each[0])
+    plans = []
+    for worth, best, qpos, i in rated[:_NUM_GRIPS]:
+        ends = [placed(grips[i], yaw) for yaw in np.linspace(-np.pi, np.pi, 8, endpoint=False)]
+        ways = [Way(base=base, poses=(steps.moved(T, enter), T)) for base in bases for T in ends]
+        worth_there, best_there, _ = arm.rate(ways, qpos)
+        plans.append((min(worth, worth_there), len(plans), picks[i][best], ways[best_there]))
+    worth, _, pick, put = max(plans)
+    if worth <= UNREACHABLE:
+        raise UnreachableError(f"none of {len(grips)} ways to hold the {thing.kind} leads there; draw another scene")
+    (out, _, grip, _), (before, there) = pick.poses, put.poses
+    yield from arm.drive(pick.base)
     yield Step(pose=out, opening=steps.OPEN)
     yield from steps.grasp(grip, target.obj)
     yield Step(pose=steps.moved(grip, 0.03 * UP), opening=SHUT, holds=target.obj, speed_m_s=0.15)
     yield Step(pose=out, opening=SHUT, holds=target.obj, speed_m_s=0.2)
+    yield from arm.drive(put.base, holds=target.obj)
     yield Step(pose=before, opening=SHUT, holds=target.obj, speed_m_s=0.2)
     yield Step(pose=there, opening=SHUT, holds=target.obj, speed_m_s=0.12)
     yield from steps.release(steps.here(view))
     yield from steps.retreat(view)
-    yield Step(pose=steps.moved(steps.backed(before, 0.12), 0.1 * UP))
+    yield Step(pose=steps.backed(before, 0.1))
+    yield from arm.go_home()
 
 
 def _in_container(arm: Arm, target: Target) -> Array:
@@ -354,34 +403,20 @@ def _under_dispenser(arm: Arm, target: Target) -> Array:
 
 
 _OVER, _INTO = _CARRY_M * UP, -_ENTER_M * AHEAD + 0.03 * UP
-_BESIDE: tuple[Base, ...] = (_HERE, (0.0, 0.2), (0.0, -0.2))
-_BEFORE: tuple[Base, ...] = (_HERE, (-0.1, -0.15), (-0.1, 0.15))
 
 SCRIPTS: Mapping[str, Script] = {
-    "PnPCounterToCab": partial(
-        _pick_and_place, place=_in_fixture, tilts=_FORWARD_TILTS, leave=_OVER, enter=_INTO, bases=_BEFORE
-    ),
-    "PnPCabToCounter": partial(
-        _pick_and_place, place=_on_counter, tilts=_FORWARD_TILTS, leave=_INTO, enter=_OVER, bases=_BEFORE
-    ),
-    "PnPCounterToSink": partial(
-        _pick_and_place, place=_in_fixture, tilts=_TILTS, leave=_OVER, enter=0.25 * UP, bases=_BESIDE
-    ),
-    "PnPSinkToCounter": partial(
-        _pick_and_place, place=_in_container, tilts=_TILTS, leave=0.28 * UP, enter=_OVER, bases=_BESIDE
-    ),
+    "PnPCounterToCab": partial(_pick_and_place, place=_in_fixture, tilts=_FORWARD_TILTS, leave=_OVER, enter=_INTO),
+    "PnPCabToCounter": partial(_pick_and_place, place=_on_counter, tilts=_FORWARD_TILTS, leave=_INTO, enter=_OVER),
+    "PnPCounterToSink": partial(_pick_and_place, place=_in_fixture, tilts=_TILTS, leave=_OVER, enter=0.25 * UP),
+    "PnPSinkToCounter": partial(_pick_and_place, place=_in_container, tilts=_TILTS, leave=0.28 * UP, enter=_OVER),
     "PnPCounterToMicrowave": partial(
-        _pick_and_place, place=_in_container, tilts=_FORWARD_TILTS, leave=_OVER, enter=_INTO, bases=_BEFORE
+        _pick_and_place, place=_in_container, tilts=_FORWARD_TILTS, leave=_OVER, enter=_INTO
     ),
     "PnPMicrowaveToCounter": partial(
-        _pick_and_place, place=_in_container, tilts=_FORWARD_TILTS, leave=_INTO, enter=_OVER, bases=_BEFORE
+        _pick_and_place, place=_in_container, tilts=_FORWARD_TILTS, leave=_INTO, enter=_OVER
     ),
-    "PnPCounterToStove": partial(
-        _pick_and_place, place=_in_container, tilts=_TILTS, leave=_OVER, enter=_OVER, bases=_BESIDE
-    ),
-    "PnPStoveToCounter": partial(
-        _pick_and_place, place=_in_container, tilts=_TILTS, leave=_OVER, enter=_OVER, bases=_BESIDE
-    ),
+    "PnPCounterToStove": partial(_pick_and_place, place=_in_container, tilts=_TILTS, leave=_OVER, enter=_OVER),
+    "PnPStoveToCounter": partial(_pick_and_place, place=_in_container, tilts=_TILTS, leave=_OVER, enter=_OVER),
     "OpenSingleDoor": partial(_doors, fraction=0.96),
     "CloseSingleDoor": partial(_doors, fraction=0.0),
     "OpenDoubleDoor": partial(_doors, fraction=0.96),
@@ -396,10 +431,6 @@ SCRIPTS: Mapping[str, Script] = {
     "TurnOnMicrowave": partial(_microwave_button, name="start"),
     "TurnOffMicrowave": partial(_microwave_button, name="stop"),
     "CoffeePressButton": _coffee_button,
-    "CoffeeSetupMug": partial(
-        _pick_and_place, place=_under_dispenser, tilts=_MUG_TILTS, leave=_OVER, enter=_INTO, bases=_BEFORE
-    ),
-    "CoffeeServeMug": partial(
-        _pick_and_place, place=_on_counter, tilts=_MUG_TILTS, leave=_INTO, enter=_OVER, bases=_BEFORE
-    ),
+    "CoffeeSetupMug": partial(_pick_and_place, place=_under_dispenser, tilts=_MUG_TILTS, leave=_OVER, enter=_INTO),
+    "CoffeeServeMug": partial(_pick_and_place, place=_on_counter, tilts=_MUG_TILTS, leave=_INTO, enter=_OVER),
 }

@@ -20,9 +20,9 @@ from dual_system.tasks.kitchen.predicates import GRIP_SITE, HAND, View
 OPEN, SHUT = 1.0, 0.0
 UP, AHEAD, RIGHT = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])
 
-FREE_M_S, TOUCHING_M_S = 0.30, 0.12  # speeds of the tool
+FREE_M_S, SWING_M_S, TOUCHING_M_S = 0.30, 0.22, 0.12  # speeds of the tool
 _GRIP_STEPS = 8  # control steps in which fingers close
-_SWING_POINTS = 10
+_SWING_POINTS = 6
 _BACK_M, _UP_M = 0.10, 0.15
 
 
@@ -128,13 +128,13 @@ def swing(hinge: Hinge, from_rad: float, to_rad: float, frame: Array, *, follow:
         T = np.eye(4)
         T[:3, :3] = turned @ frame[:3, :3]
         T[:3, 3] = hinge.at(angle)[0] + turned @ offset
-        yield Step(pose=T, opening=opening, speed_m_s=TOUCHING_M_S * 1.5, holds=hinge.joint, value=float(angle))
+        yield Step(pose=T, opening=opening, speed_m_s=SWING_M_S, holds=hinge.joint, value=float(angle))
 
 
 def slide(drawer: Slide, from_m: float, to_m: float, frame: Array, *, opening: float = SHUT) -> Steps:
     """Leads a drawer along its axis; ``frame`` is the tool at the start."""
     there = moved(frame, (to_m - from_m) * np.array(drawer.axis))
-    yield Step(pose=there, opening=opening, speed_m_s=TOUCHING_M_S * 1.5, holds=drawer.joint, value=to_m)
+    yield Step(pose=there, opening=opening, speed_m_s=SWING_M_S, holds=drawer.joint, value=to_m)
 
 
 def turn(knob: Knob, frame: Array, from_rad: float, to_rad: float) -> Steps:
