@@ -155,6 +155,7 @@ class _DoorGrasp:
 
 def _door_grasps(door: Hinge) -> list[_DoorGrasp]:
     side = -float(np.sign(door.open_rad))
+    lefts: tuple[float, ...]
     if door.grip_m[2] < _LOW_M:  # a microwave's, whose door is wide as well
         backs, lefts, tilts, follows = (-0.3, -0.4), (-0.1, 0.05), (35.0, 50.0), (0.15, 0.5)
     else:
@@ -344,7 +345,7 @@ def _pick_and_place(
         for T in grips
     ]
     rated = sorted(((*arm.rate(ways), i) for i, ways in enumerate(picks)), key=lambda each: -each[0])
-    plans = []
+    plans: list[tuple[float, int, Way, Way]] = []
     for worth, best, qpos, i in rated[:_NUM_GRIPS]:
         ends = [placed(grips[i], yaw) for yaw in np.linspace(-np.pi, np.pi, 8, endpoint=False)]
         ways = [Way(base=base, poses=(steps.moved(T, enter), T)) for base in bases for T in ends]
