@@ -61,7 +61,7 @@ class Controller:
         self._torque_range = model.actuator_ctrlrange[self._arm]
         self._finger_range_m = model.actuator_ctrlrange[self._fingers]
         self._closing_m = np.array([-1.0, 1.0]) * _GRIPPER_SPEED / 2 * np.ptp(self._finger_range_m, axis=1)
-        self._jacobian, self._origin_jacobian = np.zeros((6, model.nv)), np.zeros((6, model.nv))
+        self._jacobian = np.zeros((6, model.nv))
         self._mass = np.zeros((model.nv, model.nv))
 
     def begin(self, data: mujoco.MjData) -> None:
@@ -114,9 +114,8 @@ class Controller:
     def _drive(self, data: mujoco.MjData) -> None:
         model, goal = self._model, self.goal
         mujoco.mj_jacSite(model, data, self._jacobian[:3], self._jacobian[3:], self._grip)
-        mujoco.mj_jacSite(model, data, self._origin_jacobian[:3], self._origin_jacobian[3:], self._origin)
         mujoco.mj_fullM(model, self._mass, data.qM)
-        velocity = (self._jacobian - self._origin_jacobian) @ data.qvel
+        velocity = self._velocity(data, self._grip) - self._velocity(data, self._origin)
         origin = data.site_xmat[self._origin].reshape(3, 3)
         lag_m = data.site_xpos[self._origin] + origin @ goal.position_m - data.site_xpos[self._grip]
         turn = _rotation_error(origin @ goal.rotation, data.site_xmat[self._grip].reshape(3, 3))
@@ -125,9 +124,8 @@ class Controller:
         J, M = self._jacobian[:, self._dof], self._mass[self._block]
         MiJT = np.linalg.solve(M, J.T)  # (7, 6)
         inertia_inv = J @ MiJT
-        wrench = np.concatenate(
-            [np.linalg.solve(inertia_inv[:3, :3], pull[:3]), np.linalg.solve(inertia_inv[3:, 3:], pull[3:])]
-        )
+        blocks = np.stack([inertia_inv[:3, :3], inertia_inv[3:, 3:]])  # positions and turns are decoupled
+        wrench = np.linalg.solve(blocks, pull.reshape(2, 3, 1)).ravel()
         away = omron.START_QPOS - data.qpos[self._qpos]
         posture = M @ (_POSTURE_KP * away - _POSTURE_KD * data.qvel[self._dof])
         posture -= J.T @ np.linalg.solve(inertia_inv, MiJT.T @ posture)
@@ -136,6 +134,12 @@ class Controller:
         lift = _TORSO_KP * (goal.torso_m - data.qpos[self._torso_qpos]) - _TORSO_KD * data.qvel[self._torso_dof]
         data.ctrl[self._torso] = self._mass[self._torso_dof, self._torso_dof] * lift + data.qfrc_bias[self._torso_dof]
         data.ctrl[self._base] = goal.base_velocity
+
+    def _velocity(self, data: mujoco.MjData, site: int) -> Array:
+        """Returns a site's velocity (6,), linear, then angular, in the world's axes."""
+        found = np.empty(6)
+        mujoco.mj_objectVelocity(self._model, data, mujoco.mjtObj.mjOBJ_SITE, site, found, 0)
+        return np.roll(found, 3)
 
 
 def rotation_of(vector: Array) -> Array:

@@ -6,7 +6,7 @@ of held-out scenes show held-out instances of the objects.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from types import TracebackType
 
@@ -168,7 +168,7 @@ class KitchenEnvironment:
         poses = body.poses(moments)
         shown = range(0, len(poses), every)
         looked_at = {*(step for step in shown if step % look_every == 0), *shown[-1:]}
-        cameras = None if self._image_px is None else Cameras(body, self._image_px, (puppet.CAMERA,))
+        cameras = self._open(body, (puppet.CAMERA,))
         try:
             for step in shown:
                 body.pose(poses[step])
@@ -222,10 +222,16 @@ class KitchenEnvironment:
     def _begin(self, scene: Scene) -> None:
         self.close()
         self._world = World(scene)
-        if self._image_px is not None:
-            self._cameras = Cameras(self._world, self._image_px, VIEWS)
+        self._cameras = self._open(self._world, VIEWS)
         self._memory = predicates.remember(self._world.view, None)
         self._step, self._status, self._reason, self._action = 0, Status.ONGOING, "", _WAITING
+
+    def _open(self, world: World | puppet.Puppet, cameras: Sequence[str]) -> Cameras | None:
+        if self._image_px is None:
+            return None
+        size = world.model.vis.global_
+        size.offwidth = size.offheight = self._image_px  # MuJoCo clears all of its buffer for every picture
+        return Cameras(world, self._image_px, cameras)
 
     def _observe(self, *, look: bool = True) -> Snapshot:
         world, scene = self.world, self.scene
