@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -256,6 +257,7 @@ def _apart(wheels: tuple[Path, Path], place: Path) -> list[Row]:
             (port,) = free_ports(1)
             listen = ["--listen", f"127.0.0.1:{port}", "--out", place / "behind"]
             start(answering / "pp-gateway", "--dialect", "openpi", "--rows", "10", *connect, *listen)
+            _wait_for(port)
             _run([answering / "python", "-c", OPENPI, str(port)], place)
         finally:
             for process in reversed(running):
@@ -268,6 +270,19 @@ def _apart(wheels: tuple[Path, Path], place: Path) -> list[Row]:
             said = _run([commands / "pp-check", log], place).stdout.strip()
             rows.append({"models": "[serve]", "robot": name, "pp-check": said.removeprefix(f"{log}: ")})
     return rows
+
+
+def _wait_for(port: int) -> None:
+    """Waits until a server listens: openpi's client asks once. Raises OSError when patience ends."""
+    ends_s = time.monotonic() + PATIENCE_S
+    while True:
+        try:
+            socket.create_connection(("127.0.0.1", port)).close()
+            return
+        except OSError:
+            if time.monotonic() > ends_s:
+                raise
+        time.sleep(0.2)
 
 
 def _outside() -> dict[str, str]:
