@@ -46,6 +46,7 @@ COMMANDS = {
             "import": Verb("dual_system.data.import_sets", "Import LeRobot v3 folders or RoboMME's HDF5 files."),
             "bags": Verb("sim_client.bags", "Make a LeRobot v3 set of rosbag2 recordings in MCAP."),
             "card": Verb("dual_system.data.card", "Write a dataset's README.md and contact sheet."),
+            "kitchen": Verb("dual_system.data.kitchen", "Collect pairs of two bodies of the kitchen's tasks."),
             "pairs": Verb("dual_system.tasks.pair_files", "Collect counterfactual pairs: two pasts of one present."),
         },
     ),

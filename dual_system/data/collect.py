@@ -15,13 +15,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import tyro
 from tqdm import tqdm
 
 from dual_system.data.dart import DART, NoiseKind
-from dual_system.data.episode import Package, Rejection, unpack
+from dual_system.data.episode import PANDA, Package, Rejection, RobotColumns, unpack
 from dual_system.data.errors import DatasetError
 from dual_system.data.jobs import DIFFICULTY_CYCLE, RECOVERY_SHARE, Job, Look, jobs_of
 from dual_system.data.lerobot_files import INFO_PATH
@@ -29,7 +29,7 @@ from dual_system.data.lerobot_v3 import COLLECTION_PATH, DatasetWriter
 from dual_system.data.rollout import UNSOLVED, work_out
 from dual_system.data.shove import SHOVES
 from dual_system.data.store import Store
-from dual_system.data.workers import LocalWorkers, RayWorkers, Workers
+from dual_system.data.workers import JobT, LocalWorkers, RayWorkers, Workers
 from dual_system.tasks.difficulty import Difficulty
 from dual_system.tasks.seeds import FIRST_COLLECTION_SEED
 from dual_system.tasks.task import chosen_tasks
@@ -97,6 +97,27 @@ class MachineOptions:
     """Do not show a progress bar."""
 
 
+class Collection(Protocol[JobT]):
+    """What is collected: `CollectOptions`, or the kitchen's pairs."""
+
+    @property
+    def out(self) -> Path: ...
+    @property
+    def machine(self) -> MachineOptions: ...
+    @property
+    def image_px(self) -> int: ...
+    @property
+    def robot(self) -> RobotColumns: ...
+    def task_names(self) -> tuple[str, ...]: ...
+    def jobs(self) -> list[JobT]:
+        """One per episode, in the dataset's order."""
+        ...
+
+    def settings(self) -> dict[str, Any]:
+        """What all episodes of a dataset have in common; their number and the workers are no part of it."""
+        ...
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CollectOptions:
     """Collects oracle episodes that succeed into a LeRobot v3 dataset. The same command again resumes a killed run."""
@@ -128,6 +149,14 @@ class CollectOptions:
             raise DatasetError(f"--shove-share {self.content.shove_share} is not a share, in [0, 1]")
         if self.content.shove_share and self.content.texts != "follow":
             raise DatasetError("--shove-share would make latched coordinates wrong; give --texts follow with it")
+
+    @property
+    def image_px(self) -> int:
+        return self.pictures.image_px
+
+    @property
+    def robot(self) -> RobotColumns:
+        return PANDA
 
     def task_names(self) -> tuple[str, ...]:
         """The tasks in alphabetical order, each once. Raises TaskError for an unknown one."""
@@ -204,7 +233,7 @@ def print_line(text: str) -> None:
 
 
 def collect(
-    options: CollectOptions, workers: Workers[Job, Package], say: Callable[[str], None] = lambda text: None
+    options: Collection[JobT], workers: Workers[JobT, Package], say: Callable[[str], None] = lambda text: None
 ) -> Report:
     """Collects what is missing and joins everything into the dataset.
 
@@ -235,7 +264,7 @@ def collect(
                 bar.update()
                 _require_disk(options, jobs, sizes)
         with files.writing(out):
-            report = _join(out, store, jobs, wanted)
+            report = _join(out, store, jobs, wanted, options.robot)
     if not options.machine.keep_episodes:
         shutil.rmtree(out / COLLECTING)
     return report
@@ -255,9 +284,9 @@ def disk_needed(num_missing: int, sizes: Sequence[int], image_px: int) -> int:
     return round(2 * num_missing * mean + sum(sizes))
 
 
-def _require_disk(options: CollectOptions, jobs: Sequence[Job], sizes: dict[str, int]) -> tuple[int, int]:
+def _require_disk(options: Collection[JobT], jobs: Sequence[JobT], sizes: dict[str, int]) -> tuple[int, int]:
     """Returns the bytes needed and free. Raises DatasetError if they are too few."""
-    needed = disk_needed(len(jobs) - len(sizes), list(sizes.values()), options.pictures.image_px)
+    needed = disk_needed(len(jobs) - len(sizes), list(sizes.values()), options.image_px)
     free = shutil.disk_usage(options.out).free
     if needed > free:
         raise DatasetError(
@@ -268,7 +297,7 @@ def _require_disk(options: CollectOptions, jobs: Sequence[Job], sizes: dict[str,
     return needed, free
 
 
-def _disk_sentence(options: CollectOptions, jobs: Sequence[Job], sizes: dict[str, int]) -> str:
+def _disk_sentence(options: Collection[JobT], jobs: Sequence[JobT], sizes: dict[str, int]) -> str:
     needed, free = _require_disk(options, jobs, sizes)
     source = "as measured" if len(sizes) >= MEASURED_EPISODES else "estimated"
     return (
@@ -277,7 +306,7 @@ def _disk_sentence(options: CollectOptions, jobs: Sequence[Job], sizes: dict[str
     )
 
 
-def _present(store: Store, jobs: Sequence[Job]) -> list[Job]:
+def _present(store: Store, jobs: Sequence[JobT]) -> list[JobT]:
     there = set(store.keys())
     return [job for job in jobs if job.key in there]
 
@@ -331,11 +360,11 @@ def _finished(out: Path, wanted: dict[str, Any]) -> Report | None:
     return None
 
 
-def _join(out: Path, store: Store, jobs: Sequence[Job], wanted: dict[str, Any]) -> Report:
+def _join(out: Path, store: Store, jobs: Sequence[JobT], wanted: dict[str, Any], robot: RobotColumns) -> Report:
     """Joins all episodes aside, in the jobs' order, and moves the dataset into place, ``meta`` last."""
     aside = out / COLLECTING / JOINED
     shutil.rmtree(aside, ignore_errors=True)
-    writer = DatasetWriter(aside)
+    writer = DatasetWriter(aside, robot)
     unsolved: list[str] = []
     rejected: list[Rejection] = []
     for job in jobs:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dual_system.data.episode import DEMO_CAMERA, About, EpisodeWriter, Package, RobotColumns, Row
 from dual_system.data.lerobot_files import write_json
-from dual_system.data.video import FPS, Frame
+from dual_system.data.video import Frame
 from dual_system.tasks.kitchen.catalogue import UNSEEN_BY_CATEGORY, UNSEEN_BY_PRECISION
 from dual_system.tasks.kitchen.layout import ACTION_NAMES, STATE_NAMES
 from dual_system.tasks.kitchen.omron import VIEWS
@@ -37,41 +37,41 @@ class Instant:
     frames: Mapping[str, Frame]  # of `VIEWS`; empty: the last ones are repeated
 
 
-def pack_pair(demo: Sequence[Frame], execution: Iterable[Instant], about: About, *, demo_hz: int = 1) -> Package:
+def pack_pair(demo: Sequence[Frame | None], execution: Iterable[Instant], about: About, *, words: str = "") -> Package:
     """Returns the files of a pair.
 
-    The demonstration's frames are ``demo_hz`` a second; its rows, at 20 Hz, repeat each until the next, and have the
-    robot's own state and action of the first instant: it stands there meanwhile.
+    Args:
+        demo: the demonstration at 20 Hz, None where the last frame is repeated. Its rows have the robot's own state and
+            action of the first instant: it stands there meanwhile.
+        execution: rows at 20 Hz.
+        words: the goal, as the subgoal of the whole execution. A row that is told it in words reads it; PONDER does not
+            unless its recipe is grounded.
 
     Raises:
-        ValueError: ``demo_hz`` does not divide 20, there is no instant, or an instant is not of this robot.
+        ValueError: there is no instant, or one of another robot, or the demonstration does not begin with a frame.
     """
-    if demo_hz < 1 or FPS % demo_hz:
-        raise ValueError(f"demo_hz must divide {FPS}, came {demo_hz}")
     writer, is_first = EpisodeWriter(about.image_px, PANDA_OMRON), True
+    if demo and demo[0] is None:
+        raise ValueError(f"{about.task} {about.seed}: the demonstration's first row has no frame")
     for instant in execution:
         if is_first:
-            _show(writer, demo, instant, FPS // demo_hz)
-            is_first = False
-        writer.add(_row(instant), instant.frames)
+            for frame in demo:
+                row = _row(instant, "", is_demonstration=True)
+                writer.add(row, {} if frame is None else {DEMO_CAMERA: frame})
+        writer.add(_row(instant, words, is_transition=is_first and bool(words)), instant.frames)
+        is_first = False
     if is_first:
         raise ValueError(f"{about.task} {about.seed}: an execution without an instant")
     return writer.pack(about)
 
 
-def _show(writer: EpisodeWriter, demo: Sequence[Frame], first: Instant, step: int) -> None:
-    """Writes the demonstration's rows; the last one is that of its last frame."""
-    for index in range((len(demo) - 1) * step + 1 if len(demo) else 0):
-        frames = {DEMO_CAMERA: demo[index // step]} if index % step == 0 else {}
-        writer.add(_row(first, is_demonstration=True), frames)
-
-
-def _row(instant: Instant, *, is_demonstration: bool = False) -> Row:
+def _row(instant: Instant, words: str, *, is_transition: bool = False, is_demonstration: bool = False) -> Row:
     return Row(
         state=instant.state,
         action=instant.action,
-        subgoal="",
-        grounded_subgoal="",
+        subgoal=words,
+        grounded_subgoal=words,
+        is_transition=is_transition,
         is_demonstration=is_demonstration,
     )
 

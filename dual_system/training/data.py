@@ -35,6 +35,8 @@ _SYSTEMS = ("pounce", "ponder")
 _MIN_REACH = 1e-3
 _MIN_SPAN = 1e-3
 """Smallest span of a dim: one that hardly moves is not stretched to fill [-1, 1]."""
+_RARE = 0.1
+"""Share of a native dim's range below which its quantiles say that it moves rarely; then the range is the span."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -373,8 +375,8 @@ class TrainingSet:
         reach_N = _reach(actions_MND[..., :-1]) if by_row else np.ones(horizon)
         actions_MND[..., :-1] /= reach_N[:, None]
         return RobotStatistics(
-            state=_quantiles(np.concatenate(states)),
-            action=_quantiles(actions_MND.reshape(-1, num_actions)),
+            state=_quantiles(np.concatenate(states), may_be_rare=space == "native"),
+            action=_quantiles(actions_MND.reshape(-1, num_actions), may_be_rare=space == "native"),
             space=space,
             reach=tuple(reach_N.tolist()) if by_row else (),
         )
@@ -403,8 +405,13 @@ def _reach(moves_MND: NDArray[np.float32]) -> NDArray[np.float64]:
     return share_N.clip(_MIN_REACH)
 
 
-def _quantiles(values: NDArray[np.float32]) -> Quantiles:
+def _quantiles(values: NDArray[np.float32], *, may_be_rare: bool) -> Quantiles:
+    """``may_be_rare``: a base that drives in one row of two hundred would be at a thousand times its quantiles."""
     low, high = np.quantile(values.astype(np.float64), _QUANTILES, axis=0)
+    if may_be_rare:
+        least, most = values.min(axis=0), values.max(axis=0)
+        is_rare = high - low < _RARE * (most - least)
+        low, high = np.where(is_rare, least, low), np.where(is_rare, most, high)
     middle, half = (low + high) / 2, np.maximum(high - low, _MIN_SPAN) / 2
     return Quantiles(q01=tuple((middle - half).tolist()), q99=tuple((middle + half).tolist()))
 

@@ -17,7 +17,7 @@ from dual_system.tasks.kitchen.catalogue import TASKS
 from dual_system.tasks.kitchen.layout import NUM_ACTION, NUM_STATE
 from dual_system.training.data import TrainingSet
 
-PX, NUM_DEMO, NUM_TICKS = 64, 3, 25
+PX, NUM_DEMO, NUM_TICKS, WORDS = 64, 3, 25, "open the drawer on the left"
 ABOUT = About(
     task="OpenDrawer", instruction="open the left drawer", seed=0, difficulty="", origin="script", is_success=True,
     image_px=PX,
@@ -26,6 +26,10 @@ ABOUT = About(
 
 def shade(value: int) -> np.ndarray:
     return np.full((PX, PX, 3), value, np.uint8)
+
+
+DEMO = [shade(20 + index) if index % 20 == 0 else None for index in range(20 * (NUM_DEMO - 1) + 1)]
+"""Three frames at 1 Hz."""
 
 
 def execution(seed: int) -> list[Instant]:
@@ -43,8 +47,7 @@ def execution(seed: int) -> list[Instant]:
 def write(root: Path, tasks: list[str]) -> Path:
     writer = DatasetWriter(root, PANDA_OMRON)
     for seed, task in enumerate(tasks):
-        demo = [shade(20 * (1 + index)) for index in range(NUM_DEMO)]
-        writer.add(unpack(pack_pair(demo, execution(seed), replace(ABOUT, task=task, seed=seed))))
+        writer.add(unpack(pack_pair(DEMO, execution(seed), replace(ABOUT, task=task, seed=seed), words=WORDS)))
     writer.finish()
     write_splits(root, tasks)
     return root
@@ -63,6 +66,8 @@ def test_a_pair_is_read_as_it_was_done(tmp_path: Path) -> None:
         np.testing.assert_array_equal(np.flatnonzero(rows.is_rendered[:start]), [0, 20, 40])
         shown = [[views.mean() for views in each] for each in dataset.views(entry, [0, 20, 40])]
         np.testing.assert_allclose(shown, [[20], [40], [60]], atol=3)
+        assert rows.grounded_subgoal == ("",) * start + (WORDS,) * NUM_TICKS
+        np.testing.assert_array_equal(np.flatnonzero(rows.is_transition), [start])
         (seen,) = dataset.views(entry, [start])
         np.testing.assert_allclose([view.mean() for view in seen], [100, 140, 180], atol=3)
 
@@ -105,7 +110,7 @@ def test_training_on_a_split_sees_no_held_out_task(tmp_path: Path) -> None:
 def test_what_is_no_pair_is_refused() -> None:
     with pytest.raises(ValueError, match="OpenDrawer 0: an execution without an instant"):
         pack_pair([shade(1)], [], ABOUT)
-    with pytest.raises(ValueError, match="demo_hz must divide 20, came 3"):
-        pack_pair([], execution(0), ABOUT, demo_hz=3)
+    with pytest.raises(ValueError, match="OpenDrawer 0: the demonstration's first row has no frame"):
+        pack_pair([None, shade(1)], execution(0), ABOUT)
     with pytest.raises(ValueError, match="expected 53 numbers of state and 12 of action, came 53 and 8"):
         pack_pair([], [replace(execution(0)[0], action=np.zeros(8, np.float32))], ABOUT)

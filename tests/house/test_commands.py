@@ -140,7 +140,7 @@ def test_a_word_like_no_verb_is_refused_with_all(called: list[Any], capsys: pyte
     assert commands.collect(["zzz"]) == REFUSED
     assert (
         capsys.readouterr().err
-        == "pp-collect: 'zzz' is neither a verb nor a file. Verbs: correct, import, bags, card, pairs.\n"
+        == "pp-collect: 'zzz' is neither a verb nor a file. Verbs: correct, import, bags, card, kitchen, pairs.\n"
     )
     assert not called
 

@@ -158,6 +158,29 @@ def test_commands_come_back_from_the_networks_numbers(built: Any) -> None:
     np.testing.assert_array_equal(moved, back)  # what is commanded is not relative to the state
 
 
+def test_a_number_that_moves_rarely_stays_within_the_networks_range(folder: Path, monkeypatch: Any) -> None:
+    """A base that drives in one row of a hundred and ten is no outlier at a thousand times its quantiles."""
+    data = TrainingSet(folder)
+    source = type(data._sources[0])
+    rows = source.rows
+
+    def with_a_drive(self: Any) -> Any:
+        read = rows(self)
+        action = read.action.copy()
+        action[:, 7:9] = 0.0
+        action[-1, 7] = 0.6
+        return replace(read, action=action)
+
+    monkeypatch.setattr(source, "rows", with_a_drive)
+    table = data.statistics(1, "native").action
+    driving, standing = np.zeros(NUM_ACTION), np.zeros(NUM_ACTION)
+    driving[7] = 0.6
+    assert table.normalise(driving)[7] == pytest.approx(1.0, abs=1e-4)
+    assert table.normalise(standing)[7] == pytest.approx(-1.0, abs=1e-4)
+    assert abs(table.normalise(standing)[8]) < 0.01  # never moves: in the middle
+    assert table.q99[0] < 1.0  # a number that moves all the time keeps its quantiles
+
+
 def test_an_invocation_is_read_in_training_as_in_serving(built: Any) -> None:
     data, model, bundle = built
     example = example_of(data, model)
