@@ -160,6 +160,7 @@ class ObjectHandle:
     grasp_width_m: float
     grasp_yaw_rad: float  # direction in which they close, about z from x
     radius_m: float  # of a container; 0 for others
+    is_round: bool  # seen from above: fingers may close in any direction
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -73,7 +73,7 @@ KINDS: dict[str, Kind] = {
                     (("orange", "green"),) * _EACH, is_washable=True),
     "bread": _kind("block", ((52, 32, 26), (60, 30, 28), (48, 33, 25), (56, 31, 30), (50, 29, 27), (64, 33, 26)),
                    (("crust", "tan"), ("brown", "crust"), ("tan", "cream")) * 2),
-    "chocolate": _kind("block", ((60, 28, 12), (55, 30, 13), (65, 26, 12), (50, 32, 12), (58, 27, 14), (62, 31, 13)),
+    "chocolate": _kind("block", ((60, 28, 17), (55, 30, 18), (65, 26, 17), (50, 32, 18), (58, 27, 19), (62, 31, 17)),
                        (("brown", "red"), ("navy", "silver"), ("purple", "white"),
                         ("dark green", "cream"), ("brown", "yellow"), ("dark red", "white"))),
     "cheese": _kind("block", ((40, 28, 24), (45, 30, 22), (36, 26, 26), (42, 32, 24), (38, 27, 21), (48, 29, 25)),
@@ -152,6 +152,7 @@ def add_object(workshop: Workshop, plan: ObjectPlan) -> ObjectHandle:
         grasp_width_m=width_m,
         grasp_yaw_rad=yaw_rad,
         radius_m=radius_of(plan.kind, plan.instance),
+        is_round=kind.shape == "post" or (kind.shape == "ball" and made.size_mm[0] == made.size_mm[1]),
     )
 
 
@@ -165,7 +166,7 @@ def _block(part: Part, size: Sequence[float], looks: Sequence[str]) -> Grasp:
     part.box((0.0, 0.0, 0.0), size, looks[0], **_FREE)
     band = (size[0] * 0.45, size[1] + 0.0006, size[2] + 0.0006)
     part.box((0.0, 0.0, 0.0), band, looks[1], is_solid=False)
-    return (0.0, 0.0, 0.0), 2 * size[1], np.pi / 2
+    return (0.0, 0.0, 0.4 * size[2]), 2 * size[1], np.pi / 2  # fingertips stay clear of what it lies on
 
 
 def _post(part: Part, size: Sequence[float], looks: Sequence[str]) -> Grasp:

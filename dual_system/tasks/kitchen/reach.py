@@ -48,6 +48,10 @@ class Reach:
         ahead_m, left_m = self._view.data.qpos[self._base]
         return float(ahead_m), float(left_m)
 
+    def joints(self) -> Array:
+        """Returns the arm's joints (7,) now."""
+        return self._view.data.qpos[self._qpos].copy()
+
     def worth(
         self,
         poses: Sequence[Array],

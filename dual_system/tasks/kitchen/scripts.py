@@ -17,13 +17,13 @@ import numpy as np
 from dual_system.tasks.geometry import Array
 from dual_system.tasks.kinematics import UnreachableError
 from dual_system.tasks.kitchen import omron, steps
-from dual_system.tasks.kitchen.handles import Button, CoffeeMachine, Drawer, Hinge, Microwave, Sink, Stove
+from dual_system.tasks.kitchen.handles import Button, Cabinet, CoffeeMachine, Drawer, Hinge, Microwave, Sink, Stove
 from dual_system.tasks.kitchen.plan import COUNTER_TOP_M, Goal, Target
 from dual_system.tasks.kitchen.predicates import View, hinges, region_of
 from dual_system.tasks.kitchen.reach import UNREACHABLE, Base, Reach
 from dual_system.tasks.kitchen.steps import AHEAD, SHUT, UP, Step, Steps
 
-_BASES: tuple[Base, ...] = ((0.0, 0.0), (0.0, 0.2), (0.0, -0.2), (-0.15, 0.0), (-0.15, 0.2), (-0.15, -0.2))
+_BASES: tuple[Base, ...] = ((0.0, 0.0), (0.0, 0.2), (0.0, -0.2), (-0.15, 0.0), (-0.15, 0.2), (-0.15, -0.2), (-0.3, 0.0))
 _STEEP_RAD = 0.8
 _NUM_GRIPS = 4  # ways to hold an object that are followed to where it goes
 _LEVER_OUT_M, _FINGER_M = 0.13, 0.016  # where a lever is pushed; from its middle to that of closed fingers
@@ -35,7 +35,7 @@ _EASY = 0.1  # worth of a way that needs no second go
 _TILTS = tuple(np.deg2rad((0.0, 20.0, 40.0)))
 _FORWARD_TILTS = tuple(np.deg2rad((50.0, 65.0)))  # into cabinets and microwaves
 _MUG_TILTS = tuple(np.deg2rad((65.0, 80.0)))
-_CARRY_M, _ENTER_M = 0.14, 0.30
+_CARRY_M, _ENTER_M = 0.14, 0.38
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,9 +75,14 @@ class Arm:
         """Brings the hand back to where it was at first, seen from the base."""
         (ahead, left), (ahead_0, left_0) = self._reach.base(), self._home_base
         home = steps.moved(self._home, [left_0 - left, ahead - ahead_0, 0.0])
-        nearer_m = min(0.0, float(steps.here(self.view)[1, 3] - home[1, 3]))  # to the robot: open doors are ahead
-        yield Step(pose=steps.moved(home, nearer_m * AHEAD))
-        yield Step(pose=home)
+        here = steps.here(self.view)
+        nearer_m = min(0.0, float(here[1, 3] - home[1, 3]))  # to the robot: open doors are ahead
+        turned = [steps.rotated_about_itself(home, turn) for turn in (0.0, np.pi, np.pi / 2, -np.pi / 2)]
+        turned.append(steps.moved(here, home[:3, 3] - here[:3, 3]))  # or as it is
+        ways = [Way(base=self._reach.base(), poses=(steps.moved(T, nearer_m * AHEAD), T)) for T in turned]
+        _, best, _ = self.rate(ways, self._reach.joints())
+        for T in ways[best].poses:
+            yield Step(pose=T)
 
     def drive(self, base: Base, *, holds: str = "") -> Steps:
         """Moves the base to a place if it is not there; the hand rides along."""
@@ -264,7 +269,7 @@ def _turn_knob(arm: Arm, target: Target, *, is_on: bool) -> Steps:
         T[:3, :3] = steps.about(axis, angle) @ T[:3, :3]
         return T
 
-    kinds = list(product((-0.2, -0.35), (-0.2, 0.0, 0.2), (55.0, 80.0), ends, (0.0, np.pi, -np.pi)))
+    kinds = list(product((-0.2, -0.35), (-0.2, 0.0, 0.2), (70.0, 85.0), ends, (0.0, np.pi, -np.pi)))
     ways = [
         Way(base=(back, left), poses=(frame(tilt, now + half_turn), frame(tilt, end + half_turn)))
         for back, left, tilt, end, half_turn in kinds
@@ -327,9 +332,12 @@ def _pick_and_place(
     goal, now = place(arm, target), view.position_m(target.obj)
     grips = []
     for tilt in tilts:
-        ways_round = (tilt, -tilt) if tilt < _STEEP_RAD else (tilt,)  # a flat hand comes from the robot's side
-        grips += [steps.grip_on(view, thing, each) for each in ways_round]
-    grips += [steps.flipped(T) for T in grips]
+        round_ways = (tilt, -tilt) if tilt < _STEEP_RAD else (tilt,)  # a flat hand comes from the robot's side
+        grips += [T for each in round_ways for T in steps.grips_on(view, thing, each)]
+    has_walls = isinstance(view.bay.fixtures.get(target.fixture), Cabinet | Microwave)
+    grips = [
+        T for grip in grips for T in (grip, steps.flipped(grip)) if not (has_walls and leave[1]) or _points_ahead(T)
+    ]
 
     def placed(T: Array, yaw: float) -> Array:
         turned = steps.about(UP, yaw)
@@ -348,7 +356,14 @@ def _pick_and_place(
     plans: list[tuple[float, int, Way, Way]] = []
     for worth, best, qpos, i in rated[:_NUM_GRIPS]:
         ends = [placed(grips[i], yaw) for yaw in np.linspace(-np.pi, np.pi, 8, endpoint=False)]
-        ways = [Way(base=base, poses=(steps.moved(T, enter), T)) for base in bases for T in ends]
+        if has_walls and enter[1]:
+            ends = [T for T in ends if _points_ahead(T)]
+        ways = [
+            Way(base=base, poses=(steps.moved(T, enter), T))
+            for base in bases
+            if not leave[1] or base[0] <= picks[i][best].base[0]  # driving ahead would push the hand back in
+            for T in ends
+        ]
         worth_there, best_there, _ = arm.rate(ways, qpos)
         plans.append((min(worth, worth_there), len(plans), picks[i][best], ways[best_there]))
     worth, _, pick, put = max(plans)
@@ -367,6 +382,12 @@ def _pick_and_place(
     yield from steps.retreat(view)
     yield Step(pose=steps.backed(before, 0.1))
     yield from arm.go_home()
+
+
+def _points_ahead(T: Array) -> bool:
+    """Returns whether a tool points into a fixture rather than along it."""
+    flat = T[:2, 2] / max(float(np.linalg.norm(T[:2, 2])), 1e-6)
+    return bool(flat[1] > 0.7)
 
 
 def _in_container(arm: Arm, target: Target) -> Array:

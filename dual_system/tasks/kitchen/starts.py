@@ -23,6 +23,7 @@ _DRAWER_ASIDE_M = counter.DRAWER_HALF_M + 0.3
 DRAWER_BACK_M = 0.23
 _PAN_YAW_RAD = (np.deg2rad(22.5), np.deg2rad(45.0))  # of the handle, to either side of the robot's direction
 _MUG_YAW_RAD, _SERVED_YAW_RAD = np.deg2rad((45.0, 90.0)), np.deg2rad((22.5, 45.0))
+_INSIDE_YAW_RAD = 0.6  # of what lies in a fixture or a container: fingers come from the robot's side
 _WATER_ON_RAD, _KNOB_ON_RAD = (0.40, 0.50), (0.50, np.pi / 2)
 SPOUT_START_RAD = 0.25
 OBJ, CONTAINER = "obj", "container"
@@ -191,7 +192,8 @@ def cabinet_pnp(rng: np.random.Generator, instances: Instances, *, is_in_cabinet
     under_x = (drawn.x_m - _UNDER_CABINET_X_M, drawn.x_m + _UNDER_CABINET_X_M)
     word = drawn.draw_kind(objects.GRASPABLES)
     if is_in_cabinet:
-        drawn.put_somewhere(OBJ, word, inside_x, (-0.30, -0.26), z_m=floor)
+        yaw = np.pi / 2 + float(rng.uniform(-_INSIDE_YAW_RAD, _INSIDE_YAW_RAD))
+        drawn.put_somewhere(OBJ, word, inside_x, (-0.30, -0.26), z_m=floor, yaw_rad=yaw)
     else:
         drawn.put_somewhere(OBJ, word, under_x, _FRONT_Y_M)
         behind = drawn.draw_kind(objects.GRASPABLES)
@@ -223,7 +225,7 @@ def microwave_pnp(rng: np.random.Generator, instances: Instances, *, is_in_micro
     tray_x, tray_y, tray_z = microwave.TRAY_M
     tray = (drawn.x_m + tray_x, microwave.CENTER_Y_M + tray_y, tray_z)
     right = drawn.x_m + microwave.HALF_WIDTH_M
-    beside_x, beside_y = (right + 0.115, right + 0.16), (-0.52, -0.42)  # the door is in the way on the left
+    beside_x, beside_y = (right + 0.15, right + 0.19), (-0.52, -0.42)  # the door is in the way on the left
     word = drawn.draw_kind(objects.DISHES)
     words = {"obj": word}
     if is_in_microwave:
@@ -263,7 +265,8 @@ def put_on(drawn: Draft, name: str, kind: str, vessel: str) -> None:
     x, y, z = below.position_m
     floor = z - objects.half_of(below.kind, below.instance)[2] + objects.FLOOR_M
     shift = drawn.rng.uniform(-0.01, 0.01, size=2)
-    drawn.put(name, kind, (x + shift[0], y + shift[1], floor), yaw_rad=float(drawn.rng.uniform(-np.pi, np.pi)))
+    yaw = np.pi / 2 + float(drawn.rng.uniform(-_INSIDE_YAW_RAD, _INSIDE_YAW_RAD))
+    drawn.put(name, kind, (x + shift[0], y + shift[1], floor), yaw_rad=yaw)
 
 
 def _put_container(drawn: Draft, x_m: Span, y_m: Span = (-0.52, -0.36)) -> str:

@@ -23,6 +23,7 @@ UP, AHEAD, RIGHT = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]), np.arra
 FREE_M_S, SWING_M_S, TOUCHING_M_S = 0.30, 0.22, 0.12  # speeds of the tool
 _GRIP_STEPS = 8  # control steps in which fingers close
 _SWING_POINTS = 6
+_ROUND_YAWS_RAD = tuple(np.deg2rad((-40.0, 0.0, 40.0)))
 _BACK_M, _UP_M = 0.10, 0.15
 
 
@@ -145,17 +146,30 @@ def turn(knob: Knob, frame: Array, from_rad: float, to_rad: float) -> Steps:
         yield Step(pose=T, opening=SHUT, speed_m_s=TOUCHING_M_S, holds=knob.joint, value=float(angle))
 
 
-def grip_on(view: View, thing: ObjectHandle, tilt_rad: float) -> Array:
-    """Returns the tool's pose that grasps an object as it stands now, tilted about the axis along which it closes."""
+def rotated_about_itself(T: Array, angle_rad: float) -> Array:
+    """Returns a pose turned about the direction in which the tool points."""
+    there = T.copy()
+    there[:3, :3] = about(T[:3, 2], angle_rad) @ T[:3, :3]
+    return there
+
+
+def grips_on(view: View, thing: ObjectHandle, tilt_rad: float) -> list[Array]:
+    """Returns the tool's poses that grasp an object as it stands now, tilted about the axis along which it closes.
+
+    Round things are grasped from several sides, all others across what is narrow.
+    """
     body = view.data.body(thing.name)
     R = body.xmat.reshape(3, 3)
-    closing = R @ [np.cos(thing.grasp_yaw_rad), np.sin(thing.grasp_yaw_rad), 0.0]
-    closing = closing - UP * closing[2]
-    closing /= np.linalg.norm(closing)
-    toward = np.cross(closing, UP)
-    if toward @ AHEAD < 0.0:
-        toward = -toward
-    return tool(body.xpos + R @ thing.grasp_m, tilted(toward, tilt_rad), closing)
+    across = R @ [np.cos(thing.grasp_yaw_rad), np.sin(thing.grasp_yaw_rad), 0.0]
+    across = across - UP * across[2]
+    across /= np.linalg.norm(across)
+    closings = [about(UP, yaw) @ RIGHT for yaw in _ROUND_YAWS_RAD] if thing.is_round else [across]
+    grips = []
+    for closing in closings:
+        toward = np.cross(UP, closing)
+        toward = -toward if toward @ AHEAD < 0.0 else toward
+        grips.append(tool(body.xpos + R @ thing.grasp_m, tilted(toward, tilt_rad), closing))
+    return grips
 
 
 def about(axis: Array, angle_rad: float) -> Array:
