@@ -26,7 +26,7 @@ from dual_system.tasks.kitchen.world import World
 CAMERA = "demonstration"
 _VIEWS: dict[Family, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
     "pnp": ((0.85, -1.65, 1.95), (0.0, -0.40, 1.10)),
-    "doors": ((1.00, -2.10, 1.85), (0.0, -0.35, 1.45)),
+    "doors": ((1.00, -2.35, 1.80), (0.0, -0.35, 1.55)),
     "drawers": ((0.95, -2.00, 1.60), (0.0, -0.75, 0.85)),
     "sink": ((0.80, -1.50, 1.85), (0.0, -0.35, 1.05)),
     "stove": ((0.80, -1.60, 1.85), (0.0, -0.45, 0.95)),

@@ -29,6 +29,7 @@ _NUM_GRIPS = 4  # ways to hold an object that are followed to where it goes
 _LEVER_OUT_M, _FINGER_M = 0.13, 0.016  # where a lever is pushed; from its middle to that of closed fingers
 _WATER_RAD, _NO_WATER_RAD = 0.50, 0.25
 _SPOUT_RAD, _KNOB_RAD = 0.72, 0.75
+_KNOB_ATTEMPTS, _KNOB_OFF_BY_RAD = 3, 0.3
 _LOW_M, _WIDE_RAD, _HALF_SHUT_RAD = 1.3, 0.8, 0.7  # doors: a low bar, wide open, where to take it anew to shut it
 _AROUND_M = -0.17 * AHEAD  # around the edge of an open leaf
 _EASY = 0.1  # worth of a way that needs no second go
@@ -257,30 +258,37 @@ def _sink(arm: Arm, target: Target) -> Sink:
 
 
 def _turn_knob(arm: Arm, target: Target, *, is_on: bool) -> Steps:
+    """Grasps the knob and turns the wrist; where that has not done, once more from another place of the base."""
     stove = arm.view.bay.fixtures[target.fixture]
     assert isinstance(stove, Stove)
     knob = stove.knobs[target.part]
-    now = arm.view.angle(knob.joint)
-    ends = (_KNOB_RAD, -_KNOB_RAD) if is_on else (0.0,)
     axis = np.array(knob.axis)
+    bases = list(product((-0.2, -0.35), (-0.2, 0.0, 0.2)))
 
     def frame(tilt: float, angle: float) -> Array:
         T = steps.tool(knob.anchor_m, steps.tilted(AHEAD, np.deg2rad(tilt)), np.cross(axis, knob.blade))
         T[:3, :3] = steps.about(axis, angle) @ T[:3, :3]
         return T
 
-    kinds = list(product((-0.2, -0.35), (-0.2, 0.0, 0.2), (70.0, 85.0), ends, (0.0, np.pi, -np.pi)))
-    ways = [
-        Way(base=(back, left), poses=(frame(tilt, now + half_turn), frame(tilt, end + half_turn)))
-        for back, left, tilt, end, half_turn in kinds
-    ]
-    way = arm.best(ways)
-    end = next(kind[3] for kind, each in zip(kinds, ways, strict=True) if each is way)
-    yield from arm.drive(way.base)
-    yield from steps.grasp(way.poses[0], knob.joint)
-    yield from steps.turn(knob, way.poses[0], now, end)
-    yield from steps.release(steps.here(arm.view))
-    yield from steps.retreat(arm.view, back_m=0.2)
+    for _ in range(_KNOB_ATTEMPTS):
+        now = arm.view.angle(knob.joint)
+        ends = (_KNOB_RAD, -_KNOB_RAD) if is_on else (0.0,)
+        kinds = list(product(bases, (70.0, 85.0), ends, (0.0, np.pi, -np.pi)))
+        ways = [
+            Way(base=base, poses=(frame(tilt, now + half_turn), frame(tilt, end + half_turn)))
+            for base, tilt, end, half_turn in kinds
+        ]
+        way = arm.best(ways)
+        end = next(kind[2] for kind, each in zip(kinds, ways, strict=True) if each is way)
+        yield from arm.drive(way.base)
+        yield from steps.grasp(way.poses[0], knob.joint)
+        yield from steps.turn(knob, way.poses[0], now, end)
+        yield from steps.release(steps.here(arm.view))
+        yield from steps.retreat(arm.view, back_m=0.2)
+        if abs(arm.view.angle(knob.joint) - end) < _KNOB_OFF_BY_RAD:
+            return
+        bases.remove(way.base)
+        yield from arm.go_home()
 
 
 def _microwave_button(arm: Arm, target: Target, *, name: str) -> Steps:
