@@ -25,6 +25,7 @@ from dual_system.tasks.kitchen.steps import AHEAD, SHUT, UP, Step, Steps
 
 _BASES: tuple[Base, ...] = ((0.0, 0.0), (0.0, 0.2), (0.0, -0.2), (-0.15, 0.0), (-0.15, 0.2), (-0.15, -0.2), (-0.3, 0.0))
 _STEEP_RAD = 0.8
+_TURN_COST, _DRIVE_COST = 0.08, 0.3  # of worth, a radian and a metre: far turns may end at a joint's limit
 _NUM_GRIPS = 4  # ways to hold an object that are followed to where it goes
 _LEVER_OUT_M, _FINGER_M = 0.13, 0.016  # where a lever is pushed; from its middle to that of closed fingers
 _WATER_RAD, _NO_WATER_RAD = 0.50, 0.25
@@ -47,6 +48,7 @@ class Way:
     poses: tuple[Array, ...]
     joint: str = ""  # what the tool leads on the way
     values: tuple[float, ...] = ()  # of it, one a pose
+    cost: float = 0.0  # taken off its worth
 
 
 class Arm:
@@ -62,7 +64,7 @@ class Arm:
         rated = [
             self._reach.worth(way.poses, way.base, joint=way.joint, values=way.values, start=start) for way in ways
         ]
-        best = int(np.argmax([worth for worth, _ in rated]))
+        best = int(np.argmax([worth - way.cost for (worth, _), way in zip(rated, ways, strict=True)]))
         return rated[best][0], best, rated[best][1]
 
     def best(self, ways: Sequence[Way]) -> Way:
@@ -363,21 +365,22 @@ def _pick_and_place(
     rated = sorted(((*arm.rate(ways), i) for i, ways in enumerate(picks)), key=lambda each: -each[0])
     plans: list[tuple[float, int, Way, Way]] = []
     for worth, best, qpos, i in rated[:_NUM_GRIPS]:
-        ends = [placed(grips[i], yaw) for yaw in np.linspace(-np.pi, np.pi, 8, endpoint=False)]
-        if has_walls and enter[1]:
-            ends = [T for T in ends if _points_ahead(T)]
-        ways = [
-            Way(base=base, poses=(steps.moved(T, enter), T))
-            for base in bases
-            if not leave[1] or base[0] <= picks[i][best].base[0]  # driving ahead would push the hand back in
-            for T in ends
-        ]
-        worth_there, best_there, _ = arm.rate(ways, qpos)
-        plans.append((min(worth, worth_there), len(plans), picks[i][best], ways[best_there]))
-    worth, _, pick, put = max(plans)
-    if worth <= UNREACHABLE:
+        out, base_0 = steps.moved(grips[i], leave), picks[i][best].base
+        ways = []
+        for yaw, base in product(np.linspace(-np.pi, np.pi, 8, endpoint=False), bases):
+            there = placed(grips[i], yaw)
+            if (has_walls and enter[1] and not _points_ahead(there)) or (leave[1] and base[0] > base_0[0]):
+                continue  # it would reach along a wall, or drive into what it has just come out of
+            before = steps.moved(there, enter)
+            cost = _TURN_COST * abs(yaw) + _DRIVE_COST * float(np.hypot(base[0] - base_0[0], base[1] - base_0[1]))
+            ways.append(Way(base=base, poses=(*steps.between(out, before), before, there), cost=cost))
+        if ways:
+            worth_there, best_there, _ = arm.rate(ways, qpos)
+            plans.append((min(worth, worth_there), len(plans), picks[i][best], ways[best_there]))
+    if not plans or max(plans)[0] <= UNREACHABLE:
         raise UnreachableError(f"none of {len(grips)} ways to hold the {thing.kind} leads there; draw another scene")
-    (out, _, grip, _), (before, there) = pick.poses, put.poses
+    _, _, pick, put = max(plans)
+    (out, _, grip, _), (*_, before, there) = pick.poses, put.poses
     yield from arm.drive(pick.base)
     yield Step(pose=out, opening=steps.OPEN)
     yield from steps.grasp(grip, target.obj)

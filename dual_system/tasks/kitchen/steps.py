@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dual_system.tasks.geometry import Array
+from dual_system.tasks.geometry import Array, rotation_log
 from dual_system.tasks.kitchen.handles import Hinge, Knob, ObjectHandle, Slide
 from dual_system.tasks.kitchen.predicates import GRIP_SITE, HAND, View
 
@@ -71,6 +71,20 @@ def moved(T: Array, by_m: Sequence[float] | Array) -> Array:
     there = T.copy()
     there[:3, 3] += by_m
     return there
+
+
+def between(T: Array, there: Array, num: int = 2) -> list[Array]:
+    """Returns poses on the straight way from one to another, without its ends."""
+    turn = rotation_log(there[:3, :3] @ T[:3, :3].T)
+    angle = float(np.linalg.norm(turn))
+    poses = []
+    for share in np.linspace(0.0, 1.0, num + 2)[1:-1]:
+        pose = T.copy()
+        pose[:3, 3] += share * (there[:3, 3] - T[:3, 3])
+        if angle > 1e-9:
+            pose[:3, :3] = about(turn / angle, share * angle) @ T[:3, :3]
+        poses.append(pose)
+    return poses
 
 
 def backed(T: Array, by_m: float) -> Array:
