@@ -45,9 +45,6 @@ from dual_system.tasks.task import TaskError
 from protocol.command_line import command, parse
 from protocol.version import DISTRIBUTION
 
-SHOWN_ALONE = "do what was shown"
-"""Instruction of a goal set's episodes: it must not tell the goal, which the subgoal's column does."""
-
 Rate = Literal[1, 2, 4, 5, 10, 20]
 
 
@@ -164,7 +161,7 @@ def record(environment: KitchenEnvironment, job: PairJob, seed: int, rejected: t
     ]
     about = About(
         task=job.task,
-        instruction=SHOWN_ALONE if job.task in GOAL_SETS else environment.instruction,
+        instruction=environment.instruction,
         seed=seed,
         difficulty="",
         origin="script",
@@ -173,7 +170,7 @@ def record(environment: KitchenEnvironment, job: PairJob, seed: int, rejected: t
         rejected=rejected,
     )
     execution = _executed(environment, first, FPS // job.invocation_hz)
-    return pack_pair(shown, execution, about, words=environment.instruction)
+    return pack_pair(shown, execution, about, words=environment.scene.instruction)
 
 
 def _executed(environment: KitchenEnvironment, snapshot: Snapshot, look_every: int) -> Iterator[Instant]:

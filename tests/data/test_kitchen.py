@@ -13,10 +13,10 @@ from dual_system.data import kitchen
 from dual_system.data.collect import collect
 from dual_system.data.dataset import Dataset
 from dual_system.data.episode import DEMO_CAMERA, Package, unpack
-from dual_system.data.kitchen import SHOWN_ALONE, KitchenOptions, PairJob, record, work_out
+from dual_system.data.kitchen import KitchenOptions, PairJob, record, work_out
 from dual_system.data.paired import SPLITS_PATH
 from dual_system.tasks.kitchen.environment import KitchenEnvironment
-from dual_system.tasks.kitchen.goals import GOAL_SETS
+from dual_system.tasks.kitchen.goals import GOAL_SETS, SHOWN_ALONE
 from dual_system.tasks.kitchen.layout import ACTION_NAMES, STATE_NAMES
 from dual_system.tasks.task import TaskError
 from dual_system.training.data import TrainingSet
@@ -108,7 +108,8 @@ def test_a_goal_set_s_instruction_does_not_tell_the_goal() -> None:
     job = PairJob(task=name, slot=0, image_px=PX, demonstration_hz=1, invocation_hz=1)
     with KitchenEnvironment(name, image_px=PX) as environment:
         episode = unpack(record(environment, job, job.seed(0)))
-        words = environment.instruction
+        words = environment.scene.instruction
+        assert environment.instruction == SHOWN_ALONE
     assert episode.about.instruction == SHOWN_ALONE
     assert set(episode.rows.grounded_subgoal[-3:]) == {words}
     assert words != SHOWN_ALONE

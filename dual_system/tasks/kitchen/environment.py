@@ -20,7 +20,7 @@ from dual_system.tasks.kinematics import UnreachableError
 from dual_system.tasks.kitchen import predicates, puppet
 from dual_system.tasks.kitchen.catalogue import PAPER_HORIZON, TASKS, draw_scene
 from dual_system.tasks.kitchen.control import CONTROL_HZ
-from dual_system.tasks.kitchen.goals import GOAL_SETS, draw_goal_scene
+from dual_system.tasks.kitchen.goals import GOAL_SETS, SHOWN_ALONE, draw_goal_scene
 from dual_system.tasks.kitchen.layout import NUM_ACTION
 from dual_system.tasks.kitchen.omron import VIEWS
 from dual_system.tasks.kitchen.performing import perform
@@ -92,8 +92,8 @@ class KitchenEnvironment:
 
     @property
     def instruction(self) -> str:
-        """The instruction of this episode."""
-        return self.scene.instruction
+        """The instruction of this episode; that of a goal set does not tell the goal."""
+        return SHOWN_ALONE if self.name in GOAL_SETS else self.scene.instruction
 
     @property
     def layout(self) -> Scene:
@@ -257,8 +257,8 @@ class KitchenEnvironment:
             tcp_pose=pose_of(here(world.view)),
             status=self._status,
             reason=self._reason,
-            simple_subgoal=self.instruction,
-            grounded_subgoal=self.instruction,
+            simple_subgoal=self.scene.instruction,
+            grounded_subgoal=self.scene.instruction,
             subtask_index=int(self._status is Status.SUCCESS),
             subgoal_index=0,
             first_choice=self._status is Status.SUCCESS if is_decided else None,

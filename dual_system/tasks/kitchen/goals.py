@@ -22,6 +22,9 @@ from dual_system.tasks.kitchen.plan import Goal, Instances, Scene, Target
 from dual_system.tasks.kitchen.starts import OBJ, Start
 from dual_system.tasks.task import TaskError
 
+SHOWN_ALONE = "do what was shown"
+"""Instruction of every goal set's episodes; the goal's own words are the subgoal."""
+
 _GOAL_STREAM = 1  # of a seed: its second stream draws the goal
 
 Choice = tuple[str, Target, str]
