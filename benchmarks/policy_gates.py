@@ -40,18 +40,20 @@ def _told(found: dict[str, Results], folder: Path) -> list[Row]:
 
 def _blind(found: dict[str, Results], folder: Path) -> list[Row]:
     """(ii) Shown another scene, it fails: it acts on what it sees."""
-    if not {"grounded", "other_scene"} <= found.keys():
+    told = _told_rate(found)
+    if not told or "other_scene" not in found:
         return []
-    most = success_rate(list(found["grounded"].outcomes.values())) / 2
+    most = told / 2
     shown = _interval(found["other_scene"])
     return [_row("(ii) another scene's pictures", f"≤ {100 * most:.0f}", shown, lambda rate: rate <= most)]
 
 
 def _looks(found: dict[str, Results], folder: Path) -> list[Row]:
     """(iii) Told places 12 px off, it looks for what is meant."""
-    if not {"grounded", "displaced"} <= found.keys():
+    told = _told_rate(found)
+    if not told or "displaced" not in found:
         return []
-    least = 0.7 * success_rate(list(found["grounded"].outcomes.values()))
+    least = 0.7 * told
     shown = _interval(found["displaced"])
     return [_row("(iii) told places 12 px off", f"≥ {100 * least:.0f}", shown, lambda rate: rate >= least)]
 
@@ -82,6 +84,11 @@ def _sees(found: dict[str, Results], folder: Path) -> list[Row]:
     return [
         _row(f"(v) the task alone, {solved.size} scenes that need no memory", "≥ 60", shown, lambda rate: rate >= 0.6)
     ]
+
+
+def _told_rate(found: dict[str, Results]) -> float:
+    """Success of the hand that is told places, by which others are measured; 0 before it was played."""
+    return success_rate(list(found["grounded"].outcomes.values())) if "grounded" in found else 0.0
 
 
 def _interval(results: Results) -> Interval:

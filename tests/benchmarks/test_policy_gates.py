@@ -62,6 +62,11 @@ def test_blindness_and_looking_are_measured_against_the_told_hand(tmp_path: Path
     assert is_open(tmp_path)[1:] == [("(ii)", is_enough), ("(iii)", is_enough)]
 
 
+def test_a_hand_that_does_nothing_opens_no_gate(tmp_path: Path) -> None:
+    write_plays(tmp_path, {"grounded": 0, "simple": 0, "other_scene": 0, "displaced": 0, "alone": 0})
+    assert is_open(tmp_path) == [("(i)", False), ("(i)", False), ("(v)", False)]
+
+
 @pytest.mark.parametrize(("heeds", "expected"), [([0.5, None, 0.5], True), ([0.4, 0.5, None], False)])
 def test_heed_is_the_mean_over_pairs_whose_scripts_differ(
     tmp_path: Path, heeds: list[float | None], expected: bool
