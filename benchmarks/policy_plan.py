@@ -201,6 +201,8 @@ def _test(
     row = _folder(folder, recipe, seed)
     has_ponder = recipe in (each.__name__ for each in WITH_PONDER)
     models = ("--ponder-checkpoint", f"{row / 'ponder'}") if has_ponder else ()
+    if not has_ponder and not {"--subgoal-text", "--ponder-checkpoint"} & set(given):
+        models = ("--cognition", "null")  # no PONDER: one with random weights would ask for demonstrations of its own
     played = ("--tasks", *tasks, "--episodes", f"{scenes}", "--runs", "1", "--split", "test", "--max-steps", "700")
     models += ("--pounce-checkpoint", f"{row / 'pounce'}")
     return "sim_client.evaluate", "--out", f"{folder / 'test' / name}", *played, *models, *given

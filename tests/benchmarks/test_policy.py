@@ -57,6 +57,15 @@ def test_a_stage_reads_only_what_an_earlier_one_writes(tmp_path: Path) -> None:
         written |= outs
 
 
+def test_no_row_is_played_with_a_random_ponder(tmp_path: Path) -> None:
+    """It would be no control: it costs, and it asks for demonstrations at a rate of its own."""
+    played = [arguments for stage in stages(tmp_path) if stage.is_test for _, *arguments in stage.commands]
+    assert played
+    for arguments in played:
+        told = {"--ponder-checkpoint", "--subgoal-text"} & set(arguments)
+        assert told or arguments[arguments.index("--cognition") + 1] == "null"
+
+
 PROGRAM = """
     import signal, sys, time
     from pathlib import Path
