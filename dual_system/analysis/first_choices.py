@@ -23,7 +23,7 @@ Scenes that were played twice, after their own past and after another that leads
 retold`). Of those with a first choice in both plays, in how many it was right in both, in one, in neither. A policy
 that ignores the past chooses alike twice and is right in one at most."""
 
-_OF_PLAY = ("out", "pictures")
+_OF_PLAY = ("out", "pictures", "tasks", "record", "record_hz", "pixels", "progress", "patience_s", "link")
 """Options that may differ between two plays of one condition."""
 
 _Part = tuple[str, NDArray[np.bool_], bool | None]  # a name, its episodes (R, E), and whether the discs were in sight
@@ -69,28 +69,33 @@ def _row(results: Results, task: str, chosen_RE: NDArray[np.bool_], saw_discs: b
     return [f"{num_chosen} of {chosen_RE.size}", str(num_right), right, chance]
 
 
-def retold(results: Sequence[Results]) -> str:
-    """Returns a row for each task and condition that was played after both pasts; "" if none was."""
-    rows = []
-    for own, other in _pairs(results):
-        for task in own.tasks:
-            ours, theirs = own.first_choices[task], other.first_choices[task]
-            is_made = (ours >= 0) & (theirs >= 0)
-            num_right = (ours + theirs)[is_made]
-            if is_made.any():
-                counts = [int((num_right == count).sum()) for count in (2, 1, 0)]
-                both = percent(wilson(counts[0] / int(is_made.sum()), int(is_made.any(axis=0).sum())))
-                rows.append([task, own.label, f"{is_made.sum()} of {is_made.size}", *map(str, counts), both])
+def is_retold(results: Results) -> bool:
+    """Whether scenes were played after another past than their own."""
+    return results.config.get("pictures") == "retold"
+
+
+def retold(own: Sequence[Results], others: Sequence[Results]) -> str:
+    """Returns a row for each condition and task that was played after both pasts; "" if none was."""
+    rows = [
+        row
+        for ours in own
+        for theirs in others
+        if _settings(ours) == _settings(theirs)
+        for task in ours.tasks
+        if ours.scenes[task] == theirs.scenes.get(task)
+        for row in _both(task, ours, theirs)
+    ]
     return markdown(["task", "condition", "chose twice", "both right", "one", "none", "both, %"], rows) if rows else ""
 
 
-def _pairs(results: Sequence[Results]) -> Iterator[tuple[Results, Results]]:
-    """Every condition after its own past, with the same one after another: same models, options and scenes."""
-    for other in results:
-        if other.config.get("pictures") == "retold":
-            for own in results:
-                if "pictures" not in own.config and _settings(own) == _settings(other) and own.scenes == other.scenes:
-                    yield own, other
+def _both(task: str, ours: Results, theirs: Results) -> Iterator[list[str]]:
+    """The row of a task, if any scene was chosen in twice."""
+    is_made = (ours.first_choices[task] >= 0) & (theirs.first_choices[task] >= 0)
+    num_right = (ours.first_choices[task] + theirs.first_choices[task])[is_made]
+    if num_right.size:
+        counts = [int((num_right == count).sum()) for count in (2, 1, 0)]
+        both = percent(wilson(counts[0] / num_right.size, int(is_made.any(axis=0).sum())))
+        yield [task, ours.label, f"{num_right.size} of {is_made.size}", *map(str, counts), both]
 
 
 def _settings(results: Results) -> dict[str, Any]:

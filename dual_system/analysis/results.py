@@ -144,11 +144,12 @@ def _tick(episode: Mapping[str, Any], name: str) -> int:
 
 
 def read_comparable(paths: Sequence[Path]) -> list[Results]:
-    """Reads several conditions over the same tasks.
+    """Reads several conditions over the same tasks. Raises ResultsError as `read_results` and `comparable` do."""
+    return comparable([read_results(path) for path in paths])
 
-    Raises ResultsError as `read_results` does, or if one has other tasks than the first, or for a repeated label.
-    """
-    results = [read_results(path) for path in paths]
+
+def comparable(results: list[Results]) -> list[Results]:
+    """Returns the conditions. Raises ResultsError if one has other tasks than the first, or for a repeated label."""
     _require(bool(results), "no results were given")
     first = results[0]
     for i, other in enumerate(results[1:], 1):

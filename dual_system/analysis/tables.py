@@ -18,9 +18,9 @@ from dual_system.analysis.ceiling_tables import ceilings
 from dual_system.analysis.counterfactual import COUNTERFACTUAL, read_counterfactual
 from dual_system.analysis.diagnosis import DIAGNOSIS, read_diagnosis
 from dual_system.analysis.diagnosis_tables import counterfactual_table, diagnosis_tables
-from dual_system.analysis.first_choices import ABOUT_FIRST_CHOICES, ABOUT_RETOLD, first_choices, retold
+from dual_system.analysis.first_choices import ABOUT_FIRST_CHOICES, ABOUT_RETOLD, first_choices, is_retold, retold
 from dual_system.analysis.markdown import markdown, percent
-from dual_system.analysis.results import Results, ResultsError, read_comparable
+from dual_system.analysis.results import Results, ResultsError, comparable, read_results
 from dual_system.analysis.statistics import bootstrap, paired, wilson
 from protocol import files
 from protocol.command_line import command, parse
@@ -50,7 +50,10 @@ def main(argv: list[str] | None = None) -> int:
     evaluations = [p for p in options.results if not any(p in paths for paths in of_kind.values())]
     diagnoses, parts = [], []
     if evaluations:
-        parts.append(tables(read_comparable(evaluations)).rstrip("\n"))
+        played = [read_results(path) for path in evaluations]
+        own = [each for each in played if not is_retold(each)]
+        others = [each for each in played if is_retold(each)] if own else []
+        parts.append(tables(comparable(own or played), others).rstrip("\n"))
     if of_kind[DIAGNOSIS]:
         diagnoses = [read_diagnosis(path) for path in of_kind[DIAGNOSIS]]
         parts.append(diagnosis_tables(diagnoses))
@@ -70,14 +73,17 @@ def _holds(path: Path, name: str) -> bool:
     return path.name == name or (path / name).is_file()
 
 
-def tables(results: Sequence[Results]) -> str:
-    """Returns all tables as markdown. Raises ResultsError if conditions were run on different scenes."""
+def tables(results: Sequence[Results], after_another_past: Sequence[Results] = ()) -> str:
+    """Returns all tables as markdown. Raises ResultsError if conditions were run on different scenes.
+
+    Scenes that were retold are judged otherwise, so they are compared with their own past's alone (`retold`).
+    """
     parts = ["# Evaluation", NOTE, "\n".join(_about(each) for each in results)]
     parts += ["## By family (form of the paper's Table 1)", by_family(results)]
     parts += ["## By task (form of the paper's Table 7)", by_task(results), *ceilings(results)]
     if first := first_choices(results):
         parts += ["## First choice", ABOUT_FIRST_CHOICES, first]
-    if twins := retold(results):
+    if twins := retold(results, after_another_past):
         parts += ["## The same present after another past", ABOUT_RETOLD, twins]
     if len(results) > 1:
         parts += ["## Between conditions (form of the paper's Tables 3 and 4)", between_conditions(results)]

@@ -250,13 +250,23 @@ def write_choices(folder: Path, choices: list[str | None], **config: Any) -> Pat
 
 
 def test_two_pasts_of_one_present_are_counted_scene_by_scene(tmp_path: Path) -> None:
-    own = write_choices(tmp_path / "own", ["right", "right", "wrong", "wrong", None])
+    """A condition is the same whatever was recorded of it, and whichever other tasks it was played in."""
+    own = write_choices(tmp_path / "own", ["right", "right", "wrong", "wrong", None], record=True)
+    add_task(own, "PickXtimes")
     other = write_choices(tmp_path / "other", ["right", "wrong", "right", "wrong", "right"], pictures="retold")
     late = write_choices(tmp_path / "late", ["right"] * 5, pictures="retold", delay_ms=1000)
-    text = tables(read_comparable([own, other, late]))
-    assert f"| MoveCube | {own} | 4 of 5 | 1 | 2 | 1 | 25.00 [4.6, 69.9] |" in text
-    assert f"| MoveCube | {other} |" not in text.split("another past")[1]
-    assert "another past" not in tables(read_comparable([own]))
+    assert main([str(own), str(other), str(late), "--out", str(tmp_path)]) == 0
+    text = (tmp_path / "tables.md").read_text()
+    assert text.count(f"| MoveCube | {own} | 4 of 5 | 1 | 2 | 1 | 25.00 [4.6, 69.9] |") == 1
+    assert f"{other}" not in text, "it is judged otherwise, and stands in no other table"
+    assert main([str(own), "--out", str(tmp_path)]) == 0
+    assert "another past" not in (tmp_path / "tables.md").read_text()
+
+
+def add_task(folder: Path, task: str) -> None:
+    found = json.loads((folder / "results.json").read_text())
+    found["episodes"] += [episode | {"task": task} for episode in found["episodes"]]
+    (folder / "results.json").write_text(json.dumps(found))
 
 
 def test_who_could_choose_in_sight_of_the_discs_is_listed_apart(tmp_path: Path) -> None:
