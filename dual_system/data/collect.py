@@ -217,7 +217,7 @@ class Report:
 def main(argv: list[str] | None = None) -> int:
     try:
         options = parse(CollectOptions, argv, prog="pp-collect")
-        report = collect(options, _workers(options), say=print_line)
+        report = collect(options, workers_on(options.machine, work_out), say=print_line)
     except KeyboardInterrupt:
         sys.stderr.write("pp-collect: interrupted; finished episodes are kept, the same command goes on\n")
         return INTERRUPTED
@@ -396,11 +396,9 @@ def _join(out: Path, store: Store, jobs: Sequence[JobT], wanted: dict[str, Any],
     return report
 
 
-def _workers(options: CollectOptions) -> Workers[Job, Package]:
-    machine = options.machine
-    if machine.ray is not None:
-        return RayWorkers(machine.ray, work_out)
-    return LocalWorkers(machine.workers, work_out)
+def workers_on(machine: MachineOptions, work: Callable[[JobT], Package]) -> Workers[JobT, Package]:
+    """The processes that do the work, on this computer or a Ray cluster."""
+    return LocalWorkers(machine.workers, work) if machine.ray is None else RayWorkers(machine.ray, work)
 
 
 if __name__ == "__main__":

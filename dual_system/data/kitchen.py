@@ -24,6 +24,7 @@ from dual_system.data.collect import (
     MachineOptions,
     collect,
     print_line,
+    workers_on,
 )
 from dual_system.data.dataset import Dataset
 from dual_system.data.episode import About, Package, Rejection, RobotColumns
@@ -32,7 +33,6 @@ from dual_system.data.jobs import ATTEMPTS
 from dual_system.data.paired import PANDA_OMRON, Instant, pack_pair, write_splits
 from dual_system.data.rollout import UNSOLVED, UnsolvedError, asked, check_solved
 from dual_system.data.video import FPS
-from dual_system.data.workers import LocalWorkers, RayWorkers, Workers
 from dual_system.tasks.engine import Status
 from dual_system.tasks.environment import Snapshot
 from dual_system.tasks.kinematics import UnreachableError
@@ -128,7 +128,7 @@ class KitchenOptions:
 def main(argv: list[str] | None = None, prog: str = "pp-collect kitchen") -> int:
     options = parse(KitchenOptions, argv, prog=prog)
     try:
-        report = collect(options, _workers(options), say=print_line)
+        report = collect(options, workers_on(options.machine, work_out), say=print_line)
     except KeyboardInterrupt:
         sys.stderr.write(f"{prog}: interrupted; finished pairs are kept, the same command goes on\n")
         return INTERRUPTED
@@ -181,13 +181,6 @@ def _executed(environment: KitchenEnvironment, snapshot: Snapshot, look_every: i
         yield Instant(state=snapshot.state, action=action, frames=snapshot.frames)
         snapshot = environment.step(action, look=(snapshot.step + 1) % look_every == 0)
     check_solved(snapshot)
-
-
-def _workers(options: KitchenOptions) -> Workers[PairJob, Package]:
-    machine = options.machine
-    if machine.ray is not None:
-        return RayWorkers(machine.ray, work_out)
-    return LocalWorkers(machine.workers, work_out)
 
 
 if __name__ == "__main__":

@@ -189,7 +189,7 @@ class Environment:
         ends between two of them. Raises ValueError unless the rates divide 20 Hz.
         """
         self._require_episode()
-        every, look_every = _steps_between(rate_hz), _steps_between(look_hz or rate_hz)
+        every, look_every = steps_between(rate_hz), steps_between(look_hz or rate_hz)
         shown = range(0, len(self._video), every)
         looked_at = {*(step for step in shown if step % look_every == 0), *shown[-1:]}
         return (self._demonstrated(step, self._video[step], look=step in looked_at) for step in shown)
@@ -426,7 +426,8 @@ class Environment:
             raise RuntimeError("no episode has begun; call reset first")
 
 
-def _steps_between(rate_hz: int) -> int:
+def steps_between(rate_hz: int) -> int:
+    """Returns the control steps between two frames of a rate. Raises ValueError unless it divides 20 Hz."""
     if rate_hz < 1 or CONTROL_HZ % rate_hz:
         raise ValueError(f"a video of {CONTROL_HZ} Hz cannot be shown at {rate_hz} Hz; use 1, 2, 4, 5, 10 or 20")
     return CONTROL_HZ // rate_hz

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dual_system.tasks.engine import Status
-from dual_system.tasks.environment import Snapshot
+from dual_system.tasks.environment import Snapshot, steps_between
 from dual_system.tasks.geometry import Array, pose_of
 from dual_system.tasks.kinematics import UnreachableError
 from dual_system.tasks.kitchen import predicates, puppet
@@ -159,7 +159,7 @@ class KitchenEnvironment:
         With ``look_hz`` only snapshots at that rate have pictures, and the last one. The episode does not change.
         Raises ValueError unless the rates divide 20 Hz, and UnreachableError if the script does not reach the goal.
         """
-        every, look_every = (_steps_between(rate) for rate in (rate_hz, look_hz or rate_hz))
+        every, look_every = (steps_between(rate) for rate in (rate_hz, look_hz or rate_hz))
         scene, stage = self.scene, World(self.scene)
         assert self._start is not None
         stage.load(self._start)
@@ -280,12 +280,6 @@ def _until_done(world: World) -> Iterator[Array]:
         if predicates.fired(world.view, memory, scene.goals) == scene.goal:
             return
     raise UnreachableError(f"{scene.task}, seed {scene.seed}: the script misses its goal; there is no demonstration")
-
-
-def _steps_between(rate_hz: int) -> int:
-    if rate_hz < 1 or CONTROL_HZ % rate_hz:
-        raise ValueError(f"a video of {CONTROL_HZ} Hz cannot be shown at {rate_hz} Hz; use 1, 2, 4, 5, 10 or 20")
-    return CONTROL_HZ // rate_hz
 
 
 def _checked(action: ArrayLike) -> Array:
