@@ -67,7 +67,7 @@ def _attend(queries_BQWD: Tensor, keys_BGPD: Tensor, values_BGPD: Tensor, bias_B
     bias = bias_BWP[:, None].expand(-1, num_key_heads, -1, -1).flatten(0, 1)[:, None].expand(-1, group, -1, -1)
     queries = queries_BQWD.reshape(num_rows * num_key_heads, group, num_queries, size)
     seen = F.scaled_dot_product_attention(queries, shared(keys_BGPD), shared(values_BGPD), attn_mask=bias)
-    return seen.view(queries_BQWD.shape)
+    return seen.reshape(queries_BQWD.shape)  # a GPU's kernels leave the heads innermost: no view
 
 
 def attend_fused(

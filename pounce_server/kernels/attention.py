@@ -82,7 +82,7 @@ def attend_eager(rope: Rope, qkv: Tensor, rotation: Rotation, slots: Slots, seen
     here = slice(seen.first, slots.first + num_tokens)
     keys, values = slots.keys[:, :, here], slots.values[:, :, here]
     mixed = F.scaled_dot_product_attention(queries, keys, values, attn_mask=seen.bias)
-    mixed = mixed.view(batch_size, num_kv_heads, num_tokens, -1)
+    mixed = mixed.reshape(batch_size, num_kv_heads, num_tokens, -1)  # a GPU's kernels leave the heads innermost
     return mixed.transpose(1, 2).reshape(len(qkv), -1)
 
 

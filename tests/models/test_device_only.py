@@ -69,6 +69,19 @@ def a_guard_for_cuda() -> Iterator[None]:
         guards[CUDA] = None
 
 
+@pytest.fixture(autouse=True)
+def the_layout_of_a_gpu_s_attention(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its fused kernels return (B, H, T, D) with the heads innermost but one: what views the result fails there alone."""
+    attention = F.scaled_dot_product_attention
+
+    def transposed(*args: Any, **kwargs: Any) -> Tensor:
+        mixed_BHTD = attention(*args, **kwargs)
+        batch_size, heads, length, size = mixed_BHTD.shape
+        return mixed_BHTD.new_empty(batch_size, length, heads, size).transpose(1, 2)
+
+    monkeypatch.setattr(F, "scaled_dot_product_attention", transposed)
+
+
 class Launches(TorchDispatchMode):
     """Counts operations, and refuses tensors of the host and whatever makes the host wait."""
 
