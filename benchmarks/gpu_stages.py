@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
@@ -18,6 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from benchmarks.gpu_parts import fire_parts, sample_parts, told, trials
 from benchmarks.roofline import measure_ceilings
 from dual_system.models.fp8 import has_products
 from dual_system.models.gpu import current
@@ -61,7 +62,13 @@ PREDICTED_MS = {
     "GR00T fused": 9.0,
     "8 robots' fires together": 96.0,
 }
-"""Medians on an H100, by counting kernels, bytes and multiplications; none was measured."""
+"""Medians on an H100, by counting kernels, bytes and multiplications, from before the first run."""
+
+GPU_TESTS = (
+    *(f"tests/models/test_{name}.py" for name in ("kernel_time", "graphs", "fp8")),
+    *("tests/pounce_server/test_fused_gpu.py", "tests/ponder_server/test_captured_engine.py"),
+)
+"""The files that hold tests for a GPU."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -157,6 +164,10 @@ class Day:
         p50, p95 = np.percentile(took, (50, 95), method="inverted_cdf")
         return {"n": len(took), "min_ms": round(min(took), 3), "p50_ms": round(p50, 3), "p95_ms": round(p95, 3)}
 
+    def medians(self, calls: Mapping[str, Callable[[], object]]) -> dict[str, float]:
+        """Each call's median [ms] of a few."""
+        return {name: self.ms(call, 10)["p50_ms"] for name, call in calls.items()}
+
     def time(self, name: str, call: Callable[[], object], count: int | None = None, **after: Callable[[], None]) -> Any:
         """A row of :meth:`ms`."""
         return self.row(name, partial(self.ms, call, count, **after))
@@ -230,20 +241,16 @@ def kernels(day: Day) -> None:
 
     def verdicts(length: int) -> dict[str, str]:
         samples = rehearse(stack, memory, num_rows=1, length=length)
-        _, told = choose(samples, PONDER_TWINS, KERNELS, cuda_time_ms)
-        return {one.operation: f"{'kernel' if one.is_taken else 'twin'}: {one.why}" for one in told}
+        return told(choose(samples, PONDER_TWINS, KERNELS, cuda_time_ms)[1])
 
     with torch.inference_mode():
         for length in (1, 16, 160):
             day.row(f"PONDER's kernels, {length} tokens after {tokens}", partial(verdicts, length))
     options = ["-q", "--noconftest", "--continue-on-collection-errors", "-m", "gpu", "-p", "no:cacheprovider"]
-    paths = ["tests/models/test_graphs.py", "tests/models/test_fp8.py", "tests/pounce_server/test_fused_gpu.py"]
-    paths += ["tests/ponder_server/test_captured_engine.py"]
 
     def run() -> str:
-        done = subprocess.run(
-            [sys.executable, "-m", "pytest", *options, *paths], capture_output=True, text=True, check=False, timeout=120
-        )
+        command = [sys.executable, "-m", "pytest", *options, *GPU_TESTS]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=200)
         if done.returncode:
             raise RuntimeError(done.stdout[-350:])
         return done.stdout.strip().splitlines()[-1]
@@ -287,13 +294,15 @@ def ponder_fire(day: Day) -> None:
             context = _open(engine, "day", length)
             restore = partial(context.restore, context.save())
             day.time(f"fire at {length} tokens{name}", partial(engine.fire, "day", frames), after=restore)
+            day.row(f"parts at {length} tokens{name}", partial(fire_parts, engine, "day", frames, day.medians))
             engine.close("day")
+        day.row(f"trials{name}", lambda: trials(engine._runner._captured))
         return frames
 
     fires("")
     frames = fires(", twins", kernels=False)
     pictures = torch.from_numpy(np.stack(frames)).to(day.device)
-    day.time("vision tower, two frames", partial(ponder.image_features, pictures))
+    day.time("vision tower, two frames, not captured", partial(ponder.image_features, pictures))
     row, seen = _row(ponder, max(1, longest // sum(len(segment) for segment in ponder.format.query(2))))
     day.time(f"baseline: {len(row.ids)} tokens encoded again", partial(ponder.encode_row, row, seen), 3)
     fires(", fp8", weights="fp8")  # last: it replaces the network's layers
@@ -414,7 +423,7 @@ class Stage:
 
 STAGES = {
     "probe": Stage(probe, 45),
-    "kernels": Stage(kernels, 75),
+    "kernels": Stage(kernels, 150),  # most of it compiles kernels
     "ponder_right": Stage(ponder_right, 90),
     "ponder_fire": Stage(ponder_fire, 200),
     "ponder_text": Stage(ponder_text, 75),
@@ -474,7 +483,9 @@ def _fused(day: Day, name: str, model: Any, inputs: Any, noise: Tensor, expected
         return last.actions
 
     day.time(f"{name} fused", sampled)
+    day.row(f"{name} parts", partial(sample_parts, fused, inputs, noise, day.medians))
     day.row(f"{name} kernels taken", lambda: fused.kernels or "none tried")
+    day.row(f"{name} trials", partial(trials, fused))
     day.row(f"{name} fused against eager, mean", lambda: float((sampled() - expected).abs().mean()))
 
 

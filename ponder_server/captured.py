@@ -57,15 +57,15 @@ def position_buckets(max_tokens: int, least: int = LEAST_POSITIONS) -> tuple[int
     return (*buckets, -(-max_tokens // 64) * 64)
 
 
-def check_captured(replayed_KH: Tensor, direct_KH: Tensor) -> None:
-    """Raises RuntimeError unless a replay's cognition is the one of the same work run directly.
+def check_captured(replayed: Tensor, direct: Tensor, what: str = "forwards change cognition") -> None:
+    """Raises RuntimeError unless a replay's result is the one of the same work run directly.
 
     It detects a driver that records wrongly before a robot moves.
     """
-    change = float((replayed_KH - direct_KH).norm() / direct_KH.norm())
+    change = float((replayed.float() - direct.float()).norm() / direct.float().norm())
     if not change <= MOST_CHANGE:  # also refuses NaN
         raise RuntimeError(
-            f"captured forwards change cognition by {change:.1e} (relative L2) against the same ones run directly; "
+            f"captured {what} by {change:.1e} (relative L2) against the same ones run directly; "
             f"expected 0, at most {MOST_CHANGE:.0e}. ponder-serve --no-graphs does without graphs; please report it."
         )
 

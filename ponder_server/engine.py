@@ -45,6 +45,7 @@ from ponder_server.contract import (
 from ponder_server.draft import Draft, NoDraft
 from ponder_server.engine_config import EngineConfig
 from ponder_server.episode import Episode, Query
+from ponder_server.eyes import Eyes
 from ponder_server.heartbeats import heartbeats
 from ponder_server.narrow import check_change, check_weights, quantise
 from ponder_server.opening import Opener
@@ -82,6 +83,7 @@ class QwenEngine:
         """
         check_weights(config.weights, ponder.device)
         self._ponder = ponder
+        self._eyes = Eyes(ponder)
         self._config = config
         self._format = ponder.format
         self._episodes: dict[str, Episode] = {}
@@ -144,6 +146,7 @@ class QwenEngine:
             timer = cuda_time_ms if has_kernels else None
             num_read = max(MAX_CHECKED_TOKENS, 1 + self._format.num_carriers)
             self._runner.capture(capture, num_read=num_read, timer=timer)
+            self._eyes.capture(capture)
             draft.capture(capture)
 
     @property
@@ -348,6 +351,8 @@ class QwenEngine:
             self._runner.check(self._example_cognition)
             self._spec = replace(self._spec, kernels=self._runner.kernels)
         frames = self.example_frames()
+        max_rows = min(self._config.max_batch_rows, self._config.max_sessions)
+        self._eyes.prepare(len(self._see(frames, "warm-up")), max_rows=max_rows)
         self.open(WARM_UP_SESSION, WARM_UP_OPENING)
         try:
             context = self._episode(WARM_UP_SESSION).context
@@ -426,7 +431,7 @@ class QwenEngine:
     def _embed(self, ids: Sequence[int], pictures: Sequence[Pictures]) -> Tensor:
         if not pictures:
             return self._ponder.embed(ids)
-        return self._ponder.embed(ids, torch.from_numpy(np.stack(pictures)).to(self._ponder.device))
+        return self._ponder.embed(ids, torch.from_numpy(np.stack(pictures)), self._eyes)
 
     @torch.inference_mode()
     def _make_room(self, episode: Episode) -> None:

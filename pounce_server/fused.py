@@ -88,7 +88,7 @@ class FusedPounce:
         """
         network: Any = self._network
         prefix = network.embed(inputs, self._see(inputs.images))
-        key = (len(noise_BNA), _bucket_tokens(prefix.num_tokens))
+        key = (len(noise_BNA), bucket_tokens(prefix.num_tokens))
         if key not in self._buckets:  # captured before loading, because capturing overwrites the buffers
             self._capture_all(prefix, len(noise_BNA), prefix.num_tokens - network.num_text_tokens(inputs))
         bucket = self._buckets[key]
@@ -113,7 +113,7 @@ class FusedPounce:
     def _capture_all(self, prefix: Any, batch_size: int, num_beside_text: int) -> None:
         """The buckets of all prompts, the longest first so that the others reuse its memory in the pool."""
         network: Any = self._network
-        most = _bucket_tokens(num_beside_text + self._max_prompt_tokens)
+        most = bucket_tokens(num_beside_text + self._max_prompt_tokens)
         for length in range(most, num_beside_text, -BUCKET_TOKENS):
             bucket: Bucket = network.bucket(prefix, length)
             if self._timer is not None and not self._tried:
@@ -145,7 +145,8 @@ def fused_for(model: AnyPounce, device: torch.device, *, autotune: bool = False)
     return FusedPounce(model, operations, cuda_graphs(device), cuda_time_ms)
 
 
-def _bucket_tokens(num_tokens: int) -> int:
+def bucket_tokens(num_tokens: int) -> int:
+    """Tokens before the actions with the padding of their bucket."""
     return -(-num_tokens // BUCKET_TOKENS) * BUCKET_TOKENS
 
 

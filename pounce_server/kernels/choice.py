@@ -1,7 +1,7 @@
 """Selects the fastest library per matrix product on this GPU: timed once and stored on disk.
 
 cuBLAS and cuBLASLt compute the same product with different kernels, and neither is always faster. The choice is made
-at the first use of a shape, before a graph is captured (`graphs.cuda_graph` runs work first). The file also holds the
+at the first use of a shape, before a graph is captured (`graphs.cuda_graphs` runs work first). The file also holds the
 choices of other GPUs and versions, which are kept.
 """
 

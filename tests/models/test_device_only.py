@@ -36,6 +36,7 @@ from dual_system.models.pounce.family import blank_model
 from dual_system.models.pounce.precision import cast_streams
 from ponder_server.captured import CapturedDecoder
 from ponder_server.decoder import Place
+from ponder_server.eyes import Eyes
 from ponder_server.narrow import quantise
 from ponder_server.operations import KERNELS
 from ponder_server.slots import SlotMemory
@@ -71,7 +72,7 @@ def a_guard_for_cuda() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def the_layout_of_a_gpu_s_attention(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its fused kernels return (B, H, T, D) with the heads innermost but one: what views the result fails there alone."""
+    """Its fused kernels return (B, H, T, D), the heads innermost but one: what views the result fails there alone."""
     attention = F.scaled_dot_product_attention
 
     def transposed(*args: Any, **kwargs: Any) -> Tensor:
@@ -258,6 +259,29 @@ def test_ponder_s_vision_tower(ponder: Ponder) -> None:
         on_gpu(ponder)
         frames = torch.zeros(2, *ponder.image_px, 3, dtype=torch.uint8, device=GPU)
         assert launched(lambda: ponder.image_features(frames)) <= 80
+
+
+def test_a_fire_s_pictures_wait_for_nothing(ponder: Ponder, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They go in one copy from pinned memory to the tower's graph, which holds all of its launches."""
+    monkeypatch.setattr("ponder_server.eyes.check_captured", lambda *_: None)  # fakes have no numbers
+    monkeypatch.setattr(Tensor, "pin_memory", lambda tensor: tensor)  # without a GPU nothing can be pinned
+    works: list[Callable[[], None]] = []
+
+    def capture(work: Callable[[], None]) -> Callable[[], None]:
+        works.append(work)
+        return lambda: None
+
+    with FakeTensorMode(), torch.inference_mode():
+        on_gpu(ponder)
+        eyes = Eyes(ponder)
+        eyes.capture(capture)
+        eyes.prepare(2, max_rows=2)
+        for work in works:
+            assert launched(work) <= 80
+        pictures = torch.zeros(2, *ponder.image_px, 3, dtype=torch.uint8)
+        with HostCopies() as copies:
+            eyes(pictures)
+        assert (copies.count, len(works)) == (1, 2)
 
 
 @pytest.mark.parametrize(

@@ -293,9 +293,9 @@ def test_a_demonstration_is_encoded_once_and_shared(ponder: Ponder, monkeypatch:
     num_encoded = []
     embed = ponder.embed
 
-    def count(ids: Sequence[int], frames: torch.Tensor | None = None) -> torch.Tensor:
+    def count(ids: Sequence[int], *pictures: torch.Tensor) -> torch.Tensor:
         num_encoded.append(len(ids))
-        return embed(ids, frames)
+        return embed(ids, *pictures)
 
     monkeypatch.setattr(ponder, "embed", count)
     num_tokens = engine.open("a", WITH_DEMO)

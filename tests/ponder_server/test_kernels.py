@@ -305,6 +305,28 @@ def test_what_is_right_and_faster_is_taken_and_nothing_else(samples: dict[str, t
     assert not any(verdict.is_taken for verdict in verdicts)
 
 
+@pytest.mark.parametrize(
+    ("untimed", "is_taken", "why"),
+    [(0, False, "it cannot be captured: RuntimeError: a"), (1, True, "its twin cannot be captured: RuntimeError: a")],
+)
+def test_what_cannot_be_captured_loses(
+    samples: dict[str, tuple[Any, ...]], untimed: int, is_taken: bool, why: str
+) -> None:
+    """Servers run it in graphs alone, so it is as useless there as if it did not run."""
+    num_timed = 0
+
+    def timer(work: Callable[[], object]) -> float:
+        nonlocal num_timed
+        num_timed += 1
+        if num_timed == 1 + untimed:
+            raise RuntimeError("a stream is capturing")
+        return 1.0
+
+    _, (verdict,) = choose({"swiglu": samples["swiglu"]}, TWINS, TWINS, timer)
+    assert verdict.is_taken is is_taken
+    assert verdict.why.startswith(why)
+
+
 @interpreted
 @torch.inference_mode()
 def test_the_kernels_themselves_are_right_by_the_server_s_own_measure(

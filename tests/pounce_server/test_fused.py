@@ -263,7 +263,7 @@ def test_a_kernel_that_is_wrong_broken_or_slow_is_not_taken_and_the_heartbeat_sa
     slow = FusedPounce(model, operations, directly, Timer(2e-3, 1e-3))
     fused_actions(slow, inputs, noise)
     assert slow._network.expert.do == slow._network.language.do == TWINS
-    assert "norm 0/2 (prefill: 2 us, its twin 1; it differs by 0.0e+00)" in slow.kernels
+    assert "norm 0/2 (prefill: 2.0 us, its twin 1.0; it differs by 0.0e+00)" in slow.kernels
 
 
 @pytest.mark.skipif(bool(LACK), reason=LACK)

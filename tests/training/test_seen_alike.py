@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -75,10 +76,10 @@ def test_training_and_serving_read_the_same(monkeypatch: pytest.MonkeyPatch, pon
     pictures: list[torch.Tensor] = []
     embed = Ponder.embed
 
-    def listened(ponder: Ponder, ids_T: list[int], frames_NHW3: torch.Tensor | None = None) -> torch.Tensor:
+    def listened(ponder: Ponder, ids_T: list[int], frames_NHW3: torch.Tensor | None = None, *look: Any) -> torch.Tensor:
         ids.extend(ids_T)
         pictures.extend(() if frames_NHW3 is None else frames_NHW3)
-        return embed(ponder, ids_T, frames_NHW3)
+        return embed(ponder, ids_T, frames_NHW3, *look)
 
     engine = engine_of(ponder)
     monkeypatch.setattr(Ponder, "embed", listened)

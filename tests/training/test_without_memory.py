@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -98,9 +99,9 @@ def test_rows_are_the_contexts_of_serving_token_by_token(
         heard.append(list(context.ids))
         return answer(context, *rest)
 
-    def seen(self: Ponder, ids: Sequence[int], frames: Tensor | None = None) -> Tensor:
+    def seen(self: Ponder, ids: Sequence[int], frames: Tensor | None = None, *look: Any) -> Tensor:
         pictures.extend(() if frames is None else frames)
-        return embed(self, ids, frames)
+        return embed(self, ids, frames, *look)
 
     monkeypatch.setattr(engine, "_answer", kept)
     monkeypatch.setattr(Ponder, "embed", seen)

@@ -8,7 +8,7 @@ the same modules over a few tokens at a time (``ponder_server/decoder.py``).
 # B batch, T tokens, H hidden, N selected positions, V vocabulary
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Self
 
@@ -176,8 +176,15 @@ class Ponder(nn.Module):
         grid = (height // vision.patch_size, width // vision.patch_size)
         return image_tokens(self.qwen.model.visual, patches.to(self.dtype), grid)
 
-    def embed(self, ids_T: Sequence[int] | npt.NDArray[np.integer], frames_NHW3: Tensor | None = None) -> Tensor:
+    def embed(
+        self,
+        ids_T: Sequence[int] | npt.NDArray[np.integer],
+        frames_NHW3: Tensor | None = None,
+        look: Callable[[Tensor], Tensor] | None = None,
+    ) -> Tensor:
         """Input embeddings (T, H): rows of the table, with the frames' vision tokens at the image positions.
+
+        ``look`` gives these tokens in place of `image_features`.
 
         Raises ValueError unless the frames have as many tokens as ``ids`` has image positions.
         """
@@ -191,7 +198,7 @@ class Ponder(nn.Module):
             raise ValueError(f"tokens hold {num_places} image positions, the frames bring {num_features}")
         if frames_NHW3 is None:
             return embeds_TH
-        features = self.image_features(frames_NHW3).to(embeds_TH.dtype)
+        features = (look or self.image_features)(frames_NHW3).to(embeds_TH.dtype)
         return embeds_TH.masked_scatter(is_image_T[:, None], features)
 
     def forward(self, embeds_BTH: Tensor, positions_4BT: Tensor) -> Tensor:
