@@ -107,6 +107,7 @@ def _gather(report: Path, device: torch.device, size: str) -> None:
     found = {name: path for name in STAGES if (path := report.parent / f"{name}.json").exists()}
     day = {
         "name": "gpu_day",
+        "question": "What is right, how fast, for how many robots, and how fast does it train, on a GPU?",
         "device": str(device),
         "size": size,
         "predicted_p50_ms": PREDICTED_MS,

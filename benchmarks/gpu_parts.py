@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dual_system.models.kernels.launch import cuda_time_ms
 from dual_system.models.kernels.trial import Verdict
 from ponder_server.captured import CapturedDecoder
 from ponder_server.contract import Frame
@@ -16,6 +17,11 @@ from pounce_server.fused import FusedPounce, bucket_tokens
 
 Medians = Callable[[Mapping[str, Callable[[], object]]], dict[str, float]]
 """Durations [ms] of calls by name, each to the end of the device's work."""
+
+
+def captured(work: Callable[[], object]) -> dict[str, float]:
+    """A row: the time of work that is shorter than its launch, without that."""
+    return {"captured_ms": round(cuda_time_ms(work), 4)}
 
 
 def launches(device: torch.device) -> None:

@@ -18,7 +18,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from benchmarks.gpu_parts import fire_parts, sample_parts, told, trials
+from benchmarks.gpu_parts import captured, fire_parts, sample_parts, told, trials
+from benchmarks.report import git_version
 from benchmarks.roofline import measure_ceilings
 from dual_system.models.fp8 import has_products
 from dual_system.models.gpu import current
@@ -147,7 +148,8 @@ class Day:
         self.rows[name] = {"FAILED": what, "at": f"{where.name}:{where.lineno}"}
 
     def write(self, *, is_over: bool = False) -> None:
-        stage = {"of": self._of, "is_over": is_over, "rows": self.rows}
+        date = time.strftime("%Y-%m-%d", time.gmtime())
+        stage = {"of": self._of, "date": date, "git": git_version(), "is_over": is_over, "rows": self.rows}
         self._path.write_text(json.dumps(stage, indent=1) + "\n")
 
     def ms(self, call: Callable[[], object], count: int | None = None, after: Callable[[], None] = lambda: None) -> Any:
@@ -211,13 +213,14 @@ def probe(day: Day) -> None:
         attend = partial(F.scaled_dot_product_attention, q, k, k, attn_mask=bias)
         day.time(f"attention of a pi0.5 {what}, heads as rows", attend, 5)
     if has_products(device):
-        weight = torch.randn(4096, 4096, device=device)
+        weight = torch.randn(12_288, 4096, device=device)  # of 9B's MLP, more than the card's cache holds
         rows_OI = quantise_eager(weight)
         for count in (1, 16, 160):
             x = torch.randn(count, 4096, device=device, dtype=torch.bfloat16)
-            day.time(f"{count} rows times bfloat16 weights", partial(F.linear, x, weight.bfloat16()))
+            day.row(f"{count} rows times bfloat16 weights", partial(captured, partial(F.linear, x, weight.bfloat16())))
             if count <= FEW_ROWS and not missing_for(device):
-                day.time(f"{count} rows times fp8 weights, our kernel", partial(few_rows_fused, x, *rows_OI))
+                few = partial(few_rows_fused, x, *rows_OI)
+                day.row(f"{count} rows times fp8 weights, our kernel", partial(captured, few))
             rows = quantise_eager(x)
             scales = {"scale_a": rows.scale_M[:, None], "scale_b": rows_OI.scale_M[None]}
             scaled = partial(
@@ -225,7 +228,7 @@ def probe(day: Day) -> None:
             )
             for is_fast in (False, True):
                 name = f"{count} rows, an fp8 product, fast accumulation {is_fast}"
-                day.time(name, partial(scaled, use_fast_accum=is_fast))
+                day.row(name, partial(captured, partial(scaled, use_fast_accum=is_fast)))
 
 
 def kernels(day: Day) -> None:

@@ -27,6 +27,8 @@ def reports_in(folder: Path) -> list[dict[str, Any]]:
 
 
 def section(report: dict[str, Any]) -> str:
+    if "stages" in report:
+        return day_section(report)
     machine, versions = report["machine"], report["versions"]
     cpu = " ".join(filter(None, (machine["cpu"], machine.get("instructions"))))
     loads = f"{machine['load_average_before'][0]} before, {machine['load_average_after'][0]} after"
@@ -44,6 +46,29 @@ def section(report: dict[str, Any]) -> str:
     lines += [f"- {note}" for note in report["notes"]]
     lines += ["", "Config: " + _inline(report["config"]) + "; " + _inline(versions) + ".", ""]
     return "\n".join(lines)
+
+
+def day_section(report: dict[str, Any]) -> str:
+    """That of a `gpu_day`, whose stages may have run at several commits."""
+    lines = [f"## {report['name']}", "", report["question"], ""]
+    for name, stage in report["stages"].items():
+        rows = [cells for row, found in stage["rows"].items() for cells in _day_rows(row, found)]
+        columns = [key for key in _DAY_COLUMNS if any(key in row for row in rows)]
+        lines += [f"**{name}**, {stage['of']}, {stage['date']}, commit `{stage['git']}`", ""]
+        lines += [*lines_of([{key: row.get(key) for key in columns} for row in rows]), ""]
+    return "\n".join(lines)
+
+
+_DAY_COLUMNS = ("row", "n", "min_ms", "p50_ms", "p95_ms", "predicted_p50_ms", "found")
+
+
+def _day_rows(name: str, found: Any) -> list[dict[str, Any]]:
+    """A row of durations, or what was found, one row for each name in it."""
+    if not isinstance(found, dict):
+        return [{"row": name, "found": f"{found:.3g}" if isinstance(found, float) else str(found)}]
+    durations = {key: found[key] for key in _DAY_COLUMNS if key in found}
+    others = [cells for key in found if key not in durations for cells in _day_rows(f"{name}: {key}", found[key])]
+    return [{"row": name, **durations}, *others] if durations else others
 
 
 def _inline(values: dict[str, Any]) -> str:

@@ -57,7 +57,7 @@ class Report:
             "name": self.name,
             "question": self.question,
             "date": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-            "git": _git_version(),
+            "git": git_version(),
             "machine": {
                 "cpu": _cpu_model(),
                 "instructions": _instructions(),
@@ -101,7 +101,7 @@ def lines_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     if not rows:
         return ["(no rows)"]
     cells = [list(rows[0])] + [["" if value is None else str(value) for value in row.values()] for row in rows]
-    widths = [max(len(line[column]) for line in cells) for column in range(len(cells[0]))]
+    widths = [max(2, *(len(line[column]) for line in cells)) for column in range(len(cells[0]))]  # a mark is two
     is_text = [any(isinstance(row[key], str) for row in rows) for key in rows[0]]
     marks = [":" + "-" * (w - 1) if text else "-" * (w - 1) + ":" for w, text in zip(widths, is_text, strict=True)]
     padded = [
@@ -127,7 +127,7 @@ def _cpu_info(name: str) -> str:
     return next((line.partition(":")[2].strip() for line in lines if line.startswith(name)), "")
 
 
-def _git_version() -> str:
+def git_version() -> str:
     """Commit of the working tree; "+changes" if tracked files differ from it."""
     here = Path(__file__).parent
     try:

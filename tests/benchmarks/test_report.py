@@ -68,6 +68,29 @@ def test_a_report_of_another_machine_stands_beside_under_its_file_s_name(written
     assert [each["name"] for each in render.reports_in(written.parent)] == ["speed", "speed_elsewhere"]
 
 
+def test_a_gpu_s_day_shows_every_row_of_every_stage_and_where_it_ran() -> None:
+    rows = {
+        "fire": {"n": 3, "p50_ms": 23.7, "predicted_p50_ms": 13.0},
+        "solve": {"is_right": True, "n": 3, "p50_ms": 0.1},
+        "trials": {"1x16": {"norm": "kernel: 2 us"}},
+        "error": 0.05776,
+        "broken": {"FAILED": "ValueError: no"},
+    }
+    stage = {"of": "full on cuda", "date": "2026-11-29", "git": "abc", "rows": rows}
+    page = render.section({"name": "gpu_day", "question": "How fast?", "stages": {"fires": stage}})
+    assert "**fires**, full on cuda, 2026-11-29, commit `abc`" in page
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("|")]
+    assert cells[0] == ["row", "n", "p50_ms", "predicted_p50_ms", "found"]
+    assert cells[2:] == [
+        ["fire", "3", "23.7", "13.0", ""],
+        ["solve", "3", "0.1", "", ""],
+        ["solve: is_right", "", "", "", "True"],
+        ["trials: 1x16: norm", "", "", "", "kernel: 2 us"],
+        ["error", "", "", "", "0.0578"],
+        ["broken: FAILED", "", "", "", "ValueError: no"],
+    ]
+
+
 def test_the_committed_page_is_what_the_committed_reports_give() -> None:
     reports = render.reports_in(report.REPORTS)
     page = report.REPORTS / "README.md"

@@ -1,6 +1,6 @@
 """Whether a kernel is taken: tried beside its eager twin on the card, at warm-up.
 
-A kernel that has never met a GPU must not hurt. So a server runs both, with a layer's weights and at the forward's
+A kernel that has never met this GPU must not hurt. So a server runs both, with a layer's weights and at the forward's
 shape, and takes the kernel only if it is right and faster.
 """
 
