@@ -34,7 +34,7 @@ def weight_gb(model: nn.Module, *, is_fp8: bool = False) -> float:
     """Size of a model in bfloat16 on the meta device; with fp8, narrow matrices take a byte a number, a scale a row."""
     total = 0
     for name, each in model.named_parameters():
-        narrow = is_fp8 and each.ndim == 2 and is_narrow(name)
+        narrow = is_fp8 and each.ndim == 2 and is_narrow("fp8", name)
         total += each.numel() + 4 * len(each) if narrow else each.numel() * each.element_size()
     return total / 1e9
 

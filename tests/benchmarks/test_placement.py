@@ -21,7 +21,7 @@ def test_sums_are_what_a_server_allocates() -> None:
     engine = QwenEngine(ponder, EngineConfig(max_sessions=1, max_context_tokens=512))
     assert session_gb(ponder, 512) == engine.spec.session_bytes / 1e9
     narrow_gb = weight_gb(ponder.qwen, is_fp8=True)
-    quantise(ponder, "int8")
+    quantise(ponder, "fp8")
     held = {id(each): each for each in (*ponder.qwen.parameters(), *ponder.qwen.buffers())}.values()
     rotations = sum(each.nbytes for name, each in ponder.qwen.named_buffers() if name.endswith("inv_freq"))
     assert narrow_gb == (sum(each.nbytes for each in held) - rotations) / 1e9

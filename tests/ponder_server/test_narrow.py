@@ -60,7 +60,7 @@ def test_the_layers_take_a_quarter_and_the_rest_is_untouched(weights: WeightsNam
     }  # fmt: skip
     assert {"lm_head.weight", "model.language_model.embed_tokens.weight", "model.visual.pos_embed.weight"} <= set(after)
     assert {f"model.language_model.layers.{index}.mlp.down_proj.weight" for index in range(4)} < gone
-    assert any(name.startswith("model.visual.blocks.1.") for name in gone)
+    assert any(name.startswith("model.visual.blocks.1.") for name in gone) is (weights == "int8"), "fp8: text alone"
 
 
 @narrow

@@ -18,7 +18,7 @@ except ModuleNotFoundError:
 
 __all__ = ["Timer", "Tolerance", "block_size", "check_tensor", "cuda_time_ms", "kernel", "missing_for", "tl"]
 
-REPEATS = 20
+REPEATS = 10
 """Runs in a graph that is timed: its own launch is shared among them."""
 REPLAYS = 5
 """Timed replays after a first; the shortest counts, because what else the machine does only adds."""
