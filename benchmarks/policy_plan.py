@@ -72,6 +72,7 @@ def stages(folder: Path) -> tuple[Stage, ...]:
     data = ("--data", *map(str, sets))
     locating = ("dual_system.policy.towers", "--out", f"{towers}", "--stills", f"{STILLS}")
     training = ("dual_system.training.train", "--no-progress", "--picture-store", f"{folder / 'pictures'}")
+    training += ("--frozen-features",)
     scenes = ("--tasks", *TASKS, "--episodes", f"{PLAYS}", "--runs", "1", "--seed", f"{PLAYS_SEED}")
     asked = ("--pounce-checkpoint", f"{hand / 'pounce'}", "--subgoal-text", "grounded", "--max-steps", "700")
     playing = ("sim_client.evaluate", "--out", f"{plays}", *scenes, *asked, "--record", "--record-hz", "1")

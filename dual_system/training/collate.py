@@ -10,12 +10,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 
 from clock.sampling import SampledInvocation
 from dual_system.models.frame_sampling import FrameSampling, PastFrame
 from dual_system.models.groot.pounce import GrootInputs, GrootPounceConfig
 from dual_system.models.groot.prompt import EagleTokenizer
 from dual_system.models.normalisation import Floats, RobotStatistics
+from dual_system.models.pi05.modulation import NO_FRAME
 from dual_system.models.pi05.pounce import PounceConfig, PounceInputs
 from dual_system.models.pi05.prompt import Tokenizer
 from dual_system.models.pounce.batching import joined_groot, joined_pi05
@@ -52,8 +54,17 @@ class _TrainingMoment:
         return self.example.episode.instruction
 
     @property
-    def frames(self) -> tuple[Frame, ...]:
+    def views(self) -> tuple[Frame, ...]:
         return self.example.episode.views[self.invocation.tick]
+
+    @property
+    def is_embedded(self) -> bool:
+        """Whether the views are what a frozen tower makes of them (`frozen_towers`)."""
+        return any(view.dtype == np.float16 for view in self.views)
+
+    @property
+    def frames(self) -> Sequence[NDArray[np.uint8] | None]:
+        return [None if self.is_embedded else view.astype(np.uint8, copy=False) for view in self.views]
 
     @property
     def proprio(self) -> Floats:
@@ -69,11 +80,18 @@ class _TrainingMoment:
 
     @property
     def past(self) -> tuple[PastFrame, ...]:
-        episode = self.example.episode
-        if self.sampling is None:
+        if self.is_embedded or self.sampling is None:
             return ()
-        num_seen = self.sampling.num_seen(episode.num_demo_history, self.invocation.tick)
-        return self.sampling.read(dict(enumerate(episode.history)), num_seen)
+        history = enumerate(self.example.episode.history)
+        return self.sampling.read(
+            {index: frame.astype(np.uint8, copy=False) for index, frame in history}, self.num_seen
+        )
+
+    @property
+    def num_seen(self) -> int:
+        """How much of the history the frame memory has seen."""
+        num_demo = self.example.episode.num_demo_history
+        return 0 if self.sampling is None else self.sampling.num_seen(num_demo, self.invocation.tick)
 
     @property
     def subgoal(self) -> str:
@@ -113,6 +131,8 @@ def collate_pounce(
     if isinstance(config, PounceConfig) and isinstance(tokenizer, Tokenizer):
         seen = replace(config, windows=())  # the training set has looked through them
         inputs = joined_pi05([pi05_inputs(moment, seen, tokenizer, statistics, _CPU) for moment in moments])
+        if moments[0].is_embedded:
+            inputs = _with_features(inputs, moments)
     elif isinstance(config, GrootPounceConfig) and isinstance(tokenizer, EagleTokenizer):
         read = [groot_inputs(moment, config, tokenizer, statistics, _CPU) for moment in moments]
         inputs = joined_groot(_padded_on_the_left(read, tokenizer))
@@ -134,6 +154,22 @@ def collate_pounce(
         episode_I=torch.tensor([moment.index for moment in moments]),
         query_I=torch.tensor([NO_QUERY if query is None else query for query in queries]),
     )
+
+
+def _with_features(inputs: PounceInputs, moments: Sequence[_TrainingMoment]) -> PounceInputs:
+    """The inputs with what a frozen tower made of the views, and of the past in its slots, in the pictures' place."""
+    seen_BSW = torch.from_numpy(np.stack([np.concatenate(moment.views) for moment in moments])).float()
+    inputs = replace(inputs, seen=seen_BSW, has_view=torch.ones_like(inputs.has_view))
+    sampling = moments[0].sampling
+    if inputs.past_step is None or sampling is None:
+        return inputs
+    past_BFSW = torch.zeros(*inputs.past_step.shape, *moments[0].views[0].shape, dtype=torch.float16)
+    past_step_BF = torch.full_like(inputs.past_step, NO_FRAME)
+    for row, moment in enumerate(moments):
+        for slot, index in enumerate(sampling.indices(moment.num_seen)):
+            past_BFSW[row, slot] = torch.from_numpy(moment.example.episode.history[index])
+            past_step_BF[row, slot] = index * sampling.stride_ticks
+    return replace(inputs, past=past_BFSW, past_step=past_step_BF)
 
 
 def _padded_on_the_left(inputs: Sequence[GrootInputs], tokenizer: EagleTokenizer) -> list[GrootInputs]:

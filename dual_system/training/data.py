@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
@@ -27,7 +28,8 @@ from dual_system.models.pounce.family import AnyPounceConfig, sampling_of
 from dual_system.models.windows import Box, Windows
 from dual_system.tasks.seeds import UNTRAINED, split_of
 from dual_system.training.chunks import chunk_ticks
-from dual_system.training.episode import Frame, TrainingEpisode
+from dual_system.training.episode import Frame, Picture, TrainingEpisode
+from dual_system.training.frozen_towers import FrozenTowers
 from dual_system.training.picture_store import PictureStore, Views
 
 _QUANTILES = (0.01, 0.99)
@@ -58,10 +60,10 @@ class PictureSizes:
         windows = f" {self.windows}" if self.windows else ""
         return f"{None if self.form is None else (self.form.reader, self.form.image_px)} {self.pounce_px}{windows}"
 
-    def of_ponder(self, views: tuple[Frame, ...]) -> tuple[Frame, ...]:
+    def of_ponder(self, views: tuple[Picture, ...]) -> tuple[Picture, ...]:
         return () if self.form is None else tuple(self.form.reader.images(views, self.form.image_px))
 
-    def of_pounce(self, views: tuple[Frame, ...]) -> tuple[Frame, ...]:
+    def of_pounce(self, views: tuple[Picture, ...]) -> tuple[Picture, ...]:
         if self.pounce_px is None:
             return ()
         if self.windows:
@@ -87,7 +89,7 @@ class _Source:
     def rows(self) -> Rows:
         return self.dataset.rows(self.entry.index)
 
-    def frames(self, rows: Sequence[int]) -> Iterator[tuple[Frame, ...]]:
+    def frames(self, rows: Sequence[int]) -> Iterator[tuple[Picture, ...]]:
         """Yields every camera's picture at each of these rows."""
         return self.dataset.views(self.entry, rows)
 
@@ -168,6 +170,7 @@ class TrainingSet:
         """
         self.roots = roots
         self._sizes, self._demo_hz = sizes or PictureSizes(), demo_hz
+        self._folder, self._is_embedded = store, False
         self._store = None if store is None else PictureStore(store, self._sizes.key)
         self._sources = [source for root in roots for source in _sources(Dataset(root), tasks)]
         found_px = {source.dataset.image_px for source in self._sources}
@@ -278,8 +281,28 @@ class TrainingSet:
             self._cached_bytes -= _num_bytes(dropped)
         return episode
 
-    def _read(self, number: int) -> TrainingEpisode:
-        source = self._sources[number]
+    def embedded(self, towers: FrozenTowers) -> TrainingSet:
+        """The same episodes with the features of ``towers`` in the pictures' place, in the store beside the pictures.
+
+        Raises ValueError if this set has no store.
+        """
+        if self._folder is None:
+            raise ValueError("features of frozen towers are kept beside the pictures: give a --picture-store")
+        found = copy.copy(self)
+        found._cache, found._cached_bytes, found._is_embedded = OrderedDict(), 0, True
+        found._store = store = PictureStore(self._folder, f"{self._sizes.key} {towers.key}")
+        for source in self._sources:
+            if not store.has(key := self._key(source)):
+                _, rendered = self._instants(source)
+                features = towers.features(*self._decoded(source, sorted({*rendered})))
+                store.write(key, dict(zip(_SYSTEMS, features, strict=True)))
+        return found
+
+    def _instants(self, source: _Source) -> tuple[list[int], list[int]]:
+        """The rows of the demonstration that are read; and the rendered row of each of these and of every own row.
+
+        Raises ValueError if one of the demonstration's was not rendered.
+        """
         entry, rows = source.entry, source.rows()
         start = entry.num_demonstration_rows
         sampling = DemoSampling(hz=self._demo_hz, to_its_end=start > 0 and bool(rows.is_rendered[start - 1]))
@@ -291,7 +314,14 @@ class TrainingSet:
                 f"collect with --demonstration-hz {self._demo_hz}"
             )
         rendered = np.maximum.accumulate(np.where(rows.is_rendered, np.arange(len(rows.is_rendered)), 0))
-        views, images = self._pictures(source, rendered[[*demo, *range(start, entry.num_rows)]].tolist())
+        return demo, rendered[[*demo, *range(start, entry.num_rows)]].tolist()
+
+    def _read(self, number: int) -> TrainingEpisode:
+        source = self._sources[number]
+        entry, rows = source.entry, source.rows()
+        start = entry.num_demonstration_rows
+        demo, rendered = self._instants(source)
+        views, images = self._pictures(source, rendered)
         history, num_demo_history = self._history(source, views, len(demo))
         episode = TrainingEpisode(
             instruction=entry.instruction,
@@ -307,7 +337,8 @@ class TrainingSet:
             history=history,
             num_demo_history=num_demo_history,
         )
-        return episode if self._sizes.form is None else episode.as_seen((rendered[start:] - start).clip(min=0))
+        seen_at = (np.array(rendered[len(demo) :]) - start).clip(min=0)
+        return episode if self._sizes.form is None else episode.as_seen(seen_at)
 
     def _history(self, source: _Source, views: Views, num_demo: int) -> tuple[tuple[Frame, ...], int]:
         """The front pictures on the grid of POUNCE's frame memory, and how many are the demonstration's.
@@ -342,15 +373,27 @@ class TrainingSet:
         return [views[row] for row in rows], [images[row] for row in rows]
 
     def _decoded(self, source: _Source, rows: Sequence[int]) -> tuple[Views, ...]:
-        """`_pictures` of distinct rows, from the store if it has them."""
-        key = source.key + (f" {self._demo_hz}".encode() if self._demo_hz != 1 else b"")
+        """`_pictures` of distinct rows, from the store if it has them.
+
+        Raises OSError if they are features and the store lacks them, because the disk is full or a file is damaged.
+        """
+        key = self._key(source)
         if self._store is not None and (kept := self._store.read(key, len(rows), _SYSTEMS)) is not None:
             return kept
+        if self._is_embedded:
+            raise OSError(
+                f"{self._folder}: no features of {source.entry.task} {source.entry.seed}, or a damaged file; "
+                "make room there, and start again"
+            )
         whole = list(source.frames(rows))
-        views, images = [self._sizes.of_pounce(each) for each in whole], [self._sizes.of_ponder(each) for each in whole]
+        views: Views = [self._sizes.of_pounce(each) for each in whole]
+        images: Views = [self._sizes.of_ponder(each) for each in whole]
         if self._store is not None:
             self._store.write(key, dict(zip(_SYSTEMS, (views, images), strict=True)))
         return views, images
+
+    def _key(self, source: _Source) -> bytes:
+        return source.key + (f" {self._demo_hz}".encode() if self._demo_hz != 1 else b"")
 
     def statistics(self, horizon: int, space: ActionSpace = "joint_delta", *, by_row: bool = False) -> RobotStatistics:
         """Quantiles of the network's states and actions in an `action_space`.

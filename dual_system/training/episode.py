@@ -10,7 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-Frame = NDArray[np.uint8]  # (height, width, 3) RGB
+Picture = NDArray[np.uint8]  # (height, width, 3) RGB
+Frame = NDArray[np.uint8 | np.float16]
+"""A picture, or the tokens (S, W) that a frozen tower makes of it (`frozen_towers`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -48,7 +48,8 @@ class Example:
     rows: tuple[Row, ...]
     """One of the whole episode; for a PONDER without memory one of every query."""
     images: Tensor | None
-    """PONDER's images in the order of the rows, (N, height, width, 3) uint8; None if PONDER is not run."""
+    """PONDER's images in the order of the rows, (N, height, width, 3) uint8, or (N, S, H) float16 from a frozen tower;
+    None if PONDER is not run."""
     schedule: SampledSchedule
     invocations: tuple[SampledInvocation, ...]
     """The invocations drawn from the schedule."""
@@ -157,7 +158,7 @@ def subgoals_by_query(episode: TrainingEpisode, form: ContextFormat, schedule: S
 
 
 def row_images(episode: TrainingEpisode, schedule: SampledSchedule) -> Tensor | None:
-    """All images of the row: the demonstration's, then every query's; (N, height, width, 3) uint8."""
+    """All images of the row, as in `Example.images`: the demonstration's, then every query's."""
     instants = [*episode.demo, *(episode.images[query.tick] for query in schedule.queries)]
     pictures = [picture for images in instants for picture in images]
     return torch.from_numpy(np.stack(pictures)) if pictures else None

@@ -51,7 +51,8 @@ class PonderBatch:
     rows: tuple[Row, ...] = ()
     """() if PONDER is not run. Episode by episode; a PONDER without memory has a row for every query, in order."""
     frames: tuple[Tensor | None, ...] = ()
-    """Per row, (num_images, height, width, 3) uint8 in the order of its image positions; None without images."""
+    """Per row, (num_images, height, width, 3) uint8 in the order of its image positions, or their vision tokens
+    (num_images, S, H) in half precision; None without images."""
     rows_per_episode: tuple[int, ...] = ()
     """Number of rows of each episode; () for one row each."""
 
@@ -342,8 +343,15 @@ def embed_rows(ponder: Ponder, episodes: PonderBatch) -> list[Tensor]:
     """Input embeddings (T, H) of each row."""
     frames = [each for each in episodes.frames if each is not None]
     ids = np.concatenate([row.ids for row in episodes.rows])
-    embeds = ponder.embed(ids, torch.cat(frames) if frames else None)
+    images = torch.cat(frames) if frames else None
+    look = _as_stored if images is not None and images.is_floating_point() else None
+    embeds = ponder.embed(ids, images, look)
     return list(embeds.split([len(row.ids) for row in episodes.rows]))
+
+
+def _as_stored(tokens_NSH: Tensor) -> Tensor:
+    """Vision tokens (N S, H) that were computed before (`frozen_towers`)."""
+    return tokens_NSH.flatten(0, 1)
 
 
 def _read(

@@ -1,4 +1,4 @@
-"""Decoded pictures on disk, at the networks' sizes: videos are decoded once, not once per process and run.
+"""Decoded pictures on disk, at the networks' sizes, or what frozen towers make of them: once, not per process and run.
 
 There is one file per episode. A process writes a missing file; several may do so at once with the same bytes.
 """
@@ -41,8 +41,12 @@ class PictureStore:
         found = tuple(_instants(arrays, name, num_instants) for name in names)
         return found if all(len(views) == num_instants for views in found) else None
 
+    def has(self, episode: bytes) -> bool:
+        """Whether there is a file of this episode."""
+        return (self._folder / f"{_name(episode)}.npz").exists()
+
     def write(self, episode: bytes, views: dict[str, Views]) -> None:
-        """Stores pictures (height, width, 3) uint8. Does nothing if the disk is full: training goes on without."""
+        """Stores pictures, or features of one shape. Does nothing if the disk is full: training goes on without."""
         path = self._folder / f"{_name(episode)}.npz"
         partial = path.with_suffix(f".{uuid.uuid4().hex}")  # unique among processes and hosts
         try:
@@ -57,8 +61,8 @@ def _name(key: bytes) -> str:
     return hashlib.blake2b(key, digest_size=12).hexdigest()
 
 
-def _arrays(views: dict[str, Views]) -> dict[str, NDArray[np.uint8]]:
-    """``name/number``: (instants, height, width, 3) of each view, for the last instants, those that have it."""
+def _arrays(views: dict[str, Views]) -> dict[str, NDArray[np.uint8 | np.float16]]:
+    """``name/number``: (instants, *picture) of each view, for the last instants, those that have it."""
     return {
         f"{name}/{number}": np.stack([pictures[number] for pictures in instants if number < len(pictures)])
         for name, instants in views.items()
@@ -66,7 +70,7 @@ def _arrays(views: dict[str, Views]) -> dict[str, NDArray[np.uint8]]:
     }
 
 
-def _instants(arrays: dict[str, NDArray[np.uint8]], name: str, num_instants: int) -> Views:
+def _instants(arrays: dict[str, NDArray[np.uint8 | np.float16]], name: str, num_instants: int) -> Views:
     mine = [array for key, array in arrays.items() if key.rpartition("/")[0] == name]
     if not mine:
         return [()] * num_instants

@@ -34,6 +34,7 @@ from dual_system.training.build import Start, build, export
 from dual_system.training.collate import collate_ponder, collate_pounce
 from dual_system.training.data import PictureSizes, TrainingSet
 from dual_system.training.example import make_example
+from dual_system.training.frozen_towers import FrozenTowers
 from dual_system.training.joint import JointModel, PonderBatch, PounceBatch
 from dual_system.training.memory import memory_of, require_room, sentence
 from dual_system.training.parallel import World, gather, joined, require_alike, shard
@@ -89,6 +90,8 @@ class MachineOptions:
     """Processes that prepare batches ahead; 0 prepares them in the training process."""
     cache_mb: int = 6000
     """Memory for decoded pictures [MB], at the sizes that the networks read."""
+    frozen_features: bool = False
+    """Store what frozen vision towers make of the pictures beside them in --picture-store, once, and train on that."""
     picture_store: Path | None = None
     """Folder for decoded pictures at those sizes: other processes and runs then need not decode videos."""
 
@@ -240,6 +243,8 @@ def train(options: TrainOptions) -> None:
             store=machine.picture_store,
             demo_hz=run.demo_hz,
         )
+        if machine.frozen_features:
+            data = data.embedded(FrozenTowers(model))
         with files.writing(options.out):
             _update(run, model, Batches(data, run, model, bundle, world), data.hash, options, world)
             _write(run, model, bundle, data, options, world)

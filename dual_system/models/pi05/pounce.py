@@ -44,9 +44,13 @@ class PounceInputs:
     state: Tensor | None = None
     """(B, S) float32, normalised; required if the config's ``state_input`` is "token"."""
     past: Tensor | None = None
-    """(B, F, 3, px, px) uint8: front pictures of the past for ``frame_memory``; None: none for any sample."""
+    """(B, F, 3, px, px) uint8: front pictures of the past for ``frame_memory``; or (B, F, S, W) as the vision tower
+    and its projector embed them; None: none for any sample."""
     past_step: Tensor | None = None
     """(B, F) int64: the step of each (`PastFrame`), or `NO_FRAME` for an empty slot."""
+    seen: Tensor | None = None
+    """(B, S, W): the images as the vision tower and its projector embed them, if training has stored that; then
+    ``images`` is not read."""
 
     def forgetting(self, is_null_B: Tensor) -> "PounceInputs":
         """Inputs whose marked samples have no past pictures: the memory's learned null."""
@@ -225,7 +229,7 @@ class Pounce(nn.Module):
             state_B1W=state_B1W,
             is_isolated=self.config.cognition.attention == "isolated",
             is_cognition_last=self.config.cognition.place == "after_text",
-            seen_BSW=seen_BSW,
+            seen_BSW=inputs.seen if seen_BSW is None else seen_BSW,
         )
 
     def prefill(self, inputs: PounceInputs) -> PrefixCache:
@@ -245,8 +249,10 @@ class Pounce(nn.Module):
         is_frame_BF = inputs.past_step != NO_FRAME
         if is_frame_BF.any():
             with torch.no_grad():
-                pictures_M13PP = inputs.past[is_frame_BF][:, None].float() / 127.5 - 1.0
-                features_BFCW[is_frame_BF] = pooled(self.pi05.embed_images(pictures_M13PP), memory.pooled_side)
+                past_M = inputs.past[is_frame_BF]
+                if not past_M.is_floating_point():
+                    past_M = self.pi05.embed_images(past_M[:, None].float() / 127.5 - 1.0)
+                features_BFCW[is_frame_BF] = pooled(past_M, memory.pooled_side)
         return features_BFCW, inputs.past_step
 
     def loss(
