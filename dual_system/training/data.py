@@ -293,34 +293,16 @@ class TrainingSet:
         found._store = store = PictureStore(self._folder, f"{self._sizes.key} {towers.key}")
         for source in self._sources:
             if not store.has(key := self._key(source)):
-                _, rendered = self._instants(source)
+                _, rendered = _instants(source, self._demo_hz)
                 features = towers.features(*self._decoded(source, sorted({*rendered})))
                 store.write(key, dict(zip(_SYSTEMS, features, strict=True)))
         return found
-
-    def _instants(self, source: _Source) -> tuple[list[int], list[int]]:
-        """The rows of the demonstration that are read; and the rendered row of each of these and of every own row.
-
-        Raises ValueError if one of the demonstration's was not rendered.
-        """
-        entry, rows = source.entry, source.rows()
-        start = entry.num_demonstration_rows
-        sampling = DemoSampling(hz=self._demo_hz, to_its_end=start > 0 and bool(rows.is_rendered[start - 1]))
-        demo = sampling.indices(start, FPS)
-        if blank := [row for row in demo if not rows.is_rendered[row]]:
-            raise ValueError(
-                f"{source.dataset.root}: the demonstration of {entry.task} {entry.seed} is to be sampled "
-                f"{self._demo_hz} times a second, and {len(blank)} of these {len(demo)} pictures were not rendered; "
-                f"collect with --demonstration-hz {self._demo_hz}"
-            )
-        rendered = np.maximum.accumulate(np.where(rows.is_rendered, np.arange(len(rows.is_rendered)), 0))
-        return demo, rendered[[*demo, *range(start, entry.num_rows)]].tolist()
 
     def _read(self, number: int) -> TrainingEpisode:
         source = self._sources[number]
         entry, rows = source.entry, source.rows()
         start = entry.num_demonstration_rows
-        demo, rendered = self._instants(source)
+        demo, rendered = _instants(source, self._demo_hz)
         views, images = self._pictures(source, rendered)
         history, num_demo_history = self._history(source, views, len(demo))
         episode = TrainingEpisode(
@@ -404,25 +386,49 @@ class TrainingSet:
         Raises:
             ValueError: the space is another robot's.
         """
-        _, num_actions = self.robot.dims_in(space)
-        states, actions = [], []
-        for source in self._sources:
-            rows = source.rows()
-            own = ~rows.is_demonstration
-            state, action, begin = rows.state[own], rows.action[own], source.entry.corrected_from
-            ticks = chunk_ticks(np.arange(begin, len(action)), horizon, len(action))
-            state = state[begin:]
-            states.append(states_in(space, state).astype(np.float32))
-            actions.append(actions_in(space, action, state, ticks).astype(np.float32))
-        actions_MND = np.concatenate(actions)
-        reach_N = _reach(actions_MND[..., :-1]) if by_row else np.ones(horizon)
-        actions_MND[..., :-1] /= reach_N[:, None]
-        return RobotStatistics(
-            state=_quantiles(np.concatenate(states), may_be_rare=space == "native"),
-            action=_quantiles(actions_MND.reshape(-1, num_actions), may_be_rare=space == "native"),
-            space=space,
-            reach=tuple(reach_N.tolist()) if by_row else (),
+        return _statistics(self._sources, self.robot.dims_in(space)[1], horizon, space, by_row=by_row)
+
+
+def _instants(source: _Source, demo_hz: int) -> tuple[list[int], list[int]]:
+    """The rows of the demonstration that are read; and the rendered row of each of these and of every own row.
+
+    Raises ValueError if one of the demonstration's was not rendered.
+    """
+    entry, rows = source.entry, source.rows()
+    start = entry.num_demonstration_rows
+    sampling = DemoSampling(hz=demo_hz, to_its_end=start > 0 and bool(rows.is_rendered[start - 1]))
+    demo = sampling.indices(start, FPS)
+    if blank := [row for row in demo if not rows.is_rendered[row]]:
+        raise ValueError(
+            f"{source.dataset.root}: the demonstration of {entry.task} {entry.seed} is to be sampled "
+            f"{demo_hz} times a second, and {len(blank)} of these {len(demo)} pictures were not rendered; "
+            f"collect with --demonstration-hz {demo_hz}"
         )
+    rendered = np.maximum.accumulate(np.where(rows.is_rendered, np.arange(len(rows.is_rendered)), 0))
+    return demo, rendered[[*demo, *range(start, entry.num_rows)]].tolist()
+
+
+def _statistics(
+    sources: Sequence[_Source], num_actions: int, horizon: int, space: ActionSpace, *, by_row: bool
+) -> RobotStatistics:
+    states, actions = [], []
+    for source in sources:
+        rows = source.rows()
+        own = ~rows.is_demonstration
+        state, action, begin = rows.state[own], rows.action[own], source.entry.corrected_from
+        ticks = chunk_ticks(np.arange(begin, len(action)), horizon, len(action))
+        state = state[begin:]
+        states.append(states_in(space, state).astype(np.float32))
+        actions.append(actions_in(space, action, state, ticks).astype(np.float32))
+    actions_MND = np.concatenate(actions)
+    reach_N = _reach(actions_MND[..., :-1]) if by_row else np.ones(horizon)
+    actions_MND[..., :-1] /= reach_N[:, None]
+    return RobotStatistics(
+        state=_quantiles(np.concatenate(states), may_be_rare=space == "native"),
+        action=_quantiles(actions_MND.reshape(-1, num_actions), may_be_rare=space == "native"),
+        space=space,
+        reach=tuple(reach_N.tolist()) if by_row else (),
+    )
 
 
 def _sources(dataset: Dataset, tasks: Sequence[str]) -> list[_Source]:
