@@ -145,17 +145,26 @@ def _delta(
     state = tl.load(state_ptr + in_slots)
     speed_of_head = -tl.exp(tl.load(a_log_ptr + head).to(tl.float32))
     bias = tl.load(dt_bias_ptr + head).to(tl.float32)
+    CHANNELS: tl.constexpr = 2 * KEY_HEADS * KEY_DIM + HEADS * VALUE_DIM
+    q_ptr = mixed_ptr + row * length * CHANNELS + key_head * KEY_DIM + d
+    k_ptr = q_ptr + KEY_HEADS * KEY_DIM
+    v_ptr = mixed_ptr + row * length * CHANNELS + 2 * KEY_HEADS * KEY_DIM + head * VALUE_DIM + e
+    speed_ptr = speed_beta_ptr + row * length * 2 * HEADS + head
+    # A token's numbers are on their way while the one before is summed: few programs wait for memory, one by one.
+    next_q, next_k, next_v = tl.load(q_ptr), tl.load(k_ptr), tl.load(v_ptr)
+    next_speed, next_beta = tl.load(speed_ptr), tl.load(speed_ptr + HEADS)
     for token in range(num_new):
         at = row * length + token
-        mixed_at = mixed_ptr + at * (2 * KEY_HEADS * KEY_DIM + HEADS * VALUE_DIM)
-        q = tl.load(mixed_at + key_head * KEY_DIM + d).to(tl.float32)
-        k = tl.load(mixed_at + (KEY_HEADS + key_head) * KEY_DIM + d).to(tl.float32)
-        v = tl.load(mixed_at + 2 * KEY_HEADS * KEY_DIM + head * VALUE_DIM + e).to(tl.float32)
+        q, k, v = next_q.to(tl.float32), next_k.to(tl.float32), next_v.to(tl.float32)
+        speed, beta = next_speed.to(tl.float32) + bias, tl.sigmoid(next_beta.to(tl.float32))
+        following = tl.minimum(token + 1, num_new - 1)
+        next_q, next_k = tl.load(q_ptr + following * CHANNELS), tl.load(k_ptr + following * CHANNELS)
+        next_v = tl.load(v_ptr + following * CHANNELS)
+        next_speed = tl.load(speed_ptr + following * 2 * HEADS)
+        next_beta = tl.load(speed_ptr + following * 2 * HEADS + HEADS)
         q = q * (tl.rsqrt(tl.sum(q * q, axis=0) + 1e-6) * SCALE)
         k = k * tl.rsqrt(tl.sum(k * k, axis=0) + 1e-6)
-        speed = tl.load(speed_beta_ptr + at * 2 * HEADS + head).to(tl.float32) + bias
         softplus = tl.where(speed > 20.0, speed, tl.log(1.0 + tl.exp(tl.minimum(speed, 20.0))))
-        beta = tl.sigmoid(tl.load(speed_beta_ptr + at * 2 * HEADS + HEADS + head).to(tl.float32))
         beta = beta.to(read_ptr.dtype.element_ty).to(tl.float32)  # as torch rounds it
         state = state * tl.exp(speed_of_head * softplus)
         written = (v - tl.sum(state * k[:, None], axis=0)) * beta
