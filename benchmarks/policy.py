@@ -2,9 +2,9 @@
 
     python -m benchmarks.policy --folder POLICY_DIR --minutes 150
 
-A stage is a set of commands that run side by side, each of which resumes by itself; when all have ended well, it is
-marked as done. Stages are run in their order until the slice is over. What each has cost is added to ``hours.jsonl``,
-of which a table is printed at the end.
+A stage is a set of commands that run side by side, one a core, each of which resumes by itself. One that has ended well
+is marked as done, and so is a stage without another. Stages are run in their order until the slice is over. What each
+has cost is added to ``hours.jsonl``, of which a table is printed at the end.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -57,8 +58,9 @@ def main(argv: list[str] | None = None) -> int:
     return code
 
 
-def _mark(stage: Stage, folder: Path) -> Path:
-    return folder / "done" / stage.name.replace(" ", "_")
+def _mark(stage: Stage, folder: Path, number: int | None = None) -> Path:
+    """The file that says that a stage is done, or the command of this number."""
+    return folder / "done" / (stage.name.replace(" ", "_") + ("" if number is None else f".{number}"))
 
 
 def _run(stage: Stage, folder: Path, ends_s: float) -> int:
@@ -68,20 +70,30 @@ def _run(stage: Stage, folder: Path, ends_s: float) -> int:
     sys.stdout.write(f"--- {stage.name}\n")
     sys.stdout.flush()
     before, began_s = _core_s(), time.monotonic()
-    processes = [
-        subprocess.Popen([sys.executable, "-m", *each], env=os.environ | {"OMP_NUM_THREADS": "1"})
-        for each in stage.commands
-    ]
-    try:
-        codes = [_ended(process, ends_s) for process in processes]
-    finally:
-        for process in processes:
-            process.kill()
+    _mark(stage, folder).parent.mkdir(exist_ok=True)
+    left = [number for number in range(len(stage.commands)) if not _mark(stage, folder, number).exists()]
+    processes: list[subprocess.Popen[bytes]] = []
+
+    def ended(number: int) -> int:
+        if time.monotonic() >= ends_s:
+            return UNFINISHED
+        command = [sys.executable, "-m", *stage.commands[number]]
+        processes.append(process := subprocess.Popen(command, env=os.environ | {"OMP_NUM_THREADS": "1"}))
+        if not (code := _ended(process, ends_s)):
+            _mark(stage, folder, number).touch()
+        return code
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        try:
+            codes = list(pool.map(ended, left))
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in processes:
+                process.kill()
     entry = {"stage": stage.name, "wall_s": time.monotonic() - began_s, "core_s": _core_s() - before}
     with (folder / "hours.jsonl").open("a") as file:
         file.write(json.dumps(entry) + "\n")
     if not any(codes):
-        _mark(stage, folder).parent.mkdir(exist_ok=True)
         _mark(stage, folder).touch()
         return DONE
     if time.monotonic() >= ends_s:

@@ -93,6 +93,7 @@ def stages(folder: Path) -> tuple[Stage, ...]:
             commands=(
                 (*training, *data, *_run(recipes.laptop_hand.__name__, towers, towers, hand)),
                 (*training, *data, *_run(recipes.laptop_grounding.__name__, towers, towers, words)),
+                (*training, *data, *_run(recipes.laptop_current_grounding.__name__, towers, towers, current_words)),
             ),
         ),
         Stage(name="plays", commands=(playing,)),
@@ -106,7 +107,6 @@ def stages(folder: Path) -> tuple[Stage, ...]:
                     f"{corrections}",
                     *_run(recipes.laptop_hand_corrected.__name__, towers, hand, corrected),
                 ),
-                (*training, *data, *_run(recipes.laptop_current_grounding.__name__, towers, towers, current_words)),
             ),
         ),
         Stage(name="pairs", commands=tuple(_pairs(folder, task) for task in TASKS)),

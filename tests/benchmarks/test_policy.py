@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 import inspect
 import json
+import os
+import subprocess
 import textwrap
 from pathlib import Path
 from typing import Any
@@ -138,6 +140,43 @@ def test_a_slice_that_is_over_is_gone_on_with(programs: Path, monkeypatch: pytes
     assert policy.main(["--folder", str(programs)]) == DONE
     assert counted(programs) == reached + 1
     assert len(entries(programs)) == slices + 1
+
+
+def test_a_command_that_ended_is_not_run_again_beside_one_that_did_not(
+    programs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A finished training refuses to be started again: the stage would fail for ever."""
+    short, long = programs / "short.txt", programs / "0.txt"
+
+    def planned(count: int) -> None:
+        commands = (("counting", f"{short}", "1"), ("counting", f"{long}", f"{count}"))
+        monkeypatch.setattr(policy, "stages", lambda _: (Stage(name="two", commands=commands),))
+
+    planned(1_000_000)
+    while not (programs / "done" / "two.0").exists():
+        assert policy.main(["--folder", str(programs), "--minutes", "0.02"]) == UNFINISHED
+    short.write_text("not a number: a second run would fail")
+    planned(counted(programs) + 1)
+    assert policy.main(["--folder", str(programs)]) == DONE
+
+
+def test_no_more_commands_run_at_once_than_there_are_cores(programs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: 1)
+    most, opened = 0, subprocess.Popen
+    running: set[Any] = set()
+
+    def counting(*arguments: Any, **options: Any) -> Any:
+        nonlocal most
+        running.difference_update([each for each in running if each.poll() is not None])
+        running.add(process := opened(*arguments, **options))
+        most = max(most, len(running))
+        return process
+
+    monkeypatch.setattr(subprocess, "Popen", counting)
+    commands = tuple(("counting", f"{programs / f'{number}.txt'}", "2") for number in range(3))
+    monkeypatch.setattr(policy, "stages", lambda _: (Stage(name="three", commands=commands),))
+    assert policy.main(["--folder", str(programs)]) == DONE
+    assert most == 1
 
 
 def test_a_command_that_fails_ends_the_slice(
