@@ -18,16 +18,19 @@ help:
 ## make setup   create .venv and install the pinned packages (the others call it when needed)
 setup: $(READY)
 
+# Byte code is written for what is imported, when it is: of everything it takes as long as the downloads.
+INSTALL := $(BIN)/pip install --quiet --no-compile
+
 $(READY): requirements.txt pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed; set PYTHON=python3.11"; exit 1; }
 	@$(PYTHON) -c 'import venv, ensurepip' || { echo "The venv module is missing: apt-get install python3-venv"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet "$(TORCH)"           # first and alone: a range elsewhere would fetch gigabytes of CUDA
-	$(BIN)/pip install --quiet -r requirements.txt
-	$(BIN)/pip install --quiet --no-deps robosuite==1.5.2 openpi-client==0.1.2  # their own pins contradict numpy 2
+	$(INSTALL) "$(TORCH)"           # first and alone: a range elsewhere would fetch gigabytes of CUDA
+	$(INSTALL) -r requirements.txt
+	$(INSTALL) --no-deps robosuite==1.5.2 openpi-client==0.1.2  # their own pins contradict numpy 2
 	# A CUDA build of torch brings its own Triton, and elsewhere than on Linux there is none.
-	$(BIN)/python -c 'import triton' 2>/dev/null || test "$$(uname)" != Linux || $(BIN)/pip install --quiet triton==3.6.0
-	$(BIN)/pip install --quiet --no-deps --no-build-isolation --editable .
+	$(BIN)/python -c 'import triton' 2>/dev/null || test "$$(uname)" != Linux || $(INSTALL) triton==3.6.0
+	$(INSTALL) --no-deps --no-build-isolation --editable .
 	touch $@
 
 ## make demo    a trained pair drives a Panda through PickHighlight, with memory and without; everything is in out/demo
