@@ -4,14 +4,14 @@
 
 A stage is a set of commands that run side by side, one a core, each of which resumes by itself. One that has ended well
 is marked as done, and so is a stage without another. Stages are run in their order until the slice is over. What each
-has cost is added to ``hours.jsonl``, of which a table is printed at the end.
+has cost, and each of its commands, is added to ``hours.jsonl``, of which a table is printed at the end.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
-import resource
 import subprocess
 import sys
 import time
@@ -23,12 +23,14 @@ from pathlib import Path
 from benchmarks.policy_gates import gates
 from benchmarks.policy_losses import losses
 from benchmarks.policy_plan import Stage, stages, trained
+from benchmarks.policy_table import table
 from benchmarks.policy_weights import require_committed
 from dual_system.analysis.markdown import markdown
 from protocol.command_line import command, parse
 
 _ENDING_S = 120.0
 """What a command is given to save its state when a slice ends."""
+_LOOK_S = 0.1
 DONE, UNFINISHED, FAILED = 0, 3, 1
 
 
@@ -54,7 +56,7 @@ def main(argv: list[str] | None = None) -> int:
             if stage.is_test:
                 require_committed(trained(folder), folder)
             code = _run(stage, folder, ends_s)
-    sys.stdout.write(gates(folder / "gates") + losses(folder / "rows") + account(folder))
+    sys.stdout.write(gates(folder / "gates") + losses(folder / "rows") + table(folder) + account(folder))
     return code
 
 
@@ -69,17 +71,19 @@ def _run(stage: Stage, folder: Path, ends_s: float) -> int:
         return UNFINISHED
     sys.stdout.write(f"--- {stage.name}\n")
     sys.stdout.flush()
-    before, began_s = _core_s(), time.monotonic()
+    began_s = time.monotonic()
     _mark(stage, folder).parent.mkdir(exist_ok=True)
     left = [number for number in range(len(stage.commands)) if not _mark(stage, folder, number).exists()]
     processes: list[subprocess.Popen[bytes]] = []
+    core_s: dict[int, float] = {}
 
     def ended(number: int) -> int:
         if time.monotonic() >= ends_s:
             return UNFINISHED
         command = [sys.executable, "-m", *stage.commands[number]]
         processes.append(process := subprocess.Popen(command, env=os.environ | {"OMP_NUM_THREADS": "1"}))
-        if not (code := _ended(process, ends_s)):
+        code, core_s[number] = _ended(process, ends_s)
+        if not code:
             _mark(stage, folder, number).touch()
         return code
 
@@ -90,7 +94,8 @@ def _run(stage: Stage, folder: Path, ends_s: float) -> int:
             pool.shutdown(wait=False, cancel_futures=True)
             for process in processes:
                 process.kill()
-    entry = {"stage": stage.name, "wall_s": time.monotonic() - began_s, "core_s": _core_s() - before}
+    entry = {"stage": stage.name, "wall_s": time.monotonic() - began_s, "core_s": sum(core_s.values())}
+    entry |= {"core_s_by_command": core_s}
     with (folder / "hours.jsonl").open("a") as file:
         file.write(json.dumps(entry) + "\n")
     if not any(codes):
@@ -102,22 +107,22 @@ def _run(stage: Stage, folder: Path, ends_s: float) -> int:
     return FAILED
 
 
-def _ended(process: subprocess.Popen[bytes], ends_s: float) -> int:
-    """Waits for a command; at the end of the slice it is told to (by SIGTERM: nohup shields from Ctrl-C) and saves."""
-    try:
-        return process.wait(max(0.0, ends_s - time.monotonic()))
-    except subprocess.TimeoutExpired:
-        process.terminate()
-    try:
-        return process.wait(_ENDING_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        return process.wait()
+def _ended(process: subprocess.Popen[bytes], ends_s: float) -> tuple[int, float]:
+    """A command's exit code and processor time [s], its children's included.
 
-
-def _core_s() -> float:
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
+    At the end of the slice it is told to end (by SIGTERM: nohup shields from Ctrl-C) and saves.
+    """
+    for until_s, end in ((ends_s, process.terminate), (ends_s + _ENDING_S, process.kill), (math.inf, process.kill)):
+        while True:
+            pid, status, used = os.wait4(process.pid, os.WNOHANG)
+            if pid:
+                process.returncode = os.waitstatus_to_exitcode(status)
+                return process.returncode, used.ru_utime + used.ru_stime
+            if time.monotonic() >= until_s:
+                break
+            time.sleep(_LOOK_S)
+        end()
+    raise AssertionError("a killed process ends")
 
 
 def account(folder: Path) -> str:
