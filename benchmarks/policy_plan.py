@@ -41,9 +41,10 @@ ROWS = (
     (recipes.laptop, 1),
     (recipes.laptop_without_grounding, 0),
     (recipes.laptop_framesamp, 1),
-    (recipes.laptop_current, 0),
+    (recipes.laptop_framesamp_grounded, 0),
     (recipes.laptop_observation, 1),
     (recipes.laptop_window, 0),
+    (recipes.laptop_current, 0),
 )
 """The rows of the table that are trained: recipe and seed, two that cost alike at a time, one on each core."""
 RETOLD = ("VideoUnmask", "PickHighlight", "MoveCube")
@@ -179,6 +180,7 @@ def _tests(folder: Path) -> Iterator[tuple[tuple[str, ...], ...]]:
         "laptop_text_grounded": ("laptop_text", "--subgoal-text", "grounded"),
         "laptop_text_simple": ("laptop_text", "--subgoal-text", "simple"),
         "laptop_text_predicted": ("laptop_text", *words),
+        "laptop_framesamp_grounded_0": ("laptop_framesamp_grounded",),
         "laptop_window_0": ("laptop_window",),
         "laptop_without_grounding_0": ("laptop_without_grounding",),
     }
@@ -202,8 +204,6 @@ def _test(
     row = _folder(folder, recipe, seed)
     has_ponder = recipe in (each.__name__ for each in WITH_PONDER)
     models = ("--ponder-checkpoint", f"{row / 'ponder'}") if has_ponder else ()
-    if not has_ponder and not {"--subgoal-text", "--ponder-checkpoint"} & set(given):
-        models = ("--cognition", "null")  # no PONDER: one with random weights would ask for demonstrations of its own
     played = ("--tasks", *tasks, "--episodes", f"{scenes}", "--runs", "1", "--split", "test", "--max-steps", "700")
     models += ("--pounce-checkpoint", f"{row / 'pounce'}")
     return "sim_client.evaluate", "--out", f"{folder / 'test' / name}", *played, *models, *given

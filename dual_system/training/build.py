@@ -34,6 +34,7 @@ from dual_system.models.pounce.initialise import open_gates, random_pounce
 from dual_system.models.pounce.precision import cast_streams
 from dual_system.training.data import RobotShape, TrainingSet
 from dual_system.training.joint import JointModel, Trains, runs_ponder
+from dual_system.training.memory_words import MemoryWords
 from dual_system.training.recipe import Recipe
 from protocol import disk
 
@@ -68,7 +69,7 @@ def build(run: Recipe, data: TrainingSet, start: Start) -> tuple[JointModel, Pou
         raise ValueError(
             f"recipe {run.name} starts from pretrained weights; give their folders with --ponder, --pounce"
         )
-    if run.trains != "pounce" and run.example.is_grounded:
+    if (run.trains != "pounce" and run.example.is_grounded) or run.grounds_memory:
         data.require_texts()
     ponder = _ponder(run, data, start)
     bundle = _pounce(run, data, start, ponder)
@@ -80,7 +81,11 @@ def build(run: Recipe, data: TrainingSet, start: Start) -> tuple[JointModel, Pou
     freeze(pounce, run.freeze)
     if run.freezes_ponder_vision:
         ponder.qwen.model.visual.requires_grad_(False)
-    return JointModel(ponder, pounce, w1=run.w1, w2=run.w2, trains=run.trains), bundle
+    words = None
+    if run.grounds_memory and isinstance(pounce.config, PounceConfig):
+        words = MemoryWords.random(ponder.format.vocabulary.num_tokens, pounce.config.pi05.expert.width, run.train.seed)
+        words = words.to(start.device)
+    return JointModel(ponder, pounce, w1=run.w1, w2=run.w2, trains=run.trains, memory_words=words), bundle
 
 
 def _ponder(run: Recipe, data: TrainingSet, start: Start) -> Ponder:

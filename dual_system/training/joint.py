@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from itertools import accumulate
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -28,10 +28,11 @@ from torch.nn.utils.rnn import pad_sequence
 
 from dual_system.models.groot.pounce import GrootInputs
 from dual_system.models.pi05.committed import draw_counts
-from dual_system.models.pi05.pounce import PounceInputs
+from dual_system.models.pi05.pounce import Pounce, PounceInputs
 from dual_system.models.ponder.context import Row
 from dual_system.models.ponder.network import Ponder
 from dual_system.models.pounce.family import AnyPounce, action_loss
+from dual_system.training.memory_words import MemoryWords, num_wanted
 from dual_system.training.own_text import Read, with_own_texts
 
 Trains = Literal["both", "ponder", "pounce"]
@@ -110,6 +111,8 @@ class PounceBatch:
     """int64: index of the episode in the PonderBatch."""
     query_I: Tensor
     """int64: query index in that episode, or NO_QUERY."""
+    words_IL: Tensor | None = None
+    """int64: the texts that a frame memory is taught (`memory_words`); None: it is taught none."""
 
     @property
     def num_episodes(self) -> int:
@@ -139,6 +142,7 @@ class PounceBatch:
             actions_INA=change(self.actions_INA),
             episode_I=change(self.episode_I),
             query_I=change(self.query_I),
+            words_IL=None if self.words_IL is None else change(self.words_IL),
         )
 
 
@@ -230,8 +234,10 @@ class JointModel(nn.Module):
         trains: Trains = "both",
         reads_together: bool = True,
         num_groups: int = 1,
+        memory_words: MemoryWords | None = None,
     ) -> None:
-        """``reads_together`` and ``num_groups`` are `encode_rows`'s ``together`` and ``num_groups``.
+        """``reads_together`` and ``num_groups`` are `encode_rows`'s ``together`` and ``num_groups``; ``memory_words``
+        grounds POUNCE's frame memory.
 
         Raises ValueError if POUNCE was built for another (K, H) than PONDER's.
         """
@@ -245,6 +251,7 @@ class JointModel(nn.Module):
         self.w1, self.w2 = w1, w2
         self.trains = trains
         self.reads_together, self.num_groups = reads_together, num_groups
+        self.memory_words = memory_words
         for name, system in (("ponder", ponder), ("pounce", pounce)):
             if trains not in ("both", name):
                 system.requires_grad_(False)
@@ -257,9 +264,12 @@ class JointModel(nn.Module):
     def counts(self, episodes: PonderBatch, invocations: PounceBatch, draws: Draws) -> Counts:
         """What `forward`'s losses will be means over."""
         is_grounded, acts = self.trains != "pounce" and self.w2 != 0, self.trains != "ponder"
+        num_supervised = sum(len(row.supervised_index) for row in episodes.rows) if is_grounded else 0
+        if self.memory_words is not None and invocations.words_IL is not None:
+            num_supervised += num_wanted(invocations.words_IL)
         return Counts(
             num_rows=draws.num_counted_rows if acts else 0,
-            num_supervised=sum(len(row.supervised_index) for row in episodes.rows) if is_grounded else 0,
+            num_supervised=num_supervised,
             num_null=int(_is_null(invocations, draws).sum()) if acts else 0,
         )
 
@@ -285,6 +295,10 @@ class JointModel(nn.Module):
                 inputs = replace(inputs, cognition=cognition_IKH, is_null=_is_null(invocations, draws))
             if isinstance(inputs, PounceInputs):
                 inputs = inputs.forgetting(draws.is_dropped_I)
+                if self.memory_words is not None and invocations.words_IL is not None:
+                    inputs, memory_ISE, visible_IS = cast(Pounce, self.pounce).looked_back(inputs)
+                    logits_NV, targets_N = self.memory_words(memory_ISE, visible_IS, invocations.words_IL)
+                    grounding = _mean_cross_entropy(logits_NV, targets_N)
             matching = action_loss(
                 self.pounce, inputs, invocations.actions_INA, draws.noise_SNA, draws.time_S, draws.num_committed_S
             )
@@ -303,7 +317,12 @@ class JointModel(nn.Module):
         targets_N = torch.from_numpy(np.concatenate(wanted)).to(hidden[0].device)
         logits_NV = self.ponder.logits(_taken(hidden, index))
         predicted_N = logits_NV.detach().argmax(dim=-1)
-        return F.cross_entropy(logits_NV.float(), targets_N) if len(targets_N) else logits_NV.sum(), predicted_N
+        return _mean_cross_entropy(logits_NV, targets_N), predicted_N
+
+
+def _mean_cross_entropy(logits_NV: Tensor, targets_N: Tensor) -> Tensor:
+    """Zero, on the graph, if there is no target."""
+    return F.cross_entropy(logits_NV.float(), targets_N) if len(targets_N) else logits_NV.sum()
 
 
 def _is_null(invocations: PounceBatch, draws: Draws) -> Tensor:

@@ -115,6 +115,11 @@ def laptop_framesamp() -> Recipe:
     return _of_the_hand("laptop_framesamp", _with_frames(FrameSampling(num_frames=16, stride_ticks=10)))
 
 
+def laptop_framesamp_grounded() -> Recipe:
+    """Row: FrameSamp+Modul whose memory is taught the texts that PONDER is, with the same weight."""
+    return replace(laptop_framesamp(), name="laptop_framesamp_grounded", grounds_memory=True, w2=laptop().w2)
+
+
 def laptop_window() -> Recipe:
     """Row: FrameSamp's consumer on the last six pictures, one a second."""
     newest = FrameSampling(num_frames=6, rule="newest", stride_ticks=20)
@@ -149,5 +154,6 @@ ALL: tuple[Callable[[], Recipe], ...] = (
     laptop_observation,
     laptop_text,
     laptop_framesamp,
+    laptop_framesamp_grounded,
     laptop_window,
 )

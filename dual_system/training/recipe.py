@@ -7,7 +7,7 @@ from typing import Any
 
 from dual_system.data.video import FPS
 from dual_system.models.action_space import ActionSpace
-from dual_system.models.pi05.pounce import Freeze
+from dual_system.models.pi05.pounce import Freeze, PounceConfig
 from dual_system.models.ponder.configs import PonderConfig
 from dual_system.models.pounce.family import AnyPounceConfig
 from dual_system.training.example import ExampleConfig
@@ -38,6 +38,8 @@ class Recipe:
     """Leave PONDER's vision tower as it came."""
     remembers: bool = True
     """False: PONDER is trained and served without memory (`ContextFormat.remembers`)."""
+    grounds_memory: bool = False
+    """POUNCE's frame memory is taught PONDER's texts, with weight ``w2`` (`memory_words`)."""
     demo_hz: int = 1
     """Frames per second of demonstrations (paper: 1); stored in PONDER's checkpoint and contract."""
     space: ActionSpace = "joint_delta"
@@ -56,6 +58,12 @@ class Recipe:
             raise ValueError(
                 f"recipe {self.name}: POUNCE would learn from recorded subgoals and be given those of a PONDER without "
                 "memory; expected cognition as its channel"
+            )
+        has_memory = isinstance(self.pounce, PounceConfig) and self.pounce.frame_memory is not None
+        if self.grounds_memory and not (has_memory and self.trains == "pounce" and self.example.is_grounded):
+            raise ValueError(
+                f"recipe {self.name}: grounds_memory is for a POUNCE with a frame memory that is trained alone on "
+                "grounded examples"
             )
         if self.demo_hz < 1 or FPS % self.demo_hz:
             raise ValueError(f"recipe {self.name}: demo_hz must divide {FPS}, came {self.demo_hz}")

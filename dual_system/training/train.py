@@ -30,6 +30,7 @@ from dual_system.models.pi05.pounce import PounceConfig
 from dual_system.models.ponder.fused_attention import fuse_attention
 from dual_system.models.ponder.recompute import recompute_layers
 from dual_system.models.pounce.checkpoint import PounceBundle
+from dual_system.models.pounce.family import sampling_of
 from dual_system.training.build import Start, build, export
 from dual_system.training.collate import collate_ponder, collate_pounce
 from dual_system.training.data import PictureSizes, TrainingSet
@@ -37,6 +38,7 @@ from dual_system.training.example import make_example
 from dual_system.training.frozen_towers import FrozenTowers
 from dual_system.training.joint import JointModel, PonderBatch, PounceBatch
 from dual_system.training.memory import memory_of, require_room, sentence
+from dual_system.training.memory_words import words_to_remember
 from dual_system.training.parallel import World, gather, joined, require_alike, shard
 from dual_system.training.prefetch import Prefetcher
 from dual_system.training.recipe import Recipe, defaults
@@ -175,7 +177,10 @@ class Batches:
         episodes = collate_ponder(examples if self._runs_ponder else [])
         if run.trains == "ponder":  # POUNCE is not run: one invocation suffices for the batch's shape
             examples = [replace(each, invocations=each.schedule.invocations[:1], told=("",)) for each in examples]
-        return episodes, collate_pounce(examples, self._pounce, bundle.tokenizer, bundle.statistics)
+        invocations = collate_pounce(examples, self._pounce, bundle.tokenizer, bundle.statistics)
+        if run.grounds_memory and (sampling := sampling_of(self._pounce)) is not None:
+            invocations = replace(invocations, words_IL=words_to_remember(examples, self._form, sampling))
+        return episodes, invocations
 
     def _draw(self, rng: np.random.Generator) -> list[int]:
         """Numbers of the batch's episodes, long ones first, so that the processes' shares have similar lengths."""

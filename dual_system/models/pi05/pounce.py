@@ -51,6 +51,8 @@ class PounceInputs:
     seen: Tensor | None = None
     """(B, S, W): the images as the vision tower and its projector embed them, if training has stored that; then
     ``images`` is not read."""
+    past_features: Tensor | None = None
+    """(B, F, C, W) float32: ``past`` as `Pounce.looked_back` embeds it; None: it has not yet."""
 
     def forgetting(self, is_null_B: Tensor) -> "PounceInputs":
         """Inputs whose marked samples have no past pictures: the memory's learned null."""
@@ -239,8 +241,18 @@ class Pounce(nn.Module):
             return cache
         return replace(cache, memory=self.frame_memory(*self._past_features(inputs, self.frame_memory.config)))
 
+    def looked_back(self, inputs: PounceInputs) -> tuple[PounceInputs, Tensor, Tensor]:
+        """The inputs with their past pictures' features, the frame memory's tokens (B, S, E), and which are visible."""
+        if self.frame_memory is None:
+            raise ValueError("frame_memory is None: expected a POUNCE with a memory of past pictures")
+        features_BFCW, step_BF = self._past_features(inputs, self.frame_memory.config)
+        seen = replace(inputs, past_features=features_BFCW, past_step=step_BF)
+        return seen, *self.frame_memory.tokens(features_BFCW, step_BF)
+
     def _past_features(self, inputs: PounceInputs, memory: FrameMemoryConfig) -> tuple[Tensor, Tensor]:
         """The past pictures' features (B, F, C, W) and steps (B, F). No gradient reaches the vision tower here."""
+        if inputs.past_features is not None and inputs.past_step is not None:
+            return inputs.past_features, inputs.past_step
         device, width = inputs.age_ns.device, self.config.pi05.language.width
         shape = (len(inputs.age_ns), memory.sampling.num_frames)
         features_BFCW = torch.zeros(*shape, memory.tokens_per_frame, width, device=device)
