@@ -36,7 +36,7 @@ from sim_client.condition import EvalOptions, EvaluationError, Job
 from sim_client.harness import BuildServer, ServerStep, open_harness
 from sim_client.launch import Daemons
 from sim_client.ledger import Ledger, write_json
-from sim_client.null_ponder import NullPonder, cognition_shape
+from sim_client.null_ponder import NullPonder, cognition_shape, hears_ponder
 from sim_client.suite import Suite
 from sim_client.swapped_ponder import SwappedPonder
 from sim_client.telling_ponder import FAR_PX, TellingPonder
@@ -170,12 +170,13 @@ class EvaluationHarness:
             kind = m.SubgoalKind.TASK_SIMPLE if told == "simple" else m.SubgoalKind.TASK_GROUNDED
             off_px = FAR_PX if told == "displaced" else 0.0
             return lambda bus, robot, _: TellingPonder(Link(bus, robot=robot, proc="ponder"), kind, off_px).step
-        is_null = options.condition.cognition == "null"
-        is_unheard = is_null and options.workers.servers == "in-process" and not options.log.record
-        if is_unheard and options.pounce_checkpoint is not None:
+        pounce = options.pounce_checkpoint
+        if pounce is not None and options.workers.servers == "in-process" and not options.log.record:
             with contextlib.suppress(ValueError):  # a public folder does not hold K and H: PONDER has to be loaded
-                shape = cognition_shape(options.pounce_checkpoint)
-                return lambda bus, robot, _: NullPonder(Link(bus, robot=robot, proc="ponder"), *shape).step
+                shape = cognition_shape(pounce)
+                is_deaf = options.ponder_checkpoint is None and not hears_ponder(pounce)
+                if is_deaf or options.condition.cognition == "null":
+                    return lambda bus, robot, _: NullPonder(Link(bus, robot=robot, proc="ponder"), *shape).step
         return None
 
     def _build_donor(self, bus: Bus, robot: str, checkpoint: Path | None) -> ServerStep:

@@ -1,6 +1,6 @@
-"""A PONDER for episodes with null cognition: it keeps the schedule and needs no model.
+"""A PONDER for episodes in which POUNCE reads none of it: it keeps the schedule and needs no model.
 
-The episode is the same as with a real PONDER, tick for tick, because POUNCE receives none of the answers.
+The episode is the same as with a real PONDER, tick for tick.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from protocol import messages as m
+from protocol.files import read_object
 from protocol.link import Link
 from sim_client.ponder_double import Answer, PonderDouble
 
@@ -43,6 +44,12 @@ class NullPonder(PonderDouble):
 
     def end(self) -> None:
         pass
+
+
+def hears_ponder(pounce: Path) -> bool:
+    """Whether a POUNCE folder's network reads cognition or text. Raises ValueError if the folder is none of ours."""
+    num_carriers, _ = cognition_shape(pounce)
+    return num_carriers > 0 or bool(read_object(pounce / "config.json")["config"].get("reads_subgoal", False))
 
 
 def cognition_shape(pounce: Path) -> tuple[int, int]:

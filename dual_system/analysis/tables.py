@@ -168,6 +168,8 @@ def _condition(results: Results) -> tuple[str, str, str, str]:
     told = config.get("subgoal_text", "ponder" if results.num_carriers == 0 else None)
     if told is not None:
         gets = _TOLD[told]
+    if results.num_carriers == 0 and {"ponder_checkpoint": None}.items() <= config.items() and told == "ponder":
+        gets = "nothing of PONDER's"
     if config.get("deliver") == "held-transition":
         reported_ms = config.get("held_age_ms", 0)
         gets += f" held at transitions, with {f'age {reported_ms} ms' if reported_ms else 'its true age'}"

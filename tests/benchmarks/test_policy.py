@@ -20,6 +20,7 @@ from dual_system.data.collect import CollectOptions
 from dual_system.data.correct import CorrectOptions
 from dual_system.policy.towers import TowersOptions
 from dual_system.tasks.pair_files import PairsOptions
+from dual_system.training.recipes import recipe
 from dual_system.training.train import TrainOptions
 from protocol.command_line import parse
 from sim_client.condition import EvalOptions
@@ -59,13 +60,22 @@ def test_a_stage_reads_only_what_an_earlier_one_writes(tmp_path: Path) -> None:
         written |= outs
 
 
-def test_no_row_is_played_with_a_random_ponder(tmp_path: Path) -> None:
-    """It would be no control: it costs, and it asks for demonstrations at a rate of its own."""
-    played = [arguments for stage in stages(tmp_path) if stage.is_test for _, *arguments in stage.commands]
-    assert played
-    for arguments in played:
-        told = {"--ponder-checkpoint", "--subgoal-text"} & set(arguments)
-        assert told or arguments[arguments.index("--cognition") + 1] == "null"
+def test_every_row_is_played_with_what_its_pounce_reads(tmp_path: Path) -> None:
+    """Null cognition takes a frame memory away too, so it is the pair's own control alone."""
+    played = [parse(EvalOptions, arguments[1:], prog="pp-eval") for stage in stages(tmp_path) if stage.is_test
+              for arguments in stage.commands]  # fmt: skip
+    kinds = set()
+    for options in played:
+        assert options.pounce_checkpoint is not None
+        pounce = recipe(options.pounce_checkpoint.parent.name.rpartition("_")[0]).pounce
+        told = options.condition.subgoal_text != "ponder"
+        reads = pounce.cognition.num_carriers > 0 or (pounce.reads_subgoal and not told)
+        assert (options.ponder_checkpoint is not None) == reads
+        assert told <= pounce.reads_subgoal
+        kinds.add((reads, told, options.condition.cognition))
+    nulls = [each.out.name for each in played if each.condition.cognition == "null"]
+    assert nulls == ["laptop_0_null", "laptop_1_null"]
+    assert len(kinds) == 5
 
 
 PROGRAM = """

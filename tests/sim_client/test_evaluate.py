@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -23,7 +24,7 @@ from dual_system.data.dataset import Dataset
 from dual_system.data.export import ExportOptions, export
 from dual_system.models.ponder.configs import tiny_cpu as tiny_ponder
 from dual_system.models.pounce.checkpoint import random_bundle, save_bundle
-from dual_system.models.pounce.configs import tiny_cpu
+from dual_system.models.pounce.configs import tiny_cpu, tiny_frame_memory
 from dual_system.tasks.seeds import SeedError
 from protocol import messages as m
 from protocol.mcap_log import read_log
@@ -395,6 +396,29 @@ def test_null_cognition_needs_no_ponder(tmp_path: Path) -> None:
         streams[name], models[name] = line["stream_sha256"], line["models"]["ponder"]["model_hash"]
     assert streams["asked"] == streams["nobody"]
     assert models["nobody"] == "null" != models["asked"]
+
+
+@pytest.mark.sim
+def test_a_memory_of_its_own_needs_no_ponder_and_is_there(tmp_path: Path) -> None:
+    """Commands are the same with a PONDER that nobody reads, and others than without a memory, as after null."""
+    config = dataclasses.replace(tiny_cpu(num_carriers=0), frame_memory=tiny_frame_memory())
+    bundle = random_bundle(config, seed=0)
+    with torch.no_grad():
+        for layer in bundle.model.frame_memory.layers:  # type: ignore[union-attr]
+            layer.dense.weight.fill_(0.1)
+    save_bundle(bundle, tmp_path / "pounce")
+    streams, models = {}, {}
+    changes: dict[str, Any]
+    for name, changes in {"asked": {"record": True}, "nobody": {}, "forgets": {"cognition": "null"}}.items():
+        chosen = options(
+            tmp_path / name, tasks=("PickHighlight",), episodes=1, runs=1, policy="servers", max_steps=65,
+            pounce_checkpoint=tmp_path / "pounce", **changes,
+        )  # fmt: skip
+        with contextlib.closing(EvaluationHarness(chosen)) as harness:
+            line = harness.play(chosen.jobs()[0])
+        streams[name], models[name] = line["stream_sha256"], line["models"]["ponder"]["model_hash"]
+    assert streams["asked"] == streams["nobody"] != streams["forgets"]
+    assert models["nobody"] == models["forgets"] == "null" != models["asked"]
 
 
 def test_sums_are_rounded_alike_whichever_server_a_process_has() -> None:
