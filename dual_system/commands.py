@@ -86,7 +86,8 @@ COMMANDS = {
         {
             "counterfactual": Verb(
                 "sim_client.counterfactual", "Score how often a trained pair's action follows its own past."
-            )
+            ),
+            "probe": Verb("dual_system.training.probe", "Probe what C and a frame memory's read-out hold."),
         },
     ),
 }

@@ -41,7 +41,7 @@ def build_reader(checkpoint: Path | None, **options: Any) -> tuple[Read, EngineS
     """Builds a PONDER outside of any episode, for offline measurements. ``options``: as in `build`.
 
     Returns the engine's spec, and a function from an instruction, the demonstration's instants and the T observations
-    since with the robot's states (T, 8), to the last one's cognition (K, H) as in serving, with PONDER's own texts.
+    since with the robot's states (T, 8), to every one's cognition (T, K, H) as in serving, with PONDER's own texts.
     """
     engine = build_engine(PonderOptions(checkpoint=checkpoint, **options))
 
@@ -53,7 +53,7 @@ def build_reader(checkpoint: Path | None, **options: Any) -> tuple[Read, EngineS
             fires = [
                 engine.fire(_OFFLINE, tuple(views), proprio=state) for views, state in zip(seen, state_T8, strict=True)
             ]
-            return fires[-1].cognition
+            return np.stack([fire.cognition for fire in fires])
         finally:
             engine.close(_OFFLINE)
 

@@ -150,7 +150,7 @@ def _answers(
     demo = [views for views, is_shown in zip(past, telling.is_demonstration, strict=True) if is_shown]
     seen = [views for views, is_shown in zip(past, telling.is_demonstration, strict=True) if not is_shown]
     states = [*telling.states[~telling.is_demonstration], pair.state]
-    cognition = read(pair.instruction, demo, [*seen, now], np.stack(states))
+    cognition = read(pair.instruction, demo, [*seen, now], np.stack(states))[-1]
     age_ns = options.age_ms * NS_PER_MS
     return np.stack([act(pair.instruction, now, pair.state, cognition, age_ns, seed) for seed in seeds])
 

@@ -49,7 +49,7 @@ def remembers(instruction: str, demo: Any, seen: Any, states: Any) -> np.ndarray
     """The first brightness that was shown; the last one is the present, and so is the last state."""
     assert (len(demo), len(seen), int(seen[-1][0].max())) == (2, 3, 99)
     assert states.tolist() == [[2] * 8, [3] * 8, [7] * 8]
-    return np.full((1, 4), demo[0][0].max(), np.float32)
+    return np.full((3, 1, 4), demo[0][0].max(), np.float32)
 
 
 def goes_there(instruction: str, now: Any, state: Any, cognition: Any, age_ns: int, seed: int) -> np.ndarray:
