@@ -28,7 +28,7 @@ predicted rightly. Every row also knows the task and the time. 95 % intervals by
 TIME = "task and time alone"
 _FOLDS = 5
 _PENALTIES = np.logspace(-3, 4, 8)
-"""Of standardised features, as a share of the number of instants."""
+"""They are for standardised features, as a share of the number of instants."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
