@@ -27,6 +27,7 @@ LABELS = {
     OURS: "words of A2 and C",
     CURRENT: "words of A2 and C",
     FRAMES: "none",
+    "laptop_framesamp_grounded": "words of C",
     OBSERVATION: "none",
     "laptop_window": "none",
     "laptop_without_grounding": "none",
