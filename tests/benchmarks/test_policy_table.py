@@ -11,7 +11,7 @@ import pytest
 from safetensors.numpy import save_file
 
 from benchmarks.policy_plan import ROWS
-from benchmarks.policy_table import _holm, _trained_as, table
+from benchmarks.policy_table import LABELS, _holm, _trained_as, table
 
 TASKS = ("VideoUnmask", "PickHighlight", "MoveCube", "PickXtimes")
 SCENES = 40
@@ -115,6 +115,12 @@ def test_one_contrast_alone_is_corrected_for_both_that_were_named(tmp_path: Path
     write_row(tmp_path, "laptop_framesamp_0", first(0))
     assert verdicts(tmp_path) == {"laptop_framesamp": "met"}
     assert _holm([0.0039], 2) == [0.0078]
+
+
+def test_every_row_that_is_trained_says_what_it_was_told() -> None:
+    trained = {recipe.__name__ for recipe, _ in ROWS}
+    assert all(any(name.startswith(recipe) for name in LABELS) for recipe in trained)
+    assert all(_trained_as(name)[0] in trained for name in LABELS)
 
 
 def test_holm_against_hand_numbers() -> None:
