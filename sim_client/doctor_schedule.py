@@ -37,7 +37,7 @@ class ScheduleProbeOptions:
     control_hz: int = schedules.CONTROL_HZ
     """With --schedule: ticks per second."""
     query_period_ms: int = 1000
-    """With --schedule: period of PONDER's queries in ms."""
+    """With --schedule: period of PONDER's queries in ms. 0: one query an episode."""
     openpi: str | None = None
     """With --schedule: HOST:PORT of an openpi policy server, which is timed in place of our servers."""
     openpi_robot: RobotName = "droid"
@@ -96,6 +96,9 @@ def ponder(options: ScheduleProbeOptions, measure: Callable[[], Measured]) -> Fi
     except (TransportError, ProtocolError) as error:
         return _absent("ponder", error)
     p99_ms, period_ms = found.p99_ns / 1e6, options.query_period_ms
+    if not period_ms:
+        text = f"{found.text} It is asked once an episode: holds."
+        return Finding("ponder", Level.OK, f"{text} Its cognition comes {p99_ms:.0f} ms after the start and is kept.")
     text = f"{found.text} It is asked every {period_ms} ms"
     if p99_ms <= period_ms:
         oldest_ms = period_ms + p99_ms

@@ -37,6 +37,7 @@ def openpi_with(durations_ms: list[int], horizon: int = 50, **options: Any) -> F
 
 
 ASKED = ScheduleProbeOptions()
+ONCE = ScheduleProbeOptions(query_period_ms=0)
 
 
 @pytest.mark.parametrize(
@@ -55,6 +56,8 @@ ASKED = ScheduleProbeOptions()
         (doctor_schedule.pounce(ASKED, absent), FAILED, "no liveliness token", "Start pounce-serve"),
         (doctor_schedule.ponder(ASKED, server(300)), OK, "at most 1301 ms old", ""),
         (doctor_schedule.ponder(ASKED, server(1150)), WARNING, "every 1000 ms", "--query-period-ms 1200"),
+        (doctor_schedule.ponder(ONCE, server(1150)), OK, "asked once an episode: holds", ""),
+        (doctor_schedule.ponder(ONCE, absent), FAILED, "no liveliness token", "Start ponder-serve"),
         (doctor_schedule.ponder(ASKED, absent), FAILED, "no liveliness token", "Start ponder-serve"),
         (openpi_with([80] * 99 + [900]), OK, "p50 80.0 ms, p99 80.0 ms of 100 answers", ""),
         (openpi_with([80] * 20 + [900]), OK, "with d=18 s=25 H=50: holds", ""),
