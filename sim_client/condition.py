@@ -10,13 +10,13 @@ import tyro
 
 from dual_system.tasks.difficulty import Difficulty
 from dual_system.tasks.seeds import scenes, split_of
-from dual_system.tasks.task import chosen_tasks
 from protocol.command_line import flat
 from protocol.errors import CommandError
 from protocol.options import LinkOptions
 from sim_client import config
 from sim_client.config import ModelsOptions, ScheduleOptions, ServersOptions, SimOptions
 from sim_client.swapped_ponder import donors_in
+from sim_client.worlds import Pictures, chosen, limit, require
 
 
 class EvaluationError(CommandError):
@@ -35,10 +35,11 @@ class ConditionOptions:
     subgoal_text: Literal["ponder", "grounded", "simple", "displaced"] = "ponder"
     """Source of the subgoals for a POUNCE that reads text: PONDER, or the task, with places (grounded), without
     (simple), or with places that are 12 px off (displaced). The task's come as late as PONDER's."""
-    pictures: Literal["own", "other-scene", "without-cue", "retold"] = "own"
+    pictures: Pictures = "own"
     """What the models are shown: the scene; another one, in which the arm moves alike; the scene without what only
-    memory could tell later (PickHighlight's discs, the cubes of the unmasking tasks); or retold: after another past,
-    by which the episode is judged. pp-tables sets it beside the same scenes after their own."""
+    memory could tell later (PickHighlight's discs, the cubes of the unmasking tasks, a kitchen's demonstration); or
+    retold: after another past (a goal set's twin), by which the episode is judged. pp-tables sets it beside the same
+    scenes after their own. last-frame: a kitchen's demonstration, its last frame alone."""
     deliver: Literal["every", "held-transition"] = "every"
     """Delivery of cognition. held-transition: only the first, then those at predicted transitions (paper, 5.2)."""
     reported_age_ms: int = 0
@@ -48,7 +49,7 @@ class ConditionOptions:
     delay_ms: int = 300
     """PONDER's delay in ms (paper: fixed 300 ms)."""
     max_steps: int = 1300
-    """Limit of control steps per episode (paper: 1300)."""
+    """Limit of control steps per episode (paper: 1300; a kitchen's end after 1000)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,7 +88,7 @@ class EvalOptions:
     out: Path
     """Folder of one condition: results.json, and with --record one MCAP per episode."""
     tasks: tuple[str, ...] = ("all",)
-    """Names of the tasks, or `all`. sim-client --list-tasks shows them."""
+    """Names of the tasks, or `all` (RoboMME's sixteen). sim-client --list-tasks shows them."""
     ponder_checkpoint: Path | None = None
     """PONDER's checkpoint. None: random weights."""
     pounce_checkpoint: Path | None = None
@@ -150,15 +151,17 @@ class EvalOptions:
 
     def task_names(self) -> tuple[str, ...]:
         """The tasks in alphabetical order, each once. Raises TaskError for an unknown one."""
-        return chosen_tasks(self.tasks)
+        return chosen(self.tasks)
 
     def jobs(self) -> list[Job]:
         """Returns every episode, task by task: a worker keeps its scene, and finished tasks are complete.
 
         Raises:
-            TaskError: an unknown task.
+            TaskError: an unknown task, or one without the pictures that are asked for.
             DonorError: an episode has no donor.
         """
+        for task in self.task_names():
+            require(task, self.condition.pictures)
         keys = [(task, run, seed) for task in self.task_names() for run in range(self.runs) for seed in self.seeds]
         folder = self.condition.donors
         donors = {} if folder is None else donors_in(folder, keys)
@@ -170,6 +173,7 @@ class EvalOptions:
     def sim(self, worker: int = 0) -> SimOptions:
         """Returns the episodes' options, as of `sim-client`, in the ``worker``-th process of this computer."""
         condition, models = self.condition, self.models
+        max_steps = min((limit(task, condition.max_steps) for task in self.task_names()), default=condition.max_steps)
         if models.device == "cuda" and self.workers.ray is None:  # Ray shows a worker its own GPUs alone
             models = replace(models, device=f"cuda:{int(worker * self.workers.gpus_per_worker)}")
         return SimOptions(
@@ -188,7 +192,7 @@ class EvalOptions:
                 delay_ms=condition.delay_ms,
                 deliver="null" if condition.cognition == "null" else condition.deliver,
                 held_age_ms=condition.reported_age_ms,
-                max_steps=condition.max_steps,
+                max_steps=max_steps,
             ),
             servers=ServersOptions(patience_s=self.workers.patience_s),
             models=models,

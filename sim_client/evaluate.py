@@ -24,8 +24,6 @@ import dual_system.tasks.headless  # noqa: F401 - before anything that imports m
 # isort: split
 
 from dual_system.data.workers import LocalWorkers, RayWorkers, Workers, worker_index
-from dual_system.tasks.disguises import disguised
-from dual_system.tasks.environment import Environment
 from protocol import messages as m
 from protocol.bus import Bus
 from protocol.command_line import command, parse
@@ -40,6 +38,7 @@ from sim_client.null_ponder import NullPonder, cognition_shape, hears_ponder
 from sim_client.suite import Suite
 from sim_client.swapped_ponder import SwappedPonder
 from sim_client.telling_ponder import FAR_PX, TellingPonder
+from sim_client.worlds import World, open_world
 
 DONE, REFUSED, INTERRUPTED = 0, 2, 130
 Line = dict[str, Any]  # one episode's entry in results.json
@@ -58,8 +57,10 @@ def main(argv: list[str] | None = None) -> int:
         sys.stderr.write("pp-eval: interrupted; finished episodes are kept, the same command resumes\n")
         return INTERRUPTED
     for task in sorted({episode["task"] for episode in episodes}):
-        successes = [episode["success"] for episode in episodes if episode["task"] == task]
-        sys.stdout.write(f"{task}: {sum(successes)} of {len(successes)}\n")
+        played = [episode for episode in episodes if episode["task"] == task and "unpaired" not in episode]
+        unpaired = sum(episode["task"] == task for episode in episodes) - len(played)
+        left_out = f" ({unpaired} more have no demonstration)" if unpaired else ""
+        sys.stdout.write(f"{task}: {sum(e['success'] for e in played)} of {len(played)}{left_out}\n")
     folder = shlex.quote(str(options.out))
     sys.stdout.write(f"{options.out / 'results.json'}; tables: pp-tables {folder} --out {folder}\n")
     return DONE
@@ -131,14 +132,15 @@ class EvaluationHarness:
         self._open.callback(harness.bus.close)
         self._suite = Suite(sim, harness.link, harness.clock, daemons.dead)
         self._task = ""
-        self._environment: Environment | None = None
+        self._environment: World | None = None
 
     def play(self, job: Job) -> Line:
         """Like the function of this name."""
         if self._donor is not None and job.donor is not None:
             self._donor.load(job.donor)
         line = self._suite.play(self._scene(job.task), job.task, job.seed, run=job.run)
-        if self._options.policy == "servers" and line["status"] == "ABORTED" and line["steps"] == 0:
+        is_begun = line["status"] != "ABORTED" or line["steps"] > 0 or "unpaired" in line
+        if self._options.policy == "servers" and not is_begun:
             raise EvaluationError(f"{job.key} was not begun: {line['reason']}")
         if job.donor is not None:
             line["donor"] = job.donor.name
@@ -151,13 +153,15 @@ class EvaluationHarness:
                 self._environment.close()
                 self._environment = None
 
-    def _scene(self, task: str) -> Environment:
+    def _scene(self, task: str) -> World:
         if self._environment is None or task != self._task:
             if self._environment is not None:
                 self._environment.close()
             needs_frames = self._options.policy == "servers" or self._options.log.record  # the oracle alone needs none
-            condition = self._options.condition
-            self._environment = disguised(task, condition.pictures, max_steps=condition.max_steps, render=needs_frames)
+            shown = self._options.condition
+            self._environment = open_world(
+                task, pictures=shown.pictures, max_steps=shown.max_steps, render=needs_frames
+            )
             self._task = task
         return self._environment
 

@@ -16,7 +16,6 @@ from clock.service import ClockService
 from dual_system.analysis.ceiling import ceiling_in, first_choice_in
 from dual_system.models.ponder.demo_sampling import DemoSampling
 from dual_system.tasks.environment import Snapshot
-from dual_system.tasks.kinematics import UnreachableError
 from dual_system.tasks.physics import CONTROL_HZ
 from protocol import disk, files, images
 from protocol import messages as m
@@ -31,7 +30,7 @@ from sim_client.ledger import write_json
 from sim_client.recorder import Recorder
 from sim_client.robot import demonstration
 from sim_client.robot_end import RobotEnd
-from sim_client.worlds import World, open_world, robot_of, suite_of
+from sim_client.worlds import World, goals_of, open_world, robot_of, suite_of, why_unpaired
 
 OnTick = Callable[[int, int], None]
 """Called with (episode index, ticks played) during an episode."""
@@ -115,17 +114,17 @@ class Suite:
             self._link, self._actions, environment, self._recorder, self._end.take_turn, self._patience_ns, self._looks
         )
         ceiling, chance = ceiling_in(task, environment.layout), first_choice_in(task, environment.layout)
-        opened = m.OpenReply()
+        opened, unpaired = m.OpenReply(), ""
         self._recorder.begin(info, path)
         if info.policy == "oracle":
             outcome, _ = play_oracle(info, side, first, on_tick)
-        elif why_not:
-            outcome = Outcome(status=m.TaskStatus.ABORTED, reason=why_not, num_ticks=0)
+        elif why_not or (unpaired := why_unpaired(environment)):
+            outcome = Outcome(status=m.TaskStatus.ABORTED, reason=why_not or unpaired, num_ticks=0)
         else:
             try:
                 opened = self._end.open(m.OpenRequest(info=info, demo=self._demonstration(environment, sampling)))
                 outcome = side.run(info, first, on_tick)
-            except (TransportError, EpisodeRefused, UnreachableError) as error:
+            except (TransportError, EpisodeRefused) as error:
                 outcome = Outcome(status=m.TaskStatus.ABORTED, reason=str(error), num_ticks=0)
         result, missing = self._end.end(
             outcome.status, outcome.reason, outcome.num_ticks, with_servers=info.policy != "oracle"
@@ -149,6 +148,8 @@ class Suite:
             "models": {contract.proc: _model(contract) for contract in opened.contracts},
             "warnings": [*opened.warnings, *missing],
             "schedule": result.statistics,
+            **goals_of(environment),
+            **({"unpaired": unpaired} if unpaired else {}),
         }
 
     def _terms(self, environment: World) -> tuple[int, DemoSampling | None, str]:

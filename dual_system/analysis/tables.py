@@ -19,6 +19,7 @@ from dual_system.analysis.counterfactual import COUNTERFACTUAL, read_counterfact
 from dual_system.analysis.diagnosis import DIAGNOSIS, read_diagnosis
 from dual_system.analysis.diagnosis_tables import counterfactual_table, diagnosis_tables
 from dual_system.analysis.first_choices import ABOUT_FIRST_CHOICES, ABOUT_RETOLD, first_choices, is_retold, retold
+from dual_system.analysis.goals import is_kitchen, kitchen_tables, read_kitchen
 from dual_system.analysis.markdown import markdown, percent
 from dual_system.analysis.results import Results, ResultsError, comparable, read_results
 from dual_system.analysis.statistics import bootstrap, paired, wilson
@@ -48,7 +49,11 @@ def main(argv: list[str] | None = None) -> int:
     options = parse(TablesOptions, argv, prog="pp-tables")
     of_kind = {name: [p for p in options.results if _holds(p, name)] for name in (DIAGNOSIS, COUNTERFACTUAL)}
     evaluations = [p for p in options.results if not any(p in paths for paths in of_kind.values())]
+    kitchens = [p for p in evaluations if is_kitchen(p)]
+    evaluations = [p for p in evaluations if p not in kitchens]
     diagnoses, parts = [], []
+    if kitchens:
+        parts.append(kitchen_tables([read_kitchen(path) for path in kitchens]))
     if evaluations:
         played = [read_results(path) for path in evaluations]
         own = [each for each in played if not is_retold(each)]

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from types import TracebackType
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,7 +21,7 @@ from dual_system.tasks.kinematics import UnreachableError
 from dual_system.tasks.kitchen import predicates, puppet
 from dual_system.tasks.kitchen.catalogue import PAPER_HORIZON, TASKS, draw_scene
 from dual_system.tasks.kitchen.control import CONTROL_HZ
-from dual_system.tasks.kitchen.goals import GOAL_SETS, SHOWN_ALONE, draw_goal_scene
+from dual_system.tasks.kitchen.goals import GOAL_SETS, SHOWN_ALONE, draw_goal_scene, drawn_goal
 from dual_system.tasks.kitchen.layout import NUM_ACTION
 from dual_system.tasks.kitchen.omron import VIEWS
 from dual_system.tasks.kitchen.performing import perform
@@ -35,6 +36,7 @@ from dual_system.tasks.task import TaskError
 IMAGE_PX = 128
 _WAITING = np.zeros(NUM_ACTION)
 _WAITING[-1] = -1.0
+_REST_STEPS = 40
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,6 +79,7 @@ class KitchenEnvironment:
         self._step, self._status, self._reason = 0, Status.ONGOING, ""
         self._action: Array = _WAITING
         self._start: WorldState | None = None
+        self._rehearsal: tuple[puppet.Moment, ...] | None = None
 
     @property
     def scene(self) -> Scene:
@@ -139,31 +142,24 @@ class KitchenEnvironment:
     def oracle(self) -> Iterator[NDArray[np.float32]]:
         """Yields the actions (12,) of the script, each computed from the state in which it is requested.
 
-        It ends early where the arm cannot do the next thing.
+        It ends early where the arm cannot do the next thing, and else a while after the last one.
         """
-        goal = self.scene.goals[self.scene.goal]
         try:
-            for action in perform(self.world, script(goal, self.world.view)):
-                yield action.astype(np.float32)
-            while True:  # what was let go may still have to come to rest
-                yield _WAITING.astype(np.float32)
+            yield from _script(self.world)
         except UnreachableError:
             return
 
-    has_demonstration = True
-    difficulty = ""
+    has_demonstration: ClassVar[bool] = True
+    difficulty: ClassVar[str] = ""
 
     def demonstration(self, rate_hz: int = CONTROL_HZ, *, look_hz: int | None = None) -> Iterator[Snapshot]:
         """Yields GR-1's demonstration from this episode's start at ``rate_hz``, its pictures of one camera.
 
         With ``look_hz`` only snapshots at that rate have pictures, and the last one. The episode does not change.
-        Raises ValueError unless the rates divide 20 Hz, and UnreachableError if the script does not reach the goal.
+        Raises ValueError unless the rates divide 20 Hz, and UnreachableError as `rehearse` does.
         """
         every, look_every = (steps_between(rate) for rate in (rate_hz, look_hz or rate_hz))
-        scene, stage = self.scene, World(self.scene)
-        assert self._start is not None
-        stage.load(self._start)
-        moments = puppet.record(stage, _until_done(stage), scene.horizon)
+        scene, moments = self.scene, self.rehearse()
         body = puppet.Puppet(scene, TASKS[scene.goals[scene.goal].task].family)
         poses = body.poses(moments)
         shown = range(0, len(poses), every)
@@ -180,6 +176,30 @@ class KitchenEnvironment:
         finally:
             if cameras is not None:
                 cameras.close()
+
+    def rehearse(self) -> tuple[puppet.Moment, ...]:
+        """Returns what the script does from this episode's start until it reaches the goal; it is played once.
+
+        A scene has a demonstration if and only if the script solves it. Raises UnreachableError if it does not.
+        """
+        if self._rehearsal is None:
+            assert self._start is not None
+            stage = World(self.scene)
+            stage.load(self._start)
+            self._rehearsal = tuple(puppet.record(stage, _until_done(stage)))
+        return self._rehearsal
+
+    @property
+    def own_goal(self) -> int:
+        """The goal that the seed draws, whichever is asked for."""
+        return drawn_goal(self.name, self.scene.seed) if self.name in GOAL_SETS else 0
+
+    @property
+    def goal_done(self) -> int | None:
+        """The goal that has ended the episode; None if none has."""
+        if self._status not in (Status.SUCCESS, Status.FAIL):
+            return None
+        return predicates.fired(self.world.view, self._memory, self.scene.goals)
 
     def save(self) -> EpisodeState:
         """Returns a copy of the current state of the whole episode."""
@@ -221,7 +241,7 @@ class KitchenEnvironment:
 
     def _begin(self, scene: Scene) -> None:
         self.close()
-        self._world = World(scene)
+        self._world, self._rehearsal = World(scene), None
         self._cameras = self._open(self._world, VIEWS)
         self._memory = predicates.remember(self._world.view, None)
         self._step, self._status, self._reason, self._action = 0, Status.ONGOING, "", _WAITING
@@ -270,15 +290,27 @@ def instances_of(seed: int) -> Instances:
     return "B" if split_of(seed) in UNTRAINED else "A"
 
 
+def _script(world: World) -> Iterator[NDArray[np.float32]]:
+    """Yields the script's actions, then waits: what was let go may still have to come to rest."""
+    scene = world.scene
+    for action in perform(world, script(scene.goals[scene.goal], world.view)):
+        yield action.astype(np.float32)
+    for _ in range(_REST_STEPS):
+        yield _WAITING.astype(np.float32)
+
+
 def _until_done(world: World) -> Iterator[Array]:
-    """Yields the script's actions up to the goal. Raises UnreachableError if it is missed."""
+    """Yields the script's actions up to the goal, as an episode takes them. Raises UnreachableError if it is missed."""
     scene = world.scene
     memory = predicates.remember(world.view, None)
-    for action in perform(world, script(scene.goals[scene.goal], world.view)):
-        yield action
+    for action, _ in zip(_script(world), range(PAPER_HORIZON), strict=False):
+        yield _checked(action)
         memory = predicates.remember(world.view, memory)
-        if predicates.fired(world.view, memory, scene.goals) == scene.goal:
+        done = predicates.fired(world.view, memory, scene.goals)
+        if done == scene.goal:
             return
+        if done is not None:
+            break
     raise UnreachableError(f"{scene.task}, seed {scene.seed}: the script misses its goal; there is no demonstration")
 
 

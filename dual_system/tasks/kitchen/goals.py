@@ -170,7 +170,6 @@ def draw_goal_scene(name: str, seed: int, goal: int | None = None, instances: In
         raise TaskError(f"goal set {name!r} has no goal {goal}; expected one from 0 to {num - 1}")
     start = until_it_fits(lambda rng: goal_set.start(rng, instances), seed)
     goals = tuple(_goal(choice, start.words) for choice in goal_set.choices)
-    drawn = int(np.random.default_rng((seed, _GOAL_STREAM)).integers(num))
     horizon = max(TASKS[each.task].horizon for each in goals)
     return Scene(
         task=name,
@@ -178,8 +177,18 @@ def draw_goal_scene(name: str, seed: int, goal: int | None = None, instances: In
         horizon=horizon,
         plan=start.draft.plan(),
         goals=goals,
-        goal=drawn if goal is None else goal,
+        goal=drawn_goal(name, seed) if goal is None else goal,
     )
+
+
+def drawn_goal(name: str, seed: int) -> int:
+    """Returns the goal of a set that a seed draws."""
+    return int(np.random.default_rng((seed, _GOAL_STREAM)).integers(len(GOAL_SETS[name].choices)))
+
+
+def twin_of(name: str, seed: int) -> int:
+    """Returns the goal that is shown as the twin of the drawn one; each goal is the twin of one other."""
+    return (drawn_goal(name, seed) + 1) % len(GOAL_SETS[name].choices)
 
 
 def twins(scene: Scene) -> tuple[Scene, ...]:

@@ -144,8 +144,8 @@ class Puppet:
         return qpos
 
 
-def record(world: World, actions: Iterable[Array], num_max: int) -> list[Moment]:
-    """Plays actions in a world, at most so many, and returns its moments, the first before the first action."""
+def record(world: World, actions: Iterable[Array]) -> list[Moment]:
+    """Plays actions in a world and returns its moments, the first before the first action."""
     names = [joint for joint in _joint_names(world.model) if joint not in _PANDA_JOINTS]
     addresses = _addresses(world.model, names)
     fingers = [world.model.joint(name).qposadr[0] for name in omron.FINGER_JOINTS]
@@ -157,7 +157,7 @@ def record(world: World, actions: Iterable[Array], num_max: int) -> list[Moment]
         )
 
     moments = [moment()]
-    for action, _ in zip(actions, range(num_max), strict=False):
+    for action in actions:
         world.advance(action)
         moments.append(moment())
     return moments

@@ -132,6 +132,7 @@ def test_an_episode_times_out_and_then_takes_no_action() -> None:
 def test_the_script_reaches_the_goal(environment: EnvironmentOf, name: str) -> None:
     env = environment(name)
     last = env.reset(SEED)
+    assert env.goal_done is None
     for action in env.oracle():
         assert action.shape == (NUM_ACTION,)
         last = env.step(action)
@@ -139,6 +140,8 @@ def test_the_script_reaches_the_goal(environment: EnvironmentOf, name: str) -> N
             break
     assert last.status is Status.SUCCESS
     assert last.step < draw_scene(name, SEED).horizon
+    assert env.goal_done == 0
+    assert len(env.rehearse()) == last.step + 1  # what is shown is what was done, to the step
 
 
 def test_another_goal_of_the_set_ends_the_episode() -> None:
@@ -153,6 +156,7 @@ def test_another_goal_of_the_set_ends_the_episode() -> None:
                 break
         assert last.status is Status.FAIL
         assert last.first_choice is False
+        assert env.goal_done == 0
         assert twin.goals[0].instruction in last.reason
 
 
@@ -185,7 +189,7 @@ def test_a_video_has_no_frames_between_its_frames(environment: EnvironmentOf, ra
 def test_the_puppets_hand_goes_where_the_tool_went_and_the_scene_moves_as_it_did() -> None:
     scene = draw_scene("OpenDrawer", SEED)
     world = kitchen.World(scene)
-    moments = puppet.record(world, kitchen.perform(world, kitchen.script(scene.goals[0], world.view)), scene.horizon)
+    moments = puppet.record(world, kitchen.perform(world, kitchen.script(scene.goals[0], world.view)))
     body = puppet.Puppet(scene, "drawers")
     poses = body.poses(moments)
     assert len(poses) == len(moments)
