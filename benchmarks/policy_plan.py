@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -116,6 +116,7 @@ def stages(folder: Path) -> tuple[Stage, ...]:
             Stage(name=f"rows {first // 2 + 1}", commands=tuple(rows[first : first + 2]))
             for first in range(0, len(rows), 2)
         ),
+        Stage(name="cost", commands=tuple(_cost(folder, recipe) for recipe, seed in ROWS if seed == 0)),
         *(
             Stage(name=f"test {number}", commands=commands, is_test=True)
             for number, commands in enumerate(_tests(folder), 1)
@@ -152,6 +153,13 @@ def _row(folder: Path, recipe: str, seed: int) -> Sequence[str]:
     ponder = folder / own.get(recipe, "words")
     run = _run(recipe, ponder, folder / "corrected", _folder(folder, recipe, seed))
     return *run, "--seed", f"{seed}"
+
+
+def _cost(folder: Path, recipe: Callable[[], object]) -> tuple[str, ...]:
+    row = _folder(folder, recipe.__name__, 0)
+    ponder = ("--ponder", f"{row / 'ponder'}") if recipe in WITH_PONDER else ()
+    out = folder / "cost" / f"{recipe.__name__}.json"
+    return "benchmarks.policy_cost", "--out", f"{out}", "--pounce", f"{row / 'pounce'}", *ponder
 
 
 def _tests(folder: Path) -> Iterator[tuple[tuple[str, ...], ...]]:

@@ -50,7 +50,7 @@ def table(folder: Path) -> str:
         return ""
     rows = [_row(name, results, folder) for name, results in played.items()]
     head = ["row", "scenes", "success, %", "first choice right, %", "without memory at most, %", "labels"]
-    head += ["parameters", "core-hours", "delay, ms"]
+    head += ["parameters", "core-hours", "delay, ms", "CPU-ms and bytes a robot second"]
     parts = ["## The table", markdown(head, rows)]
     if controls := list(_controls(played)):
         parts += ["## Controls", markdown(["row", "success, %", "band, %", "is a control"], controls)]
@@ -76,7 +76,17 @@ def _row(name: str, results: Results, folder: Path) -> list[str]:
         _parameters(folder / "rows" / f"{recipe}_{seed}"),
         _core_hours(folder, recipe, seed),
         str(results.config.get("delay_ms", "")) if recipe in _DELAYED else "0",
+        _cost(folder / "cost" / f"{recipe}.json"),
     ]
+
+
+def _cost(file: Path) -> str:
+    """Medians of both models' calls, one of each a second, and the bytes of a cognition (`policy_cost`)."""
+    if not file.is_file():
+        return ""
+    found = json.loads(file.read_text())
+    spent_ms = sum(found[name]["p50"] for name in ("ponder_cpu_ms", "pounce_cpu_ms") if name in found)
+    return f"{spent_ms:.0f}, {found['cognition_bytes']}"
 
 
 def _trained_as(name: str) -> tuple[str, int]:

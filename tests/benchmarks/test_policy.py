@@ -15,6 +15,7 @@ import pytest
 
 from benchmarks import policy
 from benchmarks.policy import DONE, FAILED, UNFINISHED, account
+from benchmarks.policy_cost import CostOptions
 from benchmarks.policy_plan import Stage, stages
 from dual_system.data.collect import CollectOptions
 from dual_system.data.correct import CorrectOptions
@@ -27,6 +28,7 @@ from sim_client.condition import EvalOptions
 from sim_client.counterfactual import CounterfactualOptions
 
 OPTIONS: dict[str, Any] = {
+    "benchmarks.policy_cost": CostOptions,
     "dual_system.data.collect": CollectOptions,
     "dual_system.data.correct": CorrectOptions,
     "sim_client.evaluate": EvalOptions,

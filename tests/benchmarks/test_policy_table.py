@@ -60,9 +60,12 @@ def test_a_row_says_what_it_is(tmp_path: Path) -> None:
     place = [(recipe.__name__, seed) for recipe, seed in ROWS].index(("laptop", 1))
     spent = {"stage": f"rows {place // 2 + 1}", "core_s_by_command": {f"{place % 2}": 1800.0, f"{1 - place % 2}": 9.0}}
     (tmp_path / "hours.jsonl").write_text(f"{json.dumps(spent)}\n{json.dumps(spent)}\n")
-    ((name, scenes, success, choice, ceiling, labels, parameters, hours, delay),) = lines_of(
-        table(tmp_path), "The table"
-    )
+    (tmp_path / "cost").mkdir()
+    costs = {"ponder_cpu_ms": {"p50": 40.2}, "pounce_cpu_ms": {"p50": 21.4}, "cognition_bytes": 640}
+    (tmp_path / "cost" / "laptop.json").write_text(json.dumps(costs))
+    (row,) = lines_of(table(tmp_path), "The table")
+    name, scenes, success, choice, ceiling, labels, parameters, hours, delay, cost = row
+    assert cost == "62, 640"
     assert (name, scenes, ceiling, delay) == ("laptop_1", "4 x 40", "25.0", "300")
     assert success.startswith("75.00 [")
     assert choice.startswith("75.00 [")
