@@ -47,6 +47,14 @@ ROWS = (
     (recipes.laptop_current, 0),
 )
 """The rows of the table that are trained: recipe and seed, two that cost alike at a time, one on each core."""
+DELAYED = (
+    (recipes.laptop_delayed, recipes.laptop),
+    (recipes.laptop_framesamp_delayed, recipes.laptop_framesamp),
+    (recipes.laptop_text_delayed, recipes.laptop_text),
+)
+"""Rows that go on at delays that are drawn, and the finished row, of seed 0, that each goes on from."""
+DELAYS_MS, DELAY_SCENES = (0, 300, 1_000, 2_000, 4_000), 20
+"""Delays that they are played at, and development scenes a task of each."""
 RETOLD = ("VideoUnmask", "PickHighlight", "MoveCube")
 """Tasks whose present can have another past."""
 WITH_PONDER = (recipes.laptop, recipes.laptop_without_grounding, recipes.laptop_current)
@@ -79,6 +87,7 @@ def stages(folder: Path) -> tuple[Stage, ...]:
     playing = ("sim_client.evaluate", "--out", f"{plays}", *scenes, *asked, "--record", "--record-hz", "1")
     correcting = ("dual_system.data.correct", f"{plays}", "--out", f"{corrections}")
     rows = [(*training, *data, *_row(folder, recipe.__name__, seed)) for recipe, seed in ROWS]
+    delayed = [(*training, *data, *_delayed(folder, recipe.__name__, row.__name__)) for recipe, row in DELAYED]
     return (
         *(Stage(name=f"data {out.name}", commands=(_collect(out),)) for out in sets),
         Stage(name="album", commands=((*locating, "--minutes", "0"),)),
@@ -117,10 +126,12 @@ def stages(folder: Path) -> tuple[Stage, ...]:
             for first in range(0, len(rows), 2)
         ),
         Stage(name="cost", commands=tuple(_cost(folder, recipe) for recipe, seed in ROWS if seed == 0)),
+        Stage(name="rows delayed", commands=tuple(delayed)),
         *(
             Stage(name=f"test {number}", commands=commands, is_test=True)
             for number, commands in enumerate(_tests(folder), 1)
         ),
+        *(Stage(name=f"delays {delay_ms} ms", commands=tuple(_delays(folder, delay_ms))) for delay_ms in DELAYS_MS),
     )
 
 
@@ -160,6 +171,31 @@ def _cost(folder: Path, recipe: Callable[[], object]) -> tuple[str, ...]:
     ponder = ("--ponder", f"{row / 'ponder'}") if recipe in WITH_PONDER else ()
     out = folder / "cost" / f"{recipe.__name__}.json"
     return "benchmarks.policy_cost", "--out", f"{out}", "--pounce", f"{row / 'pounce'}", *ponder
+
+
+def _delayed(folder: Path, recipe: str, row: str) -> Sequence[str]:
+    from_row = _folder(folder, row, 0)
+    ponder = from_row if recipe == recipes.laptop_delayed.__name__ else folder / "words"
+    return _run(recipe, ponder, from_row, _folder(folder, recipe, 0))
+
+
+def _delays(folder: Path, delay_ms: int) -> Iterator[tuple[str, ...]]:
+    """Every channel at one delay, on development scenes; cognition also where it is told another age than its own."""
+    pair, words = _folder(folder, "laptop_delayed", 0), folder / "words" / "ponder"
+    channels = {
+        "cognition": ("laptop_delayed", "--ponder-checkpoint", f"{pair / 'ponder'}"),
+        "memory": ("laptop_framesamp_delayed",),
+        "oracle_text": ("laptop_text_delayed", "--subgoal-text", "grounded"),
+        "predicted_text": ("laptop_text_delayed", "--ponder-checkpoint", f"{words}"),
+    }
+    told_ms = {300: 2_000, 2_000: 300}.get(delay_ms)
+    if told_ms is not None:
+        channels[f"cognition_told_{told_ms}"] = (*channels["cognition"], "--reported-age-ms", f"{told_ms}")
+    scenes = ("--tasks", *TASKS, "--episodes", f"{DELAY_SCENES}", "--runs", "1", "--split", "development")
+    for name, (recipe, *given) in channels.items():
+        played = ("--pounce-checkpoint", f"{_folder(folder, recipe, 0) / 'pounce'}", "--max-steps", "700")
+        out = folder / "delays" / f"{name}_{delay_ms}"
+        yield "sim_client.evaluate", "--out", f"{out}", *scenes, *played, *given, "--delay-ms", f"{delay_ms}"
 
 
 def _tests(folder: Path) -> Iterator[tuple[tuple[str, ...], ...]]:

@@ -66,5 +66,4 @@ def refer(stamps: Iterable[Ready], now_ns: int, delivery: Delivery) -> Reference
         ref = latest_ready(stamps, now_ns)
     if ref is None:
         return NULL
-    is_frozen = delivery.kind == DeliveryKind.HELD_TRANSITION and delivery.reported_age_ns > 0
-    return Reference(query=ref.query, age_ns=delivery.reported_age_ns if is_frozen else age_ns(ref, now_ns))
+    return Reference(query=ref.query, age_ns=delivery.reported_age_ns or age_ns(ref, now_ns))

@@ -33,6 +33,11 @@ class History:
                 raise MalformedMessage("DemoFrame", "images", "a front picture", f"none at instant {index}")
             self._frames[index] = images.unpack(instant.images[0])
 
+    @property
+    def is_delayed(self) -> bool:
+        """Whether it is read as it was at the query whose cognition is given."""
+        return self._sampling.until == "query"
+
     def on_observation(self, observation: Observation) -> None:
         """Keeps the front picture of a tick of the grid. One that is no picture counts as lost."""
         if not observation.images or observation.tick % self._sampling.stride_ticks:

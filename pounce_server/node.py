@@ -14,6 +14,7 @@ from itertools import compress
 import numpy as np
 
 from clock.playback import tick_at
+from clock.timebase import NS_PER_S
 from model_server.rendezvous import Rendezvous
 from pounce_server.contract import EngineSpec, Request, Window
 from pounce_server.history import History
@@ -132,8 +133,12 @@ class PounceNode:
         )
         if self._history is None or self._info.schedule.delivery.kind == m.DeliveryKind.NULL:
             return Work(invocation=invocation, request=request)
-        remembered = replace(request, past=self._history.at(observation.tick))
-        num_missing = self._history.num_missing(observation.tick)
+        tick = observation.tick
+        if invocation.ref_query is not None and self._history.is_delayed:
+            before_ns = observation.source_ns - (invocation.now_ns - invocation.age_ns)
+            tick = max(0, tick - round(before_ns * self._info.schedule.control_hz / NS_PER_S))
+        remembered = replace(request, past=self._history.at(tick))
+        num_missing = self._history.num_missing(tick)
         return Work(invocation=invocation, request=remembered, num_missing=num_missing)
 
     def answer(self, work: Work, rows_NA: m.Floats, *, infer_ns: int) -> m.ActionChunk:

@@ -43,7 +43,8 @@ class ConditionOptions:
     deliver: Literal["every", "held-transition"] = "every"
     """Delivery of cognition. held-transition: only the first, then those at predicted transitions (paper, 5.2)."""
     reported_age_ms: int = 0
-    """Age in ms given to POUNCE with --deliver held-transition; 0 is the true age. The paper fixes it at 300."""
+    """Age in ms that POUNCE is told, whatever the true one; 0 is the true age. The paper fixes that of held transitions
+    at 300."""
     query_period_ms: int = 1000
     """Period of PONDER's queries in ms (paper: 1 Hz). 0: one query an episode, whose cognition is never too old."""
     delay_ms: int = 300
@@ -116,8 +117,8 @@ class EvalOptions:
         if min(self.episodes, self.runs, workers.workers) < 1:
             raise EvaluationError("--episodes, --runs and --workers must be at least 1")
         _ = self.seeds
-        if condition.reported_age_ms and condition.deliver != "held-transition":
-            raise EvaluationError("--reported-age-ms is for --deliver held-transition; otherwise ages are true")
+        if condition.reported_age_ms and condition.cognition == "null":
+            raise EvaluationError("--reported-age-ms is the age of a cognition, and --cognition null delivers none")
         if condition.cognition == "null" and condition.deliver != "every":
             raise EvaluationError("--cognition null delivers nothing, so nothing is held; leave --deliver out")
         if (condition.cognition == "other-episode") != (condition.donors is not None):

@@ -37,7 +37,8 @@ class ScheduleOptions:
     deliver: Literal["every", "held-transition", "null"] = "every"
     """Cognition that POUNCE is conditioned on (paper, 5.2)."""
     held_age_ms: int = 0
-    """Age in ms given to POUNCE with --deliver held-transition; 0 is the true age. The paper fixes it at 300."""
+    """Age in ms that POUNCE is told, whatever the true one; 0 is the true age. The paper fixes that of held transitions
+    at 300."""
     seam: Literal["switch", "offset-fade", "ensemble"] = "switch"
     """Transition from one action chunk to the next."""
     wait: Literal["stand-still", "hold"] = "stand-still"

@@ -32,6 +32,10 @@ Success in per cent, 95 % intervals in brackets: of a task Wilson's over its sce
 bootstrap over scenes and runs. Columns and rows marked "{paper.MARK}" are the paper's figures, over the same
 tasks: other scenes, other pictures, other physics. They are no baseline of ours."""
 
+ABOUT_DELAYS = """\
+Means over the tasks, by the delay of what POUNCE gets, or of the newest picture of its memory; when it is used, it is
+up to one query period older."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TablesOptions:
@@ -90,6 +94,8 @@ def tables(results: Sequence[Results], after_another_past: Sequence[Results] = (
         parts += ["## First choice", ABOUT_FIRST_CHOICES, first]
     if twins := retold(results, after_another_past):
         parts += ["## The same present after another past", ABOUT_RETOLD, twins]
+    if curves := by_delay(results):
+        parts += ["## By delay", ABOUT_DELAYS, curves]
     if len(results) > 1:
         parts += ["## Between conditions (form of the paper's Tables 3 and 4)", between_conditions(results)]
     return "\n\n".join(parts) + "\n"
@@ -144,6 +150,25 @@ def between_conditions(results: Sequence[Results]) -> str:
     return markdown(head, rows)
 
 
+def by_delay(results: Sequence[Results]) -> str:
+    """Returns a row for each channel of a POUNCE that was played at several delays; "" if none was."""
+    found: dict[str, dict[str, dict[int, Results]]] = {}
+    for each in results:
+        delay_ms, checkpoint = each.config.get("delay_ms"), each.config.get("pounce_checkpoint")
+        if delay_ms is not None and checkpoint is not None:
+            channels = found.setdefault(Path(checkpoint).parent.name, {})
+            channels.setdefault(_condition(each)[0], {}).setdefault(delay_ms, each)
+    found = {pounce: channels for pounce, channels in found.items() if max(map(len, channels.values())) > 1}
+    delays = sorted({delay for channels in found.values() for curve in channels.values() for delay in curve})
+    rows = [
+        [f"{pounce}: {gets}", *(percent(bootstrap(each.of(each.tasks))) if (each := curve.get(delay)) else ""
+                                for delay in delays)]
+        for pounce, channels in found.items()
+        for gets, curve in channels.items()
+    ]  # fmt: skip
+    return markdown(["POUNCE gets", *(f"{delay / 1000:g} s" for delay in delays)], rows) if rows else ""
+
+
 _GIVEN = {
     "null": "the null cognition",
     "other-episode": "another episode's cognition",
@@ -175,9 +200,11 @@ def _condition(results: Results) -> tuple[str, str, str, str]:
         gets = _TOLD[told]
     if results.num_carriers == 0 and {"ponder_checkpoint": None}.items() <= config.items() and told == "ponder":
         gets = "nothing of PONDER's"
+    reported_ms = config.get("held_age_ms", 0)
     if config.get("deliver") == "held-transition":
-        reported_ms = config.get("held_age_ms", 0)
         gets += f" held at transitions, with {f'age {reported_ms} ms' if reported_ms else 'its true age'}"
+    elif reported_ms:
+        gets += f", told as {reported_ms} ms old"
     if (shown := config.get("pictures")) is not None:
         gets += f", {_SHOWN[shown]}"
     carriers = "" if results.num_carriers is None else str(results.num_carriers)

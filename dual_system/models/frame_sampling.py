@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from dual_system.models.ponder.demo_sampling import FASTEST_HZ, DemoSampling
 
 FrameRule = Literal["spread", "newest"]
+FrameEnd = Literal["observation", "query"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,6 +32,9 @@ class FrameSampling:
     """spread: evenly over the whole history, first and last included (FrameSamp). newest: the last ones, a window."""
     stride_ticks: int = 1
     """Distance of the grid; RoboMME's FrameSamp keeps every step."""
+    until: FrameEnd = "observation"
+    """What the newest picture may be of: POUNCE's own observation, or the one that its cognition is of (a delayed
+    memory: as old as C would be, whether or not POUNCE reads any)."""
 
     def __post_init__(self) -> None:
         if self.num_frames < 2:

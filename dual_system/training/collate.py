@@ -90,8 +90,10 @@ class _TrainingMoment:
     @property
     def num_seen(self) -> int:
         """How much of the history the frame memory has seen."""
-        num_demo = self.example.episode.num_demo_history
-        return 0 if self.sampling is None else self.sampling.num_seen(num_demo, self.invocation.tick)
+        if self.sampling is None:
+            return 0
+        tick = self.example.remembered_tick(self.invocation, self.sampling)
+        return self.sampling.num_seen(self.example.episode.num_demo_history, tick)
 
     @property
     def subgoal(self) -> str:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from clock.sampling import Clocks, SampledInvocation, SampledQuery, SampledSchedule, sample_schedule
+from dual_system.models.frame_sampling import FrameSampling
 from dual_system.models.ponder.context import ContextFormat, Row, Transition
 from dual_system.models.ponder.coordinates import normalised_text
 from dual_system.training.episode import TrainingEpisode
@@ -34,6 +35,8 @@ class ExampleConfig:
     """False: the row has no texts, as in RoboCasa-DC."""
     told: Told | None = None
     """Texts for POUNCE in place of PONDER's; None: PONDER's newest subgoal, if it reads subgoals."""
+    delay_up_to_ns: int = 0
+    """PONDER's mean delay is drawn for each episode, from 0 to this one, in place of the clocks'; 0: it is not."""
     branch_weight: float = 1.0
     """Weight of invocations in the 1.5 s after a transition, where the subgoal decides, against all others."""
     has_reasoning: bool = True
@@ -64,6 +67,13 @@ class Example:
         (row,) = self.rows
         return row
 
+    def remembered_tick(self, invocation: SampledInvocation, sampling: FrameSampling) -> int:
+        """The newest tick that a frame memory may have a picture of."""
+        query = invocation.reference.query
+        if sampling.until == "observation":
+            return invocation.tick
+        return 0 if query is None else self.schedule.queries[query].tick
+
     @property
     def frames(self) -> tuple[Tensor | None, ...]:
         """The images of each row."""
@@ -81,7 +91,11 @@ def make_example(
     if (num_views := form.demonstrations.num_views) is not None:
         num_images = form.reader.num_images(num_views)
         episode = replace(episode, demo=tuple(images[:num_images] for images in episode.demo))
-    schedule = sample_schedule(rng, config.clocks, episode.num_ticks, transition_ticks=episode.transition_ticks)
+    clocks = config.clocks
+    if config.delay_up_to_ns:
+        mean_ns = int(rng.integers(config.delay_up_to_ns, endpoint=True))
+        clocks = replace(clocks, delay=replace(clocks.delay, mean_ns=mean_ns))
+    schedule = sample_schedule(rng, clocks, episode.num_ticks, transition_ticks=episode.transition_ticks)
     imitated = [each for each in schedule.invocations if each.tick >= episode.imitated_from]
     count = min(config.max_invocations, len(imitated))
     weights = None if config.branch_weight == 1 else _weights(episode, imitated, config.branch_weight)

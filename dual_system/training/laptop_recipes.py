@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from clock import sampling
+from clock.timebase import NS_PER_S
 from dual_system.models.frame_sampling import FrameMemoryConfig, FrameSampling
 from dual_system.models.pi05.pounce import PounceConfig
 from dual_system.models.ponder import configs as ponder_configs
@@ -19,6 +20,8 @@ from dual_system.training.trainer import TrainConfig
 _LAPTOP = TrainConfig(seed=0, optim=OptimConfig(learning_rate=1e-3, warmup_steps=200, ema_decay=0.999))
 _ROW_STEPS = 1_500
 """Steps that every row of the table goes on with, whatever its channel."""
+_DELAYED_STEPS = 300
+"""Further steps of a row at delays that are drawn."""
 
 
 def laptop_hand() -> Recipe:
@@ -126,6 +129,27 @@ def laptop_window() -> Recipe:
     return replace(_of_the_hand("laptop_window", _with_frames(newest)), demo_hz=1)
 
 
+def laptop_delayed() -> Recipe:
+    """`laptop` goes on at delays of 0 to 2 s, for the curve of success over delay."""
+    return _delayed(laptop())
+
+
+def laptop_text_delayed() -> Recipe:
+    """`laptop_text` goes on likewise."""
+    return _delayed(laptop_text())
+
+
+def laptop_framesamp_delayed() -> Recipe:
+    """`laptop_framesamp` goes on likewise, with a memory that is as old as C would be."""
+    delayed = FrameSampling(num_frames=16, stride_ticks=10, until="query")
+    return _delayed(replace(laptop_framesamp(), pounce=_with_frames(delayed)))
+
+
+def _delayed(run: Recipe) -> Recipe:
+    example = replace(run.example, delay_up_to_ns=2 * NS_PER_S)
+    return replace(run, name=f"{run.name}_delayed", example=example, num_steps=_DELAYED_STEPS)
+
+
 def _with_frames(sampling: FrameSampling) -> PounceConfig:
     memory = FrameMemoryConfig(sampling=sampling, position_size=96, num_heads=4, head_dim=32)
     return replace(pounce_configs.laptop(num_carriers=0), frame_memory=memory)
@@ -156,4 +180,7 @@ ALL: tuple[Callable[[], Recipe], ...] = (
     laptop_framesamp,
     laptop_framesamp_grounded,
     laptop_window,
+    laptop_delayed,
+    laptop_text_delayed,
+    laptop_framesamp_delayed,
 )

@@ -77,7 +77,11 @@ def words_to_remember(examples: Sequence[Example], form: ContextFormat, sampling
     An invocation in an episode without subgoals has no token.
     """
     texts = [
-        text_ids(example.episode, form, invocation.tick // sampling.stride_ticks * sampling.stride_ticks)
+        text_ids(
+            example.episode,
+            form,
+            example.remembered_tick(invocation, sampling) // sampling.stride_ticks * sampling.stride_ticks,
+        )
         for example in examples
         for invocation in example.invocations
     ]

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
-from clock.reference import NULL
-from clock.sampling import SampledInvocation, SampledSchedule
+from clock.reference import Ready, Reference
+from clock.sampling import SampledInvocation, SampledQuery, SampledSchedule
 from dual_system.analysis.probe import ABOUT, Array, Instants, probe_table
 from dual_system.data.dataset import Dataset, Entry
 from dual_system.data.episode import Rows
@@ -150,9 +150,13 @@ def _read_out_of(folder: Path, options: ProbeOptions) -> Read:
 
     def read_out(_: Dataset, entry: Entry) -> Array:
         episode = data[number[entry.task, entry.seed]]
-        ticks = range(0, episode.num_ticks, FPS)
-        asked = tuple(SampledInvocation(tick=tick, now_ns=0, reference=NULL) for tick in ticks)
-        schedule = SampledSchedule(queries=(), invocations=asked)
+        stamps = [Ready(query=query, source_ns=0, ready_ns=0) for query in range(-(-episode.num_ticks // FPS))]
+        queries = tuple(SampledQuery(tick=each.query * FPS, stamp=each) for each in stamps)
+        asked = tuple(
+            SampledInvocation(tick=each.tick, now_ns=0, reference=Reference(query=each.stamp.query, age_ns=0))
+            for each in queries
+        )
+        schedule = SampledSchedule(queries=queries, invocations=asked)
         example = Example(
             episode=episode,
             rows=(),

@@ -249,6 +249,28 @@ def write_choices(folder: Path, choices: list[str | None], **config: Any) -> Pat
     return folder
 
 
+def test_a_channel_s_delays_stand_in_one_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    played: dict[str, dict[str, Any]] = {
+        "C_0": {},
+        "C_2000": {"delay_ms": 2000},
+        "told": {"delay_ms": 2000, "held_age_ms": 300},
+    }
+    for place, (name, changes) in enumerate(played.items()):
+        write(Path(name), {"StopCube": ["1" * (3 - place) + "0"]}, pounce_checkpoint="rows/pair_0/pounce", **changes)
+    write(Path("once"), {"StopCube": ["1111"]}, pounce_checkpoint="rows/other_0/pounce")
+    assert main([*played, "once", "--out", "."]) == 0
+    text = Path("tables.md").read_text()
+    curves = text[text.index("## By delay") :].split("## ")[1].splitlines()
+    head, _, row, told = [line for line in curves if line.startswith("| ")]
+    assert head == "| POUNCE gets | 0.3 s | 2 s |"
+    assert row.startswith("| pair_0: C_t | 75.00 [")
+    assert "| 50.00 [" in row
+    assert told.startswith("| pair_0: C_t, told as 300 ms old |  | 25.00 [")
+    assert main(["once", "--out", "."]) == 0
+    assert "By delay" not in Path("tables.md").read_text()
+
+
 def test_two_pasts_of_one_present_are_counted_scene_by_scene(tmp_path: Path) -> None:
     """A condition is the same whatever was recorded of it, and whichever other tasks it was played in."""
     own = write_choices(tmp_path / "own", ["right", "right", "wrong", "wrong", None], record=True)

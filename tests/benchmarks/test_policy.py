@@ -64,8 +64,8 @@ def test_a_stage_reads_only_what_an_earlier_one_writes(tmp_path: Path) -> None:
 
 def test_every_row_is_played_with_what_its_pounce_reads(tmp_path: Path) -> None:
     """Null cognition takes a frame memory away too, so it is the pair's own control alone."""
-    played = [parse(EvalOptions, arguments[1:], prog="pp-eval") for stage in stages(tmp_path) if stage.is_test
-              for arguments in stage.commands]  # fmt: skip
+    played = [parse(EvalOptions, arguments[1:], prog="pp-eval") for stage in stages(tmp_path)
+              if stage.is_test or stage.name.startswith("delays") for arguments in stage.commands]  # fmt: skip
     kinds = set()
     for options in played:
         assert options.pounce_checkpoint is not None

@@ -134,6 +134,13 @@ def test_the_papers_intervention_reports_a_frozen_age() -> None:
     assert refer([ready(0, 0, 300)], 9_000 * MS, frozen) == Reference(query=0, age_ns=300 * MS)
 
 
+@given(stamps=stamps(), now_ns=NOW, told_ms=st.integers(1, 5_000))
+def test_another_age_is_told_of_the_same_content(stamps: list[Ready], now_ns: int, told_ms: int) -> None:
+    told = refer(stamps, now_ns, Delivery(kind=DeliveryKind.EVERY, reported_age_ns=told_ms * MS))
+    true = refer(stamps, now_ns, Delivery(kind=DeliveryKind.EVERY))
+    assert told == (NULL if true == NULL else Reference(query=true.query, age_ns=told_ms * MS))
+
+
 def test_a_frozen_age_is_not_told_of_null() -> None:
     frozen = Delivery(kind=DeliveryKind.HELD_TRANSITION, reported_age_ns=300 * MS)
     assert refer([], 9_000 * MS, frozen) == NULL

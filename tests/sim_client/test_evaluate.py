@@ -137,7 +137,7 @@ def test_one_folder_holds_one_condition(tmp_path: Path) -> None:
     ("changes", "words"),
     [
         ({"episodes": 0}, "at least 1"),
-        ({"reported_age_ms": 300}, "held-transition"),
+        ({"reported_age_ms": 300, "cognition": "null"}, "delivers none"),
         ({"cognition": "null", "deliver": "held-transition"}, "nothing is held"),
         ({"cognition": "other-episode"}, "--donors"),
         ({"donors": Path("x")}, "--donors"),
@@ -249,6 +249,7 @@ def test_a_period_of_nothing_is_one_cognition_an_episode(tmp_path: Path) -> None
         ({"cognition": "null"}, m.DeliveryKind.NULL, 0),
         ({"deliver": "held-transition"}, m.DeliveryKind.HELD_TRANSITION, 0),
         ({"deliver": "held-transition", "reported_age_ms": 300}, m.DeliveryKind.HELD_TRANSITION, 300_000_000),
+        ({"delay_ms": 2000, "reported_age_ms": 300}, m.DeliveryKind.EVERY, 300_000_000),
     ],
 )
 def test_interventions_are_deliveries(tmp_path: Path, changes: Any, kind: m.DeliveryKind, age_ns: int) -> None:

@@ -204,6 +204,18 @@ def test_a_correction_begins_within_its_episode(episode_of_noise: MakeEpisode) -
             replace(episode_of_noise(70), imitated_from=wrong)
 
 
+def test_an_episode_has_one_delay_of_those_that_are_drawn(episode_of_noise: MakeEpisode) -> None:
+    config = ExampleConfig(clocks=EVALUATION, delay_up_to_ns=2_000_000_000)
+    found = []
+    for seed in range(20):
+        schedule = example_of(episode_of_noise(90), config, seed).schedule
+        delays = {query.stamp.ready_ns - query.stamp.source_ns for query in schedule.queries}
+        assert len(delays) == 1
+        found += delays
+    assert 0 <= min(found) < 500_000_000
+    assert 1_500_000_000 < max(found) <= 2_000_000_000
+
+
 def test_no_more_invocations_than_asked_for_and_in_order(episode_of_noise: MakeEpisode) -> None:
     drawn = example_of(episode_of_noise(60), ExampleConfig(clocks=ROBOMME, max_invocations=5))
     ticks = [each.tick for each in drawn.invocations]

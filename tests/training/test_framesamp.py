@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from clock.playback import deadline_ns
 from clock.sampling import ROBOMME
 from dual_system.data.dataset import Dataset
 from dual_system.data.episode import Package
@@ -53,13 +54,14 @@ def long_folder(
     return write_dataset(tmp_path_factory.mktemp("long") / "set", [package])
 
 
-@pytest.mark.parametrize("rule", ["spread", "newest"])
+@pytest.mark.parametrize(("rule", "until"), [("spread", "observation"), ("newest", "observation"), ("spread", "query")])
 def test_training_and_serving_read_the_same_pictures(
-    rule: Any, long_folder: Path, episode_info: Callable[..., m.EpisodeInfo], paper: m.Schedule
+    rule: Any, until: Any, long_folder: Path, episode_info: Callable[..., m.EpisodeInfo], paper: m.Schedule
 ) -> None:
     """Every invocation of a schedule, and the node of the server that saw the same pictures: equal bits."""
     memory = tiny_frame_memory()
-    config = replace(POUNCE, frame_memory=replace(memory, sampling=replace(memory.sampling, num_frames=6, rule=rule)))
+    sampling = replace(memory.sampling, num_frames=6, rule=rule, until=until)
+    config = replace(POUNCE, frame_memory=replace(memory, sampling=sampling))
     spec, tokenizer = EagerEngine(random_bundle(config, 0)).spec, tiny_tokenizer_for_random_weights()
     data = TrainingSet(long_folder, sizes=PictureSizes(pounce_px=config.image_px, past=sampling_of(config)))
     clocks = ExampleConfig(clocks=ROBOMME, max_invocations=1 << 30, is_grounded=False)
@@ -75,12 +77,21 @@ def test_training_and_serving_read_the_same_pictures(
     for tick in range(len(shown) - NUM_DEMO_ROWS):
         is_seen = tick % STRIDE == 0 or tick in asked
         seen = packed(shown[NUM_DEMO_ROWS + tick]) if is_seen else ()
-        node.on_observation(m.Observation(tick=tick, source_ns=0, proprio=data[0].state_TS[tick], images=seen))
+        source_ns = deadline_ns(example.invocations[0].now_ns, tick, 20) if tick else 0
+        node.on_observation(m.Observation(tick=tick, source_ns=source_ns, proprio=data[0].state_TS[tick], images=seen))
         if tick not in asked:
             continue
         place, nothing = asked[tick], np.zeros((0, 0), np.float32)
+        now_ns, reference = example.invocations[place].now_ns, example.invocations[place].reference
         node.on_invocation(
-            m.Invocation(invocation=place, tick=tick, now_ns=0, ref_query=None, age_ns=0, cognition=nothing)
+            m.Invocation(
+                invocation=place,
+                tick=tick,
+                now_ns=now_ns,
+                ref_query=reference.query,
+                age_ns=reference.age_ns,
+                cognition=nothing,
+            )
         )
         work = node.next_work()
         assert work is not None
@@ -94,6 +105,10 @@ def test_training_and_serving_read_the_same_pictures(
     assert len({tuple(steps.tolist()) for steps in batch.past_step}) > 6
     lengths = {int((steps != NO_FRAME).sum()) for steps in batch.past_step}
     assert lengths == {4, 5, 6}  # three of the demonstration, and tick 0
+    newest = [int(steps.max()) - 60 for steps in batch.past_step]
+    own = [each.tick // 20 * 20 for each in example.invocations]
+    assert all(here <= there for here, there in zip(newest, own, strict=True))
+    assert (newest == own) == (until == "observation")
 
 
 def test_a_grid_that_was_not_rendered_is_refused(

@@ -131,7 +131,12 @@ def test_every_row_of_the_laptop_table_has_the_same_chances(name: str) -> None:
     row, pair, hand = recipe(name), recipe("laptop"), recipe("laptop_hand_corrected")
     assert (row.train, row.space) == (pair.train, pair.space)
     assert row.pounce.pi05 == pair.pounce.pi05 == hand.pounce.pi05
-    if name not in ("laptop_hand", "laptop_hand_corrected", "laptop_grounding", "laptop_current_grounding"):
+    if name.endswith("_delayed"):
+        found = differences(recipe(name.removesuffix("_delayed")), row)
+        memory = {"pounce.frame_memory.sampling.until": ("observation", "query")} if "framesamp" in name else {}
+        delays = {"num_steps": (1_500, 300), "example.delay_up_to_ns": (0, 2 * NS_PER_S)}
+        assert found == {"name": (name.removesuffix("_delayed"), name), **delays, **memory}
+    elif name not in ("laptop_hand", "laptop_hand_corrected", "laptop_grounding", "laptop_current_grounding"):
         assert (row.num_steps, row.batch_episodes) == (pair.num_steps, pair.batch_episodes)
         for field in ("clocks", "max_invocations", "branch_weight"):
             assert getattr(row.example, field) == getattr(pair.example, field)
