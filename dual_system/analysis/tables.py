@@ -160,12 +160,11 @@ def by_delay(results: Sequence[Results]) -> str:
             channels.setdefault(_condition(each)[0], {}).setdefault(delay_ms, each)
     found = {pounce: channels for pounce, channels in found.items() if max(map(len, channels.values())) > 1}
     delays = sorted({delay for channels in found.values() for curve in channels.values() for delay in curve})
-    rows = [
-        [f"{pounce}: {gets}", *(percent(bootstrap(each.of(each.tasks))) if (each := curve.get(delay)) else ""
-                                for delay in delays)]
-        for pounce, channels in found.items()
-        for gets, curve in channels.items()
-    ]  # fmt: skip
+    rows = []
+    for pounce, channels in found.items():
+        for gets, curve in channels.items():
+            means = {delay: percent(bootstrap(played.of(played.tasks))) for delay, played in curve.items()}
+            rows.append([f"{pounce}: {gets}", *(means.get(delay, "") for delay in delays)])
     return markdown(["POUNCE gets", *(f"{delay / 1000:g} s" for delay in delays)], rows) if rows else ""
 
 

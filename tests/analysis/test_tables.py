@@ -257,7 +257,12 @@ def test_a_channel_s_delays_stand_in_one_row(tmp_path: Path, monkeypatch: pytest
         "told": {"delay_ms": 2000, "held_age_ms": 300},
     }
     for place, (name, changes) in enumerate(played.items()):
-        write(Path(name), {"StopCube": ["1" * (3 - place) + "0"]}, pounce_checkpoint="rows/pair_0/pounce", **changes)
+        write(
+            Path(name),
+            {"StopCube": ["1" * (3 - place) + "0" * (1 + place)]},
+            pounce_checkpoint="rows/pair_0/pounce",
+            **changes,
+        )
     write(Path("once"), {"StopCube": ["1111"]}, pounce_checkpoint="rows/other_0/pounce")
     assert main([*played, "once", "--out", "."]) == 0
     text = Path("tables.md").read_text()

@@ -412,7 +412,7 @@ def test_a_memory_of_its_own_needs_no_ponder_and_is_there(tmp_path: Path) -> Non
     changes: dict[str, Any]
     for name, changes in {"asked": {"record": True}, "nobody": {}, "forgets": {"cognition": "null"}}.items():
         chosen = options(
-            tmp_path / name, tasks=("PickHighlight",), episodes=1, runs=1, policy="servers", max_steps=65,
+            tmp_path / name, tasks=("PickHighlight",), episodes=1, runs=1, policy="servers", max_steps=25,
             pounce_checkpoint=tmp_path / "pounce", **changes,
         )  # fmt: skip
         with contextlib.closing(EvaluationHarness(chosen)) as harness:
