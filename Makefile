@@ -18,7 +18,7 @@ help:
 ## make setup   create .venv and install the pinned packages (the others call it when needed)
 setup: $(READY)
 
-# Byte code is written for what is imported, when it is: of everything it takes as long as the downloads.
+# pip compiles one file after another, which takes longer than to fetch them; at the end all cores do it at once.
 INSTALL := $(BIN)/pip install --quiet --no-compile
 
 $(READY): requirements.txt pyproject.toml
@@ -31,6 +31,7 @@ $(READY): requirements.txt pyproject.toml
 	# A CUDA build of torch brings its own Triton, and elsewhere than on Linux there is none.
 	$(BIN)/python -c 'import triton' 2>/dev/null || test "$$(uname)" != Linux || $(INSTALL) triton==3.6.0
 	$(INSTALL) --no-deps --no-build-isolation --editable .
+	@$(BIN)/python -m compileall -q -j 0 $(VENV)/lib >/dev/null || true  # some files are of a newer Python
 	touch $@
 
 ## make demo    a trained pair drives a Panda through PickHighlight, with memory and without; everything is in out/demo
