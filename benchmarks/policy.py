@@ -110,7 +110,8 @@ def _run(stage: Stage, folder: Path, ends_s: float) -> int:
 def _ended(process: subprocess.Popen[bytes], ends_s: float) -> tuple[int, float]:
     """A command's exit code and processor time [s], its children's included.
 
-    At the end of the slice it is told to end (by SIGTERM: nohup shields from Ctrl-C); what it has not saved is done again.
+    At the end of the slice it is told to end (by SIGTERM: nohup shields from Ctrl-C). What it has not saved is done
+    again.
     """
     for until_s, end in ((ends_s, process.terminate), (ends_s + _ENDING_S, process.kill), (math.inf, process.kill)):
         while True:
