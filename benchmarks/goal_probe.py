@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 import dual_system.tasks.headless  # noqa: F401 - before anything that imports mujoco
 from benchmarks.report import Row, lines_of
 from dual_system.analysis.markdown import percent
+from dual_system.analysis.probe import predicted
 from dual_system.analysis.statistics import wilson
 from dual_system.tasks.kitchen.environment import KitchenEnvironment
 from dual_system.tasks.kitchen.goals import GOAL_SETS
@@ -27,8 +28,6 @@ from protocol.command_line import command, parse
 
 Floats = NDArray[np.float64]
 _POOLED = 8  # a view's height and width
-_FOLDS = 5
-_RIDGES = 10.0 ** np.arange(-3, 3)
 LEVEL = 0.995
 
 
@@ -53,39 +52,9 @@ def seen_at_first(environment: KitchenEnvironment, seed: int, goal: int | None =
 
 def is_found(seen_NF: Floats, goals_N: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Returns for each scene whether the classifier that was fitted to the others' folds names its goal."""
-    fold_N = np.arange(len(goals_N)) % _FOLDS
-    found_N = np.zeros(len(goals_N), bool)
-    for fold in range(_FOLDS):
-        is_held = fold_N == fold
-        named = _fitted(seen_NF[~is_held], goals_N[~is_held], seen_NF[is_held])
-        found_N[is_held] = named == goals_N[is_held]
+    named_N = predicted(seen_NF, np.eye(int(goals_N.max()) + 1)[goals_N], np.arange(len(goals_N))).argmax(axis=1)
+    found_N: NDArray[np.bool_] = named_N == goals_N
     return found_N
-
-
-def _fitted(seen_NF: Floats, goals_N: NDArray[np.int64], held_MF: Floats) -> NDArray[np.int64]:
-    """Names the goals of held-out scenes by ridge regression onto one number a goal.
-
-    The ridge is the one whose leave-one-out error on the fitted scenes is least.
-    """
-    mean_F, std_F = seen_NF.mean(0), seen_NF.std(0)
-    used = std_F > 1e-9
-    x_NF, x_MF = ((each - mean_F)[:, used] / std_F[used] for each in (seen_NF, held_MF))
-    y_NK = np.eye(int(goals_N.max()) + 1)[goals_N]
-    centre_K = y_NK.mean(0)
-    width = max(int(used.sum()), 1)
-    values_N, vectors_NN = np.linalg.eigh(x_NF @ x_NF.T / width)
-    turned_NK = vectors_NN.T @ (y_NK - centre_K)
-
-    def left_out_error(ridge: float) -> float:
-        shrunk_N = values_N / (values_N + ridge)
-        left_NK = (y_NK - centre_K) - vectors_NN @ (shrunk_N[:, None] * turned_NK)
-        own_N = np.einsum("ni,i,ni->n", vectors_NN, shrunk_N, vectors_NN)
-        return float(np.mean((left_NK / (1 - own_N)[:, None]) ** 2))
-
-    ridge = min(_RIDGES, key=left_out_error)
-    weights_NK = vectors_NN @ (turned_NK / (values_N + ridge)[:, None])
-    named: NDArray[np.int64] = (x_MF @ x_NF.T / width @ weights_NK + centre_K).argmax(1)
-    return named
 
 
 def _pooled(picture_HWC: Floats) -> Floats:

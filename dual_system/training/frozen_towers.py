@@ -1,7 +1,7 @@
 """Frozen vision towers of a run: what they make of a picture never changes, so it is computed once and stored.
 
 The paper freezes its backbones; so do recipes with ``freeze`` and ``freezes_ponder_vision``. Half precision moves a
-loss by less than one part in a thousand. It pays where towers are small: a laptop's 64 tokens of 128 numbers are 16 kB
+loss by less than two parts in a thousand. It pays where towers are small: a laptop's 64 tokens of 128 numbers are 16 kB
 beside a picture's 12, those of pi0.5's SigLIP a megabyte beside 150 kB.
 """
 

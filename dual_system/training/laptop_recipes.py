@@ -41,7 +41,7 @@ def laptop_hand() -> Recipe:
             branch_weight=3.0,
         ),
         train=_LAPTOP,
-        num_steps=12_000,  # of 64 rows; what it is told, it begins to heed after some 4,000
+        num_steps=12_000,
         batch_episodes=8,
         trains="pounce",
         demo_hz=2,
