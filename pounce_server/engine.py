@@ -23,7 +23,7 @@ from dual_system.models.pi05.pounce import Pounce, PounceInputs
 from dual_system.models.pi05.prompt import Tokenizer
 from dual_system.models.pounce.batching import joined_groot, joined_pi05, of_equal_length
 from dual_system.models.pounce.checkpoint import PounceBundle
-from dual_system.models.pounce.family import AnyPounce, max_committed_rows, sampling_of
+from dual_system.models.pounce.family import AnyPounce, max_committed_rows, own_parts, sampling_of
 from dual_system.models.pounce.precision import cast_streams
 from dual_system.models.pounce.reading import groot_inputs, pi05_inputs
 from pounce_server.compiled import compiled_sampler
@@ -114,11 +114,8 @@ class EagerEngine:
             reads_subgoal=config.reads_subgoal,
             past=sampling_of(config),
         )
-        if path != "eager" and self.spec.past is not None:
-            raise ValueError(
-                f"this checkpoint's expert is modulated by a frame memory, which --path {path} does not compute; serve "
-                "it with --path eager"
-            )
+        if path != "eager" and (own := own_parts(config)):
+            raise ValueError(f"this checkpoint has {own}, which --path {path} does not compute; serve it with --path eager")
         model = cast_streams(bundle.model, dtype).to(self._device).eval().requires_grad_(False)
         if path != "eager" and continuity != "none":
             raise ValueError(f"the path {path!r} knows no --continuity; leave one of them out")

@@ -15,6 +15,7 @@ from dual_system.models.stored_tensors import Shape, require_shapes
 
 COGNITION = "pounce_prefix."
 FRAME_MEMORY = "pounce_frame_memory."
+POINTER = "pounce_pointer."
 
 
 def write_tensors(tensors: Mapping[str, Tensor], path: Path) -> None:
@@ -36,13 +37,13 @@ def renamed(name: str, table: Iterable[tuple[str, str]]) -> str:
 def require_fit(model: nn.Module, found: Mapping[str, Shape], public_name: Callable[[str], str], source: str) -> bool:
     """Compares the shapes of tensors with public names with a model's; returns whether a cognition prefix is there.
 
-    A public file has none, and no frame memory: the model then keeps its own parameters of these.
+    A public file has none, no frame memory and no pointer: the model then keeps its own parameters of these.
 
     Raises:
         WeightsError: a tensor is missing, unknown or of another shape.
     """
     expected = {public_name(name): tuple(parameter.shape) for name, parameter in model.state_dict().items()}
-    absent = tuple(own for own in (COGNITION, FRAME_MEMORY) if not any(name.startswith(own) for name in found))
+    absent = tuple(own for own in (COGNITION, FRAME_MEMORY, POINTER) if not any(name.startswith(own) for name in found))
     expected = {public: shape for public, shape in expected.items() if not public.startswith(absent)}
     require_shapes(expected, found, source)
     return COGNITION not in absent

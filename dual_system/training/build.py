@@ -69,7 +69,7 @@ def build(run: Recipe, data: TrainingSet, start: Start) -> tuple[JointModel, Pou
         raise ValueError(
             f"recipe {run.name} starts from pretrained weights; give their folders with --ponder, --pounce"
         )
-    if (run.trains != "pounce" and run.example.is_grounded) or run.grounds_memory:
+    if (run.trains != "pounce" and run.example.is_grounded) or run.grounds_memory or run.grounds_pointer:
         data.require_texts()
     ponder = _ponder(run, data, start)
     bundle = _pounce(run, data, start, ponder)
@@ -178,6 +178,7 @@ def with_channel(run: Recipe, bundle: PounceBundle) -> PounceBundle:
         cognition=wanted.cognition,
         reads_subgoal=wanted.reads_subgoal,
         frame_memory=wanted.frame_memory or model.config.frame_memory,
+        num_pointed=wanted.num_pointed or model.config.num_pointed,
     )
     if config == model.config:
         return bundle

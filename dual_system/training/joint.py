@@ -29,7 +29,7 @@ from torch.nn.utils.rnn import pad_sequence
 from dual_system.models.groot.pounce import GrootInputs
 from dual_system.models.pi05.committed import draw_counts
 from dual_system.models.pi05.pounce import Pounce, PounceInputs
-from dual_system.models.ponder.context import Row
+from dual_system.models.ponder.context import IGNORE, Row
 from dual_system.models.ponder.network import Ponder
 from dual_system.models.pounce.family import AnyPounce, action_loss
 from dual_system.training.memory_words import MemoryWords, num_wanted
@@ -113,6 +113,8 @@ class PounceBatch:
     """int64: query index in that episode, or NO_QUERY."""
     words_IL: Tensor | None = None
     """int64: the texts that a frame memory is taught (`memory_words`); None: it is taught none."""
+    places_IQ: Tensor | None = None
+    """int64: the patches that a pointer is taught (`pointed_places`), or `IGNORE`; None: it is taught none."""
 
     @property
     def num_episodes(self) -> int:
@@ -143,6 +145,7 @@ class PounceBatch:
             episode_I=change(self.episode_I),
             query_I=change(self.query_I),
             words_IL=None if self.words_IL is None else change(self.words_IL),
+            places_IQ=None if self.places_IQ is None else change(self.places_IQ),
         )
 
 
@@ -267,6 +270,8 @@ class JointModel(nn.Module):
         num_supervised = sum(len(row.supervised_index) for row in episodes.rows) if is_grounded else 0
         if self.memory_words is not None and invocations.words_IL is not None:
             num_supervised += num_wanted(invocations.words_IL)
+        if invocations.places_IQ is not None:
+            num_supervised += int((invocations.places_IQ != IGNORE).sum())
         return Counts(
             num_rows=draws.num_counted_rows if acts else 0,
             num_supervised=num_supervised,
@@ -299,6 +304,10 @@ class JointModel(nn.Module):
                     inputs, memory_ISE, visible_IS = cast(Pounce, self.pounce).looked_back(inputs)
                     logits_NV, targets_N = self.memory_words(memory_ISE, visible_IS, invocations.words_IL)
                     grounding = _mean_cross_entropy(logits_NV, targets_N)
+                if invocations.places_IQ is not None:
+                    inputs, scores_IQS = cast(Pounce, self.pounce).pointing(inputs)
+                    is_known_IQ = invocations.places_IQ != IGNORE
+                    grounding = _mean_cross_entropy(scores_IQS[is_known_IQ], invocations.places_IQ[is_known_IQ])
             matching = action_loss(
                 self.pounce, inputs, invocations.actions_INA, draws.noise_SNA, draws.time_S, draws.num_committed_S
             )

@@ -17,7 +17,7 @@ from dual_system.training.recipe import Recipe
 from dual_system.training.told import Told
 from dual_system.training.trainer import TrainConfig
 
-_LAPTOP = TrainConfig(seed=0, optim=OptimConfig(learning_rate=1e-3, warmup_steps=200, ema_decay=0.999))
+_LAPTOP = TrainConfig(seed=0, flow_samples=4, optim=OptimConfig(learning_rate=1e-3, warmup_steps=200, ema_decay=0.999))
 _ROW_STEPS = 1_500
 """Steps that every row of the table goes on with, whatever its channel."""
 _DELAYED_STEPS = 300
@@ -27,7 +27,8 @@ _DELAYED_STEPS = 300
 def laptop_hand() -> Recipe:
     """Stage B of the laptop pair: one hand for all rows, a third of them told places, a third plain texts.
 
-    It stands in for a pretrained pi0.5. Its vision tower comes trained and frozen (`policy.towers`).
+    It stands in for a pretrained pi0.5. Its vision tower comes trained and frozen (`policy.towers`), and its pointer
+    learns here, and only here, where the oracle's text points.
     """
     return Recipe(
         name="laptop_hand",
@@ -41,9 +42,11 @@ def laptop_hand() -> Recipe:
             branch_weight=3.0,
         ),
         train=_LAPTOP,
-        num_steps=12_000,
+        num_steps=6_000,
         batch_episodes=8,
+        w2=0.1,
         trains="pounce",
+        grounds_pointer=True,
         demo_hz=2,
         space="ee_delta",
         statistics_by_row=True,
@@ -164,6 +167,7 @@ def _of_the_hand(name: str, pounce: PounceConfig, told: Told | None = None) -> R
         example=replace(hand.example, told=told, max_invocations=pair.example.max_invocations),
         num_steps=pair.num_steps,
         batch_episodes=pair.batch_episodes,
+        grounds_pointer=False,
     )
 
 

@@ -40,6 +40,8 @@ class Recipe:
     """False: PONDER is trained and served without memory (`ContextFormat.remembers`)."""
     grounds_memory: bool = False
     """POUNCE's frame memory is taught PONDER's texts, with weight ``w2`` (`memory_words`)."""
+    grounds_pointer: bool = False
+    """POUNCE's pointer is taught the places in PONDER's texts, with weight ``w2`` (`pointed_places`)."""
     demo_hz: int = 1
     """Frames per second of demonstrations (paper: 1); stored in PONDER's checkpoint and contract."""
     space: ActionSpace = "joint_delta"
@@ -65,6 +67,14 @@ class Recipe:
                 f"recipe {self.name}: grounds_memory is for a POUNCE with a frame memory that is trained alone on "
                 "grounded examples"
             )
+        has_pointer = isinstance(self.pounce, PounceConfig) and self.pounce.num_pointed > 0
+        if self.grounds_pointer and not (has_pointer and self.trains == "pounce" and self.example.is_grounded):
+            raise ValueError(
+                f"recipe {self.name}: grounds_pointer is for a POUNCE with a pointer that is trained alone on grounded "
+                "examples"
+            )
+        if self.grounds_pointer and self.grounds_memory:
+            raise ValueError(f"recipe {self.name}: one of grounds_memory and grounds_pointer: both have weight w2")
         if self.demo_hz < 1 or FPS % self.demo_hz:
             raise ValueError(f"recipe {self.name}: demo_hz must divide {FPS}, came {self.demo_hz}")
 

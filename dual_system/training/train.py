@@ -39,6 +39,7 @@ from dual_system.training.frozen_towers import FrozenTowers
 from dual_system.training.joint import JointModel, PonderBatch, PounceBatch
 from dual_system.training.memory import memory_of, require_room, sentence
 from dual_system.training.memory_words import words_to_remember
+from dual_system.training.pointed_places import pointed_places
 from dual_system.training.parallel import World, gather, joined, require_alike, shard
 from dual_system.training.prefetch import Prefetcher
 from dual_system.training.recipe import Recipe, defaults
@@ -180,6 +181,8 @@ class Batches:
         invocations = collate_pounce(examples, self._pounce, bundle.tokenizer, bundle.statistics)
         if run.grounds_memory and (sampling := sampling_of(self._pounce)) is not None:
             invocations = replace(invocations, words_IL=words_to_remember(examples, self._form, sampling))
+        if run.grounds_pointer and isinstance(self._pounce, PounceConfig):
+            invocations = replace(invocations, places_IQ=pointed_places(examples, self._pounce))
         return episodes, invocations
 
     def _draw(self, rng: np.random.Generator) -> list[int]:

@@ -156,7 +156,7 @@ def test_it_trains_resumes_to_the_same_bits_and_exports_what_serves(folder: Path
     assert len(request.past) == 8
     rows = engine.invoke(request)
     assert np.abs(rows - engine.invoke(replace(request, past=()))).max() > 0
-    with pytest.raises(ValueError, match="modulated by a frame memory, which --path fused does not compute"):
+    with pytest.raises(ValueError, match="has a frame memory, which --path fused does not compute"):
         EagerEngine(load_bundle(tmp_path / "whole" / "pounce"), path="fused")
 
 

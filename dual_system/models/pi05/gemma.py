@@ -133,6 +133,11 @@ class AdaRmsNorm(nn.Module):
         scale, shift, gate = self.dense(cond_BE).chunk(3, dim=-1)
         return torch.stack([1.0 + scale, shift, gate])[:, :, None]
 
+    def style_shift(self, cond_BE: Tensor) -> Tensor:
+        """Returns (3, B, 1, E): what a further condition adds to `style`, which is linear in it."""
+        shift_B3E = F.linear(cond_BE, self.dense.weight).unflatten(-1, (3, -1))
+        return shift_B3E.transpose(0, 1)[:, :, None]
+
     def forward(self, x_BTE: Tensor, style_3B1E: Tensor) -> tuple[Tensor, Tensor]:
         """Returns the styled norm of ``x_BTE`` and the gate for the residual that follows."""
         one_plus_scale, shift, gate = style_3B1E.unbind()
@@ -183,5 +188,12 @@ class ActionExpert(nn.Module):
 
     def styles(self, cond_BE: Tensor) -> Tensor:
         """Returns (M, 3, B, 1, E): the styles of all norms in the order of the forward pass."""
+        return torch.stack([norm.style(cond_BE) for norm in self._norms()])
+
+    def style_shift(self, cond_BE: Tensor) -> Tensor:
+        """Returns (M, 3, B, 1, E): what ``cond_BE`` adds to every norm's style if it is added to the condition."""
+        return torch.stack([norm.style_shift(cond_BE) for norm in self._norms()])
+
+    def _norms(self) -> list[AdaRmsNorm]:
         norms = [norm for layer in self.layers for norm in (layer.input_layernorm, layer.post_attention_layernorm)]
-        return torch.stack([norm.style(cond_BE) for norm in (*norms, self.norm)])
+        return [*norms, self.norm]

@@ -21,6 +21,7 @@ from dual_system.models.pi05 import committed as committed
 from dual_system.models.pi05.committed import Committed, pinned, row_styles
 from dual_system.models.pi05.gemma import ActionExpert, GemmaConfig, LanguageModel, Rotation, attend
 from dual_system.models.pi05.modulation import MemoryCache
+from dual_system.models.pi05.pointer import Pointed, Pointer
 from dual_system.models.siglip import VisionConfig, VisionTower
 from dual_system.models.sinusoid import sinusoid
 
@@ -94,6 +95,8 @@ class PrefixCache:
     """(B,) int64: position of the first action token."""
     memory: MemoryCache | None = None
     """What modulates the action stream's FFNs; None: nothing does."""
+    pointed: Pointed | None = None
+    """What conditions the expert beside the flow time; None: nothing does."""
 
     def repeated(self, times: int) -> "PrefixCache":
         """The batch repeated ``times``: several action streams against one prefix."""
@@ -105,6 +108,7 @@ class PrefixCache:
             visible=self.visible.repeat(times, 1),
             next_position=self.next_position.repeat(times),
             memory=None if self.memory is None else self.memory.repeated(times),
+            pointed=None if self.pointed is None else self.pointed.repeated(times),
         )
 
 
@@ -191,10 +195,10 @@ class Pi05(nn.Module):
             is_isolated=is_isolated,
         )
 
-    def prefill(self, prefix: Prefix) -> PrefixCache:
+    def prefill(self, prefix: Prefix, pointer: Pointer | None = None) -> PrefixCache:
         """Runs the prefix through the language layers and keeps every layer's keys and values.
 
-        The last layer computes only keys and values, because nothing uses its output.
+        The last layer computes only keys and values, because nothing uses its output. A ``pointer`` reads its input.
         """
         runs = [self._run_prefix(stream, last_layer_output=False) for stream in prefix.streams()]
         keys, values = (
@@ -202,7 +206,13 @@ class Pi05(nn.Module):
             for layers in ([run[0] for run in runs], [run[1] for run in runs])
         )
         next_position_B = prefix.is_real.sum(dim=1) - prefix.num_cognition
-        return PrefixCache(keys=keys, values=values, visible=prefix.is_real, next_position=next_position_B)
+        pointed = None
+        if pointer is not None:
+            hidden_BTW = torch.cat([run[2] for run in runs], dim=1)
+            pointed = pointer(hidden_BTW, prefix.is_real, prefix.num_cognition, self.expert)
+        return PrefixCache(
+            keys=keys, values=values, visible=prefix.is_real, next_position=next_position_B, pointed=pointed
+        )
 
     def prefix_hidden(self, prefix: Prefix) -> Tensor:
         """Returns (B, T, W) after the last norm: for parity tests and probes, not for acting."""
@@ -257,7 +267,7 @@ class Pi05(nn.Module):
         is_action_BN = cache.visible.new_ones(x_BNA.shape[:2])
         visible = torch.cat([cache.visible, is_action_BN], dim=1)[:, None, None, :]
         x_BNE = self.action_in_proj(x_BNA).to(self.stream_dtype)
-        styles = iter(styles_M3B1E)
+        styles = iter(styles_M3B1E if cache.pointed is None else styles_M3B1E + cache.pointed.styles)
         stack = zip(self.expert.layers, cache.keys, cache.values, strict=True)
         for index, (layer, prefix_key, prefix_value) in enumerate(stack):
             normed_BNE, gate = layer.input_layernorm(x_BNE, next(styles))

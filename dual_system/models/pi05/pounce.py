@@ -15,6 +15,7 @@ from dual_system.models.interface import CognitionConfig, CognitionPrefix, check
 from dual_system.models.pi05.committed import Committed, first_rows
 from dual_system.models.pi05.modulation import NO_FRAME, FrameMemory, pooled
 from dual_system.models.pi05.network import Pi05, Pi05Config, Prefix, PrefixCache, StepTable
+from dual_system.models.pi05.pointer import Pointer
 from dual_system.models.ponder.demo_sampling import FASTEST_HZ
 from dual_system.models.windows import Box
 
@@ -53,6 +54,8 @@ class PounceInputs:
     ``images`` is not read."""
     past_features: Tensor | None = None
     """(B, F, C, W) float32: ``past`` as `Pounce.looked_back` embeds it; None: it has not yet."""
+    prefilled: PrefixCache | None = None
+    """What `Pounce.prefill` returns for all of these; None: it has not been run yet."""
 
     def forgetting(self, is_null_B: Tensor) -> "PounceInputs":
         """Inputs whose marked samples have no past pictures: the memory's learned null."""
@@ -95,6 +98,8 @@ class PounceConfig:
     """Put the newest subgoal's text into the prompt in place of cognition: the paper's subgoal-text reference (3.1)."""
     frame_memory: FrameMemoryConfig | None = None
     """A memory of POUNCE's own past front pictures that modulates the expert (FrameSamp+Modul); None: there is none."""
+    num_pointed: int = 0
+    """Places of the front picture that a pointer conditions the expert on (`pointer`); 0: pi0.5, which has none."""
 
     def __post_init__(self) -> None:
         check_channel(self.cognition, self.reads_subgoal)
@@ -106,11 +111,17 @@ class PounceConfig:
                     f"frame_memory needs a front camera and control_hz {FASTEST_HZ}, that of demonstrations; came "
                     f"{self.num_cameras} cameras and {self.control_hz}"
                 )
+        has_state_last = self.state_input == "token" and self.cognition.place != "after_text"
+        if self.num_pointed and not (self.num_cameras and has_state_last):
+            raise ValueError(
+                "num_pointed needs a front camera, state_input 'token' and the cognition before the pictures; came "
+                f"{self.num_cameras} cameras, {self.state_input!r} and {self.cognition.place!r}"
+            )
         if not 0 <= self.max_committed_rows < self.pi05.horizon:
             raise ValueError(f"max_committed_rows must be 0..{self.pi05.horizon - 1}, came {self.max_committed_rows}")
         if not 0 < self.robot_action_dim <= self.pi05.action_dim:
             raise ValueError(f"robot_action_dim must be 1..{self.pi05.action_dim}, came {self.robot_action_dim}")
-        for name, least in (("num_cameras", 0), ("num_steps", 1), ("max_prompt_tokens", 1)):
+        for name, least in (("num_cameras", 0), ("num_pointed", 0), ("num_steps", 1), ("max_prompt_tokens", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}, came {getattr(self, name)}")
 
@@ -201,6 +212,10 @@ class Pounce(nn.Module):
             self.frame_memory = FrameMemory(
                 config.frame_memory, num_patches=num_patches, feature_width=width, expert=expert
             )
+        self.pointer = None
+        if config.num_pointed:
+            num_patches, expert_width = config.pi05.vision.num_patches, config.pi05.expert.width
+            self.pointer = Pointer(config.num_pointed, num_patches=num_patches, width=width, expert_width=expert_width)
 
     @property
     def backbone(self) -> Backbone:
@@ -236,7 +251,9 @@ class Pounce(nn.Module):
 
     def prefill(self, inputs: PounceInputs) -> PrefixCache:
         """Embeds [P][images][text][state] and runs it through the language layers once; encodes the frame memory."""
-        cache = self.pi05.prefill(self.embed_prefix(inputs))
+        if inputs.prefilled is not None:
+            return inputs.prefilled
+        cache = self.pi05.prefill(self.embed_prefix(inputs), self.pointer)
         if self.frame_memory is None:
             return cache
         return replace(cache, memory=self.frame_memory(*self._past_features(inputs, self.frame_memory.config)))
@@ -248,6 +265,13 @@ class Pounce(nn.Module):
         features_BFCW, step_BF = self._past_features(inputs, self.frame_memory.config)
         seen = replace(inputs, past_features=features_BFCW, past_step=step_BF)
         return seen, *self.frame_memory.tokens(features_BFCW, step_BF)
+
+    def pointing(self, inputs: PounceInputs) -> tuple[PounceInputs, Tensor]:
+        """The inputs with their prefix filled in, and the pointer's scores (B, Q, S) of the front picture's patches."""
+        cache = self.prefill(inputs)
+        if cache.pointed is None:
+            raise ValueError("num_pointed is 0: expected a POUNCE with a pointer")
+        return replace(inputs, prefilled=cache), cache.pointed.scores
 
     def _past_features(self, inputs: PounceInputs, memory: FrameMemoryConfig) -> tuple[Tensor, Tensor]:
         """The past pictures' features (B, F, C, W) and steps (B, F). No gradient reaches the vision tower here."""

@@ -16,7 +16,15 @@ from torch import Tensor
 
 from dual_system.models.pi05.network import Pi05Config
 from dual_system.models.pi05.pounce import Pounce
-from dual_system.models.public_layout import COGNITION, FRAME_MEMORY, assign, renamed, require_fit, write_tensors
+from dual_system.models.public_layout import (
+    COGNITION,
+    FRAME_MEMORY,
+    POINTER,
+    assign,
+    renamed,
+    require_fit,
+    write_tensors,
+)
 from dual_system.models.stored_tensors import StoredTensors, WeightsError
 
 _ROOT = "paligemma_with_expert."
@@ -40,6 +48,7 @@ _PREFIXES = (
     ("cognition_prefix.", COGNITION),
     ("state_projector.", "state_proj."),  # pi0's name for it
     ("frame_memory.", FRAME_MEMORY),
+    ("pointer.", POINTER),
 )
 
 

@@ -32,7 +32,7 @@ from dual_system.models.pounce.family import (
     random_model,
     save_weights,
 )
-from dual_system.models.pounce.initialise import initialise_missing_memory, initialise_prefix
+from dual_system.models.pounce.initialise import initialise_missing, initialise_prefix
 from dual_system.models.public_statistics import read_statistics, statistics_files
 from dual_system.models.stored_tensors import CheckpointError, StoredTensors, refuse_quantised, require_layers
 from protocol.files import read_object
@@ -215,7 +215,7 @@ def load_bundle(
     if not has_prefix:
         initialise_prefix(model, torch.Generator().manual_seed(prefix_seed))
     if isinstance(model, Pounce):
-        initialise_missing_memory(model, torch.Generator().manual_seed(prefix_seed))
+        initialise_missing(model, torch.Generator().manual_seed(prefix_seed))
     is_prefix_trained = has_prefix and not (stored is not None and stored.has_fresh_prefix)
     return PounceBundle(
         model=model,

@@ -60,7 +60,7 @@ def tiny_cpu(*, num_carriers: int = 1, cognition_size: int = 64, horizon: int = 
 
 
 def laptop(*, num_carriers: int = 1, cognition_size: int = 160) -> PounceConfig:
-    """The pair that two CPU cores train: 64 px windows of both cameras, state as one token, tool deltas."""
+    """The pair that two CPU cores train: 64 px windows of both cameras, state as one token, tool deltas, a pointer."""
     network = PounceConfig(
         pi05=Pi05Config(
             vision=VisionConfig(width=128, depth=4, num_heads=4, mlp_width=256, image_px=64, patch_px=8),
@@ -74,6 +74,7 @@ def laptop(*, num_carriers: int = 1, cognition_size: int = 160) -> PounceConfig:
         windows=LAPTOP_WINDOWS,
         max_prompt_tokens=64,
         state_input="token",
+        num_pointed=2,
     )
     return in_space(network, "ee_delta")
 

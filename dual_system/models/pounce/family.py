@@ -76,6 +76,13 @@ def sampling_of(config: AnyPounceConfig) -> FrameSampling | None:
     return None if memory is None else memory.sampling
 
 
+def own_parts(config: AnyPounceConfig) -> str:
+    """What a model has beyond the public network and the cognition prefix, in words; "" for nothing."""
+    memory, places = (config.frame_memory, config.num_pointed) if isinstance(config, PounceConfig) else (None, 0)
+    parts = [*(["a frame memory"] if memory is not None else []), *(["a pointer"] if places else [])]
+    return " and ".join(parts)
+
+
 def load_weights(model: AnyPounce, path: Path) -> bool:
     """Loads a public file; returns whether it held a cognition prefix. See `pi05.weights` and `groot.weights`."""
     if isinstance(model, Pounce):

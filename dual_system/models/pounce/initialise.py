@@ -30,6 +30,8 @@ def random_pounce(config: PounceConfig, seed: int, device: torch.device | str = 
         _draw(model.state_projector, generator)
     if model.frame_memory is not None:
         model.frame_memory.initialise(generator)
+    if model.pointer is not None:
+        model.pointer.initialise(generator)
     return model
 
 
@@ -72,12 +74,12 @@ def initialise_prefix(model: Pounce | GrootPounce, generator: torch.Generator) -
     model.cognition_prefix.initialise(text_rms, generator)
 
 
-def initialise_missing_memory(model: Pounce, generator: torch.Generator) -> None:
-    """Draws a frame memory that a loaded file did not hold: it changes nothing until it is trained."""
-    memory = model.frame_memory
-    if memory is not None and any(parameter.is_meta for parameter in memory.parameters()):
-        memory.to_empty(device=model.pi05.language.embed_tokens.weight.device)
-        memory.initialise(generator)
+def initialise_missing(model: Pounce, generator: torch.Generator) -> None:
+    """Draws a frame memory or a pointer that a loaded file did not hold: it changes nothing until it is trained."""
+    for part in (model.frame_memory, model.pointer):
+        if part is not None and any(parameter.is_meta for parameter in part.parameters()):
+            part.to_empty(device=model.pi05.language.embed_tokens.weight.device)
+            part.initialise(generator)
 
 
 def initialise_pi05(pi05: Pi05, generator: torch.Generator) -> None:

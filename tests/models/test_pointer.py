@@ -1,0 +1,117 @@
+"""A pointer changes nothing until it is trained, points at what is there, and acts in serving as in training."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from dual_system.models.pi05.pounce import Pounce, PounceConfig, PounceInputs
+from dual_system.models.pounce.checkpoint import load_bundle, random_bundle, save_bundle
+from dual_system.models.pounce.configs import tiny_cpu
+from dual_system.models.pounce.family import random_model
+from pounce_server.engine import EagerEngine
+
+PLAIN = replace(tiny_cpu(horizon=6), state_input="token")
+POINTING = replace(PLAIN, num_pointed=2)
+NUM_PATCHES = POINTING.pi05.vision.num_patches
+
+
+def pounce(config: PounceConfig = POINTING, *, is_trained: bool = True) -> Pounce:
+    model = random_model(config, 0)
+    assert isinstance(model, Pounce)
+    if is_trained and model.pointer is not None:
+        with torch.no_grad():
+            model.pointer.condition.weight.normal_(generator=torch.Generator().manual_seed(1))
+    return model
+
+
+def velocity(model: Pounce, inputs: PounceInputs) -> Tensor:
+    generator = torch.Generator().manual_seed(2)
+    count = len(inputs.age_ns)
+    noise_BNA = torch.randn(count, model.config.horizon, model.config.padded_action_dim, generator=generator)
+    with torch.no_grad():
+        return model.pi05.velocity_at(noise_BNA, torch.linspace(0.2, 0.8, count), model.prefill(inputs))
+
+
+def test_until_it_is_trained_the_network_is_pi05_bit_for_bit() -> None:
+    inputs = POINTING.example_inputs(3)
+    plain, pointing = pounce(PLAIN), pounce(is_trained=False)
+    pointing.load_state_dict(pointing.state_dict() | plain.state_dict())
+    assert torch.equal(velocity(pointing, inputs), velocity(plain, inputs))
+    assert not torch.equal(velocity(pounce(), inputs), velocity(plain, inputs))
+
+
+def test_scores_are_of_the_front_pictures_patches_row_by_row() -> None:
+    model, inputs = pounce(), POINTING.example_inputs(2)
+    _, before_BQS = model.pointing(inputs)
+    images = inputs.images.clone()
+    images[:, 0, :, :28, 28:56] += 0.5  # the second patch of the first row
+    _, after_BQS = model.pointing(replace(inputs, images=images))
+    assert before_BQS.shape == (2, 2, NUM_PATCHES)
+    assert (after_BQS - before_BQS).abs().mean(dim=(0, 1)).argmax() == 1
+
+
+def test_one_draw_of_the_flow_is_many_and_a_batch_is_its_samples() -> None:
+    model, inputs = pounce(), POINTING.example_inputs(2)
+    actions_BNA = POINTING.example_actions(2)
+    noise_SNA = torch.randn(6, *actions_BNA.shape[1:], generator=torch.Generator().manual_seed(3))
+    times_S = torch.linspace(0.1, 0.9, 6)
+    with torch.no_grad():
+        together_SNA = model.unreduced_loss(inputs, actions_BNA, noise_SNA, times_S)
+        for draw in range(3):
+            rows = slice(2 * draw, 2 * draw + 2)
+            alone_BNA = model.unreduced_loss(inputs, actions_BNA, noise_SNA[rows], times_S[rows])
+            torch.testing.assert_close(together_SNA[rows], alone_BNA, rtol=1e-5, atol=1e-6)
+
+
+def test_serving_conditions_the_flow_as_training_does() -> None:
+    model, inputs = pounce(), POINTING.example_inputs(2)
+    noise_BNA = torch.randn(2, 6, POINTING.padded_action_dim, generator=torch.Generator().manual_seed(4))
+    with torch.no_grad():
+        first = next(iter(model.sample(inputs, noise_BNA, model.step_table())))
+        moved_BNA = noise_BNA - model.pi05.velocity_at(noise_BNA, torch.ones(2), model.prefill(inputs)) / 10
+    torch.testing.assert_close(first.actions, moved_BNA, rtol=1e-5, atol=1e-6)
+
+
+def test_what_was_filled_in_is_not_computed_again() -> None:
+    model, inputs = pounce(), POINTING.example_inputs(2)
+    filled, scores_BQS = model.pointing(inputs)
+    assert filled.prefilled is not None
+    assert model.prefill(filled) is filled.prefilled
+    assert torch.equal(filled.prefilled.pointed.scores, scores_BQS)  # type: ignore[union-attr]
+    with pytest.raises(ValueError, match="num_pointed is 0"):
+        pounce(PLAIN).pointing(inputs)
+
+
+def test_without_a_front_picture_it_points_at_nothing_there() -> None:
+    model, inputs = pounce(), POINTING.example_inputs(1)
+    has_view = torch.tensor([[False, True]])
+    dark = replace(inputs, has_view=has_view)
+    bright = replace(dark, images=torch.cat([inputs.images[:, :1] * -1, inputs.images[:, 1:]], dim=1))
+    assert bool(velocity(model, dark).isfinite().all())
+    assert torch.equal(velocity(model, dark), velocity(model, bright))
+
+
+def test_only_the_front_picture_and_the_state_are_read_by_it_so_it_needs_both() -> None:
+    for broken in ({"num_cameras": 0}, {"state_input": "prompt"}):
+        with pytest.raises(ValueError, match="num_pointed needs a front camera"):
+            replace(POINTING, **broken)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="num_pointed must be at least 0, came -1"):
+        replace(PLAIN, num_pointed=-1)
+
+
+def test_a_folder_keeps_it(tmp_path: Path) -> None:
+    bundle = replace(random_bundle(POINTING, 0), model=pounce())
+    save_bundle(bundle, tmp_path / "pointing")
+    assert load_bundle(tmp_path / "pointing").digest() == bundle.digest()
+
+
+def test_a_fast_path_that_does_not_compute_it_is_refused() -> None:
+    bundle = random_bundle(POINTING, 0)
+    with pytest.raises(ValueError, match="has a pointer, which --path fused does not compute"):
+        EagerEngine(bundle, path="fused")
+    EagerEngine(bundle)

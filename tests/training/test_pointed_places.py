@@ -1,0 +1,107 @@
+"""A pointer's labels are the patches under the places that a text names, and its loss is beside the flow's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from clock.sampling import ROBOMME
+from dual_system.models.pi05.pounce import Pounce
+from dual_system.models.ponder.configs import tiny_cpu as tiny_ponder
+from dual_system.models.ponder.context import IGNORE
+from dual_system.models.ponder.network import Ponder
+from dual_system.models.pounce.checkpoint import random_bundle
+from dual_system.models.pounce.configs import laptop, tiny_cpu
+from dual_system.models.pounce.family import sample_times
+from dual_system.models.windows import LAPTOP_WINDOWS
+from dual_system.training.build import with_channel
+from dual_system.training.collate import collate_pounce
+from dual_system.training.episode import TrainingEpisode
+from dual_system.training.example import Example, ExampleConfig, make_example
+from dual_system.training.joint import Draws, JointModel, PonderBatch, PounceBatch
+from dual_system.training.pointed_places import pointed_places
+from dual_system.training.recipes import recipe
+
+PONDER = Ponder.random(replace(tiny_ponder(), num_layers=4), seed=1)
+POUNCE = replace(tiny_cpu(num_carriers=0, horizon=6), state_input="token", num_pointed=2)
+CONFIG = ExampleConfig(clocks=ROBOMME, max_invocations=3)
+
+
+@pytest.fixture
+def example(episode_of_noise: Callable[..., TrainingEpisode]) -> Example:
+    return make_example(episode_of_noise(90, changes=(0, 43)), PONDER.format, CONFIG, np.random.default_rng(0))
+
+
+def told(example: Example, text: str) -> Example:
+    return replace(example, written=(text,) * len(example.written))
+
+
+def batch_of(example: Example) -> PounceBatch:
+    bundle = random_bundle(POUNCE, 0)
+    batch = collate_pounce([example], POUNCE, bundle.tokenizer, bundle.statistics)
+    return replace(batch, places_IQ=pointed_places([example], POUNCE))
+
+
+def joint() -> JointModel:
+    return JointModel(PONDER, random_bundle(POUNCE, 0).model, w2=0.3, trains="pounce")
+
+
+def draws_of(batch: PounceBatch, model: JointModel) -> Draws:
+    generators = [torch.Generator().manual_seed(0)]
+    return Draws.draw(batch, lambda count, generator: sample_times(model.pounce, count, generator), 0.0, generators)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(row=st.integers(0, 7), column=st.integers(0, 7), within=st.tuples(st.floats(0.05, 0.95), st.floats(0.05, 0.95)))
+def test_a_place_in_the_window_is_the_patch_that_it_lies_in(
+    row: int, column: int, within: tuple[float, float], example: Example
+) -> None:
+    top, left, bottom, right = LAPTOP_WINDOWS[0]
+    y = top + (row + within[0]) / 8 * (bottom - top)
+    x = left + (column + within[1]) / 8 * (right - left)
+    text = f"push the cube at [{round(1000 * x)}, {round(1000 * y)}] to the target at [0, 0]"
+    assert pointed_places([told(example, text)], laptop()).tolist() == [[8 * row + column, IGNORE]] * 3
+
+
+def test_a_text_without_places_teaches_nothing(example: Example) -> None:
+    batch, model = batch_of(told(example, "press the button")), joint()
+    assert model.counts(PonderBatch(), batch, draws_of(batch, model)).num_supervised == 0
+    assert float(model(PonderBatch(), batch, draws_of(batch, model)).grounding.detach()) == 0
+
+
+def test_the_flow_loss_is_that_without_labels_and_the_pointers_is_added(example: Example) -> None:
+    batch, model = batch_of(told(example, "pick up the cube at [100, 900]")), joint()
+    draws = draws_of(batch, model)
+    loss = model(PonderBatch(), batch, draws)
+    unlabelled = model(PonderBatch(), replace(batch, places_IQ=None), draws)
+    assert torch.equal(loss.flow_matching, unlabelled.flow_matching)
+    assert loss.total == loss.flow_matching + 0.3 * loss.grounding
+    loss.grounding.backward()
+    reached = {name for name, each in model.named_parameters() if each.grad is not None and bool(each.grad.any())}
+    assert "pounce.pointer.score.weight" in reached
+    assert not any("expert" in name or "pointer.condition" in name for name in reached)
+
+
+def test_the_hand_learns_to_point_and_no_row_of_the_table_is_taught_to() -> None:
+    assert recipe("laptop_hand").grounds_pointer
+    assert recipe("laptop_hand_corrected").grounds_pointer
+    for name in ("laptop", "laptop_observation", "laptop_text", "laptop_framesamp", "laptop_framesamp_grounded"):
+        assert not recipe(name).grounds_pointer
+    with pytest.raises(ValueError, match="grounds_pointer is for a POUNCE with a pointer"):
+        replace(recipe("laptop"), grounds_pointer=True)
+
+
+def test_a_hand_without_a_pointer_is_given_one_that_changes_nothing_yet() -> None:
+    plain = random_bundle(replace(POUNCE, num_pointed=0), 0)
+    model = with_channel(replace(recipe("laptop_hand"), pounce=POUNCE), plain).model
+    assert isinstance(model, Pounce)
+    assert model.pointer is not None
+    assert bool(model.pointer.score.weight.any())
+    assert not bool(model.pointer.condition.weight.any())
+    assert all(torch.equal(each, model.state_dict()[name]) for name, each in plain.model.state_dict().items())
