@@ -17,7 +17,7 @@ from dual_system.training.recipe import Recipe
 from dual_system.training.told import Told
 from dual_system.training.trainer import TrainConfig
 
-_LAPTOP = TrainConfig(seed=0, flow_samples=4, optim=OptimConfig(learning_rate=1e-3, warmup_steps=200, ema_decay=0.999))
+_LAPTOP = TrainConfig(seed=0, flow_samples=2, optim=OptimConfig(learning_rate=1e-3, warmup_steps=200, ema_decay=0.999))
 _ROW_STEPS = 1_500
 """Steps that every row of the table goes on with, whatever its channel."""
 _DELAYED_STEPS = 300
@@ -42,7 +42,7 @@ def laptop_hand() -> Recipe:
             branch_weight=3.0,
         ),
         train=_LAPTOP,
-        num_steps=6_000,
+        num_steps=3_500,
         batch_episodes=8,
         w2=0.1,
         trains="pounce",
@@ -56,12 +56,12 @@ def laptop_hand() -> Recipe:
 
 def laptop_hand_corrected() -> Recipe:
     """Stage B, its end: the hand goes on with the oracle's corrections of its own play among the data (DAgger)."""
-    return replace(laptop_hand(), name="laptop_hand_corrected", num_steps=2_000)
+    return replace(laptop_hand(), name="laptop_hand_corrected", num_steps=1_500)
 
 
 def laptop_grounding() -> Recipe:
     """Stage A2 of the laptop pair: PONDER learns the tasks' words, as the paper's did before joint training."""
-    return replace(laptop(), name="laptop_grounding", num_steps=4_000, w2=1.0, trains="ponder")
+    return replace(laptop(), name="laptop_grounding", num_steps=2_500, w2=1.0, trains="ponder")
 
 
 def laptop() -> Recipe:
