@@ -115,7 +115,9 @@ class EagerEngine:
             past=sampling_of(config),
         )
         if path != "eager" and (own := own_parts(config)):
-            raise ValueError(f"this checkpoint has {own}, which --path {path} does not compute; serve it with --path eager")
+            raise ValueError(
+                f"this checkpoint has {own}, which --path {path} does not compute; serve it with --path eager"
+            )
         model = cast_streams(bundle.model, dtype).to(self._device).eval().requires_grad_(False)
         if path != "eager" and continuity != "none":
             raise ValueError(f"the path {path!r} knows no --continuity; leave one of them out")

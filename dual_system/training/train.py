@@ -39,8 +39,8 @@ from dual_system.training.frozen_towers import FrozenTowers
 from dual_system.training.joint import JointModel, PonderBatch, PounceBatch
 from dual_system.training.memory import memory_of, require_room, sentence
 from dual_system.training.memory_words import words_to_remember
-from dual_system.training.pointed_places import pointed_places
 from dual_system.training.parallel import World, gather, joined, require_alike, shard
+from dual_system.training.pointed_places import pointed_places
 from dual_system.training.prefetch import Prefetcher
 from dual_system.training.recipe import Recipe, defaults
 from dual_system.training.recipes import recipe

@@ -149,7 +149,7 @@ class PounceConfig:
         image_shape = (batch_size, self.num_cameras, 3, px, px)
         token_shape = (batch_size, num_tokens)
         cognition_BKH = torch.randn((batch_size, cognition.num_carriers, cognition.cognition_size), generator=generator)
-        return PounceInputs(
+        inputs = PounceInputs(
             images=torch.rand(image_shape, generator=generator) * 2 - 1,
             has_view=torch.ones(batch_size, self.num_cameras, dtype=torch.bool),
             token_ids=torch.randint(self.pi05.vocab_size, token_shape, generator=generator),
@@ -157,16 +157,13 @@ class PounceConfig:
             age_ns=torch.full((batch_size,), 300_000_000),
             cognition=cognition_BKH if cognition.num_carriers else None,
             state=torch.rand(batch_size, self.robot_state_dim, generator=generator) * 2 - 1 if has_token else None,
-            **({} if self.frame_memory is None else self._example_past(batch_size, self.frame_memory, generator)),
         )
-
-    def _example_past(
-        self, batch_size: int, memory: FrameMemoryConfig, generator: torch.Generator
-    ) -> dict[str, Tensor]:
-        num_frames, px = memory.sampling.num_frames, self.image_px
-        past = torch.randint(256, (batch_size, num_frames, 3, px, px), generator=generator, dtype=torch.uint8)
-        steps_F = torch.arange(num_frames) * memory.sampling.stride_ticks
-        return {"past": past, "past_step": steps_F.repeat(batch_size, 1)}
+        if self.frame_memory is None:
+            return inputs
+        sampling = self.frame_memory.sampling
+        past = torch.randint(256, (batch_size, sampling.num_frames, 3, px, px), generator=generator, dtype=torch.uint8)
+        steps_F = torch.arange(sampling.num_frames) * sampling.stride_ticks
+        return replace(inputs, past=past, past_step=steps_F.repeat(batch_size, 1))
 
     def example_actions(self, batch_size: int, *, seed: int = 0) -> Tensor:
         """Makes normalised training targets, (B, N, A) float32, zero beyond the robot's dims."""
