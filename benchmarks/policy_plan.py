@@ -59,6 +59,10 @@ RETOLD = ("VideoUnmask", "PickHighlight", "MoveCube")
 """Tasks whose present can have another past."""
 WITH_PONDER = (recipes.laptop, recipes.laptop_without_grounding, recipes.laptop_current)
 """Those whose POUNCE reads cognition."""
+WITH_MEMORY = (recipes.laptop_framesamp, recipes.laptop_framesamp_grounded)
+"""Those whose POUNCE reads a frame memory."""
+PROBED_SCENES = 40
+"""Development scenes a task on which a probe is fitted and tried."""
 TEST_SCENES, FEW_TEST_SCENES = 100, 50
 """Test scenes a task of the rows of both contrasts and their controls, and of the others."""
 
@@ -130,6 +134,9 @@ def stages(folder: Path) -> tuple[Stage, ...]:
             Stage(name=f"rows {first // 2 + 1}", commands=tuple(rows[first : first + 2]))
             for first in range(0, len(rows), 2)
         ),
+        Stage(name="probe plays", commands=(_probed_plays(folder),)),
+        Stage(name="probe data", commands=(_probed_data(folder),)),
+        Stage(name="probe", commands=(_probe(folder),)),
         Stage(name="cost", commands=tuple(_cost(folder, recipe) for recipe, seed in ROWS if seed == 0)),
         Stage(name="rows delayed", commands=tuple(delayed)),
         *(
@@ -169,6 +176,25 @@ def _row(folder: Path, recipe: str, seed: int) -> Sequence[str]:
     ponder = folder / own.get(recipe, "words")
     run = _run(recipe, ponder, folder / "corrected", _folder(folder, recipe, seed))
     return *run, "--seed", f"{seed}"
+
+
+def _probed_plays(folder: Path) -> tuple[str, ...]:
+    """The script's own episodes of development scenes, which nothing is trained on."""
+    scenes = ("--tasks", *TASKS, "--episodes", f"{PROBED_SCENES}", "--runs", "1", "--split", "development")
+    played = ("--policy", "oracle", "--record", "--record-hz", "2")
+    return "sim_client.evaluate", "--out", f"{folder / 'probe' / 'plays'}", *scenes, *played
+
+
+def _probed_data(folder: Path) -> tuple[str, ...]:
+    read = (f"{folder / 'probe' / 'plays'}", "--demonstration-hz", "2", "--only-success", "--no-progress")
+    return "dual_system.data.export", *read, "--out", f"{folder / 'probe' / 'data'}"
+
+
+def _probe(folder: Path) -> tuple[str, ...]:
+    ponders = [f"{_folder(folder, recipe.__name__, 0) / 'ponder'}" for recipe in WITH_PONDER]
+    memories = [f"{_folder(folder, recipe.__name__, 0) / 'pounce'}" for recipe in WITH_MEMORY]
+    read = ("--data", f"{folder / 'probe' / 'data'}", "--ponder", *ponders, "--pounce", *memories, "--no-progress")
+    return "dual_system.training.probe", *read, "--out", f"{folder / 'probe' / 'found'}"
 
 
 def _cost(folder: Path, recipe: Callable[[], object]) -> tuple[str, ...]:

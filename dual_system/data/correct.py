@@ -26,6 +26,7 @@ from tqdm import tqdm
 import dual_system.tasks.headless  # noqa: F401 - before mujoco is imported
 from dual_system.data.episode import About, EpisodeWriter, Package, unpack
 from dual_system.data.errors import DatasetError
+from dual_system.data.recorded import logs_in
 from dual_system.data.export import refuse_split, texts_by_tick
 from dual_system.data.jobs import Look
 from dual_system.data.lerobot_files import INFO_PATH
@@ -70,16 +71,6 @@ class CorrectOptions:
         if self.per_episode < 1 or self.workers < 1:
             raise ValueError(f"per_episode and workers must be at least 1, came {self.per_episode} and {self.workers}")
 
-    def logs(self) -> list[Path]:
-        """The logs, those of a folder in alphabetical order. Raises DatasetError if a folder has none."""
-        found = []
-        for path in self.files:
-            inside = sorted(path.rglob("*.mcap")) if path.is_dir() else [path]
-            if not inside:
-                raise DatasetError(f"{path} holds no .mcap log; record with pp-eval --record")
-            found += inside
-        return found
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Job:
@@ -108,7 +99,7 @@ class Outcome:
 def main(argv: list[str] | None = None, prog: str = "pp-collect correct") -> int:
     options = parse(CorrectOptions, argv, prog=prog)
     reasons = correct(options, LocalWorkers(options.workers, work_out))
-    num_logs = len(options.logs())
+    num_logs = len(logs_in(options.files))
     num_kept = num_logs * options.per_episode - len(reasons)
     sys.stdout.write(f"{num_kept} episodes of {num_logs} logs in {options.out}\n")
     for reason in sorted(set(reasons)):
@@ -128,7 +119,9 @@ def correct(options: CorrectOptions, workers: Workers[Job, Outcome]) -> list[str
     if (options.out / INFO_PATH).exists():
         raise DatasetError(f"{options.out} holds a dataset already; use another --out")
     jobs = [
-        Job(path=path, part=part, options=options) for path in options.logs() for part in range(options.per_episode)
+        Job(path=path, part=part, options=options)
+        for path in logs_in(options.files)
+        for part in range(options.per_episode)
     ]
     bar = tqdm(total=len(jobs), unit="episode", disable=not options.progress)
     writer = DatasetWriter(files.folder(options.out))

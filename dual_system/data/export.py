@@ -22,7 +22,7 @@ from dual_system.data.episode import CAMERAS, About, Episode, EpisodeWriter, Row
 from dual_system.data.errors import DatasetError
 from dual_system.data.lerobot_files import INFO_PATH
 from dual_system.data.lerobot_v3 import DatasetWriter
-from dual_system.data.recorded import commands, joined, recording_of, unpacked, why_unfit
+from dual_system.data.recorded import commands, joined, logs_in, recording_of, unpacked, why_unfit
 from dual_system.data.recording import RecordingWriter
 from dual_system.data.rollout import Narrator
 from dual_system.data.video import FPS, Frame
@@ -45,7 +45,7 @@ class ExportOptions:
     """Turns recorded episodes into a LeRobot v3 dataset, in the order they are named."""
 
     files: tyro.conf.Positional[tuple[Path, ...]]
-    """MCAP logs of sim-client or pp-eval."""
+    """MCAP logs of sim-client or pp-eval, or folders of them."""
     out: Path
     """Folder of the new dataset."""
     rows: Literal["auto", "training", "recorded"] = "auto"
@@ -73,7 +73,7 @@ def main(argv: list[str] | None = None) -> int:
     num_episodes, left_out = export(options)
     for told in left_out:
         sys.stderr.write(f"pp-export: left out: {told}\n")
-    sys.stdout.write(f"{num_episodes} of {len(options.files)} episodes in {options.out}\n")
+    sys.stdout.write(f"{num_episodes} of {len(logs_in(options.files))} episodes in {options.out}\n")
     return DONE
 
 
@@ -89,9 +89,10 @@ def export(options: ExportOptions) -> tuple[int, list[str]]:
         raise DatasetError(f"{options.out} holds a dataset already; use another --out")
     if not options.files:
         raise DatasetError("name at least one log")
-    writer = (_Training if _is_for_training(options) else _Recorded)(options)
+    logs = logs_in(options.files)
+    writer = (_Training if _is_for_training(options, logs[0]) else _Recorded)(options)
     num_episodes, left_out = 0, list[str]()
-    for path in tqdm(options.files, unit="episode", disable=not options.progress):
+    for path in tqdm(logs, unit="episode", disable=not options.progress):
         try:
             record = read_log(path)
             if options.only_success and not (record.result and record.result.is_success):
@@ -138,9 +139,9 @@ class _Recorded:
         self._writer.add(recording_of(path, record))
 
 
-def _is_for_training(options: ExportOptions) -> bool:
+def _is_for_training(options: ExportOptions, first: Path) -> bool:
     if options.rows == "auto":
-        return _is_ours(read_log(options.files[0]).info)
+        return _is_ours(read_log(first).info)
     return options.rows == "training"
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,17 @@ from protocol.mcap_log import EpisodeRecord, Picture, read_pictures
 
 _STYLES = {m.SubgoalKind.SUBGOAL: "subtask", m.SubgoalKind.DEMO_REASONING: "memory"}
 _OF_THE_TASK = (m.SubgoalKind.TASK_GROUNDED, m.SubgoalKind.TASK_SIMPLE)
+
+
+def logs_in(paths: Iterable[Path]) -> list[Path]:
+    """The logs named, and for a folder all below it, in alphabetical order. Raises DatasetError if a folder has none."""
+    found: list[Path] = []
+    for path in paths:
+        inside = sorted(path.rglob("*.mcap")) if path.is_dir() else [path]
+        if not inside:
+            raise DatasetError(f"{path} holds no .mcap log; record with pp-eval --record")
+        found += inside
+    return found
 
 
 def why_unfit(path: Path, record: EpisodeRecord) -> str:

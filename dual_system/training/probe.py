@@ -36,6 +36,7 @@ from dual_system.training.collate import collate_pounce
 from dual_system.training.data import PictureSizes, TrainingSet
 from dual_system.training.diagnose import in_turns
 from dual_system.training.example import Example
+from protocol import files
 from protocol.command_line import command, parse
 
 
@@ -53,6 +54,8 @@ class ProbeOptions:
     """Names of the tasks to probe on. Empty: all of the data."""
     episodes: int = 160
     """Largest number of episodes, the tasks taking turns."""
+    out: Path | None = None
+    """Folder for probe.md, which is printed in any case."""
     progress: bool = True
     """Do not show a progress bar."""
 
@@ -62,7 +65,12 @@ def main(argv: list[str] | None = None, prog: str = "pp-diagnose probe") -> int:
     options = parse(ProbeOptions, argv, prog=prog)
     if not options.ponder and not options.pounce:
         raise ValueError("nothing to probe: give checkpoints with --ponder, --pounce, or both")
-    sys.stdout.write(f"{ABOUT}\n\n{probe_table(instants(options))}")
+    told = f"{ABOUT}\n\n{probe_table(instants(options))}"
+    if options.out is not None:
+        with files.writing(options.out):
+            files.folder(options.out)
+            (options.out / "probe.md").write_text(told)
+    sys.stdout.write(told)
     return 0
 
 

@@ -19,8 +19,10 @@ from benchmarks.policy_cost import CostOptions
 from benchmarks.policy_plan import Stage, stages
 from dual_system.data.collect import CollectOptions
 from dual_system.data.correct import CorrectOptions
+from dual_system.data.export import ExportOptions
 from dual_system.policy.towers import TowersOptions
 from dual_system.tasks.pair_files import PairsOptions
+from dual_system.training.probe import ProbeOptions
 from dual_system.training.recipes import recipe
 from dual_system.training.train import TrainOptions
 from protocol.command_line import parse
@@ -31,10 +33,12 @@ OPTIONS: dict[str, Any] = {
     "benchmarks.policy_cost": CostOptions,
     "dual_system.data.collect": CollectOptions,
     "dual_system.data.correct": CorrectOptions,
+    "dual_system.data.export": ExportOptions,
     "sim_client.evaluate": EvalOptions,
     "dual_system.policy.towers": TowersOptions,
     "dual_system.tasks.pair_files": PairsOptions,
     "sim_client.counterfactual": CounterfactualOptions,
+    "dual_system.training.probe": ProbeOptions,
     "dual_system.training.train": TrainOptions,
 }
 
