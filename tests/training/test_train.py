@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
+import os
 import shutil
+import signal
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -21,10 +25,11 @@ from dual_system.models.ponder.demo_sampling import DemoSampling
 from dual_system.models.pounce.checkpoint import load_bundle
 from dual_system.training import recipes, train
 from dual_system.training.data import TrainingSet
+from dual_system.training.ending import ending
 from dual_system.training.parallel import World
 from dual_system.training.recipe import Recipe
 from dual_system.training.train import InsteadOptions, LogOptions, MachineOptions, TrainOptions
-from dual_system.training.trainer import Trainer
+from dual_system.training.trainer import Trainer, num_steps_in
 from pounce_server.contract import example_request
 from pounce_server.engine import EagerEngine
 from protocol.command_line import parse
@@ -114,6 +119,52 @@ def test_a_run_that_was_killed_ends_as_one_that_was_not(
     train.train(options(folder, tmp_path / "cut"))
     for name in ("log.jsonl", "ponder/model.safetensors", "pounce/model.safetensors"):
         assert (finished / name).read_bytes() == (tmp_path / "cut" / name).read_bytes()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_run_that_is_told_to_end_saves_the_step_that_it_was_in(
+    folder: Path, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    update, before = train.Trainer._update, signal.getsignal(number)
+
+    def told_in_the_first(self: Trainer) -> train.StepReport:
+        os.kill(os.getpid(), number)
+        return update(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(train.Trainer, "_update", told_in_the_first)
+        with pytest.raises(KeyboardInterrupt, match="step 1 of 2 is saved"):
+            train.train(options(folder, tmp_path / "cut"))
+    assert signal.getsignal(number) == before
+    assert num_steps_in(tmp_path / "cut" / "checkpoint") == 1
+    train.train(options(folder, tmp_path / "cut"))
+    for name in ("log.jsonl", "ponder/model.safetensors", "pounce/model.safetensors"):
+        assert (finished / name).read_bytes() == (tmp_path / "cut" / name).read_bytes()
+
+
+def test_told_twice_it_ends_at_once() -> None:
+    with pytest.raises(KeyboardInterrupt), ending() as is_told_to_end:
+        assert not is_told_to_end()
+        os.kill(os.getpid(), signal.SIGINT)
+        assert is_told_to_end()
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_a_worker_that_was_forked_ends_at_once() -> None:
+    context = multiprocessing.get_context("fork")
+    awake = context.Event()
+
+    def work() -> None:
+        awake.set()
+        time.sleep(60)
+
+    with ending():
+        worker = context.Process(target=work)
+        worker.start()
+        assert awake.wait(timeout=30)  # a fork forgets what was pending at its first instant
+        worker.terminate()
+        worker.join(timeout=30)
+    assert worker.exitcode not in (None, 0)
 
 
 @pytest.mark.parametrize(
