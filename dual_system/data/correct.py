@@ -26,11 +26,11 @@ from tqdm import tqdm
 import dual_system.tasks.headless  # noqa: F401 - before mujoco is imported
 from dual_system.data.episode import About, EpisodeWriter, Package, unpack
 from dual_system.data.errors import DatasetError
-from dual_system.data.recorded import logs_in
 from dual_system.data.export import refuse_split, texts_by_tick
 from dual_system.data.jobs import Look
 from dual_system.data.lerobot_files import INFO_PATH
 from dual_system.data.lerobot_v3 import DatasetWriter
+from dual_system.data.recorded import logs_in
 from dual_system.data.rollout import Scribe, UnsolvedError, asked, check_solved, kept_environment
 from dual_system.data.workers import LocalWorkers, Workers
 from dual_system.tasks.engine import Status

@@ -23,7 +23,7 @@ _OF_THE_TASK = (m.SubgoalKind.TASK_GROUNDED, m.SubgoalKind.TASK_SIMPLE)
 
 
 def logs_in(paths: Iterable[Path]) -> list[Path]:
-    """The logs named, and for a folder all below it, in alphabetical order. Raises DatasetError if a folder has none."""
+    """The logs, and of a folder all below it in alphabetical order. Raises DatasetError if a folder has none."""
     found: list[Path] = []
     for path in paths:
         inside = sorted(path.rglob("*.mcap")) if path.is_dir() else [path]

@@ -1,4 +1,4 @@
-"""A run that is told to end saves first: at SIGTERM (a scheduler's preemption, torchrun, a slice's end) and at Ctrl-C."""
+"""A run that is told to end saves first: at SIGTERM (of schedulers, torchrun, a slice's end) and at Ctrl-C."""
 
 from __future__ import annotations
 

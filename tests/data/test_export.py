@@ -55,7 +55,7 @@ def collected() -> list[Row]:
 def test_a_folder_stands_for_all_logs_below_it(log: Path, exported: Dataset, tmp_path: Path) -> None:
     assert export(ExportOptions(files=(log.parent,), out=tmp_path / "all", progress=False))[0] >= 1
     (tmp_path / "none").mkdir()
-    with pytest.raises(DatasetError, match="none holds no .mcap log; record with pp-eval --record"):
+    with pytest.raises(DatasetError, match=r"none holds no \.mcap log; record with pp-eval --record"):
         export(ExportOptions(files=(tmp_path / "none",), out=tmp_path / "out", progress=False))
 
 
