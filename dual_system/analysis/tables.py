@@ -16,6 +16,7 @@ import tyro
 from dual_system.analysis import paper
 from dual_system.analysis.ceiling_tables import ceilings
 from dual_system.analysis.counterfactual import COUNTERFACTUAL, read_counterfactual
+from dual_system.analysis.cue_age import ABOUT_CUE_AGE, by_cue_age
 from dual_system.analysis.diagnosis import DIAGNOSIS, read_diagnosis
 from dual_system.analysis.diagnosis_tables import counterfactual_table, diagnosis_tables
 from dual_system.analysis.first_choices import ABOUT_FIRST_CHOICES, ABOUT_RETOLD, first_choices, is_retold, retold
@@ -92,6 +93,8 @@ def tables(results: Sequence[Results], after_another_past: Sequence[Results] = (
     parts += ["## By task (form of the paper's Table 7)", by_task(results), *ceilings(results)]
     if first := first_choices(results):
         parts += ["## First choice", ABOUT_FIRST_CHOICES, first]
+    if aged := by_cue_age(results):
+        parts += ["## By the time since the cue was in sight", ABOUT_CUE_AGE, aged]
     if twins := retold(results, after_another_past):
         parts += ["## The same present after another past", ABOUT_RETOLD, twins]
     if curves := by_delay(results):

@@ -239,6 +239,26 @@ def test_first_choices_are_of_the_episodes_that_committed(tmp_path: Path) -> Non
     assert FIRST_CHOICES.replace("FOLDER", str(folder)) in tables([read_results(folder)])
 
 
+def test_choices_are_counted_by_the_time_since_the_cue_was_in_sight(tmp_path: Path) -> None:
+    """Beside the discs nothing is remembered yet; a count has no cue that goes."""
+    folder = write(tmp_path / "a", {"PickHighlight": ["11010"], "MoveCube": ["10"], "PickXtimes": ["1"]})
+    found = json.loads((folder / "results.json").read_text())
+    choices = iter(
+        [("right", 99), ("right", 179), ("wrong", 180), ("right", 420), (None, None)]
+        + [("right", 0), ("wrong", 79), ("right", 50)]
+    )
+    for episode in found["episodes"]:
+        episode["first_choice"], episode["first_choice_tick"] = next(choices)
+    (folder / "results.json").write_text(json.dumps(found))
+    text = tables([read_results(folder)])
+    section = text[text.index("## By the time since") :].split("\n\n")[2].splitlines()
+    assert section[0] == "| task | condition | 0 to 4 s | 4 to 8 s | 8 to 16 s | from 16 s |"
+    assert section[2:] == [
+        f"| PickHighlight | {folder} | 1, 1 of 1 | 0, 0 of 1 |  | 1, 1 of 1 |",
+        f"| MoveCube | {folder} | 1, 1 of 2 |  |  |  |",
+    ]
+
+
 def write_choices(folder: Path, choices: list[str | None], **config: Any) -> Path:
     """Results of MoveCube in which these were the first choices."""
     write(folder, {"MoveCube": ["0" * len(choices)]}, **config)
