@@ -15,7 +15,7 @@ _TICKS_PER_S = 20
 _EDGES_S = (0, 4, 8, 16, 1 << 30)
 
 ABOUT_CUE_AGE = """\
-First choices by the seconds between the last sight of the cue and the choice: of a demonstration since the episode began, of
+First choices by the seconds since the cue was last in sight: of a demonstration since the episode began, of
 PickHighlight since its discs were gone. Right choices, solved episodes, and all that chose."""
 
 

@@ -243,10 +243,8 @@ def test_choices_are_counted_by_the_time_since_the_cue_was_in_sight(tmp_path: Pa
     """Beside the discs nothing is remembered yet; a count has no cue that goes."""
     folder = write(tmp_path / "a", {"PickHighlight": ["11010"], "MoveCube": ["10"], "PickXtimes": ["1"]})
     found = json.loads((folder / "results.json").read_text())
-    choices = iter(
-        [("right", 99), ("right", 179), ("wrong", 180), ("right", 420), (None, None)]
-        + [("right", 0), ("wrong", 79), ("right", 50)]
-    )
+    lit = [("right", 99), ("right", 179), ("wrong", 180), ("right", 420), (None, None)]
+    choices = iter([*lit, ("right", 0), ("wrong", 79), ("right", 50)])
     for episode in found["episodes"]:
         episode["first_choice"], episode["first_choice_tick"] = next(choices)
     (folder / "results.json").write_text(json.dumps(found))
