@@ -7,6 +7,7 @@ thread of the parent can hold a lock that they need.
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import fields, is_dataclass, replace
@@ -68,6 +69,7 @@ class Prefetcher:
             prefetch_factor=_AHEAD,
             collate_fn=_identity,
             multiprocessing_context="fork",
+            worker_init_fn=_ignore_signals,
         )
         self._made, self._step = iter(loader), step
         self._next = self._moving.submit(self._fetch)
@@ -92,6 +94,15 @@ class _Steps(Dataset[Any]):
     def __getitem__(self, index: int) -> _Batch:
         made: _Batch = _with_arrays(self._make(self._first + index))
         return made
+
+
+def _ignore_signals(worker: int) -> None:
+    """Ignores SIGTERM and SIGINT in a worker: schedulers, torchrun and a terminal send them to the workers too.
+
+    The trainer ends its workers itself, after it has saved its step (`ending`).
+    """
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _identity(batch: Any) -> Any:

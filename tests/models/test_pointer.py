@@ -13,6 +13,7 @@ from dual_system.models.pi05.pounce import Pounce, PounceConfig, PounceInputs
 from dual_system.models.pounce.checkpoint import load_bundle, random_bundle, save_bundle
 from dual_system.models.pounce.configs import tiny_cpu
 from dual_system.models.pounce.family import random_model
+from dual_system.models.pounce.precision import cast_streams
 from pounce_server.engine import EagerEngine
 
 PLAIN = replace(tiny_cpu(horizon=6), state_input="token")
@@ -102,6 +103,17 @@ def test_only_the_front_picture_and_the_state_are_read_by_it_so_it_needs_both() 
             replace(POINTING, **broken)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="num_pointed must be at least 0, came -1"):
         replace(PLAIN, num_pointed=-1)
+
+
+def test_beside_streams_in_bfloat16_it_computes_in_float32() -> None:
+    inputs, exact = POINTING.example_inputs(2), pounce()
+    rounded = pounce()
+    cast_streams(rounded, "bfloat16")
+    _, exact_BQS = exact.pointing(inputs)
+    _, rounded_BQS = rounded.pointing(inputs)
+    assert rounded_BQS.dtype == torch.float32
+    torch.testing.assert_close(rounded_BQS, exact_BQS, rtol=0.0, atol=0.1)
+    assert bool(velocity(rounded, inputs).isfinite().all())
 
 
 def test_a_folder_keeps_it(tmp_path: Path) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import signal
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -87,3 +90,17 @@ def test_what_goes_wrong_there_is_said_here(prefetcher: Prefetcher) -> None:
 def test_somebody_must_make_them() -> None:
     with pytest.raises(ValueError, match="at least one process"):
         Prefetcher(made, "cpu", 0)
+
+
+def test_workers_outlive_the_signals_of_their_process_group(prefetcher: Prefetcher) -> None:
+    """Schedulers and torchrun send SIGTERM to all of them, and the trainer has a step to save first."""
+    same(prefetcher(0), made(0))
+    workers = multiprocessing.active_children()
+    assert len(workers) == 2
+    for number in (signal.SIGTERM, signal.SIGINT):
+        for worker in workers:
+            assert worker.pid is not None
+            os.kill(worker.pid, number)
+    for step in range(1, 6):  # more than were prefetched
+        same(prefetcher(step), made(step))
+    assert all(worker.is_alive() for worker in workers)

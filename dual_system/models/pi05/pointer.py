@@ -3,7 +3,8 @@
 Every token of the front picture is scored, as it enters the last language layer, where it has read text and cognition.
 The mean of the tokens under the softmax of the scores, with the state's token, is a vector that conditions all adaRMS
 norms of the expert beside the flow time; a norm's style is linear in its condition, so the vector's share is added to
-styles that are tabulated. With `condition` at zero, its initial value, the network is pi0.5 bit for bit.
+styles that are tabulated. With `condition` at zero, its initial value, the network is pi0.5 bit for bit. All of it is
+float32.
 
 pi0.5 has no such head. A hand of a few million weights that has hours to learn in needs it (docs/decisions.md).
 """
@@ -57,12 +58,12 @@ class Pointer(nn.Module):
 
         Without a front picture there is nothing to point at: its places are zero.
         """
-        normed_BTW = self.norm(hidden_BTW)
+        normed_BTW = self.norm(hidden_BTW.float())
         front_BSW = normed_BTW[:, first : first + self.num_patches]
         is_seen_B1S = is_real_BT[:, None, first : first + self.num_patches]
-        scores_BQS = self.score(front_BSW).transpose(1, 2).float()
+        scores_BQS = self.score(front_BSW).transpose(1, 2)
         shares_BQS = scores_BQS.masked_fill(~is_seen_B1S, torch.finfo(torch.float32).min).softmax(dim=-1) * is_seen_B1S
-        places_BQW = shares_BQS.to(front_BSW.dtype) @ front_BSW
+        places_BQW = shares_BQS @ front_BSW
         read_BE = self.read(torch.cat([places_BQW.flatten(1), normed_BTW[:, -1]], dim=-1))
         condition_BE = self.condition(nn.functional.silu(read_BE))
         return Pointed(scores=scores_BQS, styles=expert.style_shift(condition_BE))
