@@ -173,12 +173,17 @@ def with_channel(run: Recipe, bundle: PounceBundle) -> PounceBundle:
     model, wanted = bundle.model, run.pounce
     if not isinstance(model, Pounce) or not isinstance(wanted, PounceConfig) or model.config.cognition.num_carriers:
         return bundle
+    if model.config.num_pointed not in (0, wanted.num_pointed):
+        raise ValueError(
+            f"the hand points at {model.config.num_pointed} places, recipe {run.name} at {wanted.num_pointed}; take a "
+            "recipe with the hand's num_pointed, or a hand without a pointer"
+        )
     config = replace(
         model.config,
         cognition=wanted.cognition,
         reads_subgoal=wanted.reads_subgoal,
         frame_memory=wanted.frame_memory or model.config.frame_memory,
-        num_pointed=wanted.num_pointed or model.config.num_pointed,
+        num_pointed=wanted.num_pointed,
     )
     if config == model.config:
         return bundle

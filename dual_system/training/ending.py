@@ -1,4 +1,4 @@
-"""A run that is told to end saves first: at SIGTERM (of schedulers, torchrun, a slice's end) and at Ctrl-C."""
+"""A run that is asked to stop saves first: on SIGTERM (of schedulers, torchrun, a slice's end) and on Ctrl-C."""
 
 from __future__ import annotations
 
@@ -11,31 +11,33 @@ from types import FrameType
 
 
 @contextmanager
-def ending() -> Iterator[Callable[[], bool]]:
-    """Yields whether this process has been told to end; told a second time it ends at once, as outside of the block.
+def stop_requests() -> Iterator[Callable[[], bool]]:
+    """Yields whether SIGTERM or SIGINT came; the second one acts at once, as outside of the block.
 
-    Only the main thread hears signals: in another one nobody is told.
+    Only the main thread gets signals: in another one there is never a request. A signal that is ignored (SIGINT under
+    nohup) stays ignored.
     """
-    told: list[int] = []
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    requests: list[int] = []
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    before = {number: handler for number, handler in handlers.items() if handler not in (signal.SIG_IGN, None)}
     mine = os.getpid()
 
     def restore() -> None:
         for number, handler in before.items():
             signal.signal(number, handler)
 
-    def hear(number: int, frame: FrameType | None) -> None:
+    def request(number: int, frame: FrameType | None) -> None:
         restore()
-        told.append(number)
-        if os.getpid() != mine:  # a forked worker has nothing to save
+        requests.append(number)
+        if os.getpid() != mine:  # a forked process has nothing to save
             os.kill(os.getpid(), number)
 
     for number in before:
-        signal.signal(number, hear)
+        signal.signal(number, request)
     try:
-        yield lambda: bool(told)
+        yield lambda: bool(requests)
     finally:
         restore()

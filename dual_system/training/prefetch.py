@@ -99,7 +99,7 @@ class _Steps(Dataset[Any]):
 def _ignore_signals(worker: int) -> None:
     """Ignores SIGTERM and SIGINT in a worker: schedulers, torchrun and a terminal send them to the workers too.
 
-    The trainer ends its workers itself, after it has saved its step (`ending`).
+    The trainer ends its workers itself, after it has saved its step (`stop_requests`).
     """
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, signal.SIG_IGN)

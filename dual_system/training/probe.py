@@ -65,12 +65,12 @@ def main(argv: list[str] | None = None, prog: str = "pp-diagnose probe") -> int:
     options = parse(ProbeOptions, argv, prog=prog)
     if not options.ponder and not options.pounce:
         raise ValueError("nothing to probe: give checkpoints with --ponder, --pounce, or both")
-    told = f"{ABOUT}\n\n{probe_table(instants(options))}"
+    table = f"{ABOUT}\n\n{probe_table(instants(options))}"
     if options.out is not None:
         with files.writing(options.out):
             files.folder(options.out)
-            (options.out / "probe.md").write_text(told)
-    sys.stdout.write(told)
+            (options.out / "probe.md").write_text(table)
+    sys.stdout.write(table)
     return 0
 
 

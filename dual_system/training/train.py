@@ -34,7 +34,7 @@ from dual_system.models.pounce.family import sampling_of
 from dual_system.training.build import Start, build, export
 from dual_system.training.collate import collate_ponder, collate_pounce
 from dual_system.training.data import PictureSizes, TrainingSet
-from dual_system.training.ending import ending
+from dual_system.training.ending import stop_requests
 from dual_system.training.example import make_example
 from dual_system.training.frozen_towers import FrozenTowers
 from dual_system.training.joint import JointModel, PonderBatch, PounceBatch
@@ -205,8 +205,8 @@ def main(argv: list[str] | None = None) -> int:
     except torch.OutOfMemoryError as error:
         sys.stderr.write(f"pp-train: {_out_of_memory(options, error)}\n")
         return REFUSED
-    except KeyboardInterrupt as told:
-        kept = str(told) or "the last checkpoint is kept"
+    except KeyboardInterrupt as stop:
+        kept = str(stop) or "the last checkpoint is kept"
         sys.stderr.write(f"pp-train: interrupted; {kept}, the same command goes on from it\n")
         return INTERRUPTED
     return DONE
@@ -292,18 +292,18 @@ def _update(
                 options.out, first_step=trainer.step, sample_every=log.sample_every, tensorboard=log.tensorboard
             )
             stack.enter_context(watch)
-        is_told_to_end = stack.enter_context(ending())
+        is_stop_requested = stack.enter_context(stop_requests())
         for report in trainer.run(run.num_steps):
             if watch is not None:
                 watch.step(report, trainer)
             bar.set_postfix_str(f"flow {report.flow_matching:.3f} text {report.grounding:.3f}", refresh=False)
             bar.update()
-            (num_told,) = world.sums([is_told_to_end()])  # one that stops alone would leave the others waiting
-            if num_told or trainer.step % log.save_every == 0:
+            (num_requests,) = world.sums([is_stop_requested()])  # one that stops alone would leave the others waiting
+            if num_requests or trainer.step % log.save_every == 0:
                 if watch is not None:
                     watch.flush()
                 trainer.save(checkpoint)
-            if num_told and trainer.step < run.num_steps:
+            if num_requests and trainer.step < run.num_steps:
                 raise KeyboardInterrupt(f"step {trainer.step} of {run.num_steps} is saved")
         trainer.save(checkpoint)
         trainer.take_average()

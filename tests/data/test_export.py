@@ -16,6 +16,7 @@ from dual_system.data.episode import CAMERAS, Row
 from dual_system.data.errors import DatasetError
 from dual_system.data.export import ExportOptions, export, main, read_episode
 from dual_system.data.jobs import Job, Look
+from dual_system.data.recorded import logs_in
 from dual_system.data.rollout import play
 from dual_system.tasks.environment import make_environment
 from protocol.mcap_log import EpisodeRecord, read_log
@@ -52,8 +53,12 @@ def collected() -> list[Row]:
     return rows
 
 
-def test_a_folder_stands_for_all_logs_below_it(log: Path, exported: Dataset, tmp_path: Path) -> None:
-    assert export(ExportOptions(files=(log.parent,), out=tmp_path / "all", progress=False))[0] >= 1
+def test_a_folder_stands_for_all_logs_below_it(log: Path, tmp_path: Path) -> None:
+    for name in ("deep/b.mcap", "a.mcap"):
+        (tmp_path / "logs" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "logs" / name).symlink_to(log)
+    assert logs_in([log, tmp_path / "logs"]) == [log, *(tmp_path / "logs" / name for name in ("a.mcap", "deep/b.mcap"))]
+    assert export(ExportOptions(files=(tmp_path / "logs",), out=tmp_path / "all", progress=False)) == (2, [])
     (tmp_path / "none").mkdir()
     with pytest.raises(DatasetError, match=r"none holds no \.mcap log; record with pp-eval --record"):
         export(ExportOptions(files=(tmp_path / "none",), out=tmp_path / "out", progress=False))

@@ -56,7 +56,30 @@ def test_scores_are_of_the_front_pictures_patches_row_by_row() -> None:
     assert (after_BQS - before_BQS).abs().mean(dim=(0, 1)).argmax() == 1
 
 
-def test_one_draw_of_the_flow_is_many_and_a_batch_is_its_samples() -> None:
+def test_a_batch_is_its_samples_whatever_the_lengths_of_their_prompts() -> None:
+    model, inputs = pounce(), POINTING.example_inputs(2)
+    is_token = inputs.is_token.clone()
+    is_token[1, 8:] = False
+    together_BNA = velocity(model, replace(inputs, is_token=is_token))
+    short = POINTING.example_inputs(2)
+    alone = replace(
+        short,
+        images=short.images[1:],
+        has_view=short.has_view[1:],
+        token_ids=short.token_ids[1:, :8],
+        is_token=short.is_token[1:, :8],
+        age_ns=short.age_ns[1:],
+        cognition=None if short.cognition is None else short.cognition[1:],
+        state=None if short.state is None else short.state[1:],
+    )
+    generator = torch.Generator().manual_seed(2)
+    noise_BNA = torch.randn(2, 6, POINTING.padded_action_dim, generator=generator)
+    with torch.no_grad():
+        alone_BNA = model.pi05.velocity_at(noise_BNA[1:], torch.tensor([0.8]), model.prefill(alone))
+    torch.testing.assert_close(together_BNA[1:], alone_BNA, rtol=1e-4, atol=1e-5)
+
+
+def test_draws_of_the_flow_that_share_a_prefix_are_those_that_do_not() -> None:
     model, inputs = pounce(), POINTING.example_inputs(2)
     actions_BNA = POINTING.example_actions(2)
     noise_SNA = torch.randn(6, *actions_BNA.shape[1:], generator=torch.Generator().manual_seed(3))
@@ -98,7 +121,8 @@ def test_without_a_front_picture_it_points_at_nothing_there() -> None:
 
 
 def test_only_the_front_picture_and_the_state_are_read_by_it_so_it_needs_both() -> None:
-    for broken in ({"num_cameras": 0}, {"state_input": "prompt"}):
+    last = replace(POINTING.cognition, place="after_text")
+    for broken in ({"num_cameras": 0}, {"state_input": "prompt"}, {"cognition": last}):
         with pytest.raises(ValueError, match="num_pointed needs a front camera"):
             replace(POINTING, **broken)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="num_pointed must be at least 0, came -1"):

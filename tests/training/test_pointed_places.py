@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,13 +22,15 @@ from dual_system.models.pounce.checkpoint import random_bundle
 from dual_system.models.pounce.configs import laptop, tiny_cpu
 from dual_system.models.pounce.family import sample_times
 from dual_system.models.windows import LAPTOP_WINDOWS
+from dual_system.training import train
 from dual_system.training.build import with_channel
 from dual_system.training.collate import collate_pounce
 from dual_system.training.episode import TrainingEpisode
 from dual_system.training.example import Example, ExampleConfig, make_example
 from dual_system.training.joint import Draws, JointModel, PonderBatch, PounceBatch
 from dual_system.training.pointed_places import pointed_places
-from dual_system.training.recipes import recipe
+from dual_system.training.recipes import RECIPES, recipe
+from dual_system.training.train import InsteadOptions, LogOptions, MachineOptions, TrainOptions
 
 PONDER = Ponder.random(replace(tiny_ponder(), num_layers=4), seed=1)
 POUNCE = replace(tiny_cpu(num_carriers=0, horizon=6), state_input="token", num_pointed=2)
@@ -105,3 +109,26 @@ def test_a_hand_without_a_pointer_is_given_one_that_changes_nothing_yet() -> Non
     assert bool(model.pointer.score.weight.any())
     assert not bool(model.pointer.condition.weight.any())
     assert all(torch.equal(each, model.state_dict()[name]) for name, each in plain.model.state_dict().items())
+    one = random_bundle(replace(POUNCE, num_pointed=1), 0)
+    with pytest.raises(ValueError, match="the hand points at 1 places, recipe laptop_hand at 2"):
+        with_channel(replace(recipe("laptop_hand"), pounce=POUNCE), one)
+
+
+def test_a_run_teaches_it_whoever_makes_the_batch_and_in_however_many_parts(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = recipe("tiny_framesamp")
+    pounce = replace(run.pounce, frame_memory=None, state_input="token", num_pointed=2)  # type: ignore[call-arg]
+    example = replace(run.example, is_grounded=True)
+    pointing = replace(run, name="tiny_pointing", pounce=pounce, example=example, grounds_pointer=True, w2=0.3)
+    monkeypatch.setitem(RECIPES, "tiny_pointing", lambda: pointing)
+    instead, quiet = InsteadOptions(steps=1, max_invocations=4), LogOptions(progress=False)
+    reports = []
+    for name, machine in (("a", {}), ("b", {"accumulate": 2}), ("c", {"loaders": 1})):
+        options = TrainOptions(recipe="tiny_pointing", data=(folder,), out=tmp_path / name, instead=instead, log=quiet)
+        train.train(replace(options, machine=MachineOptions(**machine)))
+        reports.append(json.loads((tmp_path / name / "log.jsonl").read_text().splitlines()[0]))
+    for report in reports:
+        assert report["num_supervised"] == reports[0]["num_supervised"] > 0
+        assert report["flow_matching"] == pytest.approx(reports[0]["flow_matching"], rel=1e-5)
+        assert report["grounding"] == pytest.approx(reports[0]["grounding"], rel=1e-5)

@@ -25,7 +25,7 @@ from dual_system.models.ponder.demo_sampling import DemoSampling
 from dual_system.models.pounce.checkpoint import load_bundle
 from dual_system.training import recipes, train
 from dual_system.training.data import TrainingSet
-from dual_system.training.ending import ending
+from dual_system.training.ending import stop_requests
 from dual_system.training.parallel import World
 from dual_system.training.recipe import Recipe
 from dual_system.training.train import InsteadOptions, LogOptions, MachineOptions, TrainOptions
@@ -122,17 +122,17 @@ def test_a_run_that_was_killed_ends_as_one_that_was_not(
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_run_that_is_told_to_end_saves_the_step_that_it_was_in(
+def test_a_run_that_is_asked_to_stop_saves_the_step_that_it_was_in(
     folder: Path, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
     update, before = train.Trainer._update, signal.getsignal(number)
 
-    def told_in_the_first(self: Trainer) -> train.StepReport:
+    def asked_in_the_first(self: Trainer) -> train.StepReport:
         os.kill(os.getpid(), number)
         return update(self)
 
     with monkeypatch.context() as patch:
-        patch.setattr(train.Trainer, "_update", told_in_the_first)
+        patch.setattr(train.Trainer, "_update", asked_in_the_first)
         with pytest.raises(KeyboardInterrupt, match="step 1 of 2 is saved"):
             train.train(options(folder, tmp_path / "cut"))
     assert signal.getsignal(number) == before
@@ -142,13 +142,24 @@ def test_a_run_that_is_told_to_end_saves_the_step_that_it_was_in(
         assert (finished / name).read_bytes() == (tmp_path / "cut" / name).read_bytes()
 
 
-def test_told_twice_it_ends_at_once() -> None:
-    with ending() as is_told_to_end:
-        assert not is_told_to_end()
+def test_the_second_request_acts_at_once() -> None:
+    with stop_requests() as is_requested:
+        assert not is_requested()
         os.kill(os.getpid(), signal.SIGINT)
-        assert is_told_to_end()
+        assert is_requested()
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_a_signal_that_is_ignored_stays_ignored() -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with stop_requests() as is_requested:
+            os.kill(os.getpid(), signal.SIGINT)
+            assert not is_requested()
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_a_worker_that_was_forked_ends_at_once() -> None:
@@ -159,7 +170,7 @@ def test_a_worker_that_was_forked_ends_at_once() -> None:
         awake.set()
         time.sleep(60)
 
-    with ending():
+    with stop_requests():
         worker = context.Process(target=work)
         worker.start()
         assert awake.wait(timeout=30)  # a fork forgets what was pending at its first instant
