@@ -3,19 +3,18 @@
     python -m benchmarks.policy --folder POLICY_DIR --minutes 150
 
 A stage is a set of commands that run side by side, one a core, each of which resumes by itself. One that has ended well
-is marked as done, and so is a stage without another. Stages are run in their order until the slice is over. What each
-has cost, and each of its commands, is added to ``hours.jsonl``, of which a table is printed at the end.
+is marked as done, and so is a stage without another. Stages are run in their order until the slice is over, by its minutes,
+SIGTERM or Ctrl-C. What each has cost, and each of its commands, is added to ``hours.jsonl``, of which a table is printed at the end.
 """
 
 from __future__ import annotations
 
 import json
-import math
 import os
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +25,7 @@ from benchmarks.policy_plan import Stage, stages, trained
 from benchmarks.policy_table import table
 from benchmarks.policy_weights import require_committed
 from dual_system.analysis.markdown import markdown
+from dual_system.training.ending import stop_requests
 from protocol.command_line import command, parse
 
 _ENDING_S = 120.0
@@ -51,11 +51,12 @@ def main(argv: list[str] | None = None) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     ends_s = time.monotonic() + 60 * options.minutes
     code = DONE
-    for stage in stages(folder):
-        if code == DONE and not _mark(stage, folder).exists():
-            if stage.is_test:
-                require_committed(trained(folder), folder)
-            code = _run(stage, folder, ends_s)
+    with stop_requests() as is_requested:
+        for stage in stages(folder):
+            if code == DONE and not _mark(stage, folder).exists():
+                if stage.is_test:
+                    require_committed(trained(folder), folder)
+                code = _run(stage, folder, lambda: is_requested() or time.monotonic() >= ends_s)
     sys.stdout.write(gates(folder / "gates") + losses(folder / "rows") + table(folder) + account(folder))
     return code
 
@@ -65,9 +66,9 @@ def _mark(stage: Stage, folder: Path, number: int | None = None) -> Path:
     return folder / "done" / (stage.name.replace(" ", "_") + ("" if number is None else f".{number}"))
 
 
-def _run(stage: Stage, folder: Path, ends_s: float) -> int:
+def _run(stage: Stage, folder: Path, is_over: Callable[[], bool]) -> int:
     """Runs a stage until it is done or the slice is over; adds its cost to the account."""
-    if time.monotonic() >= ends_s:
+    if is_over():
         return UNFINISHED
     sys.stdout.write(f"--- {stage.name}\n")
     sys.stdout.flush()
@@ -78,11 +79,11 @@ def _run(stage: Stage, folder: Path, ends_s: float) -> int:
     core_s: dict[int, float] = {}
 
     def ended(number: int) -> int:
-        if time.monotonic() >= ends_s:
+        if is_over():
             return UNFINISHED
         command = [sys.executable, "-m", *stage.commands[number]]
         processes.append(process := subprocess.Popen(command, env=os.environ | {"OMP_NUM_THREADS": "1"}))
-        code, core_s[number] = _ended(process, ends_s)
+        code, core_s[number] = _ended(process, is_over)
         if not code:
             _mark(stage, folder, number).touch()
         return code
@@ -101,29 +102,29 @@ def _run(stage: Stage, folder: Path, ends_s: float) -> int:
     if not any(codes):
         _mark(stage, folder).touch()
         return DONE
-    if time.monotonic() >= ends_s:
+    if is_over():
         return UNFINISHED
     sys.stderr.write(f"policy: {stage.name} ended with {codes}; what it printed says why\n")
     return FAILED
 
 
-def _ended(process: subprocess.Popen[bytes], ends_s: float) -> tuple[int, float]:
+def _ended(process: subprocess.Popen[bytes], is_over: Callable[[], bool]) -> tuple[int, float]:
     """A command's exit code and processor time [s], its children's included.
 
-    At the end of the slice it is told to end (by SIGTERM: nohup shields from Ctrl-C). What it has not saved is done
-    again.
+    At the end of the slice it gets SIGTERM (nohup shields from Ctrl-C). What it has not saved is done again.
     """
-    for until_s, end in ((ends_s, process.terminate), (ends_s + _ENDING_S, process.kill), (math.inf, process.kill)):
-        while True:
-            pid, status, used = os.wait4(process.pid, os.WNOHANG)
-            if pid:
-                process.returncode = os.waitstatus_to_exitcode(status)
-                return process.returncode, used.ru_utime + used.ru_stime
-            if time.monotonic() >= until_s:
-                break
-            time.sleep(_LOOK_S)
-        end()
-    raise AssertionError("a killed process ends")
+    kill_s: float | None = None
+    while True:
+        pid, status, used = os.wait4(process.pid, os.WNOHANG)
+        if pid:
+            process.returncode = os.waitstatus_to_exitcode(status)
+            return process.returncode, used.ru_utime + used.ru_stime
+        if kill_s is None and is_over():
+            process.terminate()
+            kill_s = time.monotonic() + _ENDING_S
+        elif kill_s is not None and time.monotonic() >= kill_s:
+            process.kill()
+        time.sleep(_LOOK_S)
 
 
 def account(folder: Path) -> str:

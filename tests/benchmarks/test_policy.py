@@ -6,8 +6,10 @@ import importlib
 import inspect
 import json
 import os
+import signal
 import subprocess
 import textwrap
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -156,6 +158,15 @@ def test_a_slice_that_is_over_is_gone_on_with(programs: Path, monkeypatch: pytes
     assert policy.main(["--folder", str(programs)]) == DONE
     assert counted(programs) == reached + 1
     assert len(entries(programs)) == slices + 1
+
+
+def test_a_signal_ends_the_slice_and_its_cost_is_counted(programs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan(programs, monkeypatch, 1_000_000)
+    timer = threading.Timer(0.3, os.kill, args=(os.getpid(), signal.SIGTERM))
+    timer.start()
+    assert policy.main(["--folder", str(programs)]) == UNFINISHED
+    timer.join()
+    assert [entry["stage"] for entry in entries(programs)] == ["part 0"]
 
 
 def test_a_command_that_ended_is_not_run_again_beside_one_that_did_not(
