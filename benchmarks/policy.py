@@ -3,8 +3,9 @@
     python -m benchmarks.policy --folder POLICY_DIR --minutes 150
 
 A stage is a set of commands that run side by side, one a core, each of which resumes by itself. One that has ended well
-is marked as done, and so is a stage without another. Stages are run in their order until the slice is over, by its minutes,
-SIGTERM or Ctrl-C. What each has cost, and each of its commands, is added to ``hours.jsonl``, of which a table is printed at the end.
+is marked as done, and so is a stage without another. Stages are run in their order until the slice is over: by its
+minutes, SIGTERM or Ctrl-C. What each has cost, and each of its commands, is added to ``hours.jsonl``, of which a table
+is printed at the end.
 """
 
 from __future__ import annotations
