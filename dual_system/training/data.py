@@ -30,6 +30,7 @@ from dual_system.tasks.seeds import UNTRAINED, split_of
 from dual_system.training.chunks import chunk_ticks
 from dual_system.training.episode import Frame, Picture, TrainingEpisode
 from dual_system.training.frozen_towers import FrozenTowers
+from dual_system.training.parallel import World
 from dual_system.training.picture_store import PictureStore, Views
 
 _QUANTILES = (0.01, 0.99)
@@ -281,8 +282,10 @@ class TrainingSet:
             self._cached_bytes -= _num_bytes(dropped)
         return episode
 
-    def embedded(self, towers: FrozenTowers) -> TrainingSet:
+    def embedded(self, towers: FrozenTowers, world: World) -> TrainingSet:
         """The same episodes with the features of ``towers`` in the pictures' place, in the store beside the pictures.
+
+        Each of several processes begins at another episode, and finds stored what the others have computed.
 
         Raises ValueError if this set has no store.
         """
@@ -291,7 +294,8 @@ class TrainingSet:
         found = copy.copy(self)
         found._cache, found._cached_bytes, found._is_embedded = OrderedDict(), 0, True
         found._store = store = PictureStore(self._folder, f"{self._sizes.key} {towers.key}")
-        for source in self._sources:
+        first = len(self._sources) * world.rank // world.size
+        for source in (*self._sources[first:], *self._sources[:first]):
             if not store.has(key := self._key(source)):
                 _, rendered = _instants(source, self._demo_hz)
                 features = towers.features(*self._decoded(source, sorted({*rendered})))

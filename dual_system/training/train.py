@@ -254,7 +254,7 @@ def train(options: TrainOptions) -> None:
             demo_hz=run.demo_hz,
         )
         if machine.frozen_features:
-            data = data.embedded(FrozenTowers(model))
+            data = data.embedded(FrozenTowers(model), world)
         with files.writing(options.out):
             _update(run, model, Batches(data, run, model, bundle, world), data.hash, options, world)
             _write(run, model, bundle, data, options, world)

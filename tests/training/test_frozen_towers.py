@@ -38,7 +38,7 @@ def one_step(run: Recipe, folder: Path, store: Path, *, embeds: bool) -> tuple[J
     model, bundle = train.build(run, TrainingSet(folder), Start())
     data = TrainingSet(folder, sizes=train._picture_sizes(run, model), store=store)
     if embeds:
-        data = data.embedded(FrozenTowers(model))
+        data = data.embedded(FrozenTowers(model), World())
     batches = train.Batches(data, run, model, bundle, World())
     trainer = Trainer(model, batches, run.train)
     (report,) = trainer.run(1)
@@ -83,11 +83,11 @@ def test_other_towers_have_other_features(folder: Path, tmp_path: Path) -> None:
     run = recipe_of("tiny")
     model, _ = train.build(run, TrainingSet(folder), Start())
     data = TrainingSet(folder, sizes=train._picture_sizes(run, model), store=tmp_path)
-    first = data.embedded(FrozenTowers(model))[0]
+    first = data.embedded(FrozenTowers(model), World())[0]
     with torch.no_grad():
         for parameter in model.pounce.backbone.vision[0].parameters():
             parameter.mul_(1.5)
-    second = data.embedded(FrozenTowers(model))[0]
+    second = data.embedded(FrozenTowers(model), World())[0]
     assert first.views[0][0].shape == second.views[0][0].shape
     assert not np.array_equal(first.views[0][0], second.views[0][0])
     assert np.array_equal(first.images[0][0], second.images[0][0])
@@ -97,15 +97,35 @@ def test_a_set_without_a_store_says_so(folder: Path) -> None:
     run = recipe_of("tiny")
     model, _ = train.build(run, TrainingSet(folder), Start())
     with pytest.raises(ValueError, match="give a --picture-store"):
-        TrainingSet(folder, sizes=train._picture_sizes(run, model)).embedded(FrozenTowers(model))
+        TrainingSet(folder, sizes=train._picture_sizes(run, model)).embedded(FrozenTowers(model), World())
 
 
 def test_a_damaged_file_of_features_is_not_read_as_pictures(folder: Path, tmp_path: Path) -> None:
     run = recipe_of("tiny")
     model, _ = train.build(run, TrainingSet(folder), Start())
     data = TrainingSet(folder, sizes=train._picture_sizes(run, model), store=tmp_path)
-    stored = data.embedded(FrozenTowers(model))
+    stored = data.embedded(FrozenTowers(model), World())
     for path in tmp_path.rglob("*.npz"):
         path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(OSError, match="no features of"):
         stored[0]
+
+
+def test_several_processes_begin_at_different_episodes_and_find_what_others_stored(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = recipe_of("tiny")
+    model, _ = train.build(run, TrainingSet(folder), Start())
+    data = TrainingSet(folder, sizes=train._picture_sizes(run, model), store=tmp_path)
+    computed, features = list[int](), FrozenTowers.features
+
+    def counted(self: FrozenTowers, views: Any, images: Any) -> Any:
+        computed.append(len(views))
+        if len(computed) == 1:  # the second of two processes; while it computes, the first one runs
+            data.embedded(FrozenTowers(model), World())
+        return features(self, views, images)
+
+    monkeypatch.setattr(FrozenTowers, "features", counted)
+    data.embedded(FrozenTowers(model), World(rank=1, size=2))
+    ours, first, again = computed
+    assert ours == again != first, "it begins with the second episode, and the first one is stored by then"
