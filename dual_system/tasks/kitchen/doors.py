@@ -1,0 +1,114 @@
+"""Opening and shutting doors: taken by the bar and led along the arc, and pushed where they were left ajar."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from dual_system.tasks.geometry import Array
+from dual_system.tasks.kitchen import steps
+from dual_system.tasks.kitchen.arm import Arm, Way
+from dual_system.tasks.kitchen.handles import Hinge
+from dual_system.tasks.kitchen.plan import Target
+from dual_system.tasks.kitchen.predicates import hinges
+from dual_system.tasks.kitchen.pushing import push
+from dual_system.tasks.kitchen.reach import Base
+from dual_system.tasks.kitchen.steps import AHEAD, UP, Step, Steps
+
+_LOW_M, _WIDE_RAD, _HALF_SHUT_RAD = 1.3, 0.9, 0.7  # doors: a low bar, wide open, where to push it to shut it
+_AROUND_M = -0.17 * AHEAD  # around the edge of an open leaf
+_EASY = 0.1  # worth of a way that needs no second go
+_ATTEMPTS, _DONE_RAD = 3, 0.06
+_BAR_OUT_M, _BESIDE_BAR_M, _PAST_RAD = 0.06, 0.08, 0.03  # of a leaf's face; where it is pushed, and how far
+_PUSH_BACKS, _PUSH_LEFTS = (-0.3, -0.15), (-0.35, -0.2, 0.0, 0.2, 0.35)
+_LOST_RAD = 0.15  # a door that lags this much behind the hand is no longer in it
+
+
+def lead_doors(arm: Arm, target: Target, *, fraction: float) -> Steps:
+    """Yields the steps that bring each door of a fixture to a fraction of its opening."""
+    for i, door in enumerate(hinges(arm.view.bay, target.fixture)):
+        if i:
+            yield from arm.go_home()
+        to_rad = fraction * door.open_rad
+        for _ in range(_ATTEMPTS):
+            left_rad = abs(arm.view.angle(door.joint) - to_rad)
+            if left_rad < _DONE_RAD:
+                break
+            is_ajar = not to_rad and left_rad < _WIDE_RAD
+            yield from _push_shut(arm, door) if is_ajar else _lead_door(arm, door, to_rad)
+
+
+def _push_shut(arm: Arm, door: Hinge) -> Steps:
+    """Pushes a door that is ajar at its face, between bar and hinge, a little past the shut one."""
+    grip, _, normal = door.at(arm.view.angle(door.joint))
+    toward_hinge = (np.array(door.anchor_m) - grip) * [1.0, 1.0, 0.0]
+    toward_hinge -= normal * (toward_hinge @ normal)
+    toward_hinge /= np.linalg.norm(toward_hinge)
+    face = grip - _BAR_OUT_M * normal + _BESIDE_BAR_M * toward_hinge
+    past_rad = -_PAST_RAD * float(np.sign(door.open_rad))
+    yield from push(arm, door, past_rad, face, from_side=normal, bases=tuple(product(_PUSH_BACKS, _PUSH_LEFTS)))
+
+
+def _lead_door(arm: Arm, door: Hinge, to_rad: float) -> Steps:
+    """Takes a door by its bar and leads it along its arc, or to half shut if it cannot be led all the way."""
+    grasps = _door_grasps(door)
+    now = arm.view.angle(door.joint)
+    is_shutting = abs(now) > abs(to_rad)
+
+    def way(grasp: _DoorGrasp, start_rad: float, end_rad: float) -> Way:
+        span = np.linspace(start_rad, end_rad, 4).tolist()
+        poses = tuple(grasp.at(door, angle) for angle in span)
+        before = steps.backed(poses[0], 0.1)
+        if abs(start_rad) > _WIDE_RAD and is_shutting:  # the open leaf is between the hand and its bar
+            before = steps.moved(before, _AROUND_M)
+        return Way(base=grasp.base, poses=(before, *poses), joint=door.joint, values=(start_rad, *span))
+
+    worth, _, _ = arm.rate([way(grasp, now, to_rad) for grasp in grasps])
+    end = to_rad if worth > _EASY or not is_shutting else _HALF_SHUT_RAD * float(np.sign(now))
+    _, best, _ = arm.rate([way(grasp, now, end) for grasp in grasps])
+    grasp = grasps[best]
+    yield from arm.drive(grasp.base)
+    now = arm.view.angle(door.joint)  # the arm may have touched it
+    before, frame, *_ = way(grasp, now, end).poses
+    yield Step(pose=before)
+    yield from steps.grasp(frame, door.joint)
+    for step in steps.swing(door, now, end, frame, follow=grasp.follow):
+        yield step
+        if step.value is not None and abs(arm.view.angle(door.joint) - step.value) > _LOST_RAD:
+            break
+    yield from steps.release(steps.here(arm.view))
+    yield from steps.retreat(arm.view, back_m=0.1)
+    if abs(arm.view.angle(door.joint)) > _WIDE_RAD:
+        yield Step(pose=steps.moved(steps.here(arm.view), _AROUND_M))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _DoorGrasp:
+    """How a door's bar is held: where the base stands, and how the hand turns with the leaf."""
+
+    base: Base
+    tilt_rad: float
+    follow: float
+    is_flipped: bool
+
+    def at(self, door: Hinge, angle_rad: float) -> Array:
+        """Returns the tool's pose (4, 4) at an angle of the door."""
+        grip, bar, _ = door.at(angle_rad)
+        toward = steps.about(UP, self.follow * angle_rad) @ AHEAD
+        T = steps.tool(grip, steps.tilted(toward, self.tilt_rad), np.cross(bar, toward))
+        return steps.flipped(T) if self.is_flipped else T
+
+
+def _door_grasps(door: Hinge) -> list[_DoorGrasp]:
+    side = -float(np.sign(door.open_rad))
+    lefts: tuple[float, ...]
+    if door.grip_m[2] < _LOW_M:  # a microwave's, whose door is wide as well
+        backs, lefts, tilts, follows = (-0.3, -0.4), (-0.1, 0.05), (35.0, 50.0), (0.15, 0.5)
+    else:
+        backs, lefts, tilts, follows = (-0.15, -0.25), (-0.1, 0.05, 0.2, 0.35), (60.0, 75.0), (0.0, 0.2)
+    return [
+        _DoorGrasp(base=(back, left * side), tilt_rad=float(np.deg2rad(tilt)), follow=follow, is_flipped=flip)
+        for back, left, tilt, follow, flip in product(backs, lefts, tilts, follows, (False, True))
+    ]

@@ -1,0 +1,198 @@
+"""Picking an object up and putting it elsewhere, and once more where that has failed.
+
+The ways to hold it, to put it and to stand are rated by their ends; the first of the best whose whole path touches
+nothing is taken. Nothing moves sideways near a fixture: hand and object come back to the robot's side before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from dual_system.tasks.geometry import Array
+from dual_system.tasks.kinematics import UnreachableError
+from dual_system.tasks.kitchen import steps
+from dual_system.tasks.kitchen.arm import Arm, Way
+from dual_system.tasks.kitchen.grips import grips_on
+from dual_system.tasks.kitchen.handles import Cabinet, Microwave
+from dual_system.tasks.kitchen.plan import Target
+from dual_system.tasks.kitchen.predicates import View
+from dual_system.tasks.kitchen.reach import UNREACHABLE, Base, Leg
+from dual_system.tasks.kitchen.steps import SHUT, UP, Step, Steps
+
+_BASES: tuple[Base, ...] = ((0.0, 0.0), (0.0, 0.2), (0.0, -0.2), (-0.15, 0.0), (-0.15, 0.2), (-0.15, -0.2), (-0.3, 0.0))
+_STEEP_RAD = 0.8
+_TURN_COST, _DRIVE_COST = 0.08, 0.3  # of worth, a radian and a metre: far turns may end at a joint's limit
+_NUM_GRIPS, _NUM_PUTS, _NUM_PLANS = 6, 3, 12  # ways to hold, to put each of them, and plans whose path is followed
+_ATTEMPTS = 3
+_BACK_M, _LIFT_M = 0.1, 0.03
+_SLIPPED_M, _MISPLACED_M = 0.04, 0.05  # in the hand, and from where it should be
+
+
+Place = Callable[[View, Target], Array]
+"""Where an object's origin shall be, (3,) in metres."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Manner:
+    """How a task's object is held and carried."""
+
+    place: Place
+    tilts: tuple[float, ...]
+    """Of the hand; it keeps its own from picking to placing, so that the object stays upright [rad]."""
+    leave: Array
+    """From where the object stands to where it is free [m]."""
+    enter: Array
+    """From where it is free to where it shall be, reversed [m]."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Plan:
+    """One way to hold an object, to put it, and to stand for both."""
+
+    worth: float
+    pick_base: Base
+    put_base: Base
+    out: Array  # the hand (4, 4) where the object, once picked, is free
+    grip: Array
+    before: Array  # the hand where the object is about to be put
+    there: Array
+
+
+def pick_and_place(arm: Arm, target: Target, *, manner: Manner) -> Steps:
+    """Yields the steps of picking and placing, from another side where the object has not come to its place."""
+    tried: list[Array] = []
+    goal = manner.place(arm.view, target)
+    for _ in range(_ATTEMPTS):
+        plan = _best(arm, target, manner, tried)
+        tried.append(plan.grip)
+        yield from _perform(arm, target, plan)
+        yield from arm.go_home()
+        if float(np.linalg.norm(arm.view.position_m(target.obj)[:2] - goal[:2])) < _MISPLACED_M:
+            return
+
+
+def _perform(arm: Arm, target: Target, plan: _Plan) -> Steps:
+    """Yields the steps of one plan; it ends early where the object is not in the hand."""
+    view, obj = arm.view, target.obj
+    yield from arm.drive(plan.pick_base)
+    for T in _to_grip(steps.here(view), plan):
+        yield Step(pose=T)
+    yield from steps.grasp(plan.grip, obj)
+    held = view.position_m(obj) - steps.here(view)[:3, 3]
+    yield Step(pose=steps.moved(plan.grip, _LIFT_M * UP), opening=SHUT, holds=obj, speed_m_s=0.15)
+    yield Step(pose=plan.out, opening=SHUT, holds=obj, speed_m_s=0.2)
+    now = view.position_m(obj) - steps.here(view)[:3, 3]
+    if float(np.linalg.norm(now - held)) > _SLIPPED_M:
+        return
+    yield from arm.drive(plan.put_base, holds=obj)
+    for T in (*steps.around(steps.here(view), plan.before), plan.before):
+        yield Step(pose=T, opening=SHUT, holds=obj, speed_m_s=0.2)
+    yield Step(pose=plan.there, opening=SHUT, holds=obj, speed_m_s=0.12)
+    yield from steps.release(steps.here(view))
+    yield Step(pose=steps.backed(steps.here(view), _BACK_M), speed_m_s=0.2)
+    yield Step(pose=plan.before)
+
+
+def _legs(arm: Arm, target: Target, plan: _Plan) -> list[Leg]:
+    """Returns the path of a plan from where the hand is."""
+    start = arm.after_drive(steps.here(arm.view), plan.pick_base)
+    lifted = steps.moved(plan.grip, _LIFT_M * UP)
+    out = arm.after_drive(plan.out, plan.put_base, plan.pick_base)
+    backed = steps.backed(plan.there, _BACK_M)
+    return [
+        Leg(base=plan.pick_base, poses=(*_to_grip(start, plan), steps.backed(plan.grip, _BACK_M), plan.grip)),
+        Leg(base=plan.pick_base, poses=(lifted, plan.out), carries=target.obj),
+        Leg(base=plan.put_base, poses=(*steps.around(out, plan.before), plan.before, plan.there), carries=target.obj),
+        Leg(base=plan.put_base, poses=(backed, plan.before)),
+    ]
+
+
+def _to_grip(start: Array, plan: _Plan) -> list[Array]:
+    """Returns the hand's poses from a start to where it is about to approach the object."""
+    return [*steps.around(start, plan.out), plan.out]
+
+
+def _best(arm: Arm, target: Target, manner: Manner, tried: list[Array]) -> _Plan:
+    """Returns the plan to follow. Raises UnreachableError if nothing leads there."""
+    plans = _plans(arm, target, manner)
+    if not plans:
+        kind = arm.view.bay.objects[target.obj].kind
+        raise UnreachableError(f"no way to hold the {kind} leads to where it shall be; draw another scene")
+    fresh = [plan for plan in plans if not any(np.allclose(plan.grip, T, atol=0.02) for T in tried)] or plans
+    ranked = sorted(fresh, key=lambda plan: -plan.worth)[:_NUM_PLANS]
+    return ranked[arm.first_free(_legs(arm, target, plan) for plan in ranked)]
+
+
+def _plans(arm: Arm, target: Target, manner: Manner) -> list[_Plan]:
+    """Returns plans within reach, rated by how well the ends of their parts are reached."""
+    view, leave, enter = arm.view, manner.leave, manner.enter
+    goal, now = manner.place(view, target), view.position_m(target.obj)
+    grips = _grips(view, target, manner)
+    picks = []
+    for T in grips:
+        out = steps.moved(T, leave)
+        ways = [Way(base=base, poses=(out, steps.backed(T, _BACK_M), T, out)) for base in _BASES]
+        worth, best, qpos = arm.rate(ways)
+        picks.append((worth, ways[best].base, T, qpos))
+    picks.sort(key=lambda each: -each[0])
+    plans = []
+    for worth, pick_base, grip, qpos in picks[:_NUM_GRIPS]:
+        out, ways = steps.moved(grip, leave), []
+        for yaw, base in product(np.linspace(-np.pi, np.pi, 8, endpoint=False), _BASES):
+            there = _placed(grip, goal, now, yaw)
+            if (_has_walls(view, target) and enter[1] and not _points_ahead(there)) or (
+                leave[1] and base[0] > pick_base[0]
+            ):
+                continue  # it would reach along a wall, or drive into what it has just come out of
+            before = steps.moved(there, enter)
+            cost = _TURN_COST * abs(yaw) + _DRIVE_COST * float(np.hypot(*np.subtract(base, pick_base)))
+            ways.append(Way(base=base, poses=(*steps.between(out, before), before, there), cost=cost))
+        for put_worth, i, _ in arm.rate_best(ways, _NUM_PUTS, qpos):
+            if min(worth, put_worth) <= UNREACHABLE:
+                continue
+            *_, before, there = ways[i].poses
+            plans.append(
+                _Plan(
+                    worth=min(worth, put_worth - ways[i].cost),
+                    pick_base=pick_base,
+                    put_base=ways[i].base,
+                    out=out,
+                    grip=grip,
+                    before=before,
+                    there=there,
+                )
+            )
+    return plans
+
+
+def _grips(view: View, target: Target, manner: Manner) -> list[Array]:
+    """Returns the hand's poses that hold the object, with either finger in front."""
+    thing = view.bay.objects[target.obj]
+    grips = []
+    for tilt in manner.tilts:
+        round_ways = (tilt, -tilt) if tilt < _STEEP_RAD else (tilt,)  # a flat hand comes from the robot's side
+        grips += [T for each in round_ways for T in grips_on(view, thing, each)]
+    is_inside = _has_walls(view, target) and bool(manner.leave[1])
+    return [T for grip in grips for T in (grip, steps.flipped(grip)) if not is_inside or _points_ahead(T)]
+
+
+def _placed(grip: Array, goal: Array, now: Array, yaw_rad: float) -> Array:
+    """Returns the hand's pose with the object at the goal, turned about the vertical by an angle."""
+    turned = steps.about(UP, yaw_rad)
+    there = grip.copy()
+    there[:3, :3], there[:3, 3] = turned @ grip[:3, :3], goal + turned @ (grip[:3, 3] - now)
+    return there
+
+
+def _has_walls(view: View, target: Target) -> bool:
+    return isinstance(view.bay.fixtures.get(target.fixture), Cabinet | Microwave)
+
+
+def _points_ahead(T: Array) -> bool:
+    """Returns whether a tool points into a fixture rather than along it."""
+    flat = T[:2, 2] / max(float(np.linalg.norm(T[:2, 2])), 1e-6)
+    return bool(flat[1] > 0.7)
