@@ -20,10 +20,9 @@ from dual_system.tasks.kitchen.steps import AHEAD, UP, Step, Steps
 _LOW_M, _WIDE_RAD, _HALF_SHUT_RAD = 1.3, 0.9, 0.7  # doors: a low bar, wide open, where to push it to shut it
 _AROUND_M = -0.17 * AHEAD  # around the edge of an open leaf
 _EASY = 0.1  # worth of a way that needs no second go
-_ATTEMPTS, _DONE_RAD = 3, 0.06
+_MORE_ATTEMPTS, _DONE_RAD = 2, 0.06
 _BAR_OUT_M, _BESIDE_BAR_M, _PAST_RAD = 0.06, 0.08, 0.03  # of a leaf's face; where it is pushed, and how far
 _PUSH_BACKS, _PUSH_LEFTS = (-0.3, -0.15), (-0.35, -0.2, 0.0, 0.2, 0.35)
-_LOST_RAD = 0.15  # a door that lags this much behind the hand is no longer in it
 
 
 def lead_doors(arm: Arm, target: Target, *, fraction: float) -> Steps:
@@ -32,12 +31,16 @@ def lead_doors(arm: Arm, target: Target, *, fraction: float) -> Steps:
         if i:
             yield from arm.go_home()
         to_rad = fraction * door.open_rad
-        for _ in range(_ATTEMPTS):
+        yield from _lead_door(arm, door, to_rad)
+        for _ in range(_MORE_ATTEMPTS):
             left_rad = abs(arm.view.angle(door.joint) - to_rad)
             if left_rad < _DONE_RAD:
                 break
-            is_ajar = not to_rad and left_rad < _WIDE_RAD
-            yield from _push_shut(arm, door) if is_ajar else _lead_door(arm, door, to_rad)
+            if not to_rad and left_rad < _WIDE_RAD:
+                yield from _push_shut(arm, door)
+            else:
+                yield from arm.go_home()
+                yield from _lead_door(arm, door, to_rad)
 
 
 def _push_shut(arm: Arm, door: Hinge) -> Steps:
@@ -74,10 +77,7 @@ def _lead_door(arm: Arm, door: Hinge, to_rad: float) -> Steps:
     before, frame, *_ = way(grasp, now, end).poses
     yield Step(pose=before)
     yield from steps.grasp(frame, door.joint)
-    for step in steps.swing(door, now, end, frame, follow=grasp.follow):
-        yield step
-        if step.value is not None and abs(arm.view.angle(door.joint) - step.value) > _LOST_RAD:
-            break
+    yield from steps.swing(door, now, end, frame, follow=grasp.follow)
     yield from steps.release(steps.here(arm.view))
     yield from steps.retreat(arm.view, back_m=0.1)
     if abs(arm.view.angle(door.joint)) > _WIDE_RAD:

@@ -1,13 +1,13 @@
 """Picking an object up and putting it elsewhere, and once more where that has failed.
 
 The ways to hold it, to put it and to stand are rated by their ends; the first of the best whose whole path touches
-nothing is taken. Nothing moves sideways near a fixture: hand and object come back to the robot's side before.
+nothing is taken. If it can, the hand moves sideways only at the robot's side, away from fixtures.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -60,6 +60,18 @@ class _Plan:
     grip: Array
     before: Array  # the hand where the object is about to be put
     there: Array
+    is_around: bool = True  # it goes sideways near the robot only, rather than straight
+
+    def to_grip(self, start: Array) -> list[Array]:
+        """Returns the hand's poses from a start to where it is about to approach the object."""
+        return [*self._corners(start, self.out), self.out]
+
+    def to_place(self, start: Array) -> list[Array]:
+        """Returns the hand's poses from a start to where it is about to put the object."""
+        return [*self._corners(start, self.before), self.before]
+
+    def _corners(self, start: Array, end: Array) -> list[Array]:
+        return steps.around(start, end) if self.is_around else []
 
 
 def pick_and_place(arm: Arm, target: Target, *, manner: Manner) -> Steps:
@@ -79,7 +91,7 @@ def _perform(arm: Arm, target: Target, plan: _Plan) -> Steps:
     """Yields the steps of one plan; it ends early where the object is not in the hand."""
     view, obj = arm.view, target.obj
     yield from arm.drive(plan.pick_base)
-    for T in _to_grip(steps.here(view), plan):
+    for T in plan.to_grip(steps.here(view)):
         yield Step(pose=T)
     yield from steps.grasp(plan.grip, obj)
     held = view.position_m(obj) - steps.here(view)[:3, 3]
@@ -89,7 +101,7 @@ def _perform(arm: Arm, target: Target, plan: _Plan) -> Steps:
     if float(np.linalg.norm(now - held)) > _SLIPPED_M:
         return
     yield from arm.drive(plan.put_base, holds=obj)
-    for T in (*steps.around(steps.here(view), plan.before), plan.before):
+    for T in plan.to_place(steps.here(view)):
         yield Step(pose=T, opening=SHUT, holds=obj, speed_m_s=0.2)
     yield Step(pose=plan.there, opening=SHUT, holds=obj, speed_m_s=0.12)
     yield from steps.release(steps.here(view))
@@ -104,16 +116,11 @@ def _legs(arm: Arm, target: Target, plan: _Plan) -> list[Leg]:
     out = arm.after_drive(plan.out, plan.put_base, plan.pick_base)
     backed = steps.backed(plan.there, _BACK_M)
     return [
-        Leg(base=plan.pick_base, poses=(*_to_grip(start, plan), steps.backed(plan.grip, _BACK_M), plan.grip)),
+        Leg(base=plan.pick_base, poses=(*plan.to_grip(start), steps.backed(plan.grip, _BACK_M), plan.grip)),
         Leg(base=plan.pick_base, poses=(lifted, plan.out), carries=target.obj),
-        Leg(base=plan.put_base, poses=(*steps.around(out, plan.before), plan.before, plan.there), carries=target.obj),
+        Leg(base=plan.put_base, poses=(*plan.to_place(out), plan.there), carries=target.obj),
         Leg(base=plan.put_base, poses=(backed, plan.before)),
     ]
-
-
-def _to_grip(start: Array, plan: _Plan) -> list[Array]:
-    """Returns the hand's poses from a start to where it is about to approach the object."""
-    return [*steps.around(start, plan.out), plan.out]
 
 
 def _best(arm: Arm, target: Target, manner: Manner, tried: list[Array]) -> _Plan:
@@ -123,7 +130,8 @@ def _best(arm: Arm, target: Target, manner: Manner, tried: list[Array]) -> _Plan
         kind = arm.view.bay.objects[target.obj].kind
         raise UnreachableError(f"no way to hold the {kind} leads to where it shall be; draw another scene")
     fresh = [plan for plan in plans if not any(np.allclose(plan.grip, T, atol=0.02) for T in tried)] or plans
-    ranked = sorted(fresh, key=lambda plan: -plan.worth)[:_NUM_PLANS]
+    best = sorted(fresh, key=lambda plan: -plan.worth)[:_NUM_PLANS]
+    ranked = [replace(plan, is_around=is_around) for plan in best for is_around in (True, False)]
     return ranked[arm.first_free(_legs(arm, target, plan) for plan in ranked)]
 
 
