@@ -15,7 +15,7 @@ from dual_system.tasks.kitchen.reach import UNREACHABLE, Base, Leg, Reach
 from dual_system.tasks.kitchen.steps import SHUT, Step, Steps
 
 _SAME_BASE_M = 0.02
-_FREE = 0.03  # worth of a path that is taken without looking at others
+_FREE = 0.1  # worth of a path that is taken without looking at others
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

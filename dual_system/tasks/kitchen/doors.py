@@ -14,12 +14,13 @@ from dual_system.tasks.kitchen.handles import Hinge
 from dual_system.tasks.kitchen.plan import Target
 from dual_system.tasks.kitchen.predicates import hinges
 from dual_system.tasks.kitchen.pushing import push
-from dual_system.tasks.kitchen.reach import Base
+from dual_system.tasks.kitchen.reach import Base, Leg
 from dual_system.tasks.kitchen.steps import AHEAD, UP, Step, Steps
 
 _LOW_M, _WIDE_RAD, _HALF_SHUT_RAD = 1.3, 0.9, 0.7  # doors: a low bar, wide open, where to push it to shut it
 _AROUND_M = -0.17 * AHEAD  # around the edge of an open leaf
-_EASY = 0.1  # worth of a way that needs no second go
+_NUM_WAYS, _SPAN = 6, 7  # whose paths are followed, and poses along the arc of each
+_BACK_M = 0.1
 _MORE_ATTEMPTS, _DONE_RAD = 2, 0.06
 _BAR_OUT_M, _BESIDE_BAR_M, _PAST_RAD = 0.06, 0.08, 0.03  # of a leaf's face; where it is pushed, and how far
 _PUSH_BACKS, _PUSH_LEFTS = (-0.3, -0.15), (-0.35, -0.2, 0.0, 0.2, 0.35)
@@ -60,18 +61,22 @@ def _lead_door(arm: Arm, door: Hinge, to_rad: float) -> Steps:
     now = arm.view.angle(door.joint)
     is_shutting = abs(now) > abs(to_rad)
 
-    def way(grasp: _DoorGrasp, start_rad: float, end_rad: float) -> Way:
-        span = np.linspace(start_rad, end_rad, 4).tolist()
+    def way(grasp: _DoorGrasp, start_rad: float, end_rad: float, num: int = 4) -> Way:
+        span = np.linspace(start_rad, end_rad, num).tolist()
         poses = tuple(grasp.at(door, angle) for angle in span)
-        before = steps.backed(poses[0], 0.1)
+        before = steps.backed(poses[0], _BACK_M)
         if abs(start_rad) > _WIDE_RAD and is_shutting:  # the open leaf is between the hand and its bar
             before = steps.moved(before, _AROUND_M)
         return Way(base=grasp.base, poses=(before, *poses), joint=door.joint, values=(start_rad, *span))
 
-    worth, _, _ = arm.rate([way(grasp, now, to_rad) for grasp in grasps])
-    end = to_rad if worth > _EASY or not is_shutting else _HALF_SHUT_RAD * float(np.sign(now))
-    _, best, _ = arm.rate([way(grasp, now, end) for grasp in grasps])
-    grasp = grasps[best]
+    half_rad = _HALF_SHUT_RAD * float(np.sign(now))
+    ends = (to_rad, half_rad) if is_shutting and abs(now) > _WIDE_RAD else (to_rad,)
+    ranked = [
+        (grasps[i], end)
+        for end in ends
+        for _, i, _ in arm.rate_best([way(grasp, now, end) for grasp in grasps], _NUM_WAYS)
+    ]
+    grasp, end = ranked[arm.first_free([_leg(door, way(grasp, now, end, _SPAN))] for grasp, end in ranked)]
     yield from arm.drive(grasp.base)
     now = arm.view.angle(door.joint)  # the arm may have touched it
     before, frame, *_ = way(grasp, now, end).poses
@@ -79,9 +84,16 @@ def _lead_door(arm: Arm, door: Hinge, to_rad: float) -> Steps:
     yield from steps.grasp(frame, door.joint)
     yield from steps.swing(door, now, end, frame, follow=grasp.follow)
     yield from steps.release(steps.here(arm.view))
-    yield from steps.retreat(arm.view, back_m=0.1)
+    yield from steps.retreat(arm.view, back_m=_BACK_M)
     if abs(arm.view.angle(door.joint)) > _WIDE_RAD:
         yield Step(pose=steps.moved(steps.here(arm.view), _AROUND_M))
+
+
+def _leg(door: Hinge, way: Way) -> Leg:
+    """Returns the path of a way: to the bar, along the arc, and back from the bar."""
+    before, frame, *_, last = way.poses
+    poses = (before, steps.backed(frame, _BACK_M), *way.poses[1:], steps.backed(last, _BACK_M))
+    return Leg(base=way.base, poses=poses, joint=door.joint, values=(*way.values[:1], *way.values, way.values[-1]))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

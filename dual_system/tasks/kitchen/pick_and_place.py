@@ -60,6 +60,8 @@ class _Plan:
     grip: Array
     before: Array  # the hand where the object is about to be put
     there: Array
+    backed: Array  # the hand once it has let go and drawn back
+    away: Array  # the hand where it is free of the object and of what that was put into
     is_around: bool = True  # it goes sideways near the robot only, rather than straight
 
     def to_grip(self, start: Array) -> list[Array]:
@@ -105,8 +107,8 @@ def _perform(arm: Arm, target: Target, plan: _Plan) -> Steps:
         yield Step(pose=T, opening=SHUT, holds=obj, speed_m_s=0.2)
     yield Step(pose=plan.there, opening=SHUT, holds=obj, speed_m_s=0.12)
     yield from steps.release(steps.here(view))
-    yield Step(pose=steps.backed(steps.here(view), _BACK_M), speed_m_s=0.2)
-    yield Step(pose=plan.before)
+    yield Step(pose=plan.backed, speed_m_s=0.2)
+    yield Step(pose=plan.away)
 
 
 def _legs(arm: Arm, target: Target, plan: _Plan) -> list[Leg]:
@@ -114,12 +116,11 @@ def _legs(arm: Arm, target: Target, plan: _Plan) -> list[Leg]:
     start = arm.after_drive(steps.here(arm.view), plan.pick_base)
     lifted = steps.moved(plan.grip, _LIFT_M * UP)
     out = arm.after_drive(plan.out, plan.put_base, plan.pick_base)
-    backed = steps.backed(plan.there, _BACK_M)
     return [
         Leg(base=plan.pick_base, poses=(*plan.to_grip(start), steps.backed(plan.grip, _BACK_M), plan.grip)),
         Leg(base=plan.pick_base, poses=(lifted, plan.out), carries=target.obj),
         Leg(base=plan.put_base, poses=(*plan.to_place(out), plan.there), carries=target.obj),
-        Leg(base=plan.put_base, poses=(backed, plan.before)),
+        Leg(base=plan.put_base, poses=(plan.backed, plan.away)),
     ]
 
 
@@ -163,6 +164,7 @@ def _plans(arm: Arm, target: Target, manner: Manner) -> list[_Plan]:
             if min(worth, put_worth) <= UNREACHABLE:
                 continue
             *_, before, there = ways[i].poses
+            backed = steps.backed(there, _BACK_M)
             plans.append(
                 _Plan(
                     worth=min(worth, put_worth - ways[i].cost),
@@ -172,6 +174,8 @@ def _plans(arm: Arm, target: Target, manner: Manner) -> list[_Plan]:
                     grip=grip,
                     before=before,
                     there=there,
+                    backed=backed,
+                    away=steps.moved(backed, enter) if enter[1] else before,  # not across the object
                 )
             )
     return plans

@@ -29,7 +29,8 @@ _MANIPULABILITY = 8.0  # brings it to the size of joint margins in rad
 _INSIDE_M = 0.004
 _LIMIT_RAD = 0.03
 _DEPTH_COST = 20.0  # of worth, a metre
-_STRIDE_M, _STRIDE_RAD = 0.04, 0.25  # between the poses of a path at which it is looked at
+_STRIDE_M, _STRIDE_RAD = 0.03, 0.25  # between the poses of a path at which it is looked at
+_DRIVE_LOOKS = 4  # at a drive of the base
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,6 +40,8 @@ class Leg:
     base: Base
     poses: Sequence[Array]
     carries: str = ""  # the object in the hand
+    joint: str = ""  # what the tool leads on the way
+    values: Sequence[float] = ()  # of it, one a pose
 
 
 class Reach:
@@ -108,30 +111,39 @@ class Reach:
         """
         scratch, qpos = self._scratch, self.joints()
         scratch.qpos[:] = self._view.data.qpos
-        worst, deep_m, grip = np.inf, 0.0, np.eye(4)
-        carried: frozenset[int] = frozenset()
+        worst, deep_m, carries, grip = np.inf, 0.0, "", np.eye(4)
         for leg in path:
-            scratch.qpos[self._base], scratch.qpos[self._qpos] = leg.base, qpos
-            start = self._tool()
-            if leg.carries and not carried:
-                grip, carried = np.linalg.inv(start) @ self._pose(leg.carries), self._view.geoms[leg.carries]
-            elif not leg.carries:
-                carried = frozenset()
-            open_m = self._view.bay.objects[leg.carries].grasp_width_m / 2 if leg.carries else omron.OPEN_M
+            if leg.carries and not carries:
+                grip = np.linalg.inv(self._tool()) @ self._pose(leg.carries)
+            carries = leg.carries
+            open_m = self._view.bay.objects[carries].grasp_width_m / 2 if carries else omron.OPEN_M
             scratch.qpos[self._fingers] = open_m, -open_m
-            for pose in _dense([start, *leg.poses]):
+            for base in np.linspace(scratch.qpos[self._base], leg.base, _DRIVE_LOOKS + 1)[1:]:
+                scratch.qpos[self._base] = base
+                deep_m = max(deep_m, self._depth_with_m(carries, grip))
+            led = self._view.model.joint(leg.joint).qposadr[0] if leg.joint else None
+            values = [scratch.qpos[led], *leg.values] if led is not None else [0.0] * (len(leg.poses) + 1)
+            for pose, value in _dense([self._tool(), *leg.poses], values):
+                if led is not None:
+                    scratch.qpos[led] = value
                 qpos, miss = self._solve(pose, qpos)
                 if miss > _NEAR:
                     return UNREACHABLE - miss
                 worst = min(worst, self._ease(qpos))
-                if leg.carries:
-                    self._put(leg.carries, self._tool() @ grip)
-                mujoco.mj_kinematics(self._view.model, scratch)
-                mujoco.mj_collision(self._view.model, scratch)
-                deep_m = max(deep_m, self._depth_m(self._robot | carried))
+                deep_m = max(deep_m, self._depth_with_m(carries, grip))
                 if worst - _DEPTH_COST * deep_m <= floor:
                     return worst - _DEPTH_COST * deep_m
         return worst - _DEPTH_COST * deep_m
+
+    def _depth_with_m(self, carries: str, grip: Array) -> float:
+        """Takes along what the hand carries; returns how deep that and the robot are inside other things."""
+        moving = self._robot
+        if carries:
+            self._put(carries, self._tool() @ grip)
+            moving = moving | self._view.geoms[carries]
+        mujoco.mj_kinematics(self._view.model, self._scratch)
+        mujoco.mj_collision(self._view.model, self._scratch)
+        return self._depth_m(moving)
 
     def _ease(self, qpos: Array) -> float:
         """How far solved joints (7,) are from their limits, or from a singularity [rad]."""
@@ -188,11 +200,11 @@ class Reach:
         return max(0.0, -float(dist_m[is_moving[:, 0] != is_moving[:, 1]].min(initial=0.0)) - _INSIDE_M)
 
 
-def _dense(poses: Sequence[Array]) -> list[Array]:
-    """Returns the poses after the first one, with so many in between that each is a stride from the next."""
-    dense: list[Array] = []
-    for T, there in pairwise(poses):
+def _dense(poses: Sequence[Array], values: Sequence[float]) -> list[tuple[Array, float]]:
+    """Returns what follows the first pose and value, with so many in between that each is a stride from the next."""
+    dense: list[tuple[Array, float]] = []
+    for (T, value), (there, last) in pairwise(zip(poses, values, strict=True)):
         turn_rad = float(np.linalg.norm(rotation_log(there[:3, :3] @ T[:3, :3].T)))
-        strides = max(float(np.linalg.norm(there[:3, 3] - T[:3, 3])) / _STRIDE_M, turn_rad / _STRIDE_RAD)
-        dense += [*steps.between(T, there, int(strides)), there]
+        num = int(max(float(np.linalg.norm(there[:3, 3] - T[:3, 3])) / _STRIDE_M, turn_rad / _STRIDE_RAD))
+        dense += zip([*steps.between(T, there, num), there], np.linspace(value, last, num + 2)[1:], strict=True)
     return dense

@@ -31,7 +31,7 @@ _KNOB_ATTEMPTS, _KNOB_OFF_BY_RAD = 3, 0.3
 _TILTS = tuple(np.deg2rad((0.0, 20.0, 40.0)))
 _FORWARD_TILTS = tuple(np.deg2rad((50.0, 65.0)))  # into cabinets and microwaves
 _MUG_TILTS = tuple(np.deg2rad((65.0, 80.0)))
-_CARRY_M, _ENTER_M = 0.14, 0.38
+_CARRY_M, _ENTER_M, _ENTER_MACHINE_M = 0.14, 0.38, 0.20
 
 
 Script = Callable[[Arm, Target], Steps]
@@ -159,6 +159,7 @@ def _press(
 
 
 _OVER, _INTO = _CARRY_M * UP, -_ENTER_M * AHEAD + 0.03 * UP
+_INTO_MACHINE = -_ENTER_MACHINE_M * AHEAD + 0.03 * UP
 
 
 def _carry(place: Place, tilts: tuple[float, ...], leave: Array, enter: Array) -> Script:
@@ -188,6 +189,6 @@ SCRIPTS: Mapping[str, Script] = {
     "TurnOnMicrowave": partial(_microwave_button, name="start"),
     "TurnOffMicrowave": partial(_microwave_button, name="stop"),
     "CoffeePressButton": _coffee_button,
-    "CoffeeSetupMug": _carry(places.under_dispenser, _MUG_TILTS, leave=_OVER, enter=_INTO),
-    "CoffeeServeMug": _carry(places.on_counter, _MUG_TILTS, leave=_INTO, enter=_OVER),
+    "CoffeeSetupMug": _carry(places.under_dispenser, _MUG_TILTS, leave=_OVER, enter=_INTO_MACHINE),
+    "CoffeeServeMug": _carry(places.on_counter, _MUG_TILTS, leave=_INTO_MACHINE, enter=_OVER),
 }
