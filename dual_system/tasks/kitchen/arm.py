@@ -88,7 +88,7 @@ class Arm:
         here = steps.here(self.view)
         turned = [steps.rotated_about_itself(home, turn) for turn in (0.0, np.pi, np.pi / 2, -np.pi / 2)]
         turned.append(steps.moved(here, home[:3, 3] - here[:3, 3]))  # or as it is
-        paths = [(*steps.around(here, T), T) for T in turned]
+        paths = [path for T in turned for path in ((*steps.around(here, T), T), (T,))]
         for T in paths[self.first_free([Leg(base=self.base, poses=path)] for path in paths)]:
             yield Step(pose=T)
 

@@ -85,15 +85,23 @@ def _lead_door(arm: Arm, door: Hinge, to_rad: float) -> Steps:
     yield from steps.swing(door, now, end, frame, follow=grasp.follow)
     yield from steps.release(steps.here(arm.view))
     yield from steps.retreat(arm.view, back_m=_BACK_M)
-    if abs(arm.view.angle(door.joint)) > _WIDE_RAD:
+    if not is_shutting:  # from the open leaf the hand goes back as it came
         yield Step(pose=steps.moved(steps.here(arm.view), _AROUND_M))
+        yield Step(pose=before)
 
 
 def _leg(door: Hinge, way: Way) -> Leg:
-    """Returns the path of a way: to the bar, along the arc, and back from the bar."""
+    """Returns the path of a way: to the bar, along the arc, back from it and, where that opens, to where it began."""
     before, frame, *_, last = way.poses
-    poses = (before, steps.backed(frame, _BACK_M), *way.poses[1:], steps.backed(last, _BACK_M))
-    return Leg(base=way.base, poses=poses, joint=door.joint, values=(*way.values[:1], *way.values, way.values[-1]))
+    away = steps.backed(last, _BACK_M)
+    is_shutting = abs(way.values[-1]) < abs(way.values[0])
+    ends = (away,) if is_shutting else (away, steps.moved(away, _AROUND_M), before)
+    return Leg(
+        base=way.base,
+        poses=(before, steps.backed(frame, _BACK_M), *way.poses[1:], *ends),
+        joint=door.joint,
+        values=(way.values[0], *way.values, *[way.values[-1]] * len(ends)),
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

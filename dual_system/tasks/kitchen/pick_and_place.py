@@ -23,7 +23,17 @@ from dual_system.tasks.kitchen.predicates import View
 from dual_system.tasks.kitchen.reach import UNREACHABLE, Base, Leg
 from dual_system.tasks.kitchen.steps import SHUT, UP, Step, Steps
 
-_BASES: tuple[Base, ...] = ((0.0, 0.0), (0.0, 0.2), (0.0, -0.2), (-0.15, 0.0), (-0.15, 0.2), (-0.15, -0.2), (-0.3, 0.0))
+_BASES: tuple[Base, ...] = (
+    (0.0, 0.0),
+    (0.0, 0.2),
+    (0.0, -0.2),
+    (-0.15, 0.0),
+    (-0.15, 0.2),
+    (-0.15, -0.2),
+    (-0.3, 0.0),
+    (-0.3, 0.2),
+    (-0.3, -0.2),
+)
 _STEEP_RAD = 0.8
 _TURN_COST, _DRIVE_COST = 0.08, 0.3  # of worth, a radian and a metre: far turns may end at a joint's limit
 _NUM_GRIPS, _NUM_PUTS, _NUM_PLANS = 6, 3, 12  # ways to hold, to put each of them, and plans whose path is followed
@@ -62,18 +72,16 @@ class _Plan:
     there: Array
     backed: Array  # the hand once it has let go and drawn back
     away: Array  # the hand where it is free of the object and of what that was put into
-    is_around: bool = True  # it goes sideways near the robot only, rather than straight
+    comes_around: bool = True  # the hand goes sideways near the robot only, rather than straight
+    carries_around: bool = True  # so it does with the object
 
     def to_grip(self, start: Array) -> list[Array]:
         """Returns the hand's poses from a start to where it is about to approach the object."""
-        return [*self._corners(start, self.out), self.out]
+        return [*(steps.around(start, self.out) if self.comes_around else []), self.out]
 
     def to_place(self, start: Array) -> list[Array]:
         """Returns the hand's poses from a start to where it is about to put the object."""
-        return [*self._corners(start, self.before), self.before]
-
-    def _corners(self, start: Array, end: Array) -> list[Array]:
-        return steps.around(start, end) if self.is_around else []
+        return [*(steps.around(start, self.before) if self.carries_around else []), self.before]
 
 
 def pick_and_place(arm: Arm, target: Target, *, manner: Manner) -> Steps:
@@ -132,7 +140,10 @@ def _best(arm: Arm, target: Target, manner: Manner, tried: list[Array]) -> _Plan
         raise UnreachableError(f"no way to hold the {kind} leads to where it shall be; draw another scene")
     fresh = [plan for plan in plans if not any(np.allclose(plan.grip, T, atol=0.02) for T in tried)] or plans
     best = sorted(fresh, key=lambda plan: -plan.worth)[:_NUM_PLANS]
-    ranked = [replace(plan, is_around=is_around) for plan in best for is_around in (True, False)]
+    ranked = [
+        replace(plan, comes_around=comes, carries_around=carries)
+        for plan, carries, comes in product(best, (True, False), (True, False))
+    ]
     return ranked[arm.first_free(_legs(arm, target, plan) for plan in ranked)]
 
 
