@@ -11,13 +11,15 @@ from dual_system.tasks.kitchen.steps import AHEAD, RIGHT, UP, about, tilted, too
 
 _ROUND_YAWS_RAD = tuple(np.deg2rad((-40.0, 0.0, 40.0)))
 _UPRIGHT = 0.7  # cosine of its axis to the vertical, either way up
+_LONG_M, _NEARER_M, _FLAT_RAD = 0.045, 0.02, 0.8  # half a length, and how far to this side of its middle
 _ABOVE_MIDDLE = 0.2  # of half the height of what has fallen over: fingertips stay clear of what it lies on
 
 
 def grips_on(view: View, thing: ObjectHandle, tilt_rad: float) -> list[Array]:
     """Returns the tool's poses (4, 4) that grasp an object, tilted about the axis along which the fingers close.
 
-    Round things are grasped from several sides, all others across what is narrow.
+    Round things are grasped from several sides, all others across what is narrow, and what is long also nearer to the
+    robot: the palm of a flat hand would press on its end.
     """
     body = view.data.body(thing.name)
     R = body.xmat.reshape(3, 3)
@@ -31,7 +33,9 @@ def grips_on(view: View, thing: ObjectHandle, tilt_rad: float) -> list[Array]:
     for closing in closings:
         toward = np.cross(UP, closing)
         toward = -toward if toward @ AHEAD < 0.0 else toward
-        grips.append(tool(at, tilted(toward, tilt_rad), closing))
+        is_long = float(np.abs(toward @ R) @ thing.half_m) > _LONG_M and tilt_rad > _FLAT_RAD
+        for nearer_m in (0.0, _NEARER_M) if is_long else (0.0,):
+            grips.append(tool(at - nearer_m * toward, tilted(toward, tilt_rad), closing))
     return grips
 
 

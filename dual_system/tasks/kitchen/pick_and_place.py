@@ -23,17 +23,7 @@ from dual_system.tasks.kitchen.predicates import View
 from dual_system.tasks.kitchen.reach import UNREACHABLE, Base, Leg
 from dual_system.tasks.kitchen.steps import SHUT, UP, Step, Steps
 
-_BASES: tuple[Base, ...] = (
-    (0.0, 0.0),
-    (0.0, 0.2),
-    (0.0, -0.2),
-    (-0.15, 0.0),
-    (-0.15, 0.2),
-    (-0.15, -0.2),
-    (-0.3, 0.0),
-    (-0.3, 0.2),
-    (-0.3, -0.2),
-)
+_BASES: tuple[Base, ...] = ((0.0, 0.0), (0.0, 0.2), (0.0, -0.2), *product((-0.15, -0.3), (0.0, 0.2, -0.2)))
 _STEEP_RAD = 0.8
 _TURN_COST, _DRIVE_COST = 0.08, 0.3  # of worth, a radian and a metre: far turns may end at a joint's limit
 _NUM_GRIPS, _NUM_PUTS, _NUM_PLANS = 6, 3, 12  # ways to hold, to put each of them, and plans whose path is followed
@@ -87,13 +77,13 @@ class _Plan:
 def pick_and_place(arm: Arm, target: Target, *, manner: Manner) -> Steps:
     """Yields the steps of picking and placing, from another side where the object has not come to its place."""
     tried: list[Array] = []
-    goal = manner.place(arm.view, target)
     for _ in range(_ATTEMPTS):
         plan = _best(arm, target, manner, tried)
         tried.append(plan.grip)
         yield from _perform(arm, target, plan)
         yield from arm.go_home()
-        if float(np.linalg.norm(arm.view.position_m(target.obj)[:2] - goal[:2])) < _MISPLACED_M:
+        away_m = arm.view.position_m(target.obj) - manner.place(arm.view, target)
+        if float(np.linalg.norm(away_m[:2])) < _MISPLACED_M:
             return
 
 
@@ -104,19 +94,26 @@ def _perform(arm: Arm, target: Target, plan: _Plan) -> Steps:
     for T in plan.to_grip(steps.here(view)):
         yield Step(pose=T)
     yield from steps.grasp(plan.grip, obj)
-    held = view.position_m(obj) - steps.here(view)[:3, 3]
+    held = _in_hand(view, obj)
     yield Step(pose=steps.moved(plan.grip, _LIFT_M * UP), opening=SHUT, holds=obj, speed_m_s=0.15)
     yield Step(pose=plan.out, opening=SHUT, holds=obj, speed_m_s=0.2)
-    now = view.position_m(obj) - steps.here(view)[:3, 3]
-    if float(np.linalg.norm(now - held)) > _SLIPPED_M:
+    if float(np.linalg.norm(_in_hand(view, obj) - held)) > _SLIPPED_M:
         return
     yield from arm.drive(plan.put_base, holds=obj)
     for T in plan.to_place(steps.here(view)):
         yield Step(pose=T, opening=SHUT, holds=obj, speed_m_s=0.2)
+    if float(np.linalg.norm(_in_hand(view, obj) - held)) > _SLIPPED_M:
+        return
     yield Step(pose=plan.there, opening=SHUT, holds=obj, speed_m_s=0.12)
     yield from steps.release(steps.here(view))
     yield Step(pose=plan.backed, speed_m_s=0.2)
     yield Step(pose=plan.away)
+
+
+def _in_hand(view: View, obj: str) -> Array:
+    """Returns where an object is in the hand's frame (3,)."""
+    T = steps.here(view)
+    return T[:3, :3].T @ (view.position_m(obj) - T[:3, 3])
 
 
 def _legs(arm: Arm, target: Target, plan: _Plan) -> list[Leg]:

@@ -26,7 +26,7 @@ _PATIENCE, _STALLED = 10, 0.7  # iterations after which at least that share of t
 _POSTURE, _MAX_ERROR, _MAX_STEP_RAD = 0.1, 0.15, 0.25  # of an iteration
 _NEAR = 0.006  # m, and a fifth of it in rad
 _MANIPULABILITY = 8.0  # brings it to the size of joint margins in rad
-_INSIDE_M = 0.004
+_INSIDE_M, _TOUCHING_M = 0.004, 0.0015  # depths that count as none: of rated poses, and of paths
 _LIMIT_RAD = 0.03
 _DEPTH_COST = 20.0  # of worth, a metre
 _STRIDE_M, _STRIDE_RAD = 0.03, 0.25  # between the poses of a path at which it is looked at
@@ -143,7 +143,7 @@ class Reach:
             moving = moving | self._view.geoms[carries]
         mujoco.mj_kinematics(self._view.model, self._scratch)
         mujoco.mj_collision(self._view.model, self._scratch)
-        return self._depth_m(moving)
+        return self._depth_m(moving, _TOUCHING_M)
 
     def _ease(self, qpos: Array) -> float:
         """How far solved joints (7,) are from their limits, or from a singularity [rad]."""
@@ -193,11 +193,11 @@ class Reach:
             qpos = np.minimum(np.maximum(qpos + step, self._low), self._high)
         return qpos, miss
 
-    def _depth_m(self, moving: frozenset[int]) -> float:
+    def _depth_m(self, moving: frozenset[int], tolerance_m: float = _INSIDE_M) -> float:
         """How deep moving geoms are inside others, beyond a tolerance."""
         geoms, dist_m = self._scratch.contact.geom, self._scratch.contact.dist
         is_moving = np.isin(geoms, list(moving))
-        return max(0.0, -float(dist_m[is_moving[:, 0] != is_moving[:, 1]].min(initial=0.0)) - _INSIDE_M)
+        return max(0.0, -float(dist_m[is_moving[:, 0] != is_moving[:, 1]].min(initial=0.0)) - tolerance_m)
 
 
 def _dense(poses: Sequence[Array], values: Sequence[float]) -> list[tuple[Array, float]]:
