@@ -61,12 +61,12 @@ class Arm:
             ranked.sort(key=lambda each: -each[0])
         return [(worth, i, qpos) for _, worth, i, qpos in ranked[:num]]
 
-    def best(self, ways: Sequence[Way]) -> Way:
-        """Returns the way that is reached best. Raises UnreachableError if none is."""
-        worth, best, _ = self.rate(ways)
-        if worth <= UNREACHABLE:
+    def best(self, ways: Sequence[Way], num: int = 1) -> list[Way]:
+        """Returns the few ways that are reached best, the best first. Raises UnreachableError if none is."""
+        rated = [(worth, i) for worth, i, _ in self.rate_best(ways, num) if worth > UNREACHABLE]
+        if not rated:
             raise UnreachableError(f"none of {len(ways)} ways is within the arm's reach; draw another scene")
-        return ways[best]
+        return [ways[i] for _, i in rated]
 
     def first_free(self, paths: Iterable[Sequence[Leg]]) -> int:
         """Returns the first path that the hand follows from here without touching anything, or the best of all."""

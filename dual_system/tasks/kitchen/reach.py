@@ -23,7 +23,8 @@ Base = tuple[float, float]
 UNREACHABLE = -1.0
 _ITERATIONS, _DAMPING = 40, 1e-4
 _PATIENCE, _STALLED = 10, 0.7  # iterations after which at least that share of the miss must have gone
-_POSTURE, _MAX_ERROR, _MAX_STEP_RAD = 0.1, 0.15, 0.25  # of an iteration
+_POSTURE, _POSTURE_STRIDE = 0.1, 0.15  # of the way to the usual posture: in an iteration, and in a stride
+_MAX_ERROR, _MAX_STEP_RAD = 0.15, 0.25  # of an iteration
 _NEAR = 0.006  # m, and a fifth of it in rad
 _MANIPULABILITY = 8.0  # brings it to the size of joint margins in rad
 _INSIDE_M, _TOUCHING_M = 0.004, 0.0015  # depths that count as none: of rated poses, and of paths
@@ -42,6 +43,7 @@ class Leg:
     carries: str = ""  # the object in the hand
     joint: str = ""  # what the tool leads on the way
     values: Sequence[float] = ()  # of it, one a pose
+    open_m: float = omron.OPEN_M  # of each finger that carries nothing
 
 
 class Reach:
@@ -116,7 +118,7 @@ class Reach:
             if leg.carries and not carries:
                 grip = np.linalg.inv(self._tool()) @ self._pose(leg.carries)
             carries = leg.carries
-            open_m = self._view.bay.objects[carries].grasp_width_m / 2 if carries else omron.OPEN_M
+            open_m = self._view.bay.objects[carries].grasp_width_m / 2 if carries else leg.open_m
             scratch.qpos[self._fingers] = open_m, -open_m
             for base in np.linspace(scratch.qpos[self._base], leg.base, _DRIVE_LOOKS + 1)[1:]:
                 scratch.qpos[self._base] = base
@@ -126,7 +128,7 @@ class Reach:
             for pose, value in _dense([self._tool(), *leg.poses], values):
                 if led is not None:
                     scratch.qpos[led] = value
-                qpos, miss = self._solve(pose, qpos)
+                qpos, miss = self._solve(pose, qpos, is_near=True)
                 if miss > _NEAR:
                     return UNREACHABLE - miss
                 worst = min(worst, self._ease(qpos))
@@ -171,8 +173,11 @@ class Reach:
         self._scratch.qpos[first : first + 3] = T[:3, 3]
         mujoco.mju_mat2Quat(self._scratch.qpos[first + 3 : first + 7], T[:3, :3].ravel())
 
-    def _solve(self, pose: Array, start: Array) -> tuple[Array, float]:
-        """Joint angles near a start, drawn towards the arm's usual posture, and by how much they miss the pose."""
+    def _solve(self, pose: Array, start: Array, *, is_near: bool = False) -> tuple[Array, float]:
+        """Joint angles near a start, drawn towards the arm's usual posture, and by how much they miss the pose.
+
+        If the pose ``is_near``, a stride away, they are drawn by no more than the controller does on the way.
+        """
         model, scratch, qpos, before = self._view.model, self._scratch, start.copy(), np.inf
         for left in reversed(range(_ITERATIONS)):
             scratch.qpos[self._qpos] = qpos
@@ -186,7 +191,8 @@ class Reach:
                 break
             before = miss if left % _PATIENCE == 0 else before
             A = self._jacobian[:, self._dof]
-            away = _POSTURE * (omron.START_QPOS - qpos)
+            share = _POSTURE if not is_near else _POSTURE_STRIDE if left == _ITERATIONS - 1 else 0.0
+            away = share * (omron.START_QPOS - qpos)
             pull = np.minimum(np.maximum(error, -_MAX_ERROR), _MAX_ERROR) - A @ away
             step = A.T @ np.linalg.solve(A @ A.T + self._damping, pull) + away
             step = np.minimum(np.maximum(step, -_MAX_STEP_RAD), _MAX_STEP_RAD)

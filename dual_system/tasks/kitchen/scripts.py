@@ -65,7 +65,7 @@ def _drawer(arm: Arm, target: Target, *, fraction: float) -> Steps:
         for back, tilt, yaw in product((0.0, -0.15), (65.0, 80.0), (0.0, -25.0, 25.0))
         for T in (frame(tilt, yaw), steps.flipped(frame(tilt, yaw)))
     ]
-    way = arm.best(ways)
+    (way,) = arm.best(ways)
     yield from arm.drive(way.base)
     yield from steps.grasp(way.poses[0], slide.joint)
     yield from steps.slide(slide, now, there, way.poses[0])
@@ -118,7 +118,7 @@ def _turn_knob(arm: Arm, target: Target, *, is_on: bool) -> Steps:
             Way(base=base, poses=(frame(tilt, now + half_turn), frame(tilt, end + half_turn)))
             for base, tilt, end, half_turn in kinds
         ]
-        way = arm.best(ways)
+        (way,) = arm.best(ways)
         end = next(kind[2] for kind, each in zip(kinds, ways, strict=True) if each is way)
         yield from arm.drive(way.base)
         yield from steps.grasp(way.poses[0], knob.joint)
@@ -153,7 +153,7 @@ def _press(
         for closing in (flat, -flat, np.cross(flat, direction)):
             T = steps.tool(np.array(button.center_m) + button.half_m * np.array(button.normal), direction, closing)
             ways.append(Way(base=(back, left), poses=(steps.backed(T, 0.1), T)))
-    way = arm.best(ways)
+    (way,) = arm.best(ways)
     yield from arm.drive(way.base)
     yield from steps.press(way.poses[1])
 
