@@ -22,12 +22,13 @@ from dual_system.tasks.kitchen.pick_and_place import Manner, Place, pick_and_pla
 from dual_system.tasks.kitchen.plan import Goal, Target
 from dual_system.tasks.kitchen.predicates import View
 from dual_system.tasks.kitchen.pushing import push
+from dual_system.tasks.kitchen.reach import Leg
 from dual_system.tasks.kitchen.steps import AHEAD, UP, Steps
 
 _LEVER_OUT_M = 0.13  # where a lever is pushed
 _WATER_RAD, _NO_WATER_RAD = 0.50, 0.25
 _SPOUT_RAD, _KNOB_RAD = 0.72, 0.75
-_KNOB_ATTEMPTS, _KNOB_OFF_BY_RAD = 3, 0.3
+_KNOB_ATTEMPTS, _KNOB_OFF_BY_RAD, _NUM_KNOB_WAYS = 3, 0.3, 6
 _TILTS = tuple(np.deg2rad((0.0, 20.0, 40.0)))
 _FORWARD_TILTS = tuple(np.deg2rad((50.0, 65.0)))  # into cabinets and microwaves
 _MUG_TILTS = tuple(np.deg2rad((65.0, 80.0)))
@@ -103,7 +104,7 @@ def _turn_knob(arm: Arm, target: Target, *, is_on: bool) -> Steps:
     assert isinstance(stove, Stove)
     knob = stove.knobs[target.part]
     axis = np.array(knob.axis)
-    bases = list(product((-0.2, -0.35), (-0.2, 0.0, 0.2)))
+    bases = list(product((-0.2, -0.35, -0.5), (-0.2, 0.0, 0.2)))
 
     def frame(tilt: float, angle: float) -> Array:
         T = steps.tool(knob.anchor_m, steps.tilted(AHEAD, np.deg2rad(tilt)), np.cross(axis, knob.blade))
@@ -113,12 +114,13 @@ def _turn_knob(arm: Arm, target: Target, *, is_on: bool) -> Steps:
     for _ in range(_KNOB_ATTEMPTS):
         now = arm.view.angle(knob.joint)
         ends = (_KNOB_RAD, -_KNOB_RAD) if is_on else (0.0,)
-        kinds = list(product(bases, (70.0, 85.0), ends, (0.0, np.pi, -np.pi)))
+        kinds = list(product(bases, (55.0, 70.0, 85.0), ends, (0.0, np.pi, -np.pi)))
         ways = [
             Way(base=base, poses=(frame(tilt, now + half_turn), frame(tilt, end + half_turn)))
             for base, tilt, end, half_turn in kinds
         ]
-        (way,) = arm.best(ways)
+        best = arm.best(ways, _NUM_KNOB_WAYS)
+        way = best[arm.first_free([Leg(base=each.base, poses=_to_and_from(each.poses))] for each in best)]
         end = next(kind[2] for kind, each in zip(kinds, ways, strict=True) if each is way)
         yield from arm.drive(way.base)
         yield from steps.grasp(way.poses[0], knob.joint)
@@ -129,6 +131,11 @@ def _turn_knob(arm: Arm, target: Target, *, is_on: bool) -> Steps:
             return
         bases.remove(way.base)
         yield from arm.go_home()
+
+
+def _to_and_from(poses: tuple[Array, ...]) -> tuple[Array, ...]:
+    """Returns the path that grasps a knob at the first pose, turns it to the last one and draws back."""
+    return steps.backed(poses[0], 0.1), *poses, steps.backed(poses[-1], 0.2)
 
 
 def _microwave_button(arm: Arm, target: Target, *, name: str) -> Steps:
