@@ -6,6 +6,7 @@ import numpy as np
 
 from dual_system.tasks.geometry import Array
 from dual_system.tasks.kitchen.handles import ObjectHandle
+from dual_system.tasks.kitchen.objects import KINDS
 from dual_system.tasks.kitchen.predicates import View
 from dual_system.tasks.kitchen.steps import AHEAD, RIGHT, UP, about, tilted, tool
 
@@ -18,8 +19,8 @@ _ABOVE_MIDDLE = 0.2  # of half the height of what has fallen over: fingertips st
 def grips_on(view: View, thing: ObjectHandle, tilt_rad: float) -> list[Array]:
     """Returns the tool's poses (4, 4) that grasp an object, tilted about the axis along which the fingers close.
 
-    Round things are grasped from several sides, all others across what is narrow, and what is long also nearer to the
-    robot: the palm of a flat hand would press on its end.
+    Round things are grasped from several sides, all others across what is narrow, and long blocks also nearer to the
+    robot: the palm of a flat hand would press on their ends.
     """
     body = view.data.body(thing.name)
     R = body.xmat.reshape(3, 3)
@@ -33,7 +34,8 @@ def grips_on(view: View, thing: ObjectHandle, tilt_rad: float) -> list[Array]:
     for closing in closings:
         toward = np.cross(UP, closing)
         toward = -toward if toward @ AHEAD < 0.0 else toward
-        is_long = float(np.abs(toward @ R) @ thing.half_m) > _LONG_M and tilt_rad > _FLAT_RAD
+        is_block = KINDS[thing.kind].shape == "block"  # what is rounded there would slip away
+        is_long = is_block and tilt_rad > _FLAT_RAD and float(np.abs(toward @ R) @ thing.half_m) > _LONG_M
         for nearer_m in (0.0, _NEARER_M) if is_long else (0.0,):
             grips.append(tool(at - nearer_m * toward, tilted(toward, tilt_rad), closing))
     return grips

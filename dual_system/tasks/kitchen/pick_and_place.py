@@ -26,7 +26,8 @@ from dual_system.tasks.kitchen.steps import SHUT, UP, Step, Steps
 _BASES: tuple[Base, ...] = ((0.0, 0.0), (0.0, 0.2), (0.0, -0.2), *product((-0.15, -0.3), (0.0, 0.2, -0.2)))
 _STEEP_RAD = 0.8
 _TURN_COST, _DRIVE_COST = 0.08, 0.3  # of worth, a radian and a metre: far turns may end at a joint's limit
-_NUM_GRIPS, _NUM_PUTS, _NUM_PLANS = 6, 3, 12  # ways to hold, to put each of them, and plans whose path is followed
+_NUM_STANDS, _NUM_PICKS, _NUM_PUTS = 2, 8, 3  # to hold it one way from; to pick it in all; to put each pick
+_NUM_PLANS = 24  # whose paths are followed at most
 _ATTEMPTS = 3
 _BACK_M, _LIFT_M = 0.1, 0.03
 _SLIPPED_M, _MISPLACED_M = 0.04, 0.05  # in the hand, and from where it should be
@@ -153,11 +154,10 @@ def _plans(arm: Arm, target: Target, manner: Manner) -> list[_Plan]:
     for T in grips:
         out = steps.moved(T, leave)
         ways = [Way(base=base, poses=(out, steps.backed(T, _BACK_M), T, out)) for base in _BASES]
-        worth, best, qpos = arm.rate(ways)
-        picks.append((worth, ways[best].base, T, qpos))
+        picks += [(worth, ways[i].base, T, qpos) for worth, i, qpos in arm.rate_best(ways, _NUM_STANDS)]
     picks.sort(key=lambda each: -each[0])
     plans = []
-    for worth, pick_base, grip, qpos in picks[:_NUM_GRIPS]:
+    for worth, pick_base, grip, qpos in picks[:_NUM_PICKS]:
         out, ways = steps.moved(grip, leave), []
         for yaw, base in product(np.linspace(-np.pi, np.pi, 8, endpoint=False), _BASES):
             there = _placed(grip, goal, now, yaw)

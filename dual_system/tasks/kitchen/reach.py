@@ -31,7 +31,7 @@ _INSIDE_M, _TOUCHING_M = 0.004, 0.0015  # depths that count as none: of rated po
 _LIMIT_RAD = 0.03
 _DEPTH_COST = 20.0  # of worth, a metre
 _STRIDE_M, _STRIDE_RAD = 0.03, 0.25  # between the poses of a path at which it is looked at
-_DRIVE_LOOKS = 4  # at a drive of the base
+_DRIVE_LOOKS = 8  # at a drive of the base
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
