@@ -12,7 +12,7 @@ from dual_system.tasks.kitchen.steps import AHEAD, RIGHT, UP, about, tilted, too
 
 _ROUND_YAWS_RAD = tuple(np.deg2rad((-40.0, 0.0, 40.0)))
 _UPRIGHT = 0.7  # cosine of its axis to the vertical, either way up
-_LONG_M, _NEARER_M, _FLAT_RAD = 0.045, 0.02, 0.8  # half a length, and how far to this side of its middle
+_LONG_M, _NEARER_M, _FLAT_RAD = 0.035, 0.02, 0.8  # half a length, and how far to this side of its middle
 _ABOVE_MIDDLE = 0.2  # of half the height of what has fallen over: fingertips stay clear of what it lies on
 
 
