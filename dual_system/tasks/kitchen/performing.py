@@ -65,7 +65,8 @@ def _drive(world: World, step: Step, target_m: Array) -> Iterator[Array]:
         away_m = target_m - [world.data.joint(name).qpos[0] for name in omron.BASE_JOINTS[:2]]
         if np.abs(away_m).max() < _DRIVEN_M:
             break
-        speed = np.clip(_DRIVE_GAIN * away_m, -_DRIVE_M_S, _DRIVE_M_S)
+        speed = _DRIVE_GAIN * away_m
+        speed *= min(1.0, _DRIVE_M_S / np.abs(speed).max())  # both ways at once: along a straight line
         action = _rest(step.opening)
         action[ACTION["base_velocity"]] = [*(speed + _FRICTION_M_S * np.sign(speed)), 0.0]
         action[ACTION["mode"]] = 1.0

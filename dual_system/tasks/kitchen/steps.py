@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dual_system.tasks.geometry import Array, rotation_log
-from dual_system.tasks.kitchen.handles import Hinge, Knob, ObjectHandle, Slide
+from dual_system.tasks.kitchen.handles import Hinge, Knob, Slide
 from dual_system.tasks.kitchen.predicates import GRIP_SITE, HAND, View
 
 OPEN, SHUT = 1.0, 0.0
@@ -23,8 +23,8 @@ UP, AHEAD, RIGHT = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]), np.arra
 FREE_M_S, SWING_M_S, TOUCHING_M_S = 0.30, 0.22, 0.12  # speeds of the tool
 _GRIP_STEPS = 8  # control steps in which fingers close
 _SWING_POINTS = 6
-_ROUND_YAWS_RAD = tuple(np.deg2rad((-40.0, 0.0, 40.0)))
 _BACK_M, _UP_M = 0.10, 0.15
+_SIDEWAYS_M = 0.03  # less is no way around
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,6 +85,18 @@ def between(T: Array, there: Array, num: int = 2) -> list[Array]:
             pose[:3, :3] = about(turn / angle, share * angle) @ T[:3, :3]
         poses.append(pose)
     return poses
+
+
+def around(T: Array, there: Array) -> list[Array]:
+    """Returns the corners of a way to another pose that goes sideways only where it is nearest to the robot.
+
+    Fixtures are ahead: the hand first comes back to where the nearer of both ends is, and goes ahead last.
+    """
+    if abs(there[0, 3] - T[0, 3]) < _SIDEWAYS_M:
+        return []
+    near_m = min(T[1, 3], there[1, 3])
+    corners = [moved(each, (near_m - each[1, 3]) * AHEAD) for each in (T, there)]
+    return [corner for corner, end in zip(corners, (T, there), strict=True) if end[1, 3] - near_m > _SIDEWAYS_M]
 
 
 def backed(T: Array, by_m: float) -> Array:
@@ -165,25 +177,6 @@ def rotated_about_itself(T: Array, angle_rad: float) -> Array:
     there = T.copy()
     there[:3, :3] = about(T[:3, 2], angle_rad) @ T[:3, :3]
     return there
-
-
-def grips_on(view: View, thing: ObjectHandle, tilt_rad: float) -> list[Array]:
-    """Returns the tool's poses that grasp an object as it stands now, tilted about the axis along which it closes.
-
-    Round things are grasped from several sides, all others across what is narrow.
-    """
-    body = view.data.body(thing.name)
-    R = body.xmat.reshape(3, 3)
-    across = R @ [np.cos(thing.grasp_yaw_rad), np.sin(thing.grasp_yaw_rad), 0.0]
-    across = across - UP * across[2]
-    across /= np.linalg.norm(across)
-    closings = [about(UP, yaw) @ RIGHT for yaw in _ROUND_YAWS_RAD] if thing.is_round else [across]
-    grips = []
-    for closing in closings:
-        toward = np.cross(UP, closing)
-        toward = -toward if toward @ AHEAD < 0.0 else toward
-        grips.append(tool(body.xpos + R @ thing.grasp_m, tilted(toward, tilt_rad), closing))
-    return grips
 
 
 def about(axis: Array, angle_rad: float) -> Array:
