@@ -92,7 +92,7 @@ class Lessons:
         config, encode = self._model.config, self._bundle.tokenizer.encode
         has_things = torch.nonzero(self._labels.is_real_BK.any(dim=1))[:, 0].numpy()
         stills = rng.choice(has_things, _BATCH)
-        lessons = [self._lesson(int(still), rng, placed_share) for still in stills]
+        lessons = [self.lesson(int(still), rng, placed_share) for still in stills]
         ids = [encode(stateless_prompt_text(with_subgoal(_INSTRUCTION, text))) for text, _ in lessons]
         longest = max(map(len, ids))
         seen_BSW = self._seen_NSW[torch.from_numpy(stills)]
@@ -108,7 +108,8 @@ class Lessons:
         places = [(patches + [IGNORE] * config.num_pointed)[: config.num_pointed] for _, patches in lessons]
         return inputs, torch.tensor(places)
 
-    def _lesson(self, still: int, rng: np.random.Generator, placed_share: float) -> tuple[str, list[int]]:
+    def lesson(self, still: int, rng: np.random.Generator, placed_share: float) -> tuple[str, list[int]]:
+        """A text about one thing of a still, or two, and the patch of each."""
         things = np.flatnonzero(self._labels.is_real_BK[still].numpy())
         count = 2 if len(things) > 1 and rng.random() < _PAIR_SHARE else 1
         chosen = rng.choice(things, count, replace=False)
