@@ -285,20 +285,17 @@ class TrainingSet:
     def embedded(self, towers: FrozenTowers, world: World) -> TrainingSet:
         """The same episodes with the features of ``towers`` in the pictures' place, in the store beside the pictures.
 
-        Each of several processes begins at another episode, and finds stored what the others have computed.
-
-        Raises ValueError if this set has no store.
+        Each process begins with its own share. Raises ValueError if this set has no store.
         """
         if self._folder is None:
             raise ValueError("features of frozen towers are kept beside the pictures: give a --picture-store")
         found = copy.copy(self)
         found._cache, found._cached_bytes, found._is_embedded = OrderedDict(), 0, True
         found._store = store = PictureStore(self._folder, f"{self._sizes.key} {towers.key}")
-        first = len(self._sources) * world.rank // world.size
-        for source in (*self._sources[first:], *self._sources[:first]):
+        for source in _beginning_with_own(self._sources, world):
             if not store.has(key := self._key(source)):
-                _, rendered = _instants(source, self._demo_hz)
-                features = towers.features(*self._decoded(source, sorted({*rendered})))
+                rendered = sorted({*_instants(source, self._demo_hz)[1]})
+                features = towers.features(*self._decoded(source, rendered))
                 store.write(key, dict(zip(_SYSTEMS, features, strict=True)))
         return found
 
@@ -391,6 +388,12 @@ class TrainingSet:
             ValueError: the space is another robot's.
         """
         return _statistics(self._sources, self.robot.dims_in(space)[1], horizon, space, by_row=by_row)
+
+
+def _beginning_with_own(sources: Sequence[_Source], world: World) -> Iterator[_Source]:
+    """All episodes, each process's share first."""
+    first = len(sources) * world.rank // world.size
+    yield from (*sources[first:], *sources[:first])
 
 
 def _instants(source: _Source, demo_hz: int) -> tuple[list[int], list[int]]:
