@@ -43,7 +43,7 @@ class Manner:
 
     place: Place
     tilts: tuple[float, ...]
-    """Of the hand [rad], which keeps its own from picking to placing: the object stays upright."""
+    """The hand's [rad]: one is kept from picking to placing, so that the object stays upright."""
     leave: Array
     """From where the object stands to where it is free [m]."""
     enter: Array
