@@ -67,7 +67,7 @@ class ChatEndpoint:
             left_s = deadline_s - time.monotonic()
             if left_s <= 0:
                 exchange.abandon()
-                raise ChatError(f"no reply within {answer_s:g} s")
+                raise _late(answer_s)
             with contextlib.suppress(queue.Empty):
                 answer = exchange.box.get(timeout=min(_LOOK_S, left_s))
                 if isinstance(answer, ChatError):
@@ -112,6 +112,10 @@ class ChatEndpoint:
         return text.replace(self._key, "***") if self._key else text
 
 
+def _late(answer_s: float) -> ChatError:
+    return ChatError(f"no reply within {answer_s:g} s")
+
+
 class _Exchange:
     """The thread of one POST. Its socket is closed from outside when nobody waits for it any more."""
 
@@ -128,6 +132,8 @@ class _Exchange:
                 self.box.put(self._endpoint.read(connection, self._body))
         except ChatError as error:
             self.box.put(error)
+        except TimeoutError:  # the socket's limit is the caller's: on a busy machine either may be first
+            self.box.put(_late(self._timeout_s))
         except Exception as error:  # http.client, ssl and the resolver fail in ways of their own
             why = str(error) or type(error).__name__
             self.box.put(ChatError(f"no answer from {self._endpoint.url}: {why[:200]}"))
