@@ -9,7 +9,7 @@ from pathlib import Path
 from dual_system.training import laptop_recipes as recipes
 
 TASKS = ("VideoUnmask", "PickHighlight", "MoveCube", "PickXtimes")
-EPISODES, STILLS, TOWER_MINUTES, POINTING_MINUTES = 200, 8_000, 20, 20
+EPISODES, STILLS, TOWER_MINUTES = 200, 8_000, 20
 CURRENT_WORDS = "words_current"
 """Folder of the PONDER without memory."""
 PLAYS, PLAYS_SEED = 40, 1_000_000
@@ -102,11 +102,10 @@ def stages(folder: Path) -> tuple[Stage, ...]:
             ),
         ),
         Stage(name="pretrained", commands=((*locating, "--minutes", "0", *data),)),
-        Stage(name="pointing", commands=(_pointing(towers, folder / "pointing"),)),
         Stage(
             name="hand and words",
             commands=(
-                (*training, *data, *_run(recipes.laptop_hand.__name__, towers, folder / "pointing", hand)),
+                (*training, *data, *_run(recipes.laptop_hand.__name__, towers, towers, hand)),
                 (*training, *data, *_run(recipes.laptop_grounding.__name__, towers, towers, words)),
             ),
         ),
@@ -146,11 +145,6 @@ def stages(folder: Path) -> tuple[Stage, ...]:
         ),
         *(Stage(name=f"delays {delay_ms} ms", commands=tuple(_delays(folder, delay_ms))) for delay_ms in DELAYS_MS),
     )
-
-
-def _pointing(towers: Path, out: Path) -> tuple[str, ...]:
-    amount = ("--stills", f"{STILLS}", "--minutes", f"{POINTING_MINUTES}")
-    return "dual_system.policy.pointing", "--towers", f"{towers}", "--out", f"{out}", *amount
 
 
 def trained(folder: Path) -> list[Path]:

@@ -22,7 +22,6 @@ from benchmarks.policy_plan import Stage, stages
 from dual_system.data.collect import CollectOptions
 from dual_system.data.correct import CorrectOptions
 from dual_system.data.export import ExportOptions
-from dual_system.policy.pointing import PointingOptions
 from dual_system.policy.towers import TowersOptions
 from dual_system.tasks.pair_files import PairsOptions
 from dual_system.training.probe import ProbeOptions
@@ -38,7 +37,6 @@ OPTIONS: dict[str, Any] = {
     "dual_system.data.correct": CorrectOptions,
     "dual_system.data.export": ExportOptions,
     "sim_client.evaluate": EvalOptions,
-    "dual_system.policy.pointing": PointingOptions,
     "dual_system.policy.towers": TowersOptions,
     "dual_system.tasks.pair_files": PairsOptions,
     "sim_client.counterfactual": CounterfactualOptions,

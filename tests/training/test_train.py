@@ -7,7 +7,6 @@ import multiprocessing
 import os
 import shutil
 import signal
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -168,7 +167,7 @@ def test_a_worker_that_was_forked_ends_at_once() -> None:
 
     def work() -> None:
         awake.set()
-        time.sleep(60)
+        signal.pause()
 
     with stop_requests():
         worker = context.Process(target=work)
