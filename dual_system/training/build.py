@@ -35,6 +35,7 @@ from dual_system.models.pounce.precision import cast_streams
 from dual_system.training.data import RobotShape, TrainingSet
 from dual_system.training.joint import JointModel, Trains, runs_ponder
 from dual_system.training.memory_words import MemoryWords
+from dual_system.training.place_words import draw_place_words
 from dual_system.training.recipe import Recipe
 from protocol import disk
 
@@ -103,6 +104,10 @@ def _ponder(run: Recipe, data: TrainingSet, start: Start) -> Ponder:
         if run.has_own_tokenizers:
             own = Vocabulary.trained_on(data.texts(), run.ponder.first_carrier_id, words=PLACE_WORDS)
         ponder = Ponder.random(run.ponder, own, seed=seed, device=start.device, dtype=dtype)
+        if own is not None:
+            ids = [own.encode(word)[0] for word in PLACE_WORDS]
+            for table in (ponder.qwen.model.language_model.embed_tokens.weight, ponder.qwen.lm_head.weight):
+                draw_place_words(table, ids, seed)
     if not runs_ponder(run.trains, run.pounce.cognition.num_carriers):
         return ponder
     try:
@@ -131,6 +136,9 @@ def _pounce(run: Recipe, data: TrainingSet, start: Start, ponder: Ponder) -> Pou
         own = _own_tokenizer(run, data)
         bundle = random_bundle(run.pounce, run.train.seed, statistics=measured(), tokenizer=own)
         open_gates(bundle.model)
+        if own is not None and isinstance(bundle.model, Pounce):
+            ids = [own.encode(word)[-1] for word in PLACE_WORDS]  # the first is BOS
+            draw_place_words(bundle.model.pi05.language.embed_tokens.weight, ids, run.train.seed)
         return bundle
     if declares_config(start.pounce):
         found = load_bundle(start.pounce, tokenizer=start.tokenizer)

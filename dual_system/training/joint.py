@@ -13,7 +13,7 @@ One system can be trained alone: PONDER on its texts; POUNCE on the cognition of
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from itertools import accumulate
@@ -115,6 +115,8 @@ class PounceBatch:
     """int64: the texts that a frame memory is taught (`memory_words`); None: it is taught none."""
     places_IQ: Tensor | None = None
     """int64: the patches that a pointer is taught (`pointed_places`), or `IGNORE`; None: it is taught none."""
+    lessons: PounceBatch | None = None
+    """Invocations of the same episodes that the pointer alone learns from (`pointed_places.lesson`)."""
 
     @property
     def num_episodes(self) -> int:
@@ -130,13 +132,21 @@ class PounceBatch:
         if not is_here_I.any():
             raise ValueError(f"episodes {begin} to {end - 1} of a batch have no invocation to learn from")
         found = self._each(lambda tensor: tensor[is_here_I])
-        return replace(found, episode_I=found.episode_I - begin)
+        lessons = None if self.lessons is None else self.lessons.part(begin, end)
+        return replace(found, episode_I=found.episode_I - begin, lessons=lessons)
+
+    def pointing_tasks(self) -> Iterator[tuple[PounceInputs, Tensor]]:
+        """What a pointer is taught, if it is: these invocations first, then the lessons."""
+        for batch in (self, self.lessons):
+            if batch is not None and batch.places_IQ is not None:
+                yield cast(PounceInputs, batch.inputs), batch.places_IQ
 
     def to(self, device: torch.device | str) -> PounceBatch:
-        return self._each(lambda tensor: tensor.to(device))
+        lessons = None if self.lessons is None else self.lessons.to(device)
+        return replace(self._each(lambda tensor: tensor.to(device)), lessons=lessons)
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> PounceBatch:
-        """The batch with every tensor changed."""
+        """The batch with every tensor changed, without its lessons."""
         inputs = {each.name: getattr(self.inputs, each.name) for each in fields(self.inputs)}
         changed: dict[str, Any] = {name: None if tensor is None else change(tensor) for name, tensor in inputs.items()}
         return PounceBatch(
@@ -270,8 +280,7 @@ class JointModel(nn.Module):
         num_supervised = sum(len(row.supervised_index) for row in episodes.rows) if is_grounded else 0
         if self.memory_words is not None and invocations.words_IL is not None:
             num_supervised += num_wanted(invocations.words_IL)
-        if invocations.places_IQ is not None:
-            num_supervised += int((invocations.places_IQ != IGNORE).sum())
+        num_supervised += sum(int((places_IQ != IGNORE).sum()) for _, places_IQ in invocations.pointing_tasks())
         return Counts(
             num_rows=draws.num_counted_rows if acts else 0,
             num_supervised=num_supervised,
@@ -305,9 +314,7 @@ class JointModel(nn.Module):
                     logits_NV, targets_N = self.memory_words(memory_ISE, visible_IS, invocations.words_IL)
                     grounding = _mean_cross_entropy(logits_NV, targets_N)
                 if invocations.places_IQ is not None:
-                    inputs, scores_IQS = cast(Pounce, self.pounce).pointing(inputs)
-                    is_known_IQ = invocations.places_IQ != IGNORE
-                    grounding = _mean_cross_entropy(scores_IQS[is_known_IQ], invocations.places_IQ[is_known_IQ])
+                    inputs, grounding = _pointing(cast(Pounce, self.pounce), replace(invocations, inputs=inputs))
             matching = action_loss(
                 self.pounce, inputs, invocations.actions_INA, draws.noise_SNA, draws.time_S, draws.num_committed_S
             )
@@ -327,6 +334,18 @@ class JointModel(nn.Module):
         logits_NV = self.ponder.logits(_taken(hidden, index))
         predicted_N = logits_NV.detach().argmax(dim=-1)
         return _mean_cross_entropy(logits_NV, targets_N), predicted_N
+
+
+def _pointing(pounce: Pounce, invocations: PounceBatch) -> tuple[PounceInputs, Tensor]:
+    """The invocations' inputs, their prefix filled in, and the loss of the places that they and their lessons teach."""
+    read, scores, targets = [], [], []
+    for inputs, places_IQ in invocations.pointing_tasks():
+        filled, scores_IQS = pounce.pointing(inputs)
+        is_known_IQ = places_IQ != IGNORE
+        read.append(filled)
+        scores.append(scores_IQS[is_known_IQ])
+        targets.append(places_IQ[is_known_IQ])
+    return read[0], _mean_cross_entropy(torch.cat(scores), torch.cat(targets))
 
 
 def _mean_cross_entropy(logits_NV: Tensor, targets_N: Tensor) -> Tensor:

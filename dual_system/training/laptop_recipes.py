@@ -28,7 +28,7 @@ def laptop_hand() -> Recipe:
     """Stage B of the laptop pair: one hand for all rows, a third of them told places, a third plain texts.
 
     It stands in for a pretrained pi0.5. Its vision tower comes trained and frozen (`policy.towers`), and its pointer
-    learns here, and only here, where the oracle's text points.
+    learns here, and only here, where texts point: the oracle's, and lessons of places that are drawn anew.
     """
     return Recipe(
         name="laptop_hand",
@@ -44,7 +44,7 @@ def laptop_hand() -> Recipe:
         train=_LAPTOP,
         num_steps=3_500,
         batch_episodes=8,
-        w2=0.1,
+        w2=0.5,  # of pointing
         trains="pounce",
         grounds_pointer=True,
         demo_hz=2,

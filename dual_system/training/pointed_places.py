@@ -1,19 +1,30 @@
-"""Where a pointer should point: the patches of the places that PONDER's newest text names, in training only."""
+"""Where a pointer should point: the patches of the places that a text names, in training only.
+
+In a demonstration the hand is mostly on its way already, and a scene that was seen often is known: a pointer that is
+taught the oracle's texts alone learns from these, and not to read. So it also gets lessons, whose texts name places
+that are drawn anew: nothing but the text tells them.
+"""
 
 # I invocations of all examples, Q places of a pointer
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from dual_system.models.pi05.pounce import PounceConfig
 from dual_system.models.ponder.context import IGNORE
-from dual_system.models.ponder.coordinates import XY_1000
+from dual_system.models.ponder.coordinates import TEXT_PX, XY_1000, xy_1000_from_yx_px
 from dual_system.models.windows import WHOLE, Box, placed_in
 from dual_system.training.example import Example
+
+_EVERY = 4
+"""Of so many invocations one is a lesson as well."""
 
 
 def pointed_places(examples: Sequence[Example], config: PounceConfig) -> Tensor:
@@ -21,14 +32,40 @@ def pointed_places(examples: Sequence[Example], config: PounceConfig) -> Tensor:
 
     (I, Q) int64; `IGNORE` where the text names fewer places, or one outside of the front camera's window.
     """
-    box = config.windows[0] if config.windows else WHOLE
+    return _patches_of((text for example in examples for text in _newest(example)), config)
+
+
+def lesson(example: Example, config: PounceConfig, rng: np.random.Generator) -> Example:
+    """Some invocations of an example, told their newest text with other places, anywhere in the front window."""
+    texts = _newest(example)
+    # Whole pixels of a text's picture, which alone are words, within the window's edges.
+    top, left, bottom, right = (int(edge * TEXT_PX) for edge in _window(config))
+
+    def elsewhere(_: re.Match[str]) -> str:
+        yx_px = int(rng.integers(top + 1, bottom)), int(rng.integers(left + 1, right))
+        return "[{}, {}]".format(*xy_1000_from_yx_px(yx_px))
+
+    told = tuple(XY_1000.sub(elsewhere, text) for text in texts[::_EVERY])
+    return replace(example, invocations=example.invocations[::_EVERY], told=told)
+
+
+def told_places(lessons: Sequence[Example], config: PounceConfig) -> Tensor:
+    """`pointed_places` of what each invocation is told."""
+    return _patches_of((text for each in lessons for text in each.told), config)
+
+
+def _newest(example: Example) -> list[str]:
+    queries = [each.reference.query for each in example.invocations]
+    return ["" if query is None else example.written[query] for query in queries]
+
+
+def _window(config: PounceConfig) -> Box:
+    return config.windows[0] if config.windows else WHOLE
+
+
+def _patches_of(texts: Iterable[str], config: PounceConfig) -> Tensor:
     side = round(config.pi05.vision.num_patches**0.5)
-    texts = [
-        "" if each.reference.query is None else example.written[each.reference.query]
-        for example in examples
-        for each in example.invocations
-    ]
-    return torch.tensor([_patches(text, config.num_pointed, box, side) for text in texts])
+    return torch.tensor([_patches(text, config.num_pointed, _window(config), side) for text in texts])
 
 
 def _patches(text: str, num_places: int, box: Box, side: int) -> list[int]:

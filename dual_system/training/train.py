@@ -13,6 +13,7 @@ The same command again resumes. On several GPUs or hosts:
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -35,13 +36,13 @@ from dual_system.training.build import Start, build, export
 from dual_system.training.collate import collate_ponder, collate_pounce
 from dual_system.training.data import PictureSizes, TrainingSet
 from dual_system.training.ending import stop_requests
-from dual_system.training.example import make_example
+from dual_system.training.example import Example, make_example
 from dual_system.training.frozen_towers import FrozenTowers
 from dual_system.training.joint import JointModel, PonderBatch, PounceBatch
 from dual_system.training.memory import memory_of, require_room, sentence
 from dual_system.training.memory_words import words_to_remember
 from dual_system.training.parallel import World, gather, joined, require_alike, shard
-from dual_system.training.pointed_places import pointed_places
+from dual_system.training.pointed_places import lesson, pointed_places, told_places
 from dual_system.training.prefetch import Prefetcher
 from dual_system.training.recipe import Recipe, defaults
 from dual_system.training.recipes import recipe
@@ -52,7 +53,7 @@ from protocol.command_line import command, parse
 
 DONE, REFUSED, INTERRUPTED = 0, 2, 130
 _SYSTEMS, CHECKPOINT = ("ponder", "pounce"), "checkpoint"
-_EPISODE_STREAM = 7  # random stream of a step for episodes and schedules
+_EPISODE_STREAM, _LESSON_STREAM = 7, 8  # random streams of a step: for episodes and schedules, and of each lesson
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -183,8 +184,17 @@ class Batches:
         if run.grounds_memory and (sampling := sampling_of(self._pounce)) is not None:
             invocations = replace(invocations, words_IL=words_to_remember(examples, self._form, sampling))
         if run.grounds_pointer and isinstance(self._pounce, PounceConfig):
-            invocations = replace(invocations, places_IQ=pointed_places(examples, self._pounce))
+            lessons = self._lessons(examples, self._pounce, chance)
+            invocations = replace(invocations, places_IQ=pointed_places(examples, self._pounce), lessons=lessons)
         return episodes, invocations
+
+    def _lessons(self, examples: Sequence[Example], config: PounceConfig, chance: tuple[int, ...]) -> PounceBatch:
+        made = [
+            lesson(each, config, np.random.default_rng([*chance, place, _LESSON_STREAM]))
+            for each, place in zip(examples, self._places, strict=True)
+        ]
+        batch = collate_pounce(made, config, self._bundle.tokenizer, self._bundle.statistics)
+        return replace(batch, places_IQ=told_places(made, config))
 
     def _draw(self, rng: np.random.Generator) -> list[int]:
         """Numbers of the batch's episodes, long ones first, so that the processes' shares have similar lengths."""

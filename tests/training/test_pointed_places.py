@@ -17,6 +17,7 @@ from clock.sampling import ROBOMME
 from dual_system.models.pi05.pounce import Pounce
 from dual_system.models.ponder.configs import tiny_cpu as tiny_ponder
 from dual_system.models.ponder.context import IGNORE
+from dual_system.models.ponder.coordinates import XY_1000
 from dual_system.models.ponder.network import Ponder
 from dual_system.models.pounce.checkpoint import random_bundle
 from dual_system.models.pounce.configs import laptop, tiny_cpu
@@ -28,7 +29,7 @@ from dual_system.training.collate import collate_pounce
 from dual_system.training.episode import TrainingEpisode
 from dual_system.training.example import Example, ExampleConfig, make_example
 from dual_system.training.joint import Draws, JointModel, PonderBatch, PounceBatch
-from dual_system.training.pointed_places import pointed_places
+from dual_system.training.pointed_places import lesson, pointed_places, told_places
 from dual_system.training.recipes import RECIPES, recipe
 from dual_system.training.train import InsteadOptions, LogOptions, MachineOptions, TrainOptions
 
@@ -73,6 +74,29 @@ def test_a_place_in_the_window_is_the_patch_that_it_lies_in(
     assert pointed_places([told(example, text)], laptop()).tolist() == [[8 * row + column, IGNORE]] * 3
 
 
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30)
+@given(seed=st.integers(0, 2**32))
+def test_a_lesson_tells_places_of_the_window_and_teaches_them(seed: int, example: Example) -> None:
+    known = told(example, "push the cube at [400, 300] to the target at [600, 500], which is red")
+    made = lesson(known, laptop(), np.random.default_rng(seed))
+    assert made.invocations == known.invocations[::4]
+    (top, left, bottom, right), places = LAPTOP_WINDOWS[0], told_places([made], laptop())
+    for text, patches in zip(made.told, places.tolist(), strict=True):
+        found = XY_1000.findall(text)
+        assert XY_1000.sub("", text) == XY_1000.sub("", known.written[0])
+        for (x, y), patch in zip(found, patches, strict=True):
+            row, column = divmod(patch, 8)
+            assert row <= 8 * (int(y) / 1000 - top) / (bottom - top) < row + 1
+            assert column <= 8 * (int(x) / 1000 - left) / (right - left) < column + 1
+
+
+def test_lessons_tell_every_patch(example: Example) -> None:
+    known = told(example, "pick up the cube at [400, 300]")
+    rng = np.random.default_rng(0)
+    seen = {patch for _ in range(600) for patch, _ in told_places([lesson(known, laptop(), rng)], laptop()).tolist()}
+    assert seen == set(range(64))
+
+
 def test_a_text_without_places_teaches_nothing(example: Example) -> None:
     batch, model = batch_of(told(example, "press the button")), joint()
     assert model.counts(PonderBatch(), batch, draws_of(batch, model)).num_supervised == 0
@@ -90,6 +114,17 @@ def test_the_flow_loss_is_that_without_labels_and_the_pointers_is_added(example:
     reached = {name for name, each in model.named_parameters() if each.grad is not None and bool(each.grad.any())}
     assert "pounce.pointer.score.weight" in reached
     assert not any("expert" in name or "pointer.condition" in name for name in reached)
+
+
+def test_lessons_teach_the_pointer_and_leave_the_flow_loss_alone(example: Example) -> None:
+    batch, model = batch_of(told(example, "pick up the cube at [100, 900]")), joint()
+    other = replace(batch, places_IQ=torch.where(batch.places_IQ == IGNORE, IGNORE, 5))  # type: ignore[arg-type]
+    taught, draws = replace(batch, lessons=other), draws_of(batch, model)
+    alone, lessons_alone, both = (model(PonderBatch(), each, draws) for each in (batch, other, taught))
+    assert torch.equal(both.flow_matching, alone.flow_matching)
+    torch.testing.assert_close(both.grounding, (alone.grounding + lessons_alone.grounding) / 2)
+    counted = [model.counts(PonderBatch(), each, draws).num_supervised for each in (batch, taught)]
+    assert counted == [3, 6]
 
 
 def test_the_hand_learns_to_point_and_no_row_of_the_table_is_taught_to() -> None:

@@ -305,6 +305,12 @@ def test_both_tokenizers_can_be_trained_on_the_data(
         text = "pick what was shown"
         lengths[name] = len(model.ponder.format.vocabulary.encode(text)), len(bundle.tokenizer.encode(text))
     assert all(mine < tinys for mine, tinys in zip(lengths["own"], lengths["tiny"], strict=True))
+    table = bundle.model.pi05.language.embed_tokens.weight
+    place, near, far = (table[bundle.tokenizer.encode(f" [{x},")[-1]] for x in (500, 504, 102))
+    assert torch.cosine_similarity(place, near, dim=0) > 0.9 > torch.cosine_similarity(place, far, dim=0)
+    for table in (model.ponder.qwen.model.language_model.embed_tokens.weight, model.ponder.qwen.lm_head.weight):
+        place, near, far = (table[model.ponder.format.vocabulary.encode(f" [{x},")[0]] for x in (500, 504, 102))
+        assert torch.cosine_similarity(place, near, dim=0) > 0.9 > torch.cosine_similarity(place, far, dim=0)
 
 
 def test_out_of_memory_says_what_to_lower(

@@ -9,16 +9,16 @@ import re
 
 YX_PX = re.compile(r"<\s*(\d+)\s*,\s*(\d+)\s*>")
 XY_1000 = re.compile(r"\[\s*(\d+)\s*,\s*(\d+)\s*\]")
-
-
-_PIXELS = range(257)  # of a 256 px image, its far edge included
+TEXT_PX = 256
+"""Side of the picture whose pixels the tasks' texts name."""
+_PIXELS = range(TEXT_PX + 1)  # its far edge included
 
 
 def _scaled(value: int, numerator: int, denominator: int) -> int:
     return (2 * value * numerator + denominator) // (2 * denominator)
 
 
-def xy_1000_from_yx_px(yx_px: tuple[int, int], image_px: tuple[int, int] = (256, 256)) -> tuple[int, int]:
+def xy_1000_from_yx_px(yx_px: tuple[int, int], image_px: tuple[int, int] = (TEXT_PX, TEXT_PX)) -> tuple[int, int]:
     """``(y, x)`` pixels of a (height, width) image as ``(x, y)`` in 0..1000. ValueError if outside."""
     (y, x), (height, width) = yx_px, image_px
     if not (0 <= y <= height and 0 <= x <= width):
@@ -26,7 +26,7 @@ def xy_1000_from_yx_px(yx_px: tuple[int, int], image_px: tuple[int, int] = (256,
     return _scaled(x, 1000, width), _scaled(y, 1000, height)
 
 
-def yx_px_from_xy_1000(xy_1000: tuple[int, int], image_px: tuple[int, int] = (256, 256)) -> tuple[int, int]:
+def yx_px_from_xy_1000(xy_1000: tuple[int, int], image_px: tuple[int, int] = (TEXT_PX, TEXT_PX)) -> tuple[int, int]:
     """Inverse of :func:`xy_1000_from_yx_px`; the nearest pixel. ValueError if outside 0..1000."""
     (x, y), (height, width) = xy_1000, image_px
     if not (0 <= x <= 1000 and 0 <= y <= 1000):
@@ -34,7 +34,7 @@ def yx_px_from_xy_1000(xy_1000: tuple[int, int], image_px: tuple[int, int] = (25
     return _scaled(y, height, 1000), _scaled(x, width, 1000)
 
 
-def normalised_text(text: str, image_px: tuple[int, int] = (256, 256)) -> str:
+def normalised_text(text: str, image_px: tuple[int, int] = (TEXT_PX, TEXT_PX)) -> str:
     """Rewrites every ``<y, x>`` in ``text`` as ``[x, y]``, the form that PONDER is trained to generate."""
 
     def rewrite(match: re.Match[str]) -> str:
@@ -44,7 +44,7 @@ def normalised_text(text: str, image_px: tuple[int, int] = (256, 256)) -> str:
     return YX_PX.sub(rewrite, text)
 
 
-def pixel_text(text: str, image_px: tuple[int, int] = (256, 256)) -> str:
+def pixel_text(text: str, image_px: tuple[int, int] = (TEXT_PX, TEXT_PX)) -> str:
     """Rewrites every ``[x, y]`` in ``text`` as ``<y, x>``, the form of the task texts and the viewer."""
 
     def rewrite(match: re.Match[str]) -> str:
@@ -55,8 +55,8 @@ def pixel_text(text: str, image_px: tuple[int, int] = (256, 256)) -> str:
 
 
 PLACE_WORDS = (
-    *(f" [{_scaled(px, 1000, 256)}," for px in _PIXELS),
-    *(f" {_scaled(px, 1000, 256)}]" for px in _PIXELS),
+    *(f" [{_scaled(px, 1000, TEXT_PX)}," for px in _PIXELS),
+    *(f" {_scaled(px, 1000, TEXT_PX)}]" for px in _PIXELS),
 )
 """Both halves of every `` [x, y]`` that a 256 px image has. A tokenizer of a network from scratch has a token for each:
 spelled in digits, a place is a sum that a small network does not learn."""
@@ -67,7 +67,7 @@ def without_places(text: str) -> str:
     return re.sub(r" at " + XY_1000.pattern, "", text)
 
 
-def moved_places(text: str, by_xy_px: tuple[int, int], image_px: tuple[int, int] = (256, 256)) -> str:
+def moved_places(text: str, by_xy_px: tuple[int, int], image_px: tuple[int, int] = (TEXT_PX, TEXT_PX)) -> str:
     """The text with every ``[x, y]`` moved by pixels, kept within the image."""
     height, width = image_px
 
