@@ -24,7 +24,7 @@ from dual_system.models.windows import WHOLE, Box, placed_in
 from dual_system.training.example import Example
 
 _EVERY = 4
-"""Of so many invocations one is a lesson as well."""
+"""Number of invocations to each lesson."""
 
 
 def pointed_places(examples: Sequence[Example], config: PounceConfig) -> Tensor:
