@@ -146,7 +146,7 @@ class PounceBatch:
         return replace(self._each(lambda tensor: tensor.to(device)), lessons=lessons)
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> PounceBatch:
-        """The batch with every tensor changed, without its lessons."""
+        """The batch with every tensor but the lessons' changed."""
         inputs = {each.name: getattr(self.inputs, each.name) for each in fields(self.inputs)}
         changed: dict[str, Any] = {name: None if tensor is None else change(tensor) for name, tensor in inputs.items()}
         return PounceBatch(
@@ -156,6 +156,7 @@ class PounceBatch:
             query_I=change(self.query_I),
             words_IL=None if self.words_IL is None else change(self.words_IL),
             places_IQ=None if self.places_IQ is None else change(self.places_IQ),
+            lessons=self.lessons,
         )
 
 

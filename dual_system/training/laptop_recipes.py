@@ -44,7 +44,7 @@ def laptop_hand() -> Recipe:
         train=_LAPTOP,
         num_steps=3_500,
         batch_episodes=8,
-        w2=0.5,  # of pointing
+        w2=0.5,  # of pointing alone: no PONDER is run
         trains="pounce",
         grounds_pointer=True,
         demo_hz=2,
@@ -123,7 +123,7 @@ def laptop_framesamp() -> Recipe:
 
 def laptop_framesamp_grounded() -> Recipe:
     """Row: FrameSamp+Modul whose memory is taught the texts that PONDER is, with the same weight."""
-    return replace(laptop_framesamp(), name="laptop_framesamp_grounded", grounds_memory=True, w2=laptop().w2)
+    return replace(laptop_framesamp(), name="laptop_framesamp_grounded", grounds_memory=True)
 
 
 def laptop_window() -> Recipe:
@@ -167,6 +167,7 @@ def _of_the_hand(name: str, pounce: PounceConfig, told: Told | None = None) -> R
         example=replace(hand.example, told=told, max_invocations=pair.example.max_invocations),
         num_steps=pair.num_steps,
         batch_episodes=pair.batch_episodes,
+        w2=pair.w2,
         grounds_pointer=False,
     )
 

@@ -1,8 +1,8 @@
 """Where a pointer should point: the patches of the places that a text names, in training only.
 
-In a demonstration the hand is mostly on its way already, and a scene that was seen often is known: a pointer that is
-taught the oracle's texts alone learns from these, and not to read. So it also gets lessons, whose texts name places
-that are drawn anew: nothing but the text tells them.
+In a demonstration the hand is mostly on its way already, and a scene that was seen often is known. A pointer that is
+taught the recorded texts alone learns these cues instead of the text. So it also gets lessons: invocations that are
+told other places, which nothing but the text gives away.
 """
 
 # I invocations of all examples, Q places of a pointer
@@ -32,29 +32,29 @@ def pointed_places(examples: Sequence[Example], config: PounceConfig) -> Tensor:
 
     (I, Q) int64; `IGNORE` where the text names fewer places, or one outside of the front camera's window.
     """
-    return _patches_of((text for example in examples for text in _newest(example)), config)
+    return _patches_of((text for example in examples for text in _newest_texts(example)), config)
 
 
-def lesson(example: Example, config: PounceConfig, rng: np.random.Generator) -> Example:
-    """Some invocations of an example, told their newest text with other places, anywhere in the front window."""
-    texts = _newest(example)
-    # Whole pixels of a text's picture, which alone are words, within the window's edges.
+def lessons_of(example: Example, config: PounceConfig, rng: np.random.Generator) -> Example:
+    """Some invocations of an example, each told its newest text with other places, anywhere in the front window."""
+    # An example without invocations has no lessons; any other has one at least, as every part of a batch needs.
+    some = slice(int(rng.integers(min(_EVERY, max(1, len(example.invocations))))), None, _EVERY)
     top, left, bottom, right = (int(edge * TEXT_PX) for edge in _window(config))
 
-    def elsewhere(_: re.Match[str]) -> str:
-        yx_px = int(rng.integers(top + 1, bottom)), int(rng.integers(left + 1, right))
+    def other_place(_: re.Match[str]) -> str:
+        yx_px = int(rng.integers(top + 1, bottom)), int(rng.integers(left + 1, right))  # only whole pixels have a token
         return "[{}, {}]".format(*xy_1000_from_yx_px(yx_px))
 
-    told = tuple(XY_1000.sub(elsewhere, text) for text in texts[::_EVERY])
-    return replace(example, invocations=example.invocations[::_EVERY], told=told)
+    told = tuple(XY_1000.sub(other_place, text) for text in _newest_texts(example)[some])
+    return replace(example, invocations=example.invocations[some], told=told)
 
 
 def told_places(lessons: Sequence[Example], config: PounceConfig) -> Tensor:
-    """`pointed_places` of what each invocation is told."""
+    """The patches of the places that each invocation is told, as `pointed_places`."""
     return _patches_of((text for each in lessons for text in each.told), config)
 
 
-def _newest(example: Example) -> list[str]:
+def _newest_texts(example: Example) -> list[str]:
     queries = [each.reference.query for each in example.invocations]
     return ["" if query is None else example.written[query] for query in queries]
 

@@ -31,7 +31,8 @@ class Recipe:
     w1: float = 1.0
     """Weight of flow matching."""
     w2: float = 0.1
-    """Weight of grounding, the LM head's cross-entropy. It is 0 if and only if the examples are not grounded."""
+    """Weight of grounding: the cross-entropy of PONDER's LM head, or of what ``grounds_...`` names. It is 0 if and only
+    if the examples are not grounded."""
     trains: Trains = "both"
     """The systems to train."""
     freezes_ponder_vision: bool = False
@@ -41,7 +42,7 @@ class Recipe:
     grounds_memory: bool = False
     """POUNCE's frame memory is taught PONDER's texts, with weight ``w2`` (`memory_words`)."""
     grounds_pointer: bool = False
-    """POUNCE's pointer is taught the places in PONDER's texts, with weight ``w2`` (`pointed_places`)."""
+    """POUNCE's pointer is taught the places in texts and in lessons (`pointed_places`), with weight ``w2``."""
     demo_hz: int = 1
     """Frames per second of demonstrations (paper: 1); stored in PONDER's checkpoint and contract."""
     space: ActionSpace = "joint_delta"
@@ -67,11 +68,13 @@ class Recipe:
                 f"recipe {self.name}: grounds_memory is for a POUNCE with a frame memory that is trained alone on "
                 "grounded examples"
             )
-        has_pointer = isinstance(self.pounce, PounceConfig) and self.pounce.num_pointed > 0
+        has_pointer = (
+            isinstance(self.pounce, PounceConfig) and self.pounce.num_pointed > 0 and self.pounce.reads_subgoal
+        )
         if self.grounds_pointer and not (has_pointer and self.trains == "pounce" and self.example.is_grounded):
             raise ValueError(
-                f"recipe {self.name}: grounds_pointer is for a POUNCE with a pointer that is trained alone on grounded "
-                "examples"
+                f"recipe {self.name}: grounds_pointer is for a POUNCE that has a pointer and reads subgoals, trained "
+                "alone on grounded examples"
             )
         if self.grounds_pointer and self.grounds_memory:
             raise ValueError(f"recipe {self.name}: one of grounds_memory and grounds_pointer: both have weight w2")

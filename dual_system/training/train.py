@@ -42,7 +42,7 @@ from dual_system.training.joint import JointModel, PonderBatch, PounceBatch
 from dual_system.training.memory import memory_of, require_room, sentence
 from dual_system.training.memory_words import words_to_remember
 from dual_system.training.parallel import World, gather, joined, require_alike, shard
-from dual_system.training.pointed_places import lesson, pointed_places, told_places
+from dual_system.training.pointed_places import lessons_of, pointed_places, told_places
 from dual_system.training.prefetch import Prefetcher
 from dual_system.training.recipe import Recipe, defaults
 from dual_system.training.recipes import recipe
@@ -53,7 +53,7 @@ from protocol.command_line import command, parse
 
 DONE, REFUSED, INTERRUPTED = 0, 2, 130
 _SYSTEMS, CHECKPOINT = ("ponder", "pounce"), "checkpoint"
-_EPISODE_STREAM, _LESSON_STREAM = 7, 8  # random streams of a step: for episodes and schedules, and of each lesson
+_EPISODE_STREAM, _LESSON_STREAM = 7, 8  # random streams of a step: for episodes and schedules, and for lessons
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -184,13 +184,14 @@ class Batches:
         if run.grounds_memory and (sampling := sampling_of(self._pounce)) is not None:
             invocations = replace(invocations, words_IL=words_to_remember(examples, self._form, sampling))
         if run.grounds_pointer and isinstance(self._pounce, PounceConfig):
-            lessons = self._lessons(examples, self._pounce, chance)
+            lessons = self._lessons(step, examples, self._pounce)
             invocations = replace(invocations, places_IQ=pointed_places(examples, self._pounce), lessons=lessons)
         return episodes, invocations
 
-    def _lessons(self, examples: Sequence[Example], config: PounceConfig, chance: tuple[int, ...]) -> PounceBatch:
+    def _lessons(self, step: int, examples: Sequence[Example], config: PounceConfig) -> PounceBatch:
+        chance = (self._run.train.seed, _LESSON_STREAM, step)
         made = [
-            lesson(each, config, np.random.default_rng([*chance, place, _LESSON_STREAM]))
+            lessons_of(each, config, np.random.default_rng([*chance, place]))
             for each, place in zip(examples, self._places, strict=True)
         ]
         batch = collate_pounce(made, config, self._bundle.tokenizer, self._bundle.statistics)

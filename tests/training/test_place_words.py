@@ -9,13 +9,13 @@ from dual_system.models.ponder.coordinates import PLACE_WORDS
 from dual_system.training.place_words import draw_place_words
 
 PER_AXIS = len(PLACE_WORDS) // 2
-IDS = [3 + 2 * index for index in range(len(PLACE_WORDS))]  # any, in any order
+IDS = [3 + 2 * index for index in range(len(PLACE_WORDS))][::-1]  # any, in any order
 
 
 def drawn(seed: int = 0) -> tuple[Tensor, Tensor]:
     before = torch.randn(2 * len(PLACE_WORDS) + 5, 128, generator=torch.Generator().manual_seed(7)) / 8
     after = before.clone()
-    draw_place_words(after, IDS, seed)
+    draw_place_words(after, IDS, torch.Generator().manual_seed(seed))
     return before, after
 
 
@@ -29,8 +29,8 @@ def test_near_places_have_near_rows_and_far_ones_have_not() -> None:
         likeness = [alike(after[of_axis], distance) for distance in (1, 4, 8, 16, 64)]
         assert likeness == sorted(likeness, reverse=True)
         assert likeness[0] > 0.99
-        assert likeness[2] > 0.3
-        assert likeness[-1] < 0.2
+        assert likeness[2] > 0.75
+        assert likeness[-1] < 0.4
 
 
 def test_the_two_axes_have_rows_of_their_own() -> None:
@@ -49,3 +49,11 @@ def test_a_table_keeps_its_rms_and_all_other_rows() -> None:
 def test_rows_follow_from_the_seed() -> None:
     assert torch.equal(drawn()[1], drawn()[1])
     assert not torch.equal(drawn()[1], drawn(1)[1])
+
+
+def test_two_tables_of_one_generator_share_nothing() -> None:
+    generator = torch.Generator().manual_seed(0)
+    tables = [torch.ones(len(PLACE_WORDS), 128) for _ in range(2)]
+    for table in tables:
+        draw_place_words(table, list(range(len(PLACE_WORDS))), generator)
+    assert float(torch.cosine_similarity(*tables, dim=-1).abs().mean()) < 0.3

@@ -24,17 +24,20 @@ from dual_system.models.pounce.configs import laptop, tiny_cpu
 from dual_system.models.pounce.family import sample_times
 from dual_system.models.windows import LAPTOP_WINDOWS
 from dual_system.training import train
-from dual_system.training.build import with_channel
+from dual_system.training.build import Start, build, with_channel
 from dual_system.training.collate import collate_pounce
+from dual_system.training.data import TrainingSet
 from dual_system.training.episode import TrainingEpisode
 from dual_system.training.example import Example, ExampleConfig, make_example
 from dual_system.training.joint import Draws, JointModel, PonderBatch, PounceBatch
-from dual_system.training.pointed_places import lesson, pointed_places, told_places
+from dual_system.training.parallel import World
+from dual_system.training.pointed_places import lessons_of, pointed_places, told_places
+from dual_system.training.recipe import Recipe
 from dual_system.training.recipes import RECIPES, recipe
-from dual_system.training.train import InsteadOptions, LogOptions, MachineOptions, TrainOptions
+from dual_system.training.train import Batches, InsteadOptions, LogOptions, MachineOptions, TrainOptions
 
 PONDER = Ponder.random(replace(tiny_ponder(), num_layers=4), seed=1)
-POUNCE = replace(tiny_cpu(num_carriers=0, horizon=6), state_input="token", num_pointed=2)
+POUNCE = replace(tiny_cpu(num_carriers=0, horizon=6), state_input="token", num_pointed=2, reads_subgoal=True)
 CONFIG = ExampleConfig(clocks=ROBOMME, max_invocations=3)
 
 
@@ -74,27 +77,44 @@ def test_a_place_in_the_window_is_the_patch_that_it_lies_in(
     assert pointed_places([told(example, text)], laptop()).tolist() == [[8 * row + column, IGNORE]] * 3
 
 
+@pytest.fixture
+def busy(episode_of_noise: Callable[..., TrainingEpisode]) -> Example:
+    """Eleven invocations, and a text of its own for every query."""
+    episode = episode_of_noise(150, changes=tuple(range(0, 150, 20)))
+    found = make_example(episode, PONDER.format, replace(CONFIG, max_invocations=11), np.random.default_rng(1))
+    texts = [f"push cube {query} at [400, 300] to the target at [600, 500]" for query in range(len(found.written))]
+    return replace(found, written=tuple(texts))
+
+
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30)
 @given(seed=st.integers(0, 2**32))
-def test_a_lesson_tells_places_of_the_window_and_teaches_them(seed: int, example: Example) -> None:
-    known = told(example, "push the cube at [400, 300] to the target at [600, 500], which is red")
-    made = lesson(known, laptop(), np.random.default_rng(seed))
-    assert made.invocations == known.invocations[::4]
+def test_lessons_tell_places_of_the_window_in_the_texts_of_their_invocations(seed: int, busy: Example) -> None:
+    made = lessons_of(busy, laptop(), np.random.default_rng(seed))
     (top, left, bottom, right), places = LAPTOP_WINDOWS[0], told_places([made], laptop())
-    for text, patches in zip(made.told, places.tolist(), strict=True):
-        found = XY_1000.findall(text)
-        assert XY_1000.sub("", text) == XY_1000.sub("", known.written[0])
-        for (x, y), patch in zip(found, patches, strict=True):
+    assert len(made.invocations) == len(made.told) == len(places) in (2, 3)
+    for invocation, text, patches in zip(made.invocations, made.told, places.tolist(), strict=True):
+        assert invocation.reference.query is not None
+        assert XY_1000.sub("", text) == XY_1000.sub("", busy.written[invocation.reference.query])
+        for (x, y), patch in zip(XY_1000.findall(text), patches, strict=True):
             row, column = divmod(patch, 8)
             assert row <= 8 * (int(y) / 1000 - top) / (bottom - top) < row + 1
             assert column <= 8 * (int(x) / 1000 - left) / (right - left) < column + 1
 
 
-def test_lessons_tell_every_patch(example: Example) -> None:
-    known = told(example, "pick up the cube at [400, 300]")
+def test_lessons_are_of_every_moment_and_tell_every_patch(busy: Example) -> None:
     rng = np.random.default_rng(0)
-    seen = {patch for _ in range(600) for patch, _ in told_places([lesson(known, laptop(), rng)], laptop()).tolist()}
-    assert seen == set(range(64))
+    made = [lessons_of(busy, laptop(), rng) for _ in range(400)]
+    assert {each for one in made for each in one.invocations} == set(busy.invocations)
+    assert {patch for patch, _ in told_places(made, laptop()).tolist()} == set(range(64))
+
+
+def test_a_lesson_s_place_reaches_the_prompt_and_its_label_the_pointer(busy: Example) -> None:
+    bundle = random_bundle(POUNCE, 0)
+    one, other = (lessons_of(busy, POUNCE, np.random.default_rng([5, each])) for each in (0, 1))
+    one, other = (replace(each, invocations=busy.invocations[:1], told=each.told[:1]) for each in (one, other))
+    read = [collate_pounce([each], POUNCE, bundle.tokenizer, bundle.statistics).inputs for each in (one, other)]
+    assert read[0].token_ids.tolist() != read[1].token_ids.tolist()
+    assert not torch.equal(told_places([one], POUNCE), told_places([other], POUNCE))
 
 
 def test_a_text_without_places_teaches_nothing(example: Example) -> None:
@@ -116,15 +136,18 @@ def test_the_flow_loss_is_that_without_labels_and_the_pointers_is_added(example:
     assert not any("expert" in name or "pointer.condition" in name for name in reached)
 
 
-def test_lessons_teach_the_pointer_and_leave_the_flow_loss_alone(example: Example) -> None:
+def test_lessons_teach_the_pointer_and_leave_the_flow_loss_alone(example: Example, busy: Example) -> None:
     batch, model = batch_of(told(example, "pick up the cube at [100, 900]")), joint()
-    other = replace(batch, places_IQ=torch.where(batch.places_IQ == IGNORE, IGNORE, 5))  # type: ignore[arg-type]
-    taught, draws = replace(batch, lessons=other), draws_of(batch, model)
-    alone, lessons_alone, both = (model(PonderBatch(), each, draws) for each in (batch, other, taught))
+    other = batch_of(busy)
+    taught = replace(batch, lessons=other)
+    alone, both = (model(PonderBatch(), each, draws_of(batch, model)) for each in (batch, taught))
+    lessons_alone = model(PonderBatch(), other, draws_of(other, model))
     assert torch.equal(both.flow_matching, alone.flow_matching)
-    torch.testing.assert_close(both.grounding, (alone.grounding + lessons_alone.grounding) / 2)
-    counted = [model.counts(PonderBatch(), each, draws).num_supervised for each in (batch, taught)]
-    assert counted == [3, 6]
+    num_here, num_lessons, num_both = (
+        model.counts(PonderBatch(), each, draws_of(each, model)).num_supervised for each in (batch, other, taught)
+    )
+    assert (num_here, num_lessons, num_both) == (3, 22, 25)
+    torch.testing.assert_close(both.grounding, (3 * alone.grounding + 22 * lessons_alone.grounding) / 25)
 
 
 def test_the_hand_learns_to_point_and_no_row_of_the_table_is_taught_to() -> None:
@@ -132,8 +155,9 @@ def test_the_hand_learns_to_point_and_no_row_of_the_table_is_taught_to() -> None
     assert recipe("laptop_hand_corrected").grounds_pointer
     for name in ("laptop", "laptop_observation", "laptop_text", "laptop_framesamp", "laptop_framesamp_grounded"):
         assert not recipe(name).grounds_pointer
-    with pytest.raises(ValueError, match="grounds_pointer is for a POUNCE with a pointer"):
-        replace(recipe("laptop"), grounds_pointer=True)
+    for unable in (recipe("laptop"), replace(recipe("laptop_observation"), w2=0.5)):
+        with pytest.raises(ValueError, match="grounds_pointer is for a POUNCE that has a pointer and reads subgoals"):
+            replace(unable, grounds_pointer=True)
 
 
 def test_a_hand_without_a_pointer_is_given_one_that_changes_nothing_yet() -> None:
@@ -149,14 +173,17 @@ def test_a_hand_without_a_pointer_is_given_one_that_changes_nothing_yet() -> Non
         with_channel(replace(recipe("laptop_hand"), pounce=POUNCE), one)
 
 
+def pointing_recipe() -> Recipe:
+    run = recipe("tiny_framesamp")
+    pounce = replace(run.pounce, frame_memory=None, state_input="token", num_pointed=2, reads_subgoal=True)  # type: ignore[call-arg]
+    example = replace(run.example, is_grounded=True)
+    return replace(run, name="tiny_pointing", pounce=pounce, example=example, grounds_pointer=True, w2=0.3)
+
+
 def test_a_run_teaches_it_whoever_makes_the_batch_and_in_however_many_parts(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = recipe("tiny_framesamp")
-    pounce = replace(run.pounce, frame_memory=None, state_input="token", num_pointed=2)  # type: ignore[call-arg]
-    example = replace(run.example, is_grounded=True)
-    pointing = replace(run, name="tiny_pointing", pounce=pounce, example=example, grounds_pointer=True, w2=0.3)
-    monkeypatch.setitem(RECIPES, "tiny_pointing", lambda: pointing)
+    monkeypatch.setitem(RECIPES, "tiny_pointing", pointing_recipe)
     instead, quiet = InsteadOptions(steps=1, max_invocations=4), LogOptions(progress=False)
     reports = []
     for name, machine in (("a", {}), ("b", {"accumulate": 2}), ("c", {"loaders": 1})):
@@ -167,3 +194,17 @@ def test_a_run_teaches_it_whoever_makes_the_batch_and_in_however_many_parts(
         assert report["num_supervised"] == reports[0]["num_supervised"] > 0
         assert report["flow_matching"] == pytest.approx(reports[0]["flow_matching"], rel=1e-5)
         assert report["grounding"] == pytest.approx(reports[0]["grounding"], rel=1e-5)
+
+
+def test_a_step_has_the_same_lessons_in_however_many_processes(folder: Path) -> None:
+    run = replace(pointing_recipe(), batch_episodes=4)
+    data = TrainingSet(folder)
+    model, bundle = build(run, data, Start())
+    batches = [
+        Batches(data, run, model, bundle, World(rank=rank, size=size)) for rank, size in ((0, 1), (0, 2), (1, 2))
+    ]
+    whole, *shares = (each.on_cpu(3)[1].lessons for each in batches)
+    assert whole is not None
+    places = torch.cat([each.places_IQ for each in shares if each is not None and each.places_IQ is not None])
+    assert sorted(whole.places_IQ.tolist()) == sorted(places.tolist())  # type: ignore[union-attr]
+    assert bool((places != IGNORE).any())
