@@ -68,14 +68,17 @@ class Arm:
             raise UnreachableError(f"none of {len(ways)} ways is within the arm's reach; draw another scene")
         return [ways[i] for _, i in rated]
 
-    def first_free(self, paths: Iterable[Sequence[Leg]]) -> int:
-        """Returns the first path that the hand follows from here without touching anything, or the best of all."""
+    def first_free(self, paths: Iterable[Sequence[Leg]], *, alike: float = 0.0) -> int:
+        """Returns the first path that the hand follows from here without touching anything.
+
+        If there is none, the best of all is returned, or the first that is worth no more than ``alike`` less.
+        """
         rated: list[float] = []
-        for path in paths:
+        for i, path in enumerate(paths):
             rated.append(self._reach.follow(path, max(rated, default=-np.inf)))
             if rated[-1] > _FREE:
-                break
-        return int(np.argmax(rated))
+                return i
+        return next(i for i, worth in enumerate(rated) if worth >= max(rated) - alike)
 
     def after_drive(self, T: Array, base: Base, start: Base | None = None) -> Array:
         """Returns a pose of the hand after it has ridden along to another place of the base."""

@@ -20,6 +20,7 @@ from dual_system.tasks.kitchen.steps import AHEAD, UP, Step, Steps
 _LOW_M, _WIDE_RAD, _HALF_SHUT_RAD = 1.3, 0.9, 0.7  # doors: a low bar, wide open, where to push it to shut it
 _AROUND_M = -0.17 * AHEAD  # around the edge of an open leaf
 _NUM_WAYS, _SPAN = 6, 7  # whose paths are followed, and poses along the arc of each
+_ALIKE = 0.01  # paths at the joints' limits differ by less; then the grasp decides that is best all along the arc
 _BACK_M = 0.1
 _MORE_ATTEMPTS, _DONE_RAD = 2, 0.06
 _BAR_OUT_M, _BESIDE_BAR_M, _PAST_RAD = 0.06, 0.08, 0.03  # of a leaf's face; where it is pushed, and how far
@@ -76,7 +77,8 @@ def _lead_door(arm: Arm, door: Hinge, to_rad: float) -> Steps:
         for end in ends
         for _, i, _ in arm.rate_best([way(grasp, now, end) for grasp in grasps], _NUM_WAYS)
     ]
-    grasp, end = ranked[arm.first_free([_leg(door, way(grasp, now, end, _SPAN))] for grasp, end in ranked)]
+    paths = ([_leg(door, way(grasp, now, end, _SPAN))] for grasp, end in ranked)
+    grasp, end = ranked[arm.first_free(paths, alike=_ALIKE)]
     yield from arm.drive(grasp.base)
     now = arm.view.angle(door.joint)  # the arm may have touched it
     before, frame, *_ = way(grasp, now, end).poses

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from dual_system.tasks.kitchen import places, steps
+from dual_system.tasks.kitchen.arm import _FREE, Arm
 from dual_system.tasks.kitchen.catalogue import draw_scene
 from dual_system.tasks.kitchen.grips import grips_on
 from dual_system.tasks.kitchen.reach import UNREACHABLE, Leg, Reach
@@ -44,6 +48,14 @@ def test_a_floor_does_not_change_what_is_above_it(world: World) -> None:
     reach, here = Reach(world.view), steps.here(world.view)
     path = [Leg(base=AT_HOME, poses=(steps.moved(here, 0.1 * UP),))]
     assert reach.follow(path, UNREACHABLE) == reach.follow(path)
+
+
+@given(worths=st.lists(st.floats(-2.0, 2.0), min_size=1, max_size=6), alike=st.floats(0.0, 0.5))
+def test_the_first_free_path_is_taken_or_the_first_of_those_like_the_best(worths: list[float], alike: float) -> None:
+    arm: Any = Arm.__new__(Arm)
+    arm._reach = SimpleNamespace(follow=lambda worth, floor: worth)
+    enough = _FREE if max(worths) > _FREE else max(worths) - alike
+    assert arm.first_free(worths, alike=alike) == [worth > _FREE or worth >= enough for worth in worths].index(True)
 
 
 def test_a_way_around_goes_sideways_nearest_to_the_robot() -> None:
