@@ -106,7 +106,7 @@ def _ponder(run: Recipe, data: TrainingSet, start: Start) -> Ponder:
             own = Vocabulary.trained_on(data.texts(), run.ponder.first_carrier_id, words=PLACE_WORDS)
         ponder = Ponder.random(run.ponder, own, seed=seed, device=start.device, dtype=dtype)
         if own is not None:
-            ids, generator = [own.encode(word)[0] for word in PLACE_WORDS], _places_of(seed)
+            ids, generator = [own.encode(word)[0] for word in PLACE_WORDS], _place_generator(seed)
             for table in (ponder.qwen.model.language_model.embed_tokens.weight, ponder.qwen.lm_head.weight):
                 draw_place_words(table, ids, generator)
     if not runs_ponder(run.trains, run.pounce.cognition.num_carriers):
@@ -139,7 +139,7 @@ def _pounce(run: Recipe, data: TrainingSet, start: Start, ponder: Ponder) -> Pou
         open_gates(bundle.model)
         if own is not None and isinstance(bundle.model, Pounce):
             ids = [own.encode(word)[-1] for word in PLACE_WORDS]  # the first is BOS
-            draw_place_words(bundle.model.pi05.language.embed_tokens.weight, ids, _places_of(run.train.seed))
+            draw_place_words(bundle.model.pi05.language.embed_tokens.weight, ids, _place_generator(run.train.seed))
         return bundle
     if declares_config(start.pounce):
         found = load_bundle(start.pounce, tokenizer=start.tokenizer)
@@ -152,7 +152,7 @@ def _pounce(run: Recipe, data: TrainingSet, start: Start, ponder: Ponder) -> Pou
     )
 
 
-def _places_of(seed: int) -> torch.Generator:
+def _place_generator(seed: int) -> torch.Generator:
     """A generator that repeats none of the numbers that the networks were filled with."""
     return torch.Generator().manual_seed(seed + _PLACES_APART)
 

@@ -68,10 +68,10 @@ class Recipe:
                 f"recipe {self.name}: grounds_memory is for a POUNCE with a frame memory that is trained alone on "
                 "grounded examples"
             )
-        has_pointer = (
+        points_as_told = (
             isinstance(self.pounce, PounceConfig) and self.pounce.num_pointed > 0 and self.pounce.reads_subgoal
         )
-        if self.grounds_pointer and not (has_pointer and self.trains == "pounce" and self.example.is_grounded):
+        if self.grounds_pointer and not (points_as_told and self.trains == "pounce" and self.example.is_grounded):
             raise ValueError(
                 f"recipe {self.name}: grounds_pointer is for a POUNCE that has a pointer and reads subgoals, trained "
                 "alone on grounded examples"

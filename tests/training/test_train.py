@@ -120,6 +120,15 @@ def test_a_run_that_was_killed_ends_as_one_that_was_not(
         assert (finished / name).read_bytes() == (tmp_path / "cut" / name).read_bytes()
 
 
+@pytest.fixture
+def in_the_foreground() -> Iterator[None]:
+    """A shell starts its background jobs with SIGINT ignored, and then so do the commands."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("in_the_foreground")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_run_that_is_asked_to_stop_saves_the_step_that_it_was_in(
     folder: Path, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
@@ -141,6 +150,7 @@ def test_a_run_that_is_asked_to_stop_saves_the_step_that_it_was_in(
         assert (finished / name).read_bytes() == (tmp_path / "cut" / name).read_bytes()
 
 
+@pytest.mark.usefixtures("in_the_foreground")
 def test_the_second_request_acts_at_once() -> None:
     with stop_requests() as is_requested:
         assert not is_requested()
