@@ -1,4 +1,4 @@
-"""Yields of the kitchen's scripts: of so many seeds a task, how many the Panda solves, and the CPU time of a pair.
+"""Yields of the kitchen's scripts: of so many seeds a task, how many the Panda solves; CPU time of a pair and a step.
 
 The file that is written after every task is also where a killed run goes on: the same command plays what is missing.
 """
@@ -14,7 +14,7 @@ from statistics import median
 from typing import Any, Literal
 
 import dual_system.tasks.headless  # noqa: F401 - before anything that imports mujoco
-from benchmarks.report import Row, lines_of
+from benchmarks.report import Row, lines_of, spread
 from dual_system.analysis.markdown import percent
 from dual_system.analysis.statistics import wilson
 from dual_system.data.kitchen import PairJob, record
@@ -30,6 +30,7 @@ from protocol.errors import CommandError
 from sim_client.ledger import write_json
 
 Yield = dict[str, Any]  # what is known of one task
+_WARM_UP_STEPS, _TIMED_STEPS = 20, 100  # with pictures, in a scene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,7 +48,7 @@ class YieldOptions:
     split: Literal["demo", "development"] = "demo"
     """Split of the scenes. demo: the objects' instances A, which are trained on; development: those held out, B."""
     pairs: int = 2
-    """Number of solved scenes a task that are also collected as a pair with pictures, whose CPU time is taken."""
+    """Number of solved scenes a task also played with pictures and collected as a pair, for their CPU time."""
 
     def names(self) -> tuple[str, ...]:
         """Returns what is played, each once. Raises TaskError for an unknown name."""
@@ -75,6 +76,7 @@ def played(name: str, seeds: range, num_pairs: int) -> Yield:
         "steps": steps,
         "cpu_s": round(sum(cpu_s) / len(cpu_s), 2),
         "pair_cpu_s": [collected_s(name, seed) for seed in solved[:num_pairs]],
+        "step_cpu_ms": [cpu_ms for seed in solved[:num_pairs] for cpu_ms in stepped_ms(name, seed)],
     }
 
 
@@ -99,11 +101,25 @@ def collected_s(name: str, seed: int) -> float:
         return round(time.process_time() - start_s, 2)
 
 
+def stepped_ms(name: str, seed: int) -> list[float]:
+    """Returns the CPU milliseconds of a scene's steps with three pictures each; the first ones warm up."""
+    cpu_ms: list[float] = []
+    with KitchenEnvironment(name) as environment:
+        environment.reset(seed)
+        for action in environment.oracle():
+            start_s = time.process_time()
+            now = environment.step(action)
+            cpu_ms.append(round(1e3 * (time.process_time() - start_s), 2))
+            if now.status is not Status.ONGOING or len(cpu_ms) == _WARM_UP_STEPS + _TIMED_STEPS:
+                break
+    return cpu_ms[_WARM_UP_STEPS:]
+
+
 def table(found: dict[str, Yield]) -> list[Row]:
     """Returns a row a task, in the order in which they were played."""
     rows: list[Row] = []
     for name, task in found.items():
-        num, pairs_s = len(task["steps"]), task["pair_cpu_s"]
+        num, pairs_s, steps_ms = len(task["steps"]), task["pair_cpu_s"], task["step_cpu_ms"]
         rows.append(
             {
                 "task": name,
@@ -111,7 +127,8 @@ def table(found: dict[str, Yield]) -> list[Row]:
                 "success, % [95 %]": percent(wilson(task["solved"] / num, num)),
                 "longest, steps": max(task["steps"]),
                 "script, CPU s": task["cpu_s"],
-                "pair, CPU s": median(pairs_s) if pairs_s else None,
+                "pair, CPU s": round(median(pairs_s), 1) if pairs_s else None,
+                **spread(steps_ms, "step_cpu_ms"),
             }
         )
     return rows

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from protocol.logs import set_up_logging
 from protocol.metrics import Metrics
 from protocol.options import DaemonOptions, LinkOptions
-from protocol.process import StopFlag
+from protocol.process import ENDING_S, StopFlag
 from protocol.status import status_of
 from protocol.watchdog import watchdog
 from protocol.zenoh_bus import ZenohBus, open_bus
@@ -31,7 +31,8 @@ def daemon(link: LinkOptions, operations: DaemonOptions) -> Iterator[Daemon]:
         TransportError: the bus or the status page's port cannot be opened.
         OSError, ValueError: the log file cannot be written, or an option does not apply.
     """
-    should_stop, metrics = StopFlag(drains=True, sigterm_drains=operations.drain), Metrics()
+    should_stop = StopFlag(drains=True, sigterm_drains=operations.drain, ends_within_s=ENDING_S)
+    metrics = Metrics()
     set_up_logging(options=operations)
     with status_of(metrics, operations, lambda: should_stop.is_draining):
         bus = open_bus(link)

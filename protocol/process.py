@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import gc
 import os
 import platform
@@ -15,9 +16,12 @@ from protocol.bus import Bus
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
+ENDING_S = 30.0
+"""What a daemon has to end in once it was told to: an episode's log is closed, its servers are told and end in 5 s."""
 IDLE_WAIT_NS = 20_000_000  # an idle daemon steps this often: its heartbeat depends on it
 
 
+_STDERR = 2
 PARENT_VARIABLE = "PONDERPOUNCE_PARENT_PID"
 """Environment variable with the process id of a parent; a daemon that has it exits when the parent is gone."""
 
@@ -28,16 +32,20 @@ class StopFlag:
     Args:
         drains: whether SIGUSR1 sets ``is_draining``: no new episodes, and the process leaves after the running one.
         sigterm_drains: whether the first SIGTERM does so too.
+        ends_within_s: a process that has been stopped for so long and is still there is stuck: it tells on stderr where
+            each of its threads is, and leaves with exit code 1. None: it may take its time.
 
     Attributes:
         asked_ns: when the loop last asked (monotonic), which shows that it turns.
     """
 
-    def __init__(self, *, drains: bool = False, sigterm_drains: bool = False) -> None:
+    def __init__(
+        self, *, drains: bool = False, sigterm_drains: bool = False, ends_within_s: float | None = None
+    ) -> None:
         self.is_set = False
         self.is_draining = False
         self.asked_ns = time.monotonic_ns()
-        self._sigterm_drains = sigterm_drains
+        self._sigterm_drains, self._ends_within_s = sigterm_drains, ends_within_s
         self._parent_pid = int(os.environ.get(PARENT_VARIABLE, "0"))
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._set)
@@ -48,14 +56,22 @@ class StopFlag:
         if number == signal.SIGTERM and self._sigterm_drains and not self.is_draining:
             self.is_draining = True
         else:
-            self.is_set = True
+            self._stop()
 
     def _drain(self, number: int, frame: FrameType | None) -> None:
         self.is_draining = True
 
+    def _stop(self) -> None:
+        if not self.is_set and self._ends_within_s is not None:
+            # A thread of C, which needs no lock of Python's: one that is never given back may be why it is stuck.
+            faulthandler.dump_traceback_later(self._ends_within_s, exit=True, file=_STDERR)
+        self.is_set = True
+
     def __call__(self) -> bool:
         self.asked_ns = time.monotonic_ns()
-        return self.is_set or (self._parent_pid > 0 and os.getppid() != self._parent_pid)
+        if self._parent_pid > 0 and os.getppid() != self._parent_pid:
+            self._stop()
+        return self.is_set
 
 
 def run(bus: Bus, step: Callable[[], bool], should_stop: Callable[[], bool]) -> None:

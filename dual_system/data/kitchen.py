@@ -9,11 +9,12 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import tyro
 
 import dual_system.tasks.headless  # noqa: F401 - before mujoco is imported
@@ -31,10 +32,8 @@ from dual_system.data.episode import About, Package, Rejection, RobotColumns
 from dual_system.data.errors import DatasetError
 from dual_system.data.jobs import ATTEMPTS
 from dual_system.data.paired import PANDA_OMRON, Instant, pack_pair, write_splits
-from dual_system.data.rollout import UNSOLVED, UnsolvedError, asked, check_solved
+from dual_system.data.rollout import UNSOLVED
 from dual_system.data.video import FPS
-from dual_system.tasks.engine import Status
-from dual_system.tasks.environment import Snapshot
 from dual_system.tasks.kinematics import UnreachableError
 from dual_system.tasks.kitchen.catalogue import TASKS
 from dual_system.tasks.kitchen.environment import IMAGE_PX, KitchenEnvironment
@@ -147,14 +146,14 @@ def work_out(job: PairJob) -> Package:
             seed = job.seed(attempt)
             try:
                 return record(environment, job, seed, tuple(rejected))
-            except (UnsolvedError, UnreachableError, SceneFullError) as error:
+            except (UnreachableError, SceneFullError) as error:
                 rejected.append(Rejection(seed=seed, reason=str(error)))
     return {UNSOLVED: (json.dumps([asdict(each) for each in rejected]) + "\n").encode()}
 
 
 def record(environment: KitchenEnvironment, job: PairJob, seed: int, rejected: tuple[Rejection, ...] = ()) -> Package:
-    """One attempt. Raises UnsolvedError, or what the scene or the script raises."""
-    first = environment.reset(seed)
+    """One attempt. Raises UnreachableError where the script misses its goal, or what the scene raises."""
+    environment.reset(seed)
     shown = [
         next(iter(snapshot.frames.values()), None)
         for snapshot in environment.demonstration(look_hz=job.demonstration_hz)
@@ -169,18 +168,18 @@ def record(environment: KitchenEnvironment, job: PairJob, seed: int, rejected: t
         image_px=job.image_px,
         rejected=rejected,
     )
-    execution = _executed(environment, first, FPS // job.invocation_hz)
+    execution = _executed(environment, FPS // job.invocation_hz)
     return pack_pair(shown, execution, about, words=environment.scene.instruction)
 
 
-def _executed(environment: KitchenEnvironment, snapshot: Snapshot, look_every: int) -> Iterator[Instant]:
-    """Plays the script; yields what was seen before each action, and the action."""
-    script = environment.oracle()
-    while snapshot.status is Status.ONGOING:
-        action = asked(script, snapshot)
-        yield Instant(state=snapshot.state, action=action, frames=snapshot.frames)
-        snapshot = environment.step(action, look=(snapshot.step + 1) % look_every == 0)
-    check_solved(snapshot)
+def _executed(environment: KitchenEnvironment, look_every: int) -> Iterator[Instant]:
+    """Yields what is seen before each action of the rehearsal, and the action: it was simulated once already."""
+    start = environment.save()
+    for step, moment in enumerate(environment.rehearse()):
+        if moment.action is not None:
+            now = replace(start, step=step, world=moment.world)
+            snapshot = environment.restore(now, look=step % look_every == 0)
+            yield Instant(state=snapshot.state, action=moment.action.astype(np.float32), frames=snapshot.frames)
 
 
 if __name__ == "__main__":

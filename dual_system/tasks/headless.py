@@ -9,6 +9,9 @@ import os
 GL_PROBLEM = ""
 """Why mujoco is here without a renderer; "" if it has one."""
 
+# Mesa's software renderer then draws in the calling thread: a picture of 128 px costs its threads more than it gives.
+os.environ.setdefault("LP_NUM_THREADS", "0")
+
 try:
     mujoco = importlib.import_module("mujoco")
     if not hasattr(mujoco, "Renderer"):  # it hides why

@@ -22,7 +22,7 @@ from protocol.logs import set_up_logging
 from protocol.messages import Health, ServingState
 from protocol.metrics import End, Metrics
 from protocol.options import LinkOptions
-from protocol.process import StopFlag
+from protocol.process import ENDING_S, StopFlag
 from protocol.sockets import endpoint
 from protocol.status import status_of
 from protocol.version import version
@@ -43,7 +43,8 @@ log = logging.getLogger("pp-gateway")
 @command("pp-gateway")
 def main(argv: list[str] | None = None) -> int:
     options = parse(GatewayOptions, argv, prog="pp-gateway")
-    should_stop, metrics = StopFlag(drains=True, sigterm_drains=options.operations.drain), Metrics()
+    should_stop = StopFlag(drains=True, sigterm_drains=options.operations.drain, ends_within_s=ENDING_S)
+    metrics = Metrics()
     set_up_logging(options=options.operations)
     options.check()
     options.api_key()  # a bad file before servers are started

@@ -16,7 +16,7 @@ from protocol.link import Link
 from protocol.logs import set_up_logging
 from protocol.messages import Image
 from protocol.options import LinkOptions
-from protocol.process import IDLE_WAIT_NS, StopFlag
+from protocol.process import ENDING_S, IDLE_WAIT_NS, StopFlag
 from protocol.sockets import endpoint
 from protocol.topics import COGNITION, EVENT, HEALTH, INFO, OBSERVATION, PHASE, SUBGOAL, TICK, alive_key
 from protocol.zenoh_bus import open_bus
@@ -91,7 +91,7 @@ class Watcher:
 @command("pp-replay watch")
 def main(argv: list[str] | None = None, prog: str = "pp-replay watch") -> int:
     options = parse(WatchOptions, argv, prog=prog)
-    should_stop = StopFlag()
+    should_stop = StopFlag(ends_within_s=ENDING_S)
     set_up_logging()
     address = options.address
     bus = open_bus(options.link)

@@ -32,6 +32,7 @@ class Script:
         return {
             "seeds": [seeds[0], seeds[-1]], "solved": len(seeds) - len(failed), "failed": failed,
             "steps": [seed % 7 for seed in seeds], "cpu_s": 1.5, "pair_cpu_s": [4.0] * num_pairs,
+            "step_cpu_ms": [7.0, 8.0, 9.0],
         }  # fmt: skip
 
 
@@ -64,6 +65,18 @@ def test_other_scenes_are_not_added_to_a_file(
     assert run(monkeypatch, Script(), tmp_path / "a.json") == 0
     assert run(monkeypatch, Script(), tmp_path / "a.json", "--split", "development") == 2
     assert "was begun with {'seeds': 5, 'split': 'demo', 'pairs': 2}" in capsys.readouterr().err
+
+
+def test_a_row_has_the_spread_of_the_steps() -> None:
+    (row,) = module.table({"OpenDrawer": Script()("OpenDrawer", range(5), 2)})
+    assert (row["n"], row["p50_step_cpu_ms"], row["max_step_cpu_ms"]) == (3, 8.0, 9.0)
+
+
+@pytest.mark.sim
+def test_steps_are_timed_with_pictures_after_the_first_ones() -> None:
+    cpu_ms = module.stepped_ms("CoffeePressButton", 0)
+    assert 50 <= len(cpu_ms) <= 100
+    assert min(cpu_ms) > 0
 
 
 @pytest.mark.parametrize(("split", "instances"), [("demo", "A"), ("development", "B")])

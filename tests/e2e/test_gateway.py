@@ -17,6 +17,7 @@ from clock.check import disagreements
 from dual_system.tasks.environment import make_environment
 from protocol import messages as m
 from protocol.mcap_log import read_log
+from protocol.process import ENDING_S
 from sim_client.launch import free_ports
 
 pytestmark = [
@@ -51,7 +52,7 @@ class Gateway:
 
     def stop(self) -> int:
         self.process.terminate()
-        return self.process.wait(30)
+        return self.process.wait(2 * ENDING_S)
 
 
 @pytest.fixture(scope="module")

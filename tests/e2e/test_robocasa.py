@@ -20,6 +20,7 @@ from dual_system.data.episode import About, EpisodeWriter, RobotColumns, Row, un
 from dual_system.data.lerobot_v3 import DatasetWriter
 from protocol import messages as m
 from protocol.mcap_log import EpisodeRecord, read_log
+from protocol.process import ENDING_S
 from sim_client.launch import free_ports
 
 pytestmark = [pytest.mark.e2e, pytest.mark.realtime, pytest.mark.slow]
@@ -121,7 +122,7 @@ def played(
         )
         assert done.returncode == 0, done.stderr + (out / "gateway.log").read_text()
         gateway.terminate()
-        assert gateway.wait(30) == 0
+        assert gateway.wait(2 * ENDING_S) == 0, (out / "gateway.log").read_text()
     finally:
         gateway.kill()
         gateway.wait()

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import faulthandler
+import os
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 
 import pytest
 
-from protocol.process import StopFlag
+from protocol.process import PARENT_VARIABLE, StopFlag
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
 
@@ -42,3 +46,42 @@ def test_a_process_that_cannot_drain_leaves_the_signal_alone() -> None:
     before = signal.getsignal(signal.SIGUSR1)
     StopFlag()
     assert signal.getsignal(signal.SIGUSR1) is before
+
+
+STUCK = """
+import signal, threading, time
+from protocol.process import PARENT_VARIABLE, StopFlag
+
+def of_the_bus():
+    threading.Event().wait()
+
+threading.Thread(target=of_the_bus, daemon=True).start()
+should_stop = StopFlag(ends_within_s={ends_within_s})
+signal.raise_signal(signal.{name})
+assert should_stop()
+time.sleep({ending_s})
+"""
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGINT"])
+def test_a_process_that_is_stuck_while_it_ends_tells_where_and_leaves(name: str) -> None:
+    program = STUCK.format(ends_within_s=0.2, name=name, ending_s=600)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 1
+    assert "in of_the_bus" in done.stderr  # every thread's place
+    assert "in <module>" in done.stderr
+
+
+def test_a_process_that_ends_in_time_ends_well() -> None:
+    program = STUCK.format(ends_within_s=600, name="SIGTERM", ending_s=0)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_process_whose_parent_is_gone_is_told_to_end_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(PARENT_VARIABLE, str(os.getpid()))  # not our parent's
+    armed: list[float] = []
+    monkeypatch.setattr(faulthandler, "dump_traceback_later", lambda after_s, **_: armed.append(after_s))
+    flag = StopFlag(ends_within_s=7.0)
+    assert (flag(), flag()) == (True, True)
+    assert armed == [7.0]

@@ -180,13 +180,17 @@ class KitchenEnvironment:
     def rehearse(self) -> tuple[puppet.Moment, ...]:
         """Returns what the script does from this episode's start until it reaches the goal; it is played once.
 
-        A scene has a demonstration if and only if the script solves it. Raises UnreachableError if it does not.
+        A scene has a demonstration if and only if the script solves it. Raises UnreachableError if it does not. The
+        episode does not change.
         """
         if self._rehearsal is None:
             assert self._start is not None
-            stage = World(self.scene)
-            stage.load(self._start)
-            self._rehearsal = tuple(puppet.record(stage, _until_done(stage)))
+            now = self.world.save()
+            self.world.load(self._start)
+            try:
+                self._rehearsal = tuple(puppet.record(self.world, _until_done(self.world)))
+            finally:
+                self.world.load(now)
         return self._rehearsal
 
     @property

@@ -21,7 +21,7 @@ from dual_system.tasks.kitchen.bay import ROBOT_STAND, build_bay
 from dual_system.tasks.kitchen.catalogue import Family
 from dual_system.tasks.kitchen.plan import Scene
 from dual_system.tasks.kitchen.steps import flipped, here
-from dual_system.tasks.kitchen.world import World
+from dual_system.tasks.kitchen.world import World, WorldState
 
 CAMERA = "demonstration"
 _VIEWS: dict[Family, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
@@ -43,11 +43,13 @@ _SOLVED_EVERY = 4  # control steps between two poses of the puppet
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Moment:
-    """What the puppet shows at one control step: the scene's joints, the tool, and how far the hand is closed."""
+    """One control step of an execution: what the puppet shows of it, and the Panda's world, to be looked at later."""
 
     qpos: Array  # of the bay's joints, in the order of `bay_joints`
     tool: Array  # (4, 4)
     closing: float
+    world: WorldState
+    action: Array | None  # (12,) what is done next; None at the end
 
 
 class Puppet:
@@ -150,17 +152,21 @@ def record(world: World, actions: Iterable[Array]) -> list[Moment]:
     addresses = _addresses(world.model, names)
     fingers = [world.model.joint(name).qposadr[0] for name in omron.FINGER_JOINTS]
 
-    def moment() -> Moment:
+    def moment(action: Array | None) -> Moment:
         opening_m = np.abs(world.data.qpos[fingers]).mean()
         return Moment(
-            qpos=world.data.qpos[addresses], tool=here(world.view), closing=float(1.0 - opening_m / omron.OPEN_M)
+            qpos=world.data.qpos[addresses],
+            tool=here(world.view),
+            closing=float(1.0 - opening_m / omron.OPEN_M),
+            world=world.save(),
+            action=action,
         )
 
-    moments = [moment()]
+    moments = []
     for action in actions:
+        moments.append(moment(action))
         world.advance(action)
-        moments.append(moment())
-    return moments
+    return [*moments, moment(None)]
 
 
 _PANDA_JOINTS = {*omron.ARM_JOINTS, *omron.FINGER_JOINTS, *omron.BASE_JOINTS, omron.TORSO_JOINT}
