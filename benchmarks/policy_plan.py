@@ -9,7 +9,7 @@ from pathlib import Path
 from dual_system.training import laptop_recipes as recipes
 
 TASKS = ("VideoUnmask", "PickHighlight", "MoveCube", "PickXtimes")
-EPISODES, STILLS, TOWER_MINUTES = 200, 8_000, 60
+EPISODES, STILLS, TOWER_MINUTES = 200, 8_000, 22
 CURRENT_WORDS = "words_current"
 """Folder of the PONDER without memory."""
 PLAYS, PLAYS_SEED = 40, 1_000_000

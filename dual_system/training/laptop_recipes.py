@@ -42,7 +42,7 @@ def laptop_hand() -> Recipe:
             branch_weight=3.0,
         ),
         train=_LAPTOP,
-        num_steps=3_500,
+        num_steps=8_000,
         batch_episodes=8,
         w2=0.5,  # of pointing alone: no PONDER is run
         trains="pounce",

@@ -71,10 +71,12 @@ class Recipe:
         points_as_told = (
             isinstance(self.pounce, PounceConfig) and self.pounce.num_pointed > 0 and self.pounce.reads_subgoal
         )
-        if self.grounds_pointer and not (points_as_told and self.trains == "pounce" and self.example.is_grounded):
+        if self.grounds_pointer and not (
+            points_as_told and self.trains == "pounce" and self.example.is_grounded and self.space != "native"
+        ):
             raise ValueError(
                 f"recipe {self.name}: grounds_pointer is for a POUNCE that has a pointer and reads subgoals, trained "
-                "alone on grounded examples"
+                "alone on grounded examples of the Panda"
             )
         if self.grounds_pointer and self.grounds_memory:
             raise ValueError(f"recipe {self.name}: one of grounds_memory and grounds_pointer: both have weight w2")

@@ -46,14 +46,48 @@ def test_until_it_is_trained_the_network_is_pi05_bit_for_bit() -> None:
     assert not torch.equal(velocity(pounce(), inputs), velocity(plain, inputs))
 
 
-def test_scores_are_of_the_front_pictures_patches_row_by_row() -> None:
+def test_the_first_scores_are_of_the_front_pictures_patches_row_by_row() -> None:
     model, inputs = pounce(), POINTING.example_inputs(2)
     _, before_BQS = model.pointing(inputs)
     images = inputs.images.clone()
     images[:, 0, :, :28, 28:56] += 0.5  # the second patch of the first row
     _, after_BQS = model.pointing(replace(inputs, images=images))
-    assert before_BQS.shape == (2, 2, NUM_PATCHES)
-    assert (after_BQS - before_BQS).abs().mean(dim=(0, 1)).argmax() == 1
+    assert before_BQS.shape == (2, 4, NUM_PATCHES + 1)
+    changed_QS = (after_BQS - before_BQS).abs().mean(dim=0)
+    assert changed_QS[:2].sum(dim=0).argmax() == 1
+
+
+def test_the_others_are_of_the_second_camera_s_and_it_may_be_out_of_view() -> None:
+    model, inputs = pounce(), POINTING.example_inputs(2)
+    _, before_BQS = model.pointing(inputs)
+    images = inputs.images.clone()
+    images[:, 1, :, 28:56, :28] += 0.5  # the first patch of the second row
+    _, after_BQS = model.pointing(replace(inputs, images=images))
+    changed_QS = (after_BQS - before_BQS).abs().mean(dim=0)
+    assert changed_QS[2:, :-1].sum(dim=0).argmax() == round(NUM_PATCHES**0.5)
+    assert (before_BQS[:, :2, -1] == torch.finfo(torch.float32).min).all()
+    assert bool(before_BQS[:, 2:, -1].isfinite().all())
+
+
+def test_what_is_out_of_view_is_not_read_from_the_second_picture() -> None:
+    model, inputs = pounce(), POINTING.example_inputs(1)
+    assert model.pointer is not None
+    assert model.pointer.out_of_view is not None
+    with torch.no_grad():
+        model.pointer.out_of_view.bias.fill_(1e4)
+        away = model.prefill(inputs).pointed
+        model.pointer.read.weight[:, 3 * POINTING.pi05.language.width :].zero_()
+        same = model.prefill(inputs).pointed
+    assert away is not None
+    assert same is not None
+    assert torch.equal(away.styles, same.styles)
+
+
+def test_with_one_camera_it_points_in_front_alone() -> None:
+    one = replace(POINTING, num_cameras=1)
+    model = pounce(one)
+    _, scores_BQS = model.pointing(one.example_inputs(2))
+    assert scores_BQS.shape == (2, 2, NUM_PATCHES + 1)
 
 
 def test_a_batch_is_its_samples_whatever_the_lengths_of_their_prompts() -> None:
@@ -120,7 +154,14 @@ def test_without_a_front_picture_it_points_at_nothing_there() -> None:
     assert torch.equal(velocity(model, dark), velocity(model, bright))
 
 
-def test_only_the_front_picture_and_the_state_are_read_by_it_so_it_needs_both() -> None:
+def test_without_a_second_picture_it_finds_nothing_there() -> None:
+    model, inputs = pounce(), POINTING.example_inputs(1)
+    dark = replace(inputs, has_view=torch.tensor([[True, False]]))
+    bright = replace(dark, images=torch.cat([inputs.images[:, :1], inputs.images[:, 1:] * -1], dim=1))
+    assert torch.equal(velocity(model, dark), velocity(model, bright))
+
+
+def test_it_needs_a_front_picture_and_the_state() -> None:
     last = replace(POINTING.cognition, place="after_text")
     for broken in ({"num_cameras": 0}, {"state_input": "prompt"}, {"cognition": last}):
         with pytest.raises(ValueError, match="num_pointed needs a front camera"):

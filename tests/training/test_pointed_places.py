@@ -23,6 +23,8 @@ from dual_system.models.pounce.checkpoint import random_bundle
 from dual_system.models.pounce.configs import laptop, tiny_cpu
 from dual_system.models.pounce.family import sample_times
 from dual_system.models.windows import LAPTOP_WINDOWS
+from dual_system.policy.studio import NAMES, Studio
+from dual_system.tasks.scene import CUBE_HALF_M
 from dual_system.training import train
 from dual_system.training.build import Start, build, with_channel
 from dual_system.training.collate import collate_pounce
@@ -74,7 +76,38 @@ def test_a_place_in_the_window_is_the_patch_that_it_lies_in(
     y = top + (row + within[0]) / 8 * (bottom - top)
     x = left + (column + within[1]) / 8 * (right - left)
     text = f"push the cube at [{round(1000 * x)}, {round(1000 * y)}] to the target at [0, 0]"
-    assert pointed_places([told(example, text)], laptop()).tolist() == [[8 * row + column, IGNORE]] * 3
+    places = pointed_places([told(example, text)], laptop())
+    assert places[:, :2].tolist() == [[8 * row + column, IGNORE]] * 3
+    assert bool((places[:, 2] != IGNORE).all())
+    assert places[:, 3].tolist() == [IGNORE] * 3
+
+
+@pytest.mark.sim
+def test_the_wrist_camera_s_patch_is_where_it_shows_the_thing_that_is_named(example: Example) -> None:
+    studio, errors = Studio(image_px=64), []
+    for seed in range(40):
+        still = studio.still(seed)
+        episode = example.episode
+        state_TS = np.tile(studio.physics.state().astype(np.float32), (len(episode.state_TS), 1))
+        at = replace(example, episode=replace(episode, state_TS=state_TS))
+        for thing in still.things:
+            if "cube" not in NAMES[thing.kind] or abs(thing.position_m[2] - CUBE_HALF_M) > 1e-3:
+                continue
+            if (front := thing.seen.get("front")) is None:
+                continue
+            (top, left, bottom, right) = LAPTOP_WINDOWS[0]
+            y, x = top + front[0] * (bottom - top), left + front[1] * (right - left)
+            text = f"pick up the cube at [{round(1000 * x)}, {round(1000 * y)}]"
+            (patch,) = {int(each) for each in pointed_places([told(at, text)], laptop())[:, 2]}
+            wrist = thing.seen.get("wrist")
+            if wrist is not None and patch < 64:
+                row, column = divmod(patch, 8)
+                errors.append(max(abs(row + 0.5 - 8 * wrist[0]), abs(column + 0.5 - 8 * wrist[1])))
+            elif wrist is not None:
+                errors.append(1.0 if min(*wrist, 1 - wrist[0], 1 - wrist[1]) < 0.1 else 9.0)
+    studio.close()
+    assert len(errors) > 40
+    assert np.mean(np.array(errors) < 1.0) > 0.95  # in the patch, or beside its edge
 
 
 @pytest.fixture
@@ -93,9 +126,10 @@ def test_lessons_tell_places_of_the_window_in_the_texts_of_their_invocations(see
     (top, left, bottom, right), places = LAPTOP_WINDOWS[0], told_places([made], laptop())
     assert len(made.invocations) == len(made.told) == len(places) in (2, 3)
     for invocation, text, patches in zip(made.invocations, made.told, places.tolist(), strict=True):
+        assert patches[2:] == [IGNORE, IGNORE]  # the arm is where the recorded place was
         assert invocation.reference.query is not None
         assert XY_1000.sub("", text) == XY_1000.sub("", busy.written[invocation.reference.query])
-        for (x, y), patch in zip(XY_1000.findall(text), patches, strict=True):
+        for (x, y), patch in zip(XY_1000.findall(text), patches[:2], strict=True):
             row, column = divmod(patch, 8)
             assert row <= 8 * (int(y) / 1000 - top) / (bottom - top) < row + 1
             assert column <= 8 * (int(x) / 1000 - left) / (right - left) < column + 1
@@ -105,7 +139,7 @@ def test_lessons_are_of_every_moment_and_tell_every_patch(busy: Example) -> None
     rng = np.random.default_rng(0)
     made = [lessons_of(busy, laptop(), rng) for _ in range(400)]
     assert {each for one in made for each in one.invocations} == set(busy.invocations)
-    assert {patch for patch, _ in told_places(made, laptop()).tolist()} == set(range(64))
+    assert {patch for patch, *_ in told_places(made, laptop()).tolist()} == set(range(64))
 
 
 def test_a_lesson_s_place_reaches_the_prompt_and_its_label_the_pointer(busy: Example) -> None:
@@ -146,8 +180,8 @@ def test_lessons_teach_the_pointer_and_leave_the_flow_loss_alone(example: Exampl
     num_here, num_lessons, num_both = (
         model.counts(PonderBatch(), each, draws_of(each, model)).num_supervised for each in (batch, other, taught)
     )
-    assert (num_here, num_lessons, num_both) == (3, 22, 25)
-    torch.testing.assert_close(both.grounding, (3 * alone.grounding + 22 * lessons_alone.grounding) / 25)
+    assert (num_here, num_lessons, num_both) == (6, 44, 50)
+    torch.testing.assert_close(both.grounding, (6 * alone.grounding + 44 * lessons_alone.grounding) / 50)
 
 
 def test_the_hand_learns_to_point_and_no_row_of_the_table_is_taught_to() -> None:

@@ -1,15 +1,17 @@
-"""The laptop pair's head: it points at places of the front picture, and the expert acts on what is there.
+"""The laptop pair's head: it points at places in both pictures, and the expert acts on what is there.
 
 Every token of the front picture is scored, as it enters the last language layer, where it has read text and cognition.
-The mean of the tokens under the softmax of the scores, with the state's token, is a vector that conditions all adaRMS
-norms of the expert beside the flow time; a norm's style is linear in its condition, so the vector's share is added to
-styles that are tabulated. With `condition` at zero, its initial value, the network is pi0.5 bit for bit. All of it is
-float32.
+The mean of the tokens under the softmax of the scores is a place. With the state it asks every token of the second
+camera's picture whether that place is there; one more score says that it is out of view. Places, what the second camera
+sees of them, and the state's token are a vector that conditions all adaRMS norms of the expert beside the flow time; a
+norm's style is linear in its condition, so the vector's share is added to styles that are tabulated. With `condition`
+at zero, its initial value, the network is pi0.5 bit for bit. All of it is float32.
 
 pi0.5 has no such head. A hand of a few million weights that has hours to learn in needs it (docs/decisions.md).
 """
 
-# B batch, T prefix tokens, S tokens of the front picture, Q places, W language width, E expert width, M norms
+# B batch, T prefix tokens, S tokens of a picture, Q places, P = Q or with a second camera 2 Q, W language width,
+# E expert width, M norms
 
 from dataclasses import dataclass
 
@@ -18,13 +20,16 @@ from torch import Tensor, nn
 
 from dual_system.models.pi05.gemma import ActionExpert, RmsNorm
 
+_NEVER = torch.finfo(torch.float32).min
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Pointed:
     """What a pointer chose in one prefix, for all flow steps."""
 
     scores: Tensor
-    """(B, Q, S): logits over the front picture's tokens, row by row."""
+    """(B, P, S + 1): logits over the tokens of the front picture, row by row, for each place; then for each of them
+    over those of the second camera's picture. The last logit says that it is out of view, which in front none is."""
     styles: Tensor
     """(M, 3, B, 1, E), to be added to the styles of the flow time."""
 
@@ -36,12 +41,16 @@ class Pointed:
 class Pointer(nn.Module):
     """Points at ``num_places`` places: at what is to be grasped or pressed, and at where it is to go."""
 
-    def __init__(self, num_places: int, *, num_patches: int, width: int, expert_width: int) -> None:
+    def __init__(
+        self, num_places: int, *, num_patches: int, width: int, expert_width: int, has_second_camera: bool
+    ) -> None:
         super().__init__()
         self.num_patches = num_patches
         self.norm = RmsNorm(width)
         self.score = nn.Linear(width, num_places, bias=False)
-        self.read = nn.Linear((num_places + 1) * width, expert_width)
+        self.ask = nn.Linear(2 * width, width, bias=False) if has_second_camera else None
+        self.out_of_view = nn.Linear(2 * width, 1) if has_second_camera else None
+        self.read = nn.Linear((num_places * (2 if has_second_camera else 1) + 1) * width, expert_width)
         self.condition = nn.Linear(expert_width, expert_width, bias=False)
 
     @torch.no_grad()
@@ -56,14 +65,28 @@ class Pointer(nn.Module):
     def forward(self, hidden_BTW: Tensor, is_real_BT: Tensor, first: int, expert: ActionExpert) -> Pointed:
         """Points in a prefix whose front picture's tokens begin at ``first`` and whose last token is the state.
 
-        Without a front picture there is nothing to point at: its places are zero.
+        Without a front picture there is nothing to point at: its places are zero. Without a second one all is out of
+        its view.
         """
         normed_BTW = self.norm(hidden_BTW.float())
-        front_BSW = normed_BTW[:, first : first + self.num_patches]
-        is_seen_B1S = is_real_BT[:, None, first : first + self.num_patches]
-        scores_BQS = self.score(front_BSW).transpose(1, 2)
-        shares_BQS = scores_BQS.masked_fill(~is_seen_B1S, torch.finfo(torch.float32).min).softmax(dim=-1) * is_seen_B1S
-        places_BQW = shares_BQS @ front_BSW
-        read_BE = self.read(torch.cat([places_BQW.flatten(1), normed_BTW[:, -1]], dim=-1))
-        condition_BE = self.condition(nn.functional.silu(read_BE))
-        return Pointed(scores=scores_BQS, styles=expert.style_shift(condition_BE))
+        second, end = first + self.num_patches, first + 2 * self.num_patches
+        front_BSW, state_BW = normed_BTW[:, first:second], normed_BTW[:, -1]
+        never_BQ1 = front_BSW.new_full((len(front_BSW), self.score.out_features, 1), _NEVER)
+        scores_BQS = torch.cat([self.score(front_BSW).transpose(1, 2), never_BQ1], dim=-1)
+        scores, places_BQW = [scores_BQS], _mean(scores_BQS, front_BSW, is_real_BT[:, first:second])
+        read = [places_BQW.flatten(1), state_BW]
+        if self.ask is not None and self.out_of_view is not None:
+            second_BSW = normed_BTW[:, second:end]
+            asked_BQ2W = torch.cat([places_BQW, state_BW[:, None].expand_as(places_BQW)], dim=-1)
+            found_BQS = self.ask(asked_BQ2W) @ second_BSW.transpose(1, 2) / second_BSW.shape[-1] ** 0.5
+            scores.append(torch.cat([found_BQS, self.out_of_view(asked_BQ2W)], dim=-1))
+            read.append(_mean(scores[-1], second_BSW, is_real_BT[:, second:end]).flatten(1))
+        condition_BE = self.condition(nn.functional.silu(self.read(torch.cat(read, dim=-1))))
+        return Pointed(scores=torch.cat(scores, dim=1), styles=expert.style_shift(condition_BE))
+
+
+def _mean(scores_BQS: Tensor, tokens_BSW: Tensor, is_real_BS: Tensor) -> Tensor:
+    """The mean (B, Q, W) of the tokens under the softmax of the scores, of which there is one more; zero if unreal."""
+    is_seen_B1S = is_real_BS[:, None]
+    masked_BQS = torch.cat([scores_BQS[..., :-1].masked_fill(~is_seen_B1S, _NEVER), scores_BQS[..., -1:]], dim=-1)
+    return (masked_BQS.softmax(dim=-1)[..., :-1] * is_seen_B1S) @ tokens_BSW

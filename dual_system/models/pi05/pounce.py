@@ -99,7 +99,8 @@ class PounceConfig:
     frame_memory: FrameMemoryConfig | None = None
     """A memory of POUNCE's own past front pictures that modulates the expert (FrameSamp+Modul); None: there is none."""
     num_pointed: int = 0
-    """Places of the front picture that a pointer conditions the expert on (`pointer`); 0: pi0.5, which has none."""
+    """Places of the front picture that a pointer conditions the expert on (`pointer`), and where a second camera sees
+    them; 0: pi0.5, which has none."""
 
     def __post_init__(self) -> None:
         check_channel(self.cognition, self.reads_subgoal)
@@ -212,7 +213,13 @@ class Pounce(nn.Module):
         self.pointer = None
         if config.num_pointed:
             num_patches, expert_width = config.pi05.vision.num_patches, config.pi05.expert.width
-            self.pointer = Pointer(config.num_pointed, num_patches=num_patches, width=width, expert_width=expert_width)
+            self.pointer = Pointer(
+                config.num_pointed,
+                num_patches=num_patches,
+                width=width,
+                expert_width=expert_width,
+                has_second_camera=config.num_cameras > 1,
+            )
 
     @property
     def backbone(self) -> Backbone:
@@ -264,7 +271,7 @@ class Pounce(nn.Module):
         return seen, *self.frame_memory.tokens(features_BFCW, step_BF)
 
     def pointing(self, inputs: PounceInputs) -> tuple[PounceInputs, Tensor]:
-        """The inputs with their prefix filled in, and the pointer's scores (B, Q, S) of the front picture's patches."""
+        """The inputs with their prefix filled in, and the pointer's scores (B, P, S + 1), see `Pointed`."""
         cache = self.prefill(inputs)
         if cache.pointed is None:
             raise ValueError("num_pointed is 0: expected a POUNCE with a pointer")

@@ -64,8 +64,8 @@ def laptop(*, num_carriers: int = 1, cognition_size: int = 160) -> PounceConfig:
     network = PounceConfig(
         pi05=Pi05Config(
             vision=VisionConfig(width=128, depth=4, num_heads=4, mlp_width=256, image_px=64, patch_px=8),
-            language=GemmaConfig(width=128, depth=4, mlp_width=256, head_dim=32, num_heads=4),
-            expert=GemmaConfig(width=128, depth=4, mlp_width=256, head_dim=32, num_heads=4),
+            language=GemmaConfig(width=128, depth=2, mlp_width=256, head_dim=32, num_heads=4),
+            expert=GemmaConfig(width=128, depth=2, mlp_width=256, head_dim=32, num_heads=4),
             vocab_size=1024,
             action_dim=8,
             horizon=ROBOMME_HORIZON,
