@@ -22,7 +22,6 @@ from sim_client.launch import free_ports
 
 pytestmark = [
     pytest.mark.e2e,
-    pytest.mark.realtime,
     pytest.mark.sim,
     pytest.mark.slow,
     pytest.mark.filterwarnings("ignore:connect.. must be used as a context:DeprecationWarning"),  # openpi-client's

@@ -23,7 +23,7 @@ from protocol.mcap_log import EpisodeRecord, read_log
 from protocol.process import ENDING_S
 from sim_client.launch import free_ports
 
-pytestmark = [pytest.mark.e2e, pytest.mark.realtime, pytest.mark.slow]
+pytestmark = [pytest.mark.e2e, pytest.mark.slow]
 
 ROOT = Path(__file__).parents[2]
 TASK, INSTRUCTION, SEEDS = "OpenDrawer", "open the left drawer", (0, 1)

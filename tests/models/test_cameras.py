@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 
@@ -15,8 +17,10 @@ pytestmark = pytest.mark.sim
 
 
 @pytest.fixture(scope="module")
-def studio() -> Studio:
-    return Studio(image_px=64)
+def studio() -> Iterator[Studio]:
+    studio = Studio(image_px=64)
+    yield studio
+    studio.close()
 
 
 @pytest.mark.parametrize("seed", [3, 4, 5])
