@@ -353,7 +353,10 @@ def check_robot(r: m.Robot) -> None:
         _require(size in (0, r.num_proprio), r, name, f"{r.num_proprio} numbers", size)
     is_range = len(r.state_low) == len(r.state_high) and bool((r.state_low <= r.state_high).all())
     _require(is_range, r, "state_low", "<= state_high", "the opposite")
+    _text(r, "name", limit=MAX_ID)
     _require(len(r.cameras) <= MAX_IMAGES, r, "cameras", f"at most {MAX_IMAGES}", len(r.cameras))
+    longest = max(map(len, r.cameras), default=0)
+    _require(longest <= MAX_ID, r, "cameras", f"names of at most {MAX_ID} characters", longest)
     _index(r, "image_height", "image_width", "num_proprio", "stop_ticks")
     for field, expected, came in faults(r):
         raise _broken(r, field, expected, came)
@@ -412,11 +415,13 @@ def check_open_reply(r: m.OpenReply) -> None:
         if contract is not None:
             check_contract(contract)
     _members(r, r.members)
+    longest = max(map(len, r.warnings), default=0)
+    _require(longest <= MAX_TEXT, r, "warnings", f"texts of at most {MAX_TEXT} characters", longest)
 
 
 def check_close_request(r: m.CloseRequest) -> None:
     if r.result is not None:
-        check_episode_result(r.result)
+        check(r.result)
 
 
 def check_active_reply(r: m.ActiveReply) -> None:
@@ -460,6 +465,11 @@ def check_error_reply(r: Any) -> None:
     _text(r, "error")
 
 
+def check_engage_reply(r: m.EngageReply) -> None:
+    _text(r, "error")
+    _text(r, "level", limit=MAX_ID)
+
+
 CHECKS: dict[type, Callable[[Any], None]] = {
     m.Observation: check_observation,
     m.Query: check_query,
@@ -486,7 +496,7 @@ CHECKS: dict[type, Callable[[Any], None]] = {
     m.TimeRequest: check_time_request,
     m.TimeReply: check_time_reply,
     m.EngageRequest: check_engage_request,
-    m.EngageReply: check_error_reply,
+    m.EngageReply: check_engage_reply,
 }
 
 

@@ -23,7 +23,7 @@ from google.protobuf.message import Message as Proto
 
 from protocol import messages as m
 from protocol import splice
-from protocol.checks import MAX_IMAGES, MAX_MESSAGE_BYTES, MAX_PLAIN_MESSAGE_BYTES, check
+from protocol.checks import MAX_IMAGES, MAX_MESSAGE_BYTES, MAX_PLAIN_MESSAGE_BYTES, MAX_TEXT, check
 from protocol.errors import MalformedMessage, ProtocolError
 from protocol.ponderpounce.v1 import common_pb2, episode_pb2, stream_pb2
 
@@ -35,6 +35,19 @@ _PROTOS: dict[str, type[Proto]] = {
     for name in module.DESCRIPTOR.message_types_by_name
 }
 _DTYPES = {common_pb2.DTYPE_F32: np.dtype("<f4"), common_pb2.DTYPE_F16: np.dtype("<f2")}
+
+
+_WORDS: dict[type, tuple[str, ...]] = {
+    m.Event: ("text",),
+    m.Health: ("detail",),
+    m.EpisodeResult: ("reason",),
+    m.CloseRequest: ("result",),
+    m.OpenReply: ("error", "warnings"),
+    **dict.fromkeys(
+        (m.ContractReply, m.CloseReply, m.ActiveReply, m.JournalReply, m.TimeReply, m.EngageReply), ("error",)
+    ),
+}
+"""Fields with words for people."""
 
 
 def proto_class(cls: type) -> type[Proto]:
@@ -55,11 +68,12 @@ def type_name(cls: type) -> str:
 
 
 def encode(message: Any) -> bytes:
-    """Serializes one message.
+    """Serializes one message. Words for people that are too long are cut: they may quote what anybody has sent.
 
     Raises:
         MalformedMessage: the message breaks a rule of ``checks``.
     """
+    message = brief(message)
     check(message)
     if isinstance(message, m.Observation):
         small = _to_proto(message, but="images").SerializeToString()
@@ -88,6 +102,21 @@ def decode(cls: type[T], payload: bytes) -> T:
         raise MalformedMessage(cls.__name__, "*", f"{type_name(cls)} bytes", f"{error}") from None
     check(message)
     return message
+
+
+def brief(message: T) -> T:
+    """The message with its words for people cut to what `check` allows; itself if they are that short."""
+    cut = {name: _cut(getattr(message, name)) for name in _WORDS.get(type(message), ())}
+    changed = {name: words for name, words in cut.items() if words is not getattr(message, name)}
+    return dataclasses.replace(message, **changed) if changed else message  # type: ignore[type-var]
+
+
+def _cut(words: Any) -> Any:
+    if isinstance(words, str):
+        return words if len(words) <= MAX_TEXT else f"{words[: MAX_TEXT // 2]} ... ({len(words)} characters)"
+    if isinstance(words, tuple):
+        return tuple(map(_cut, words)) if any(len(each) > MAX_TEXT for each in words) else words
+    return brief(words)
 
 
 def _meta(image: m.Image) -> bytes:

@@ -114,7 +114,8 @@ class Link:
         Raises:
             MalformedMessage: the message breaks the protocol, which is a bug of this process.
         """
-        signed = dataclasses.replace(message, header=self.header(topic.name, at_ns, clock_id))  # type: ignore[type-var]
+        header = self.header(topic.name, at_ns, clock_id)
+        signed = codec.brief(dataclasses.replace(message, header=header))  # type: ignore[type-var]
         payload = codec.encode(signed)
         source_ns = getattr(signed, "source_ns", at_ns)
         self.bus.publish(
@@ -351,8 +352,16 @@ class Service:
                 log.exception("unexpected error in call %s", self._call.name)
                 self._link.drop(f"call {self._call.name}", DropReason.FAILED, repr(error)[:500])
                 reply = self._call.reply(error=f"unexpected error, see the log: {error!r}"[:1000])
-            request.reply(codec.encode(reply))
+            request.reply(self._encoded(reply))
         return len(requests)
+
+    def _encoded(self, reply: Any) -> bytes:
+        try:
+            return codec.encode(reply)
+        except ProtocolError as error:
+            log.exception("a reply to call %s breaks the protocol", self._call.name)
+            self._link.drop(f"call {self._call.name}", DropReason.FAILED, str(error))
+            return codec.encode(self._call.reply(error=f"unexpected error, see the log: {error}"))
 
 
 def source_of(header: Header) -> str:

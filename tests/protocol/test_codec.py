@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+from collections.abc import Iterator
 from enum import IntEnum
 from typing import Any
 
@@ -15,7 +16,16 @@ from hypothesis.extra import numpy as hnp
 
 from protocol import codec
 from protocol import messages as m
-from protocol.checks import MAX_INDEX, MAX_INSTANT_NS, MAX_MESSAGE_BYTES, MAX_PLAIN_MESSAGE_BYTES, MAX_UNIX_NS
+from protocol.checks import (
+    CHECKS,
+    MAX_INDEX,
+    MAX_INSTANT_NS,
+    MAX_MESSAGE_BYTES,
+    MAX_PLAIN_MESSAGE_BYTES,
+    MAX_TEXT,
+    MAX_UNIX_NS,
+    check,
+)
 from protocol.errors import MalformedMessage, ProtocolError
 from protocol.ponderpounce.v1 import common_pb2, episode_pb2, stream_pb2
 
@@ -31,6 +41,7 @@ INSTANT = st.integers(-MAX_INSTANT_NS, MAX_INSTANT_NS)
 ANCHOR = st.integers(-MAX_INSTANT_NS // 2, MAX_INSTANT_NS // 2)
 DURATION = st.integers(0, MAX_INSTANT_NS)
 TEXT = st.text(max_size=30)
+LONG = "x" * (MAX_TEXT + 1)
 NUMBER = st.floats(width=32, allow_nan=False, allow_infinity=False)
 DOUBLE = st.floats(allow_nan=False)
 
@@ -415,6 +426,56 @@ def test_a_flipped_bit_decodes_or_is_refused(cls: type, data: st.DataObject) -> 
         payload[data.draw(st.integers(0, len(payload) - 1))] ^= 1 << data.draw(st.integers(0, 7))
     with contextlib.suppress(MalformedMessage):
         codec.encode(codec.decode(cls, bytes(payload)))
+
+
+def with_a_long_text(value: Any) -> Iterator[Any]:
+    """The value with one of its texts, wherever it is, longer than any may be."""
+    if isinstance(value, str):
+        yield LONG
+    elif dataclasses.is_dataclass(value):
+        for field in dataclasses.fields(value):
+            for longer in with_a_long_text(getattr(value, field.name)):
+                yield dataclasses.replace(value, **{field.name: longer})  # type: ignore[type-var]
+    elif isinstance(value, tuple):
+        for place, each in enumerate(value):
+            yield from ((*value[:place], longer, *value[place + 1 :]) for longer in with_a_long_text(each))
+    elif isinstance(value, dict):
+        for key, each in value.items():
+            yield value | {LONG: each}
+            yield from (value | {key: longer} for longer in with_a_long_text(each))
+
+
+@pytest.mark.parametrize("cls", CHECKS, ids=lambda c: c.__name__)
+@given(data=st.data())
+@settings(max_examples=8, deadline=None)
+def test_no_text_of_any_message_is_longer_than_a_server_can_quote(cls: type, data: st.DataObject) -> None:
+    for longer in with_a_long_text(data.draw(MESSAGES[cls])):
+        with pytest.raises(MalformedMessage):
+            check(longer)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        m.Event(severity=m.Severity.ERROR, name="refused", text=LONG),
+        m.Health(state=m.ServingState.FAILED, version="1", detail=LONG),
+        m.OpenReply(error=LONG, warnings=("short", LONG)),
+        m.CloseReply(error=LONG),
+        m.EngageReply(error=LONG),
+        m.CloseRequest(
+            header=m.Header(),
+            result=m.EpisodeResult(
+                status=m.TaskStatus.ABORTED, is_success=False, reason=LONG, num_ticks=0, stream_sha256="",
+                statistics={},
+            ),
+        ),
+    ],
+    ids=lambda message: type(message).__name__,
+)  # fmt: skip
+def test_words_for_people_that_quote_too_much_are_cut_and_sent(message: Any) -> None:
+    sent = codec.decode(type(message), codec.encode(message))
+    assert f"... ({len(LONG)} characters)" in repr(sent)
+    assert repr(sent).startswith(repr(message)[:80])
 
 
 @given(obs=MESSAGES[m.Observation])

@@ -340,6 +340,30 @@ def test_a_call_that_does_not_decode_is_answered_and_counted(
     assert dict(receiver.dropped) == {"refused_call": 1}
 
 
+@pytest.mark.parametrize(
+    "handler",
+    [lambda request: m.TimeReply(t1_ns=8, t2_ns=7), lambda request: m.TimeReply(clock_id="c" * 1000)],
+    ids=["times", "name"],
+)
+def test_a_reply_of_ours_that_breaks_the_protocol_ends_no_process(
+    sender: Link, receiver: Link, serve_time: Callable[[Any], None], handler: Callable[[Any], Any]
+) -> None:
+    serve_time(handler)
+    reply = sender.call(topics.TIME, "ponder", m.TimeRequest(t0_ns=6), timeout_ns=1)
+    assert reply.error.startswith("unexpected error, see the log: TimeReply.")
+    assert dict(receiver.dropped) == {"failed": 1}
+
+
+def test_a_refusal_that_quotes_all_that_came_is_cut(sender: Link, serve_time: Callable[[Any], None]) -> None:
+    def refuse(request: Any) -> Any:
+        raise ProtocolError("expected less than " + "x" * 50_000)
+
+    serve_time(refuse)
+    error = sender.call(topics.TIME, "ponder", m.TimeRequest(t0_ns=6), timeout_ns=1).error
+    assert error.startswith("expected less than xxx")
+    assert error.endswith("... (50019 characters)")
+
+
 def test_an_unreadable_answer_is_a_failed_call(bus: LocalBus, sender: Link) -> None:
     inbox = bus.serve(topics.call_key(topics.TIME, "r0", "ponder"))
     bus.add_participant(lambda: any([request.reply(b"\xff") is None for request in inbox.drain()]))

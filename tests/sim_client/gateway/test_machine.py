@@ -366,6 +366,16 @@ def test_pictures_are_resized_where_that_was_asked_for(bench_with: Callable[...,
     assert bench.ask(step_of(begins=True, frames={"front": big, "wrist": big})).tick == 0
 
 
+def test_an_instruction_that_is_too_long_is_refused_and_the_next_episode_is_played(
+    bench_with: Callable[..., Any], step_of: StepOf, tmp_path: Path
+) -> None:
+    bench = bench_with(out=tmp_path)
+    with pytest.raises(Refused, match="instruction: expected at most 20000 characters, came 30000"):
+        bench.ask(step_of(0, begins=True, instruction="x" * 30_000))
+    assert len(play(bench, step_of, 3)) == 3
+    assert len(list(tmp_path.rglob("*.mcap*"))) == 1
+
+
 def test_what_the_servers_refuse_is_told_and_the_next_may_try(
     bench_with: Callable[..., Any], step_of: StepOf, robot_with: Callable[..., m.Robot]
 ) -> None:
