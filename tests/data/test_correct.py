@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ from dual_system.data.episode import unpack
 from dual_system.data.errors import DatasetError
 from dual_system.models.ponder.configs import tiny_cpu
 from dual_system.models.ponder.network import Ponder
+from dual_system.tasks.environment import Snapshot, make_environment
 from dual_system.training.data import TrainingSet
 from dual_system.training.example import ExampleConfig, make_example
 from protocol.mcap_log import EpisodeRecord, read_log
@@ -125,6 +127,31 @@ def test_another_subgoal_is_refused(log: Path, record: EpisodeRecord, monkeypatc
     monkeypatch.setattr(module, "read_log", lambda path: dataclasses.replace(record, subgoals=other))
     with pytest.raises(DatasetError, match=r"the subgoal is .* here and 'pick up the second cube' in the log"):
         work_out(Job(path=log, part=1, options=options(log, log.parent)))
+
+
+@pytest.mark.parametrize(("subgoal_index", "is_taken"), [(0, True), (1, False)])
+def test_after_something_was_dropped_the_text_may_be_that_of_its_grasp(
+    log: Path, record: EpisodeRecord, subgoal_index: int, is_taken: bool
+) -> None:
+    """The policy's log has each subtask's own text; here texts follow what happens."""
+    num_ticks = 30
+    with make_environment(record.info.task, render=False) as environment:
+        first = environment.reset(record.info.seed, record.info.difficulty)
+    dropped = dataclasses.replace(
+        first,
+        state=record.observations[num_ticks].proprio,
+        subtask_index=1,
+        subgoal_index=subgoal_index,
+        simple_subgoal="pick up what was dropped",
+    )
+
+    class Replayed:
+        def step(self, snapshot: Snapshot, action: np.ndarray) -> Snapshot:
+            return dropped
+
+    actions = [tick.action for tick in record.ticks[:num_ticks]]
+    with contextlib.nullcontext() if is_taken else pytest.raises(DatasetError, match="the subgoal is 'pick up what"):
+        assert module._acted_out(log, record, Replayed(), first, actions) is dropped  # type: ignore[arg-type]
 
 
 def test_a_log_with_a_gap_is_refused(log: Path, record: EpisodeRecord, monkeypatch: pytest.MonkeyPatch) -> None:
