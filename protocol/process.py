@@ -19,9 +19,8 @@ _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 ENDING_S = 30.0
 """What a daemon has to end in once it was told to: an episode's log is closed, its servers are told and end in 5 s."""
 IDLE_WAIT_NS = 20_000_000  # an idle daemon steps this often: its heartbeat depends on it
-
-
 _STDERR = 2
+
 PARENT_VARIABLE = "PONDERPOUNCE_PARENT_PID"
 """Environment variable with the process id of a parent; a daemon that has it exits when the parent is gone."""
 

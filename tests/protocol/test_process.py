@@ -49,7 +49,7 @@ def test_a_process_that_cannot_drain_leaves_the_signal_alone() -> None:
 
 
 STUCK = """
-import signal, threading, time
+import signal, threading
 from protocol.process import PARENT_VARIABLE, StopFlag
 
 def of_the_bus():
@@ -59,7 +59,7 @@ threading.Thread(target=of_the_bus, daemon=True).start()
 should_stop = StopFlag(ends_within_s={ends_within_s})
 signal.raise_signal(signal.{name})
 assert should_stop()
-time.sleep({ending_s})
+threading.Event().wait({ending_s})
 """
 
 
