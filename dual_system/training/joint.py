@@ -341,7 +341,7 @@ def _pointing(pounce: Pounce, invocations: PounceBatch) -> tuple[PounceInputs, T
     """The invocations' inputs, their prefix filled in, and the loss of the places that they and their lessons teach."""
     read, scores, targets = [], [], []
     for inputs, places_IQ in invocations.pointing_tasks():
-        filled, scores_IQS = pounce.pointing(inputs)
+        filled, scores_IQS = pounce.pointing(inputs, places_IQ)
         is_known_IQ = places_IQ != IGNORE
         read.append(filled)
         scores.append(scores_IQS[is_known_IQ])

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from dual_system.models.pi05.pounce import Pounce, PounceConfig, PounceInputs
+from dual_system.models.ponder.context import IGNORE
 from dual_system.models.pounce.checkpoint import load_bundle, random_bundle, save_bundle
 from dual_system.models.pounce.configs import tiny_cpu
 from dual_system.models.pounce.family import random_model
@@ -26,7 +27,7 @@ def pounce(config: PounceConfig = POINTING, *, is_trained: bool = True) -> Pounc
     assert isinstance(model, Pounce)
     if is_trained and model.pointer is not None:
         with torch.no_grad():
-            model.pointer.condition.weight.normal_(generator=torch.Generator().manual_seed(1))
+            model.pointer.condition.weight.normal_(std=0.1, generator=torch.Generator().manual_seed(1))
     return model
 
 
@@ -61,7 +62,7 @@ def test_the_others_are_of_the_second_camera_s_and_it_may_be_out_of_view() -> No
     model, inputs = pounce(), POINTING.example_inputs(2)
     _, before_BQS = model.pointing(inputs)
     images = inputs.images.clone()
-    images[:, 1, :, 28:56, :28] += 0.5  # the first patch of the second row
+    images[:, 1, :, 28:56, :28] += 5.0  # the first patch of the second row
     _, after_BQS = model.pointing(replace(inputs, images=images))
     changed_QS = (after_BQS - before_BQS).abs().mean(dim=0)
     assert changed_QS[2:, :-1].sum(dim=0).argmax() == round(NUM_PATCHES**0.5)
@@ -81,6 +82,48 @@ def test_what_is_out_of_view_is_not_read_from_the_second_picture() -> None:
     assert away is not None
     assert same is not None
     assert torch.equal(away.styles, same.styles)
+
+
+def test_the_expert_acts_on_what_is_taught_whatever_was_chosen() -> None:
+    model, inputs = pounce(), POINTING.example_inputs(2)
+    taught_BP = torch.tensor([[3, 17, NUM_PATCHES, 5], [0, 40, 2, NUM_PATCHES]])
+    _, taught = model.pointing(inputs, taught_BP)
+    before = model.prefill(inputs, taught_BP).pointed
+    assert model.pointer is not None
+    with torch.no_grad():
+        model.pointer.score.weight.mul_(-3)
+        model.pointer.out_of_view.bias.fill_(1e4)  # type: ignore[union-attr]
+        after = model.prefill(inputs, taught_BP).pointed
+    assert before is not None
+    assert after is not None
+    assert torch.equal(before.styles, after.styles)
+    assert torch.equal(before.scores, taught)
+    assert not torch.equal(before.scores, after.scores)
+
+
+def test_a_place_that_is_not_taught_is_the_chosen_one() -> None:
+    model, inputs = pounce(), POINTING.example_inputs(2)
+    chosen, untaught = model.prefill(inputs).pointed, torch.full((2, 4), IGNORE)
+    same = model.prefill(inputs, untaught).pointed
+    other = model.prefill(inputs, untaught.index_fill(1, torch.tensor([1]), 3)).pointed
+    assert chosen is not None
+    assert same is not None
+    assert other is not None
+    assert torch.equal(chosen.styles, same.styles)
+    assert not torch.equal(chosen.styles, other.styles)
+
+
+def test_a_choice_that_is_certain_is_acted_on_as_if_it_were_taught() -> None:
+    one = replace(POINTING, num_cameras=1)
+    model, inputs = pounce(one), one.example_inputs(2)
+    assert model.pointer is not None
+    with torch.no_grad():
+        model.pointer.score.weight.mul_(1e6)
+        chosen = model.prefill(inputs).pointed
+        assert chosen is not None
+        taught = model.prefill(inputs, chosen.scores.argmax(dim=-1)).pointed
+    assert taught is not None
+    torch.testing.assert_close(chosen.styles, taught.styles)
 
 
 def test_with_one_camera_it_points_in_front_alone() -> None:

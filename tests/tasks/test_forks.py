@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import cache
 from itertools import islice
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,8 +33,16 @@ SEEDS = {"PickHighlight": 1, "BinFill": 8, "PickXtimes": 1, "SwingXtimes": 1, "S
 SEEDS |= VIDEO_SEEDS
 """Where pairs are known to be."""
 
-every_kind = pytest.mark.parametrize("name", SEEDS)
-every_video = pytest.mark.parametrize("name", VIDEO_SEEDS)
+LIKE_ANOTHER = ("RouteStick", "VideoRepick", "VideoPlaceButton", "SwingXtimes", "VideoUnmaskSwap")
+"""Tasks whose past is told like that of another one here; a pair takes seconds to find."""
+
+
+def each_of(names: Iterable[str]) -> list[Any]:
+    return [pytest.param(name, marks=[pytest.mark.acceptance] * (name in LIKE_ANOTHER)) for name in names]
+
+
+every_kind = pytest.mark.parametrize("name", each_of(SEEDS))
+every_video = pytest.mark.parametrize("name", each_of(VIDEO_SEEDS))
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -157,7 +158,7 @@ def test_a_text_without_places_teaches_nothing(example: Example) -> None:
     assert float(model(PonderBatch(), batch, draws_of(batch, model)).grounding.detach()) == 0
 
 
-def test_the_flow_loss_is_that_without_labels_and_the_pointers_is_added(example: Example) -> None:
+def test_a_fresh_pointer_s_loss_is_added_and_leaves_that_of_the_flow_alone(example: Example) -> None:
     batch, model = batch_of(told(example, "pick up the cube at [100, 900]")), joint()
     draws = draws_of(batch, model)
     loss = model(PonderBatch(), batch, draws)
@@ -168,6 +169,18 @@ def test_the_flow_loss_is_that_without_labels_and_the_pointers_is_added(example:
     reached = {name for name, each in model.named_parameters() if each.grad is not None and bool(each.grad.any())}
     assert "pounce.pointer.score.weight" in reached
     assert not any("expert" in name or "pointer.condition" in name for name in reached)
+
+
+def test_the_flow_is_learned_on_what_is_taught(example: Example) -> None:
+    batch, model = batch_of(told(example, "pick up the cube at [100, 900]")), joint()
+    elsewhere = batch_of(told(example, "pick up the cube at [900, 100]"))
+    pointer = cast(Pounce, model.pounce).pointer
+    assert pointer is not None
+    torch.nn.init.normal_(pointer.condition.weight, std=0.1, generator=torch.Generator().manual_seed(1))
+    draws = draws_of(batch, model)
+    taught = [replace(batch, places_IQ=each) for each in (batch.places_IQ, elsewhere.places_IQ, None)]
+    there, far, chosen = (float(model(PonderBatch(), each, draws).flow_matching.detach()) for each in taught)
+    assert len({there, far, chosen}) == 3
 
 
 def test_lessons_teach_the_pointer_and_leave_the_flow_loss_alone(example: Example, busy: Example) -> None:

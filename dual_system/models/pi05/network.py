@@ -195,10 +195,11 @@ class Pi05(nn.Module):
             is_isolated=is_isolated,
         )
 
-    def prefill(self, prefix: Prefix, pointer: Pointer | None = None) -> PrefixCache:
+    def prefill(self, prefix: Prefix, pointer: Pointer | None = None, taught_BP: Tensor | None = None) -> PrefixCache:
         """Runs the prefix through the language layers and keeps every layer's keys and values.
 
-        The last layer computes only keys and values, because nothing uses its output. A ``pointer`` reads its input.
+        The last layer computes only keys and values, because nothing uses its output. A ``pointer`` reads its input,
+        and is told ``taught_BP`` in training (`Pointer.forward`).
         """
         runs = [self._run_prefix(stream, last_layer_output=False) for stream in prefix.streams()]
         keys, values = (
@@ -209,7 +210,7 @@ class Pi05(nn.Module):
         pointed = None
         if pointer is not None:
             hidden_BTW = torch.cat([run[2] for run in runs], dim=1)
-            pointed = pointer(hidden_BTW, prefix.is_real, prefix.num_cognition, self.expert)
+            pointed = pointer(prefix.embeds, hidden_BTW, prefix.is_real, prefix.num_cognition, self.expert, taught_BP)
         return PrefixCache(
             keys=keys, values=values, visible=prefix.is_real, next_position=next_position_B, pointed=pointed
         )

@@ -253,11 +253,14 @@ class Pounce(nn.Module):
             seen_BSW=inputs.seen if seen_BSW is None else seen_BSW,
         )
 
-    def prefill(self, inputs: PounceInputs) -> PrefixCache:
-        """Embeds [P][images][text][state] and runs it through the language layers once; encodes the frame memory."""
+    def prefill(self, inputs: PounceInputs, taught_BP: Tensor | None = None) -> PrefixCache:
+        """Embeds [P][images][text][state] and runs it through the language layers once; encodes the frame memory.
+
+        ``taught_BP``: what a pointer reads in training (`Pointer.forward`).
+        """
         if inputs.prefilled is not None:
             return inputs.prefilled
-        cache = self.pi05.prefill(self.embed_prefix(inputs), self.pointer)
+        cache = self.pi05.prefill(self.embed_prefix(inputs), self.pointer, taught_BP)
         if self.frame_memory is None:
             return cache
         return replace(cache, memory=self.frame_memory(*self._past_features(inputs, self.frame_memory.config)))
@@ -270,9 +273,9 @@ class Pounce(nn.Module):
         seen = replace(inputs, past_features=features_BFCW, past_step=step_BF)
         return seen, *self.frame_memory.tokens(features_BFCW, step_BF)
 
-    def pointing(self, inputs: PounceInputs) -> tuple[PounceInputs, Tensor]:
+    def pointing(self, inputs: PounceInputs, taught_BP: Tensor | None = None) -> tuple[PounceInputs, Tensor]:
         """The inputs with their prefix filled in, and the pointer's scores (B, P, S + 1), see `Pointed`."""
-        cache = self.prefill(inputs)
+        cache = self.prefill(inputs, taught_BP)
         if cache.pointed is None:
             raise ValueError("num_pointed is 0: expected a POUNCE with a pointer")
         return replace(inputs, prefilled=cache), cache.pointed.scores
