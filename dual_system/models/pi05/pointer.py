@@ -1,7 +1,7 @@
 """The laptop pair's head: it points at places in both pictures, and the expert acts on what is there.
 
 Every token of the front picture is scored, as it enters the last language layer, where it has read text and cognition.
-Under the softmax of the scores the tokens, as the vision tower sees them, have a mean: what is there, and where that is.
+Under the softmax of the scores the tokens, as the vision tower sees them, have a mean: what is there, and where it is.
 With the state it asks every token of the second camera's picture whether that place is there; one more score says that
 it is out of view. Both means, and the state's token, are a vector that conditions all adaRMS norms of the expert beside
 the flow time; a norm's style is linear in its condition, so the vector's share is added to styles that are tabulated.
