@@ -138,7 +138,7 @@ def laptop() -> PonderConfig:
     return PonderConfig(
         hidden_size=160,
         ffn_size=480,
-        num_layers=8,
+        num_layers=4,
         num_query_heads=4,
         num_kv_heads=2,
         head_dim=32,
