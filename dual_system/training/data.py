@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,7 +34,6 @@ from dual_system.training.parallel import World
 from dual_system.training.picture_store import PictureStore, Views
 
 _QUANTILES = (0.01, 0.99)
-_SYSTEMS = ("pounce", "ponder")
 _MIN_REACH = 1e-3
 _MIN_SPAN = 1e-3
 """Smallest span of a dim: one that hardly moves is not stretched to fill [-1, 1]."""
@@ -56,10 +55,15 @@ class PictureSizes:
     """The past pictures of a POUNCE with a frame memory, which needs ``pounce_px``."""
 
     @property
-    def key(self) -> str:
-        """Identifies the sizes: equal keys give equal pictures of an episode."""
+    def keys(self) -> dict[str, str]:
+        """Identifies the sizes of each system that reads pictures: equal keys give equal pictures of an episode."""
         windows = f" {self.windows}" if self.windows else ""
-        return f"{None if self.form is None else (self.form.reader, self.form.image_px)} {self.pounce_px}{windows}"
+        keys = {} if self.pounce_px is None else {"pounce": f"pounce {self.pounce_px}{windows}"}
+        return keys if self.form is None else keys | {"ponder": f"ponder {self.form.reader} {self.form.image_px}"}
+
+    def read(self, system: str, views: tuple[Picture, ...]) -> tuple[Picture, ...]:
+        """What a system reads of a robot's pictures at one instant."""
+        return self.of_ponder(views) if system == "ponder" else self.of_pounce(views)
 
     def of_ponder(self, views: tuple[Picture, ...]) -> tuple[Picture, ...]:
         return () if self.form is None else tuple(self.form.reader.images(views, self.form.image_px))
@@ -172,7 +176,7 @@ class TrainingSet:
         self.roots = roots
         self._sizes, self._demo_hz = sizes or PictureSizes(), demo_hz
         self._folder, self._is_embedded = store, False
-        self._store = None if store is None else PictureStore(store, self._sizes.key)
+        self._stores = {} if store is None else _stores(store, self._sizes.keys)
         self._sources = [source for root in roots for source in _sources(Dataset(root), tasks)]
         found_px = {source.dataset.image_px for source in self._sources}
         folders = ", ".join(map(str, roots))
@@ -291,12 +295,14 @@ class TrainingSet:
             raise ValueError("features of frozen towers are kept beside the pictures: give a --picture-store")
         found = copy.copy(self)
         found._cache, found._cached_bytes, found._is_embedded = OrderedDict(), 0, True
-        found._store = store = PictureStore(self._folder, f"{self._sizes.key} {towers.key}")
+        keys = self._sizes.keys
+        found._stores = _stores(self._folder, {system: f"{keys[system]} {towers.keys[system]}" for system in keys})
         for source in _beginning_with_own(self._sources, world):
-            if not store.has(key := self._key(source)):
-                rendered = sorted({*_instants(source, self._demo_hz)[1]})
-                features = towers.features(*self._decoded(source, rendered))
-                store.write(key, dict(zip(_SYSTEMS, features, strict=True)))
+            lacking = [system for system, store in found._stores.items() if not store.has(self._key(source))]
+            if lacking:
+                pictures = self._decoded(source, sorted({*_instants(source, self._demo_hz)[1]}), lacking)
+                for system in lacking:
+                    found._stores[system].write(self._key(source), towers.features(system, pictures[system]))
         return found
 
     def _read(self, number: int) -> TrainingEpisode:
@@ -349,31 +355,35 @@ class TrainingSet:
 
     def _pictures(self, source: _Source, rows: Sequence[int]) -> tuple[Views, Views]:
         """POUNCE's views and PONDER's images at ``rows``, which may repeat."""
-        if self._sizes == PictureSizes():
-            return [()] * len(rows), [()] * len(rows)
         once = sorted(set(rows))
-        views, images = (dict(zip(once, each, strict=True)) for each in self._decoded(source, once))
-        return [views[row] for row in rows], [images[row] for row in rows]
+        found = {
+            system: dict(zip(once, views, strict=True))
+            for system, views in self._decoded(source, once, list(self._sizes.keys)).items()
+        }
+        views, images = ([found[each][row] if each in found else () for row in rows] for each in ("pounce", "ponder"))
+        return views, images
 
-    def _decoded(self, source: _Source, rows: Sequence[int]) -> tuple[Views, ...]:
-        """`_pictures` of distinct rows, from the store if it has them.
+    def _decoded(self, source: _Source, rows: Sequence[int], systems: Sequence[str]) -> dict[str, Views]:
+        """What these systems read at distinct rows, from the store if it has them.
 
         Raises OSError if they are features and the store lacks them, because the disk is full or a file is damaged.
         """
         key = self._key(source)
-        if self._store is not None and (kept := self._store.read(key, len(rows), _SYSTEMS)) is not None:
-            return kept
-        if self._is_embedded:
+        stores = {system: store for system, store in self._stores.items() if system in systems}
+        kept = {system: store.read(key, len(rows)) for system, store in stores.items()}
+        found = {system: views for system, views in kept.items() if views is not None}
+        lacking = [system for system in systems if system not in found]
+        if lacking and self._is_embedded:
             raise OSError(
                 f"{self._folder}: no features of {source.entry.task} {source.entry.seed}, or a damaged file; "
                 "make room there, and start again"
             )
-        whole = list(source.frames(rows))
-        views: Views = [self._sizes.of_pounce(each) for each in whole]
-        images: Views = [self._sizes.of_ponder(each) for each in whole]
-        if self._store is not None:
-            self._store.write(key, dict(zip(_SYSTEMS, (views, images), strict=True)))
-        return views, images
+        whole = list(source.frames(rows)) if lacking else []
+        for system in lacking:
+            found[system] = [self._sizes.read(system, each) for each in whole]
+            if system in stores:
+                stores[system].write(key, found[system])
+        return found
 
     def _key(self, source: _Source) -> bytes:
         return source.key + (f" {self._demo_hz}".encode() if self._demo_hz != 1 else b"")
@@ -388,6 +398,10 @@ class TrainingSet:
             ValueError: the space is another robot's.
         """
         return _statistics(self._sources, self.robot.dims_in(space)[1], horizon, space, by_row=by_row)
+
+
+def _stores(folder: Path, keys: Mapping[str, str]) -> dict[str, PictureStore]:
+    return {system: PictureStore(folder, key) for system, key in keys.items()}
 
 
 def _beginning_with_own(sources: Sequence[_Source], world: World) -> Iterator[_Source]:

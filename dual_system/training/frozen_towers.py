@@ -28,23 +28,25 @@ class FrozenTowers:
     def __init__(self, model: JointModel) -> None:
         """Raises ValueError unless every system that the run trains with has a frozen one; POUNCE's must be pi0.5."""
         self._ponder, self._pounce = model.ponder, model.pounce
-        used: list[nn.Module] = []
+        used: dict[str, tuple[nn.Module, ...]] = {}
         if model.runs_ponder:
-            used.append(model.ponder.qwen.model.visual)
+            used["ponder"] = (model.ponder.qwen.model.visual,)
         if model.trains != "ponder":
             if not isinstance(model.pounce, Pounce):
                 raise ValueError("features of frozen towers are stored for pi0.5, and this POUNCE is a GR00T")
-            used += model.pounce.backbone.vision
-        if any(parameter.requires_grad for tower in used for parameter in tower.parameters()):
+            used["pounce"] = model.pounce.backbone.vision
+        towers = [tower for each in used.values() for tower in each]
+        if any(parameter.requires_grad for tower in towers for parameter in tower.parameters()):
             raise ValueError(
                 "the recipe trains a vision tower: its features change with every step. Take a recipe whose towers are "
                 "frozen, or leave --frozen-features out"
             )
-        self.key = _hash(used)
+        self.keys = {system: _hash(each) for system, each in used.items()}
+        """Identifies the towers of each system that the run uses."""
 
-    def features(self, views: Views, images: Views) -> tuple[Views, Views]:
-        """POUNCE's views and PONDER's images as (S, W) float16 tokens each; an instant without any stays so."""
-        return _each(views, self._of_pounce), _each(images, self._of_ponder)
+    def features(self, system: str, views: Views) -> Views:
+        """A system's pictures as (S, W) float16 tokens each; an instant without any stays so."""
+        return _each(views, self._of_ponder if system == "ponder" else self._of_pounce)
 
     def _of_pounce(self, pictures_MPP3: Tensor) -> Tensor:
         pixels = pictures_MPP3.permute(0, 3, 1, 2).float() / 127.5 - 1.0

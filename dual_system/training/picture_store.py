@@ -1,6 +1,7 @@
 """Decoded pictures on disk, at the networks' sizes, or what frozen towers make of them: once, not per process and run.
 
-There is one file per episode. A process writes a missing file; several may do so at once with the same bytes.
+There is one file per system and episode, so that a run finds what another one with the same tower has stored. A process
+writes a missing file; several may do so at once with the same bytes.
 """
 
 from __future__ import annotations
@@ -31,21 +32,21 @@ class PictureStore:
         self._folder = folder / _name(kind.encode())
         self._folder.mkdir(parents=True, exist_ok=True)
 
-    def read(self, episode: bytes, num_instants: int, names: tuple[str, ...]) -> tuple[Views, ...] | None:
-        """The views that `write` stored under these names; None if the file is missing or damaged."""
+    def read(self, episode: bytes, num_instants: int) -> Views | None:
+        """The views that `write` stored; None if the file is missing or damaged."""
         try:
             with (self._folder / f"{_name(episode)}.npz").open("rb") as file:  # np.load would leave a damaged one open
                 arrays = dict(np.load(file, allow_pickle=False))
         except (OSError, ValueError, EOFError, zipfile.BadZipFile):
             return None
-        found = tuple(_instants(arrays, name, num_instants) for name in names)
-        return found if all(len(views) == num_instants for views in found) else None
+        views = _instants([arrays[key] for key in sorted(arrays, key=int)], num_instants)
+        return views if len(views) == num_instants else None
 
     def has(self, episode: bytes) -> bool:
         """Whether there is a file of this episode."""
         return (self._folder / f"{_name(episode)}.npz").exists()
 
-    def write(self, episode: bytes, views: dict[str, Views]) -> None:
+    def write(self, episode: bytes, views: Views) -> None:
         """Stores pictures, or features of one shape. Does nothing if the disk is full: training goes on without."""
         path = self._folder / f"{_name(episode)}.npz"
         partial = path.with_suffix(f".{uuid.uuid4().hex}")  # unique among processes and hosts
@@ -61,22 +62,20 @@ def _name(key: bytes) -> str:
     return hashlib.blake2b(key, digest_size=12).hexdigest()
 
 
-def _arrays(views: dict[str, Views]) -> dict[str, NDArray[np.uint8 | np.float16]]:
-    """``name/number``: (instants, *picture) of each view, for the last instants, those that have it."""
+def _arrays(views: Views) -> dict[str, NDArray[np.uint8 | np.float16]]:
+    """By its number: (instants, *picture) of each view, for the last instants, those that have it."""
     return {
-        f"{name}/{number}": np.stack([pictures[number] for pictures in instants if number < len(pictures)])
-        for name, instants in views.items()
-        for number in range(max(map(len, instants), default=0))
+        str(number): np.stack([pictures[number] for pictures in views if number < len(pictures)])
+        for number in range(max(map(len, views), default=0))
     }
 
 
-def _instants(arrays: dict[str, NDArray[np.uint8 | np.float16]], name: str, num_instants: int) -> Views:
-    mine = [array for key, array in arrays.items() if key.rpartition("/")[0] == name]
-    if not mine:
+def _instants(arrays: list[NDArray[np.uint8 | np.float16]], num_instants: int) -> Views:
+    if not arrays:
         return [()] * num_instants
-    count = len(mine[0])
-    late = [count - len(array) for array in mine]  # the first instant with each view
+    count = len(arrays[0])
+    late = [count - len(array) for array in arrays]  # the first instant with each view
     return [
-        tuple(array[instant - first] for array, first in zip(mine, late, strict=True) if instant >= first)
+        tuple(array[instant - first] for array, first in zip(arrays, late, strict=True) if instant >= first)
         for instant in range(count)
     ]

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 import torch
 
+from dual_system.data.dataset import Dataset
 from dual_system.models.pi05.modulation import NO_FRAME
 from dual_system.models.pi05.pounce import PounceInputs
 from dual_system.training import recipes, train
 from dual_system.training.build import Start
-from dual_system.training.data import TrainingSet
+from dual_system.training.data import PictureSizes, TrainingSet
 from dual_system.training.frozen_towers import FrozenTowers
 from dual_system.training.joint import JointModel
 from dual_system.training.parallel import World
@@ -93,6 +94,23 @@ def test_other_towers_have_other_features(folder: Path, tmp_path: Path) -> None:
     assert np.array_equal(first.images[0][0], second.images[0][0])
 
 
+def test_a_run_of_both_systems_finds_what_runs_of_either_stored(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = recipe_of("tiny")
+    model, _ = train.build(run, TrainingSet(folder), Start())
+    both = train._picture_sizes(run, model)
+    for sizes in (PictureSizes(form=both.form), replace(both, form=None)):
+        TrainingSet(folder, sizes=sizes, store=tmp_path).embedded(FrozenTowers(model), World())
+    monkeypatch.setattr(FrozenTowers, "features", lambda *_: pytest.fail("a tower was asked again"))
+    monkeypatch.setattr(Dataset, "views", lambda *_: pytest.fail("a video was decoded again"))
+    episode = TrainingSet(folder, sizes=both, store=tmp_path).embedded(FrozenTowers(model), World())[0]
+    assert {frame.dtype for frame in (*episode.views[0], *episode.images[0])} == {np.dtype(np.float16)}
+    assert {frame.dtype for frame in TrainingSet(folder, sizes=both, store=tmp_path)[0].views[0]} == {
+        np.dtype(np.uint8)
+    }
+
+
 def test_a_set_without_a_store_says_so(folder: Path) -> None:
     run = recipe_of("tiny")
     model, _ = train.build(run, TrainingSet(folder), Start())
@@ -119,11 +137,12 @@ def test_several_processes_begin_at_different_episodes_and_find_what_others_stor
     data = TrainingSet(folder, sizes=train._picture_sizes(run, model), store=tmp_path)
     computed, features = list[int](), FrozenTowers.features
 
-    def counted(self: FrozenTowers, views: Any, images: Any) -> Any:
-        computed.append(len(views))
-        if len(computed) == 1:  # the second of two processes; while it computes, the first one runs
-            data.embedded(FrozenTowers(model), World())
-        return features(self, views, images)
+    def counted(self: FrozenTowers, system: str, views: Any) -> Any:
+        if system == "pounce":
+            computed.append(len(views))
+            if len(computed) == 1:  # the second of two processes; while it computes, the first one runs
+                data.embedded(FrozenTowers(model), World())
+        return features(self, system, views)
 
     monkeypatch.setattr(FrozenTowers, "features", counted)
     data.embedded(FrozenTowers(model), World(rank=1, size=2))
