@@ -1,7 +1,7 @@
-"""What a robot's description must say of each dimension of its commands, so that it can be stopped.
+"""What a robot's description must say: of its commands as a whole, and of each dimension, so that it can be stopped.
 
-Every rule here is one that the ladder relies on: a velocity that cannot reach zero in time, or a line to a value that
-is not measured, is refused before anything moves.
+Every rule of a dimension is one that the ladder relies on: a velocity that cannot reach zero in time, or a line to a
+value that is not measured, is refused before anything moves.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from protocol.messages import AtExit, AtStop, Dimension, DimensionKind, Robot
 
 MIN_CONTROL_HZ, MAX_CONTROL_HZ = 5, 100
-_MAX_TEXT = 128
+MAX_CAMERAS, MAX_NAME = 8, 128
 _MAX_PICTURE_NS = 10**18  # as instants
 
 AT_STOP = {
@@ -26,7 +26,9 @@ AT_STOP = {
 
 
 def faults(robot: Robot) -> Iterator[tuple[str, str, object]]:
-    """Yields (field, expected, came) of all that is wrong with a robot's rates, dimensions, pictures and leaving."""
+    """Yields (field, expected, came) of all that is wrong with a robot whose vectors have the right sizes."""
+    yield from _ranges(robot)
+    yield from _names(robot)
     if robot.control_hz and not MIN_CONTROL_HZ <= robot.control_hz <= MAX_CONTROL_HZ:
         yield "control_hz", f"{MIN_CONTROL_HZ} to {MAX_CONTROL_HZ}", robot.control_hz
     for name in ("max_picture_age_ns", "max_picture_skew_ns", "max_picture_still_ns"):
@@ -45,10 +47,33 @@ def faults(robot: Robot) -> Iterator[tuple[str, str, object]]:
         yield from _dimension(robot, index, each)
 
 
+def _ranges(robot: Robot) -> Iterator[tuple[str, str, object]]:
+    low, high, first = robot.command_low, robot.command_high, robot.initial_command
+    if not (low <= high).all():
+        yield "command_low", "<= command_high", "the opposite"
+    if not (robot.max_step >= 0).all():
+        yield "max_step", ">= 0", "a negative step"
+    if not ((low <= first) & (first <= high)).all():
+        yield "initial_command", "within command_low and command_high", first
+    if len(robot.max_lead) not in (0, robot.action_dim) or not (robot.max_lead >= 0).all():
+        yield "max_lead", f"{robot.action_dim} >= 0", robot.max_lead
+    if len(robot.state_low) != len(robot.state_high) or not (robot.state_low <= robot.state_high).all():
+        yield "state_low", "<= state_high", "the opposite"
+
+
+def _names(robot: Robot) -> Iterator[tuple[str, str, object]]:
+    if len(robot.name) > MAX_NAME:
+        yield "name", f"at most {MAX_NAME} characters", len(robot.name)
+    if len(robot.cameras) > MAX_CAMERAS:
+        yield "cameras", f"at most {MAX_CAMERAS}", len(robot.cameras)
+    if (longest := max(map(len, robot.cameras), default=0)) > MAX_NAME:
+        yield "cameras", f"names of at most {MAX_NAME} characters", longest
+
+
 def _dimension(robot: Robot, index: int, each: Dimension) -> Iterator[tuple[str, str, object]]:
     at = f"dimensions[{index}]"
-    if max(len(each.name), len(each.unit)) > _MAX_TEXT:
-        yield at, f"a name and a unit of at most {_MAX_TEXT} characters", len(each.name) + len(each.unit)
+    if max(len(each.name), len(each.unit)) > MAX_NAME:
+        yield at, f"a name and a unit of at most {MAX_NAME} characters", len(each.name) + len(each.unit)
     if each.kind not in AT_STOP:
         yield f"{at}.kind", "position, velocity, delta or gripper", each.kind.name.lower()
         return
