@@ -265,6 +265,8 @@ def train(options: TrainOptions) -> None:
             demo_hz=run.demo_hz,
         )
         if machine.frozen_features:
+            if world.is_first:
+                sys.stderr.write(f"pp-train: frozen towers look at {len(data)} episodes, unless the store has them\n")
             data = data.embedded(FrozenTowers(model), world)
         with files.writing(options.out):
             _update(run, model, Batches(data, run, model, bundle, world), data.hash, options, world)
