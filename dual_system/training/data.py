@@ -106,6 +106,38 @@ class _Source:
         return b" ".join((scene.encode(), rows.state.tobytes(), rows.action.tobytes(), rows.is_rendered.tobytes()))
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Looks:
+    """What systems read of an episode's pictures: from their stores, or else from its videos."""
+
+    sizes: PictureSizes
+    stores: Mapping[str, PictureStore]
+    """By system; none without a folder."""
+    are_features: bool = False
+    """The stores hold what frozen towers make of the pictures, which no video has."""
+
+    def at(self, source: _Source, key: bytes, rows: Sequence[int], systems: Sequence[str]) -> dict[str, Views]:
+        """The views of these systems at distinct rows of an episode that is stored under ``key``.
+
+        Raises OSError if they are features and a store lacks them, because the disk is full or a file is damaged.
+        """
+        stores = {system: store for system, store in self.stores.items() if system in systems}
+        kept = {system: store.read(key, len(rows)) for system, store in stores.items()}
+        found = {system: views for system, views in kept.items() if views is not None}
+        lacking = [system for system in systems if system not in found]
+        if lacking and self.are_features:
+            raise OSError(
+                f"{stores[lacking[0]].folder}: no features of {source.entry.task} {source.entry.seed}, or a damaged "
+                "file; make room there, and start again"
+            )
+        whole = list(source.frames(rows)) if lacking else []
+        for system in lacking:
+            found[system] = [self.sizes.read(system, each) for each in whole]
+            if system in stores:
+                stores[system].write(key, found[system])
+        return found
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobotShape:
     """What a dataset says of its robot, and POUNCE's configuration has to fit."""
@@ -175,8 +207,8 @@ class TrainingSet:
         """
         self.roots = roots
         self._sizes, self._demo_hz = sizes or PictureSizes(), demo_hz
-        self._folder, self._is_embedded = store, False
-        self._stores = {} if store is None else _stores(store, self._sizes.keys)
+        self._folder = store
+        self._looks = _Looks(sizes=self._sizes, stores={} if store is None else _stores(store, self._sizes.keys))
         self._sources = [source for root in roots for source in _sources(Dataset(root), tasks)]
         found_px = {source.dataset.image_px for source in self._sources}
         folders = ", ".join(map(str, roots))
@@ -293,16 +325,17 @@ class TrainingSet:
         """
         if self._folder is None:
             raise ValueError("features of frozen towers are kept beside the pictures: give a --picture-store")
-        found = copy.copy(self)
-        found._cache, found._cached_bytes, found._is_embedded = OrderedDict(), 0, True
-        keys = self._sizes.keys
-        found._stores = _stores(self._folder, {system: f"{keys[system]} {towers.keys[system]}" for system in keys})
+        found, keys = copy.copy(self), self._sizes.keys
+        found._cache, found._cached_bytes = OrderedDict(), 0
+        stores = _stores(self._folder, {system: f"{keys[system]} {towers.keys[system]}" for system in keys})
+        found._looks = _Looks(sizes=self._sizes, stores=stores, are_features=True)
         for source in _beginning_with_own(self._sources, world):
-            lacking = [system for system, store in found._stores.items() if not store.has(self._key(source))]
+            key = self._key(source)
+            lacking = [system for system, store in stores.items() if not store.has(key)]
             if lacking:
-                pictures = self._decoded(source, sorted({*_instants(source, self._demo_hz)[1]}), lacking)
+                pictures = self._looks.at(source, key, sorted({*_instants(source, self._demo_hz)[1]}), lacking)
                 for system in lacking:
-                    found._stores[system].write(self._key(source), towers.features(system, pictures[system]))
+                    stores[system].write(key, towers.features(system, pictures[system]))
         return found
 
     def _read(self, number: int) -> TrainingEpisode:
@@ -358,32 +391,10 @@ class TrainingSet:
         once = sorted(set(rows))
         found = {
             system: dict(zip(once, views, strict=True))
-            for system, views in self._decoded(source, once, list(self._sizes.keys)).items()
+            for system, views in self._looks.at(source, self._key(source), once, list(self._sizes.keys)).items()
         }
         views, images = ([found[each][row] if each in found else () for row in rows] for each in ("pounce", "ponder"))
         return views, images
-
-    def _decoded(self, source: _Source, rows: Sequence[int], systems: Sequence[str]) -> dict[str, Views]:
-        """What these systems read at distinct rows, from the store if it has them.
-
-        Raises OSError if they are features and the store lacks them, because the disk is full or a file is damaged.
-        """
-        key = self._key(source)
-        stores = {system: store for system, store in self._stores.items() if system in systems}
-        kept = {system: store.read(key, len(rows)) for system, store in stores.items()}
-        found = {system: views for system, views in kept.items() if views is not None}
-        lacking = [system for system in systems if system not in found]
-        if lacking and self._is_embedded:
-            raise OSError(
-                f"{self._folder}: no features of {source.entry.task} {source.entry.seed}, or a damaged file; "
-                "make room there, and start again"
-            )
-        whole = list(source.frames(rows)) if lacking else []
-        for system in lacking:
-            found[system] = [self._sizes.read(system, each) for each in whole]
-            if system in stores:
-                stores[system].write(key, found[system])
-        return found
 
     def _key(self, source: _Source) -> bytes:
         return source.key + (f" {self._demo_hz}".encode() if self._demo_hz != 1 else b"")

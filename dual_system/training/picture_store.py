@@ -29,13 +29,13 @@ class PictureStore:
 
         Raises OSError if the folder cannot be made.
         """
-        self._folder = folder / _name(kind.encode())
-        self._folder.mkdir(parents=True, exist_ok=True)
+        self.folder = folder / _name(kind.encode())
+        self.folder.mkdir(parents=True, exist_ok=True)
 
     def read(self, episode: bytes, num_instants: int) -> Views | None:
         """The views that `write` stored; None if the file is missing or damaged."""
         try:
-            with (self._folder / f"{_name(episode)}.npz").open("rb") as file:  # np.load would leave a damaged one open
+            with (self.folder / f"{_name(episode)}.npz").open("rb") as file:  # np.load would leave a damaged one open
                 arrays = dict(np.load(file, allow_pickle=False))
         except (OSError, ValueError, EOFError, zipfile.BadZipFile):
             return None
@@ -44,11 +44,11 @@ class PictureStore:
 
     def has(self, episode: bytes) -> bool:
         """Whether there is a file of this episode."""
-        return (self._folder / f"{_name(episode)}.npz").exists()
+        return (self.folder / f"{_name(episode)}.npz").exists()
 
     def write(self, episode: bytes, views: Views) -> None:
         """Stores pictures, or features of one shape. Does nothing if the disk is full: training goes on without."""
-        path = self._folder / f"{_name(episode)}.npz"
+        path = self.folder / f"{_name(episode)}.npz"
         partial = path.with_suffix(f".{uuid.uuid4().hex}")  # unique among processes and hosts
         try:
             with partial.open("wb") as file:
