@@ -208,7 +208,8 @@ class TrainingSet:
         self.roots = roots
         self._sizes, self._demo_hz = sizes or PictureSizes(), demo_hz
         self._folder = store
-        self._looks = _Looks(sizes=self._sizes, stores={} if store is None else _stores(store, self._sizes.keys))
+        stores = {} if store is None else {each: PictureStore(store, kind) for each, kind in self._sizes.keys.items()}
+        self._looks = _Looks(sizes=self._sizes, stores=stores)
         self._sources = [source for root in roots for source in _sources(Dataset(root), tasks)]
         found_px = {source.dataset.image_px for source in self._sources}
         folders = ", ".join(map(str, roots))
@@ -327,7 +328,7 @@ class TrainingSet:
             raise ValueError("features of frozen towers are kept beside the pictures: give a --picture-store")
         found, keys = copy.copy(self), self._sizes.keys
         found._cache, found._cached_bytes = OrderedDict(), 0
-        stores = _stores(self._folder, {system: f"{keys[system]} {towers.keys[system]}" for system in keys})
+        stores = {each: PictureStore(self._folder, f"{keys[each]} {towers.keys[each]}") for each in keys}
         found._looks = _Looks(sizes=self._sizes, stores=stores, are_features=True)
         for source in _beginning_with_own(self._sources, world):
             key = self._key(source)
@@ -409,10 +410,6 @@ class TrainingSet:
             ValueError: the space is another robot's.
         """
         return _statistics(self._sources, self.robot.dims_in(space)[1], horizon, space, by_row=by_row)
-
-
-def _stores(folder: Path, keys: Mapping[str, str]) -> dict[str, PictureStore]:
-    return {system: PictureStore(folder, key) for system, key in keys.items()}
 
 
 def _beginning_with_own(sources: Sequence[_Source], world: World) -> Iterator[_Source]:
