@@ -118,11 +118,11 @@ soak: setup
 images: setup
 	$(BIN)/python -m benchmarks.images
 
-## make policy  trains the laptop pair, a slice of MINUTES at a time; keeps data and checkpoints in POLICY_DIR, outside of here
+## make policy  trains the laptop pair, a slice of MINUTES at a time; keeps data and checkpoints in POLICY_DIR, outside of here; TASKS: some
 MINUTES ?= 150
 POLICY_DIR ?= $(HOME)/ponderpounce-policy
 policy: setup
-	$(BIN)/python -m benchmarks.policy --folder "$(POLICY_DIR)" --minutes $(MINUTES)
+	$(BIN)/python -m benchmarks.policy --folder "$(POLICY_DIR)" --minutes $(MINUTES) $(if $(TASKS),--tasks $(TASKS))
 
 ## make site    the documents as a site, links checked, in out/site/html
 SITE := $(VENV)/site

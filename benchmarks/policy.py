@@ -1,6 +1,6 @@
 """``make policy``: trains the laptop pair from nothing, in slices of some minutes; a killed or ended slice is resumed.
 
-    python -m benchmarks.policy --folder POLICY_DIR --minutes 150
+    python -m benchmarks.policy --folder POLICY_DIR --minutes 150 [--tasks VideoUnmask PickHighlight]
 
 A stage is a set of commands that run side by side, one a core, each of which resumes by itself. One that has ended well
 is marked as done, and so is a stage without another. Stages are run in their order until the slice is over: by its
@@ -22,7 +22,7 @@ from pathlib import Path
 
 from benchmarks.policy_gates import gates
 from benchmarks.policy_losses import losses
-from benchmarks.policy_plan import Stage, stages, trained
+from benchmarks.policy_plan import TASKS, Stage, Task, stages, trained
 from benchmarks.policy_table import table
 from benchmarks.policy_weights import require_committed
 from dual_system.analysis.markdown import markdown
@@ -43,6 +43,8 @@ class PolicyOptions:
     """Where data, checkpoints and the account of hours are kept: tens of gigabytes, outside of the checkout."""
     minutes: float = 150.0
     """Length of this slice."""
+    tasks: tuple[Task, ...] = TASKS
+    """Tasks of data, plays and table, the same in every slice. Two take half of the hours and show less."""
 
 
 @command("policy")
@@ -53,7 +55,7 @@ def main(argv: list[str] | None = None) -> int:
     ends_s = time.monotonic() + 60 * options.minutes
     code = DONE
     with stop_requests() as is_requested:
-        for stage in stages(folder):
+        for stage in stages(folder, options.tasks):
             if code == DONE and not _mark(stage, folder).exists():
                 if stage.is_test:
                     require_committed(trained(folder), folder)

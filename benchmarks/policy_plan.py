@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, get_args
 
 from dual_system.training import laptop_recipes as recipes
 
-TASKS = ("VideoUnmask", "PickHighlight", "MoveCube", "PickXtimes")
+Task = Literal["VideoUnmask", "PickHighlight", "MoveCube", "PickXtimes"]
+TASKS: tuple[Task, ...] = get_args(Task)
 EPISODES, STILLS, TOWER_MINUTES = 200, 8_000, 22
 CURRENT_WORDS = "words_current"
 """Folder of the PONDER without memory."""
@@ -57,6 +59,8 @@ DELAYS_MS, DELAY_SCENES = (0, 300, 1_000, 2_000, 4_000), 20
 """Delays that they are played at, and development scenes a task of each."""
 RETOLD = ("VideoUnmask", "PickHighlight", "MoveCube")
 """Tasks whose present can have another past."""
+CUED = ("VideoUnmask", "PickHighlight")
+"""Tasks whose cue can be left out of the pictures."""
 WITH_PONDER = (recipes.laptop, recipes.laptop_without_grounding, recipes.laptop_current)
 """Those whose POUNCE reads cognition."""
 WITH_MEMORY = (recipes.laptop_framesamp, recipes.laptop_framesamp_grounded)
@@ -77,16 +81,16 @@ class Stage:
     """Whether it plays test scenes, which no run of training may follow."""
 
 
-def stages(folder: Path) -> tuple[Stage, ...]:
-    """The stages in their order; each reads what those before it wrote."""
+def stages(folder: Path, tasks: Sequence[str] = TASKS) -> tuple[Stage, ...]:
+    """The stages in their order; each reads what those before it wrote. ``tasks``: some of `TASKS`."""
     names = ("towers", "words", CURRENT_WORDS, "hand", "plays", "corrections", "corrected")
     towers, words, current_words, hand, plays, corrections, corrected = (folder / name for name in names)
-    sets = [folder / "data" / task for task in TASKS]
+    sets = [folder / "data" / task for task in tasks]
     data = ("--data", *map(str, sets))
     locating = ("dual_system.policy.towers", "--out", f"{towers}", "--stills", f"{STILLS}")
     training = ("dual_system.training.train", "--no-progress", "--picture-store", f"{folder / 'pictures'}")
     training += ("--frozen-features",)
-    scenes = ("--tasks", *TASKS, "--episodes", f"{PLAYS}", "--runs", "1", "--seed", f"{PLAYS_SEED}")
+    scenes = ("--tasks", *tasks, "--episodes", f"{PLAYS}", "--runs", "1", "--seed", f"{PLAYS_SEED}")
     asked = ("--pounce-checkpoint", f"{hand / 'pounce'}", "--subgoal-text", "grounded", "--max-steps", "700")
     playing = ("sim_client.evaluate", "--out", f"{plays}", *scenes, *asked, "--record", "--record-hz", "1")
     correcting = ("dual_system.data.correct", f"{plays}", "--out", f"{corrections}")
@@ -122,28 +126,31 @@ def stages(folder: Path) -> tuple[Stage, ...]:
                 ),
             ),
         ),
-        Stage(name="pairs", commands=tuple(_pairs(folder, task) for task in TASKS)),
+        Stage(name="pairs", commands=tuple(_pairs(folder, task) for task in tasks)),
         Stage(
             name="gates and words",  # of the PONDER without memory: hours on one core, the gates' plays on the other
             commands=(
                 (*training, *data, *_run(recipes.laptop_current_grounding.__name__, towers, towers, current_words)),
-                *_gates(folder, corrected / "pounce"),
+                *_gates(folder, corrected / "pounce", tasks),
             ),
         ),
         *(
             Stage(name=f"rows {first // 2 + 1}", commands=tuple(rows[first : first + 2]))
             for first in range(0, len(rows), 2)
         ),
-        Stage(name="probe plays", commands=(_probed_plays(folder),)),
+        Stage(name="probe plays", commands=(_probed_plays(folder, tasks),)),
         Stage(name="probe data", commands=(_probed_data(folder),)),
         Stage(name="probe", commands=(_probe(folder),)),
         Stage(name="cost", commands=tuple(_cost(folder, recipe) for recipe, seed in ROWS if seed == 0)),
         Stage(name="rows delayed", commands=tuple(delayed)),
         *(
             Stage(name=f"test {number}", commands=commands, is_test=True)
-            for number, commands in enumerate(_tests(folder), 1)
+            for number, commands in enumerate(_tests(folder, tasks), 1)
         ),
-        *(Stage(name=f"delays {delay_ms} ms", commands=tuple(_delays(folder, delay_ms))) for delay_ms in DELAYS_MS),
+        *(
+            Stage(name=f"delays {delay_ms} ms", commands=tuple(_delays(folder, delay_ms, tasks)))
+            for delay_ms in DELAYS_MS
+        ),
     )
 
 
@@ -158,13 +165,13 @@ def _pairs(folder: Path, task: str) -> tuple[str, ...]:
     return "dual_system.tasks.pair_files", "--family", FAMILIES[task], *scenes, "--demo-hz", "2", "--out", f"{out}"
 
 
-def _gates(folder: Path, hand: Path) -> Iterator[tuple[str, ...]]:
+def _gates(folder: Path, hand: Path, tasks: Sequence[str]) -> Iterator[tuple[str, ...]]:
     """Plays and heed of the hand that all rows share."""
-    scenes = ("--tasks", *TASKS, "--episodes", f"{GATE_SCENES}", "--runs", "1", "--split", "development")
+    scenes = ("--tasks", *tasks, "--episodes", f"{GATE_SCENES}", "--runs", "1", "--split", "development")
     for name, told in GATES.items():
         given = ("--pounce-checkpoint", f"{hand}", "--max-steps", "700", *told)
         yield "sim_client.evaluate", "--out", f"{folder / 'gates' / name}", *scenes, *given
-    for task in TASKS:
+    for task in tasks:
         asked = ("--pounce", f"{hand}", "--pairs", f"{folder / 'pairs' / task}")
         yield "sim_client.counterfactual", *asked, "--out", f"{folder / 'gates' / (HEED + task)}"
 
@@ -178,9 +185,9 @@ def _row(folder: Path, recipe: str, seed: int) -> Sequence[str]:
     return *run, "--seed", f"{seed}"
 
 
-def _probed_plays(folder: Path) -> tuple[str, ...]:
+def _probed_plays(folder: Path, tasks: Sequence[str]) -> tuple[str, ...]:
     """The script's own episodes of development scenes, which nothing is trained on."""
-    scenes = ("--tasks", *TASKS, "--episodes", f"{PROBED_SCENES}", "--runs", "1", "--split", "development")
+    scenes = ("--tasks", *tasks, "--episodes", f"{PROBED_SCENES}", "--runs", "1", "--split", "development")
     played = ("--policy", "oracle", "--record", "--record-hz", "2")
     return "sim_client.evaluate", "--out", f"{folder / 'probe' / 'plays'}", *scenes, *played
 
@@ -210,7 +217,7 @@ def _delayed(folder: Path, recipe: str, row: str) -> Sequence[str]:
     return _run(recipe, ponder, from_row, _folder(folder, recipe, 0))
 
 
-def _delays(folder: Path, delay_ms: int) -> Iterator[tuple[str, ...]]:
+def _delays(folder: Path, delay_ms: int, tasks: Sequence[str]) -> Iterator[tuple[str, ...]]:
     """Every channel at one delay, on development scenes; cognition also where it is told another age than its own."""
     pair, words = _folder(folder, "laptop_delayed", 0), folder / "words" / "ponder"
     channels = {
@@ -222,34 +229,35 @@ def _delays(folder: Path, delay_ms: int) -> Iterator[tuple[str, ...]]:
     told_ms = {300: 2_000, 2_000: 300}.get(delay_ms)
     if told_ms is not None:
         channels[f"cognition_told_{told_ms}"] = (*channels["cognition"], "--reported-age-ms", f"{told_ms}")
-    scenes = ("--tasks", *TASKS, "--episodes", f"{DELAY_SCENES}", "--runs", "1", "--split", "development")
+    scenes = ("--tasks", *tasks, "--episodes", f"{DELAY_SCENES}", "--runs", "1", "--split", "development")
     for name, (recipe, *given) in channels.items():
         played = ("--pounce-checkpoint", f"{_folder(folder, recipe, 0) / 'pounce'}", "--max-steps", "700")
         out = folder / "delays" / f"{name}_{delay_ms}"
         yield "sim_client.evaluate", "--out", f"{out}", *scenes, *played, *given, "--delay-ms", f"{delay_ms}"
 
 
-def _tests(folder: Path) -> Iterator[tuple[tuple[str, ...], ...]]:
+def _tests(folder: Path, tasks: Sequence[str]) -> Iterator[tuple[tuple[str, ...], ...]]:
     """Every condition of every row, once; those side by side that need nothing of each other."""
     donors = [(f"laptop_{seed}", seed) for seed in (0, 1)]
     record = ("--record", "--record-hz", "1")
-    yield tuple(_test(folder, name, "laptop", seed, *record) for name, seed in donors)
+    yield tuple(_test(folder, tasks, name, "laptop", seed, *record) for name, seed in donors)
     given = {
         "null": ("--cognition", "null"),
         "held": ("--deliver", "held-transition"),
     }
     for kind, options in given.items():
-        yield tuple(_test(folder, f"{name}_{kind}", "laptop", seed, *options) for name, seed in donors)
+        yield tuple(_test(folder, tasks, f"{name}_{kind}", "laptop", seed, *options) for name, seed in donors)
     other = ("--cognition", "other-episode", "--donors")
     yield tuple(
-        _test(folder, f"{name}_other_episode", "laptop", seed, *other, f"{folder / 'test' / name}")
+        _test(folder, tasks, f"{name}_other_episode", "laptop", seed, *other, f"{folder / 'test' / name}")
         for name, seed in donors
     )
     for recipe in ("laptop_observation", "laptop_framesamp"):
-        yield tuple(_test(folder, f"{recipe}_{seed}", recipe, seed) for seed in (0, 1))
+        yield tuple(_test(folder, tasks, f"{recipe}_{seed}", recipe, seed) for seed in (0, 1))
     retold = ("--pictures", "retold")
-    for pair in (("laptop", "laptop_framesamp"), ("laptop_observation", "laptop_current")):
-        yield tuple(_test(folder, f"{recipe}_0_retold", recipe, 0, *retold, tasks=RETOLD) for recipe in pair)
+    can_be_retold, have_cue = (tuple(task for task in tasks if task in some) for some in (RETOLD, CUED))
+    for pair in (("laptop", "laptop_framesamp"), ("laptop_observation", "laptop_current")) if can_be_retold else ():
+        yield tuple(_test(folder, can_be_retold, f"{recipe}_0_retold", recipe, 0, *retold) for recipe in pair)
     words = ("--ponder-checkpoint", f"{folder / 'words' / 'ponder'}")
     few = {
         "laptop_text_grounded": ("laptop_text", "--subgoal-text", "grounded"),
@@ -260,20 +268,20 @@ def _tests(folder: Path) -> Iterator[tuple[tuple[str, ...], ...]]:
         "laptop_without_grounding_0": ("laptop_without_grounding",),
     }
     yield (
-        _test(folder, "laptop_current_0", "laptop_current", 0),
-        *(_test(folder, name, *how[:1], 0, *how[1:], scenes=FEW_TEST_SCENES) for name, how in few.items()),
+        _test(folder, tasks, "laptop_current_0", "laptop_current", 0),
+        *(_test(folder, tasks, name, *how[:1], 0, *how[1:], scenes=FEW_TEST_SCENES) for name, how in few.items()),
     )
-    cued = ("--pictures", "without-cue")
-    yield (_test(folder, "laptop_0_without_cue", "laptop", 0, *cued, tasks=("VideoUnmask", "PickHighlight")),)
+    if have_cue:
+        yield (_test(folder, have_cue, "laptop_0_without_cue", "laptop", 0, "--pictures", "without-cue"),)
 
 
 def _test(
     folder: Path,
+    tasks: Sequence[str],
     name: str,
     recipe: str,
     seed: int,
     *given: str,
-    tasks: Sequence[str] = TASKS,
     scenes: int = TEST_SCENES,
 ) -> tuple[str, ...]:
     row = _folder(folder, recipe, seed)

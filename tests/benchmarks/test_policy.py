@@ -10,6 +10,8 @@ import signal
 import subprocess
 import textwrap
 import threading
+from collections.abc import Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,7 @@ import pytest
 from benchmarks import policy
 from benchmarks.policy import DONE, FAILED, UNFINISHED, account
 from benchmarks.policy_cost import CostOptions
-from benchmarks.policy_plan import Stage, stages
+from benchmarks.policy_plan import TASKS, Stage, stages
 from dual_system.data.collect import CollectOptions
 from dual_system.data.correct import CorrectOptions
 from dual_system.data.export import ExportOptions
@@ -58,13 +60,19 @@ def test_every_command_of_every_stage_is_one_that_its_program_takes(tmp_path: Pa
     assert found == OPTIONS.keys()
 
 
-def test_a_stage_reads_only_what_an_earlier_one_writes(tmp_path: Path) -> None:
+@pytest.mark.parametrize("tasks", [TASKS, ("VideoUnmask", "PickHighlight"), ("PickXtimes",)])
+def test_a_stage_reads_only_what_an_earlier_one_writes(tmp_path: Path, tasks: Sequence[str]) -> None:
     written = {tmp_path / "pictures"}
-    for stage in stages(tmp_path):
+    for stage in stages(tmp_path, tasks):
         outs = {Path(arguments[arguments.index("--out") + 1]) for _, *arguments in stage.commands}
         for _, *arguments in stage.commands:
             read = {Path(each) for each in arguments if each.startswith(str(tmp_path))} - outs
             assert all(path in written or written & set(path.parents) for path in read)
+            if "--tasks" in arguments:
+                told = arguments[arguments.index("--tasks") + 1 :]
+                named = [*takewhile(lambda each: not each.startswith("--"), told)]
+                assert named
+                assert set(named) <= set(tasks)
         written |= outs
 
 
@@ -120,7 +128,7 @@ def programs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def plan(folder: Path, monkeypatch: pytest.MonkeyPatch, *counts: int) -> None:
-    def planned(_: Path) -> tuple[Stage, ...]:
+    def planned(*_: Any) -> tuple[Stage, ...]:
         return tuple(
             Stage(
                 name=f"part {number}",
@@ -177,7 +185,7 @@ def test_a_command_that_ended_is_not_run_again_beside_one_that_did_not(
 
     def planned(count: int) -> None:
         commands = (("counting", f"{short}", "1"), ("counting", f"{long}", f"{count}"))
-        monkeypatch.setattr(policy, "stages", lambda _: (Stage(name="two", commands=commands),))
+        monkeypatch.setattr(policy, "stages", lambda *_: (Stage(name="two", commands=commands),))
 
     planned(1_000_000)
     while not (programs / "done" / "two.0").exists():
@@ -201,7 +209,7 @@ def test_no_more_commands_run_at_once_than_there_are_cores(programs: Path, monke
 
     monkeypatch.setattr(subprocess, "Popen", counting)
     commands = tuple(("counting", f"{programs / f'{number}.txt'}", "2") for number in range(3))
-    monkeypatch.setattr(policy, "stages", lambda _: (Stage(name="three", commands=commands),))
+    monkeypatch.setattr(policy, "stages", lambda *_: (Stage(name="three", commands=commands),))
     assert policy.main(["--folder", str(programs)]) == DONE
     assert most == 1
 
@@ -210,7 +218,7 @@ def test_a_command_that_fails_ends_the_slice(
     programs: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     failing = Stage(name="broken", commands=(("counting", "no", "number"),))
-    monkeypatch.setattr(policy, "stages", lambda _: (failing,))
+    monkeypatch.setattr(policy, "stages", lambda *_: (failing,))
     assert policy.main(["--folder", str(programs)]) == FAILED
     assert "broken ended with [1]" in capfd.readouterr().err
 
