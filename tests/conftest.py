@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import os
+import signal
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -51,6 +52,17 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     if "gpu" in item.config.getoption("-m").replace("not gpu", ""):
         pytest.fail(f"{lack}; leave -m gpu out to skip what needs it")
     pytest.skip(lack)
+
+
+HANDLERS = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)}
+
+
+@pytest.fixture(autouse=True)
+def handlers() -> Iterator[None]:
+    """A command that a test calls in this process takes signals over, for the process's life and not for one test."""
+    yield
+    for number, handler in HANDLERS.items():
+        signal.signal(number, handler)
 
 
 ROBOT, CAMERAS, PX, DIM, NUM_PROPRIO = "r0", ("front", "wrist"), 4, 3, 3

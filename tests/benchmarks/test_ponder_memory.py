@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -76,6 +77,7 @@ def test_an_episode_keeps_nothing_beside_its_session() -> None:
     assert sum(memory.nbytes for memory in made) < 4000  # tables of the vision tower's angles at most
 
 
+@pytest.mark.acceptance
 def test_the_command_says_both_numbers(tmp_path: Path) -> None:
     """In a process of its own: one that has freed memory before grows by less than it takes, or not at all."""
     command = "; ".join(

@@ -81,7 +81,7 @@ def rounds(recorded: Callable[..., Path]) -> Path:
     return recorded("PickXtimes", SEED, LogOptions(record_hz=1))
 
 
-@pytest.mark.parametrize("name", ["log", "rounds"])
+@pytest.mark.parametrize("name", ["log", pytest.param("rounds", marks=pytest.mark.acceptance)])
 def test_played_again_its_texts_are_those_that_collecting_tells(name: str, request: pytest.FixtureRequest) -> None:
     path: Path = request.getfixturevalue(name)
     record = read_log(path)

@@ -113,6 +113,7 @@ def test_the_log_follows_from_itself_and_holds_what_the_client_played(episode: A
     assert record.result.status == m.TaskStatus.ABORTED  # the gateway was stopped while the client was connected
 
 
+@pytest.mark.acceptance
 def test_clients_on_one_port_play_side_by_side_on_one_pair_of_servers(tmp_path: Path) -> None:
     """Whoever sits beside them, equal requests get equal rows: batches change the last bits only."""
     client_module = pytest.importorskip("openpi_client.websocket_client_policy")

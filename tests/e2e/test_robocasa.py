@@ -94,7 +94,13 @@ def benchmark_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module", params=["0", "1000"], ids=["one cognition", "a cognition a second"])
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param("0", marks=pytest.mark.acceptance, id="one cognition"),
+        pytest.param("1000", id="one a second"),
+    ],
+)
 def played(
     request: pytest.FixtureRequest, pair: Path, benchmark_files: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[str, list[EpisodeRecord], list[dict[str, object]], str]:

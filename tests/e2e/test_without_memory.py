@@ -15,7 +15,7 @@ from protocol.mcap_log import read_log
 from sim_client.condition import EvalOptions
 from sim_client.evaluate import EvaluationHarness
 
-pytestmark = [pytest.mark.e2e, pytest.mark.sim, pytest.mark.slow]
+pytestmark = [pytest.mark.e2e, pytest.mark.sim, pytest.mark.slow, pytest.mark.acceptance]
 
 
 def test_it_is_trained_resumed_served_and_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -236,7 +236,7 @@ OWN = 65 + 32 + 24 * 3 + 8 * 3
 """Launches of our kernels in a forward: norms, SwiGLU, three in each recurrent layer, three in each attention layer."""
 
 
-@pytest.mark.parametrize("length", [1, 160])
+@pytest.mark.parametrize("length", [pytest.param(1, marks=pytest.mark.acceptance), 160])
 def test_a_9b_forward_of_kernels(length: int, counter: LaunchCounter) -> None:
     """Of 4,060 launches for 160 tokens, one in nine is left."""
     seen_by_torch = forward_of_kernels(length, counter, is_fp8=False)
@@ -244,7 +244,9 @@ def test_a_9b_forward_of_kernels(length: int, counter: LaunchCounter) -> None:
     assert seen_by_torch + counter.count <= 440
 
 
-@pytest.mark.parametrize(("length", "narrow"), [(1, 24 * 3 + 8 * 4 + 32 * 3), (160, 32 * 2)])
+@pytest.mark.parametrize(
+    ("length", "narrow"), [(1, 24 * 3 + 8 * 4 + 32 * 3), pytest.param(160, 32 * 2, marks=pytest.mark.acceptance)]
+)
 def test_a_9b_forward_in_fp8(length: int, narrow: int, counter: LaunchCounter, monkeypatch: pytest.MonkeyPatch) -> None:
     """Few rows: our kernel is the product. More: norms give their rows in fp8, and two products a layer are
     quantised for. Before there were kernels for it, both forwards were 2,114 launches."""

@@ -131,7 +131,8 @@ SHARED_BYTES = 227 << 10
 @pytest.mark.parametrize(
     ("capabilities", "num_kernels"),
     [
-        (("90", "100"), 2 * (NUM_PI05 + NUM_GROOT + NUM_PONDER)),
+        (("90",), NUM_PI05 + NUM_GROOT + NUM_PONDER),
+        pytest.param(("100",), NUM_PI05 + NUM_GROOT + NUM_PONDER, marks=pytest.mark.acceptance),
         pytest.param(("80",), NUM_PI05, marks=pytest.mark.acceptance),
     ],
 )

@@ -50,6 +50,7 @@ def test_full_size_has_exactly_the_published_names() -> None:
     assert len(names) == 812
 
 
+@pytest.mark.acceptance
 def test_a_file_of_full_depth_round_trips(tmp_path: Path) -> None:
     """Every published name, in small: nothing is lost, nothing added, no bit differs."""
     tiny, full = tiny_cpu(num_carriers=0), pi05_base().pi05

@@ -53,7 +53,7 @@ def half_right(texts: Iterable[tuple[int, ...]]) -> TrieDraft:
     return TrieDraft([tuple(t if i % 5 else t // 2 for i, t in enumerate(text)) for text in texts])
 
 
-@pytest.mark.parametrize("num_prompts", [NUM_TOGETHER, 2 * NUM_TOGETHER])
+@pytest.mark.parametrize("num_prompts", [NUM_TOGETHER, pytest.param(2 * NUM_TOGETHER, marks=pytest.mark.acceptance)])
 def test_speculative_texts_are_greedy_texts(num_prompts: int) -> None:
     plain = QwenEngine(PONDER, CONFIG, NoDraft())
     num_plain = num_speculative = 0

@@ -69,7 +69,7 @@ def assert_alike(one: Fire, other: Fire) -> None:
 HISTORIES = st.lists(st.tuples(st.integers(0, 5), st.sampled_from([None, 1, 3])), max_size=5)
 
 
-@pytest.mark.parametrize("has_draft", [False, True])
+@pytest.mark.parametrize("has_draft", [pytest.param(False, marks=pytest.mark.acceptance), True])
 @given(history=HISTORIES, seed=st.integers(0, 5), opening=st.sampled_from([WITHOUT_DEMO, WITH_DEMO]))
 @settings(max_examples=15)
 def test_every_answer_is_that_of_a_fresh_session(

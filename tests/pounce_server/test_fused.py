@@ -114,7 +114,7 @@ def few_tokens(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.skipif(bool(LACK), reason=LACK)
 @pytest.mark.usefixtures("rounding_interpreter", "few_tokens")
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
-@pytest.mark.parametrize("num_kv_heads", [1, 2])
+@pytest.mark.parametrize("num_kv_heads", [pytest.param(1, marks=pytest.mark.acceptance), 2])
 def test_kernels_in_the_interpreter_act_as_the_eager_model(num_kv_heads: int, dtype: DTypeName) -> None:
     config = small(num_kv_heads)
     model = model_of(config, dtype)

@@ -383,11 +383,11 @@ for name in sys.argv[1:]:
     print(name, digest.hexdigest())
 """
 
-    here = []
-    for name in task_names():
+    here, names = [], task_names()[::4]
+    for name in names:
         digest = hashlib.sha256()
         for moment in walk(name, "easy")[1:101]:
             digest.update(moment.snapshot.state.tobytes() + moment.snapshot.tcp_pose.tobytes())
         here.append(f"{name} {digest.hexdigest()}")
-    there = subprocess.run([sys.executable, "-c", script, *task_names()], capture_output=True, text=True, check=True)
+    there = subprocess.run([sys.executable, "-c", script, *names], capture_output=True, text=True, check=True)
     assert there.stdout.splitlines() == here

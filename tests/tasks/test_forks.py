@@ -33,7 +33,15 @@ SEEDS = {"PickHighlight": 1, "BinFill": 8, "PickXtimes": 1, "SwingXtimes": 1, "S
 SEEDS |= VIDEO_SEEDS
 """Where pairs are known to be."""
 
-LIKE_ANOTHER = ("RouteStick", "VideoRepick", "VideoPlaceButton", "SwingXtimes", "VideoUnmaskSwap")
+LIKE_ANOTHER = (
+    "BinFill",
+    "InsertPeg",
+    "RouteStick",
+    "VideoRepick",
+    "VideoPlaceButton",
+    "SwingXtimes",
+    "VideoUnmaskSwap",
+)
 """Tasks whose past is told like that of another one here; a pair takes seconds to find."""
 
 

@@ -65,7 +65,11 @@ if __name__ == "__main__":
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("before", "context", "said"),
-    [("new", "fork", "(2, 16, 16, 3) 2 True"), ("drawn", "spawn", "(2, 16, 16, 3) 2 True"), ("drawn", "fork", "")],
+    [
+        ("new", "fork", "(2, 16, 16, 3) 2 True"),
+        ("drawn", "fork", ""),
+        pytest.param("drawn", "spawn", "(2, 16, 16, 3) 2 True", marks=pytest.mark.acceptance),
+    ],
 )
 def test_several_in_processes_of_their_own_draw_whatever_is_set(
     tmp_path: Path, before: str, context: str, said: str

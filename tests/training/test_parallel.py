@@ -157,7 +157,7 @@ def two(one: tuple[list[dict[str, float]], Path]) -> Path:
 
 @pytest.mark.e2e
 @pytest.mark.slow
-@pytest.mark.parametrize("held", ["sharded", "whole"])
+@pytest.mark.parametrize("held", ["sharded", pytest.param("whole", marks=pytest.mark.acceptance)])
 def test_two_processes_are_one(one: tuple[list[dict[str, float]], Path], two: Path, held: str) -> None:
     reports, folder = one
     trainer = trainer_of(World())

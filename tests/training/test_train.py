@@ -121,11 +121,9 @@ def test_a_run_that_was_killed_ends_as_one_that_was_not(
 
 
 @pytest.fixture
-def in_the_foreground() -> Iterator[None]:
+def in_the_foreground() -> None:
     """A shell starts its background jobs with SIGINT ignored, and then so do the commands."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.mark.usefixtures("in_the_foreground")
@@ -161,14 +159,11 @@ def test_the_second_request_acts_at_once() -> None:
 
 
 def test_a_signal_that_is_ignored_stays_ignored() -> None:
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        with stop_requests() as is_requested:
-            os.kill(os.getpid(), signal.SIGINT)
-            assert not is_requested()
-        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGINT, before)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with stop_requests() as is_requested:
+        os.kill(os.getpid(), signal.SIGINT)
+        assert not is_requested()
+    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 
 
 def test_a_worker_that_was_forked_ends_at_once() -> None:
