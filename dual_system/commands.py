@@ -88,6 +88,7 @@ COMMANDS = {
                 "sim_client.counterfactual", "Score how often a trained pair's action follows its own past."
             ),
             "probe": Verb("dual_system.training.probe", "Probe what C and a frame memory's read-out hold."),
+            "words": Verb("dual_system.training.words", "Measure a PONDER's texts on episodes of other scenes."),
         },
     ),
 }

@@ -22,8 +22,8 @@ from dual_system.models.ponder.configs import tiny_cpu as tiny_ponder
 from dual_system.models.ponder.network import Ponder
 from dual_system.models.pounce.checkpoint import random_bundle, save_bundle
 from dual_system.models.pounce.configs import tiny_cpu, tiny_groot
-from dual_system.training import diagnose
-from dual_system.training.collate import collate_pounce
+from dual_system.training import diagnose, words
+from dual_system.training.collate import collate_ponder, collate_pounce
 from dual_system.training.diagnose import (
     EVERY_INVOCATION,
     STALE_BY,
@@ -38,12 +38,13 @@ from dual_system.training.episode import TrainingEpisode
 from dual_system.training.example import Example, make_example
 
 PX, NUM_TICKS = 64, 150
-PONDER = Ponder.random(replace(tiny_ponder(), image_px=(PX, PX), num_layers=4), seed=1)
+SMALL = replace(tiny_ponder(), image_px=(PX, PX), num_layers=4)
+PONDER = Ponder.random(SMALL, seed=1)
 BUNDLE = random_bundle(tiny_cpu(cognition_size=PONDER.hidden_size), seed=0)
 CHANGES = (0, 45, 100)
 
 
-def example() -> Example:
+def example(subgoal: str = "pick") -> Example:
     rng = np.random.default_rng(0)
     views = [tuple(rng.integers(0, 256, (PX, PX, 3), np.uint8) for _ in range(2)) for _ in range(NUM_TICKS)]
     episode = TrainingEpisode(
@@ -53,7 +54,7 @@ def example() -> Example:
         views=views,
         state_TS=rng.uniform(-0.2, 0.2, (NUM_TICKS, 8)).astype(np.float32),
         action_TA=rng.uniform(-0.2, 0.2, (NUM_TICKS, 8)).astype(np.float32),
-        subgoals=["pick"] * NUM_TICKS,
+        subgoals=[subgoal] * NUM_TICKS,
         is_transition_T=np.isin(np.arange(NUM_TICKS), CHANGES),
     )
     return make_example(episode, PONDER.format, EVERY_INVOCATION, rng)
@@ -184,6 +185,52 @@ def test_one_command_measures_and_another_draws(tmp_path: Path, capsys: pytest.C
     assert (out / "staleness.png").exists()
     assert diagnose.main([*arguments, "--episodes", "1"]) == 2
     assert "at least two" in capsys.readouterr().err
+
+
+# -- PONDER's words
+
+
+@pytest.mark.parametrize(
+    ("said", "is_right", "is_right_but_places", "off"),
+    [
+        ("pick it at [200, 300]", True, True, 0.0),
+        ("pick it at [230, 340]", False, True, 50.0),
+        ("pick to at [200, 300]", False, False, 0.0),
+    ],
+)
+def test_a_text_is_compared_in_its_words_and_in_its_places(
+    said: str, is_right: bool, is_right_but_places: bool, off: float
+) -> None:
+    row, other = (collate_ponder([example(text)]).rows[0] for text in ("pick it at [200, 300]", said))
+    predicted = torch.from_numpy(np.asarray(other.targets)[other.supervised_index + 1])
+    logits = 50 * torch.nn.functional.one_hot(predicted, PONDER.vocab_size).float()
+    found = words.Found()
+    words._add(found, row, logits, PONDER)
+    assert found.is_told_apart == [True] * 8  # queries, once a second
+    assert found.is_right == [is_right] * len(CHANGES)
+    assert found.is_right_but_places == [is_right_but_places] * len(CHANGES)
+    assert found.off == [off] * len(CHANGES)
+    assert (max(found.loss) < 1e-6) == is_right
+
+
+def test_the_words_of_a_ponder_are_measured_without_a_pounce(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_ponder(PONDER, tmp_path / "run" / "ponder")
+    data, out = dataset(tmp_path / "data", 2), tmp_path / "out"
+    arguments = ["--data", str(data), "--out", str(out), "--no-progress", "--ponder"]
+    assert words.main([*arguments, str(tmp_path / "run" / "ponder")]) == 0
+    told = capsys.readouterr().out
+    assert told == (out / "words.md").read_text()
+    cells = [cell.strip() for cell in told.splitlines()[-1].split("|")[1:-1]]
+    assert cells[:2] == ["run", "PickHighlight"]
+    assert float(cells[2]) > 5  # untrained: a guess among all tokens
+    assert cells[4] == "4"  # two texts in each episode
+    mute = Ponder.random(SMALL, seed=1)
+    mute.format = replace(mute.format, speaks=False)
+    save_ponder(mute, tmp_path / "mute" / "ponder")
+    assert words.main([*arguments, str(tmp_path / "mute" / "ponder")]) == 2
+    assert "trained with w2 = 0" in capsys.readouterr().err
 
 
 def test_checkpoints_that_are_no_pair_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
