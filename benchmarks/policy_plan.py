@@ -11,7 +11,7 @@ from dual_system.training import laptop_recipes as recipes
 
 Task = Literal["VideoUnmask", "PickHighlight", "MoveCube", "PickXtimes"]
 TASKS: tuple[Task, ...] = get_args(Task)
-EPISODES, STILLS, TOWER_MINUTES = 200, 8_000, 22
+EPISODES, STILLS, FILMS, TOWER_MINUTES = 600, 8_000, 4_000, 22
 CURRENT_WORDS = "words_current"
 """Folder of the PONDER without memory."""
 PLAYS, PLAYS_SEED = 40, 1_000_000
@@ -83,8 +83,10 @@ class Stage:
 
 def stages(folder: Path, tasks: Sequence[str] = TASKS) -> tuple[Stage, ...]:
     """The stages in their order; each reads what those before it wrote. ``tasks``: some of `TASKS`."""
-    names = ("towers", "words", CURRENT_WORDS, "hand", "plays", "corrections", "corrected")
-    towers, words, current_words, hand, plays, corrections, corrected = (folder / name for name in names)
+    names = ("towers", "films", "watched", "words", CURRENT_WORDS, "hand", "plays", "corrections", "corrected")
+    towers, films, watched, words, current_words, hand, plays, corrections, corrected = (
+        folder / name for name in names
+    )
     sets = [folder / "data" / task for task in tasks]
     data = ("--data", *map(str, sets))
     locating = ("dual_system.policy.towers", "--out", f"{towers}", "--stills", f"{STILLS}")
@@ -107,17 +109,22 @@ def stages(folder: Path, tasks: Sequence[str] = TASKS) -> tuple[Stage, ...]:
         ),
         Stage(name="pretrained", commands=((*locating, "--minutes", "0", *data),)),
         Stage(
-            name="hand and words",
+            name="films",
+            commands=(("dual_system.policy.films", "--out", f"{films}", "--films", f"{FILMS}", "--no-progress"),),
+        ),
+        Stage(
+            name="hand and watched films",
             commands=(
                 (*training, *data, *_run(recipes.laptop_hand.__name__, towers, towers, hand)),
-                (*training, *data, *_run(recipes.laptop_grounding.__name__, towers, towers, words)),
+                (*training, "--data", f"{films}", *_run(recipes.laptop_films.__name__, towers, towers, watched)),
             ),
         ),
         Stage(name="plays", commands=(playing,)),
         Stage(name="corrections", commands=((*correcting, "--image-px", "128", "--record-hz", "10"),)),
         Stage(
-            name="hand corrected",
+            name="words and hand corrected",
             commands=(
+                (*training, *data, *_run(recipes.laptop_grounding.__name__, watched, towers, words)),
                 (
                     *training,
                     *data,
@@ -130,7 +137,7 @@ def stages(folder: Path, tasks: Sequence[str] = TASKS) -> tuple[Stage, ...]:
         Stage(
             name="gates and words",  # of the PONDER without memory: hours on one core, the gates' plays on the other
             commands=(
-                (*training, *data, *_run(recipes.laptop_current_grounding.__name__, towers, towers, current_words)),
+                (*training, *data, *_run(recipes.laptop_current_grounding.__name__, watched, towers, current_words)),
                 *_gates(folder, corrected / "pounce", tasks),
             ),
         ),
@@ -179,7 +186,7 @@ def _gates(folder: Path, hand: Path, tasks: Sequence[str]) -> Iterator[tuple[str
 def _row(folder: Path, recipe: str, seed: int) -> Sequence[str]:
     """A row's options. Without grounding PONDER has not learned the tasks' words before either; without memory it has
     learned them without."""
-    own = {recipes.laptop_without_grounding.__name__: "towers", recipes.laptop_current.__name__: CURRENT_WORDS}
+    own = {recipes.laptop_without_grounding.__name__: "watched", recipes.laptop_current.__name__: CURRENT_WORDS}
     ponder = folder / own.get(recipe, "words")
     run = _run(recipe, ponder, folder / "corrected", _folder(folder, recipe, seed))
     return *run, "--seed", f"{seed}"

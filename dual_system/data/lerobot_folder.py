@@ -101,8 +101,9 @@ class LeRobotFolder:
             file = _opened(place.data)
             if missing := sorted({*columns, *_NUMBERING} - set(file.schema_arrow.names)):
                 raise ValueError(f"{place.data} has no column {', '.join(missing)}")
-            groups = tuple(_groups(file, place))
-            table = _read(place.data, place.data.stat().st_mtime_ns, groups, (*_NUMBERING, *columns))
+            changed_ns = place.data.stat().st_mtime_ns
+            groups = _groups(_footer(place.data, changed_ns), place)
+            table = _read(place.data, changed_ns, groups, (*_NUMBERING, *columns))
             numbers = table["index"]
             begin, end = place.first_row, place.first_row + place.length
             table = table.filter(pc.and_(pc.greater_equal(numbers, begin), pc.less(numbers, end)))
@@ -260,18 +261,40 @@ def _decoded(stored: Any) -> NDArray[np.uint8]:
     return np.asarray(Image.open(io.BytesIO(stored["bytes"])).convert("RGB"))
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Footer:
+    """What a file's end says of all its row groups, of which it may have one for every episode: G."""
+
+    about: pq.FileMetaData
+    texts: list[str]
+    index_G2: NDArray[np.int64]
+    """The first and the last number of a row in each group; where it is unknown, any number."""
+
+
 def _opened(path: Path) -> pq.ParquetFile:
     require_file(path)
-    file = pq.ParquetFile(path)
-    about = file.metadata
+    footer = _footer(path, path.stat().st_mtime_ns)
+    return pq.ParquetFile(path, metadata=footer.about, read_dictionary=footer.texts)
+
+
+@lru_cache(maxsize=64)
+def _footer(path: Path, changed_ns: int) -> _Footer:
+    """Raises ValueError if the file declares more than is read."""
+    about = pq.read_metadata(path)
     num_bytes = sum(about.row_group(number).total_byte_size for number in range(about.num_row_groups))
     if about.num_rows > MAX_FILE_ROWS or num_bytes > MAX_FILE_BYTES:
         raise ValueError(
             f"{path} declares {about.num_rows} rows of {num_bytes} bytes; at most {MAX_FILE_ROWS} and {MAX_FILE_BYTES} "
             "are read"
         )
-    texts = [column.path for column in map(about.schema.column, range(about.num_columns)) if _is_text(column)]
-    return pq.ParquetFile(path, metadata=about, read_dictionary=texts)
+    columns = [about.schema.column(number) for number in range(about.num_columns)]
+    index_G2 = np.tile([np.iinfo(np.int64).min, np.iinfo(np.int64).max], (about.num_row_groups, 1))
+    for leaf in (number for number, column in enumerate(columns) if column.path == "index"):
+        for group, limits_2 in enumerate(index_G2):
+            found = about.row_group(group).column(leaf).statistics
+            if found is not None and found.has_min_max:
+                limits_2[:] = found.min, found.max
+    return _Footer(about=about, texts=[column.path for column in columns if _is_text(column)], index_G2=index_G2)
 
 
 def _is_text(column: Any) -> bool:
@@ -298,15 +321,11 @@ def _spelled_out(table: pa.Table) -> pa.Table:
     return table.cast(pa.schema(kinds))
 
 
-def _groups(file: pq.ParquetFile, place: Place) -> Iterator[int]:
-    """Yields the row groups that may hold rows of an episode."""
-    about = file.metadata
-    (leaf,) = (number for number in range(about.num_columns) if about.schema.column(number).path == "index")
-    for number in range(about.num_row_groups):
-        found = about.row_group(number).column(leaf).statistics
-        is_known = found is not None and found.has_min_max
-        if not is_known or (found.max >= place.first_row and found.min < place.first_row + place.length):
-            yield number
+def _groups(footer: _Footer, place: Place) -> tuple[int, ...]:
+    """The row groups that may hold rows of an episode."""
+    first_G, last_G = footer.index_G2.T
+    meets_G = (last_G >= place.first_row) & (first_G < place.first_row + place.length)
+    return tuple(np.flatnonzero(meets_G).tolist())
 
 
 @lru_cache(maxsize=1)  # one group may hold many episodes, which are often read one after the other

@@ -59,6 +59,11 @@ def laptop_hand_corrected() -> Recipe:
     return replace(laptop_hand(), name="laptop_hand_corrected", num_steps=1_500)
 
 
+def laptop_films() -> Recipe:
+    """Stage A1 of the laptop pair's PONDER, after its tower: films of things, and where they are (`policy.films`)."""
+    return replace(laptop_grounding(), name="laptop_films")
+
+
 def laptop_grounding() -> Recipe:
     """Stage A2 of the laptop pair: PONDER learns the tasks' words, as the paper's did before joint training."""
     return replace(laptop(), name="laptop_grounding", num_steps=2_500, w2=1.0, trains="ponder")
@@ -95,7 +100,7 @@ def laptop_current() -> Recipe:
 
 
 def laptop_without_grounding() -> Recipe:
-    """Row: w2 = 0, from a PONDER that knows pictures and no words of the tasks."""
+    """Row: w2 = 0, from a PONDER that knows films and no words of the tasks."""
     run = laptop()
     return replace(
         run,
@@ -175,6 +180,7 @@ def _of_the_hand(name: str, pounce: PounceConfig, told: Told | None = None) -> R
 ALL: tuple[Callable[[], Recipe], ...] = (
     laptop_hand,
     laptop_hand_corrected,
+    laptop_films,
     laptop_grounding,
     laptop_current_grounding,
     laptop,

@@ -24,6 +24,7 @@ from benchmarks.policy_plan import TASKS, Stage, stages
 from dual_system.data.collect import CollectOptions
 from dual_system.data.correct import CorrectOptions
 from dual_system.data.export import ExportOptions
+from dual_system.policy.films import FilmsOptions
 from dual_system.policy.towers import TowersOptions
 from dual_system.tasks.pair_files import PairsOptions
 from dual_system.training.probe import ProbeOptions
@@ -39,6 +40,7 @@ OPTIONS: dict[str, Any] = {
     "dual_system.data.correct": CorrectOptions,
     "dual_system.data.export": ExportOptions,
     "sim_client.evaluate": EvalOptions,
+    "dual_system.policy.films": FilmsOptions,
     "dual_system.policy.towers": TowersOptions,
     "dual_system.tasks.pair_files": PairsOptions,
     "sim_client.counterfactual": CounterfactualOptions,

@@ -81,6 +81,24 @@ def edit_episodes(folder: Path, edit: Callable[[list[dict[str, Any]]], Any]) -> 
 # -- layouts that are right
 
 
+def test_the_end_of_a_file_is_read_once_however_many_episodes_it_holds(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It names every group of rows, one an episode: read for each of them, a folder takes the square of its length."""
+    read: list[Path] = []
+    read_metadata = pq.read_metadata
+
+    def counted(path: Path) -> Any:
+        read.append(path)
+        return read_metadata(path)
+
+    monkeypatch.setattr(pq, "read_metadata", counted)
+    dataset = Dataset(folder)
+    for entry in dataset.episodes:
+        dataset.rows(entry.index)
+    assert len(read) == len({*read})
+
+
 @pytest.mark.parametrize("row_group_size", [1, 7, 100])
 def test_row_groups_mean_nothing(folder: Path, base: Path, row_group_size: int) -> None:
     pq.write_table(pq.read_table(folder / DATA), folder / DATA, row_group_size=row_group_size)

@@ -125,6 +125,10 @@ def test_both_systems_of_a_recipe_fit(name: str) -> None:
         assert num_carriers == 0
 
 
+STAGES = ("laptop_hand", "laptop_hand_corrected", "laptop_films", "laptop_grounding", "laptop_current_grounding")
+"""What comes before the rows."""
+
+
 @pytest.mark.parametrize("name", [name for name in RECIPES if name.startswith("laptop")])
 def test_every_row_of_the_laptop_table_has_the_same_chances(name: str) -> None:
     """Same data, steps, batches, rates and branch points as the pair; only the channel differs."""
@@ -136,7 +140,7 @@ def test_every_row_of_the_laptop_table_has_the_same_chances(name: str) -> None:
         memory = {"pounce.frame_memory.sampling.until": ("observation", "query")} if "framesamp" in name else {}
         delays = {"num_steps": (1_500, 300), "example.delay_up_to_ns": (0, 2 * NS_PER_S)}
         assert found == {"name": (name.removesuffix("_delayed"), name), **delays, **memory}
-    elif name not in ("laptop_hand", "laptop_hand_corrected", "laptop_grounding", "laptop_current_grounding"):
+    elif name not in STAGES:
         assert (row.num_steps, row.batch_episodes) == (pair.num_steps, pair.batch_episodes)
         for field in ("clocks", "max_invocations", "branch_weight"):
             assert getattr(row.example, field) == getattr(pair.example, field)
