@@ -57,10 +57,10 @@ class WordsOptions:
 
 @dataclass(slots=True)
 class Found:
-    """Of one PONDER and task, over all its episodes."""
+    """What one PONDER said of one task, over all its episodes."""
 
     loss: list[float] = field(default_factory=list)
-    """Of every supervised token [nats]."""
+    """Cross-entropy of every supervised token [nats]."""
     is_told_apart: list[bool] = field(default_factory=list)
     is_right: list[bool] = field(default_factory=list)
     is_right_but_places: list[bool] = field(default_factory=list)
